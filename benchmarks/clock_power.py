@@ -17,9 +17,9 @@ from dataclasses import replace
 from pathlib import Path
 
 from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.flight.clock import CANNOT_TELL, SHIFTED, ClockEstimate, judge_clock
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
-from aerpaw_cmp.flight.draft import DraftOptions, drafts
+from aerpaw_cmp.flight.drafting.draft import DraftOptions, drafts
+from aerpaw_cmp.flight.pose.clock import CANNOT_TELL, SHIFTED, ClockEstimate, judge_clock
 from aerpaw_cmp.flight.replay import clock_channels
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest

@@ -20,7 +20,7 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal, norm
 
 from aerpaw_cmp.compare.rank import compare_ranks
-from aerpaw_cmp.compare.statistics import error_intervals, paired_difference
+from aerpaw_cmp.compare.statistics.intervals import error_intervals, paired_difference
 
 OFFSET_DB, SHADOW_DB, NOISE_DB = 7.3, 4.0, 2.0
 CUTS = np.array([-0.8, 0.5, 1.6])

@@ -24,13 +24,13 @@ import numpy as np
 from scenes import ends, shipped  # type: ignore[import-not-found]
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.compare.statistics import paired_difference
+from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.jobs.notebook import open_flight
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import Replay, replay
-from aerpaw_cmp.site.mitsuba import read_scene
+from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
 from aerpaw_cmp.site.site import Site, Tower
 
 VERDICTS = {"better": "it pays", "worse": "it costs"} | dict.fromkeys(

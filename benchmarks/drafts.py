@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 
 from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.flight.draft import DraftOptions, drafts
+from aerpaw_cmp.flight.drafting.draft import DraftOptions, drafts
 from aerpaw_cmp.logs.flight_file import IngestedFile
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions

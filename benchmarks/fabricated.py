@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.compare.level.rss import compare_rss, error_spans
 from aerpaw_cmp.compare.rank import channel_rank, commonest_rank, compare_rank, singular_values
 from aerpaw_cmp.compare.result import Fit, ModelLevel, RankFurther, RankResult, RssFurther, RssResult
-from aerpaw_cmp.compare.rss import compare_rss, error_spans
 from aerpaw_cmp.jobs.campaigns.season import with_season
-from aerpaw_cmp.report.campaign_data import CampaignData, Failure, FlownTrack, RssRow
-from aerpaw_cmp.report.data import ReportData, Track
+from aerpaw_cmp.report.content.campaign import CampaignData, Failure, FlownTrack, RssRow
+from aerpaw_cmp.report.content.flight import ReportData, Track
 from aerpaw_cmp.site.siteyaml import load_site
 
 DRIFT_DB_PER_30_DAYS = 0.4

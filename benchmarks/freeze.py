@@ -57,7 +57,7 @@ def street() -> tuple[Any, Any, Any] | None:
     spec = find_spec("sionna")
     if spec is None or find_spec("numba") is None:
         return None
-    from aerpaw_cmp.site.mitsuba import read_scene
+    from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
 
     folder = Path(next(iter(spec.submodule_search_locations or []))) / "rt" / "scenes" / "simple_street_canyon"
     site, link, poses = random_scene(200, buildings=0)

@@ -438,7 +438,7 @@ def _site(path: Path) -> Any:
 
 
 def _map(path: Path) -> Any:
-    from aerpaw_cmp.site.footprints import import_footprints
+    from aerpaw_cmp.site.imports.footprints import import_footprints
 
     return import_footprints([path], FRAME)
 
@@ -450,7 +450,7 @@ def _dem(path: Path) -> Any:
 
 
 def _pattern(path: Path) -> Any:
-    from aerpaw_cmp.site.antennas import read_pattern_text
+    from aerpaw_cmp.site.antenna.antennas import read_pattern_text
 
     return read_pattern_text(path)
 

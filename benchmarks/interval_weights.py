@@ -1,4 +1,4 @@
-"""Weights of the memories in ``aerpaw_cmp/compare/memory_weights.json``: those whose 95 % intervals hold in every cell.
+"""Weights of the memories in ``aerpaw_cmp/compare/statistics/memory_weights.json``: those whose 95 % intervals hold in every cell.
 
 Sequences with AR(1) memory (and some with white noise besides) are simulated in cells of (samples, correlation of
 neighbours). The weights minimise the squared distance of every cell's coverage from 95 %, plus a little for the width
@@ -15,7 +15,7 @@ from scipy.signal import lfilter
 from scipy.special import expit, gammaincc, logit, ndtri, stdtr
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.memory import RATES, WHITE_SHARES, cosine_terms, likelihoods, memories
+from aerpaw_cmp.compare.statistics.memory import RATES, WHITE_SHARES, cosine_terms, likelihoods, memories
 
 COVERAGE, TAIL, STEEP, WIDTH, SMOOTH = 0.948, 0.025, 5.0, 5e-4, 1e-5
 SIZES, CORRELATIONS = (100, 200, 500, 1000, 2000, 5000), (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99)

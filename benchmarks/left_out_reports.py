@@ -29,7 +29,7 @@ from aerpaw_cmp.jobs.learning.calibrate import Calibration, load_calibration, ob
 from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks
 from aerpaw_cmp.jobs.learning.calibrate_rank import fit_rank
 from aerpaw_cmp.jobs.learning.calibration_files import receiver_entry, site_entry
-from aerpaw_cmp.site.learned import folder_of, remember
+from aerpaw_cmp.site.antenna.learned import folder_of, remember
 
 RECIPES = Path(__file__).parents[1] / "tests" / "field" / "learned"
 TIMEZONE = "America/New_York"

@@ -145,10 +145,10 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
     from aerpaw_cmp.jobs.mapping import coverage_map
     from aerpaw_cmp.jobs.reporting import flight_run
     from aerpaw_cmp.maps import export
-    from aerpaw_cmp.report import canvas
-    from aerpaw_cmp.report.campaign import figures as campaign_figures
-    from aerpaw_cmp.report.maps import figures as maps_figures
-    from aerpaw_cmp.report.plots import flight as figures
+    from aerpaw_cmp.report.figures import campaign as campaign_figures
+    from aerpaw_cmp.report.figures import flight as figures
+    from aerpaw_cmp.report.figures import maps as maps_figures
+    from aerpaw_cmp.report.kit import canvas
 
     for room in (figures, campaign_figures, maps_figures):
         specs: Callable[..., Any] = room.figure_specs

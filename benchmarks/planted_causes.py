@@ -14,7 +14,7 @@ from collections import Counter
 import numpy as np
 from numpy.typing import NDArray
 
-from aerpaw_cmp.compare.causes import LevelEvidence, likely_cause
+from aerpaw_cmp.compare.judge.causes import LevelEvidence, likely_cause
 from aerpaw_cmp.flight.simulate import correlated_noise
 
 Array = NDArray[np.float64]

@@ -109,7 +109,7 @@ def samples(count: int) -> dict[str, float]:
     """One channel whose residual remembers a second and a half, ten samples a second."""
     from scipy.signal import lfilter
 
-    from aerpaw_cmp.compare.rss import compare_rss
+    from aerpaw_cmp.compare.level.rss import compare_rss
 
     generator = np.random.default_rng(1)
     decay = math.exp(-0.1 / 1.5)

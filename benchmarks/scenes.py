@@ -35,7 +35,7 @@ from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.beams import grow_paths
 from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.propagation.search.merging import merged
-from aerpaw_cmp.site.mitsuba import TriangleScene, read_scene
+from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene, read_scene
 
 SOURCES = {
     "munich": (8.5, 21.0, 27.0),

@@ -23,8 +23,8 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 from tap_common import conditions, read_lines, show, start_tap
 
-from aerpaw_cmp.live.log import BadLine, read_log
-from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
+from aerpaw_cmp.live.record.log import BadLine, read_log
+from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
 
 FINAL = {"ok": "OK", "error": "ERROR", "cme": "+CME ERROR: ", "cms": "+CMS ERROR: "}
 

@@ -19,8 +19,8 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent))
 from tap_common import conditions, free_port, read_lines, show, start_browser, start_tap
 
-from aerpaw_cmp.live.log import BadLine, read_log
-from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
+from aerpaw_cmp.live.record.log import BadLine, read_log
+from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
 
 
 def one_kill(number: int, seed: int, folder: Path, *, web: bool = False, patience_s: float = 0.25) -> dict[str, int]:

@@ -21,9 +21,9 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))
 from tap_common import CSI, conditions, cpu_s, damaged, free_port, resident_kib, show, start_browser, start_tap
 
-from aerpaw_cmp.live.log import BadLine, read_log
-from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
-from aerpaw_cmp.report.live_page import live_page
+from aerpaw_cmp.live.record.log import BadLine, read_log
+from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
+from aerpaw_cmp.report.pages.live import live_page
 
 
 def log_against_modem(log: Path, modem: ModemSimulator) -> dict[str, int]:

@@ -12,7 +12,7 @@ import typer
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.cli.app import app
 from aerpaw_cmp.common.commands import COMMANDS
-from aerpaw_cmp.live.export import ExportSummary
+from aerpaw_cmp.live.record.export import ExportSummary
 from aerpaw_cmp.live.session import TapSummary
 from tests import json_page
 from tests.json_page import listed

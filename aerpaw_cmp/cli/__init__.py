@@ -11,8 +11,8 @@ from typing import Any
 import typer
 
 from ..common.errors import UsageError
-from . import campaign, diff, explain, flight, live, logs, machine, plan, predict, site
 from .app import Interrupted, app
+from .commands import campaign, diff, explain, flight, live, logs, machine, plan, predict, site
 from .shown import say
 
 # The modules whose commands there are: importing them registers these.

@@ -13,9 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, power_from_db
-from .inertia import LANES, LARGEST, certain_rank
-from .passes import SAME_PLACE_M, Visit, same_places
-from .statistics import (
+from .statistics.inertia import LANES, LARGEST, certain_rank
+from .statistics.intervals import (
     NO_INTERVAL,
     REPLICATES,
     SEED,
@@ -26,6 +25,7 @@ from .statistics import (
     interval,
     share_interval,
 )
+from .statistics.passes import SAME_PLACE_M, Visit, same_places
 
 # Ranks of the histograms: 1 to 4 (RI of the AERPAW modems).
 MAX_RANK = 4

@@ -15,18 +15,18 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, db_from_amplitude
-from .causes import Cause
-from .detection import DetectionScore
-from .field_difference import FieldAudit
-from .forecast import ForecastScore
-from .ladder import LadderRow
+from .gains.spread import StatedSpread
+from .judge.causes import Cause
+from .judge.ladder import LadderRow
+from .level.detection import DetectionScore
+from .level.field_difference import FieldAudit
+from .level.rss import LEARNED_HERE, ChannelDifference, ErrorSpan, ResidualBins, RssComparison
+from .level.serving import ServingComparison
 from .offset import Censored
-from .passes import Repeated
 from .rank import CommonestRank, RankComparison, RankRepeat
-from .rss import LEARNED_HERE, ChannelDifference, ErrorSpan, ResidualBins, RssComparison
-from .serving import ServingComparison
-from .spread import StatedSpread
-from .statistics import Interval, PairedDifference
+from .ranks.forecast import ForecastScore
+from .statistics.intervals import Interval, PairedDifference
+from .statistics.passes import Repeated
 
 # Models that a replay is held against, with their names in words; the last two know no physics.
 BASELINE_TITLE = {
@@ -101,7 +101,7 @@ class RssFurther:
     the replay is better or worse on the same samples; ``averaged`` is by simulation and window.
     ``n_outliers`` samples lie far outside the distribution of the channel's own levels: they count in all numbers but
     ``rmse_without_outliers_db``. ``trimmed``, ``identifiable_db``, ``block_length`` and the other counts are those of
-    :class:`~aerpaw_cmp.compare.rss.RssComparison`.
+    :class:`~aerpaw_cmp.compare.level.rss.RssComparison`.
     """
 
     n_measured_out: int

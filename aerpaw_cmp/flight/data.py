@@ -21,13 +21,13 @@ from ..logs.records import Stream
 from ..propagation.arrays import Link
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
-from .cross_checks import doubts
-from .heights import at_height, lacks_height, raised
-from .hour_shift import clock_trap
 from .lock import lock_of
+from .pose.cross_checks import doubts
+from .pose.heights import at_height, lacks_height, raised
+from .pose.hour_shift import clock_trap
+from .pose.track import Track, TrackPoses, good_positions
 from .scored import scored_rows, unscored
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, SiteChoice
-from .track import Track, TrackPoses, good_positions
 
 Times = NDArray[np.datetime64]
 

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 
 from ..common.units import FloatArray
-from ..compare.detection import aligned_quality
-from ..compare.serving import at_times
+from ..compare.level.detection import aligned_quality
+from ..compare.level.serving import at_times
 from ..logs.records import Stream
 
 # Quality [dB] at perfect lock (the peak of 4095 chips), and below which the receiver has lost it.

@@ -23,13 +23,13 @@ from ..propagation.paths import Faces, PathSet
 from ..propagation.replay import PER_LINK, Replay, replay
 from ..propagation.search.effort import Estimate
 from ..site.site import Site
-from .clock import Along, ClockChannel, ClockEstimate, judge_clock
 from .data import FlightData, RssSeries, Times, rank_positions
 from .learned_gain import LearnedGain, learned_gain
 from .lock import LOCK_FLOOR_DB
 from .losses import path_loss
+from .pose.clock import Along, ClockChannel, ClockEstimate, judge_clock
+from .pose.track import TrackPoses, nanoseconds
 from .settings import RtSettings
-from .track import TrackPoses, nanoseconds
 from .training import learned_here
 
 

@@ -37,9 +37,9 @@ from ..propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
-from ..site.antennas import Isotropic
-from ..site.learned import BAND, Named, find_named, read_table
-from ..site.sphere_pattern import read_sphere_csv
+from ..site.antenna.antennas import Isotropic
+from ..site.antenna.learned import BAND, Named, find_named, read_table
+from ..site.antenna.sphere_pattern import read_sphere_csv
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -167,7 +167,7 @@ class ArraySettings(StrictModel):
 
 def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | None = None) -> Pattern:
     """The element pattern of the settings; files resolve against ``folder``, the carrier chooses among frequencies."""
-    from ..site import antennas
+    from ..site.antenna import antennas
 
     file = folder / str(settings.file)
     if settings.model == "dipole":
@@ -175,7 +175,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
     if settings.model == "tr38901":
         return antennas.TR38901()
     if settings.model == "file":
-        from ..site.pattern_files import read_pattern_file
+        from ..site.antenna.pattern_files import read_pattern_file
 
         return read_pattern_file(file, polarised=settings.polarised, carrier_hz=carrier_hz)
     if settings.model == "sphere":

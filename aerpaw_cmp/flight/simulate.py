@@ -31,8 +31,8 @@ from ..propagation.options import Search
 from ..propagation.replay import replay
 from ..site.site import Site
 from .data import site_place
+from .pose.track import interpolated
 from .settings import FlightFile, LogSettings, PlanSettings, files_of
-from .track import interpolated
 
 # What was planted.
 _TRUTH = "truth.json"

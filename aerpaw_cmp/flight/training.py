@@ -10,7 +10,7 @@ import numpy as np
 from ..common.provenance import union
 from ..common.units import AnyArray, FloatArray
 from ..propagation.arrays import Link
-from ..site.sphere_pattern import SpherePattern
+from ..site.antenna.sphere_pattern import SpherePattern
 from .data import FlightData, RankSeries, RssSeries
 
 

@@ -17,8 +17,8 @@ from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.outputs import OutputFolder, changed_files
 from ..common.provenance import KEY
 from ..common.units import FloatArray
-from ..compare import report_difference
-from ..report.diff.data import Entry, InputEntry, ReportDiff, ReportSide
+from ..compare.judge import report_difference
+from ..report.content.diff import Entry, InputEntry, ReportDiff, ReportSide
 from ..report.names import RANK_COLUMNS, RSS_COLUMNS, links_of
 
 # Differences up to this count as none: the tables hold four decimals, offsets one.
@@ -76,7 +76,7 @@ def run_diff(
     _same_flight(first_report, second_report)
     if out is None:
         return _compare_reports(first_report, second_report, tolerance_db)
-    from ..report.diff.html import write_diff
+    from ..report.pages.diff import write_diff
 
     with OutputFolder(out, job="diff", inputs=[*first_report.files, *second_report.files], force=force) as output:
         diff = _compare_reports(first_report, second_report, tolerance_db)

@@ -17,7 +17,7 @@ from ..common.units import ComplexArray, FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.result import FlightResult
 from ..flight.data import FlightData, gather, load_data, rank_positions
-from ..flight.draft import draft, flights_by_name
+from ..flight.drafting.draft import draft, flights_by_name
 from ..flight.overrides import overridden
 from ..flight.replay import FlightReplay, Replayed, replay_flight
 from ..flight.settings import FlightFile, load_flight, with_learned

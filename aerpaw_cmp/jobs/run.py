@@ -91,7 +91,7 @@ def run_ingest(
         if out is not None:
             target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=inputs, force=force))
         if draft is not None:
-            from ..flight.draft import SITE, DraftOptions, drafts
+            from ..flight.drafting.draft import SITE, DraftOptions, drafts
 
             drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=inputs, force=force))
         files = ingest(paths, options=ReadOptions(**options), reader=reader)
@@ -119,7 +119,7 @@ def run_ingest(
             account["drafts"] = [str(place) for place in places]
         if target is not None:
             target.write(partial(fill, files=files))
-            from ..flight.draft import flights_by_name
+            from ..flight.drafting.draft import flights_by_name
 
             account["flights"] = list(flights_by_name(files))
     return account
@@ -209,10 +209,10 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
     from ..flight.data import load_data
     from ..flight.replay import replay_flight
     from ..flight.settings import load_flight
-    from ..report.build import report_data
-    from ..report.export import metrics as metrics_of
+    from ..report.content.flight_parts import report_data
     from ..report.exports.formats import chosen_formats
-    from ..report.write import FIGURES, STYLES, write_report
+    from ..report.exports.tables import metrics as metrics_of
+    from ..report.pages.flight_folder import FIGURES, STYLES, write_report
     from .reporting.flight_run import run_flight
     from .reporting.foliage_notes import foliage_notes
     from .reporting.ladder import recommended_text
@@ -358,8 +358,8 @@ def run_site_import(
     list of str
         A line per thing that was done.
     """
-    from ..site.canopy import with_canopy, with_heights
-    from ..site.footprints import import_site, site_yaml
+    from ..site.imports.canopy import with_canopy, with_heights
+    from ..site.imports.footprints import import_site, site_yaml
 
     rasters = [path for path in (canopy, surface) if path is not None]
     with OutputFile(out, own=is_sealed, inputs=[*files, *rasters, Path(base)], force=force) as output:
@@ -395,7 +395,7 @@ def run_site_show(
     -------
     JobOutcome
     """
-    from ..report.site_view import write_site_view
+    from ..report.pages.site import write_site_view
     from ..site.siteyaml import load_site
     from .tasks.manifest import inputs_of_flight, inputs_of_site
 
@@ -415,7 +415,7 @@ def run_site_show(
             place = load_site(site or "lake_wheeler")
         else:
             from ..flight.data import load_data
-            from ..report.build import track_of
+            from ..report.content.flight_parts import track_of
 
             data = load_data(settings, flight.parent, logs_root)
             place, track = data.site, track_of(data)
@@ -457,7 +457,7 @@ def run_map(
     JobOutcome
     """
     from ..maps.grid import Grid
-    from ..report.maps.html import maps_metrics, write_maps
+    from ..report.pages.maps import maps_metrics, write_maps
     from ..site.siteyaml import load_site
     from .mapping import coverage_map as mapping
     from .mapping.paper_table import paper_markdown, paper_rows
@@ -543,7 +543,7 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
 
     from ..flight.data import load_data
     from ..flight.settings import load_flight
-    from ..report.build import track_of
+    from ..report.content.flight_parts import track_of
 
     settings = load_flight(flight)
     track = track_of(load_data(settings, flight.parent, logs_root))
@@ -590,9 +590,9 @@ def run_campaign(
     UsageError
         A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
     """
-    from ..report.campaign.html import campaign_metrics, write_campaign
-    from ..report.campaign.words import warnings
     from ..report.exports.formats import chosen_formats
+    from ..report.pages.campaign import campaign_metrics, write_campaign
+    from ..report.words.campaign import warnings
     from .campaigns.campaign import load_campaign
     from .campaigns.campaign import run as run_all
     from .campaigns.season import find_reports, with_season
@@ -686,7 +686,7 @@ def run_calibrate(
     JobOutcome
         The settings file is the first of its ``files``.
     """
-    from ..site.learned import remember
+    from ..site.antenna.learned import remember
     from ..site.siteyaml import site_model
     from .learning.calibrate import calibrate, load_calibration, read_flights
     from .learning.calibrate_rank import fit_rank

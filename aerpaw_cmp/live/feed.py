@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from ..logs.checksums import Record
-from .modem import RI_QUERY
+from .serial.modem import RI_QUERY
 from .session import TapStatus
 
 # Rows that stay: two hours at 10 Hz, ten at 2 Hz.

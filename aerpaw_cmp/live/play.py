@@ -10,7 +10,7 @@ from pathlib import Path
 from ..common.errors import InputError, UsageError
 from ..logs.checksums import Record
 from .feed import Feed
-from .log import BadLine, read_log
+from .record.log import BadLine, read_log
 from .stop import Stop
 
 # Time between two records beyond this (the tap was off) is passed at once, in seconds of the log.

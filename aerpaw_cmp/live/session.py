@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ..common.errors import UsageError
-from .log import LogSettings
-from .modem import OTHER_QUERIES, RI_QUERY, query_of
-from .ports import Roots
+from .record.log import LogSettings
+from .serial.modem import OTHER_QUERIES, RI_QUERY, query_of
+from .serial.ports import Roots
 
 
 @dataclass(frozen=True, slots=True)
@@ -26,7 +26,7 @@ class TapSettings:
     other_hz : float
         Rate of each query in ``queries`` [Hz].
     queries : tuple of str
-        Names in :data:`~aerpaw_cmp.live.modem.QUERIES`.
+        Names in :data:`~aerpaw_cmp.live.serial.modem.QUERIES`.
     pause_s : float
         Rest between an answer and the next command [s].
     answer_timeout_s : float

@@ -1,7 +1,7 @@
 """The tap: polls the modem, writes every answer down, survives what happens in a field.
 
 One polling thread, one command in flight. A record is in the kernel's hands before the next command goes out, unless
-the disk stalls (:mod:`~aerpaw_cmp.live.writer`). The port may vanish and come back under another number, the disk may
+the disk stalls (:mod:`~aerpaw_cmp.live.record.writer`). The port may vanish and come back under another number, the disk may
 fill, the clock may step, signals may come: each leaves its own record, and the polling goes on.
 """
 
@@ -20,16 +20,16 @@ from typing import Any
 from .. import __version__
 from ..common.errors import InputError
 from ..logs.checksums import SCHEMA, Record
-from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
-from .log import Clock, SegmentLog, boot_id, clock_synchronised
-from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
-from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
 from .predict import Asked, Predict, PredictionWorker
+from .record.log import Clock, SegmentLog, boot_id, clock_synchronised
+from .record.writer import LogWriter
 from .schedule import Schedule
+from .serial.framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
+from .serial.modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
+from .serial.ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
 from .session import TapSettings, TapStatus, TapSummary, format_status
 from .status_notifier import StatusNotifier
 from .stop import Stop
-from .writer import LogWriter
 
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
 

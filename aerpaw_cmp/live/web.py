@@ -30,7 +30,7 @@ from urllib.parse import parse_qs, quote, urlsplit
 
 from ..common.errors import UsageError
 from .feed import Feed
-from .ports import holders_of_sockets
+from .serial.ports import holders_of_sockets
 
 DEFAULT = "127.0.0.1:8765"
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")

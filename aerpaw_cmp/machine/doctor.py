@@ -210,7 +210,7 @@ def readers_check() -> Check:
 def holders(device: str) -> list[str]:
     """Processes that have a device open, as ``name (pid)``; those of other users are visible to root only."""
     try:
-        from ..live import ports
+        from ..live.serial import ports
     except ImportError:  # no termios: not a system that the tap runs on
         return []
     return [f"{holder.name} ({holder.pid})" for holder in ports.holders(Path(device), others_only=False)]

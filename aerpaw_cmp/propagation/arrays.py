@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from ..common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray
-from ..site.antennas import Isotropic as Isotropic
+from ..site.antenna.antennas import Isotropic as Isotropic
 
 
 class Pattern(Protocol):

@@ -10,8 +10,8 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
 from ..site.materials import material
+from ..site.mesh_scenes.mitsuba import TriangleScene
 from ..site.meshes import building_mesh
-from ..site.mitsuba import TriangleScene
 from ..site.scenes import added
 from ..site.site import Site
 from . import compiled

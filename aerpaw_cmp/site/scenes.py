@@ -14,7 +14,7 @@ from shapely.geometry import Polygon
 
 from ..common.errors import UsageError
 from .materials import material
-from .mitsuba import TriangleScene, read_scene
+from .mesh_scenes.mitsuba import TriangleScene, read_scene
 from .site import Building, Site
 
 # A ground plane that is added reaches this many times the size of the scene beyond it.
@@ -43,7 +43,7 @@ def placed_scene(
     path : Path
         The XML file.
     materials : mapping of str to str, optional
-        As in :func:`aerpaw_cmp.site.mitsuba.read_scene`.
+        As in :func:`aerpaw_cmp.site.mesh_scenes.mitsuba.read_scene`.
     sha256 : str, optional
         What the scene's files must have.
     offset_m : (east, north, up)

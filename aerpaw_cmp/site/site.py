@@ -17,7 +17,7 @@ from ..common.htmltable import html_table
 from ..common.units import FloatArray
 from .dem import Dem
 from .heights import VerticalDatum
-from .mitsuba import TriangleScene
+from .mesh_scenes.mitsuba import TriangleScene
 
 
 @dataclass(frozen=True, slots=True)

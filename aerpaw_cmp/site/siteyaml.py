@@ -27,7 +27,7 @@ from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines
 from .dem import Dem, read_dem
 from .heights import Height, HeightReference, VerticalDatum
 from .materials import material
-from .mitsuba import TriangleScene
+from .mesh_scenes.mitsuba import TriangleScene
 from .scenes import placed_scene
 from .site import Building, Forest, Geofence, Site, Tower, Trees
 from .trees import Distribution, TreeSizes, join_trees, place_trees, trees_at, wanted_trees

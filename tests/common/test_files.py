@@ -68,19 +68,19 @@ def _yaml(path):
 
 
 def _map(path):
-    from aerpaw_cmp.site.mapfiles import read_map_file
+    from aerpaw_cmp.site.imports.mapfiles import read_map_file
 
     return read_map_file(path)
 
 
 def _scene(path):
-    from aerpaw_cmp.site.mitsuba import _root
+    from aerpaw_cmp.site.mesh_scenes.mitsuba import _root
 
     return _root(path)
 
 
 def _mesh(path):
-    from aerpaw_cmp.site.meshfiles import read_mesh
+    from aerpaw_cmp.site.mesh_scenes.meshfiles import read_mesh
 
     return read_mesh(path)
 
@@ -93,19 +93,19 @@ def _elevation(path):
 
 
 def _pattern(path):
-    from aerpaw_cmp.site.antennas import read_pattern_text
+    from aerpaw_cmp.site.antenna.antennas import read_pattern_text
 
     return read_pattern_text(path)
 
 
 def _sphere(path):
-    from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
+    from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv
 
     return read_sphere_csv(path)
 
 
 def _gain_grids(path):
-    from aerpaw_cmp.site.antennas import read_gain_grid
+    from aerpaw_cmp.site.antenna.antennas import read_gain_grid
 
     return read_gain_grid(path, "rad_pat")
 

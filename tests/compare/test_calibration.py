@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.detection import floored_fit
-from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term
-from aerpaw_cmp.compare.ladder import log_distance_level_db
+from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term
+from aerpaw_cmp.compare.gains.spread import StatedSpread, fading_of, inside_shares
+from aerpaw_cmp.compare.judge.ladder import log_distance_level_db
 from aerpaw_cmp.compare.learning import calibration
 from aerpaw_cmp.compare.learning.calibration import (
     Observed,
@@ -18,8 +18,8 @@ from aerpaw_cmp.compare.learning.calibration import (
     groups_of,
     spread_flights,
 )
-from aerpaw_cmp.compare.rss import local_mean_db
-from aerpaw_cmp.compare.spread import StatedSpread, fading_of, inside_shares
+from aerpaw_cmp.compare.level.detection import floored_fit
+from aerpaw_cmp.compare.level.rss import local_mean_db
 from aerpaw_cmp.propagation.arrays import rotation_from_yaw_pitch_roll
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)

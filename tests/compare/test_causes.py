@@ -7,8 +7,8 @@ import pytest
 from scipy.optimize import lsq_linear
 from scipy.stats import multivariate_normal
 
-from aerpaw_cmp.compare import causes
-from aerpaw_cmp.compare.causes import LevelEvidence, likely_cause
+from aerpaw_cmp.compare.judge import causes
+from aerpaw_cmp.compare.judge.causes import LevelEvidence, likely_cause
 from benchmarks.planted_causes import TROUBLES, flight
 
 

@@ -10,8 +10,8 @@ from scipy.stats import norm, t
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.direction_gain import LinkSamples
-from aerpaw_cmp.compare.entries import crps_normal
+from aerpaw_cmp.compare.gains.direction_gain import LinkSamples
+from aerpaw_cmp.compare.judge.entries import crps_normal
 from aerpaw_cmp.compare.learning import correction
 from aerpaw_cmp.compare.learning.correction import OFF, Base, Channel, by_degree, choose, fixed_base
 from aerpaw_cmp.compare.learning.field_gp import PARTS, FieldFit, FieldModel, Rows

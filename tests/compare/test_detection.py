@@ -5,7 +5,7 @@ import pytest
 from scipy.special import expit
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.compare.detection import (
+from aerpaw_cmp.compare.level.detection import (
     BASE_S,
     DetectionForecast,
     aligned_quality,
@@ -14,8 +14,8 @@ from aerpaw_cmp.compare.detection import (
     learn_detection,
     score_detection,
 )
-from aerpaw_cmp.compare.forecast import constant_forecast
-from aerpaw_cmp.compare.receiver import out_of_group
+from aerpaw_cmp.compare.ranks.forecast import constant_forecast
+from aerpaw_cmp.compare.ranks.receiver import out_of_group
 
 FLOOR = -15.0
 

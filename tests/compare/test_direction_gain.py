@@ -7,9 +7,9 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.compare import direction_gain
-from aerpaw_cmp.compare.direction_gain import PLACE_TERM, GainModel, LinkSamples, Term, chosen_fit, fit_gain
-from aerpaw_cmp.compare.mount import fit_mounts
+from aerpaw_cmp.compare.gains import direction_gain
+from aerpaw_cmp.compare.gains.direction_gain import PLACE_TERM, GainModel, LinkSamples, Term, chosen_fit, fit_gain
+from aerpaw_cmp.compare.gains.mount import fit_mounts
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
 
 RNG = np.random.default_rng(5)

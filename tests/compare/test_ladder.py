@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.ladder import (
+from aerpaw_cmp.compare.judge.ladder import (
     Rung,
     climb,
     held_out_error_db,

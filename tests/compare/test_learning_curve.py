@@ -5,7 +5,7 @@ import itertools
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.direction_gain import GainModel, Term
+from aerpaw_cmp.compare.gains.direction_gain import GainModel, Term
 from aerpaw_cmp.compare.learning.calibration import Observed, Recipe, learn
 from aerpaw_cmp.compare.learning.learning_curve import CurvePoint, learning_curve, with_one_more
 from tests.compare.test_direction_gain import GAINS, planted

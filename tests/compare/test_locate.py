@@ -7,8 +7,8 @@ import pytest
 from scipy.stats import multivariate_normal, norm
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare import locate as locating
-from aerpaw_cmp.compare.locate import LevelTrack, fit_places, level_track, locate
+from aerpaw_cmp.compare.learning import locate as locating
+from aerpaw_cmp.compare.learning.locate import LevelTrack, fit_places, level_track, locate
 
 
 def _lawnmower(n: int) -> tuple[FloatArray, FloatArray]:

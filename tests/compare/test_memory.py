@@ -5,8 +5,16 @@ import pytest
 from scipy.optimize import brentq
 from scipy.stats import multivariate_normal
 
-from aerpaw_cmp.compare import memory
-from aerpaw_cmp.compare.memory import RATES, TERMS, WHITE_SHARES, cosine_terms, likelihoods, mean_draws, memories
+from aerpaw_cmp.compare.statistics import memory
+from aerpaw_cmp.compare.statistics.memory import (
+    RATES,
+    TERMS,
+    WHITE_SHARES,
+    cosine_terms,
+    likelihoods,
+    mean_draws,
+    memories,
+)
 
 POINTS = 2000
 

@@ -6,7 +6,7 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.stats import spearmanr
 
-from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term, fit_gain
+from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term, fit_gain
 from aerpaw_cmp.compare.learning.field_gp import FieldModel
 from aerpaw_cmp.compare.learning.next_flight import Known, rms_db
 from tests.compare.test_direction_gain import drawn

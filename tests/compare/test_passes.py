@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.passes import Pass, PassTable
-from aerpaw_cmp.compare.statistics import correlation
+from aerpaw_cmp.compare.statistics.intervals import correlation
+from aerpaw_cmp.compare.statistics.passes import Pass, PassTable
 
 RADIUS_M, WITHIN_DEG, CELL_M = 3.0, 20.0, 20.0
 FLIGHTS, LINKS, SAMPLES = 7, 3, 160

@@ -7,8 +7,6 @@ from hypothesis import strategies as st
 from scipy.stats import wasserstein_distance
 
 from aerpaw_cmp.compare import rank as ranks
-from aerpaw_cmp.compare.inertia import certain_rank
-from aerpaw_cmp.compare.passes import Visit
 from aerpaw_cmp.compare.rank import (
     MAX_RANK,
     agreement,
@@ -30,7 +28,16 @@ from aerpaw_cmp.compare.rank import (
     total_variation,
     wasserstein,
 )
-from aerpaw_cmp.compare.statistics import NO_INTERVAL, SEED, autocorrelation, bootstrap_means, interval, share_interval
+from aerpaw_cmp.compare.statistics.inertia import certain_rank
+from aerpaw_cmp.compare.statistics.intervals import (
+    NO_INTERVAL,
+    SEED,
+    autocorrelation,
+    bootstrap_means,
+    interval,
+    share_interval,
+)
+from aerpaw_cmp.compare.statistics.passes import Visit
 
 NAN = float("nan")
 

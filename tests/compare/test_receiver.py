@@ -5,10 +5,10 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.jsonable import json_safe
-from aerpaw_cmp.compare import receiver as receiving
-from aerpaw_cmp.compare.forecast import log_losses
 from aerpaw_cmp.compare.rank import cohen_kappa
-from aerpaw_cmp.compare.receiver import (
+from aerpaw_cmp.compare.ranks import receiver as receiving
+from aerpaw_cmp.compare.ranks.forecast import log_losses
+from aerpaw_cmp.compare.ranks.receiver import (
     Receiver,
     choose_features,
     decide,

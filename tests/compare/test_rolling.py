@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.entries import crps_normal
+from aerpaw_cmp.compare.judge.entries import crps_normal
 from aerpaw_cmp.compare.learning.rolling import KEEP, NONE, RouteAhead
 
 

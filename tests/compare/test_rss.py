@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.jsonable import json_safe
-from aerpaw_cmp.compare import rss
-from aerpaw_cmp.compare.rss import (
+from aerpaw_cmp.compare.level import rss
+from aerpaw_cmp.compare.level.rss import (
     averaged_fits,
     bin_residual,
     channel_difference,
@@ -24,7 +24,7 @@ from aerpaw_cmp.compare.rss import (
     stretch_means_db,
     stretches,
 )
-from aerpaw_cmp.compare.statistics import autocorrelation, error_intervals
+from aerpaw_cmp.compare.statistics.intervals import autocorrelation, error_intervals
 from tests.real_logs import dataset12
 
 NAN = float("nan")

@@ -5,8 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.direction_gain import LinkSamples
-from aerpaw_cmp.compare.spread import SHARES, Spread, StatedSpread, fading_of, inside_shares
+from aerpaw_cmp.compare.gains.direction_gain import LinkSamples
+from aerpaw_cmp.compare.gains.spread import SHARES, Spread, StatedSpread, fading_of, inside_shares
 
 N = 60_000
 

@@ -6,10 +6,8 @@ from scipy.signal import lfilter
 from scipy.stats import norm
 from scipy.stats import t as student
 
-from aerpaw_cmp.compare import statistics
-from aerpaw_cmp.compare.memory import power_draws
-from aerpaw_cmp.compare.passes import Visit, repeatability, same_places
-from aerpaw_cmp.compare.statistics import (
+from aerpaw_cmp.compare.statistics import intervals as statistics
+from aerpaw_cmp.compare.statistics.intervals import (
     Autocorrelation,
     autocorrelation,
     autocovariance,
@@ -20,6 +18,8 @@ from aerpaw_cmp.compare.statistics import (
     paired_difference,
     share_interval,
 )
+from aerpaw_cmp.compare.statistics.memory import power_draws
+from aerpaw_cmp.compare.statistics.passes import Visit, repeatability, same_places
 
 
 def shadowing(rng, n, samples, sigma):

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_ind
 
-from aerpaw_cmp.compare import verdicts
-from aerpaw_cmp.compare.report_difference import Overlap, level_difference, pooled_difference
-from aerpaw_cmp.compare.verdicts import (
+from aerpaw_cmp.compare.judge import verdicts
+from aerpaw_cmp.compare.judge.report_difference import Overlap, level_difference, pooled_difference
+from aerpaw_cmp.compare.judge.verdicts import (
     Coverage,
     Verdict,
     antenna_or_place,

@@ -10,16 +10,16 @@ import pytest
 
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.draft import DraftOptions, draft
+from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs.reporting.compare_flight import serving_of
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.report.build import report_data
-from aerpaw_cmp.report.export import metrics
-from aerpaw_cmp.report.plots import flight as figures
-from aerpaw_cmp.report.plots.serving import shown_confusion
+from aerpaw_cmp.report.content.flight_parts import report_data
+from aerpaw_cmp.report.exports.tables import metrics
+from aerpaw_cmp.report.figures import flight as figures
+from aerpaw_cmp.report.figures.flight_serving import shown_confusion
 from aerpaw_cmp.site.siteyaml import load_site
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"

@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.flight.cross_checks import questions
-from aerpaw_cmp.flight.node import Placer
+from aerpaw_cmp.flight.drafting.node import Placer
+from aerpaw_cmp.flight.pose.cross_checks import questions
 from aerpaw_cmp.logs.ingest import IngestedFile
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
 from aerpaw_cmp.site.siteyaml import load_site

@@ -14,9 +14,9 @@ from aerpaw_cmp import open_flight
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.flight import draft as drafting
 from aerpaw_cmp.flight.data import load_data, read_logs
-from aerpaw_cmp.flight.draft import DraftOptions, draft, receiver_floor_db
+from aerpaw_cmp.flight.drafting import draft as drafting
+from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft, receiver_floor_db
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.logs import ingest as ingest_module
 from aerpaw_cmp.logs.flight_file import read_flight

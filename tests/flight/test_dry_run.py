@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from aerpaw_cmp.flight import dry_run
+from aerpaw_cmp.flight.drafting import dry_run
 
 TRACK = SimpleNamespace(pose_at=np.asarray, why_not=lambda _: "most are after telemetry")
 

@@ -7,12 +7,12 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.flight import time_origin
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.draft import DraftOptions, drafts
-from aerpaw_cmp.flight.grouping import flights
+from aerpaw_cmp.flight.drafting.draft import DraftOptions, drafts
+from aerpaw_cmp.flight.pose import time_origin
+from aerpaw_cmp.flight.pose.grouping import flights
+from aerpaw_cmp.flight.pose.time_origin import origin_of
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.flight.time_origin import origin_of
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Stream
@@ -152,7 +152,7 @@ def test_no_origin_for_another_track_or_a_hover() -> None:
 @pytest.mark.parametrize("north", [True, False])
 def test_places_are_told_apart_along_either_axis(north: bool) -> None:
     """Tracks that share time are one flight near by and two apart, whether north or east of each other."""
-    from aerpaw_cmp.flight import grouping
+    from aerpaw_cmp.flight.pose import grouping
 
     span = (np.datetime64("2025-03-02T15:00:00"), np.datetime64("2025-03-02T15:05:00"))
 
@@ -168,7 +168,7 @@ def test_places_are_told_apart_along_either_axis(north: bool) -> None:
 
 
 def test_radios_meet_a_flight_up_to_the_slack_before_and_after() -> None:
-    from aerpaw_cmp.flight import grouping
+    from aerpaw_cmp.flight.pose import grouping
 
     begin, end = np.datetime64("2025-03-02T15:00:00", "ns"), np.datetime64("2025-03-02T15:05:00", "ns")
     flight, second = grouping.Flight(files=[], span=(begin, end)), np.timedelta64(1, "s")

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.detection import BASE_S
+from aerpaw_cmp.compare.level.detection import BASE_S
 from aerpaw_cmp.flight.lock import lock_of, may_lose_lock
 from aerpaw_cmp.logs.records import Stream
 

@@ -9,10 +9,10 @@ import pytest
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.compare.locate import NodeEstimate, level_track
-from aerpaw_cmp.flight import node
-from aerpaw_cmp.flight.draft import DraftOptions, draft
-from aerpaw_cmp.flight.node import listed_places
+from aerpaw_cmp.compare.learning.locate import NodeEstimate, level_track
+from aerpaw_cmp.flight.drafting import node
+from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
+from aerpaw_cmp.flight.drafting.node import listed_places
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.logs.ingest import IngestedFile, ingest
 from aerpaw_cmp.logs.readers import ReadOptions

@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.flight.patterns import (
+from aerpaw_cmp.flight.pose.patterns import (
     NOSES,
     Pattern,
     Waypoint,
@@ -21,7 +21,7 @@ from aerpaw_cmp.flight.patterns import (
     waypoints_of,
     with_turns,
 )
-from aerpaw_cmp.flight.route_files import kml_text, plan_text, waypoints_csv
+from aerpaw_cmp.flight.pose.route_files import kml_text, plan_text, waypoints_csv
 from aerpaw_cmp.logs.route import read_areas, read_route
 from aerpaw_cmp.site.siteyaml import load_site
 

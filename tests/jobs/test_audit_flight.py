@@ -10,7 +10,7 @@ import pytest
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight import replay as replays
-from aerpaw_cmp.flight import track as tracks
+from aerpaw_cmp.flight.pose import track as tracks
 from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, RtSettings
 from aerpaw_cmp.jobs.reporting import audit_flight
 from aerpaw_cmp.propagation.arrays import Poses

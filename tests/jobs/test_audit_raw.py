@@ -10,20 +10,21 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common import geodesy
-from aerpaw_cmp.compare.field_difference import FieldAudit
+from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.compare.result import APPLIED, ClockResult
 from aerpaw_cmp.flight import data as flight_data
 from aerpaw_cmp.flight import replay as flight_replay
 from aerpaw_cmp.flight import settings as flight_settings
-from aerpaw_cmp.flight import track as flight_track
 from aerpaw_cmp.flight.data import FlightData, load_data
+from aerpaw_cmp.flight.pose import track as flight_track
 from aerpaw_cmp.flight.replay import Clock, FlightReplay, replay_flight
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.audit_flight import expectations
 from aerpaw_cmp.jobs.reporting.audit_raw import raw_checked
 from aerpaw_cmp.jobs.reporting.compare_flight import compare_flight
-from aerpaw_cmp.site import antennas, site
-from aerpaw_cmp.site.sphere_pattern import sphere_csv, sphere_grid, unit_mean_gain
+from aerpaw_cmp.site import site
+from aerpaw_cmp.site.antenna import antennas
+from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv, sphere_grid, unit_mean_gain
 
 ORIGIN = (35.7275, -78.696)
 # Height of the take-off point above the ground of the origin.

@@ -12,8 +12,8 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.learning.calibration import BASELINES, SPLITS, mean_rmse
 from aerpaw_cmp.jobs.learning.calibrate import load_calibration, observe, read_flights, recipe_of
-from aerpaw_cmp.site.antennas import TR38901
-from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
+from aerpaw_cmp.site.antenna.antennas import TR38901
+from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv
 from tests.jobs.calibrated import YAW_DEG, calibrated, past_sector_antenna, settings
 from tests.json_page import unlisted
 from tests.real_logs import REAL

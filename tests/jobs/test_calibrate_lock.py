@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term
+from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term
 from aerpaw_cmp.compare.learning.calibration import Observed, Recipe
 from aerpaw_cmp.flight.data import RssSeries
+from aerpaw_cmp.flight.drafting.remembered import lock_elsewhere
 from aerpaw_cmp.flight.lock import LOCK_FLOOR_DB
-from aerpaw_cmp.flight.remembered import lock_elsewhere
 from aerpaw_cmp.flight.settings import LinkSettings
 from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks, lock_words
-from aerpaw_cmp.site.learned import Entry, LearnedLock, LearnedSeries, read_learned, remember
+from aerpaw_cmp.site.antenna.learned import Entry, LearnedLock, LearnedSeries, read_learned, remember
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
 RECIPE = Recipe(model=MODEL, rotation=lambda *_: np.eye(3), mount=False)

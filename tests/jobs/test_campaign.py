@@ -19,7 +19,7 @@ from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, run
 from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.jobs.options import RunOptions
-from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
+from aerpaw_cmp.report.content.campaign import RankRow, RssRow, place_means
 from tests.json_page import unlisted
 from tests.real_logs import REAL
 from tests.simulated import planned, simulate, write_yaml

@@ -14,8 +14,8 @@ from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_settings
-from aerpaw_cmp.site.learned import Entry, Errors, LearnedSeries, folder_of, remember
-from aerpaw_cmp.site.sphere_pattern import sphere_csv, unit_mean_gain
+from aerpaw_cmp.site.antenna.learned import Entry, Errors, LearnedSeries, folder_of, remember
+from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv, unit_mean_gain
 from tests.simulated import write_yaml
 from tests.tables import eastwards, rss_log
 

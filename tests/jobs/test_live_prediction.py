@@ -17,7 +17,7 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import plan_trajectory, telemetry_frame
 from aerpaw_cmp.jobs.live.live_twin import LiveTwin
 from aerpaw_cmp.live.follow import TelemetrySample
-from aerpaw_cmp.live.simulator import ModemSimSettings, ModemSimulator
+from aerpaw_cmp.live.serial.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.logs.writers import format_vehicle_out
 from aerpaw_cmp.propagation.arrays import Poses
 from aerpaw_cmp.propagation.options import Search

@@ -8,9 +8,9 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.jobs.live.live_tap import TOKEN, Shown, tap_modems
-from aerpaw_cmp.live.log import read_log
+from aerpaw_cmp.live.record.log import read_log
+from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.session import TapSettings
-from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
 
 
 def shown(web=None, **values):

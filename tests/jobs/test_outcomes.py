@@ -25,7 +25,7 @@ from aerpaw_cmp.jobs.campaigns.campaign_plan import campaign_status, compute, ke
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Done, Order, Outcome, Task, carry_out, outcome_store, task_facts
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
 from aerpaw_cmp.jobs.tasks.workers import InProcess, Processes, Workers
-from aerpaw_cmp.report.campaign_data import Failure, FlownTrack
+from aerpaw_cmp.report.content.campaign import Failure, FlownTrack
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 

@@ -179,8 +179,8 @@ def tiny_flight(folder: Path) -> Path:
 
 def test_a_report_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An error inside the writing leaves the old set whole."""
-    from aerpaw_cmp.report import html
-    from aerpaw_cmp.report.plots import flight as figures
+    from aerpaw_cmp.report.figures import flight as figures
+    from aerpaw_cmp.report.pages import flight as html
 
     every = figures.figure_specs
     monkeypatch.setattr(figures, "figure_specs", lambda data: every(data)[:2])  # drawing is the slow part
@@ -222,7 +222,7 @@ def test_a_limit_on_the_size_of_files_is_one_message(logs: Path) -> None:
 
 def test_a_map_that_fails_in_its_exports_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exports were written in place: a cut maps.kmz stood under its final name."""
-    from aerpaw_cmp.report.maps import figures as maps_figures
+    from aerpaw_cmp.report.figures import maps as maps_figures
 
     monkeypatch.setattr(maps_figures, "figure_specs", lambda _data: [])  # drawing is the slow part
     out = tmp_path / "map"

@@ -10,7 +10,7 @@ from aerpaw_cmp.jobs.campaigns import over_flights
 from aerpaw_cmp.jobs.campaigns.campaign_plan import Outcomes
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Outcome, Task
 from aerpaw_cmp.jobs.campaigns.over_flights import pool_offsets, rank_repeats
-from aerpaw_cmp.report.campaign_data import FlownRank, FlownTrack, RssRow
+from aerpaw_cmp.report.content.campaign import FlownRank, FlownTrack, RssRow
 
 
 def rows(flights: int = 6, links: int = 2, samples: int = 120) -> list[RssRow]:

@@ -11,7 +11,7 @@ from aerpaw_cmp.jobs.reporting.pose_paths import SHORTEST, pose_paths
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.report.data import DIFFRACTED
+from aerpaw_cmp.report.content.flight import DIFFRACTED
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 

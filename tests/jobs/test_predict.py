@@ -12,7 +12,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.jsonable import json_safe
-from aerpaw_cmp.compare.direction_gain import LinkSamples
+from aerpaw_cmp.compare.gains.direction_gain import LinkSamples
 from aerpaw_cmp.compare.learning import correction
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
@@ -26,9 +26,9 @@ from aerpaw_cmp.jobs.prediction.sources import named_flights
 from aerpaw_cmp.jobs.prediction.where import TargetOptions, Targets, find_targets
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
-from aerpaw_cmp.report.page import coded
-from aerpaw_cmp.report.plots.against import against_specs
-from aerpaw_cmp.report.prediction_html import prediction_metrics, write_prediction
+from aerpaw_cmp.report.figures.flight_against import against_specs
+from aerpaw_cmp.report.kit.page import coded
+from aerpaw_cmp.report.pages.prediction import prediction_metrics, write_prediction
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted
 

@@ -9,14 +9,22 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.compare.spread import Spread
+from aerpaw_cmp.compare.gains.spread import Spread
 from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.corrected_map import corrected_maps
 from aerpaw_cmp.jobs.prediction.sources import Memory, named_flights
 from aerpaw_cmp.jobs.prediction.where import TargetOptions
-from aerpaw_cmp.site.learned import Entry, Errors, LearnedLevel, LearnedSeries, folder_of, read_learned, remember
+from aerpaw_cmp.site.antenna.learned import (
+    Entry,
+    Errors,
+    LearnedLevel,
+    LearnedSeries,
+    folder_of,
+    read_learned,
+    remember,
+)
+from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv
 from aerpaw_cmp.site.siteyaml import load_site
-from aerpaw_cmp.site.sphere_pattern import sphere_csv
 from tests.jobs.calibrated import OFFSET_DB, past_sector_antenna
 
 pytestmark = pytest.mark.usefixtures("few_pictures")

@@ -21,7 +21,7 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import MARKS, counted_once, flight_logs, marks, marks_text, shared
 from aerpaw_cmp.jobs.diff_reports import run_diff
 from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankSamples, rank_samples, read_receiver
-from aerpaw_cmp.site.learned import folder_of
+from aerpaw_cmp.site.antenna.learned import folder_of
 from tests.jobs.calibrated import calibrated, past_sector_antenna, settings
 from tests.real_logs import REAL
 from tests.simulated import write_yaml

@@ -9,9 +9,9 @@ import time
 import pytest
 
 from aerpaw_cmp.live.feed import Feed
-from aerpaw_cmp.live.log import BadLine, read_log
-from aerpaw_cmp.live.modem import QUERIES
-from aerpaw_cmp.live.simulator import ModemSimSettings, ModemSimulator
+from aerpaw_cmp.live.record.log import BadLine, read_log
+from aerpaw_cmp.live.serial.modem import QUERIES
+from aerpaw_cmp.live.serial.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.tap import Stop, TapSettings, run_tap
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
 from benchmarks.tap_common import free_port, start_tap

@@ -13,10 +13,10 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.live.log import LogSettings
-from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
+from aerpaw_cmp.live.record.log import LogSettings
+from aerpaw_cmp.live.serial.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
+from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.session import TapSettings
-from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.tap import run_tap
 from tests.live.terminals import held, until
 
@@ -104,7 +104,7 @@ def test_the_port_vanishes_during_open(monkeypatch):
     master, slave = pty.openpty()
     path = Path(os.ttyname(slave))
     os.close(slave)
-    from aerpaw_cmp.live import ports
+    from aerpaw_cmp.live.serial import ports
 
     real = ports.make_raw
     monkeypatch.setattr(ports, "make_raw", lambda fd, baud: (os.close(master), real(fd, baud)))

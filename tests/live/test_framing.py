@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.live.framing import Answer, Framer, Late, TranscriptFramer, Unsolicited, frame_transcript, unglue
+from aerpaw_cmp.live.serial.framing import Answer, Framer, Late, TranscriptFramer, Unsolicited, frame_transcript, unglue
 from tests.real_logs import REAL
 
 CSI = ('AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',))

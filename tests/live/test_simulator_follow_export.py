@@ -8,12 +8,12 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.live import simulator
-from aerpaw_cmp.live.export import COLUMNS, export_csv
 from aerpaw_cmp.live.follow import TelemetryFollower, predict_along
-from aerpaw_cmp.live.modem import decode
 from aerpaw_cmp.live.predict import Prediction
-from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator, load_recorded, load_source
+from aerpaw_cmp.live.record.export import COLUMNS, export_csv
+from aerpaw_cmp.live.serial import simulator
+from aerpaw_cmp.live.serial.modem import decode
+from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator, load_recorded, load_source
 from aerpaw_cmp.logs.checksums import encode_record
 from aerpaw_cmp.logs.readers import Reader
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS

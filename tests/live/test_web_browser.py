@@ -15,7 +15,7 @@ import pytest
 from aerpaw_cmp.live.feed import Feed
 from aerpaw_cmp.live.session import TapStatus
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
-from aerpaw_cmp.report.live_page import LiveMap, live_page
+from aerpaw_cmp.report.pages.live import LiveMap, live_page
 from tests.report.browsing import complaints, extents, frame, needs_browser, serious_findings, set_scheme, start
 from tests.report.conftest import make_site
 

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.flight.pose.track import Track
 from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings
-from aerpaw_cmp.flight.track import Track
 from aerpaw_cmp.propagation.arrays import (
     Array,
     Link,

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.field_difference import FieldAudit
+from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.propagation.arrays import (
     Isotropic,
     Link,
@@ -38,7 +38,7 @@ from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search.merging import _labels
 from aerpaw_cmp.propagation.search.sionna import Coefficients
-from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
+from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")

@@ -33,9 +33,9 @@ from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search import prisms
 from aerpaw_cmp.propagation.search.effort import SearchRun
-from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
+from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.materials import stated_name
-from aerpaw_cmp.site.mitsuba import TriangleScene
+from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building
 
 needs_numba = pytest.mark.skipif(

@@ -26,8 +26,8 @@ from aerpaw_cmp.propagation.scene import Scene, surfaces_of
 from aerpaw_cmp.propagation.search.edges import _below
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.propagation.trace import trace
-from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
-from aerpaw_cmp.site.mitsuba import TriangleScene
+from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole
+from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 HZ = 3.4e9

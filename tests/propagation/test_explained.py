@@ -16,7 +16,7 @@ from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search.mirror import find_paths
-from aerpaw_cmp.site.antennas import HalfWaveDipole
+from aerpaw_cmp.site.antenna.antennas import HalfWaveDipole
 from aerpaw_cmp.site.site import Building
 
 

@@ -21,7 +21,7 @@ from aerpaw_cmp.propagation.search.beams import estimate, grow_paths, reflection
 from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.export import export_scene
-from aerpaw_cmp.site.mitsuba import read_scene
+from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
 from aerpaw_cmp.site.scenes import placed_scene
 from aerpaw_cmp.site.site import Building
 from tests.propagation import open_surfaces as enumerate_

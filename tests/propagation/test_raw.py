@@ -11,7 +11,7 @@ from scipy.io import savemat
 from scipy.spatial.transform import Rotation, Slerp
 
 from aerpaw_cmp.propagation.check import raw
-from aerpaw_cmp.site.sphere_pattern import read_sphere_csv, sphere_csv
+from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv, sphere_csv
 
 ZONE = "America/New_York"
 LW1 = (35.72750947, -78.69595819)

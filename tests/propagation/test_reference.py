@@ -21,7 +21,7 @@ from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_loss_db, fo
 from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import occlusion as solids
-from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
+from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.materials import MATERIALS, material
 from aerpaw_cmp.site.site import Building, Trees
 
@@ -328,7 +328,7 @@ def test_dropped_and_invented_paths_are_seen(case):
 
 
 def test_audit_of_several_replays_adds_up():
-    from aerpaw_cmp.compare.field_difference import FieldAudit
+    from aerpaw_cmp.compare.level.field_difference import FieldAudit
 
     first = FieldAudit(paths=3, power_rms_db=1.0, power_max_db=2.0, failures=("a",))
     second = FieldAudit(paths=1, power_rms_db=3.0, power_max_db=1.0, failures=("a", "b"))

@@ -8,11 +8,11 @@ import pytest
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.compare.level.rss import ChannelDifference
 from aerpaw_cmp.compare.result import AuditResult, EngineResult, PairResult, RankResult, RssResult
-from aerpaw_cmp.compare.rss import ChannelDifference
 from aerpaw_cmp.logs.records import RejectedLine
-from aerpaw_cmp.report.data import InputFile, ReportData, Track, Waypoint
-from aerpaw_cmp.report.maps.data import (
+from aerpaw_cmp.report.content.flight import InputFile, ReportData, Track, Waypoint
+from aerpaw_cmp.report.content.maps import (
     Correlation,
     LearningCurve,
     MapError,

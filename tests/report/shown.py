@@ -9,17 +9,18 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from aerpaw_cmp.compare.judge.report_difference import Overlap, level_difference, pooled_difference
 from aerpaw_cmp.compare.learning.calibration import Score
-from aerpaw_cmp.compare.report_difference import Overlap, level_difference, pooled_difference
-from aerpaw_cmp.report import html, prediction_html
-from aerpaw_cmp.report.calibration import html as calibration_html
-from aerpaw_cmp.report.calibration.data import CalibrationData
-from aerpaw_cmp.report.calibration.words import sentences
-from aerpaw_cmp.report.campaign import html as campaign_html
-from aerpaw_cmp.report.diff import html as diff_html
-from aerpaw_cmp.report.diff.data import Entry, ReportDiff, ReportSide
-from aerpaw_cmp.report.maps import html as maps_html
-from aerpaw_cmp.report.prediction_words import first_words
+from aerpaw_cmp.report.content.calibration import CalibrationData
+from aerpaw_cmp.report.content.diff import Entry, ReportDiff, ReportSide
+from aerpaw_cmp.report.pages import calibration as calibration_html
+from aerpaw_cmp.report.pages import campaign as campaign_html
+from aerpaw_cmp.report.pages import diff as diff_html
+from aerpaw_cmp.report.pages import flight as html
+from aerpaw_cmp.report.pages import maps as maps_html
+from aerpaw_cmp.report.pages import prediction as prediction_html
+from aerpaw_cmp.report.words.calibration import sentences
+from aerpaw_cmp.report.words.prediction import first_words
 from benchmarks import fabricated
 
 Fixture = Callable[[str], Any]

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report.maps import explorer as map_explorer
-from aerpaw_cmp.report.maps import html as maps_html
-from aerpaw_cmp.report.maps.data import JOINT
+from aerpaw_cmp.report.content.maps import JOINT
+from aerpaw_cmp.report.pages import maps as maps_html
+from aerpaw_cmp.report.pages import maps_explorer as map_explorer
 from tests.report.browsing import PageLaws, choose, frame, needs_browser, open_page, papers, start
 
 pytest.importorskip("selenium", reason="selenium is not installed")

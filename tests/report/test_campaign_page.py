@@ -7,11 +7,11 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report import canvas
-from aerpaw_cmp.report.campaign import figures as campaign_figures
-from aerpaw_cmp.report.campaign import html as campaign_html
-from aerpaw_cmp.report.campaign import words as campaign_words
-from aerpaw_cmp.report.campaign_data import RankPairing, Repeat
+from aerpaw_cmp.report.content.campaign import RankPairing, Repeat
+from aerpaw_cmp.report.figures import campaign as campaign_figures
+from aerpaw_cmp.report.kit import canvas
+from aerpaw_cmp.report.pages import campaign as campaign_html
+from aerpaw_cmp.report.words import campaign as campaign_words
 from benchmarks import fabricated
 
 

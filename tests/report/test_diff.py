@@ -10,10 +10,10 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.outputs import OutputFolder
-from aerpaw_cmp.compare.report_difference import pooled_difference
+from aerpaw_cmp.compare.judge.report_difference import pooled_difference
 from aerpaw_cmp.jobs.diff_reports import run_diff
-from aerpaw_cmp.report.diff.html import diff_page, verdict
-from aerpaw_cmp.report.write import write_report
+from aerpaw_cmp.report.pages.diff import diff_page, verdict
+from aerpaw_cmp.report.pages.flight_folder import write_report
 from tests.json_page import unlisted
 
 LINK = ("LW1", "USRP1")

@@ -10,8 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.report import canvas, explorer, page
-from aerpaw_cmp.report.data import Source
+from aerpaw_cmp.report.content.flight import Source
+from aerpaw_cmp.report.kit import canvas, page
+from aerpaw_cmp.report.pages import explorer
 
 
 def array(content, number):

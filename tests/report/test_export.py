@@ -6,7 +6,8 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.compare.result import EngineResult
-from aerpaw_cmp.report import export, names
+from aerpaw_cmp.report import names
+from aerpaw_cmp.report.exports import tables as export
 from benchmarks.fabricated import with_numbers
 
 

@@ -10,12 +10,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 
-from aerpaw_cmp.compare.detection import DetectionScore
+from aerpaw_cmp.compare.level.detection import DetectionScore
 from aerpaw_cmp.compare.result import RankResult, RssResult
-from aerpaw_cmp.report import canvas, html
-from aerpaw_cmp.report.data import ReportData, Track, start_of, used_towers
-from aerpaw_cmp.report.plots import flight as figures
-from aerpaw_cmp.report.plots import rss as rss_figures
+from aerpaw_cmp.report.content.flight import ReportData, Track, start_of, used_towers
+from aerpaw_cmp.report.figures import flight as figures
+from aerpaw_cmp.report.figures import flight_rss as rss_figures
+from aerpaw_cmp.report.kit import canvas
+from aerpaw_cmp.report.pages import flight as html
 from benchmarks.fabricated import rank_result, rss_result, with_numbers
 
 

@@ -5,16 +5,16 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.causes import Cause
-from aerpaw_cmp.compare.detection import DetectionScore
-from aerpaw_cmp.compare.field_difference import FieldAudit
-from aerpaw_cmp.compare.forecast import score_forecast
+from aerpaw_cmp.compare.judge.causes import Cause
+from aerpaw_cmp.compare.level.detection import DetectionScore
+from aerpaw_cmp.compare.level.field_difference import FieldAudit
+from aerpaw_cmp.compare.level.rss import ErrorSpan
+from aerpaw_cmp.compare.ranks.forecast import score_forecast
 from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
-from aerpaw_cmp.compare.rss import ErrorSpan
-from aerpaw_cmp.compare.statistics import paired_difference
-from aerpaw_cmp.report.diff.html import DIFFERENCE
-from aerpaw_cmp.report.first_screen import headlines, verdict
-from aerpaw_cmp.report.words import CAUSES, Judged, first_sentence, pooled_db, pretty, ranking_sentence
+from aerpaw_cmp.compare.statistics.intervals import paired_difference
+from aerpaw_cmp.report.pages.diff import DIFFERENCE
+from aerpaw_cmp.report.words.flight import CAUSES, Judged, first_sentence, pooled_db, pretty, ranking_sentence
+from aerpaw_cmp.report.words.flight_verdict import headlines, verdict
 from benchmarks.fabricated import with_numbers
 
 

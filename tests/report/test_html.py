@@ -13,11 +13,13 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.compare.rank import CommonestRank, RankRepeat
 from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
-from aerpaw_cmp.compare.statistics import paired_difference
+from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.logs.records import RejectedLine
-from aerpaw_cmp.report import build, html, words
-from aerpaw_cmp.report.canvas import Picture
-from aerpaw_cmp.report.data import InputFile, ReportData
+from aerpaw_cmp.report.content import flight_parts as build
+from aerpaw_cmp.report.content.flight import InputFile, ReportData
+from aerpaw_cmp.report.kit.canvas import Picture
+from aerpaw_cmp.report.pages import flight as html
+from aerpaw_cmp.report.words import flight as words
 from benchmarks.fabricated import with_numbers
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
@@ -73,7 +75,7 @@ def parse(text: str) -> Page:
 
 
 def fake_pictures(data: ReportData) -> list[Picture]:
-    from aerpaw_cmp.report.plots.flight import figure_specs
+    from aerpaw_cmp.report.figures.flight import figure_specs
 
     return [Picture(p, {"svg": b"<svg/>"}) for p in figure_specs(data)]
 
@@ -103,7 +105,7 @@ def test_well_formed_and_loads_nothing_from_elsewhere(report_data):
 
 
 def test_every_figure_has_a_place(report_data):
-    from aerpaw_cmp.report.plots.flight import figure_specs
+    from aerpaw_cmp.report.figures.flight import figure_specs
 
     page = render(report_data)
     assert [p.name for p in figure_specs(report_data) if f"figure-{p.name}" not in page.ids] == []

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.report.maps import explorer as map_explorer
-from aerpaw_cmp.report.maps import html as maps_html
-from aerpaw_cmp.report.maps.data import JOINT, MapLayer
-from aerpaw_cmp.report.packed import NONE
-from aerpaw_cmp.report.page import as_json
+from aerpaw_cmp.report.content.maps import JOINT, MapLayer
+from aerpaw_cmp.report.kit.packed import NONE
+from aerpaw_cmp.report.kit.page import as_json
+from aerpaw_cmp.report.pages import maps as maps_html
+from aerpaw_cmp.report.pages import maps_explorer as map_explorer
 
 
 def arrays_of(packed):

@@ -6,8 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report.maps.data import MapsData, RankMap, RssMap
-from aerpaw_cmp.report.maps.words import first_words, notes, warnings
+from aerpaw_cmp.report.content.maps import MapsData, RankMap, RssMap
+from aerpaw_cmp.report.words.maps import first_words, notes, warnings
 
 
 @pytest.fixture

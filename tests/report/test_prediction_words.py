@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from aerpaw_cmp.compare.judge.verdicts import Verdict
 from aerpaw_cmp.compare.learning.correction import OFF, Correction
 from aerpaw_cmp.compare.learning.field_gp import FieldModel
-from aerpaw_cmp.compare.verdicts import Verdict
-from aerpaw_cmp.report.prediction_words import FIELD, FLOWN, after_flight, first_words
+from aerpaw_cmp.report.words.prediction import FIELD, FLOWN, after_flight, first_words
 
 FREE, LEARNED, WITH_FIELD = ("free space", OFF), ("learned", OFF), ("learned", "field of 2 dB, 30 m")
 

@@ -5,10 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.serving import compare_serving
-from aerpaw_cmp.report import canvas, html
-from aerpaw_cmp.report.plots import flight as figures
-from aerpaw_cmp.report.plots.serving import confusion, serving_spec, shown_confusion
+from aerpaw_cmp.compare.level.serving import compare_serving
+from aerpaw_cmp.report.figures import flight as figures
+from aerpaw_cmp.report.figures.flight_serving import confusion, serving_spec, shown_confusion
+from aerpaw_cmp.report.kit import canvas
+from aerpaw_cmp.report.pages import flight as html
 
 
 @pytest.fixture

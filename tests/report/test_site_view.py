@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.report import canvas, shapes, site_view
+from aerpaw_cmp.report.kit import canvas, shapes
+from aerpaw_cmp.report.pages import site as site_view
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Trees
 
 

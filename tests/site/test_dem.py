@@ -174,7 +174,7 @@ def test_geotiff_equals_the_ascii_grid(tmp_path: Path) -> None:
 
 
 def test_imported_site_keeps_its_elevation_model(tmp_path: Path) -> None:
-    from aerpaw_cmp.site.footprints import import_site, site_yaml
+    from aerpaw_cmp.site.imports.footprints import import_site, site_yaml
 
     (tmp_path / "base").mkdir()
     asc(tmp_path / "base" / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10)

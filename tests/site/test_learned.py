@@ -12,9 +12,9 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.flight.remembered import Nodes, propose, searching_airframe
+from aerpaw_cmp.flight.drafting.remembered import Nodes, propose, searching_airframe
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.site.learned import (
+from aerpaw_cmp.site.antenna.learned import (
     Entry,
     Learned,
     LearnedReceiver,
@@ -24,7 +24,7 @@ from aerpaw_cmp.site.learned import (
     read_learned,
     remember,
 )
-from aerpaw_cmp.site.sphere_pattern import SpherePattern, sphere_csv
+from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, sphere_csv
 
 CARRIER_HZ = 3.3e9
 

@@ -13,9 +13,9 @@ import shapely
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.site import mapfiles
-from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
-from aerpaw_cmp.site.mapfiles import MAX_TAGS, read_map_file
+from aerpaw_cmp.site.imports import mapfiles
+from aerpaw_cmp.site.imports.footprints import Footprints, import_footprints, import_site, site_yaml
+from aerpaw_cmp.site.imports.mapfiles import MAX_TAGS, read_map_file
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.geojson import collection, feature, polygon
 

@@ -8,8 +8,8 @@ import pytest
 
 from aerpaw_cmp.flight.learned_gain import learned_gain, pair_db
 from aerpaw_cmp.propagation.arrays import Array, Link, Poses, rotation_from_aircraft, single_element
-from aerpaw_cmp.site.pair_gain import PairGain
-from aerpaw_cmp.site.sphere_pattern import SpherePattern, read_sphere_csv, sphere_csv
+from aerpaw_cmp.site.antenna.pair_gain import PairGain
+from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, read_sphere_csv, sphere_csv
 
 RNG = np.random.default_rng(3)
 SHA = {"one": "a" * 64, "other": "b" * 64}

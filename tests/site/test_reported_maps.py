@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
+from aerpaw_cmp.site.imports.footprints import Footprints, import_footprints, import_site, site_yaml
 from tests.geojson import collection, feature, polygon
 from tests.site.test_footprints import FRAME, lonlat, square
 

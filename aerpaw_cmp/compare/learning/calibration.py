@@ -12,13 +12,13 @@ import numpy as np
 
 from ...common.errors import InputError
 from ...common.units import BoolArray, FloatArray, IntArray, spread_out
-from ..detection import floored_fit
-from ..direction_gain import GainFit, GainModel, LinkSamples, Term, chosen_fit, fit_gain
-from ..ladder import log_distance_level_db
-from ..mount import GainOf, MountFit, fit_mounts
+from ..gains.direction_gain import GainFit, GainModel, LinkSamples, Term, chosen_fit, fit_gain
+from ..gains.mount import GainOf, MountFit, fit_mounts
+from ..gains.spread import Spread, StatedSpread, fading_of, inside_shares
+from ..judge.ladder import log_distance_level_db
+from ..level.detection import floored_fit
+from ..level.rss import local_mean_db
 from ..result import BASELINE_TITLE
-from ..rss import local_mean_db
-from ..spread import Spread, StatedSpread, fading_of, inside_shares
 
 SECTORS = 6
 # Directions this near a left-out sector are not learned from either.
@@ -96,7 +96,7 @@ class Learned:
     mounts: Mapping[str, MountFit]
     fit: GainFit | None
     fading: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Of each antenna: :func:`~aerpaw_cmp.compare.spread.fading_of` the flights that were learned from."""
+    """Of each antenna: :func:`~aerpaw_cmp.compare.gains.spread.fading_of` the flights that were learned from."""
 
     def spread(self, antenna: str) -> Spread:
         """Spread of a level at an antenna besides the standard deviation of the gain."""

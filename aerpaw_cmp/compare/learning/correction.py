@@ -16,9 +16,9 @@ import numpy as np
 
 from ...common.errors import InputError
 from ...common.units import FloatArray, IntArray
-from ..direction_gain import LinkSamples
-from ..entries import crps_normal
-from ..statistics import mean_interval
+from ..gains.direction_gain import LinkSamples
+from ..judge.entries import crps_normal
+from ..statistics.intervals import mean_interval
 from .calibration import MOST_GROUPS, groups_of
 from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_field
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from ...common.errors import InputError
 from ...common.units import FloatArray, IntArray, spread_out
-from ..direction_gain import LinkSamples, factor_of
+from ..gains.direction_gain import LinkSamples, factor_of
 
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")

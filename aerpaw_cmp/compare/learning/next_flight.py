@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.units import FloatArray
-from ..direction_gain import GainFit, GainModel, LinkSamples, fit_gain
+from ..gains.direction_gain import GainFit, GainModel, LinkSamples, fit_gain
 from .field_gp import NEW_FLIGHT, FieldFit, FieldModel, Part, Rows
 
 # Name of the flight to come.

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...common.units import FloatArray, IntArray
-from ..entries import crps_normal
+from ..judge.entries import crps_normal
 from .field_gp import FieldModel, Rows, covariance
 
 BIN_S = 2.0

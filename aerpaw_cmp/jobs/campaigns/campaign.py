@@ -18,7 +18,7 @@ from ...common.stages import Stages
 from ...common.yamlfile import load_yaml
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, GroupedSettings, load_flight
-from ...report.campaign_data import CampaignData, Failure
+from ...report.content.campaign import CampaignData, Failure
 from ..options import DEFAULT, RunOptions
 from ..tasks.workers import open_workers
 from .campaign_plan import compute, kept_outcomes

@@ -12,7 +12,7 @@ import numpy as np
 from ...common.errors import AerpawCmpError
 from ...common.jsonable import named
 from ...common.stages import Progress
-from ...report.campaign_data import Failure, FlownTrack
+from ...report.content.campaign import Failure, FlownTrack
 from ..tasks.outcomes import OutcomeStore
 from ..tasks.workers import Lost, Workers
 from .campaign_tasks import Done, Order, Outcome, Task, carry_out, fitted_to, task_facts

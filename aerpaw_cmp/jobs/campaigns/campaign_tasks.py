@@ -25,7 +25,7 @@ from ...flight.data import FlightData, gather, read_logs
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, RssSettings, load_flight
 from ...flight.training import logs_of
-from ...report.campaign_data import Failure, FlownRank, FlownTrack, RankRow, RssRow
+from ...report.content.campaign import Failure, FlownRank, FlownTrack, RankRow, RssRow
 from ..reporting.flight_run import run_flight
 from ..tasks.outcomes import OutcomeStore, code_digest, task_inputs, task_key
 

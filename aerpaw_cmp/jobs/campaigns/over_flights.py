@@ -13,10 +13,10 @@ from ...common.jsonable import named
 from ...common.units import FloatArray, finite_mean
 from ...common.yamlfile import StrictModel
 from ...compare.offset import Pooling, pooled_moments
-from ...compare.passes import Pass, PassPair, PassTable, Visit
 from ...compare.rank import repeat_rank
+from ...compare.statistics.passes import Pass, PassPair, PassTable, Visit
 from ...flight.settings import Positive
-from ...report.campaign_data import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
+from ...report.content.campaign import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
 
 
 class RepeatSettings(StrictModel):

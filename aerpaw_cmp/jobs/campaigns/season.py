@@ -15,9 +15,9 @@ import numpy as np
 from ...common.errors import InputError
 from ...common.files import LARGEST_TABLE, read_bounded
 from ...common.units import FloatArray
-from ...compare import season
+from ...compare.judge import season
 from ...logs.records import has_wall_clock
-from ...report.campaign_data import CampaignData, Drift, PlaceMap, RssRow, Season, SettingRank, place_means
+from ...report.content.campaign import CampaignData, Drift, PlaceMap, RssRow, Season, SettingRank, place_means
 
 _DAY_NS = 86_400e9
 _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)

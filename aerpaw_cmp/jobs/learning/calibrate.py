@@ -17,12 +17,12 @@ from ...common.provenance import union
 from ...common.stages import Stages
 from ...common.units import FloatArray
 from ...common.yamlfile import StrictModel, load_yaml
-from ...compare import direction_gain
+from ...compare.gains import direction_gain
+from ...compare.gains.mount import GainOf
 from ...compare.learning import calibration
 from ...compare.learning.calibration import Learned, Observed, Recipe, Score
 from ...compare.learning.correction import BIN_S
 from ...compare.learning.learning_curve import CurvePoint, learning_curve
-from ...compare.mount import GainOf
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ...flight.learned_gain import sphere_angles
 from ...flight.lock import LOCK_FLOOR_DB
@@ -30,8 +30,8 @@ from ...flight.settings import AntennaSettings, load_flight, load_pattern
 from ...flight.training import counted_once, flight_logs
 from ...propagation.arrays import rotation_from_yaw_pitch_roll
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
-from ...report.calibration.words import sentences
-from ...site.learned import LearnedLock, Source
+from ...report.words.calibration import sentences
+from ...site.antenna.learned import LearnedLock, Source
 from .calibrate_lock import learned_locks, lock_words
 from .calibrate_rank import RankFitSettings
 

@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from ...compare.detection import DetectionScore, learn_detection, score_detection
 from ...compare.learning.calibration import Learned, Observed, Recipe, flight_left_out
+from ...compare.level.detection import DetectionScore, learn_detection, score_detection
 from ...flight.lock import LOCK_FLOOR_DB
-from ...site.learned import LearnedLock
+from ...site.antenna.learned import LearnedLock
 
 
 def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:

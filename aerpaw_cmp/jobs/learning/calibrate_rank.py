@@ -22,15 +22,15 @@ from ...common.jsonable import json_safe
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, IntArray
 from ...common.yamlfile import StrictModel
-from ...compare import receiver
-from ...compare.forecast import ForecastScore, constant_forecast, score_forecast
-from ...compare.rss import seconds
+from ...compare.level.rss import seconds
+from ...compare.ranks import receiver
+from ...compare.ranks.forecast import ForecastScore, constant_forecast, score_forecast
 from ...flight.data import FlightData, RankSeries, rank_positions
 from ...flight.replay import attitude_rotation
 from ...flight.training import MARKS, logs_of, marks_text, shared
 from ...propagation.arrays import Link, Poses
 from ...propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
-from ...site.learned import read_table
+from ...site.antenna.learned import read_table
 
 # First key of a receiver file.
 FORMAT = "aerpaw-cmp receiver 1"
@@ -92,7 +92,7 @@ class RankSamples:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """Time relation of reports to the positions of a log: see :func:`~aerpaw_cmp.compare.receiver.time_means`.
+    """Time relation of reports to the positions of a log: see :func:`~aerpaw_cmp.compare.ranks.receiver.time_means`.
 
     ``log_score`` is that of the choice on sectors of the training flights left out [nat]; NaN where nothing was chosen.
     """

@@ -20,19 +20,26 @@ from ...common.jsonable import named
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, spread_out
 from ...common.versions import utc_now
-from ...compare.direction_gain import Frame, directed
+from ...compare.gains.direction_gain import Frame, directed
 from ...compare.learning.calibration import Learned, mean_rmse
 from ...compare.learning.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries
 from ...flight.training import flight_logs, marks_note
 from ...logs.records import has_wall_clock
-from ...report.calibration.data import AntennaMap, CalibrationData
-from ...report.calibration.html import calibration_metrics, write_calibration
-from ...report.files import write_file
+from ...report.content.calibration import AntennaMap, CalibrationData
+from ...report.kit.files import write_file
 from ...report.names import safe_name
-from ...site.learned import Entry, Errors, LearnedLevel, LearnedLock, LearnedReceiver, LearnedSeries
-from ...site.pair_gain import PairGain
-from ...site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid, sphere_netcdf, unit_mean_gain
+from ...report.pages.calibration import calibration_metrics, write_calibration
+from ...site.antenna.learned import Entry, Errors, LearnedLevel, LearnedLock, LearnedReceiver, LearnedSeries
+from ...site.antenna.pair_gain import PairGain
+from ...site.antenna.sphere_pattern import (
+    SpherePattern,
+    planning_cuts,
+    sphere_csv,
+    sphere_grid,
+    sphere_netcdf,
+    unit_mean_gain,
+)
 from .calibrate import Calibration, CalibrationFile
 from .calibrate_rank import RankCalibration
 
@@ -179,7 +186,7 @@ def _record_of(
     Returns
     -------
     CalibrationData
-        As :func:`aerpaw_cmp.report.calibration.html.write_calibration` takes it.
+        As :func:`aerpaw_cmp.report.pages.calibration.write_calibration` takes it.
     """
     mounts = {
         name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}

@@ -22,13 +22,13 @@ from ...flight.settings import FlightFile, LogSettings, load_flight
 from ...flight.simulate import planned_poses
 from ...live.follow import TelemetryFollower, TelemetrySample, predict_along
 from ...live.predict import Predict, Prediction
-from ...live.simulator import ranks_of
+from ...live.serial.simulator import ranks_of
 from ...logs.readers import by_name
 from ...logs.writers import format_vehicle_out
 from ...maps.grid import Grid
 from ...propagation.arrays import Link, Poses, rotation_from_aircraft
 from ...propagation.field.baselines import free_space_dbm
-from ...report.live_page import LiveMap
+from ...report.pages.live import LiveMap
 from ...site.site import Site
 
 _MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)

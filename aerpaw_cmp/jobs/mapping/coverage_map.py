@@ -48,8 +48,8 @@ from ...propagation.field.sum import channel_matrices, rss_dbm
 from ...propagation.options import Engine, Job, Run, Search
 from ...propagation.paths import PathSet
 from ...propagation.replay import Replay, replay
-from ...report.maps import data as page
-from ...report.prediction_html import outside_share
+from ...report.content import maps as page
+from ...report.pages.prediction import outside_share
 from ...site.site import Site
 from ...site.siteyaml import load_site
 from ..prediction.corrected_map import CorrectedMaps
@@ -576,7 +576,7 @@ def maps_record(
     stages_s: Mapping[str, float],
     paper: Iterable[page.PaperRow] = (),
 ) -> page.MapsData:
-    """The record that :func:`aerpaw_cmp.report.maps.html.write_maps` turns into files.
+    """The record that :func:`aerpaw_cmp.report.pages.maps.write_maps` turns into files.
 
     Parameters
     ----------

@@ -15,7 +15,7 @@ import yaml
 from ...common.units import finite_mean, power_from_db
 from ...maps.job import Antennas
 from ...maps.study import rank_fields
-from ...report.maps.data import PaperRow
+from ...report.content.maps import PaperRow
 from ...report.names import k_key
 from .coverage_map import INTERPOLATORS, MapOutcome
 

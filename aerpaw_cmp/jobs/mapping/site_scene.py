@@ -12,8 +12,8 @@ from ...common.errors import UsageError
 from ...common.geodesy import SiteFrame
 from ...common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ...site.export import export_scene
-from ...site.footprints import site_yaml
-from ...site.mitsuba import TriangleScene
+from ...site.imports.footprints import site_yaml
+from ...site.mesh_scenes.mitsuba import TriangleScene
 from ...site.scenes import GROUND_SHARE, bounds, ground_share, placed_scene
 from ...site.siteyaml import SceneModel, SiteModel, build_site, load_site, site_model
 from ..options import JobOutcome

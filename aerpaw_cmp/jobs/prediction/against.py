@@ -12,12 +12,12 @@ import pandas as pd
 from ...common.errors import InputError, UsageError
 from ...common.provenance import KEY
 from ...common.units import FloatArray, IntArray
-from ...compare.forecast import ForecastScore, score_forecast
 from ...compare.learning.calibration import Observed
+from ...compare.ranks.forecast import ForecastScore, score_forecast
 from ...flight.data import FlightData
 from ...flight.training import common, flight_logs, marks_text, shared
-from ...report.against import Against, AgainstSeries
-from ...report.prediction_words import against_words
+from ...report.content.against import Against, AgainstSeries
+from ...report.words.prediction import against_words
 from ..learning.calibrate import observe
 from ..learning.calibrate_rank import RankSamples, rank_samples
 from .predict import RANKS

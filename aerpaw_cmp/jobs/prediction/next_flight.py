@@ -16,16 +16,16 @@ from ...common.errors import InputError, UsageError
 from ...common.outputs import OutputFolder
 from ...common.stages import Stages
 from ...common.units import FloatArray
-from ...compare.direction_gain import GainModel, LinkSamples
+from ...compare.gains.direction_gain import GainModel, LinkSamples
 from ...compare.learning.correction import choose
 from ...compare.learning.next_flight import Known, rms_db
-from ...flight.patterns import NOSES, Pattern, Route, Waypoint, allowed_area, cut, flown, route_of
-from ...flight.route_files import kml_text, plan_text, waypoints_csv
+from ...flight.pose.patterns import NOSES, Pattern, Route, Waypoint, allowed_area, cut, flown, route_of
+from ...flight.pose.route_files import kml_text, plan_text, waypoints_csv
 from ...flight.training import counted_once
 from ...logs.route import read_areas
 from ...report.names import safe_name
-from ...report.plan_html import PlanPage, plan_metrics, write_plan
-from ...site.outlines import MAX_CROSSINGS, is_tangled
+from ...report.pages.plan import PlanPage, plan_metrics, write_plan
+from ...site.imports.outlines import MAX_CROSSINGS, is_tangled
 from ...site.site import Site
 from ..learning.calibrate import learned_antennas, observe
 from ..options import DEFAULT, JobOutcome, RunOptions

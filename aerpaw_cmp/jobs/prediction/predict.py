@@ -18,20 +18,20 @@ from ...common.outputs import OutputFolder
 from ...common.provenance import union
 from ...common.stages import Progress, Stages
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
-from ...compare.direction_gain import LinkSamples
+from ...compare.gains.direction_gain import LinkSamples
+from ...compare.gains.spread import BAND
 from ...compare.learning.correction import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
-from ...compare.spread import BAND
 from ...flight.data import FlightData, choose_site, site_place
-from ...flight.remembered import remembered
+from ...flight.drafting.remembered import remembered
 from ...flight.settings import LinkSettings, LinksSettings
 from ...flight.training import MARKS, common, counted_once, flight_logs, learned_of, learned_patterns, marks_text
 from ...maps import export
 from ...maps.grid import Grid, Layer
 from ...propagation.arrays import Poses, rotation_from_aircraft
-from ...report.prediction_html import PredictionPage, outside_share, prediction_metrics, write_prediction
-from ...report.prediction_words import FLAGS, TITLES, first_words, memory_words
-from ...site.learned import BAND as CARRIER_BAND
-from ...site.learned import folder_of, read_learned
+from ...report.pages.prediction import PredictionPage, outside_share, prediction_metrics, write_prediction
+from ...report.words.prediction import FLAGS, TITLES, first_words, memory_words
+from ...site.antenna.learned import BAND as CARRIER_BAND
+from ...site.antenna.learned import folder_of, read_learned
 from ...site.site import Site
 from ...site.siteyaml import load_site
 from ..learning.calibrate import learned_antennas, observe

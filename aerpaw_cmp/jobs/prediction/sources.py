@@ -12,13 +12,13 @@ import numpy as np
 from ...common.errors import InputError, UsageError
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray
-from ...compare.direction_gain import LinkSamples
+from ...compare.gains.direction_gain import LinkSamples
+from ...compare.gains.spread import NO_SPREAD, Spread, fading_of
 from ...compare.learning.calibration import Observed
 from ...compare.learning.correction import BIN_S, Correction, Predictor, between_blocks_db, by_degree
-from ...compare.spread import NO_SPREAD, Spread, fading_of
 from ...flight.data import FlightData, RssSeries, load_data
+from ...flight.drafting.remembered import Remembered, remembered
 from ...flight.learned_gain import pair_db
-from ...flight.remembered import Remembered, remembered
 from ...flight.replay import replay_poses
 from ...flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings, load_flight
 from ...propagation.arrays import Poses, rotation_from_aircraft

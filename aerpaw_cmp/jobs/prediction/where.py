@@ -11,11 +11,11 @@ import pandas as pd
 
 from ...common.errors import InputError, UsageError
 from ...common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
-from ...compare.direction_gain import LinkSamples
+from ...compare.gains.direction_gain import LinkSamples
 from ...flight.data import FlightData, load_data
+from ...flight.pose.track import interpolated
 from ...flight.settings import FlightFile, load_flight
 from ...flight.simulate import planned_poses
-from ...flight.track import interpolated
 from ...logs.route import read_route
 from ...maps.grid import Grid
 from ...propagation.arrays import rotation_from_aircraft

@@ -17,7 +17,7 @@ import numpy as np
 from ...common.jsonable import named
 from ...common.stages import Progress, silent
 from ...common.units import AnyArray, FloatArray, spread_out
-from ...compare.field_difference import FieldAudit
+from ...compare.level.field_difference import FieldAudit
 from ...compare.result import AuditResult, EngineResult, RssResult
 from ...flight.data import FlightData
 from ...flight.losses import path_loss

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ...common.units import FloatArray, IntArray, spread_out
-from ...compare.field_difference import FieldAudit
+from ...compare.level.field_difference import FieldAudit
 from ...compare.result import APPLIED, GIVEN, RssResult
 from ...flight.data import FlightData, RankSeries, RssSeries
 from ...flight.replay import Replayed, attitude_rotation

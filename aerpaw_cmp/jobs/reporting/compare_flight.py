@@ -21,11 +21,12 @@ from ...common.stages import give_memory_back
 from ...common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ...compare import offset as offsets
 from ...compare import rank as ranks
-from ...compare import rss, statistics
-from ...compare.detection import DetectionForecast, DetectionScore, score_detection
-from ...compare.forecast import ForecastScore, score_forecast
-from ...compare.ladder import log_distance_level_db
-from ...compare.passes import Visit, repeatability
+from ...compare.gains.spread import StatedSpread, inside_shares
+from ...compare.judge.ladder import log_distance_level_db
+from ...compare.level import rss
+from ...compare.level.detection import DetectionForecast, DetectionScore, score_detection
+from ...compare.level.serving import ServingComparison, at_times, compare_serving
+from ...compare.ranks.forecast import ForecastScore, score_forecast
 from ...compare.result import (
     APPLIED,
     Fit,
@@ -38,12 +39,12 @@ from ...compare.result import (
     RssResult,
     SnrScore,
 )
-from ...compare.serving import ServingComparison, at_times, compare_serving
-from ...compare.spread import StatedSpread, inside_shares
+from ...compare.statistics import intervals as statistics
+from ...compare.statistics.passes import Visit, repeatability
 from ...flight.data import FlightData, RankSeries, RssSeries
+from ...flight.drafting.remembered import errors_elsewhere, lock_elsewhere
 from ...flight.lock import LOCK_FLOOR_DB
 from ...flight.losses import direct_foliage_m
-from ...flight.remembered import errors_elsewhere, lock_elsewhere
 from ...flight.replay import FlightReplay, Replayed
 from ...flight.settings import RssSettings, RtSettings
 from ...flight.training import learned_here

@@ -10,7 +10,7 @@ import dataclasses
 from dataclasses import dataclass
 
 from ...common.stages import Stages
-from ...compare.ladder import series_rows
+from ...compare.judge.ladder import series_rows
 from ...compare.result import FlightResult
 from ...flight.data import FlightData
 from ...flight.replay import FlightReplay, replay_flight

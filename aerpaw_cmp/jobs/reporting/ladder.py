@@ -19,12 +19,12 @@ import yaml
 from ...common.errors import UsageError
 from ...common.units import FloatArray
 from ...common.yamlfile import parse_yaml
-from ...compare.ladder import Ladder, Rung, climb
+from ...compare.judge.ladder import Ladder, Rung, climb
 from ...compare.result import BASELINE_TITLE
 from ...flight.data import FlightData, RssSeries
+from ...flight.drafting.remembered import errors_elsewhere, offered
 from ...flight.learned_gain import pair_db
 from ...flight.losses import path_loss
-from ...flight.remembered import errors_elsewhere, offered
 from ...flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
 from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import learned_here
@@ -33,9 +33,9 @@ from ...propagation.drivers.moving import replay_moving
 from ...propagation.field.sum import mean_pair_power, rss_dbm
 from ...propagation.options import Field, Run, Search
 from ...propagation.replay import Replay, replay
-from ...site.antennas import Isotropic
+from ...site.antenna.antennas import Isotropic
+from ...site.antenna.sphere_pattern import SpherePattern
 from ...site.site import Site
-from ...site.sphere_pattern import SpherePattern
 from .levels import Levels, levels_of
 
 # Loss of the weakened ground reflection: a smooth half-space reflects more than any field.

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.units import BoolArray, FloatArray
-from ...compare import rss
-from ...compare.spread import NO_SPREAD, Spread, StatedSpread
+from ...compare.gains.spread import NO_SPREAD, Spread, StatedSpread
+from ...compare.level import rss
 from ...flight.data import RssSeries
 from ...flight.replay import Replayed
 from ...flight.settings import RssSettings

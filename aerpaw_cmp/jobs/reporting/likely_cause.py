@@ -8,12 +8,12 @@ from collections.abc import Mapping
 import numpy as np
 
 from ...common.units import FloatArray
-from ...compare import rss
-from ...compare.causes import Cause, LevelEvidence, likely_cause
+from ...compare.judge.causes import Cause, LevelEvidence, likely_cause
+from ...compare.level import rss
 from ...flight.data import RssSeries
 from ...flight.replay import Replayed
 from ...propagation.field.baselines import free_space_dbm
-from ...site.antennas import Isotropic
+from ...site.antenna.antennas import Isotropic
 from ...site.site import Site
 from .levels import Levels
 

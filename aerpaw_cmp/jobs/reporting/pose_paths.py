@@ -10,7 +10,7 @@ from ...common.units import FloatArray
 from ...flight.data import FlightData
 from ...flight.replay import FlightReplay, Replayed
 from ...propagation.paths import PathSet
-from ...report.data import DIFFRACTED, PosePaths
+from ...report.content.flight import DIFFRACTED, PosePaths
 
 # Poses per tower whose paths are drawn.
 POSES = 300

@@ -19,8 +19,8 @@ from ...common.inputs import input_files, named_files
 from ...common.outputs import file_digest
 from ...common.provenance import trained_on
 from ...flight.settings import FlightFile, load_flight
-from ...report.data import InputFile
-from ...site.learned import read_table
+from ...report.content.flight import InputFile
+from ...site.antenna.learned import read_table
 
 
 def other_inputs(

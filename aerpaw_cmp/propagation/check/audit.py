@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from ...common.units import IntArray
-from ...compare.field_difference import FieldAudit
+from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
 from ..arrays import Link, Poses
 from ..options import Engine, Field, Run, Search

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray
-from ...compare.field_difference import FieldAudit
+from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
 from ..arrays import Array, Isotropic, Link, Poses
 from ..drivers.pairs import replay_pairs

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.units import AnyArray, FloatArray, IntArray
-from ...site.antennas import Isotropic
+from ...site.antenna.antennas import Isotropic
 from ..arrays import Array, Link, Pattern, Poses
 from ..paths import Faces, PathSet
 from . import dyads

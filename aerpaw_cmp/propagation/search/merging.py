@@ -10,7 +10,7 @@ import numpy as np
 
 from ...common.errors import InputError
 from ...common.units import BoolArray, FloatArray, IntArray
-from ...site.mitsuba import TriangleScene
+from ...site.mesh_scenes.mitsuba import TriangleScene
 from ..numba_options import kernel
 from ..paths import Faces
 from ..surfaces import Surfaces

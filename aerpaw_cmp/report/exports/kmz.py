@@ -18,7 +18,7 @@ import numpy as np
 from ...common.units import AnyArray, FloatArray, IntArray
 from ...maps import kml
 from ...maps.kml import CLASS_COLOURS, xml_text
-from ..canvas import keep_extremes
+from ..kit.canvas import keep_extremes
 from ..names import iso_time
 from .points import Column, Export, latitude_longitude
 

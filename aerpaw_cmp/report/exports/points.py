@@ -19,10 +19,10 @@ from ...common.jsonable import fields_of, named
 from ...common.units import AnyArray, FloatArray
 from ...logs.records import has_wall_clock
 from ...site.site import Site
-from ..campaign_data import CampaignData, FlownRank, RssRow
-from ..data import ReportData, Track
-from ..export import DECIMALS, rank_tables, rss_tables
+from ..content.campaign import CampaignData, FlownRank, RssRow
+from ..content.flight import ReportData, Track
 from ..names import RANK_COLUMNS, RSS_COLUMNS, k_key
+from .tables import DECIMALS, rank_tables, rss_tables
 
 # 1 mm.
 _DEGREE_DECIMALS = 8

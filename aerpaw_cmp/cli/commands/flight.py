@@ -1,0 +1,268 @@
+"""``report``, ``calibrate``, ``simulate``, ``sample``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from typer import Argument, Option
+
+from ...jobs.options import RunOptions
+from ..app import DryRun, Export, Force, Json, LogsRoot, command, output
+from ..shown import number, print_files, print_json, print_plan, records, say, show, table, warn_all
+
+
+@command(
+    "report",
+    examples=[
+        "aerpaw-cmp report sample_logs/flight.yaml",
+        "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
+        "aerpaw-cmp report flight.yaml --dry-run",
+        "aerpaw-cmp report flight.yaml --figures all --style paper",
+        "aerpaw-cmp report flight.yaml --export geojson,kmz",
+        "aerpaw-cmp report flight.yaml --with calibrated.yaml",
+        "aerpaw-cmp report flight.yaml --against prediction",
+        "aerpaw-cmp report flight.yaml --strict --json --quiet",
+    ],
+)
+def report(
+    flight: Annotated[Path, Argument(help="flight.yaml")],
+    out: Annotated[Path | None, output("Output folder  [default: reports/<flight>]")] = None,
+    logs_root: LogsRoot = None,
+    engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: rt.engine]")] = None,
+    audit: Annotated[
+        str | None, Option(help="Number of audited links, 'full' or 'none'  [default: rt.audit_links]")
+    ] = None,
+    recommend: Annotated[
+        Path | None, Option("--recommend", help="Write a flight.yaml with the recommended model.")
+    ] = None,
+    learned: Annotated[
+        Path | None,
+        Option("--with", metavar="CALIBRATED", help="calibrated.yaml with antennas, ground and receiver."),
+    ] = None,
+    against: Annotated[
+        Path | None,
+        Option("--against", metavar="PREDICTION", help="Score what 'predict' said of this flight (its folder)."),
+    ] = None,
+    strict: Annotated[bool, Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    figures: Annotated[
+        Literal["page", "none", "svg", "png", "pdf", "all"],
+        Option(help="Figures to draw: those of the page, none, or all in one format or in every format."),
+    ] = "page",
+    style: Annotated[
+        Literal["screen", "paper"], Option(help="Figure style: screen, or paper (IEEE width, fonts embedded).")
+    ] = "screen",
+    export: Export = None,
+    dry_run: DryRun = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> int:
+    """Replay a flight, calibrate, compare, report."""
+    from ...jobs import run
+
+    chosen = run.ReportOptions(
+        engine=engine,
+        audit=audit,
+        recommend=recommend,
+        learned=learned,
+        against=against,
+        figures=figures,
+        style=style,
+        export=export or (),
+    )
+    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+    if dry_run:
+        print_plan(run.plan_report(flight, chosen, options), as_json)
+        return 0
+    outcome = run.run_report(flight, chosen, options)
+    if as_json:
+        print_json(outcome.metrics)
+    else:
+        _print_report_summary(outcome)
+    return max(_verdict(outcome, strict), _nothing_compared(outcome.metrics))
+
+
+def _nothing_compared(metrics: Mapping[str, Any]) -> int:
+    """1 where no channel and no rank has samples enough to compare, which is said; 0 else."""
+    from ...compare.statistics.memory import FEWEST
+
+    channels = [m for channels in metrics["rss"].values() for m in channels.values()]
+    most = max([m["n"] for m in (*channels, *metrics["rank"].values())], default=0)
+    if most >= FEWEST or any(m.get("trained_on") for m in channels):
+        return 0
+    say.warn(f"check failed: nothing was compared: {most} samples have measurement, pose and path; expected {FEWEST}")
+    return 1
+
+
+def _verdict(outcome: Any, strict: bool) -> int:
+    """Say each stated check that failed; 1 where that is asked to be a failure."""
+    for check in outcome.failed_checks:
+        say.warn(f"check failed: {check}")
+    return 1 if strict and outcome.failed_checks else 0
+
+
+def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
+    """One line per model; over several channels the range of its errors, which the page has one by one."""
+    rows = []
+    for model in dict.fromkeys(m["model"] for m in ladder):
+        mine = [m for m in ladder if m["model"] == model]
+        errors = [m["rmse_heldout_db"] for m in mine if m["rmse_heldout_db"] is not None]
+        ends = (min(errors), max(errors))[: len(errors)] if errors else None
+        star = "* " if any(m["recommended"] for m in mine) else ""
+        rows.append({"model": star + model, "rmse_db": ends, "seconds": max(m["seconds"] for m in mine)})
+    title = "Model comparison (cross-validated); * simplest replay within 1 SE of the best"
+    records(rows, {"model": "model", "RMSE dB": "rmse_db:.2f", "s": "seconds:.1f"}, title)
+
+
+def _print_forecasts(rank: Mapping[str, Any]) -> None:
+    """The forecast of the fitted receivers, where one was scored."""
+    known = [{"tower": tower, **(m.get("receiver") or {}), "n": m["n"]} for tower, m in rank.items()]
+    columns = {
+        "tower": "tower", "kappa": "kappa:.2f", "95 %": "kappa_ci95:.2f", "agreement": "agreement:.3f",
+        "commonest": "majority_agreement:.3f", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
+        "n": "n",
+    }  # fmt: skip
+    known = [forecast for forecast in known if forecast.get("kappa") is not None]
+    records(known, columns, "Rank forecast by the fitted receiver")
+
+
+def _print_report_summary(outcome: Any) -> None:
+    from ...compare.result import BASELINE_TITLE
+    from ...compare.statistics.memory import FEWEST
+
+    links = [
+        {
+            **m, "tower": tower, "channel": channel, "ci95_db": m.get("rmse_ci95_db"),
+            **{name: model["rmse_db"] if m["n"] >= FEWEST else None
+               for name, model in {"rmse_db": m, **m["baselines"]}.items()},
+        }
+        for tower, channels in outcome.metrics["rss"].items()
+        for channel, m in channels.items()
+    ]  # fmt: skip
+    columns = {
+        "tower": "tower", "channel": "channel", "offset dB": "offset_db:.1f", "RMSE dB": "rmse_db:.2f",
+        "95 %": "ci95_db:.2f", **{title: f"{name}:.2f" for name, title in BASELINE_TITLE.items()},
+        "corr.": "correlation:.2f", "n": "n", "out of cov.": "n_out_of_coverage",
+    }  # fmt: skip
+    records(links, columns, "RSS, measured against replayed")
+    _print_ladder(outcome.metrics.get("ladder", ()))
+    thresholds = [
+        {"tower": tower, "k": k, **fit, "n": m["n"]}
+        for tower, m in outcome.metrics["rank"].items()
+        for k, fit in m["simulated"].items()
+    ]
+    columns = {"tower": "tower", "K": "k", "agreement": "agreement:.3f", "total variation": "total_variation:.3f"}
+    records(thresholds, {**columns, "n": "n"}, "Rank, measured against replayed")
+    _print_forecasts(outcome.metrics["rank"])
+    if "against" in outcome.metrics:
+        show(outcome.metrics["against"]["sentence"])
+    warn_all(outcome.metrics["warnings"])
+    show(f"report: {outcome.folder / 'report.html'}")
+    if audited := (outcome.metrics.get("rt") or {}).get("audit"):
+        show(audited["summary"])
+
+
+@command(
+    "calibrate",
+    examples=[
+        "aerpaw-cmp calibrate calibration.yaml -o learned.yaml",
+        "aerpaw-cmp calibrate calibration.yaml --logs-root /data/flights --json",
+        "aerpaw-cmp calibrate calibration.yaml --into-site my_site.yaml",
+        "aerpaw-cmp calibrate calibration.yaml --score next_flight.yaml --score another.yaml",
+    ],
+)
+def calibrate(
+    calibration_yaml: Annotated[Path, Argument(metavar="CALIBRATION", help="calibration.yaml")],
+    out: Annotated[
+        Path | None, output("File for the learned settings  [default: <calibration>.calibrated.yaml]", "FILE")
+    ] = None,
+    logs_root: LogsRoot = None,
+    into_site: Annotated[
+        str | None,
+        Option(
+            "--into-site", metavar="SITE", help="Site that stores the learned antennas; drafts then use them by name."
+        ),
+    ] = None,
+    score: Annotated[
+        list[Path] | None, Option(help="flight.yaml to score with the learned settings; repeatable.")
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Learn antennas and ground from several flights."""
+    from ...jobs import run
+
+    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+    outcome = run.run_calibrate(calibration_yaml, options, into_site=into_site, score=score or ())
+    if as_json:
+        print_json(outcome.metrics)
+        return
+    from ...compare.learning.calibration import BASELINES
+
+    m = outcome.metrics
+    rows = []
+    for name, scores in [*m["scores"].items(), *((f"control: {k}", v) for k, v in m["controls"].items())]:
+        means = [sum(s[key] for s in scores) / len(scores) if scores else None
+                 for key in ("rmse_db", "rmse_4s_db", *BASELINES)]  # fmt: skip
+        rows.append([name.replace("_", " "), *(number(v, "{:.2f}") for v in means), str(len(scores))])
+    if rows:
+        heads = ["left out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "series"]
+        table(heads, rows, "Scores on what was left out, means")
+    forecasts = [
+        {**forecast, "split": split.replace("_", " ")} for split, scores in m["rank"].items() for forecast in scores
+    ]  # fmt: skip
+    columns = {
+        "left out": "split", "flight": "flight", "tower": "tower", "kappa": "kappa:.3f", "agree": "agreement:.3f",
+        "commonest": "majority_agreement:.3f", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",
+        "TV": "total_variation_expected:.3f",
+    }  # fmt: skip
+    records(forecasts, columns, "Rank on what was left out")
+    for text in [*m["words"], *m["warnings"]]:
+        show(text)
+    show(outcome.files[0])
+    page = outcome.folder / "calibration.html"
+    show(page if page.exists() else outcome.folder)
+
+
+@command(
+    "simulate",
+    examples=[
+        "aerpaw-cmp simulate plan/flight.yaml",
+        "aerpaw-cmp simulate plan/flight.yaml -o planned --json",
+    ],
+)
+def simulate(
+    flight: Annotated[Path, Argument(help="flight.yaml with flight.plan")],
+    out: Annotated[Path | None, output("Output folder  [default: simulated/<flight>]")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Forward-simulate a planned flight into logs of the real formats."""
+    from ...jobs import run
+
+    options = RunOptions(out=out, force=force, progress=say)
+    print_files(run.run_simulate(flight, options).files, as_json)
+
+
+@command(
+    "sample",
+    examples=[
+        "aerpaw-cmp sample",
+        "aerpaw-cmp sample -o try_it",
+    ],
+)
+def sample(
+    out: Annotated[Path, output("Folder for flight.yaml and the logs.")] = Path("sample"),
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Copy the sample flight into a folder of your own."""
+    from ...jobs.sample import write_sample
+
+    flight = write_sample(out, force=force)
+    if as_json:
+        print_json({"flight": str(flight)})
+        return
+    show(f"flight: {flight}")
+    show(f"next: aerpaw-cmp report {flight}")

@@ -1,0 +1,230 @@
+"""``tap``, ``modem-sim``."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from typer import Argument, Option
+from typer.core import TyperCommand
+
+from ...common.errors import UsageError, one_line
+from ..app import Force, Json, command, output
+from ..shown import print_files, print_json, say, show
+
+WEB = "127.0.0.1:8765"
+
+
+class WebCommand(TyperCommand):
+    """A command whose ``--web`` may stand without an address."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the usual address behind a bare ``--web``: an address is what holds a colon and no slash."""
+        words = []
+        for index, word in enumerate(args):
+            words.append(word)
+            following = args[index + 1] if index + 1 < len(args) else ""
+            if word == "--web" and (":" not in following or "/" in following or following.startswith("-")):
+                words.append(WEB)
+        return super().parse_args(ctx, words)
+
+
+@command(
+    "tap",
+    examples=[
+        "aerpaw-cmp tap",
+        "aerpaw-cmp tap /dev/ttyUSB2 -o taplog --no-csi-alarm 5 --duration 600",
+        "aerpaw-cmp tap /tmp/modem -o taplog --web --flight sample_logs/flight.yaml",
+        "aerpaw-cmp tap --play taplog --speed 20",
+        "aerpaw-cmp tap -o taplog --export csv",
+    ],
+    kind=WebCommand,
+)
+def tap(
+    port: Annotated[
+        list[str] | None,
+        Argument(help="Serial port, or several  [default: the first AT port of a Quectel modem]"),
+    ] = None,
+    out: Annotated[Path, output("Folder of the log segments; of several ports, a folder in it for each.")] = Path(
+        "tap"
+    ),
+    status: Annotated[bool, Option("--status/--no-status", help="A status line on standard error.")] = True,
+    enable_csi: Annotated[bool, Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")] = False,
+    ri_hz: Annotated[float, Option(help="Rate of the rank indicator.")] = 2.0,
+    other_hz: Annotated[float, Option(help="Rate of each other query.")] = 1.0,
+    no_csi_alarm: Annotated[float | None, Option(help="Seconds without CSI until the bell rings.")] = None,
+    no_csi_exit: Annotated[bool, Option("--no-csi-exit", help="Exit with code 1 on that alarm.")] = False,
+    sync_s: Annotated[float, Option(help="Longest time between a record and its sync to disk [s].")] = 1.0,
+    duration: Annotated[float | None, Option(help="Stop after this many seconds.")] = None,
+    wait: Annotated[float, Option(help="Seconds to wait for the port.")] = 0.0,
+    web: Annotated[
+        str | None,
+        Option(help=f"Also show the flight as a page, at HOST:PORT [default: {WEB}]; 0.0.0.0 asks for a token."),
+    ] = None,
+    play: Annotated[
+        list[Path] | None, Option(help="Earlier log to show on the page; nothing is tapped; repeatable.")
+    ] = None,
+    speed: Annotated[float, Option(help="Seconds of the log per second, with --play.")] = 1.0,
+    export: Annotated[Literal["csv"] | None, Option(help="Write the log below OUT as a table and stop.")] = None,
+    flight: Annotated[Path | None, Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
+    telemetry: Annotated[Path | None, Option(help="The growing vehicleOut file that --flight follows.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> int:
+    """Log the modem's rank indicator until interrupted."""
+    from ...common.jsonable import json_safe
+
+    if export is not None:
+        from ...live.record.export import export_csv
+
+        exported = export_csv(out, out / "tap.csv", force=force)
+        if as_json:
+            print_json(json_safe(exported))
+        else:
+            show(exported)
+        return 0
+    _needs_posix("tap")
+    from ...jobs.live.live_tap import Shown, play_logs, tap_modems
+    from ...live.record.log import LogSettings
+    from ...live.session import TapSettings
+
+    shown = Shown(web=web or (WEB if play else None), flight=flight, telemetry=telemetry, say=say)
+    if play:
+        play_logs(play, speed, shown)
+        return 0
+    settings = TapSettings(
+        folder=out,
+        ri_hz=ri_hz,
+        other_hz=other_hz,
+        enable_csi=enable_csi,
+        no_csi_alarm_s=no_csi_alarm,
+        no_csi_exit=no_csi_exit,
+        duration_s=duration,
+        wait_for_port_s=wait,
+        log=LogSettings(sync_interval_s=sync_s),
+    )
+    line = StatusLine(status and not say.quiet)
+    summaries = tap_modems(settings, port or [None], shown, on_status=line)
+    for summary in summaries:
+        rates = ", ".join(f"{name} {rate:.2f} Hz" for name, rate in summary.rates_hz.items())
+        lost = f", {summary.lost_records} records lost (the disk did not take them)" if summary.lost_records else ""
+        say(f"{line.end}ended: {summary.reason}; {summary.records} records{lost}, {summary.gaps} gaps; {rates}")
+    if as_json:
+        print_json(json_safe(summaries[0] if len(summaries) == 1 else {"modems": summaries}))
+    else:
+        print_files([path for summary in summaries for path in summary.segments])
+    return max(summary.exit_code for summary in summaries)
+
+
+class StatusLine:
+    """The status of one modem or more on standard error: on a terminal a line that is written over."""
+
+    def __init__(self, enabled: bool) -> None:
+        self._enabled, self._terminal = enabled, sys.stderr.isatty()
+        self._lines: dict[str, str] = {}
+
+    @property
+    def end(self) -> str:
+        """Text that leaves the line behind."""
+        return "\n" if self._terminal else ""
+
+    def __call__(self, name: str, now: Any) -> None:
+        """Show the status of the modem of this name; no name where there is only one."""
+        from ...live.session import format_status
+
+        head = f"{name}: " if name else ""
+        if now.message:
+            print(("\r\033[K" if self._terminal else "") + one_line(head + now.message), file=sys.stderr, flush=True)
+        self._lines[name] = one_line(head + format_status(now))
+        if self._enabled and self._terminal:
+            print("\r\033[K" + " | ".join(self._lines.values()), end="", file=sys.stderr, flush=True)
+        elif self._enabled:
+            print(self._lines[name], file=sys.stderr, flush=True)
+        if now.alarm:
+            print("\a", end="", file=sys.stderr, flush=True)
+
+
+def _needs_posix(command: str) -> None:
+    """Ports are opened with termios and locked with fcntl, which not every system has."""
+    import importlib
+
+    for name in ("fcntl", "termios", "pty"):
+        try:
+            importlib.import_module(name)
+        except ImportError:
+            raise UsageError(
+                f"'{command}' needs Python's {name}, which this system does not have",
+                expected="Linux (another POSIX system may do)",
+                cause="Windows; logs of a tap can be read, reported and exported on every system",
+            ) from None
+
+
+@command(
+    "modem-sim",
+    examples=[
+        "aerpaw-cmp modem-sim --link /tmp/modem",
+        "aerpaw-cmp modem-sim --link demo/modem --flight sample_logs/flight.yaml --telemetry demo/vehicleOut.txt",
+        "aerpaw-cmp modem-sim --source taplog --fault echo=true --fault unplug_every_s=20",
+    ],
+)
+def modem_sim(
+    link: Annotated[Path | None, Option(help="Symbolic link to the port, updated when the port changes.")] = None,
+    source: Annotated[Path | None, Option(help="Log to play: a transcript, a tap log, or any log with ranks.")] = None,
+    kind: Annotated[Literal["modem", "gps", "diag", "silent", "rubbish"], Option(help="Device to imitate.")] = "modem",
+    flight: Annotated[
+        Path | None, Option(help="flight.yaml: fly it again from now on, with its ranks; needs --telemetry.")
+    ] = None,
+    telemetry: Annotated[
+        Path | None, Option(help="New telemetry file for --flight; it grows during the flight.")
+    ] = None,
+    fault: Annotated[list[str] | None, Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,
+    as_json: Json = False,
+) -> int:
+    """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
+    _needs_posix("modem-sim")
+    from ...live.serial.simulator import ModemSimSettings, run_modem_sim
+
+    if (flight is None) != (telemetry is None):
+        raise UsageError("--flight or --telemetry stands alone", expected="both: the flight to fly, and its new log")
+    flown = None
+    if flight is not None and telemetry is not None:
+        from ...jobs.live.live_twin import FlownAgain
+
+        flown = FlownAgain(flight, telemetry)
+    settings = ModemSimSettings(
+        link=link,
+        source=source,
+        kind=kind,
+        faults=_faults(fault or []),
+        rank=None if flown is None else flown.rank,
+        rsrp=None if flown is None else flown.rsrp,
+    )
+
+    def ready(port: object) -> None:
+        if as_json:
+            print_json({"port": str(port)})
+        else:
+            show(port)
+
+    return run_modem_sim(settings, on_ready=ready, meanwhile=flown)
+
+
+def _faults(pairs: list[str]) -> Any:
+    """Faults from NAME=VALUE pairs."""
+    import dataclasses
+
+    from ...live.serial.simulator import Faults
+
+    known: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(Faults)}
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        if name not in known:
+            raise UsageError(f"--fault {pair!r}", expected="NAME=VALUE with one of " + ", ".join(known))
+        kind: Any = type(known[name])
+        try:
+            values[name] = text.lower() in ("", "1", "true", "yes") if kind is bool else kind(text)
+        except ValueError as error:
+            raise UsageError(f"--fault {pair!r}", expected=f"a value of type {kind.__name__}") from error
+    return Faults(**values)

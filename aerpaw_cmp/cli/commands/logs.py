@@ -1,0 +1,89 @@
+"""``ingest``, ``formats``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+from typer import Argument, Option
+
+from ..app import Force, Json, command, output
+from ..shown import print_json, records, say, show, table
+
+
+@command(
+    "ingest",
+    examples=[
+        "aerpaw-cmp ingest my_logs/ -o flight.h5",
+        "aerpaw-cmp ingest my_logs/ --timezone America/New_York --draft flight.yaml",
+        "aerpaw-cmp ingest levels.csv --map time=time --map power_dbm=rss_db --unit dBm --json",
+    ],
+)
+def ingest(
+    paths: Annotated[list[Path], Argument(help="Log files and folders.")],
+    out: Annotated[
+        Path | None, output("Flight file (HDF5) with every record  [default: none is written]", "FILE")
+    ] = None,
+    draft: Annotated[Path | None, Option(help="Also write a first flight.yaml that names these logs.")] = None,
+    site: Annotated[
+        str | None, Option(help="Site of the draft; its learned antennas are used  [default: lake_wheeler]")
+    ] = None,
+    reader: Annotated[str | None, Option(help="Reader for all files  [default: detected by content]")] = None,
+    timezone: Annotated[
+        str | None, Option(help="IANA time zone of clocks without a zone, such as America/New_York.")
+    ] = None,
+    time_origin: Annotated[str | None, Option(help="Start time (ISO 8601) of logs with relative times.")] = None,
+    ri_base: Annotated[Literal["zero", "one"] | None, Option(help="Number that the log prints for rank 1.")] = None,
+    columns: Annotated[
+        list[str] | None,
+        Option("--map", metavar="COLUMN=QUANTITY", help="Content of a CSV column: time, rss_db, rank, ..."),
+    ] = None,
+    unit: Annotated[str | None, Option(help="Unit of levels, if the file does not state it.")] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Read logs, account for every line, write the flight file."""
+    from ...jobs import run
+    from ...logs.ingest import ACCOUNT, account_notes, account_rows
+
+    options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
+    if columns:
+        options |= run.mapping(columns)
+        reader = reader or "generic_csv"
+    summary = run.run_ingest(paths, out=out, draft=draft, site=site, reader=reader, force=force, **options)
+    if as_json:
+        print_json(summary)
+        return
+    folder, rows = account_rows(summary)
+    table(list(ACCOUNT), rows, f"files below {folder}" if folder else None)
+    for note in account_notes(summary):
+        say(note)
+    if out is not None:
+        flights = summary["flights"]
+        several = f": {len(flights)} flights, {', '.join(flights)}" if len(flights) > 1 else ""
+        show(f"wrote {out}{several}")
+    if draft is not None:
+        for remark in summary["draft"]:
+            say(remark)
+        for place in summary["drafts"]:
+            show(f"wrote {place}")
+
+
+@command(
+    "formats",
+    examples=[
+        "aerpaw-cmp formats",
+        "aerpaw-cmp formats --json",
+    ],
+)
+def formats(as_json: Json = False) -> None:
+    """List the readers with a sample line each."""
+    from ...logs.readers import catalogue
+
+    readers = sorted(catalogue(), key=lambda r: r.name)
+    listed = [{"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers]
+    if as_json:
+        print_json({"readers": listed})
+        return
+    columns = {"reader": "name", "what": "title", "streams": "kinds", "a line of it": "sample"}
+    records([{**item, "kinds": ", ".join(item["kinds"])} for item in listed], columns)

@@ -1,0 +1,72 @@
+"""``bench``, ``doctor``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+from typer import Option
+
+from ..app import Json, command
+from ..shown import print_json, records, say, show
+
+
+@command(
+    "bench",
+    examples=[
+        "aerpaw-cmp bench --quick",
+        "aerpaw-cmp bench --poses 500 --json",
+    ],
+)
+def bench(
+    poses: Annotated[int, Option(min=2, help="Poses of the flight that is replayed.")] = 200,
+    quick: Annotated[bool, Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Speed against error on this machine."""
+    from ...jobs import bench as job
+
+    if quick:
+        result = job.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, progress=say)
+    else:
+        result = job.run_bench(poses=poses, progress=say)
+    if as_json:
+        print_json(result)
+        return
+    rows = [
+        {**row, "ranks": ", ".join(f"{k}: {share:.3f}" for k, share in row["rank_disagreement"].items())}
+        for row in result["replay"]["rows"]
+    ]
+    columns = {
+        "engine": "engine", "samples": "samples:.0e", "arrays": "arrays", "depth": "depth", "s": "seconds:.3g",
+        "links/s": "links_per_s:.3g", "peak MiB": "peak_mib:.0f", "missing": "missing_paths", "extra": "extra_paths",
+        "RSS error dB max": "rss_max_error_db:.2g", "rms": "rss_rms_error_db:.2g", "rank disagreement per K": "ranks",
+    }  # fmt: skip
+    records(rows, columns, f"Speed against error ({_conditions(result['conditions'])})")
+    for name, ratio in result["ratios"].items():
+        show(f"{name}: {ratio:.3g} times")
+
+
+def _conditions(at: Mapping[str, Any]) -> str:
+    """Conditions of a benchmark in words."""
+    towers = ", ".join(at["towers"])
+    return f"{at['poses']} positions, towers {towers}, {at['buildings']} buildings, {at['cpus']} CPUs"
+
+
+@command(
+    "doctor",
+    examples=[
+        "aerpaw-cmp doctor",
+        "aerpaw-cmp doctor --json",
+    ],
+)
+def doctor(as_json: Json = False) -> int:
+    """Check this machine."""
+    from ...machine import doctor as doctor_room
+
+    checks = doctor_room.checks()
+    if as_json:
+        print_json(doctor_room.as_dict(checks))
+    else:
+        records(checks, {"check": "name", "status": "status", "found": "found", "remedy": "remedy"})
+    return 1 if any(c.status == "fail" for c in checks) else 0

@@ -1,0 +1,87 @@
+"""``plan``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+from typer import Argument, Option
+
+from ...jobs.options import RunOptions
+from ..app import Flights, Force, Json, LogsRoot, command, output
+from ..shown import print_json, records, say, show, warn_all
+
+_FENCE = Option(metavar="KML", help="Area that may be flown  [default: the area of the site]")
+_AVOID = Option(metavar="KML", help="No-fly areas; repeatable.")
+_ROUTES = Option("--route", metavar="FILE", help="Another candidate: .plan, KML, CSV or log; repeatable.")
+
+
+@command(
+    "plan",
+    examples=[
+        "aerpaw-cmp plan sphere --site lake_wheeler --tower LW1 --geofence fence.kml --minutes 12",
+        "aerpaw-cmp plan lake_wheeler --with flight1.yaml --with flight2.yaml --geofence fence.kml -o next",
+        "aerpaw-cmp plan mission.plan --with flight1.yaml --route a.kml --route b.plan",
+    ],
+)
+def plan(
+    target: Annotated[
+        str,
+        Argument(help="Target: sphere (all directions), a site (a grid), a route, or points."),
+    ],
+    flights: Flights = None,
+    site: Annotated[str | None, Option(help="Site, where no flight names it.")] = None,
+    tower: Annotated[
+        list[str] | None, Option(help="Tower whose antenna counts, without --with; repeatable  [default: all]")
+    ] = None,
+    geofence: Annotated[Path | None, _FENCE] = None,
+    avoid: Annotated[list[Path] | None, _AVOID] = None,
+    routes: Annotated[list[Path] | None, _ROUTES] = None,
+    minutes: Annotated[float, Option(min=1.0, max=240.0, help="Battery: longest flight [min].")] = 15.0,
+    speed: Annotated[float, Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
+    height: Annotated[
+        list[float] | None,
+        Option(help="Height of the tool's own patterns above take-off [m]; repeatable  [default: 40]"),
+    ] = None,
+    target_height: Annotated[
+        list[float] | None, Option(help="Height of a target that is a site [m]; repeatable  [default: 40]")
+    ] = None,
+    tower_distance: Annotated[float, Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
+    out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,
+    logs_root: LogsRoot = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Rank candidate flights by the standard deviation that they would leave."""
+    from ...jobs.prediction.next_flight import PlanOptions, run_plan
+    from ...jobs.prediction.where import TargetOptions
+
+    options = PlanOptions(
+        minutes=minutes,
+        speed_mps=speed,
+        heights_m=tuple(height or (40.0,)),
+        tower_distance_m=tower_distance,
+        fence=geofence,
+        avoid=tuple(avoid or ()),
+        routes=tuple(routes or ()),
+        towers=tuple(tower or ()),
+        target=TargetOptions(heights_m=tuple(target_height or (40.0,)), spacing_m=60.0, site=site),
+    )
+    outcome = run_plan(
+        target, flights or (), options, RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+    )
+    print_json(outcome.metrics) if as_json else _print_summary(outcome)
+
+
+def _in_km(route: dict[str, Any]) -> dict[str, Any]:
+    return {**route, "km": route["length_m"] / 1000.0, "flown": route.get("refused") or "yes"}
+
+
+def _print_summary(outcome: Any) -> None:
+    m = outcome.metrics
+    show(m["sentence"])
+    length = {"SD dB": "sd_db:.2f", "km": "km:.1f", "min": "minutes:.1f"}
+    records([_in_km(c) for c in m["candidates"]], {"route": "name", **length, "may be flown": "flown"}, "Candidates")
+    records([_in_km(p) for p in m["length"]], length, "What a longer flight buys")
+    warn_all(m["warnings"])
+    show(f"page: {outcome.folder / 'plan.html'}")

@@ -1,0 +1,233 @@
+"""``site import``, ``site show``, ``map``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from typer import Argument, Option
+
+from ...common.errors import UsageError
+from ...jobs.options import RunOptions
+from ..app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, command, output, site_app
+from ..shown import print_files, print_json, print_plan, say, show, table
+
+
+@command(
+    "import",
+    of=site_app,
+    text="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) or a Mitsuba scene to a site.yaml.",
+    examples=[
+        "aerpaw-cmp site import farm.osm -o site.yaml",
+        "aerpaw-cmp site import munich.xml --origin 48.1372,11.5755 --tower BS=8.5,21,27 -o munich.yaml",
+        "aerpaw-cmp site import fields.kml barns.geojson --base my_towers.yaml --untagged building -o site.yaml",
+        "aerpaw-cmp site import farm.osm --canopy chm.tif --buildings dsm.tif -o site.yaml",
+    ],
+)
+def site_import(
+    out: Annotated[Path, output("The site.yaml to write.", "FILE")],
+    files: Annotated[
+        list[Path] | None,
+        Argument(help="Map files, or one Mitsuba XML  [default: none; with --canopy or --buildings]"),
+    ] = None,
+    base: Annotated[
+        str | None, Option(help="Site that gives towers and settings  [default: lake_wheeler; none for a scene]")
+    ] = None,
+    origin: Annotated[
+        str | None, Option(help="Scene: latitude,longitude[,ground height] of its (0, 0, 0), or 'local'.")
+    ] = None,
+    tower: Annotated[
+        list[str] | None, Option(help="Scene: name=east,north,height [m] of an antenna; repeatable.")
+    ] = None,
+    material: Annotated[
+        list[str] | None, Option(help="Scene: id=concrete, for a material without radio properties; repeatable.")
+    ] = None,
+    turn: Annotated[float, Option(help="Scene: angle of the x axis, counter-clockwise from east [deg].")] = 0.0,
+    merge_m: Annotated[float, Option(help="Scene: largest distance of a face's corners from its plane [m].")] = 1e-3,
+    untagged: Annotated[
+        Literal["building", "forest", "geofence"] | None, Option(help="Kind of the areas without a tag.")
+    ] = None,
+    canopy: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="Canopy heights (GeoTIFF): stands and trees in place of all others."),
+    ] = None,
+    buildings: Annotated[
+        Path | None,
+        Option(metavar="FILE", help="Surface model (GeoTIFF) that gives the buildings their heights."),
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Import footprints, or a scene."""
+    from ...jobs import run
+    from ...jobs.mapping import site_scene
+
+    files = files or []
+    scene = len(files) == 1 and site_scene.is_scene(files[0])
+    of_scenes = {"--origin": origin, "--tower": tower, "--material": material, "--turn": turn}
+    of_maps = {"--untagged": untagged, "--canopy": canopy, "--buildings": buildings}
+    for option in (name for name, value in (of_maps if scene else of_scenes).items() if value):
+        kinds = ("a Mitsuba scene", "map files") if scene else ("map files", "one Mitsuba XML")
+        raise UsageError(f"{option} with {kinds[0]}", expected=f"{kinds[1]}, or no {option}")
+    if scene:
+        facts = site_scene.SceneOptions(
+            origin=origin, base=base, towers=tower or (), materials=material or (), turn_deg=turn, merge_m=merge_m
+        )
+        actions = site_scene.run_scene_import(files[0], out, facts, force=force)
+    else:
+        base = base or "lake_wheeler"
+        actions = run.run_site_import(
+            files, out, base=base, untagged=untagged, canopy=canopy, surface=buildings, force=force
+        )
+    if as_json:
+        print_json({"file": str(out), "base": base, "actions": actions})
+        return
+    for line in actions:
+        say(line)
+    show(out)
+
+
+@command(
+    "export",
+    of=site_app,
+    text="A site as Mitsuba XML with PLY meshes, which sionna.rt.load_scene opens.",
+    examples=["aerpaw-cmp site export lake_wheeler -o scene", "aerpaw-cmp site export site.yaml -o out"],
+)
+def site_export(
+    site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")],
+    out: Annotated[Path, Option("-o", "--out", "--sionna", metavar="DIR", help="Output folder.")],
+    trees: Annotated[bool, Option("--trees/--no-trees", help="Also export crowns and trunks.")] = True,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write a site for Sionna."""
+    from ...jobs.mapping.site_scene import run_site_export
+
+    files = run_site_export(site, out, trees=trees, force=force).files
+    print_files(files if as_json else files[:1], as_json)
+
+
+@command(
+    "show",
+    of=site_app,
+    text="Plan of a site, and a standalone page that shows it in 3-D.",
+    examples=[
+        "aerpaw-cmp site show",
+        "aerpaw-cmp site show site.yaml -o reports/site --export",
+        "aerpaw-cmp site show --flight sample_logs/flight.yaml",
+    ],
+)
+def site_show(
+    site: Annotated[
+        str | None, Argument(help="site.yaml or packaged site  [default: that of --flight, else lake_wheeler]")
+    ] = None,
+    out: Annotated[Path | None, output("Output folder  [default: reports/site-<site>]")] = None,
+    flight: Annotated[Path | None, Option(help="Draw the track of this flight.yaml.")] = None,
+    logs_root: LogsRoot = None,
+    export: Annotated[bool, Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Look at a site."""
+    from ...jobs import run
+
+    options = RunOptions(out=out, logs_root=logs_root, force=force)
+    shown = run.run_site_show(site, options, flight=flight, export=export)
+    if not as_json and flight is None:
+        from ...site.antenna.learned import memory_lines
+
+        for line in memory_lines(site or "lake_wheeler"):
+            say(line)
+    print_files(shown.files, as_json)
+
+
+@command(
+    "map",
+    examples=[
+        "aerpaw-cmp map --quick",
+        "aerpaw-cmp map site.yaml --spacing 15 --dry-run",
+        "aerpaw-cmp map site.yaml -o reports/map --spacing 20 --rank-altitude 30 --rank-altitude 70",
+        "aerpaw-cmp map lake_wheeler --flight flight.yaml --foliage none --no-study --json",
+        "aerpaw-cmp map lake_wheeler --with flight1.yaml --with flight2.yaml",
+    ],
+)
+def map_(
+    site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
+    out: Annotated[Path | None, output("Output folder  [default: reports/map-<site>]")] = None,
+    quick: Annotated[bool, Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
+    foliage: Annotated[
+        list[str] | None, Option(help="none, attenuating, opaque or all; repeatable  [default: all]")
+    ] = None,
+    spacing: Annotated[float | None, Option(help="Distance between positions [m]  [default: 30]")] = None,
+    rss_altitude: Annotated[
+        list[float] | None, Option(help="Height of RSS maps [m]; repeatable  [default: 30, 70, 110]")
+    ] = None,
+    rank_altitude: Annotated[
+        list[float] | None, Option(help="Height of rank maps [m]; repeatable  [default: 3 and 30 to 110 by 10]")
+    ] = None,
+    k: Annotated[
+        list[float] | None,
+        Option("-k", "--k", help="Singular-value ratio K; repeatable  [default: 10, 100, 1000]"),
+    ] = None,
+    carrier_ghz: Annotated[float | None, Option(help="Carrier frequency [GHz]  [default: 3.4]")] = None,
+    engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: image]")] = None,
+    max_depth: Annotated[int | None, Option(min=0, max=3, help="Largest number of reflections  [default: 2]")] = None,
+    samples: Annotated[int | None, Option(min=1, help="Rays per tower (sionna only)  [default: 1e6]")] = None,
+    flight: Annotated[
+        Path | None, Option(help="flight.yaml whose track is the training set of the test 'along a flight'.")
+    ] = None,
+    flights: Flights = None,
+    remembered: Annotated[
+        bool, Option("--remembered", help="Correct by what the site remembers, without --with.")
+    ] = False,
+    logs_root: LogsRoot = None,
+    threshold_dbm: Annotated[
+        float | None, Option(help="Lowest level in coverage [dBm]  [default: any path is coverage]")
+    ] = None,
+    study: Annotated[bool, Option("--study/--no-study", help="Also spatial correlation and interpolation.")] = True,
+    tile_m: Annotated[
+        float | None,
+        Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),
+    ] = None,
+    workers: Workers = 1,
+    scheduler: Scheduler = None,
+    dry_run: DryRun = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Coverage and rank maps of a site, Kriging of rank."""
+    from ...jobs import run
+    from ...jobs.mapping.coverage_map import map_settings
+
+    modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
+    fields: dict[str, Any] = {
+        "foliage": modes,
+        "spacing_m": spacing,
+        "rss_altitudes_m": tuple(sorted(set(rss_altitude))) if rss_altitude else None,
+        "rank_altitudes_m": tuple(sorted(set(rank_altitude))) if rank_altitude else None,
+        "ks": tuple(sorted(set(k))) if k else None,
+        "carrier_hz": None if carrier_ghz is None else carrier_ghz * 1e9,
+        "engine": engine,
+        "max_depth": max_depth,
+        "samples": samples,
+        "threshold_dbm": threshold_dbm,
+        "study": study,
+        "tile_m": tile_m,
+    }
+    settings = map_settings(fields, quick=quick)
+    options = RunOptions(out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say)
+    if dry_run:
+        print_plan(run.plan_map(site, settings, options, flight=flight), as_json)
+        return
+    outcome = run.run_map(site, settings, options, flight=flight, flights=flights or (), remembered=remembered)
+    if as_json:
+        print_json(outcome.metrics)
+        return
+    rows = [[p["where"], p["what"], p["paper"], p["ours"]] for p in outcome.metrics["paper"]]
+    if rows:
+        table(["where", "what", "paper", "here"], rows, "What the paper states, and what this run gives")
+    for path in outcome.files:
+        if path.parent == outcome.folder:
+            show(path)
+    if outcome.metrics["tiles"]:
+        show(outcome.metrics["tiles"]["store"])

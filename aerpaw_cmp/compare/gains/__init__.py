@@ -1,0 +1,1 @@
+"""Gains over direction and their spread; the mount of an antenna."""

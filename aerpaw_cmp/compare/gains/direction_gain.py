@@ -1,0 +1,511 @@
+"""Gain over direction at both ends of a link, learned from the residuals of several flights.
+
+``residual = offset + g_uav(body) + g_tower(mast) + g_pair(body, mast) [+ place] + own + noise``
+
+``offset`` is free per flight, tower and channel. ``own`` is a nuisance of each flight and channel, correlated over
+place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes over directions:
+of the tower in the body, of the UAV at the mast, and of both together per channel (what the gain at one end does not
+explain without the other). A place field, if asked for, is one over positions and stays apart.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from ...common.errors import InputError, UsageError
+from ...common.gaussian import gaussian_kernel
+from ...common.units import BoolArray, FloatArray, IntArray
+
+Frame = Literal["body", "mast", "pair", "world", "place"]
+_Sharing = Literal["all", "antenna"]
+
+# Prior of each offset in standard deviations of the noise: free in effect, and still a proper covariance.
+_OFFSET_SD = 100.0
+
+# Means that a fit rests on (a matrix of 72 MB); of more flights they are over longer times.
+MOST_ROWS = 3000
+
+# Of the tower's gains against the UAV's: the likelier one is taken. Nothing else is chosen on flights: a length of the
+# nuisance by likelihood and its strength by flights left out, of 0.5 to 4, left 0.06 dB more on dataset 12.
+_TOWER_FACTORS = (1.0, 0.5)
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSamples:
+    """Measurements of one flight on one channel of one tower, against a model without the gain to be learned.
+
+    Parameters
+    ----------
+    flight, tower, channel : str
+        Names; tower and channel together are an antenna.
+    time_s : (n,)
+        Increasing [s].
+    position_m : (n, 3)
+        Of the UAV, east, north, up [m].
+    at_uav : (n, 3)
+        Unit vector towards the tower in the body frame (forward, left, up).
+    at_tower : (n, 3)
+        Unit vector towards the UAV in the frame of the mast (east, north, up).
+    residual_db : (n,)
+        Measured minus model [dB]; NaN does not count.
+    floor_db : (n,), optional
+        The residual of a level at the receiver's floor [dB]: a smaller one says "no higher than that".
+    """
+
+    flight: str
+    tower: str
+    channel: str
+    time_s: FloatArray
+    position_m: FloatArray
+    at_uav: FloatArray
+    at_tower: FloatArray
+    residual_db: FloatArray
+    floor_db: FloatArray | None = None
+
+    @property
+    def antenna(self) -> str:
+        """Name of the antenna at the tower."""
+        return f"{self.tower}.{self.channel}"
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    def part(self, keep: BoolArray | IntArray) -> LinkSamples:
+        """Some of the samples."""
+        arrays: dict[str, Any] = {name: getattr(self, name)[keep] for name in _ARRAYS}
+        floor_db = None if self.floor_db is None else self.floor_db[keep]
+        return dataclasses.replace(self, floor_db=floor_db, **arrays)
+
+    def binned(self, width_s: float) -> LinkSamples:
+        """Means over bins of time; directions are normalised again.
+
+        A bin mixes directions only as far as the UAV turns within it; a few seconds are less than the lengths of the
+        kernels.
+        """
+        finite = np.isfinite(self.residual_db) & np.isfinite(self.at_uav).all(axis=1)
+        if not finite.any():
+            return self.part(finite)
+        part = self.part(finite)
+        _, member = np.unique(np.floor((part.time_s - part.time_s[0]) / width_s).astype(np.int64), return_inverse=True)
+        means: dict[str, Any] = {name: _bin_means(getattr(part, name), member) for name in _ARRAYS}
+        for name in ("at_uav", "at_tower"):
+            means[name] /= np.linalg.norm(means[name], axis=1, keepdims=True)
+        return dataclasses.replace(part, floor_db=None, **means)
+
+
+_ARRAYS = ("time_s", "position_m", "at_uav", "at_tower", "residual_db")
+
+
+def _bin_means(values: FloatArray, member: IntArray) -> FloatArray:
+    count = np.bincount(member)
+    if values.ndim == 1:
+        return np.asarray(np.bincount(member, weights=values) / count)
+    return np.stack([np.bincount(member, weights=column) / count for column in values.T], axis=1)
+
+
+@dataclass(frozen=True, slots=True)
+class Term:
+    """One Gaussian process: its covariance falls exponentially, or, of the pair, as a Gaussian.
+
+    Parameters
+    ----------
+    frame : {"body", "mast", "pair", "world", "place"}
+        Its argument: direction of the tower in the body, of the UAV at the mast, both of these, the direction of the
+        tower in the world's axes at the UAV (a control: no antenna is fixed there), or the position.
+    per : {"all", "antenna"}
+        One function for all, or one per tower and channel.
+    length : float
+        Chord on the unit sphere, or metres for a place.
+    sd_db : float
+        Standard deviation [dB].
+    """
+
+    frame: Frame
+    per: _Sharing
+    length: float
+    sd_db: float
+
+
+UAV_TERMS = (Term("body", "all", 1.0, 3.2),)
+TOWER_TERMS = (Term("mast", "antenna", 0.5, 3.4),)
+PAIR_TERMS = (Term("pair", "antenna", 0.35, 1.5),)
+ANTENNA_TERMS = UAV_TERMS + TOWER_TERMS + PAIR_TERMS
+PLACE_TERM = Term("place", "antenna", 60.0, 2.0)
+
+
+@dataclass(frozen=True, slots=True)
+class GainModel:
+    """All that is not learned from directions: which terms, how strong, how long.
+
+    Parameters
+    ----------
+    terms : tuple of Term
+        At least one.
+    own_sd_db, own_length_m : float
+        Nuisance of a flight and channel: ``sd^2 exp(-distance / length)``.
+    noise_sd_db : float
+        Of a bin.
+    bin_s : float
+        Samples are averaged over this time [s].
+    """
+
+    terms: tuple[Term, ...] = ANTENNA_TERMS
+    own_sd_db: float = 1.2
+    own_length_m: float = 20.0
+    noise_sd_db: float = 1.5
+    bin_s: float = 4.0
+
+    def scaled(self, factor: float) -> GainModel:
+        """All standard deviations times a factor."""
+        return dataclasses.replace(
+            self,
+            terms=tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) for t in self.terms),
+            own_sd_db=self.own_sd_db * factor,
+            noise_sd_db=self.noise_sd_db * factor,
+        )
+
+
+def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
+    """Argument of a term of this frame: (n, 3), or (n, 6) of both directions."""
+    if frame == "pair":
+        return np.concatenate([samples.at_uav, samples.at_tower], axis=1)
+    if frame == "body":
+        return samples.at_uav
+    if frame == "mast":
+        return samples.at_tower
+    return -samples.at_tower if frame == "world" else samples.position_m
+
+
+def _kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
+    """Covariance (n, m) of a term between arguments [dB^2].
+
+    Gains of airframes have details of every size: an exponential leaves 0.1 dB less than sums of Gaussians.
+    """
+    from scipy.spatial.distance import cdist
+
+    if term.frame == "pair":
+        return term.sd_db**2 * gaussian_kernel(at, to, term.length)
+    # in place: these matrices are most of the time of a calibration
+    kernel = np.asarray(cdist(at, to))
+    kernel /= -term.length
+    np.exp(kernel, out=kernel)
+    kernel *= term.sd_db**2
+    return kernel
+
+
+def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
+    """Covariance (n, m) of the gains between samples of some series and of others [dB^2]."""
+    names = [[s.antenna for s in series for _ in range(len(s))] for series in (first, second)]
+    codes = np.unique(names[0] + names[1], return_inverse=True)[1]
+    same = codes[: len(names[0]), None] == codes[None, len(names[0]) :]
+    out = np.zeros(same.shape)
+    for term in terms:
+        at, to = (np.concatenate([argument_of(s, term.frame) for s in series]) for series in (first, second))
+        kernel = _kernel(term, at, to)
+        out += kernel * same if term.per == "antenna" else kernel
+    return out
+
+
+def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
+    """Covariance (n, n) of the levels of all rows: gains, and each series' offset, nuisance and noise [dB^2]."""
+    from scipy.spatial.distance import cdist
+
+    out, start = _covariance(model.terms, rows, rows), 0
+    for samples in rows:
+        block = slice(start, start + len(samples))
+        distance = cdist(samples.position_m, samples.position_m)
+        out[block, block] += model.own_sd_db**2 * np.exp(-distance / model.own_length_m)
+        out[block, block] += (_OFFSET_SD * model.noise_sd_db) ** 2
+        start = block.stop
+    out[np.diag_indices(len(out))] += model.noise_sd_db**2
+    return out
+
+
+def factor_of(matrix: FloatArray) -> FloatArray:
+    """Lower Cholesky factor of a symmetric matrix, in its place.
+
+    Raises
+    ------
+    InputError
+        It is not positive definite, or not finite.
+    """
+    from scipy.linalg import LinAlgError, cholesky
+
+    try:
+        if not np.isfinite(matrix.sum()):
+            raise ValueError("numbers that are not finite")
+        # the transpose is the same matrix in the order that LAPACK works on
+        return np.asarray(cholesky(matrix.T, lower=True, overwrite_a=True, check_finite=False))
+    except (LinAlgError, ValueError) as error:
+        raise InputError(
+            f"the equations of the fit cannot be solved ({error})",
+            expected="levels that are finite and vary",
+            cause="a channel that never changes, or values that are no levels",
+        ) from None
+
+
+@dataclass(frozen=True, slots=True)
+class GainFit:
+    """Gain over direction with its uncertainty.
+
+    Parameters
+    ----------
+    model : GainModel
+        With the standard deviations and the bins that were used.
+    rows : tuple of LinkSamples
+        Means over bins that were learned from.
+    log_evidence : float
+        Log marginal likelihood, but for a constant of the data.
+    common_scale : float
+        Factor on all standard deviations that makes them fit the data: ``s^2 = y' C^-1 y / rows``.
+    """
+
+    model: GainModel
+    rows: tuple[LinkSamples, ...]
+    log_evidence: float
+    common_scale: float
+    _weights: FloatArray = field(repr=False)
+    _lower: FloatArray = field(repr=False)
+    # mean gain over the rows, by terms and antenna: every flight that is predicted asks for it
+    _zeros: dict[tuple[tuple[Term, ...], str], float] = field(
+        default_factory=dict, init=False, repr=False, compare=False
+    )
+
+    @property
+    def antennas(self) -> tuple[str, ...]:
+        """``tower.channel`` of those that were fitted."""
+        return tuple(dict.fromkeys(s.antenna for s in self.rows))
+
+    def scaled(self) -> GainFit:
+        """The fit with all standard deviations times :attr:`common_scale`: the same gains, other uncertainties."""
+        s, count = self.common_scale, len(self._weights)
+        misfit = s**2 * max(count - len(self.rows), 1)
+        return dataclasses.replace(
+            self,
+            model=self.model.scaled(s),
+            log_evidence=self.log_evidence + 0.5 * misfit * (1.0 - s**-2) - count * math.log(s),
+            common_scale=1.0,
+            _weights=self._weights / s**2,
+            _lower=self._lower * s,
+        )
+
+    def predict(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> tuple[FloatArray, FloatArray]:
+        """Gain of all terms together along samples, about its mean over the samples it was learned from.
+
+        Parameters
+        ----------
+        samples : LinkSamples
+            Of a fitted antenna; their residual is not used.
+        frames : iterable of Frame, optional
+            Terms that count; all by default.
+
+        Returns
+        -------
+        gain_db, sd_db : (n,)
+            Posterior mean and standard deviation [dB]; NaN where a direction is NaN.
+
+        Raises
+        ------
+        UsageError
+            If no flight of the fit had this tower and channel.
+        """
+        gain, sd = np.full(len(samples), np.nan), np.full(len(samples), np.nan)
+        terms, known = self._terms(frames), self._known_rows(samples)
+        for start in range(0, len(known), AT_ONCE):
+            part = known[start : start + AT_ONCE]
+            gain[part], sd[part] = self._moments(terms, samples.part(part), self._rows_of(samples.antenna))
+        return gain, sd
+
+    def mean(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> FloatArray:
+        """The gain of :meth:`predict` alone (n,) [dB]."""
+        gain = np.full(len(samples), np.nan)
+        terms, known = self._terms(frames), self._known_rows(samples)
+        zero = self._zero(terms, samples.antenna)
+        for start in range(0, len(known), AT_ONCE):
+            part = known[start : start + AT_ONCE]
+            gain[part] = _covariance(terms, [samples.part(part)], self.rows) @ self._weights - zero
+        return gain
+
+    def gain(self, frame: Frame, antenna: str, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gain at one end over directions (n, 3), or of the pair of ends (n, 6): posterior mean and SD (n,) [dB].
+
+        Zero is the mean over the bins of the flights: the level itself is in the offsets.
+        """
+        return self.predict(directed(antenna, np.asarray(direction, dtype=np.float64)), (frame,))
+
+    def seen(self, frame: Frame, antenna: str) -> FloatArray:
+        """Directions (m, 3) of the bins of the fit at one end, the UAV's of all antennas together; (m, 6) of pairs."""
+        return np.concatenate(
+            [argument_of(s, frame) for s in (self.rows if frame == "body" else self._rows_of(antenna))]
+        )
+
+    def sd_about_mean(self, samples: LinkSamples) -> FloatArray:
+        """Standard deviation (n,) of the gain along samples about its mean over them, as an own offset leaves it [dB].
+
+        Every sample must have both directions.
+        """
+        self._rows_of(samples.antenna)
+        return self._moments(self.model.terms, samples, [samples])[1]
+
+    def _terms(self, frames: Iterable[Frame] | None) -> tuple[Term, ...]:
+        chosen = None if frames is None else set(frames)
+        return tuple(t for t in self.model.terms if chosen is None or t.frame in chosen)
+
+    def _rows_of(self, antenna: str) -> list[LinkSamples]:
+        """Rows of an antenna."""
+        rows = [s for s in self.rows if s.antenna == antenna]
+        if not rows:
+            raise UsageError(
+                f"tower and channel {antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
+            )
+        return rows
+
+    def _zero(self, terms: tuple[Term, ...], antenna: str) -> float:
+        """Mean of the gain over the rows of an antenna [dB]."""
+        if (terms, antenna) not in self._zeros:
+            gain = _covariance(terms, self._rows_of(antenna), self.rows) @ self._weights
+            self._zeros[terms, antenna] = float(gain.mean())
+        return self._zeros[terms, antenna]
+
+    @staticmethod
+    def _known_rows(samples: LinkSamples) -> IntArray:
+        finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1))
+        return np.flatnonzero(finite.all(axis=1))
+
+    def _moments(
+        self, terms: Sequence[Term], at: LinkSamples, about: Sequence[LinkSamples]
+    ) -> tuple[FloatArray, FloatArray]:
+        """Sum of some terms along samples about its mean over others: mean and standard deviation (n,)."""
+        from scipy.linalg import solve_triangular
+
+        centre = _covariance(terms, about, [at, *self.rows]).mean(axis=0)
+        across = _covariance(terms, [at], self.rows) - centre[len(at) :]
+        # between samples of one antenna every term counts
+        prior = sum(t.sd_db**2 for t in terms) - 2.0 * centre[: len(at)] + _covariance(terms, about, about).mean()
+        spread = solve_triangular(self._lower, across.T, lower=True, check_finite=False)
+        return across @ self._weights, np.sqrt(np.maximum(prior - (spread**2).sum(axis=0), 0.0))
+
+
+# Samples that are predicted at a time; bounds the memory.
+AT_ONCE = 2000
+
+
+def directed(antenna: str, direction: FloatArray) -> LinkSamples:
+    """Samples (n,) of an antenna towards directions (n, 3), the same at both ends, or pairs of them (n, 6)."""
+    count = len(direction)
+    tower, _, channel = antenna.partition(".")
+    return LinkSamples(
+        flight="",
+        tower=tower,
+        channel=channel,
+        time_s=np.arange(float(count)),
+        position_m=np.zeros((count, 3)),
+        at_uav=direction[:, :3],
+        at_tower=direction[:, -3:],
+        residual_db=np.full(count, np.nan),
+    )
+
+
+def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> GainFit:
+    """Learn the gain over direction.
+
+    Parameters
+    ----------
+    series : sequence of LinkSamples
+        Of all flights.
+    model : GainModel, optional
+        Terms and their strength; see :func:`chosen_fit`.
+
+    Returns
+    -------
+    GainFit
+
+    Raises
+    ------
+    InputError
+        If no sample counts, or the equations cannot be solved.
+
+    Notes
+    -----
+    ``y = offset + gains + own + noise``, all normal: with the covariance ``C`` of the rows the gain at directions of
+    covariance ``k`` with them is ``k' C^-1 y`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, eq.
+    2.25). The solution is exact but for the average over ``bin_s``.
+    """
+    from scipy.linalg import cho_solve
+
+    model, rows = _binned_series(series, model or GainModel())
+    lower = factor_of(_covariance_of_levels(model, rows))
+    target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
+    weights = cho_solve((lower, True), target, check_finite=False)
+    misfit = float(target @ weights)
+    return GainFit(
+        model=model,
+        rows=tuple(rows),
+        log_evidence=-0.5 * misfit - float(np.log(np.diag(lower)).sum()),
+        common_scale=math.sqrt(max(misfit / max(len(target) - len(rows), 1), 1e-6)),
+        _weights=weights,
+        _lower=lower,
+    )
+
+
+def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) -> GainFit:
+    """:func:`fit_gain` with the likelier strength of the tower's gains and the common scale of all.
+
+    The scale, which changes no mean, makes the standard deviations fit the data: ``s^2 = y' C^-1 y / rows``.
+    """
+    model = model or GainModel()
+    mast = [t.frame == "mast" for t in model.terms]
+    fits = [
+        fit_gain(series, dataclasses.replace(model, terms=tuple(
+            dataclasses.replace(t, sd_db=t.sd_db * factor) if t.frame == "mast" else t for t in model.terms
+        ))).scaled()
+        for factor in (_TOWER_FACTORS if any(mast) and not all(mast) else (1.0,))
+    ]  # fmt: skip
+    return max(fits, key=lambda fit: fit.log_evidence)
+
+
+def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[GainModel, list[LinkSamples]]:
+    """Means over bins of each series that has any, and the model with the bins used; InputError if none has."""
+    binned = [s.binned(model.bin_s) for s in series]
+    longer = math.ceil(sum(map(len, binned)) / MOST_ROWS)
+    if longer > 1:
+        model = dataclasses.replace(model, bin_s=model.bin_s * longer)
+        binned = [s.binned(model.bin_s) for s in series]
+    binned = [s for s in binned if len(s)]
+    if not binned:
+        raise InputError("no sample has a level and a direction", expected="RSS with positions and attitude")
+    return model, binned
+
+
+def column_forms(
+    series: Sequence[LinkSamples],
+    model: GainModel,
+    columns: Callable[[LinkSamples, float], FloatArray],
+) -> FloatArray:
+    """``X' Sigma^-1 X`` (width, width), Sigma the covariance of a model with the gains integrated out.
+
+    Parameters
+    ----------
+    series : sequence of LinkSamples
+    model : GainModel
+        Its priors and noise make Sigma.
+    columns : callable
+        ``columns(series, bin_s)`` gives the columns X of one series (bins, width), of :meth:`LinkSamples.binned`.
+
+    Returns
+    -------
+    (width, width)
+        Symmetric, positive semidefinite [squared unit of the columns per dB^2].
+    """
+    from scipy.linalg import solve_triangular
+
+    model, rows = _binned_series(series, model)
+    values = np.concatenate([columns(s, model.bin_s) for s in series if len(s.binned(model.bin_s))])
+    inside = solve_triangular(factor_of(_covariance_of_levels(model, rows)), values, lower=True)
+    return np.asarray(inside.T @ inside)

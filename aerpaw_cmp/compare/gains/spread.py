@@ -1,0 +1,158 @@
+"""Spread of a level about its prediction by learned antennas: gain, the flight's own nuisance, noise, fading."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+
+import numpy as np
+
+from ...common.units import FloatArray
+from .direction_gain import LinkSamples
+
+# Nominal shares of samples within an interval.
+SHARES = (0.5, 0.9, 0.95)
+
+# Of the band that a report draws.
+BAND = 0.9
+
+# Beyond it the expansion of :meth:`Spread.half_width_db` is no longer one of a bell.
+_MOST_KURTOSIS = 2.0
+
+
+# Squared skewness of fading in dB for each unit of excess kurtosis: 1.30 / 2.40 of Rayleigh's.
+_FADE_SKEWNESS2 = 0.54
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spread:
+    """Spread of a predicted level besides the gain's own standard deviation.
+
+    Parameters
+    ----------
+    own_sd_db : float
+        Of the nuisance of a flight and channel (shadowing that no antenna explains).
+    noise_sd_db : float
+        Of means over ``bin_s``.
+    fading_sd_db, fading_kurtosis : float
+        Standard deviation and excess kurtosis of samples about their mean over ``bin_s``.
+    bin_s : float
+        Time over which the antennas were learned from means [s].
+    """
+
+    own_sd_db: float
+    noise_sd_db: float
+    fading_sd_db: float
+    fading_kurtosis: float
+    bin_s: float
+
+    def total_db(self, gain_sd_db: FloatArray) -> FloatArray:
+        """Standard deviation (n,) of a sample about its prediction, from that of the gain (n,) [dB]."""
+        variance = self.own_sd_db**2 + self.noise_sd_db**2 + self.fading_sd_db**2
+        return np.asarray(np.sqrt(gain_sd_db**2 + variance))
+
+    def half_width_db(self, gain_sd_db: FloatArray, share: float) -> FloatArray:
+        """Half of the interval (n,) that holds a share of the samples [dB].
+
+        Notes
+        -----
+        The quantile of ``|x|`` for a sum of a normal part and of fading, by the even terms of Edgeworth's series in the
+        excess kurtosis k and the skewness s of the sum: q = z + He3(z) k / 24 + He5(z) s^2 / 72 (Cornish and Fisher,
+        Rev. Inst. Int. Stat. 5, 1938). Without the second term half of the samples are said to lie where 40 % do.
+        """
+        from scipy.special import ndtri
+
+        total = self.total_db(gain_sd_db)
+        z = float(ndtri(0.5 + 0.5 * share))
+        with np.errstate(invalid="ignore", divide="ignore"):
+            k = np.clip(self.fading_kurtosis * (self.fading_sd_db / total) ** 4, -_MOST_KURTOSIS, _MOST_KURTOSIS)
+            skew2 = _FADE_SKEWNESS2 * np.maximum(k, 0.0) * (self.fading_sd_db / total) ** 2
+        third, fifth = z**3 - 3.0 * z, z**5 - 10.0 * z**3 + 15.0 * z
+        return np.asarray(total * (z + third * k / 24.0 + fifth * skew2 / 72.0))
+
+    def text(self) -> str:
+        """For the comments of an antenna file."""
+        return "spread: " + " ".join(f"{name} {value:.4g}" for name, value in asdict(self).items())
+
+    @classmethod
+    def from_text(cls, text: str) -> Spread | None:
+        """From :meth:`text` somewhere in the comments of an antenna file; None where there is none."""
+        line = re.search(r"^# spread: (.*)$", text, re.MULTILINE)
+        words = [] if line is None else line[1].split()
+        try:
+            return cls(**{name: float(value) for name, value in zip(words[::2], words[1::2], strict=True)})
+        except (TypeError, ValueError):
+            return None
+
+
+# Of learned files that state the standard deviation of the gain alone.
+NO_SPREAD = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurtosis=0.0, bin_s=4.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatedSpread:
+    """Error bars of one series: standard deviation of the gain (n,) [dB], NaN without a pose, and what is beside it."""
+
+    gain_sd_db: FloatArray
+    spread: Spread
+
+    @property
+    def total_db(self) -> FloatArray:
+        """Standard deviation (n,) of a sample about its prediction [dB]."""
+        return self.spread.total_db(self.gain_sd_db)
+
+    def columns(self, level_dbm: FloatArray) -> dict[str, FloatArray]:
+        """Parts and 90 % interval about a level (n,), by the names of rss.csv."""
+        known = np.where(np.isfinite(self.gain_sd_db), 1.0, np.nan)
+        half = self.spread.half_width_db(self.gain_sd_db, BAND)
+        return {
+            "simulated_sd_db": self.total_db,
+            "gain_sd_db": self.gain_sd_db,
+            "own_sd_db": known * self.spread.own_sd_db,
+            "noise_sd_db": known * self.spread.noise_sd_db,
+            "fading_sd_db": known * self.spread.fading_sd_db,
+            "simulated_low_dbm": level_dbm - half,
+            "simulated_high_dbm": level_dbm + half,
+        }
+
+
+def inside_shares(error_db: FloatArray, stated: StatedSpread) -> dict[str, float]:
+    """Share of errors (n,) inside the interval of each nominal share: ``inside_50`` and so on; NaN does not count."""
+    good = np.isfinite(error_db) & np.isfinite(stated.gain_sd_db)
+    error, sd = np.abs(error_db[good]), stated.gain_sd_db[good]
+    return {
+        f"inside_{100 * share:.0f}": float(np.mean(error < stated.spread.half_width_db(sd, share)))
+        if len(error)
+        else math.nan
+        for share in SHARES
+    }
+
+
+def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float]:
+    """Standard deviation [dB] and excess kurtosis of samples about their means over bins; zeros where no bin has two.
+
+    Examples
+    --------
+    >>> fading_of([], 4.0)
+    (0.0, 0.0)
+    """
+    squares, fourth, count = 0.0, 0.0, 0
+    for samples in series:
+        finite = np.isfinite(samples.residual_db)
+        if not finite.any():
+            continue
+        level, time = samples.residual_db[finite], samples.time_s[finite]
+        _, member = np.unique(np.floor((time - time[0]) / bin_s).astype(np.int64), return_inverse=True)
+        size = np.bincount(member)
+        deviation = level - (np.bincount(member, weights=level) / size)[member]
+        several = size[member] > 1
+        # a deviation from the mean of n samples is too small by (n - 1) / n
+        deviation = deviation[several] * np.sqrt(size[member] / np.maximum(size[member] - 1.0, 1.0))[several]
+        squares, fourth = squares + float((deviation**2).sum()), fourth + float((deviation**4).sum())
+        count += len(deviation)
+    if not count or not squares:
+        return 0.0, 0.0
+    variance = squares / count
+    return math.sqrt(variance), fourth / count / variance**2 - 3.0

@@ -1,0 +1,1 @@
+"""Meaning of a flight's numbers: causes, entries, model ladder, season, verdicts."""

@@ -1,0 +1,356 @@
+"""Ladder of models, to find what a scene needs: scored on stretches of the flight that had no part in their offset.
+
+Each rung is a prediction of the same samples by a model with one thing more than another. A flight is cut into
+places, or into stretches of time; the offset of a model is fitted without one and scored on it, in turn. Models are
+compared on the same samples by paired differences, and the simplest one within one standard error of the best is
+recommended: what a flight cannot show to help is not worth having (Breiman, Friedman, Olshen, Stone 1984, section
+3.4.3: the 1 SE rule).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...common.units import BoolArray, FloatArray, IntArray
+from ..statistics.intervals import NO_INTERVAL, Interval, PairedDifference, paired_difference
+
+# Places or stretches that a flight is cut into.
+_BLOCKS = 8
+
+# A model that has no level at more than a fifth of the samples cannot be compared with the others.
+_LEAST_COVERED = 0.8
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rung:
+    """One model: its name, its level (n,) [dBm] at the samples of each series, and what it cost [s].
+
+    ``regressor_db`` (n,) per series marks a line that replays nothing: its slope is fitted beside the offset, without
+    the places that it is scored on. A regressor of zeros leaves the constant alone.
+    """
+
+    model: str
+    level_db: tuple[FloatArray, ...]
+    seconds: float
+    regressor_db: tuple[FloatArray, ...] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LadderRow:
+    """A model on one tower and channel.
+
+    Parameters
+    ----------
+    model, tower, channel : str
+    rmse_heldout_db : float
+        Over all stretches left out [dB]; NaN where the model has too few levels.
+    difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
+        RMSE minus that of the best model on the same samples [dB].
+    n : int
+        Samples that all compared models share.
+    seconds : float
+        For the whole flight, the same in each of its rows.
+    recommended : bool
+        The simplest model within one standard error of the best, over all series of the flight; the best on other
+        flights, where its calibration knows that.
+    elsewhere_db : (float, float), optional
+        RMSE of the recommended model and of free space on flights left out [dB], where these chose it.
+    """
+
+    model: str
+    tower: str
+    channel: str
+    rmse_heldout_db: float
+    difference_to_best_db: float
+    difference_to_best_ci95_db: Interval
+    n: int
+    seconds: float
+    recommended: bool
+    elsewhere_db: tuple[float, float] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ladder:
+    """All rungs, scored: ``error_db[rung][series]`` (n,), NaN outside the shared samples.
+
+    ``rmse_db`` is over all series. ``best`` (of all rungs), ``best_replay`` and ``recommended`` (without the lines that
+    replay nothing) are indices of rungs, None where nothing was compared.
+    """
+
+    rungs: tuple[Rung, ...]
+    error_db: tuple[tuple[FloatArray, ...], ...]
+    rmse_db: tuple[float, ...]
+    best: int | None
+    best_replay: int | None
+    recommended: int | None
+    elsewhere_db: tuple[float, float] | None = None
+    """RMSE of the recommended model and of free space on other flights, where these chose it [dB]."""
+
+
+def stretches_of(samples: int, blocks: int = _BLOCKS) -> IntArray:
+    """Stretch of each sample (n,): equally many neighbouring samples each."""
+    return np.asarray(np.arange(samples) * blocks // max(samples, 1), dtype=np.int64)
+
+
+def places_of(position_m: FloatArray, blocks: int = _BLOCKS) -> IntArray:
+    """Place of each sample (n,): cells of equally many samples, made by halving along the longer side of the plan.
+
+    A place that a flight comes back to is one place, and is left out as a whole; stretches of time would leave its
+    other visits in.
+
+    Parameters
+    ----------
+    position_m : (n, 2) or (n, 3)
+        East, north [m]; of equal ones the earlier come first.
+    blocks : int
+        A power of two.
+
+    Returns
+    -------
+    (n,) int
+        0 to ``blocks - 1``.
+
+    Examples
+    --------
+    >>> places_of(np.array([[0.0, 0.0], [9.0, 1.0], [1.0, 0.0], [8.0, 1.0]]), blocks=2).tolist()
+    [0, 1, 0, 1]
+    """
+    place = np.zeros(len(position_m), dtype=np.int64)
+    cells = [np.arange(len(position_m))]
+    while len(cells) < blocks:
+        cells = [part for cell in cells for part in _halves(cell, position_m)]
+    for number, cell in enumerate(cells):
+        place[cell] = number
+    return place
+
+
+def _halves(cell: IntArray, position_m: FloatArray) -> tuple[IntArray, IntArray]:
+    if not len(cell):
+        return cell, cell
+    side = int(np.ptp(position_m[cell, :2], axis=0).argmax())
+    order = cell[np.argsort(position_m[cell, side], kind="stable")]
+    return order[: len(order) // 2], order[len(order) // 2 :]
+
+
+def climb(
+    measured_db: Sequence[FloatArray], time_s: Sequence[FloatArray], rungs: Sequence[Rung], *, blocks: int = _BLOCKS,
+    position_m: Sequence[FloatArray] | None = None,
+) -> Ladder:  # fmt: skip
+    """Score the rungs of a ladder, given from the simplest to the most complex model.
+
+    Parameters
+    ----------
+    measured_db : sequence of (n,)
+        By series, in time order; NaN does not count [dB].
+    time_s : sequence of (n,)
+        Orders the errors of all series, so that channels that share their instants share their blocks [s].
+    rungs : sequence of Rung
+        Simplest first: ties go to the earlier one.
+    blocks : int
+        Places or stretches, of equally many samples.
+    position_m : sequence of (n, 3), optional
+        Where each sample was taken: places are left out (:func:`places_of`). Without, stretches of time.
+
+    Returns
+    -------
+    Ladder
+    """
+    enough = [_covers(measured_db, rung) for rung in rungs]
+    shared = [_shared(m, [r.level_db[i] for r, ok in zip(rungs, enough, strict=True) if ok])
+              for i, m in enumerate(measured_db)]  # fmt: skip
+    places = [None] * len(shared) if position_m is None else [
+        places_of(p[keep], blocks) for p, keep in zip(position_m, shared, strict=True)
+    ]  # fmt: skip
+    errors = tuple(
+        tuple(
+            held_out_error_db(m, level, keep, blocks, block, x) if ok else np.full(len(m), np.nan)
+            for m, level, keep, block, x in zip(
+                measured_db, rung.level_db, shared, places, rung.regressor_db or [None] * len(shared), strict=True
+            )
+        )
+        for rung, ok in zip(rungs, enough, strict=True)
+    )
+    joined = [np.concatenate(e)[_in_time(time_s)] if e else np.zeros(0) for e in errors]
+    rmse = tuple(_rmse(e) for e in joined)
+    if not any(np.isfinite(rmse)):
+        return Ladder(rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=None, best_replay=None, recommended=None)
+    replays = [i for i, rung in enumerate(rungs) if rung.regressor_db is None and np.isfinite(rmse[i])]
+    chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
+    if chosen is not None:
+        recommended = next(i for i in replays if i == chosen or _as_good(joined[i], joined[chosen]))
+    return Ladder(
+        rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=int(np.nanargmin(rmse)), best_replay=chosen,
+        recommended=recommended,
+    )  # fmt: skip
+
+
+def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[LadderRow]:
+    """The rows of one series.
+
+    Parameters
+    ----------
+    ladder : Ladder
+    series : int
+        Which of the series of its rungs.
+    name : (tower, channel)
+
+    Returns
+    -------
+    list of LadderRow
+        One per rung.
+    """
+    rows = []
+    for index, rung in enumerate(ladder.rungs):
+        error = ladder.error_db[index][series]
+        against_best = None if ladder.best is None else compared(error, ladder.error_db[ladder.best][series])
+        rows.append(
+            LadderRow(
+                model=rung.model,
+                tower=name[0],
+                channel=name[1],
+                rmse_heldout_db=_rmse(error),
+                difference_to_best_db=float("nan") if against_best is None else against_best.difference_db,
+                difference_to_best_ci95_db=NO_INTERVAL if against_best is None else against_best.difference_ci95_db,
+                n=int(np.isfinite(error).sum()),
+                seconds=rung.seconds,
+                recommended=index == ladder.recommended,
+                elsewhere_db=ladder.elsewhere_db if index == ladder.recommended else None,
+            )
+        )
+    return rows
+
+
+def held_out_error_db(
+    measured_db: FloatArray, level_db: FloatArray, keep: BoolArray, blocks: int = _BLOCKS,
+    place: IntArray | None = None, regressor_db: FloatArray | None = None,
+) -> FloatArray:  # fmt: skip
+    """Measured minus predicted (n,), each stretch with the offset of all the others [dB]; NaN where not ``keep``.
+
+    Parameters
+    ----------
+    measured_db, level_db : (n,)
+        Levels in time order [dB].
+    keep : (n,) bool
+        Samples that count.
+    blocks : int
+        Stretches of equal length.
+    place : (kept samples,) int, optional
+        The block of each sample that counts, in place of stretches of time.
+    regressor_db : (n,), optional
+        Has a slope that is fitted together with the offset, on the same samples.
+
+    Returns
+    -------
+    (n,)
+        Errors [dB].
+
+    Examples
+    --------
+    >>> held_out_error_db(np.array([1.0, 1.0, 3.0, 3.0]), np.zeros(4), np.ones(4, bool), blocks=2).tolist()
+    [-2.0, -2.0, 2.0, 2.0]
+    """
+    rows = np.flatnonzero(keep)
+    difference = measured_db[rows] - level_db[rows]
+    stretch = stretches_of(len(rows), blocks) if place is None else place
+    x = np.zeros(len(rows)) if regressor_db is None else regressor_db[rows]
+    offset, slope = held_out_lines(difference, x, stretch, blocks)
+    error = np.full(len(measured_db), np.nan)
+    error[rows] = difference - offset[stretch] - slope[stretch] * x
+    return error
+
+
+def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: int) -> tuple[FloatArray, FloatArray]:
+    """Least-squares lines through all blocks but one: offset and slope (blocks,) for each block left out.
+
+    Parameters
+    ----------
+    values, x : (n,)
+        Ordinate and abscissa. Where ``x`` does not vary, the slope is 0.
+    block : (n,) int
+        Of each sample, 0 to ``blocks - 1``.
+    blocks : int
+
+    Returns
+    -------
+    (offset, slope) : each (blocks,)
+        NaN offset where no sample is left.
+    """
+    centre = float(x.mean()) if len(x) else 0.0
+    centred = x - centre
+    sums = np.array(
+        [np.bincount(block, weights=w, minlength=blocks)
+         for w in (np.ones(len(x)), centred, values, centred * centred, centred * values)]
+    )  # fmt: skip
+    count, sx, sy, sxx, sxy = sums.sum(axis=1, keepdims=True) - sums
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spread = sxx - sx * sx / count
+        slope = np.where(spread > 1e-9 * np.maximum(sxx, 1e-12), (sxy - sx * sy / count) / spread, 0.0)
+        return (sy - slope * sx) / count - slope * centre, slope
+
+
+def log_distance_level_db(
+    measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray, blocks: int = _BLOCKS
+) -> FloatArray:
+    """Log-distance level (n,) about its mean [dB], each place by the slope of the other places.
+
+    The offset is left to the comparison, as for every other model. NaN where no distance is known.
+
+    Parameters
+    ----------
+    measured_db, distance_m : (n,)
+        Level [dB] and distance of the ends [m]; NaN is left out of the fit.
+    position_m : (n, 3)
+        See :func:`places_of`.
+    blocks : int
+        Places.
+
+    Returns
+    -------
+    (n,)
+        [dB].
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = 10.0 * np.log10(distance_m)
+    finite = np.isfinite(measured_db) & np.isfinite(x)
+    level = np.full(len(x), np.nan)
+    if not finite.any():
+        return level
+    centred = x - x[finite].mean()
+    place = places_of(position_m[finite], blocks)
+    slope = held_out_lines(measured_db[finite], centred[finite], place, blocks)[1]
+    overall = held_out_lines(measured_db[finite], centred[finite], np.zeros(int(finite.sum()), np.int64), 2)[1][1]
+    level[np.isfinite(centred)] = overall * centred[np.isfinite(centred)]
+    level[finite] = slope[place] * centred[finite]
+    return level
+
+
+def compared(error_db: FloatArray, best_db: FloatArray) -> PairedDifference:
+    """A model against the best one; errors of stretches left out count as they are."""
+    return paired_difference(error_db, best_db, free_offset=False)
+
+
+def _as_good(error: FloatArray, best: FloatArray) -> bool:
+    against_best = compared(error, best)
+    return bool(against_best.difference_db <= against_best.standard_error_db)
+
+
+def _covers(measured: Sequence[FloatArray], rung: Rung) -> bool:
+    measurements = sum(int(np.isfinite(m).sum()) for m in measured)
+    pairs = (int((np.isfinite(m) & np.isfinite(x)).sum()) for m, x in zip(measured, rung.level_db, strict=True))
+    return sum(pairs) >= _LEAST_COVERED * max(measurements, 1)
+
+
+def _shared(measured: FloatArray, levels: Sequence[FloatArray]) -> BoolArray:
+    return np.asarray(np.isfinite([measured, *levels]).all(axis=0))
+
+
+def _in_time(time_s: Sequence[FloatArray]) -> IntArray:
+    return np.argsort(np.concatenate(list(time_s)), kind="stable")
+
+
+def _rmse(error: FloatArray) -> float:
+    good = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(good**2))) if len(good) else float("nan")

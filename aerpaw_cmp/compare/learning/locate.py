@@ -1,0 +1,359 @@
+"""Position estimate of a transmitter of unknown place, from the levels of one flight.
+
+The model: a level falls with the logarithm of the distance, by a free slope; the airframe adds its gain where flights
+taught it, both antennas one over the elevation, shadowing is remembered for half a minute, and what lies below the
+receiver's floor says only that.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ...common.units import BoolArray, FloatArray
+
+# Exponent of the distance before a level was seen, and its standard deviation.
+_SLOPE, _SLOPE_SD = 3.0, 1.0
+
+# Gain that two antennas and the ground add over the elevation.
+_ELEVATION_SD_DB = 5.0
+
+# Shadowing, how long it is remembered, and scatter of medians over some seconds.
+#
+# With them the regions hold the surveyed rover on the six AFAR and sounder flights that docs/formats.md names.
+_SHADOW_SD_DB, _SHADOW_S, _SCATTER_SD_DB = 8.0, 30.0, 4.0
+
+# Standard deviation per axis of what the model cannot see (a tilted antenna, a wall), of the same flights.
+SYSTEMATIC_M = 20.0
+
+# Medians are taken over at least so many seconds, and there are at most so many.
+WINDOW_S, _MOST_BINS = 4.0, 120
+
+# Heights of the antenna that are tried, and their prior: a rover, a tower.
+_HEIGHTS_M = {1.5: 0.7, 10.0: 0.3}
+
+# Bins of a level that a search needs.
+FEWEST = 20
+
+# Places up to so far beyond the track are tried, at this spacing; likely ones again at half of it.
+_REACH_M, _SPACING_M = 400.0, 40.0
+
+# Places whose log evidence is lower by more take no part.
+_POSSIBLE = 8.0
+
+# With more of them the region is wider than the spacing.
+_MOST_REFINED = 300
+
+# Standard deviation of a level about which nothing is known.
+_FREE_DB = 100.0
+
+# Of the shadowing; what they leave counts as scatter.
+_TERMS = 28
+
+# Newton steps of the Laplace approximation, and the change [dB] at which they end; there is one maximum.
+_STEPS, _SETTLED_DB = 12, 0.01
+
+# Places whose matrices are held at a time.
+_AT_ONCE = 64
+
+
+@dataclass(frozen=True, slots=True)
+class LevelTrack:
+    """Levels along a track, thinned for a search.
+
+    Parameters
+    ----------
+    time_s : (n,)
+    position_m : (n, 3)
+        East, north, up.
+    level_db : (n,)
+        Medians; no lower than the floor.
+    floor_db : float
+        Level below which the receiver measures nothing; -inf where none shows.
+    airframe_db : callable, optional
+        Gain (m, n) of the airframe at each of the levels towards unit vectors (m, n, 3) from the UAV, where known.
+    """
+
+    time_s: FloatArray
+    position_m: FloatArray
+    level_db: FloatArray
+    floor_db: float = -np.inf
+    airframe_db: Callable[[FloatArray], FloatArray] | None = None
+
+    @property
+    def below(self) -> BoolArray:
+        """Levels (n,) of which only the floor is known."""
+        return np.asarray(self.level_db <= self.floor_db)
+
+
+def level_track(
+    time_s: ArrayLike, position_m: ArrayLike, level_db: ArrayLike, *, floor_db: float = -np.inf
+) -> LevelTrack:
+    """Medians of levels over windows of :data:`WINDOW_S` or longer.
+
+    A median commutes with the floor: it lies below it where more than half of its samples do.
+
+    Parameters
+    ----------
+    time_s : (n,)
+    position_m : (n, 3)
+        NaN where it is not known.
+    level_db : (n,)
+        NaN does not count.
+    floor_db : float
+
+    Returns
+    -------
+    LevelTrack
+        At most :data:`_MOST_BINS` of them.
+    """
+    time, place, level = (np.asarray(v, dtype=np.float64) for v in (time_s, position_m, level_db))
+    finite = np.isfinite(level) & np.isfinite(place).all(axis=1) & np.isfinite(time)
+    time, place, level = time[finite], place[finite], np.maximum(level[finite], floor_db)
+    if not len(time):
+        return LevelTrack(time, place, level, floor_db)
+    # a little longer, or the last instant would have a bin of its own
+    window = max(WINDOW_S, float(np.ptp(time)) / _MOST_BINS * 1.001)
+    groups = np.unique(((time - time.min()) // window).astype(np.int64), return_inverse=True)[1]
+    order = np.argsort(groups, kind="stable")
+    parts = np.split(order, np.flatnonzero(np.diff(groups[order])) + 1)
+    return LevelTrack(
+        np.array([time[p].mean() for p in parts]),
+        np.array([place[p].mean(axis=0) for p in parts]),
+        np.array([np.median(level[p]) for p in parts]),
+        floor_db,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Fits:
+    """Log evidence of places (m,), and slope and its standard deviation (m,) if the node is there."""
+
+    evidence: FloatArray
+    slope: FloatArray
+    slope_sd: FloatArray
+
+
+def fit_places(track: LevelTrack, places_m: ArrayLike) -> Fits:
+    """Log evidence of the levels if the node stood at each of some places.
+
+    Parameters
+    ----------
+    track : LevelTrack
+    places_m : (m, 3)
+        East, north, up.
+
+    Notes
+    -----
+    The level is mean + F c + noise, c ~ N(0, 1): level at 100 m, slope, two terms of the elevation, and the leading
+    terms of the shadowing's Karhunen-Loeve expansion, whose rest is noise. A level above the floor says what it is,
+    one below says P(level < floor). The evidence is Laplace's approximation at the maximum of the posterior
+    (Rasmussen and Williams, 2006, section 3.4): exact where no level lies below the floor.
+    """
+    places = np.asarray(places_m, dtype=np.float64).reshape(-1, 3)
+    shadow, noise = _shadowing(track)
+    parts = [_fit(track, places[i : i + _AT_ONCE], shadow, noise) for i in range(0, len(places), _AT_ONCE)]
+    return Fits(*(np.concatenate(values) for values in zip(*parts, strict=True)))
+
+
+def _shadowing(track: LevelTrack) -> tuple[FloatArray, float]:
+    """Leading terms (n, k) of the shadowing's covariance, and the standard deviation of what else scatters."""
+    lag = np.abs(track.time_s[:, None] - track.time_s)
+    variance, vectors = np.linalg.eigh(_SHADOW_SD_DB**2 * np.exp(-lag / _SHADOW_S))
+    terms = vectors[:, -_TERMS:] * np.sqrt(np.maximum(variance[-_TERMS:], 0.0))
+    unresolved = max(float(variance[:-_TERMS].sum()), 0.0) / len(lag)
+    return terms, float(np.hypot(_SCATTER_SD_DB, np.sqrt(unresolved)))
+
+
+def _features(track: LevelTrack, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean (m, n) of the level before one was seen, and what coefficients of unit variance add (m, n, 4)."""
+    ray = track.position_m[None] - places[:, None]
+    across = np.hypot(ray[..., 0], ray[..., 1])
+    decades = np.log10(np.maximum(np.hypot(across, ray[..., 2]), 1.0) / 100.0)
+    elevation = np.arctan2(ray[..., 2], across)
+    columns = [
+        np.full(across.shape, _FREE_DB),
+        -10.0 * _SLOPE_SD * decades,
+        _ELEVATION_SD_DB * np.sin(elevation) ** 2,
+        0.5 * _ELEVATION_SD_DB * np.cos(4.0 * elevation),
+    ]
+    mean = _middle(track) - 10.0 * _SLOPE * decades
+    if track.airframe_db is not None:
+        mean = mean + track.airframe_db(-ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9))
+    return mean, np.stack(columns, axis=-1)
+
+
+def _middle(track: LevelTrack) -> float:
+    return 0.5 * float(track.level_db.max() + track.level_db.min())
+
+
+def _fit(track: LevelTrack, places: FloatArray, shadow: FloatArray, noise: float) -> tuple[FloatArray, ...]:
+    mean, features = _features(track, places)
+    terms = np.concatenate([features, np.broadcast_to(shadow, (len(places), *shadow.shape))], axis=2)
+    eye = np.eye(terms.shape[2])
+    latent = np.broadcast_to(track.level_db, mean.shape)
+    for _ in range(_STEPS):
+        _, gradient, weight = _likelihood(track, latent, noise)
+        precision = eye + terms.swapaxes(1, 2) @ (weight[:, :, None] * terms)
+        pull = terms.swapaxes(1, 2) @ (weight * (latent - mean) + gradient)[:, :, None]
+        coefficient = np.linalg.solve(precision, pull)[:, :, 0]
+        before, latent = latent, mean + np.einsum("mnq,mq->mn", terms, coefficient)
+        if not track.below.any() or np.abs(latent - before).max() < _SETTLED_DB:
+            break
+    value, _, weight = _likelihood(track, latent, noise)
+    if track.below.any():  # else the weight is that of the noise wherever the levels lie
+        precision = eye + terms.swapaxes(1, 2) @ (weight[:, :, None] * terms)
+    evidence = value - 0.5 * (coefficient**2).sum(axis=1) - 0.5 * np.linalg.slogdet(precision)[1]
+    slope_sd = _SLOPE_SD * np.sqrt(np.linalg.inv(precision)[:, 1, 1])
+    return evidence, _SLOPE + _SLOPE_SD * coefficient[:, 1], slope_sd
+
+
+_LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
+
+
+def _likelihood(track: LevelTrack, latent: FloatArray, noise: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Log likelihood (m,) of the levels, its gradient (m, n), and minus its second derivative (m, n)."""
+    from scipy.special import log_ndtr
+
+    z = (track.level_db - latent) / noise  # a level below the floor stands at it
+    log_below = log_ndtr(z)
+    hazard = np.exp(-0.5 * z * z - _LOG_ROOT_TAU - log_below)
+    value = np.where(track.below, log_below, -0.5 * z * z - _LOG_ROOT_TAU - np.log(noise))
+    gradient = np.where(track.below, -hazard, z) / noise
+    weight = np.where(track.below, np.clip(hazard * (hazard + z), 1e-12, 1.0), 1.0) / noise**2
+    return value.sum(axis=1), gradient, weight
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NodeEstimate:
+    """Place of a node by the levels of a flight.
+
+    Parameters
+    ----------
+    place_m : (3,)
+        East, north and height above ground of the likeliest place.
+    radius90_m : float
+        Circle about it that holds 90 % of the posterior.
+    height_m : (low, high)
+        Heights that are not shown to be wrong.
+    slope, slope_sd : float
+        Exponent of the distance and its standard deviation.
+    log_odds : (k,)
+        Of the given candidates against any place within reach, at prior odds of one to one.
+    at_edge : bool
+        The likeliest place lies at the edge of the search: the node may stand farther away.
+    """
+
+    place_m: FloatArray
+    radius90_m: float
+    height_m: tuple[float, float]
+    slope: float
+    slope_sd: float
+    log_odds: FloatArray
+    at_edge: bool
+
+    def __contains__(self, place_m: ArrayLike) -> bool:
+        """Check whether a place lies within the 90 % region."""
+        step = np.asarray(place_m, dtype=np.float64)[:2] - self.place_m[:2]
+        return bool(np.hypot(*step) <= self.radius90_m)
+
+
+def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
+    """Place, height and slope that explain the levels of a flight best, and how well given places do.
+
+    Parameters
+    ----------
+    track : LevelTrack
+        At least :data:`FEWEST` bins.
+    candidates_m : (k, 3)
+        Places such as towers: east, north, up.
+
+    Raises
+    ------
+    ValueError
+        Too few levels.
+
+    Notes
+    -----
+    Evidence over a grid of places at :data:`_HEIGHTS_M`; the posterior is blurred by :data:`SYSTEMATIC_M`.
+    """
+    from scipy.special import logsumexp
+
+    if len(track.level_db) < FEWEST:
+        raise ValueError(f"{len(track.level_db)} levels: a search for a node wants {FEWEST}")
+    grid = _grid(track)
+    places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
+    evidence = fit_places(track, places).evidence + _log_prior(places)
+    candidates = np.asarray(candidates_m, dtype=np.float64).reshape(-1, 3)
+    log_odds = _log_odds(track, candidates, float(logsumexp(evidence)) - np.log(len(grid)))
+    places = places[evidence > evidence.max() - _POSSIBLE]
+    if len(places) <= _MOST_REFINED:
+        places = _refined(places)
+    fits = fit_places(track, places)
+    log_share = fits.evidence + _log_prior(places)
+    share = np.exp(log_share - logsumexp(log_share))
+    apart = np.hypot(*(places[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1))
+    density = np.exp(-0.5 * (apart / SYSTEMATIC_M) ** 2) @ share
+    best = int(np.lexsort((-share, -density.round(12)))[0])
+    heights = [h for h in _HEIGHTS_M if share[places[:, 2] == h].sum() > 0.05]
+    return NodeEstimate(
+        place_m=places[best],
+        radius90_m=_radius(apart[best], share),
+        height_m=(min(heights), max(heights)),
+        slope=float(fits.slope[best]),
+        slope_sd=float(fits.slope_sd[best]),
+        log_odds=log_odds,
+        at_edge=_on_edge(places[best], grid),
+    )
+
+
+def _log_prior(places: FloatArray) -> FloatArray:
+    """Of the height of places (m, 3)."""
+    return np.log([_HEIGHTS_M[height] for height in places[:, 2].tolist()])
+
+
+def _grid(track: LevelTrack) -> FloatArray:
+    """Places (m, 2) at equal spacing, as far as :data:`_REACH_M` beyond the track."""
+    low, high = track.position_m[:, :2].min(axis=0) - _REACH_M, track.position_m[:, :2].max(axis=0) + _REACH_M
+    axes = [np.arange(a, b + _SPACING_M, _SPACING_M) for a, b in zip(low, high, strict=True)]
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+
+
+def _on_edge(place: FloatArray, grid: FloatArray) -> bool:
+    return bool((place[:2] < grid.min(axis=0) + _SPACING_M).any() or (place[:2] > grid.max(axis=0) - _SPACING_M).any())
+
+
+def _refined(places: FloatArray) -> FloatArray:
+    """Nine places in each cell of the grid."""
+    third = _SPACING_M / 3.0
+    moved = np.array([(e, n, 0.0) for e in (-third, 0.0, third) for n in (-third, 0.0, third)])
+    return np.asarray((places[:, None] + moved).reshape(-1, 3))
+
+
+def _radius(apart_m: FloatArray, share: FloatArray) -> float:
+    """Radius that holds 90 % of a posterior whose places are each blurred by :data:`SYSTEMATIC_M`."""
+    from scipy.optimize import brentq
+    from scipy.stats import ncx2
+
+    def held(radius: float) -> float:
+        shares = ncx2.cdf((radius / SYSTEMATIC_M) ** 2, 2, np.maximum((apart_m / SYSTEMATIC_M) ** 2, 1e-12))
+        return float(share @ shares) - 0.9
+
+    return float(brentq(held, 1.0, float(apart_m.max()) + 10.0 * SYSTEMATIC_M, xtol=0.1))
+
+
+def _log_odds(track: LevelTrack, candidates: FloatArray, anywhere: float) -> FloatArray:
+    """Log of the mean evidence about each candidate over that of any place.
+
+    Three-point Gauss-Hermite rule per axis (Abramowitz and Stegun, 25.4.46) over :data:`SYSTEMATIC_M`.
+    """
+    from scipy.special import logsumexp
+
+    steps, weights = np.array([-1.0, 0.0, 1.0]) * np.sqrt(3.0) * SYSTEMATIC_M, np.array([1.0, 4.0, 1.0]) / 6.0
+    moved = np.array([(e, n, 0.0) for e in steps for n in steps])
+    log_weights = np.log(np.outer(weights, weights).ravel())
+    near = [logsumexp(fit_places(track, c + moved).evidence + log_weights) for c in candidates]
+    return np.array(near) - anywhere

@@ -1,0 +1,1 @@
+"""Levels against their prediction: RSS, detection, serving cells."""

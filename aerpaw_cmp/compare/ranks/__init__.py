@@ -1,0 +1,1 @@
+"""Ranks that a receiver reports: forecast and receiver."""

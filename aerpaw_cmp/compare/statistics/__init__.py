@@ -1,0 +1,1 @@
+"""Intervals, memory of a series, passes, inertia: pure functions of arrays."""

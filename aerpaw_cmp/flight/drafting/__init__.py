@@ -1,0 +1,1 @@
+"""A first flight.yaml from logs alone."""

@@ -1,0 +1,799 @@
+"""A first flight.yaml for logs that were just read: what can be told from them is filled in, the rest is asked for."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from math import ceil, floor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ...common.errors import InputError, UsageError, one_line
+from ...common.yamlfile import parse_yaml
+from ...logs.ingest import IngestedFile, name_inside, read_log
+from ...logs.records import Stream, has_wall_clock
+from ...site.antenna.learned import Learned, read_learned
+from ...site.site import Site
+from ...site.siteyaml import load_site
+from ..data import is_ratio, site_place
+from ..lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
+from ..pose.cross_checks import questions
+from ..pose.grouping import Span, flights, stream_span
+from ..pose.heights import height_in_name, lacks_height
+from ..pose.hour_shift import clock_trap
+from ..pose.time_origin import Origin, origin_of
+from ..settings import FlightFile, LogSettings, RssSettings, with_learned
+from .dry_run import DryRun, dry_run
+from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
+from .remembered import Nodes, Proposal, propose, searching_airframe
+
+_RADIO = re.compile(r"usrp-?([0-9]+)", re.IGNORECASE)
+
+HEAD = """\
+# A first draft for these logs, made by 'aerpaw-cmp ingest --draft'. Check every line with a question mark.
+"""
+LINK = (
+    f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: true,"
+    " bandwidth_hz: 20e6}  # out of coverage below the noise of this bandwidth; all as in your experiment?\n"
+)
+_NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
+RANK = (
+    "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz, above the noise of 20 MHz, unless link.rank names"
+    " others: is that your modem?\n"
+)
+
+SITE = "lake_wheeler"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DraftOptions:
+    """Options of a draft.
+
+    Parameters
+    ----------
+    timezone, time_origin : str, optional
+        What zone-less clocks and relative times were read with.
+    mapping : mapping
+        ``columns``, ``kind``, ``unit`` and ``ri_base`` that generic CSVs were read with.
+    site : str
+        Packaged site, or the path of a site.yaml against the folder; what it remembers of antennas is used.
+    """
+
+    timezone: str | None = None
+    time_origin: str | None = None
+    mapping: Mapping[str, Any] = field(default_factory=dict)
+    site: str = SITE
+
+
+def draft(
+    files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions(), name: str | None = None
+) -> tuple[str, list[str]]:
+    """The text of a flight.yaml that names the logs.
+
+    Parameters
+    ----------
+    files : sequence of IngestedFile
+        As ``ingest`` read them.
+    folder : Path
+        Of the flight.yaml; the paths in it are relative to it.
+    options : DraftOptions
+    name : str, optional
+        Of the flight; by default its first minute.
+
+    Returns
+    -------
+    str, list of str
+        The text, and what is left to check or was left out.
+
+    Raises
+    ------
+    UsageError
+        If no log has what a flight needs.
+    """
+    flown, site = _flown(files), options.site
+    place = load_site(site_place(site, folder))
+    every = [stream for file in files for stream in file.result.streams]
+    entries = _Entries(
+        folder=folder,
+        flown=flown,
+        has_level=_has_level(files, flown),
+        options=options,
+        positioned=any(_has_positions(stream) for stream in every),
+        towers_known=tuple(place.towers),
+        placer=_placer(files, flown, place),
+        locks=any(may_lose_lock(stream) for stream in every),
+    )
+    # of copies, the one on the telemetry's clock, then the fullest
+    for file in sorted(files, key=lambda f: (not entries.leads(f), entries.is_utc(f), -_samples(f))):
+        entries.enter(file)
+    entries.sort(files)
+    if not entries.kinds & {"rss", "rank"}:
+        raise UsageError(
+            "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in entries.out),
+            expected="telemetry and levels or ranks of one flight",
+        )
+    parts = [HEAD, f"flight: {name or _name(entries.flown, files)}\n", f"site: {site}  # or your own site.yaml?\n"]
+    if entries.towers:
+        parts += [
+            "towers:\n",
+            *(f"  {name}: {_plain(tower)}  # {about}\n" for name, (tower, about) in entries.towers.items()),
+        ]
+    if options.timezone:
+        parts.append(f"timezone: {options.timezone}\n")
+    parts += ["logs:\n", *entries.lines.values()]
+    parts += [_NO_TRACK] if entries.without_track else []
+    parts += [f"  # left out: {remark}\n" for remark in entries.out]
+    known = _remembered(entries, site, folder)
+    parts += _learned_lines(known) if "rss" in entries.kinds else []
+    parts += [RANK] if "rank" in entries.kinds else []
+    parts += _settings(entries, known)
+    text = "".join(parts)
+    proof = _proof(text, folder, {file.path: file for file in files}, list(entries.lines))
+    if proof.reason:
+        text = text.replace(HEAD, f"{HEAD}# No sample of this draft can be compared: {proof.reason}.\n", 1)
+    checks = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
+    proved = [f"no sample of this draft can be compared: {proof.reason}"]
+    if not proof.reason:
+        proved = [f"{proof.samples} samples can be compared", *proof.lost]
+    return text, proved + checks + [f"left out: {remark}" for remark in entries.out]
+
+
+def _proof(text: str, folder: Path, files: Mapping[str, IngestedFile], paths: Sequence[str]) -> DryRun:
+    """Dry run of the draft's report: the samples it would score; logs whose times the draft moves are read again."""
+    settings = parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
+    settings = with_learned(settings, folder)
+    read = []
+    for log, path in zip(settings.logs, paths, strict=True):
+        moved = log.time_origin is not None and any("clock" in s.attributes for s in files[path].result.streams)
+        same = not moved and log.clock is None
+        again = files[path] if same else read_log(folder, log.path, log.options(settings.timezone), reader=log.reader)
+        read.append(again)
+    return dry_run(settings, folder, read)
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A first flight.yaml.
+
+    Parameters
+    ----------
+    name : str
+        Of the flight.
+    text : str
+    remarks : tuple of str
+        What is left to check, or was left out.
+    """
+
+    name: str
+    text: str
+    remarks: tuple[str, ...]
+
+
+def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions()) -> list[Draft]:
+    """A flight.yaml for each flight that the logs are of, in the order of time; see :func:`draft`.
+
+    Where one flight alone is complete (levels or ranks, and positions) all logs stand in its draft, those that do not
+    belong to it as left out.
+
+    Parameters
+    ----------
+    files : sequence of IngestedFile
+        Logs of one or of several flights.
+    folder : Path
+        Against which the paths are written.
+    options : DraftOptions
+
+    Returns
+    -------
+    list of Draft
+        At least one; its remarks say what is left to check.
+    """
+    groups = flights_by_name(files)
+    written = []
+    for name, group in groups.items():
+        text, remarks = draft(group, folder, options, name)
+        written.append(Draft(name, text, tuple(remarks)))
+    home = {file.path for group in groups.values() for file in group}
+    homeless = [one_line(os.path.relpath(Path(f.path).resolve(), folder)) for f in files if f.path not in home]
+    if homeless:
+        first = written[0]
+        out = tuple(f"left out: {path}: it goes with no flight here" for path in homeless)
+        written[0] = Draft(first.name, first.text, (*first.remarks, *out))
+    return written
+
+
+def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, list[IngestedFile]]:
+    """The files of each flight that can be drafted, by the flight's name, in the order of time."""
+    every = [flight for flight in flights(files) if flight.measured]
+    complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
+    groups = [flight.files for flight in complete] if len(complete) > 1 else [list(files)]
+    named: dict[str, list[IngestedFile]] = {}
+    for group in groups:
+        name = _name(_flown(group), group)
+        taken = sum(other == name or other.startswith(f"{name}_") for other in named)
+        named[f"{name}_{taken + 1}" if taken else name] = group
+    return named
+
+
+# Samples below it are take-off, landing and waiting: at 2 m an airframe, its pilot and the grass decide the level.
+MINIMUM_HEIGHT_M = 5
+
+# A flight that never got higher has no part that is better than its start.
+_FLOWN_ABOVE_M = 15.0
+
+
+# Links that the audit of a first report checks.
+_QUICK_AUDIT = 24
+
+_QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
+
+
+# A node that is placed this well is seen from a flight some hundred metres away within some tens of degrees.
+_SURE_M = 100.0
+
+
+def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
+    """Fitting part of the site's memory; nothing, and a remark, where the memory cannot be read."""
+    series = [(tower, channel, reader) for tower, channel, reader in entries.series]
+    try:
+        known = read_learned(site_place(site, folder))
+    except (InputError, UsageError) as error:
+        entries.out.append(f"what site {site} remembers: {error.found}")
+        known = Learned()
+    fixed = () if entries.placer is None else tuple(entries.placer.site.towers)
+    return propose(known, str(Path(site).with_suffix("")), series, Nodes(placed=frozenset(entries.sure), fixed=fixed))
+
+
+def _learned_lines(known: Proposal) -> list[str]:
+    """``antennas`` and ``link``."""
+    if not known.antennas:
+        return [LINK]
+    assert known.carrier_hz is not None
+    return [
+        f"antennas: {_plain(dict(known.antennas))}  # {known.antennas_about}\n",
+        LINK.replace(f"{CARRIER_HZ / 1e9:g}e9", f"{known.carrier_hz / 1e9:g}e9", 1),
+    ]
+
+
+def _settings(entries: _Entries, known: Proposal) -> list[str]:
+    """Lines for ``rt``, ``rss`` and ``rank`` that real logs ask for."""
+    lines = _replay_lines(entries, known)
+    low: dict[str, Any] = {"minimum_height_m": MINIMUM_HEIGHT_M} if entries.highest_m() > _FLOWN_ABOVE_M else {}
+    for kind in sorted(entries.kinds & {"rss", "rank"}, reverse=True):
+        chosen: dict[str, Any] = dict(low)
+        reasons = ["without take-off and landing"] if low else []
+        if kind == "rss" and entries.flown is not None:
+            chosen |= {"field": "power"}
+            reasons.append("powers of paths added: phases of a real ground are not known")
+            if span := _span_of_offsets(entries.offsets_db):
+                chosen |= span
+                reasons.append("the levels lie outside the usual span of offsets")
+        elif kind == "rank" and known.receiver:
+            chosen |= {"receiver": known.receiver}
+            reasons.append(known.receiver_about)
+        if chosen:
+            lines.append(f"{kind}: {_plain(chosen)}  # {'; '.join(reasons)}\n")
+    return lines
+
+
+def _replay_lines(entries: _Entries, known: Proposal) -> list[str]:
+    """``rt``, where there is a track."""
+    if entries.flown is None:
+        return []
+    alone = ", max_depth: 0" if known.antennas else ""  # the gains were learned beside line of sight alone
+    if "rank" in entries.kinds:
+        return [
+            "# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n",
+            f"rt: {{audit_links: {_QUICK_AUDIT}}}{_QUICK}\n",
+        ]
+    if _has_attitude(entries.flown[0].frame):
+        return [f"rt: {{attitude: logged{alone}, audit_links: {_QUICK_AUDIT}}}{_QUICK}\n"]
+    return [
+        f"rt: {{attitude: level{alone}, audit_links: {_QUICK_AUDIT}}}"
+        "  # a quick audit; no attitude in the telemetry: the nose points along the track?\n"
+    ]
+
+
+# Of the searched offsets about those that free space expects.
+_MARGIN_DB = 20.0
+
+
+def _span_of_offsets(offsets_db: Sequence[float]) -> dict[str, Any]:
+    """``span_db`` where the usual one would end near an expected offset."""
+    usual = RssSettings().span_db
+    if not offsets_db:
+        return {}
+    low, high = min(offsets_db) - _MARGIN_DB, max(offsets_db) + _MARGIN_DB
+    if usual[0] <= low and high <= usual[1]:
+        return {}
+    return {"span_db": [10 * floor(low / 10.0), 10 * ceil(high / 10.0)]}
+
+
+def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: Site) -> Placer | None:
+    """Proposals for nodes, where there is a track at the site."""
+    if flown is None or lacks_height(flown[0]):
+        return None
+    listed = listed_places(Path(file.path).resolve().parent for file in files)
+    placer = Placer(site, flown[0], listed)
+    return placer if placer.at_site else None
+
+
+def _has_attitude(frame: Any) -> bool:
+    """Check whether most telemetry rows know how the aircraft is turned."""
+    names = ["roll_deg", "pitch_deg", "yaw_deg"]
+    return set(names) <= set(frame.columns) and bool(frame[names].notna().all(axis=1).mean() > 0.5)
+
+
+_CLIPPED_SHARE = 0.01
+
+
+def receiver_floor_db(levels: Sequence[Stream]) -> float | None:
+    """The level [dB] below which the receivers of a log hear nothing; None where none shows.
+
+    A receiver at its floor writes its least level again and again: at least one sample in a hundred, and at least ten.
+    """
+    floors = []
+    for stream in levels:
+        level = stream.frame["rss_db"].to_numpy(np.float64)
+        level = level[np.isfinite(level)]
+        if len(level) and np.sum(level == level.min()) >= max(10.0, _CLIPPED_SHARE * len(level)) and np.ptp(level) > 0:
+            floors.append(float(level.min()))
+    return max(floors) if floors else None
+
+
+@dataclass
+class _Entries:
+    """Lines of ``logs:``, and remarks on what stays out."""
+
+    folder: Path
+    flown: tuple[Stream, Span] | None
+    """The telemetry that gives the track, and its span."""
+    has_level: bool
+    options: DraftOptions
+    lines: dict[str, str] = field(default_factory=dict)
+    """By the path as it was given."""
+    kinds: set[str] = field(default_factory=set)
+    series: list[tuple[str, ...]] = field(default_factory=list)
+    """Tower, channel and reader of each level and rank."""
+    out: list[str] = field(default_factory=list)
+    without_track: bool = False
+    """A record was entered that needs a track, and there is none."""
+    entered: dict[tuple[str, ...], list[tuple[Span, str]]] = field(default_factory=dict)
+    """By tower, kind and channel: when, and from which log."""
+    contents: dict[str, str] = field(default_factory=dict)
+    """Path by SHA-256."""
+    positioned: bool = False
+    """Some log to compare has positions of its own."""
+    towers_known: Sequence[str] = ()
+    """Towers of the site."""
+    placer: Placer | None = None
+    locks: bool = False
+    """The receiver is a sounder that loses its lock."""
+    towers: dict[str, tuple[Mapping[str, Any], str]] = field(default_factory=dict)
+    """Nodes that the site does not have, and the question about each."""
+    offsets_db: list[float] = field(default_factory=list)
+    """Expected of each level."""
+    sure: set[str] = field(default_factory=set)
+    """Those of them whose place is known well enough for the directions of an antenna."""
+    tops_m: list[float] = field(default_factory=list)
+    """Greatest height of each log that has positions of its own and is compared at them."""
+
+    def highest_m(self) -> float:
+        """Greatest height [m] of the track, or of logs with positions of their own where there is no track."""
+        return max(self.tops_m, default=-np.inf) if self.flown is None else _top_m(self.flown[0])
+
+    @property
+    def _track(self) -> Stream | None:
+        return None if self.flown is None else self.flown[0]
+
+    def leads(self, file: IngestedFile) -> bool:
+        """Check whether the track is in this file."""
+        return any(s is self._track for s in file.result.streams)
+
+    def sort(self, files: Sequence[IngestedFile]) -> None:
+        """Lines in the order of the files, telemetry first."""
+        order = [f.path for f in sorted(files, key=lambda f: not self.leads(f))]
+        self.lines = {path: self.lines[path] for path in order if path in self.lines}
+        self.out.sort()
+
+    def enter(self, file: IngestedFile) -> None:
+        """One log: a line of ``logs:``, or the reason why not."""
+        path = os.path.relpath(Path(file.holder or file.path).resolve(), self.folder)
+        path = str(Path(path, name_inside(file.path))) if file.holder else path
+        shown = one_line(path)
+        if (first := self.contents.setdefault(file.sha256, shown)) != shown:
+            self.out.append(f"{shown}: the same bytes as {first}")
+        elif not _is_text(path):
+            self.out.append(f"{shown}: flight.yaml cannot hold a name that is not UTF-8; rename it")
+        else:
+            self._enter(file, path, shown)
+
+    def _enter(self, file: IngestedFile, path: str, shown: str) -> None:
+        streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
+        entry, comment = _entry(file, path, self.towers_known)
+        origin = None if self.options.time_origin else self._origin(streams)
+        if self.placer is not None:
+            levels = [s for s in streams if s.kind == "rss" and not is_ratio(s)]
+            if comment:
+                comment = self._place(file, entry, comment, levels, self.placer)
+            else:
+                comment = self._doubt(entry, levels, self.placer)
+        if self.is_utc(file):
+            entry["clock"] = "utc"
+            comment = _also(comment, "as local time it misses the telemetry, as UTC it meets it: is it UTC?")
+        refused = self._refused(streams, entry, shown, dated=origin is not None)
+        compared = [s for s in streams if s.name not in refused]
+        reasons = list(dict.fromkeys(refused.values()))
+        if not compared and reasons == [_RATIO] and all(may_lose_lock(s) for s in streams):
+            comment = "  # says when the receiver was in lock"
+            skip = [s.name for s in streams]
+            self.lines[file.path] = (
+                f"  - {_flow({'path': path, 'reader': file.result.reader, 'skip': skip})}{comment}\n"
+            )
+            return
+        if not compared:
+            self.out.append(f"{shown}: {'; '.join(reasons) or 'no samples'}")
+            return
+        self.out += [f"{shown}: {name}: {reason}" for name, reason in refused.items() if reason != _RATIO]
+        if all(s.kind == "telemetry" for s in compared):
+            entry, comment = {"path": path, "reader": file.result.reader}, ""
+        if self.options.time_origin and any("clock" in s.attributes for s in compared):
+            entry["time_origin"] = self.options.time_origin
+        elif origin is not None:
+            entry["time_origin"] = f"{origin.time.astype('datetime64[ms]')}Z"
+            comment = _also(comment, f"time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?")
+        if file.result.reader == "generic_csv":
+            entry |= self.options.mapping
+        if refused:
+            entry["skip"] = sorted(refused)
+        comment = self._ask_heights_and_floor(compared, entry, path, comment)
+        for question in questions(file, compared, self.options.timezone):
+            comment = _also(comment, question)
+        self.lines[file.path] = f"  - {_flow(entry)}{comment}\n"
+        if self.placer is not None:
+            self.offsets_db += [o for s in compared if (o := self._offset_db(s, entry, self.placer)) is not None]
+        self.kinds |= {s.kind for s in compared}
+        self.tops_m += [_top_m(s) for s in compared if _has_positions(s)]
+        self.series += [(*_key(s, entry), file.result.reader) for s in compared if s.kind in ("rss", "rank")]
+        self.without_track |= self.flown is None and not all(_has_positions(s) for s in compared)
+
+    def _ask_heights_and_floor(self, compared: Sequence[Stream], entry: dict[str, Any], path: str, comment: str) -> str:
+        """Fill in a missing height and the floor of the receiver; gives what there is to ask.
+
+        Parameters
+        ----------
+        compared : sequence of Stream
+            Of the file, those that are compared.
+        entry : dict
+            Of the file in ``logs:``; receives height and floor.
+        path : str
+        comment : str
+            What is asked already.
+
+        Returns
+        -------
+        str
+        """
+        if any(lacks_height(s) for s in compared if s is self._track or _has_positions(s)):
+            height = height_in_name(path)
+            entry |= {} if height is None else {"height_m": height}
+            question = (
+                "no altitude in the log: which height_m?" if height is None else "height_m as the file's name says?"
+            )
+            comment = _also(comment, question)
+        levels = [
+            s for s in compared if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"
+        ]  # whole decibels repeat
+        if (floor := receiver_floor_db(levels)) is not None:
+            entry["floor_db"] = round(floor + 0.01, 2)  # at the floor is below it
+            comment = _also(
+                comment, f"floor of the receiver at {floor:.1f} dB?" if comment else f"receiver floor {floor:.1f} dB?"
+            )
+        if any(is_ratio(s) for s in compared):
+            comment = _also(comment, "a ratio to the noise as a level?")
+        return comment
+
+    def _place(
+        self, file: IngestedFile, entry: dict[str, Any], comment: str, levels: Sequence[Stream], placer: Placer
+    ) -> str:
+        """Fill in the nodes that the levels fit; gives what is left to ask.
+
+        Parameters
+        ----------
+        file : IngestedFile
+        entry : dict
+            Of the file in ``logs:``; receives the nodes.
+        comment : str
+            The question where no level fits.
+        levels : sequence of Stream
+            Of the file.
+        placer : Placer
+
+        Returns
+        -------
+        str
+        """
+        places, memory = {}, site_place(self.options.site, self.folder)
+        for pci in entry.get("cells", [None]):
+            level = next((s for s in levels if s.attributes.get("pci") == pci), None)
+            if level is not None:
+                series = _key(level, entry)[1], file.result.reader
+                airframe = searching_airframe(memory, placer.site.towers, series, file.sha256)
+                places[pci] = placer.propose(placer.levels(level, self._floor_db(level), airframe))
+        for pci, place in places.items():
+            if place is None:
+                continue
+            if place.tower is not None:
+                self.towers[place.node] = place.tower, place.question
+                self.sure |= {place.node} if place.radius_m <= _SURE_M else set()
+            if pci is None:
+                entry["node"] = place.node
+                return f"  # {place.question}" if place.tower is None and place.question else ""
+            entry["cells"][pci] = place.node
+        return comment
+
+    def _doubt(self, entry: Mapping[str, Any], levels: Sequence[Stream], placer: Placer) -> str:
+        """Ask about a tower that a name gives and the levels contradict."""
+        for level in levels:
+            node = str(entry.get("node") or level.attributes.get("node"))
+            better = placer.contradiction(placer.levels(level, self._floor_db(level)), node)
+            if better is not None:
+                return f"  # the name says {node}, the levels fit {better} far better: which tower?"
+        return ""
+
+    def _floor_db(self, level: Stream) -> float:
+        if self.locks and is_sounder_power(level):
+            return LOCK_FLOOR_DB
+        floor = None if level.attributes.get("quantity") == "RSRP" else receiver_floor_db([level])
+        return -np.inf if floor is None else floor
+
+    def _offset_db(self, level: Stream, entry: Mapping[str, Any], placer: Placer) -> float | None:
+        if level.kind != "rss" or is_ratio(level):
+            return None
+        home = entry.get("cells", {}).get(level.attributes.get("pci"))
+        node = home or entry.get("node") or level.attributes.get("node")
+        return placer.offset_db(placer.levels(level, self._floor_db(level)), str(node))
+
+    def _origin(self, streams: Sequence[Stream]) -> Origin | None:
+        """Origin of relative times whose positions lie on the track of the flight."""
+        if self.flown is None or not has_wall_clock(self.flown[1][0]):
+            return None
+        relative = [s for s in streams if s.attributes.get("clock") == "relative"]
+        return next((origin for s in relative if (origin := origin_of(s, self.flown[0])) is not None), None)
+
+    def _refused(
+        self, streams: Sequence[Stream], entry: Mapping[str, Any], shown: str, *, dated: bool
+    ) -> dict[str, str]:
+        """Streams that stay out, by name, and why; the others are taken.
+
+        ``dated`` says that relative times have an origin now.
+        """
+        leading = _leading(streams)
+
+        def reason(stream: Stream) -> str | None:
+            span = stream_span(stream)
+            if span is None:
+                return "no samples"
+            hours = np.timedelta64(round(60 * self._hours(stream)), "m")
+            span = span[0] + hours, span[1] + hours
+            if stream.name in leading:
+                return f"of the same receiver and cell as {leading[stream.name]}, which is compared"
+            why = self._reason(stream, span, dated=dated)
+            return why or (None if stream.kind == "telemetry" else self._enter_series(_key(stream, entry), span, shown))
+
+        ordered = sorted(streams, key=_missing)
+        return {stream.name: why for stream in ordered if (why := reason(stream)) is not None}
+
+    def _enter_series(self, key: tuple[str, ...], span: Span, shown: str) -> str | None:
+        """Enter a series; the reason where one of that tower, channel and time is there already."""
+        same = [source for when, source in self.entered.get(key, []) if _meet(span, when)]
+        if same:
+            where = "another stream of the log" if same[0] == shown else same[0]
+            return f"{where} has {key[1]} of that tower and time already"
+        self.entered.setdefault(key, []).append((span, shown))
+        return None
+
+    def is_utc(self, file: IngestedFile) -> bool:
+        """Check whether a log whose clock has no zone meets the telemetry as UTC, and not as local time."""
+        return any(self._hours(stream) for stream in file.result.streams)
+
+    def _hours(self, stream: Stream) -> float:
+        """Hours to be added to a clock in UTC that was read as local time; 0 of any other."""
+        span = stream_span(stream)
+        if self.flown is None or span is None or stream.kind == "telemetry":
+            return 0.0
+        trap = clock_trap(span, self.flown[1], self.options.timezone)
+        written = stream.attributes.get("clock_from") == "written"
+        return trap.hours if trap is not None and trap.is_utc and not written else 0.0
+
+    def _reason(self, stream: Stream, span: Span, *, dated: bool) -> str | None:
+        relative = not has_wall_clock(span[0])
+        if stream.kind == "telemetry":
+            if self.flown is None or stream is self.flown[0]:
+                return None
+            if relative and has_wall_clock(self.flown[1][0]):
+                return "the track is that of other telemetry"
+            return "the track is that of other telemetry" if _meet(span, self.flown[1]) else _late(span, self.flown[1])
+        if self.flown is None and self.positioned and not _has_positions(stream):
+            return "it has no positions, and no telemetry is here"
+        same_clock = self.flown is not None and not has_wall_clock(self.flown[1][0])  # the track counts as the log does
+        if relative and not (dated or same_clock or _has_positions(stream)):
+            return "its times are relative; read it again with --time-origin"
+        if self.flown is not None and not relative and not _meet(span, self.flown[1]):
+            return _late(span, self.flown[1], self.options.timezone)
+        return _RATIO if self.has_level and is_ratio(stream) else None
+
+
+_RATIO = "a ratio to the noise, no level"
+
+
+def _late(span: Span, flown: Span, timezone: str | None = None) -> str:
+    trap = clock_trap(span, flown, timezone)
+    shown = [" .. ".join(str(t.astype("datetime64[s]")).replace("T", " ") for t in s) for s in (span, flown)]
+    return f"{shown[0]} is not at the time of the telemetry, {shown[1]} (UTC)" + (f": {trap.advice()}" if trap else "")
+
+
+def _missing(stream: Stream) -> int:
+    """Of two ranks of one modem, the one that was reported more often is taken: NR or LTE."""
+    return int(stream.frame["rank"].isna().sum()) if stream.kind == "rank" else 0
+
+
+def _leading(streams: Sequence[Stream]) -> dict[str, str]:
+    """Streams that tell again what the RSRP of their receiver and cell tells, and the name of that RSRP."""
+    leaders: dict[object, str] = {}
+    same = {}
+    for stream in sorted(streams, key=lambda s: s.attributes.get("quantity") != "RSRP"):
+        if stream.kind != "rss" or "quantity" not in stream.attributes:
+            continue
+        cell = tuple(stream.attributes.get(key) for key in ("node", "rat", "pci", "arfcn"))
+        if stream.attributes["quantity"] == "RSRP" and cell not in leaders:
+            leaders[cell] = stream.name
+        elif cell in leaders and not is_ratio(stream):
+            same[stream.name] = leaders[cell]
+    return same
+
+
+def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, ...]:
+    """Key by which a report tells series apart."""
+    tower = str(entry.get("node") or stream.attributes.get("node"))
+    if stream.kind == "rank":
+        return tower, "rank"
+    return tower, str(entry.get("channel") or stream.attributes.get("channel") or stream.name)
+
+
+def _top_m(stream: Stream) -> float:
+    """Greatest height above take-off [m]; minus infinity where none is known."""
+    if "altitude_m" not in stream.frame:
+        return -np.inf
+    return float(np.nanmax(stream.frame["altitude_m"].to_numpy(np.float64), initial=-np.inf))
+
+
+def _has_positions(stream: Stream) -> bool:
+    return stream.kind == "rank" and "latitude_deg" in stream.frame and bool(stream.frame["latitude_deg"].notna().any())
+
+
+def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None) -> bool:
+    """Check whether some stream of the flight is RSS in the proper sense."""
+    levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
+    spans = [span for s in levels if (span := stream_span(s))]
+    return any(flown is None or _meet(span, flown[1]) for span in spans)
+
+
+def _samples(file: IngestedFile) -> int:
+    return sum(len(s.frame) for s in file.result.streams if s.kind != "telemetry")
+
+
+def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
+    """The telemetry that most levels and ranks go with, first and last time; of equals, the longest."""
+    timed = [(stream, span, file) for file in files for stream in file.result.streams if (span := stream_span(stream))]
+    measured = [span for s, span, _ in timed if s.kind != "telemetry" and has_wall_clock(span[0])]
+    tracks = [(s, span, file) for s, span, file in timed if s.kind == "telemetry"]
+    telemetry = [(s, span) for s, span, _ in tracks if has_wall_clock(span[0])]
+    relative = [
+        (s, span)
+        for s, span, file in tracks
+        if not has_wall_clock(span[0]) and any(other.kind in ("rss", "rank") for other in file.result.streams)
+    ]
+
+    def worth(flight: tuple[Stream, Span]) -> tuple[int, np.timedelta64]:
+        return sum(_meet(flight[1], span) for span in measured), flight[1][1] - flight[1][0]
+
+    # without any wall clock, a log that holds both levels and positions is a flight in its own time
+    return max(telemetry or relative[:1], key=worth, default=None)
+
+
+def _meet(first: Span, second: Span) -> bool:
+    return bool(first[0] <= second[1] and second[0] <= first[1])
+
+
+# Of a log's cells, those told most often are proposed; in a city a phone hears a hundred.
+MOST_CELLS = 6
+
+
+def _cells(streams: Sequence[Stream]) -> list[int]:
+    """PCIs of a log of several cells, those with a twentieth of the samples of the first and more."""
+    counts = {int(s.attributes["pci"]): len(s.frame) for s in streams if "pci" in s.attributes}
+    most = max(counts.values(), default=0)
+    most_sampled = sorted(counts, key=lambda pci: -counts[pci])[:MOST_CELLS]
+    return sorted(pci for pci in most_sampled if 20 * counts[pci] >= most)
+
+
+def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[str, Any], str]:
+    """Keys of a log and a question about what had to be guessed."""
+    entry: dict[str, Any] = {"path": path, "reader": file.result.reader}
+    need = [s for s in file.result.streams if s.kind in ("rss", "rank") and not s.attributes.get("node")]
+    if not need:
+        return entry, ""
+    here = Path(file.path).resolve()
+    near = _named_tower("/".join(here.parts[-2:]), towers)  # of the file or its folder
+    alone = towers[0] if len(towers) == 1 else None
+    entry["node"] = near or _named_tower(path, towers) or alone or next(iter(towers), "LW1")
+    if cells := _cells(need):
+        entry["cells"] = dict.fromkeys(cells, entry["node"])
+        if all("pci" in stream.attributes for stream in need):
+            del entry["node"]
+        return entry, "  # which tower has which PCI?"
+    if (radio := _RADIO.findall(path)) and len(need) == 1 and need[0].kind == "rss":
+        entry["channel"] = f"USRP{radio[-1]}"
+    return entry, "" if near or alone else "  # which tower?"
+
+
+def _named_tower(path: str, towers: Sequence[str]) -> str | None:
+    """The tower of the site whose name stands in a path, the last where several do; ``lw-1`` is LW1."""
+    places = {}
+    for tower in towers:
+        letters = "[-_ ]?".join(map(re.escape, re.findall(r"\d+|[^\W\d_]+", tower)))
+        ends = r"(?!\d)" if tower[-1:].isdigit() else r"(?![^\W_])"
+        for match in re.finditer(rf"(?<![^\W_]){letters}{ends}" if letters else r"(?!)", path, re.IGNORECASE):
+            places[match.start()] = tower
+    return places[max(places)] if places else None
+
+
+def _also(comment: str, question: str) -> str:
+    """The comment behind a line of ``logs:`` with one more question."""
+    return f"{comment} {question}" if comment else f"  # {question}"
+
+
+def _plain(entry: Mapping[str, Any]) -> str:
+    """A mapping of plain names on one line."""
+    return str(yaml.safe_dump(dict(entry), default_flow_style=True, sort_keys=False, width=10_000)).strip()
+
+
+def _flow(entry: dict[str, Any]) -> str:
+    """A log's YAML mapping on one line, as a flight.yaml is read: a file may be called 1e6."""
+
+    def dumped(style: str | None) -> str:
+        text = yaml.safe_dump(
+            entry, default_flow_style=True, sort_keys=False, width=10_000, allow_unicode=style is None,
+            default_style=style,
+        )  # fmt: skip
+        return str(text).strip()
+
+    text = dumped(None)
+    try:
+        as_read = len(text.splitlines()) == 1 and parse_yaml(text, LogSettings).path == entry["path"]
+    except UsageError:
+        as_read = False
+    return text if as_read else dumped('"')
+
+
+def _is_text(path: str) -> bool:
+    """Check whether a path can be written as UTF-8: names that cannot are held as surrogates."""
+    try:
+        path.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _name(flown: tuple[Stream, Span] | None, files: Sequence[IngestedFile]) -> str:
+    """The time of take-off, or the folder."""
+    if flown is None:
+        folder = Path(files[0].path).resolve().parent.name
+        return re.sub(r"[^A-Za-z0-9_.-]", "_", folder).lstrip("_.-") or "flight"
+    return "flight_" + str(flown[1][0].astype("datetime64[m]")).replace("T", "_").replace(":", "")

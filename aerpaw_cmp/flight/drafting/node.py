@@ -1,0 +1,198 @@
+"""Tower, or place, that the levels of a log fit: proposals for a draft."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ...common.units import FloatArray
+from ...compare.learning.locate import FEWEST, LevelTrack, fit_places, level_track, locate
+from ...logs.records import Stream
+from ...propagation.field.baselines import free_space_dbm
+from ...site.antenna.antennas import MeasuredPattern
+from ...site.site import Site
+from ..learned_gain import sphere_angles
+from ..pose.track import Track
+from ..scored import unscored
+
+# Log odds from which on a tower of the site is taken; the surveyed flights give 2.8 to 4.7, others at most 1.0.
+_TOWER_ODDS = 2.0
+
+# Log evidence by which another tower must explain the levels better before a named one is doubted.
+CONTRADICTED = 8.0
+
+# Places of a list whose log odds differ by less are both named.
+_UNDECIDED = 3.0
+
+# Of the link that a draft proposes.
+CARRIER_HZ, POWER_DBM = 3.3e9, 40.0
+
+# Below it an airframe on the ground decides the level.
+_LOW_M = 5.0
+
+# A place of a list that is farther from the track is not of this flight.
+NEAR_M = 5000.0
+
+
+@dataclass(frozen=True, slots=True)
+class ListedPlace:
+    """A place of a position list: file name, line, latitude and longitude [deg]."""
+
+    file: str
+    line: int
+    latitude_deg: float
+    longitude_deg: float
+
+
+_PAIR = re.compile(r"\s*(-?\d{1,3}\.\d{3,})\s*[,;\s]\s*(-?\d{1,3}\.\d{3,})\s*")
+_MOST_BYTES = 20_000
+
+
+def listed_places(folders: Iterable[Path]) -> list[ListedPlace]:
+    """Places that position lists in some folders name: text files with ``position`` in the name, a pair a line."""
+    paths = [path for folder in sorted(set(folders)) for path in sorted(folder.glob("*[Pp]osition*"))]
+    places = []
+    for path in paths:
+        if path.suffix not in (".txt", ".csv", "") or not path.is_file() or path.stat().st_size > _MOST_BYTES:
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+            if (pair := _PAIR.fullmatch(line)) is not None:
+                places.append(ListedPlace(path.name, number, float(pair[1]), float(pair[2])))
+    return places
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """A proposal for ``node`` of a log.
+
+    Parameters
+    ----------
+    node : str
+    tower : mapping or None
+        Entry of ``towers`` in flight.yaml, where the site has no such tower.
+    question : str
+        About the proposal.
+    radius_m : float
+        Of 90 % confidence about an estimated place; 0 of a known one.
+    """
+
+    node: str
+    tower: Mapping[str, Any] | None
+    question: str
+    radius_m: float = 0.0
+
+
+@dataclass
+class Placer:
+    """Proposals for the logs of one flight."""
+
+    site: Site
+    telemetry: Stream
+    listed: Sequence[ListedPlace] = ()
+    nodes: dict[str, FloatArray] = field(default_factory=dict)
+    """Proposed so far: east and north."""
+
+    def __post_init__(self) -> None:
+        frame = self.telemetry.frame[~unscored(self.telemetry.frame)]
+        takeoff_m, ground = self.site.datum.takeoff_ground_m, self.site.ground_under_m
+        self.track = Track(frame, self.site.frame, ground_m=takeoff_m, ground=ground)
+
+    @property
+    def at_site(self) -> bool:
+        """True if the flight was flown near a tower of the site."""
+        return any(self._near(tower.latitude_deg, tower.longitude_deg) for tower in self.site.towers.values())
+
+    def levels(self, stream: Stream, floor_db: float = -np.inf, airframe: MeasuredPattern | None = None) -> LevelTrack:
+        """Levels of a log where the UAV flew, with the gain of its airframe where it is known."""
+        frame = stream.frame[~unscored(stream.frame)]
+        poses = self.track.pose_at(frame["time"])
+        place = np.where((poses.position_m[:, 2] > self.track.ground_m + _LOW_M)[:, None], poses.position_m, np.nan)
+        time = frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
+        level = frame["rss_db"].to_numpy(np.float64)
+        below_floor = frame["flag"].astype(str).str.contains("out_of_coverage").to_numpy()
+        level = np.where(np.isnan(level) & below_floor & np.isfinite(floor_db), floor_db, level)
+        track = level_track(time, place, level, floor_db=floor_db)
+        if airframe is None or not len(track.time_s):
+            return track
+        rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
+
+        def gain_db(towards: FloatArray) -> FloatArray:
+            return airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", rotation, towards)))
+
+        return replace(track, airframe_db=gain_db)
+
+    def propose(self, track: LevelTrack) -> Placement | None:
+        """Tower, listed place or estimated place that the levels fit; None where they are too few."""
+        if len(track.level_db) < FEWEST:
+            return None
+        towers = list(self.site.towers.values())
+        listed = [place for place in self.listed if self._near(place.latitude_deg, place.longitude_deg)]
+        at = [np.asarray(tower.position_m) for tower in towers] + [self._local(place) for place in listed]
+        estimate = locate(track, np.array(at))
+        odds_tower, odds_listed = estimate.log_odds[: len(towers)], estimate.log_odds[len(towers) :]
+        if len(listed) and odds_listed.max() >= max(_TOWER_ODDS, odds_tower.max()):
+            order = np.argsort(-odds_listed)
+            place, least = listed[order[0]], odds_listed[order[0]] - _UNDECIDED
+            undecided = [listed[i] for i in order[1:] if odds_listed[i] > least]
+            also = "".join(f" or line {tie.line}" for tie in undecided)
+            about = f"line {place.line} of {place.file}{also}: is the node there?"
+            return self._node(self._local(place), place.latitude_deg, place.longitude_deg, 1.5, about)
+        best = int(odds_tower.argmax())
+        if odds_tower[best] >= _TOWER_ODDS:
+            return Placement(towers[best].name, None, f"the levels fit {towers[best].name} best: is it this tower?")
+        latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
+        apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]
+        near = [t.name for t, d in zip(towers, apart, strict=True) if d <= estimate.radius90_m]
+        decided = f"the levels decide for no tower ({', '.join(near)} possible)" if near else "no tower fits the levels"
+        about = (
+            f"{decided}. They fit this place best, 90 % within {estimate.radius90_m:.0f} m, "
+            f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where did the node stand?"
+        )
+        place = estimate.place_m
+        node = self._node(place, float(latitude[0]), float(longitude[0]), float(place[2]), about)
+        return replace(node, radius_m=estimate.radius90_m)
+
+    def contradiction(self, track: LevelTrack, node: str) -> str | None:
+        """Tower that the levels fit far better than the one that is named; None where none does."""
+        if node not in self.site.towers or len(track.level_db) < FEWEST:
+            return None
+        names = list(self.site.towers)
+        evidence = fit_places(track, [self.site.towers[name].position_m for name in names]).evidence
+        best = int(evidence.argmax())
+        return names[best] if evidence[best] > evidence[names.index(node)] + CONTRADICTED else None
+
+    def offset_db(self, track: LevelTrack, node: str) -> float | None:
+        """Median of free space over the draft's link minus the level [dB]; None for an unknown node."""
+        place = self.nodes.get(node)
+        if node in self.site.towers:
+            place = self.site.towers[node].position_m
+        if place is None or not len(track.level_db):
+            return None
+        free = free_space_dbm(place[None, :], track.position_m, CARRIER_HZ, POWER_DBM)[:, 0]
+        return float(np.median(free - track.level_db))
+
+    def _node(self, place: FloatArray, latitude: float, longitude: float, height: float, about: str) -> Placement:
+        same = [name for name, placed in self.nodes.items() if np.hypot(*(placed[:2] - place[:2])) < 100.0]
+        name = same[0] if same else "NODE" + (str(len(self.nodes) + 1) if self.nodes else "")
+        tower = {"latitude_deg": round(latitude, 7), "longitude_deg": round(longitude, 7), "antenna_height_m": height}
+        if same:
+            return Placement(name, None, "")
+        self.nodes[name] = place
+        return Placement(name, tower, about)
+
+    def _local(self, place: ListedPlace) -> FloatArray:
+        east, north = self.site.frame.to_local(np.array([place.latitude_deg]), np.array([place.longitude_deg]))
+        return np.array([east[0], north[0], 1.5])
+
+    def _near(self, latitude_deg: float, longitude_deg: float) -> bool:
+        if not len(self.track):
+            return False
+        start = self.track.pose_at(np.array([self.track.start_ns], dtype="datetime64[ns]")).position_m[0]
+        with np.errstate(invalid="ignore"):
+            east, north = self.site.frame.to_local(np.array([latitude_deg]), np.array([longitude_deg]))
+        return bool(np.hypot(east[0] - start[0], north[0] - start[1]) < NEAR_M)

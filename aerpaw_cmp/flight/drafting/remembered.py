@@ -1,0 +1,233 @@
+"""Part of a site's memory that a draft takes: only what fits the tower, the channel, the reader and so the band."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ...common.errors import InputError, UsageError
+from ...common.units import FloatArray
+from ...compare.gains.direction_gain import LinkSamples
+from ...compare.gains.spread import NO_SPREAD, Spread
+from ...site.antenna import learned
+from ...site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
+from ..data import FlightData, RssSeries, site_place
+from ..learned_gain import pair_and_sd_db, sphere_angles
+from ..settings import FlightFile, check_logs, with_learned
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Remembered:
+    """Antennas of one tower and channel that a site remembers."""
+
+    entry: learned.Entry
+    series: learned.LearnedSeries
+    tower: SpherePattern
+    uav: SpherePattern
+
+    @property
+    def level(self) -> learned.LearnedLevel:
+        """Level of the log; only of memories that keep it."""
+        assert self.series.level is not None
+        return self.series.level
+
+    @property
+    def spread(self) -> Spread:
+        """Spread of a level besides the standard deviation of the gains."""
+        return Spread.from_text(self.tower.notes) or NO_SPREAD
+
+    @property
+    def prior_variance_db2(self) -> float:
+        """Variance of the gains of both ends in directions that nobody has flown."""
+        return self.tower.largest_sd_db**2 + self.uav.largest_sd_db**2
+
+    def gain_db(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        """Gain of both ends (n,) and its standard deviation (n,) [dB]."""
+        ends = {"uav": (self.uav, samples.at_uav), "tower": (self.tower, samples.at_tower)}
+        pair_db, sd_db = pair_and_sd_db(ends)
+        return pair_db + sum(pattern.gain_dbi(*sphere_angles(direction)) for pattern, direction in ends.values()), sd_db
+
+
+def remembered(site: str | Path) -> dict[str, Remembered]:
+    """Antennas of the towers of a site that its memory holds, by ``tower.channel``; the latest made of each.
+
+    Raises
+    ------
+    UsageError, InputError
+        A memory or a table that is damaged.
+    """
+    folder, out = learned.folder_of(site), {}
+    for entry in sorted(learned.read_learned(site).entries.values(), key=lambda entry: entry.made):
+        for series in entry.series:
+            tower, uav = (read_sphere_csv(folder / file) for file in (series.tower_file, series.uav_file))
+            named = learned.Named(entry=entry, part="", folder=folder)
+            check_logs((*tower.trained_on, *uav.trained_on), named, folder / series.tower_file)
+            out[f"{series.tower}.{series.channel}"] = Remembered(entry=entry, series=series, tower=tower, uav=uav)
+    return out
+
+
+# Tower, channel (``rank`` of rank) and reader of a series of the draft.
+_SeriesKey = tuple[str, str, str]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """Learned antennas and receiver for a draft, by name, each with a sentence on what to expect."""
+
+    antennas: Mapping[str, str]
+    antennas_about: str
+    carrier_hz: float | None
+    receiver: str | None
+    receiver_about: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nodes:
+    """Nodes of a draft that are no towers of the site and whose place is well known, and the towers of the site."""
+
+    placed: frozenset[str] = frozenset()
+    fixed: Sequence[str] = ()
+
+
+def propose(known: learned.Learned, site: str, series: Sequence[_SeriesKey], nodes: Nodes = Nodes()) -> Proposal:
+    """The entry that fits most series: tower antennas where the tower fits too, else the airframe alone.
+
+    The antenna of a node that flights placed themselves goes with any such node: it was learned over several places.
+
+    Parameters
+    ----------
+    known : Learned
+        The memory of the site.
+    site : str
+        Its name in the names of the antennas.
+    series : sequence of (tower, channel, reader)
+    nodes : Nodes
+
+    Returns
+    -------
+    Proposal
+        Empty where nothing fits.
+    """
+    antennas: dict[str, str] = {}
+    about, carrier = "", None
+    fits = {name: _fits(entry, series, nodes) for name, entry in known.entries.items()}
+    best = max(fits, key=lambda name: fits[name], default=None)
+    if best is not None and fits[best] > (0, 0):
+        entry = known.entries[best]
+        exact = [s for s in entry.series if (s.tower, s.channel, s.reader) in series]
+        alike = exact or [s for s in entry.series if any(_alike(s, key, nodes) for key in series)]
+        antennas = {f"{s.tower}.{s.channel}": f"{site}/{best}_{s.tower}.{s.channel}" for s in exact}
+        antennas |= {
+            f"{tower}.{channel}": f"{site}/{best}_{s.tower}.{s.channel}"
+            for s in alike
+            for tower, channel, reader in series
+            if _placed(s, tower, nodes) and _alike(s, (tower, channel, reader), nodes)
+        }
+        alone = "the airframe alone fits: {}, there with its tower antenna"
+        about = entry.about() if antennas else alone.format(entry.about())
+        antennas["uav"] = f"{site}/{best}_uav"
+        carrier = alike[0].carrier_hz
+    ranked = {(tower, reader) for tower, channel, reader in series if channel == "rank"}
+    receivers = [
+        (name, entry)
+        for name, entry in known.entries.items()
+        if any((r.tower, r.reader) in ranked for r in entry.receivers)
+    ]
+    return Proposal(
+        antennas=antennas,
+        antennas_about=about,
+        carrier_hz=carrier,
+        receiver=f"{site}/{receivers[0][0]}" if receivers else None,
+        receiver_about=receivers[0][1].about() if receivers else "",
+    )
+
+
+def searching_airframe(
+    site: str | Path, towers: Collection[str], series: tuple[str, str], log: str
+) -> SpherePattern | None:
+    """The airframe that flights taught with a node of theirs, for the search of a node; None where none fits.
+
+    Parameters
+    ----------
+    site : str or Path
+        As :func:`.read_learned` takes it.
+    towers : collection of str
+        Of the site: what was learned with one of them says little about a search.
+    series : (channel, reader)
+    log : str
+        SHA-256 of the log, which must not have been learned from.
+
+    Returns
+    -------
+    SpherePattern or None
+    """
+    with suppress(InputError, UsageError):
+        unseen = (entry for entry in learned.read_learned(site).entries.values() if log not in entry.trained_on)
+        every = (s for entry in unseen for s in entry.series if s.tower not in towers)
+        file = next((s.uav_file for s in every if (s.channel, s.reader) == series), None)
+        return None if file is None else read_sphere_csv(learned.folder_of(site) / file)
+    return None
+
+
+def offered(data: FlightData) -> FlightFile | None:
+    """The settings of a flight with the antennas that its site remembers; None where nothing fits its towers.
+
+    Airframes alone are not offered: what an airframe is worth without its tower antenna was not measured.
+    """
+    site = data.settings.site.file
+    series = [(s.tower, s.channel, data.files[int(number)].result.reader)
+              for s in data.rss for number in np.unique(s.log)]  # fmt: skip
+    try:
+        known = propose(learned.read_learned(site_place(site, data.folder)), str(Path(site).with_suffix("")), series)
+    except (InputError, UsageError):
+        return None
+    if len(known.antennas) < 2:
+        return None
+    settings = with_learned(data.settings.model_copy(update={"antennas": dict(known.antennas)}), data.folder)
+    return settings if settings.link != data.settings.link else None
+
+
+def errors_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> learned.Errors | None:
+    """Errors on flights left out of the learned antennas of a tower and channel; None where no such are used."""
+    name = antennas.get(f"{series.tower}.{series.channel}")
+    if name is None or "uav" not in antennas:
+        return None
+    try:
+        return learned.find_named(name, folder).entry.errors
+    except (InputError, UsageError):
+        return None
+
+
+def lock_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> learned.LearnedLock | None:
+    """P(lock) that other flights taught with the airframe of a flight; None without one for such a channel."""
+    try:
+        named = learned.find_named(antennas["uav"], folder)
+    except (KeyError, InputError, UsageError):
+        return None
+    locks = [s.lock for s in named.entry.series if s.channel == series.channel and s.lock is not None]
+    return locks[0] if locks else None
+
+
+# Readers of one receiver: merged flights of the sounder hold the readings of its own logs.
+SOUNDER = {"flight_mat", "sounder_log"}
+
+
+def _placed(s: learned.LearnedSeries, tower: str, nodes: Nodes) -> bool:
+    return tower in nodes.placed and s.tower not in nodes.fixed
+
+
+def _alike(s: learned.LearnedSeries, key: _SeriesKey, nodes: Nodes) -> bool:
+    """Check whether a series has the channel and the receiver of one that was learned from, whatever its tower."""
+    tower, channel, reader = key
+    same = s.reader == reader or (_placed(s, tower, nodes) and {s.reader, reader} <= SOUNDER)
+    return s.channel == channel and same
+
+
+def _fits(entry: learned.Entry, series: Sequence[_SeriesKey], nodes: Nodes) -> tuple[int, int]:
+    """Series of an entry that fit exactly, and those of another tower."""
+    exact = sum((s.tower, s.channel, s.reader) in series for s in entry.series)
+    return exact, sum(any(_alike(s, key, nodes) for key in series) for s in entry.series)

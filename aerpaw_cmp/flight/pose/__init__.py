@@ -1,0 +1,1 @@
+"""Place and time of the UAV: track, heights, clock, routes."""

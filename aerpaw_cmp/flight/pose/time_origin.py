@@ -1,0 +1,105 @@
+"""Start time of a log with relative times, from a companion log that knows the time."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pandas as pd
+
+from ...common.units import AnyArray, FloatArray
+from ...logs.records import Stream, has_wall_clock
+from .track import interpolated
+
+# Two receivers on one aircraft tell places this near each other, in the median.
+_AGREE_M = 12.0
+# The second-best origin, a minute away or farther, must be so many times worse.
+_UNIQUE = 1.8
+_POINTS = 240
+_METRES = 111_320.0
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """An origin of relative times.
+
+    Parameters
+    ----------
+    time : datetime64[ns]
+        UTC of relative time zero.
+    distance_m : float
+        Median distance of the two tracks under it.
+    """
+
+    time: np.datetime64
+    distance_m: float
+
+
+def origin_of(log: Stream, track: Stream) -> Origin | None:
+    """The origin under which the positions of a log lie on a track; None where none, or none alone, does.
+
+    Both logs tell where the aircraft was: the log at relative times t, the track at UTC. Searched is the shift s that
+    makes the median of |p_log(t) - p_track(t + s)| least: each second first, then tenths of a second around the best.
+
+    Parameters
+    ----------
+    log : Stream
+        With positions; its times count from 1970.
+    track : Stream
+        Telemetry with a wall clock.
+    """
+    mine, tracked = _points(log.frame, _POINTS), _points(track.frame, None)
+    if mine is None or tracked is None or has_wall_clock(mine[0][0].astype("datetime64[ns]")):
+        return None
+    zero_s = float(tracked[0][0].astype(np.int64)) / 1e9
+    time_s = mine[0].astype(np.int64) / 1e9
+    track_s = tracked[0].astype(np.int64) / 1e9 - zero_s
+    log_m, track_m = _metres(mine[1], tracked[1]), _metres(tracked[1], tracked[1])
+    length = time_s[-1] - time_s[0]
+    # half of the log may stick out at either end of the track
+    shifts = np.arange(-time_s[0] - 0.5 * length, track_s[-1] - time_s[0] - 0.5 * length, 1.0)
+    misses = np.array([_median_distance(time_s + shift, log_m, track_s, track_m) for shift in shifts])
+    if not len(misses) or not np.isfinite(misses).any():
+        return None
+    best = int(np.nanargmin(misses))
+    apart = np.abs(shifts - shifts[best]) > 60
+    fine = shifts[best] + np.arange(-15, 16) / 10
+    finer = np.array([_median_distance(time_s + shift, log_m, track_s, track_m) for shift in fine])
+    distance = float(np.nanmin(finer))
+    second = float(np.nanmin(misses[apart])) if np.isfinite(misses[apart]).any() else np.inf
+    # like with like: the other places were tried each second, and between two seconds an aircraft flies some metres
+    if distance > _AGREE_M or second < _UNIQUE * max(float(misses[best]), 1.0):
+        return None
+    origin_s = zero_s + float(fine[int(np.nanargmin(finer))])
+    return Origin(np.datetime64(round(origin_s * 1000), "ms").astype("datetime64[ns]"), distance)
+
+
+def _points(frame: pd.DataFrame, most: int | None) -> tuple[AnyArray, FloatArray] | None:
+    """Times and (latitude, longitude, altitude) of the rows with a place, in order, thinned out to at most ``most``."""
+    names = ["latitude_deg", "longitude_deg", "altitude_m"]
+    if not set(names) <= set(frame.columns):
+        return None
+    known = frame[["time", *names]].dropna(subset=names[:2]).drop_duplicates("time").sort_values("time")
+    if len(known) < 20:
+        return None
+    if most is not None and len(known) > most:
+        known = known.iloc[np.linspace(0, len(known) - 1, most).astype(int)]
+    return known["time"].to_numpy("datetime64[ns]"), known[names].to_numpy(np.float64)
+
+
+def _metres(points: FloatArray, about: FloatArray) -> FloatArray:
+    """Places in metres from the first; heights as logged, 0 where there are none."""
+    centre = about[0]
+    east = (points[:, 1] - centre[1]) * _METRES * np.cos(np.radians(centre[0]))
+    north = (points[:, 0] - centre[0]) * _METRES
+    return np.stack([east, north, np.nan_to_num(points[:, 2])], axis=1)
+
+
+def _median_distance(time_s: FloatArray, log_m: FloatArray, track_s: FloatArray, track_m: FloatArray) -> float:
+    """Median distance; NaN where less than half of the log lies within the track."""
+    inside = (time_s >= track_s[0]) & (time_s <= track_s[-1])
+    if 2 * inside.sum() < len(time_s):
+        return float("nan")
+    apart = log_m[inside] - interpolated(time_s[inside], track_s, track_m)
+    apart[:, 2] -= np.median(apart[:, 2])  # the logs count heights from grounds of their own
+    return float(np.median(np.linalg.norm(apart, axis=1)))

@@ -1,0 +1,1 @@
+"""The tap's durable log, its writer and its export."""

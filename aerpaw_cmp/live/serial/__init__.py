@@ -1,0 +1,1 @@
+"""The serial port: framing, modem, ports, simulator."""

@@ -1,0 +1,1 @@
+"""Contents of pages as records; a file is named by its page."""

@@ -1,0 +1,168 @@
+"""The figures of a flight's report, in order, with their captions."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from ...compare.result import RankResult, RssResult
+from ..content.flight import ReportData, Track
+from ..kit.canvas import POINTS_PER_CLOUD, FigureSpec
+from ..names import safe_name
+from ..words.flight import count, learned_on
+from . import flight_rank as rank_figures
+from . import flight_rss as rss_figures
+from .flight_against import against_specs
+from .flight_serving import serving_spec
+
+
+def figure_specs(data: ReportData) -> list[FigureSpec]:
+    """Every figure that the data allow, in reading order; where two names became one file name, a number is added."""
+    used: dict[str, int] = {}
+    result = []
+    for spec in _figures(data):
+        times = used[spec.name] = used.get(spec.name, 0) + 1
+        result.append(spec if times == 1 else replace(spec, name=f"{spec.name}_{times}"))
+    return result
+
+
+def _figures(data: ReportData) -> Iterator[FigureSpec]:
+    scored = [panel for panel in data.rss if len(panel.time) and panel.score.n]
+    if scored:
+        yield FigureSpec(
+            "overview", "overview", "Where and when the prediction fails",
+            f"{scored[0].name}. Left: the flight coloured by the residual, measured minus ray tracing after the "
+            "offset. Right: level over time.",
+            partial(rss_figures.overview, data, scored[0]),
+        )  # fmt: skip
+    if data.track is not None and len(data.track.time):
+        yield from _track_specs(data, data.track)
+    for panel in data.rss:
+        if len(panel.time):
+            yield from _rss_specs(data, panel)
+    if any(np.isfinite(row.rmse_heldout_db) for row in data.ladder):
+        yield FigureSpec(
+            "ladder", "ladder", "Models from the simplest to the richest",
+            "RMSE on held-out segments, a line per tower and channel. Whiskers: 95 % interval of the difference to the "
+            "best model on the same samples. Filled: the recommended model.",
+            partial(rss_figures.ladder, data.ladder),
+        )  # fmt: skip
+    if data.serving is not None and data.serving.n:
+        yield serving_spec(data.serving)
+    for rank in data.rank:
+        if len(rank.time):
+            yield from _rank_specs(data, rank)
+    if data.against is not None:
+        yield from against_specs(data.against)
+
+
+def _track_specs(data: ReportData, track: Track) -> Iterator[FigureSpec]:
+    present = [word for word, some in (("buildings", data.site.buildings), ("forests", data.site.forests)) if some]
+    invented = (
+        f" {' and '.join(present).capitalize()} are illustrative: they do not exist and show the method."
+        if data.site.illustrative and present
+        else ""
+    )
+    yield FigureSpec(
+        "trajectory", "flight", "Where the UAV flew",
+        f"Left: the site with its towers. Right: the flight, coloured by height.{invented}",
+        partial(rss_figures.trajectory, data, track),
+    )  # fmt: skip
+    dotted = " Dotted lines are waypoints." if data.waypoints else ""
+    yield FigureSpec(
+        "altitude", "flight", "Height over time",
+        f"Height of the UAV above the ground at the site origin.{dotted}",
+        partial(rss_figures.altitude, data, track),
+    )  # fmt: skip
+
+
+def _band_words(panel: RssResult) -> str:
+    """Sentences on what the band of learned antennas is made of, and whether it holds on this flight."""
+    bars = panel.further.error_bars
+    if not bars:
+        return ""
+    parts = ", ".join(f"{what} {bars[name]:.1f} dB" for name, what in SPREAD_PARTS.items())
+    inside = bars.get("inside_90")
+    return f" Band: 90 % interval of a sample about the prediction; its standard deviation joins {parts}." + (
+        "" if inside is None else f" It holds {100 * inside:.0f} % of the samples of this flight."
+    )
+
+
+SPREAD_PARTS = {
+    "gain_sd_db": "the learned gain",
+    "own_sd_db": "the flight's own nuisance",
+    "noise_sd_db": "noise",
+    "fading_sd_db": "fading within the average",
+}
+
+
+_HATCHED = "Hatched spans marked Z have no path in the simulation and are not scored. "
+
+
+def _rss_specs(data: ReportData, panel: RssResult) -> Iterator[FigureSpec]:
+    stem = f"{safe_name(panel.tower)}_{safe_name(panel.channel)}"
+    section = f"rss/{panel.tower}/{panel.channel}"
+    drawn = f" Of {count(len(panel.time))} samples {count(POINTS_PER_CLOUD)} are drawn, and every extreme."
+    yield FigureSpec(
+        f"rss_{stem}", section, f"{panel.name}: RSS over time",
+        "Top: the measurement after its offset, the ray tracing, and the baselines, each baseline moved to its own "
+        "best fit. " + _HATCHED * bool(panel.simulated_out_of_coverage.any())
+        + "Bottom: residual; dashed lines are plus and minus one RMSE." + _band_words(panel)
+        + drawn * (len(panel.time) > POINTS_PER_CLOUD),
+        partial(rss_figures.rss_over_time, data, panel),
+    )  # fmt: skip
+    score = panel.further.detection
+    if score is not None and score.reliability:
+        yield FigureSpec(
+            f"rss_detection_{stem}", section, f"{panel.name}: is the probability of detection calibrated?",
+            "Fifths of the predicted probability against the share that the receiver detected; on the diagonal the "
+            f"forecast is calibrated. Brier score {score.brier:.3f}, constant forecast {score.constant_brier:.3f}; log "
+            f"score {score.log_score:.3f}, constant {score.constant_log_score:.3f} ({learned_on(score)}).",
+            partial(rss_figures.detection_reliability, score),
+        )  # fmt: skip
+
+
+def _rank_specs(data: ReportData, panel: RankResult) -> Iterator[FigureSpec]:
+    stem, section = safe_name(panel.tower), f"rank/{panel.tower}"
+    if panel.probability is not None:
+        # it stands under the table of the result
+        yield FigureSpec(
+            f"rank_forecast_{stem}", "forecast", f"{panel.tower}: rank forecast along the flight",
+            "Probability of each rank by the fitted receiver (means), above the reported ranks.",
+            partial(rank_figures.rank_forecast, data, panel),
+        )  # fmt: skip
+    yield FigureSpec(
+        f"rank_histogram_{stem}", section, f"{panel.tower}: how often each rank",
+        "Shares of rank 1 to 4 among samples in coverage, measured beside every K. Whiskers: 95 % intervals.",
+        partial(rank_figures.rank_histograms, panel),
+    )  # fmt: skip
+    yield FigureSpec(
+        f"rank_map_{stem}", section, f"{panel.tower}: rank along the flight",
+        "Rank at every sample. Colour and marker give the rank; crosses marked Z had no path in the simulation.",
+        partial(rank_figures.rank_maps, data, panel),
+        page=False,
+    )  # fmt: skip
+    yield FigureSpec(
+        f"rank_time_{stem}", section, f"{panel.tower}: rank over time",
+        "Each row is one source. The lowest plot shows the singular values that decide the rank.",
+        partial(rank_figures.rank_over_time, data, panel),
+    )  # fmt: skip
+    if panel.score.simulated:
+        yield FigureSpec(
+            f"rank_confusion_{stem}", section, f"{panel.tower}: which ranks are mistaken for which",
+            "Counts; colour is the share of each measured rank (rows). Frames: equal ranks. Z: no path in the "
+            "simulation.",
+            partial(rank_figures.confusion, panel),
+            page=False,
+        )  # fmt: skip
+    if np.isfinite(panel.score.curve.agreement).any():
+        yield FigureSpec(
+            f"rank_k_{stem}", section, f"{panel.tower}: which K explains the modem",
+            "Agreement by pose and distance between the histograms as the threshold K varies. The best K is the one of "
+            "the highest agreement.",
+            partial(rank_figures.agreement_curve, panel),
+            page=False,
+        )  # fmt: skip

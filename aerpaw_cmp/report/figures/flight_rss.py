@@ -1,0 +1,241 @@
+"""Figures of the track and of received signal strength."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ...compare.judge.ladder import LadderRow
+from ...compare.level.detection import DetectionScore
+from ...compare.result import RankResult, RssResult
+from ..content.flight import ReportData, Track, start_of, used_towers
+from ..kit.canvas import (
+    BASELINE,
+    MEASURED,
+    POINTS_PER_LINE,
+    SIMULATED,
+    TOWER,
+    WAYPOINT,
+    cloud,
+    colour_bar,
+    dots,
+    draw_out_of_coverage,
+    draw_site,
+    draw_waypoints,
+    frame_around,
+    legend_below,
+    legend_of,
+    lonely,
+    robust_limits,
+    seconds_since,
+    subplots,
+    thinned,
+    thinned_plan,
+    time_axis,
+)
+from ..words.flight import count, pretty, signed
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def overview(data: ReportData, panel: RssResult) -> Figure:
+    """The flight coloured by residual beside level and residual over time, of one channel."""
+    fig, (plan, right) = subplots((9.2, 4.0), 1, 2, width_ratios=(1.0, 1.5))
+    residual = panel.residual_db
+    draw_site(plan, data.site, towers=[panel.tower])
+    few = cloud(residual)
+    points = plan.scatter(
+        *panel.position_m[few, :2].T, c=residual[few], cmap="RdBu_r", vmin=-12, vmax=12, s=6, linewidths=0,
+        rasterized=True, zorder=5,
+    )  # fmt: skip
+    _draw_node(plan, panel)
+    tower = data.site.towers.get(panel.tower)
+    ends = [] if tower is None else [tower.position_m[None]]
+    ends += [] if panel.tower_m is None else [panel.tower_m]
+    frame_around(plan, *np.concatenate([panel.position_m, *ends])[:, :2].T)
+    colour_bar(fig, points, plan, "Residual [dB]", "both")
+    start = start_of(data)
+    seconds = seconds_since(panel.time, start)
+    calibrated = panel.calibrated_db
+    dots(right, seconds, calibrated, 2.5, color=MEASURED, label="measured, calibrated")
+    right.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing")
+    time_axis(right, start)
+    right.set_ylabel("RSS [dBm]")
+    robust_limits(right, [calibrated, panel.simulated_dbm])
+    fig.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=2)
+    return fig
+
+
+def _draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
+    """The way of a tower that moves; its mark stands in the middle of it."""
+    if panel.tower_m is not None:
+        ax.plot(*thinned_plan(*panel.tower_m[:, :2].T), color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5,
+                label=f"way of {panel.tower}")  # fmt: skip
+
+
+def trajectory(data: ReportData, track: Track) -> Figure:
+    """The flight on the plan of the whole site, and closer, coloured by height."""
+    fig, (site_plan, close) = subplots((9.2, 5.4), 1, 2, width_ratios=(1.0, 1.35))
+    draw_site(site_plan, data.site)
+    draw_site(close, data.site)
+    nodes = {item.tower: item for item in data.series}.values()
+    for panel in nodes:
+        _draw_node(site_plan, panel)
+        _draw_node(close, panel)
+    site_plan.plot(*thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.0, label="flight", zorder=4)
+    points = close.scatter(
+        track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
+        label="flight (colour: height)",
+    )  # fmt: skip
+    towers = list(data.site.towers.values())
+    whole_east = np.concatenate([[t.east_m for t in towers], track.east_m[np.isfinite(track.east_m)]])
+    whole_north = np.concatenate([[t.north_m for t in towers], track.north_m[np.isfinite(track.north_m)]])
+    frame_around(site_plan, whole_east, whole_north, least_m=200.0, shape=0.75)
+    near = [data.site.towers[name] for name in used_towers(data)]
+    extent = float(np.nanmax([np.ptp(track.east_m), np.ptp(track.north_m), 100.0])) if len(track.east_m) else 100.0
+    centre = np.array([np.nanmean(track.east_m), np.nanmean(track.north_m)])
+    ways = [node.tower_m for node in nodes if node.tower_m is not None]
+    near = [t for t in near if np.hypot(t.east_m - centre[0], t.north_m - centre[1]) < extent]
+    frame_around(
+        close,
+        np.concatenate([track.east_m, [t.east_m for t in near], *(way[:, 0] for way in ways)]),
+        np.concatenate([track.north_m, [t.north_m for t in near], *(way[:, 1] for way in ways)]),
+    )
+    for waypoint in data.waypoints:
+        close.annotate(
+            waypoint.label, (waypoint.east_m, waypoint.north_m), fontsize=8, ha="center", va="center", zorder=7,
+            bbox={"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": WAYPOINT},
+        )  # fmt: skip
+    colour_bar(fig, points, close, "Height above ground [m]")
+    site_plan.set_title("Whole site")
+    close.set_title("The flight")
+    site_plan.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    close.legend(
+        *legend_of(close, lambda label: label.startswith("flight")), loc="upper center", bbox_to_anchor=(0.5, -0.12)
+    )
+    return fig
+
+
+def altitude(data: ReportData, track: Track) -> Figure:
+    """Height over time, with waypoints and the ground speed below."""
+    start = start_of(data)
+    seconds = seconds_since(track.time, start)
+    fig, ax = subplots((9.2, 2.9))
+    ax.plot(*thinned(seconds, track.up_m), color=SIMULATED, linewidth=1.2, label="height of the UAV")
+    draw_waypoints(ax, data.moments, start)
+    time_axis(ax, start)
+    ax.set_ylabel("Height above ground [m]")
+    ax.set_ylim(bottom=min(0.0, float(np.nanmin(track.up_m, initial=0.0))))
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return fig
+
+
+# --- RSS ----------------------------------------------------------------------------------------
+
+
+def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
+    """Calibrated measurement, simulation and baselines over time, and the residual under them."""
+    start, score = start_of(data), panel.score
+    seconds = seconds_since(panel.time, start)
+    fig, (ax, below) = subplots((9.2, 5.6), 2, 1, sharex=True, height_ratios=(2.6, 1.0))
+    draw_out_of_coverage(ax, seconds, panel.simulated_out_of_coverage, "Z: no path in the simulation")
+    draw_out_of_coverage(
+        ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", height=0.05, hatch="xxxxx"
+    )
+    calibrated, residual = panel.calibrated_db, panel.residual_db
+    label = f"measured, {_offset(score.offset_db)} ({count(score.n)} scored)"
+    dots(ax, seconds, calibrated, 2.5, color=MEASURED, label=label, zorder=3.5)
+    for name, baseline in panel.baselines.items():
+        colour, dashes = BASELINE[name]
+        # each model is drawn where its own best offset puts it against the same calibrated points
+        level = baseline.level_dbm + (score.offset_db - baseline.offset_db)
+        ax.plot(
+            *thinned(seconds, level), color=colour, linestyle=dashes, linewidth=1.2,
+            zorder=2.5 if name == "two_ray" else 3.7,  # its dense fringes would hide the rest
+            label=f"{pretty(name)} (own offset)",
+        )  # fmt: skip
+    ax.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing", zorder=3)
+    if panel.stated is not None:
+        some = slice(None, None, max(1, len(seconds) // POINTS_PER_LINE))
+        band = panel.stated.columns(panel.simulated_dbm)
+        low, high = (band[f"simulated_{end}_dbm"][some] for end in ("low", "high"))
+        ax.fill_between(seconds[some], low, high, color=SIMULATED, alpha=0.15, linewidth=0, label="90 % band", zorder=1)
+    alone = lonely(panel.simulated_dbm)  # a line shows no single point between two gaps
+    ax.plot(seconds[alone], panel.simulated_dbm[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
+    draw_waypoints(ax, data.moments, start)
+    robust_limits(ax, [calibrated, panel.simulated_dbm])
+    ax.set_ylabel("RSS [dBm]")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), ncols=3, markerscale=3)
+    dots(below, seconds, residual, color="#0072B2", label="measured − simulated")
+    below.axhline(0.0, color=SIMULATED, linewidth=0.8)
+    if np.isfinite(score.rmse_db):
+        for sign in (-1, 1):
+            below.axhline(
+                sign * score.rmse_db, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 3)),
+                label=f"RMSE {score.rmse_db:.1f} dB" if sign == 1 else None,
+            )  # fmt: skip
+    draw_waypoints(below, data.moments, start, names=False)
+    robust_limits(below, [residual], around=0.0)
+    below.set_ylabel("Residual [dB]")
+    time_axis(below, start)
+    shown = legend_of(below, lambda label: label.startswith(("measured", "RMSE")))
+    below.legend(
+        *shown, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1
+    )  # fmt: skip
+    return fig
+
+
+def _offset(offset_db: float) -> str:
+    return f"offset {signed(offset_db)} dB" if np.isfinite(offset_db) else "no offset"
+
+
+def detection_reliability(score: DetectionScore) -> Figure:
+    """Share of detected samples over the probability that the predicted level gave them; area: samples."""
+    predicted, detected, n = np.array(score.reliability, dtype=np.float64).T
+    fig, ax = subplots((4.8, 3.6))
+    ax.plot([0, 100], [0, 100], color="0.6", linewidth=1, label="calibrated")
+    ax.plot(100 * predicted, 100 * detected, color=SIMULATED, linewidth=1)
+    ax.scatter(
+        100 * predicted,
+        100 * detected,
+        s=12 + 120 * n / n.max(),
+        color=SIMULATED,
+        zorder=3,
+        label="fifths of the samples",
+    )
+    ax.set(xlabel="Predicted probability of detection [%]", ylabel="Detected samples [%]", xlim=(0, 100), ylim=(0, 100))
+    ax.legend(loc="upper left")
+    return fig
+
+
+def ladder(rows: Sequence[LadderRow]) -> Figure:
+    """RMSE of each model on held-out segments, a marker per tower and channel."""
+    models = list(dict.fromkeys(row.model for row in rows))
+    channels = list(dict.fromkeys((row.tower, row.channel) for row in rows))
+    fig, ax = subplots((9.2, 0.36 * len(models) + 1.5))
+    for number, (tower, channel) in enumerate(channels):
+        scored = [
+            row for row in rows if (row.tower, row.channel) == (tower, channel) and np.isfinite(row.rmse_heldout_db)
+        ]
+        at = np.array([models.index(row.model) for row in scored]) + 0.5 * ((number + 0.5) / len(channels) - 0.5)
+        rmse = np.array([row.rmse_heldout_db for row in scored])
+        bounds = np.array([row.difference_to_best_ci95_db for row in scored]) - np.array(
+            [[row.difference_to_best_db] for row in scored]
+        )
+        colour = f"C{number % 10}"
+        spread = np.nan_to_num(np.abs(bounds.T))
+        ax.errorbar(rmse, at, xerr=spread, fmt="none", ecolor=colour, elinewidth=1.0, capsize=2.0)
+        ax.scatter(
+            rmse, at, s=26, facecolor=[colour if row.recommended else "white" for row in scored], edgecolor=colour,
+            marker="os^Dvp"[number % 6], zorder=3, label=f"{tower} {channel}".strip(),
+        )  # fmt: skip
+    ax.set_yticks(range(len(models)), models)
+    ax.invert_yaxis()
+    ax.set_xlabel("RMSE on held-out segments [dB]")
+    ax.grid(axis="y", visible=False)
+    legend_below(ax)
+    return fig

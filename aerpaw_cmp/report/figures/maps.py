@@ -1,0 +1,400 @@
+"""Figures of the `map` job: RSS and rank over the grid, distributions, correlation, errors of interpolation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from ...common.units import FloatArray, spread_out
+from ...site.scenes import drawn_buildings
+from ...site.site import Site
+from ..content.flight import RANKS
+from ..content.maps import JOINT, Correlation, LearningCurve, MapError, MapLayer, MapsData, RankMap, RssMap
+from ..kit.canvas import RANK_HATCH, TOWER, FigureSpec, beyond, colour_bar, plain_ticks, rank_colour, subplots
+from ..names import k_key, safe_name
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+T = TypeVar("T")
+LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
+MARKERS = "os^Dv<>P"
+COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
+MISSING: dict[str, Any] = {"facecolor": "#F2F2F2", "edgecolor": "#888888", "hatch": "//////", "linewidth": 0.0}
+# Maps side by side, at most.
+COLUMNS = 6
+
+
+def curve_style(number: int, *, marked: bool = False) -> dict[str, Any]:
+    """Colour and line of a curve, and its marker: told apart in grey, too."""
+    line = {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[(number + number // len(COLOURS)) % len(LINES)]}
+    return line | ({"marker": MARKERS[number % len(MARKERS)], "markersize": 5} if marked else {})
+
+
+def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
+    """Items under their keys, in the order of first appearance."""
+    result: dict[Any, list[T]] = {}
+    for item in items:
+        result.setdefault(key(item), []).append(item)
+    return result
+
+
+# --- one map ------------------------------------------------------------------------------------
+
+
+def half_width(at_m: FloatArray) -> float:
+    """Half of the spacing of cell centres [m]; 15 where there is one cell only."""
+    return float(at_m[1] - at_m[0]) / 2 if len(at_m) > 1 else 15.0
+
+
+def extent_m(data: MapsData) -> tuple[float, float, float, float]:
+    """Outer edges of the grid: west, east, south, north [m]."""
+    (west, east), (south, north) = (
+        (float(at[0]) - half_width(at), float(at[-1]) + half_width(at)) for at in (data.east_m, data.north_m)
+    )
+    return west, east, south, north
+
+
+def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | None = None, **options: Any) -> Any:
+    """One map: cells as an image, hatched where NaN, with what stands there and the borders of the towers.
+
+    Parameters
+    ----------
+    ax : Axes
+    data : MapsData
+        Site, axes of the grid and borders.
+    values : (rows, columns)
+        Of the cells, from south to north; NaN out of coverage.
+    highlight : str, optional
+        The only tower that counts: no borders are drawn then.
+    options
+        Of :meth:`matplotlib.axes.Axes.imshow`.
+
+    Returns
+    -------
+    matplotlib.image.AxesImage
+        For a colour bar.
+    """
+    ax.patch.set(**MISSING)  # cells without a value are transparent, so the hatched ground shows
+    image = ax.imshow(values, origin="lower", extent=extent_m(data), interpolation="none", zorder=1, **options)
+    _draw_overlay(ax, data.site, highlight)
+    for line in data.borders_m if highlight is None else ():
+        ax.plot(line[:, 0], line[:, 1], color="white", linewidth=1.8, zorder=3)
+        ax.plot(line[:, 0], line[:, 1], color="black", linewidth=0.9, linestyle=(0, (4, 2)), zorder=3.1)
+    west, east, south, north = extent_m(data)
+    ax.set(xlim=(west, east), ylim=(south, north))
+    ax.set_aspect("equal", adjustable="box")
+    ax.grid(visible=False)
+    ax.tick_params(labelsize=7)
+    ax.locator_params(axis="x", nbins=4)
+    return image
+
+
+def _draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
+    """Outlines of buildings and forests, and the towers; only the named tower when one is named."""
+    from matplotlib.collections import PolyCollection
+
+    for forest in site.forests:
+        outline = np.asarray(forest.area.exterior.coords)
+        ax.plot(outline[:, 0], outline[:, 1], color="white", linewidth=1.4, zorder=2)
+        ax.plot(outline[:, 0], outline[:, 1], color="#2F5D28", linewidth=0.8, linestyle=(0, (2, 1)), zorder=2.1)
+    outlines = [np.asarray(building.footprint.exterior.coords)[:, :2] for building in drawn_buildings(site)]
+    ax.add_collection(PolyCollection(outlines, facecolor="white", edgecolor="black", linewidth=0.7, zorder=2.2))
+    for name, tower in site.towers.items():
+        if highlight is None or name == highlight:
+            ax.plot(
+                tower.east_m, tower.north_m, marker="^", markersize=7, color=TOWER, markeredgecolor="white",
+                linestyle="none", zorder=5,
+            )  # fmt: skip
+
+
+def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
+    """Legend entries of what :func:`draw_map` draws."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    invented = " (illustrative)" if data.site.illustrative else ""
+    entries: list[Any] = [Patch(**MISSING, label="Z: out of coverage")]
+    entries.append(Line2D([], [], marker="^", color=TOWER, markeredgecolor="white", linestyle="none", label="tower"))
+    if drawn_buildings(data.site):
+        entries.append(Patch(facecolor="white", edgecolor="black", label=f"building{invented}"))
+    if data.site.forests:
+        entries.append(Line2D([], [], color="#2F5D28", linestyle=(0, (2, 1)), label=f"forest{invented}"))
+    if borders and data.borders_m:
+        entries.append(Line2D([], [], color="black", linestyle=(0, (4, 2)), label="border of the towers' areas"))
+    return entries
+
+
+def map_axes(data: MapsData, count: int) -> tuple[Figure, list[Axes]]:
+    """A figure with room for ``count`` maps and a legend, outer axes labelled."""
+    west, east, south, north = extent_m(data)
+    columns = min(count, COLUMNS)
+    rows = -(-count // columns)
+    columns = -(-count // rows)
+    width = min((7.4 - 0.15 * columns) / columns, 3.2)  # what a colour bar and the labels leave
+    height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
+    fig, grid = subplots((9.2, rows * (height + 0.35) + 1.0), rows, columns, squeeze=False, sharex=True, sharey=True)
+    axes: list[Axes] = list(grid.ravel())
+    for ax in axes[count:]:
+        ax.set_visible(False)
+    for row in grid:
+        row[0].set_ylabel("North [m]")
+    for number in range(count):
+        if number + columns >= count:
+            axes[number].set_xlabel("East [m]")
+            axes[number].tick_params(labelbottom=True)
+    return fig, axes[:count]
+
+
+# --- figures ------------------------------------------------------------------------------------
+
+
+def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]) -> Figure:
+    """Each tower alone and all jointly, for one antenna choice and height, on one colour scale [dBm]."""
+    fig, axes = map_axes(data, len(maps))
+    image = None
+    for ax, shown in zip(axes, maps, strict=True):
+        alone = None if shown.tower == JOINT else shown.tower
+        image = draw_map(ax, data, shown.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
+        ax.set_title(f"{shown.tower}: {100 * shown.coverage:.0f} %", fontsize=9)
+    levels = np.concatenate([entry.rss_dbm.ravel() for entry in maps])
+    colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits))
+    entries = overlay_legend(data, borders=any(entry.tower == JOINT for entry in maps))
+    fig.legend(handles=entries, loc="outside lower center", ncols=3)
+    return fig
+
+
+def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
+    """Rank at every height for one K."""
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    fig, axes = map_axes(data, len(maps))
+    colours = ListedColormap([rank_colour(r) for r in RANKS])
+    norm = BoundaryNorm([0.5, 1.5, 2.5, 3.5, 4.5], 4)
+    for ax, shown in zip(axes, maps, strict=True):
+        draw_map(ax, data, np.where(shown.rank > 0, shown.rank, np.nan), cmap=colours, norm=norm)
+        ax.set_title(f"{shown.altitude_m:g} m", fontsize=9)
+    entries = [Patch(facecolor=rank_colour(r), edgecolor="black", label=f"rank {r}") for r in RANKS]
+    fig.legend(handles=[*entries, *overlay_legend(data, borders=True)], loc="outside lower center", ncols=5)
+    return fig
+
+
+def layer_maps(data: MapsData, layers: Sequence[MapLayer]) -> Figure:
+    """One further quantity at every height, on one colour scale."""
+    fig, axes = map_axes(data, len(layers))
+    finite = np.concatenate([layer.values[np.isfinite(layer.values)] for layer in layers])
+    low, high = np.percentile(finite, [1, 99]) if len(finite) else (0.0, 1.0)
+    options: dict[str, Any] = {"cmap": "cividis", "vmin": low, "vmax": high}
+    if layers[0].difference:
+        reach = max(abs(low), abs(high))
+        if reach < 1e-6:  # few positions change: their own range
+            reach = max(float(np.abs(finite).max(initial=0.0)), 1e-6)
+        options = {"cmap": "cividis", "vmin": -reach, "vmax": reach}  # dark to light: signs differ in grey too
+    image = None
+    for ax, shown in zip(axes, layers, strict=True):
+        image = draw_map(ax, data, shown.values, **options)
+        ax.set_title(shown.axes["Height"], fontsize=9)
+    bar = colour_bar(fig, image, axes, layers[0].label, beyond(finite, options["vmin"], options["vmax"]))
+    if np.array_equal(finite, np.round(finite)):  # ranks: no colour stands for half of one
+        from matplotlib.ticker import MaxNLocator
+
+        bar.locator = MaxNLocator(integer=True)
+    fig.legend(handles=overlay_legend(data, borders=True), loc="outside lower center", ncols=3)
+    return fig
+
+
+def cdfs(maps: Sequence[RssMap]) -> Figure:
+    """Distribution of RSS per tower and jointly: a panel per height, positions out of coverage counted as below."""
+    panels = grouped(maps, lambda m: m.altitude_m)
+    fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, sharex=True, squeeze=False)
+    for ax, (height, members) in zip(axes, panels.items(), strict=True):
+        for number, tower_map in enumerate(members):
+            level = np.sort(tower_map.rss_dbm[np.isfinite(tower_map.rss_dbm)])
+            missing = tower_map.rss_dbm.size - len(level)
+            share = (missing + np.arange(1, len(level) + 1)) / tower_map.rss_dbm.size
+            shown = spread_out(len(level), 400)  # steps of a four-hundredth cannot be seen
+            joint = tower_map.tower == JOINT
+            ax.plot(
+                level[shown], share[shown], **curve_style(number),
+                linewidth=2.0 if joint else 1.2,
+                label=f"tower {tower_map.tower}" if tower_map.tower.startswith("_") else tower_map.tower,
+            )  # fmt: skip
+        ax.set(title=f"{height:g} m", xlabel="RSS [dBm]", ylim=(0, 1.0))
+    axes[0].set_ylabel("Share of positions below")
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    return fig
+
+
+def rank_shares(maps: Sequence[RankMap]) -> Figure:
+    """Shares of Z and rank 1 to 4 against height, a panel per K and learned receiver."""
+    panels = grouped(maps, lambda entry: entry.source)
+    fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, squeeze=False)
+    for ax, (source, members) in zip(axes, panels.items(), strict=True):
+        at = np.arange(len(members))
+        share = 100 * np.array([member.share for member in members])
+        below = np.zeros(len(members))
+        for column, value in enumerate((0, *RANKS)):
+            face: Any = "white" if value == 0 else rank_colour(value)
+            hatch = "//////" if value == 0 else RANK_HATCH[value]
+            ax.bar(
+                at, share[:, column], 0.82, bottom=below, color=face, linewidth=0.5, hatch=hatch,
+                edgecolor="#777777" if value in (0, 1) else "black",
+                label="Z: out of coverage" if value == 0 else f"rank {value}",
+            )  # fmt: skip
+            below = below + share[:, column]
+        ax.set_xticks(at, [f"{member.altitude_m:g}" for member in members], fontsize=7)
+        ax.set(title=source, xlabel="Height [m]")
+        ax.grid(visible=False)
+    axes[0].set_ylabel("Share of positions [%]")
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    return fig
+
+
+def correlations(curves: Sequence[Correlation]) -> Figure:
+    """Correlation against distance and its model, a panel per kind, at most three in a row."""
+    columns = min(len(curves), 3)
+    rows = -(-len(curves) // columns)
+    fig, axes = subplots((9.2, 0.2 + 3.0 * rows), rows, columns, squeeze=False)
+    for ax in axes.flat[len(curves) :]:
+        ax.set_visible(False)
+    for ax, curve in zip(axes.flat, curves, strict=False):
+        ax.plot(
+            curve.distance_m, curve.correlation, marker="o", markersize=5, linestyle="none", color="#0072B2",
+            label="data",
+        )  # fmt: skip
+        if curve.fit is not None and curve.fit_distance_m is not None:
+            ax.plot(curve.fit_distance_m, curve.fit, color="#111111", linewidth=1.3, label=curve.fit_label or "model")
+        ax.set(title=curve.title, xlabel="Distance [m]", ylabel="Correlation")
+        ax.legend(loc="best", fontsize=7.5)
+    return fig
+
+
+def error_curves(errors: Sequence[MapError]) -> Figure:
+    """MAE against height for every method, a panel per K."""
+    panels = grouped(errors, lambda e: e.k)
+    fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, squeeze=False)
+    for ax, (k, members) in zip(axes, panels.items(), strict=True):
+        for number, (method, rows) in enumerate(grouped(members, lambda e: e.method).items()):
+            rows = sorted(rows, key=lambda e: e.altitude_m)
+            ax.plot(
+                [entry.altitude_m for entry in rows], [entry.mae for entry in rows], **curve_style(number, marked=True),
+                linewidth=1.2, label=method,
+            )  # fmt: skip
+        ax.set(title=f"K = {k_key(k)}", xlabel="Height [m]")
+    worst = max((error.mae for error in errors if np.isfinite(error.mae)), default=1.0)
+    axes[0].set_ylim(0.0, 1.08 * worst if worst > 0 else 1.0)  # shared by all panels
+    axes[0].set_ylabel("Mean absolute error of the rank")
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return fig
+
+
+def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
+    """MAE against the number of samples."""
+    fig, ax = subplots((9.2, 3.0))
+    for number, curve in enumerate(curves):
+        ax.semilogx(
+            curve.samples, curve.mae, **curve_style(number, marked=True), label=curve.method,
+        )  # fmt: skip
+    ax.set_ylim(bottom=0)
+    plain_ticks(ax.xaxis)
+    ax.set(xlabel="Number of samples", ylabel="Mean absolute error of the rank")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return fig
+
+
+# --- all figures ---------------------------------------------------------------------------------
+
+
+def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
+    """One colour scale for all maps [dBm]: the 1 to 99.5 % range, to whole 5 dB."""
+    parts = [entry.rss_dbm[np.isfinite(entry.rss_dbm)] for entry in maps]
+    finite = np.concatenate(parts) if parts else np.zeros(0)
+    if not len(finite):
+        return -100.0, -50.0
+    low, high = np.percentile(finite, [1.0, 99.5])
+    return float(5 * np.floor(low / 5)), float(max(5 * np.ceil(high / 5), 5 * np.floor(low / 5) + 5))
+
+
+def figure_specs(data: MapsData) -> list[FigureSpec]:
+    """Every figure that the data allow, in reading order."""
+    return [*_rss_specs(data), *_rank_specs(data), *_kriging_specs(data)]
+
+
+def _under(foliage: str) -> str:
+    return f", foliage {foliage}" if foliage else ""
+
+
+def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
+    levels = (*data.rss, *data.corrected)
+    limits = _level_limits(levels)
+    by_height = grouped(levels, lambda m: (f"{m.antennas}{_under(m.foliage)}", m.altitude_m))
+    for (antennas, height), maps in by_height.items():
+        words = f"{antennas}, {height:g} m"
+        yield FigureSpec(
+            f"rss_map_{safe_name(words)}", "rss", f"RSS, {words}",
+            "Each tower alone and, where shown, jointly with the nearest tower serving. Percentages: positions in "
+            "coverage. One colour scale for all RSS maps.",
+            partial(rss_maps, data, maps, limits),
+        )  # fmt: skip
+    for words, maps in grouped(levels, lambda m: f"{m.antennas}{_under(m.foliage)}").items():
+        yield FigureSpec(
+            f"rss_cdf_{safe_name(words)}", "rss", f"Distribution of RSS, {words}",
+            "Share of positions with an RSS below the value; a curve starts at its share of Z.",
+            partial(cdfs, maps),
+        )  # fmt: skip
+
+
+def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
+    for words, maps in grouped(data.rank, lambda m: f"{m.source}{_under(m.foliage)}").items():
+        yield FigureSpec(
+            f"rank_map_{safe_name(words)}", "rank", f"Rank, {words}", "The nearest tower serves. Hatched: no path.",
+            partial(rank_grid, data, maps),
+        )  # fmt: skip
+    for words, maps in grouped(data.rank, lambda m: _under(m.foliage)).items():
+        yield FigureSpec(
+            "_".join(["rank_share", *([safe_name(words)] if words else [])]), "rank", f"Rank against height{words}",
+            "Share of positions with each rank; Z is out of coverage.",
+            partial(rank_shares, maps),
+        )  # fmt: skip
+    for tower, maps in grouped(data.corrected_rank, lambda m: m.tower).items():
+        yield FigureSpec(
+            f"rank_map_learned_{safe_name(tower)}", "rank", f"Rank of {tower}, corrected",
+            "Most probable rank by the receiver that flights taught; all headings count alike.",
+            partial(rank_grid, data, [m for m in maps if m.k is None]),
+        )  # fmt: skip
+        yield FigureSpec(
+            f"rank_share_learned_{safe_name(tower)}", "rank", f"Rank of {tower} against height, raw and corrected",
+            "Raw: share of positions with each rank of the traced channel, by K; Z is out of coverage. Learned "
+            "receiver: mean probability of each rank.",
+            partial(rank_shares, maps),
+        )  # fmt: skip
+    for name, layers in grouped((m for m in data.layers if m.label), lambda m: m.quantity).items():
+        caption = f"{layers[0].label[0].upper()}{layers[0].label[1:]}. Hatched: no path."
+        yield FigureSpec(f"layer_{safe_name(name)}", "layers", name, caption, partial(layer_maps, data, layers))
+
+
+def _kriging_specs(data: MapsData) -> Iterator[FigureSpec]:
+    if data.correlation:
+        yield FigureSpec(
+            "correlation", "kriging", "Spatial correlation",
+            "Pearson correlation between positions against their distance, and the fitted model. "
+            + " ".join(f"{c.title}: {c.excluded} constant positions left out." for c in data.correlation),
+            partial(correlations, data.correlation),
+        )  # fmt: skip
+    for evaluation, errors in grouped(data.errors, lambda error: error.evaluation).items():
+        yield FigureSpec(
+            f"mae_{safe_name(evaluation)}", "kriging", f"Error of interpolated rank, {evaluation}",
+            "Mean absolute error against height; lower is better.",
+            partial(error_curves, errors),
+        )  # fmt: skip
+    if data.learning:
+        yield FigureSpec(
+            "learning_curve", "kriging", "How many samples are needed",
+            "Mean absolute error against the number of samples given.",
+            partial(learning_curves, data.learning),
+        )  # fmt: skip

@@ -1,0 +1,1 @@
+"""Parts of every page: shell, canvas, shapes, files."""

@@ -1,0 +1,241 @@
+"""The shell of every page: templates, scripts, the content policy, numbers and instants as text.
+
+A page is one file that needs nothing else and no network; without a script its figures still stand. Every text that
+comes from a log or a configuration is escaped by the template engine.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+import math
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import cache
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup, escape
+
+from ...logs.records import has_wall_clock
+from ..names import iso_time, k_key
+from .canvas import FigureSpec, Picture, write_figures
+from .files import json_text, write_file
+
+# ``script``: 'none', or the digest of the page's one script. Lets a browser refuse whatever would be loaded or run
+# besides, should a hostile log ever get past the escaping.
+_CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {script}"
+
+
+def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
+    """A number for a table; an en dash where there is none.
+
+    Examples
+    --------
+    >>> number(-3.14159, 2), number(float("nan")), number(-0.004, 2)
+    ('−3.14', '–', '0.00')
+    """
+    if value is None or not math.isfinite(value):
+        return "–"
+    rounded = round(value, decimals) + 0.0  # what rounds to zero has no sign
+    text = f"{rounded:,.{decimals}f}".replace(",", "\u202f").replace("-", "\u2212")
+    return f"{text}\u202f{unit}" if unit else text
+
+
+def interval(value: tuple[float, float] | None, decimals: int = 1) -> str:
+    """An interval as ``[low, high]``, or nothing; "n/a" where there are too few independent samples."""
+    if value is None:
+        return ""
+    if not all(map(math.isfinite, value)):
+        return "n/a"
+    return f"[{number(value[0], decimals)}, {number(value[1], decimals)}]"
+
+
+def percent(share: float | None, decimals: int = 0) -> str:
+    """A share as a percentage; an en dash where there is none."""
+    return number(None if share is None else 100 * share, decimals, "%")
+
+
+def minute(instant: str) -> str:
+    """An ISO 8601 instant of UTC to the minute; any other text as it is.
+
+    Examples
+    --------
+    >>> minute("2026-11-23T06:11:20+00:00"), minute("later")
+    ('2026-11-23 06:11 UTC', 'later')
+    """
+    parts = re.fullmatch(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d):\d\d(?:\.\d+)?(?:Z|\+00:00)", instant)
+    return instant if parts is None else f"{parts[1]} {parts[2]} UTC"
+
+
+def duration(seconds: float | None) -> str:
+    """Seconds with three digits that count, in ms below one second.
+
+    Examples
+    --------
+    >>> duration(0.000412), duration(0.1731), duration(5.1913), duration(None)
+    ('0.412\u202fms', '173\u202fms', '5.19\u202fs', '–')
+    """
+    if seconds is None or not math.isfinite(seconds):
+        return "–"
+    value, unit = (1000.0 * seconds, "ms") if seconds < 1.0 else (seconds, "s")
+    return number(value, 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3, unit)
+
+
+def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """Nested settings as dotted names and plain text."""
+    for key, value in settings.items():
+        name = f"{above}.{key}" if above else str(key)
+        if isinstance(value, Mapping):
+            yield from flat(value, name)
+        else:
+            yield name, ", ".join(map(short, value)) if isinstance(value, (list, tuple)) else short(value)
+
+
+def clock(instant: Any, start: Any) -> str:
+    """Time of day (UTC), or seconds after ``start`` where the log has relative times only.
+
+    Examples
+    --------
+    >>> clock(np.datetime64("2025-06-01T14:00:03.2"), np.datetime64("2025-06-01T14:00:00"))
+    '14:00:03'
+    >>> clock(np.datetime64("1970-01-01T00:00:03.2"), np.datetime64("1970-01-01"))
+    '3.2'
+    """
+    if has_wall_clock(start):
+        return str(iso_time([instant])[0])[11:19]
+    return number(float((instant - start) / np.timedelta64(1, "s")))
+
+
+def more(rows: Sequence[Any], limit: int) -> str:
+    """Words for a caption where a table does not show all rows.
+
+    Examples
+    --------
+    >>> more([1, 2, 3], 2), more([1, 2], 2)
+    (' (the first 2 of 3; the files beside this page hold all)', '')
+    """
+    return f" (the first {limit} of {len(rows)}; the files beside this page hold all)" if len(rows) > limit else ""
+
+
+def short(value: Any) -> str:
+    """A value as text; numbers to 6 digits, which metrics.json holds in full; an en dash where there is none."""
+    if value is None:
+        return "–"
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def coded(text: str) -> Markup:
+    """Text whose parts between backquotes are commands or keys; all of it escaped.
+
+    Examples
+    --------
+    >>> str(coded("Next: `a < b`."))
+    'Next: <code>a &lt; b</code>.'
+    """
+    parts = str(text).split("`")
+    return Markup("").join(
+        Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(parts)
+    )
+
+
+def policy(script: str = "") -> str:
+    """The content policy of a page with one script, or none."""
+    return _CONTENT_POLICY.format(script=digest(script) if script else "'none'")
+
+
+def digest(text: str) -> str:
+    """A script or style as a content policy names it."""
+    return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
+
+
+def picture_uri(picture: Picture) -> str:
+    """A picture as a data URI: its small PNG where it has one, else the SVG."""
+    kind, content = ("png", picture.inline) if picture.inline else ("svg+xml", picture.formats["svg"])
+    return f"data:image/{kind};base64," + base64.b64encode(content).decode("ascii")
+
+
+@cache
+def environment() -> Any:
+    """The template engine: everything escaped, an undefined name is an error."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("aerpaw_cmp.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        num=number, coded=coded,
+        interval=interval, percent=percent, duration=duration, minute=minute, k=k_key,
+        flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri, more=more,
+    )  # fmt: skip
+    return environment
+
+
+def script(*names: str) -> str:
+    """Scripts of the page, one after the other."""
+    folder = resources.files("aerpaw_cmp.report") / "templates"
+    return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
+
+
+def rendered(template: str, scripts: Sequence[str] = (), **content: Any) -> str:
+    """A page from its template, with its scripts and the content policy that lets a browser run them alone."""
+    code = script(*scripts) if scripts else ""
+    page = environment().get_template(f"{template}.html.jinja")
+    text: str = page.render(script=Markup(code), content_policy=policy(code), **content)
+    return text
+
+
+def as_json(content: Mapping[str, Any]) -> str:
+    """Text for a script element: no name can close it."""
+    return json.dumps(content, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
+
+
+def embedded(content: Mapping[str, Any] | None) -> Markup:
+    """The data of a page's script, inside the page; empty without any."""
+    return Markup(as_json(content)) if content else Markup("")
+
+
+def write_page(
+    folder: Path, name: str, numbers: Mapping[str, Any], specs: Iterable[FigureSpec], **content: Any
+) -> list[Path]:
+    """Write ``metrics.json``, ``figures/`` and the page NAME.html of a job.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        Of the page and its template.
+    numbers : mapping
+        For metrics.json.
+    specs : iterable of FigureSpec
+        Figures; the page has them by section in ``sections``.
+    content
+        For the template.
+
+    Returns
+    -------
+    list of Path
+        The page first.
+    """
+    drawn, figures = write_figures(list(specs), folder / "figures")
+    page = rendered(name, sections=by_section(drawn), **content)
+    return [
+        write_file(folder / f"{name}.html", page),
+        write_file(folder / "metrics.json", json_text(numbers)),
+        *figures,
+    ]
+
+
+def by_section(pictures: Sequence[Picture]) -> dict[str, list[Picture]]:
+    """Pictures in their order, by the section that they stand in."""
+    sections: dict[str, list[Picture]] = {}
+    for picture in pictures:
+        sections.setdefault(picture.spec.section, []).append(picture)
+    return sections

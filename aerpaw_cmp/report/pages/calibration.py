@@ -1,0 +1,180 @@
+"""calibration.html with metrics.json and figures: antennas over the sphere, where flights looked, scores left out."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from ...common.jsonable import json_object, named
+from ...compare.learning.calibration import BASELINES
+from ..content.calibration import AntennaMap, CalibrationData
+from ..content.made import about
+from ..kit import canvas
+from ..kit.canvas import FigureSpec
+from ..kit.page import write_page
+from ..names import safe_name
+
+SPLIT_TITLE = {
+    "flight_left_out": "each flight left out",
+    "altitude_left_out": "and its cruising height",
+    "heading_left_out": "and an eighth of the compass of headings",
+    "sector_left_out": "and a sector of 60 degrees at the tower",
+    "route_left_out": "a segment of the flight's own route",
+    "other_flights": "flights that had no part (--score)",
+}
+
+
+def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
+    """The numbers of the page under stable names."""
+    return json_object(
+        calibration=data.name,
+        **named(data, "flights trained_on scores controls mounts strengths ground words warnings"),
+        learning_curve={"points": data.curve, "one_more_rmse_db": data.one_more_rmse_db},
+        antennas=[
+            {"name": a.name, "share_of_sphere_seen": _share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
+        ],
+        rank=data.rank or {},
+        **about(data),
+    )
+
+
+def _share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
+    """Share of the sphere within some degrees of a direction that a flight looked in."""
+    t, p = np.radians(antenna.theta_deg)[:, None], np.radians(antenna.azimuth_deg)[None, :]
+    grid = np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
+    near = np.zeros(grid.shape[:2], bool)
+    for part in np.array_split(antenna.flown, max(1, len(antenna.flown) // 500)):
+        near |= (grid @ part.T > np.cos(np.radians(within_deg))).any(axis=-1)
+    weight = np.sin(t) * np.ones_like(near)
+    return float((near * weight).sum() / weight.sum())
+
+
+def draw_antenna(antenna: AntennaMap) -> Figure:
+    """Gain and its standard deviation over azimuth and elevation, with the directions flown."""
+    fig, axes = canvas.subplots((9.2, 6.4), 2, 1, sharex=True)
+    elevation = 90.0 - antenna.theta_deg
+    azimuth = np.append(antenna.azimuth_deg, 360.0)
+
+    def closed(values: Any) -> Any:
+        return np.concatenate([values, values[:, :1]], axis=1)
+
+    level = closed(antenna.gain_dbi)
+    low, high = np.percentile(level, [2, 98])
+    for ax, values, label, limits in (
+        (axes[0], level, "gain [dBi]", (low, high)),
+        (axes[1], closed(antenna.sd_db), "standard deviation [dB]", (0.0, float(antenna.sd_db.max()))),
+    ):
+        mesh = ax.pcolormesh(azimuth, elevation, values, shading="gouraud", vmin=limits[0], vmax=limits[1],
+                             cmap="viridis" if ax is axes[0] else "magma", rasterized=True)  # fmt: skip
+        fig.colorbar(mesh, ax=ax, label=label, pad=0.01)
+        ax.set_ylabel("elevation [deg]")
+        ax.set_yticks([-90, -45, 0, 45, 90])
+    at = np.degrees(np.arctan2(antenna.flown[:, 1], antenna.flown[:, 0])) % 360.0
+    up = np.degrees(np.arcsin(np.clip(antenna.flown[:, 2], -1, 1)))
+    for ax, colour in zip(axes, ("black", "white"), strict=True):
+        ax.plot(at, up, ".", markersize=1.5, color=colour, alpha=0.6, label="flown")
+    axes[1].set_xlabel("azimuth, counter-clockwise from forward or east [deg]")
+    axes[1].set_xticks(range(0, 361, 45))
+    axes[0].set_title(antenna.name)
+    return fig
+
+
+def draw_scores(data: CalibrationData) -> Figure:
+    """Mean RMSE of every split and control beside free space."""
+    left_out = data.scores["flight_left_out"]
+    rows = [(title, _mean(left_out, key)) for key, title in BASELINES.items()]
+    rows += [(SPLIT_TITLE.get(k, k), _mean(v)) for k, v in data.scores.items()]
+    rows += [(f"control: {k}", _mean(v)) for k, v in data.controls.items()]
+    rows = [(name, value) for name, value in rows if np.isfinite(value)]
+    fig, ax = canvas.subplots((9.2, 0.4 * len(rows) + 1.0))
+    names, values = [r[0] for r in rows][::-1], [r[1] for r in rows][::-1]
+    pale = [n in BASELINES.values() or "control" in n for n in names]
+    colours = [canvas.OUT_OF_COVERAGE if reference else canvas.SIMULATED for reference in pale]
+    ax.barh(names, values, color=colours)
+    for y, value in enumerate(values):
+        ax.text(value, y, f" {value:.2f}", va="center", fontsize=8)
+    ax.set_xlabel("mean RMSE over flights and channels [dB]")
+    return fig
+
+
+def draw_curve(data: CalibrationData) -> Figure:
+    """Error on flights left out against the number of flights learned from, and what one more would bring."""
+    fig, ax = canvas.subplots((7.0, 3.8))
+    flights = [p["flights"] for p in data.curve]
+    for key, label, colour in (
+        ("rmse_db", "as logged", canvas.SIMULATED),
+        ("rmse_4s_db", "4 s means", canvas.MEASURED),
+    ):
+        ax.plot(flights, [p[key] for p in data.curve], "o-", color=colour, label=label)
+    ax.plot(
+        [flights[-1], flights[-1] + 1], [data.curve[-1]["rmse_db"], data.one_more_rmse_db], "o--", fillstyle="none",
+        color=canvas.SIMULATED, label="one flight more (extrapolated)",
+    )  # fmt: skip
+    ax.set_xticks([*flights, flights[-1] + 1])
+    ax.set(xlabel="flights learned from", ylabel="RMSE on a flight left out [dB]")
+    ax.legend()
+    return fig
+
+
+def draw_place(place: Mapping[str, Any], name: str) -> Figure:
+    """The field over places that the fit with one has, along the flights."""
+    fig, ax = canvas.subplots((7.0, 6.0))
+    points = ax.scatter(place["east_m"], place["north_m"], c=place["gain_db"], s=4, cmap="coolwarm", rasterized=True)
+    fig.colorbar(points, ax=ax, label="field over places [dB]")
+    ax.set_aspect("equal")
+    ax.set(xlabel="east [m]", ylabel="north [m]", title=name)
+    return fig
+
+
+def _mean(rows: Sequence[Mapping[str, Any]], key: str = "rmse_db") -> float:
+    return float(np.mean([r[key] for r in rows])) if rows else float("nan")
+
+
+def figure_specs(data: CalibrationData) -> Iterator[FigureSpec]:
+    """All figures."""
+    if data.scores.get("flight_left_out"):
+        yield FigureSpec(
+            "scores", "scores", "Errors on what was left out",
+            "Mean RMSE after one offset per flight and channel. Nothing is scored where it was learned.",
+            partial(draw_scores, data),
+        )  # fmt: skip
+    if len(data.curve) > 1:
+        yield FigureSpec(
+            "learning_curve", "scores", "Expected gain of one flight more",
+            f"Mean RMSE over {data.curve[0]['series']} series, each predicted by subsets of the other flights. The "
+            "last point is extrapolated: the squared error as a constant and a part that falls with the number of "
+            "flights.",
+            partial(draw_curve, data),
+        )  # fmt: skip
+    for a in data.antennas:
+        yield FigureSpec(
+            f"antenna_{safe_name(a.name)}", "antennas", a.name,
+            f"Flights saw directions within 10 degrees of {100 * _share_seen(a):.0f} % of the sphere (dots). "
+            "Elsewhere the gain is a guess, and its standard deviation says so. The level is normalised to a mean of "
+            "0 dBi over the sphere: it is not identified beside the offsets.",
+            partial(draw_antenna, a),
+        )  # fmt: skip
+    if data.place is not None:
+        yield FigureSpec(
+            "place", "place", "Field over places",
+            "What the fit with a place field puts into places instead of antennas. No antenna file has it.",
+            partial(draw_place, data.place, "field over places"),
+        )  # fmt: skip
+
+
+def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:
+    """Write ``calibration.html``, ``metrics.json`` and ``figures/``."""
+    rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
+    columns = ("rmse_db", "rmse_4s_db", *BASELINES)
+    return write_page(
+        folder, "calibration", calibration_metrics(data), figure_specs(data),
+        data=data,
+        split_title=SPLIT_TITLE,
+        baselines=BASELINES,
+        means={name: ([_mean(scores, key) for key in columns], len(scores)) for name, scores in rows.items()},
+    )  # fmt: skip

@@ -1,0 +1,262 @@
+"""campaign.html, campaign.json and campaign.csv, with the figures beside them."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pandas as pd
+
+from ...common.cells import guarded
+from ...common.jsonable import fields_of, json_safe, named
+from ...common.stages import Progress, silent
+from ...compare.statistics.passes import Repeated
+from ..content.campaign import CampaignData, RankPairing, Repeat, RssRow
+from ..content.made import about
+from ..exports.formats import write_exports
+from ..exports.points import of_campaign
+from ..figures import campaign as campaign_figures
+from ..kit import canvas
+from ..kit.canvas import Picture
+from ..kit.files import json_text, write_file
+from ..kit.page import by_section, rendered
+from ..words import campaign as words
+from ..words.flight import pretty
+
+# Warnings that stand on the page at all.
+MANY = 200
+
+# Flights of a table that has a column or a heading for each.
+_FEW_FLIGHTS = 20
+
+# Rows of a table on the page; the files beside it hold all.
+ROWS_SHOWN = 300
+
+# From so many rows on campaign.json is written without indentation.
+_COMPACT_ROWS = 2000
+
+# Fields of a row that are samples, not numbers of a table.
+ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
+
+
+def _entries(items: Iterable[Any], without: Sequence[str]) -> list[dict[str, Any]]:
+    return [{f.name: getattr(x, f.name) for f in dataclasses.fields(x) if f.name not in without} for x in items]
+
+
+def campaign_metrics(data: CampaignData) -> dict[str, Any]:
+    """The numbers of the page under stable names; what does not exist is None."""
+    failed = {f.flight for f in data.failures}
+    result = {
+        "campaign": data.name,
+        **named(data, "title settings reference rank rank_transfers workers"),
+        "flights": [
+            {"flight": name, "ok": name not in failed, "synthetic": name in data.synthetic} for name in data.flights
+        ],
+        "failures": _entries(data.failures, ("traceback",)),
+        "mean_rmse_db": words.mean_rmse(data),
+        "likely_cause": fields_of(words.cause(data)),
+        "rss": _entries(data.rss, (*ARRAYS, "difference")),
+        "calibration": {"per": data.calibration, "groups": data.pooled},
+        "repeatability": {
+            **named(data, "radius_m heading_within_deg cell_m"),
+            "pairs_total": len(data.repeats),
+            "links": by_link(data.repeats),
+            "pairs": telling(data.repeats),
+            "rank_pairs_total": len(data.rank_repeats),
+            "rank_pairs": telling(data.rank_repeats),
+            "table": f"{_PAIR_TABLE}.csv" if data.repeats or data.rank_repeats else None,
+        },
+        "season": {
+            **named(data.season, "held_out started ranking drift"),
+            "cells": 0 if data.season.places is None else len(data.season.places.cells),
+        },
+        **about(data),
+    }
+    safe: dict[str, Any] = json_safe(result)
+    return safe
+
+
+def _campaign_frame(data: CampaignData) -> pd.DataFrame:
+    """One row per flight, setting, tower and channel (``kind`` rss) or K (``kind`` rank), and per failure."""
+    rows = [
+        {"kind": "rss", **cells(row), **{f"{name}_rmse_db": error for name, error in row.baselines.items()},
+         "fitted": " ".join(row.fitted)}
+        for row in data.rss
+    ]  # fmt: skip
+    rows += [{"kind": "rank", **cells(row)} for row in data.rank]
+    rows += [{"kind": "failed", **cells(failure)} for failure in data.failures]
+    frame: pd.DataFrame = pd.DataFrame(rows, columns=_CSV_COLUMNS)
+    return frame
+
+
+_CSV_COLUMNS = [
+    "kind", "flight", "setting", "tower", "channel", "k", "offset_db", "offset_low_db", "offset_high_db", "rmse_db",
+    "rmse_low_db", "rmse_high_db", "free_space_rmse_db", "two_ray_rmse_db", "pooled_offset_db", "pooled_rmse_db", "n",
+    "n_out_of_coverage", "held_out_offset_db", "held_out_rmse_db", "correlation", "correlation_low", "correlation_high",
+    "at_search_edge", "lag_s", "lag_verdict",
+    "fitted", "total_variation", "total_variation_low", "total_variation_high", "agreement", "agreement_low",
+    "agreement_high", "kappa", "wasserstein", "best_k", "message",
+]  # fmt: skip
+
+
+def _errors_of_pairs(data: CampaignData) -> list[tuple[Any, float, float]]:
+    """Each pair of flights with the RMSE of both under the reference setting."""
+    rmse = {row.key: row.rmse_db for row in data.reference_rows}
+    return [
+        (
+            pair,
+            rmse.get((pair.first, pair.tower, pair.channel), float("nan")),
+            rmse.get((pair.second, pair.tower, pair.channel), float("nan")),
+        )
+        for pair in data.repeats
+    ]
+
+
+def halves(data: CampaignData) -> list[tuple[RssRow, Repeated | None, Repeated]]:
+    """Rows whose first and second half pass the same places: with like headings, and with any."""
+    rows = []
+    for row in data.reference_rows:
+        every = row.within.get("any_heading")
+        if every is not None and every.n:
+            rows.append((row, row.within.get("same_heading"), every))
+    return rows
+
+
+def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
+    """The whole page."""
+    return rendered(
+        "campaign",
+        data=data,
+        sections=by_section(pictures),
+        mean_rmse=words.mean_rmse(data),
+        pair_errors=_errors_of_pairs(data),
+        halves=halves(data),
+        headline=words.headline(data),
+        verdict=words.verdict(data),
+        against_baselines=words.against_baselines,
+        warnings=words.warnings(data),
+        baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
+        rss_flights=words.rss_flights(data),
+        pretty=pretty,
+        files=files,
+        season=data.season.over_all(),
+        worst=words.worst_flights(data),
+        worst_rows=sorted(data.rss, key=lambda r: -np.nan_to_num(r.rmse_db, nan=-1.0))[:ROWS_SHOWN]
+        if len(data.rss) > ROWS_SHOWN
+        else data.rss,
+        few=words.FEW,
+        many=MANY,
+        few_flights=_FEW_FLIGHTS,
+        rows_shown=ROWS_SHOWN,
+    )
+
+
+def write_campaign(
+    data: CampaignData, folder: str | Path, *, exports: Sequence[str] = (), progress: Progress = silent
+) -> list[Path]:
+    """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; gives the files, page first.
+
+    Pairs of flights at the same places stand in ``pairs.csv``, all of them; campaign.json has the telling ones.
+
+    With ``exports`` also the samples of the first setting in those formats
+    (:data:`aerpaw_cmp.report.exports.formats.FORMATS`).
+
+    Parameters
+    ----------
+    data : CampaignData
+    folder : str or Path
+    exports : sequence of str
+        Formats.
+    progress : Progress
+        Figures done.
+
+    Returns
+    -------
+    list of Path
+    """
+    folder = Path(folder)
+    indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None
+    table = _campaign_frame(data)
+    written = [
+        write_file(folder / "campaign.json", json_text(campaign_metrics(data), indent)),
+        write_file(folder / "campaign.csv", guarded(table).to_csv(index=False, lineterminator="\n")),
+    ]
+    if data.repeats or data.rank_repeats:
+        pairs = pair_frame(data)
+        written.append(
+            write_file(folder / f"{_PAIR_TABLE}.csv", guarded(pairs).to_csv(index=False, lineterminator="\n"))
+        )
+    tables = [path.name for path in written]
+    drawn, pictures = canvas.write_figures(campaign_figures.figure_specs(data), folder / "figures")
+    written += pictures
+    samples = of_campaign(data) if exports else None
+    exported = [] if samples is None else write_exports(samples, folder, exports, progress)
+    files = [*tables, *(path.relative_to(folder).as_posix() for path in exported)]
+    written += exported
+    page = write_file(folder / "campaign.html", campaign_page(data, drawn, files))
+    return [page, *written]
+
+
+# --- pairs of flights at the same places -----------------------------------------------------------------------------
+
+# Pairs of each kind that campaign.json lists; of more, those with the most places.
+LISTED_PAIRS = 1000
+
+# The file with all of them, less its ending.
+_PAIR_TABLE = "pairs"
+
+
+Pair = TypeVar("Pair", Repeat, RankPairing)
+
+
+def telling(pairs: Sequence[Pair], most: int = LISTED_PAIRS) -> list[Pair]:
+    """All pairs, or of more than ``most`` those with the most places, in their order."""
+    chosen = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))[:most]
+    return [pairs[i] for i in sorted(chosen)]
+
+
+def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
+    """Per tower and channel: pairs of flights, those that meet, their places, and how much they differ [dB]."""
+    groups: dict[tuple[str, str], list[Repeat]] = {}
+    for pair in pairs:
+        groups.setdefault((pair.tower, pair.channel), []).append(pair)
+    rows = []
+    for (tower, channel), members in groups.items():
+        meeting = [pair for pair in members if pair.n]
+        rmse = np.array([pair.rmse_db for pair in meeting if np.isfinite(pair.rmse_db)])
+        low, median, high = np.quantile(rmse, (0.1, 0.5, 0.9)).tolist() if len(rmse) else (float("nan"),) * 3
+        rows.append(
+            {
+                "tower": tower,
+                "channel": channel,
+                "pairs": len(members),
+                "meeting": len(meeting),
+                "n": sum(pair.n for pair in meeting),
+                "rmse_mean_db": float(rmse.mean()) if len(rmse) else float("nan"),
+                "rmse_quantiles_db": {"10": low, "50": median, "90": high},
+            }
+        )
+    return rows
+
+
+def pair_frame(data: CampaignData) -> pd.DataFrame:
+    """One row per pair of flights, tower and channel (``kind`` rss), or tower (``kind`` rank)."""
+    kinds: dict[str, Sequence[Any]] = {"rss": data.repeats, "rank": data.rank_repeats}
+    table: pd.DataFrame = pd.DataFrame([{"kind": kind, **cells(p)} for kind, pairs in kinds.items() for p in pairs])
+    return table
+
+
+def cells(record: Any) -> dict[str, Any]:
+    """Fields of a record as cells of a table; an interval ``x_ci95`` becomes ``x_low`` and ``x_high``."""
+    out: dict[str, Any] = {}
+    for field in dataclasses.fields(record):
+        value = getattr(record, field.name)
+        if "ci95" in field.name:
+            low, high = value or (float("nan"), float("nan"))
+            out |= {field.name.replace("ci95", "low"): low, field.name.replace("ci95", "high"): high}
+        else:
+            out[field.name] = value
+    return out

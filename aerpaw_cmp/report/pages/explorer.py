@@ -1,0 +1,175 @@
+"""The data of the linked views: what the page's script draws, as one block of packed arrays.
+
+Every number of the page's script comes from here; it computes only what a span or a switch changes (offset, RMSE,
+correlation and histograms of the chosen samples), by the same formulas as :mod:`aerpaw_cmp.compare`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ...common.jsonable import named
+from ...common.units import BoolArray, IntArray, spread_out
+from ...compare.level.rss import RssComparison
+from ...compare.result import ModelLevel, RankResult, RssResult
+from ...logs.records import has_wall_clock
+from ...site.scenes import drawn_buildings
+from ...site.site import Site
+from ..content.flight import GEOMETRY, PosePaths, ReportData, Source, start_of
+from ..kit.canvas import keep_extremes, seconds_since
+from ..kit.packed import PackedArrays
+from ..kit.shapes import listed, outline, walls
+from ..names import k_key
+from ..words.flight import nearest_k, pretty
+
+# Samples of all series together that the page holds; beyond them each series is thinned, extremes kept.
+POINTS = 50_000
+
+_TREES = 1500
+TRACK_POINTS = 4000
+
+
+def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
+    """Everything the script needs, as plain values.
+
+    Parameters
+    ----------
+    data : ReportData
+    limit : int
+        Samples of all series together.
+    """
+    start, arrays = start_of(data), PackedArrays()
+    total = sum(len(p.time) for p in data.rss) + sum(len(p.time) for p in data.rank)
+
+    def share(n: int) -> int:
+        return n if total <= limit else max(200, limit * n // total)
+
+    rss_settings = data.settings.get("rss") or {}
+    return {
+        "start": str(start.astype("datetime64[ms]")) if has_wall_clock(start) else "",
+        "step_db": rss_settings.get("advanced", {}).get("step_db", 0.1),
+        "span_db": list(rss_settings.get("span_db", (-50.0, 50.0))),
+        "rss": [_rss(p, data.sources.get(p.name), start, arrays, share(len(p.time))) for p in data.rss],
+        "rank": [_rank(p, start, arrays, share(len(p.time))) for p in data.rank],
+        "track": _track(data, start, arrays),
+        "site": scene(data.site),
+        "paths": [_paths(p, start) for p in data.paths],
+        "packed": arrays.content(),
+    }
+
+
+def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) -> dict[str, int]:
+    """Places of the UAV, and those of a tower that moves."""
+    ends = [("", panel.position_m), *([] if panel.tower_m is None else [("tower_", panel.tower_m)])]
+    return {
+        f"{whose}{axis}": arrays.add(places[pick])
+        for whose, position_m in ends
+        for axis, places in zip(AXES, position_m.T, strict=True)
+    }
+
+
+AXES = ("east", "north", "up")
+
+
+def _rss(
+    panel: RssResult, source: Source | None, start: np.datetime64, arrays: PackedArrays, limit: int
+) -> dict[str, Any]:
+    pick = keep_extremes([panel.measured_db, panel.residual_db], limit) if len(panel.time) else np.arange(0)
+    models = [{"name": "ray tracing", **_fit(panel.score), "level": arrays.add(panel.simulated_dbm[pick]),
+               "learned_here": panel.training}]  # fmt: skip
+    for name, baseline in panel.baselines.items():
+        models.append({"name": pretty(name), **_fit(baseline), "level": arrays.add(baseline.level_dbm[pick])})
+    geometry = [
+        {"name": GEOMETRY[key].replace("\n", " "), "values": arrays.add(values[pick])}
+        for key, values in panel.geometry.items()
+        if key in GEOMETRY
+    ]
+    channel = {
+        **named(panel, "name tower unit"),
+        "of": len(panel.time),
+        "time": arrays.add(seconds_since(panel.time, start)[pick], "f8"),
+        **_place(panel, pick, arrays),
+        "measured": arrays.add(panel.measured_db[pick]),
+        "models": models,
+        "geometry": geometry,
+    }
+    if source is not None:
+        channel |= {
+            "files": list(source.files),
+            "file": arrays.add(source.file[pick]),
+            "line": arrays.add(source.line[pick], "f8"),
+        }
+    return channel
+
+
+def _fit(model: RssComparison | ModelLevel) -> dict[str, float | None]:
+    return {"offset": _number(model.offset_db), "rmse": _number(model.rmse_db)}
+
+
+def _rank(panel: RankResult, start: np.datetime64, arrays: PackedArrays, limit: int) -> dict[str, Any]:
+    pick = keep_extremes([panel.measured], limit) if len(panel.time) else np.arange(0)
+    shares = [] if panel.probability is None else panel.probability.T
+    best = nearest_k(panel)
+    return {
+        "tower": panel.tower,
+        "of": len(panel.time),
+        "time": arrays.add(seconds_since(panel.time, start)[pick], "f8"),
+        **_place(panel, pick, arrays),
+        "measured": arrays.add(panel.measured[pick]),
+        "best": 0 if best is None else list(panel.rank).index(best),
+        "models": [{"name": f"K = {k_key(k)}", "rank": arrays.add(rank[pick])} for k, rank in panel.rank.items()],
+        "probability": [
+            {"name": f"probability_rank{rank}", "values": arrays.add(share[pick])}
+            for rank, share in enumerate(shares, start=1)
+        ],
+    }
+
+
+def _track(data: ReportData, start: np.datetime64, arrays: PackedArrays) -> dict[str, int] | None:
+    track = data.track
+    if track is None or not len(track.time):
+        return None
+    known: BoolArray = np.isfinite(track.east_m) & np.isfinite(track.north_m) & np.isfinite(track.up_m)
+    pick = np.flatnonzero(known)[spread_out(int(known.sum()), TRACK_POINTS)]
+    return {
+        "time": arrays.add(seconds_since(track.time, start)[pick], "f8"),
+        "east": arrays.add(track.east_m[pick]),
+        "north": arrays.add(track.north_m[pick]),
+        "up": arrays.add(track.up_m[pick]),
+    }
+
+
+def _paths(paths: PosePaths, start: np.datetime64) -> dict[str, Any]:
+    return {
+        "tower": paths.tower,
+        "time": np.round(seconds_since(paths.time, start), 3).tolist(),
+        "lines": [[[np.round(line, 1).tolist(), kind] for line, kind in lines] for lines in paths.lines],
+    }
+
+
+def scene(site: Site, most_trees: int = _TREES) -> dict[str, Any]:
+    """Towers, buildings, trees and forests as plain lists, rounded to 0.1 m."""
+    trees, pick = site.trees, spread_out(len(site.trees), most_trees)
+    columns = ("east_m", "north_m", "ground_m", "height_m", "crown_diameter_m", "crown_base_m")
+    return {
+        "name": site.name,
+        "towers": [
+            {"name": t.name, "at": listed([t.east_m, t.north_m, t.ground_m]), "top": round(float(t.position_m[2]), 2)}
+            for t in site.towers.values()
+        ],
+        "buildings": [[listed(face) for face in walls(b)] for b in drawn_buildings(site)],
+        "forests": [listed(outline(f.area)) for f in site.forests],
+        "trees": listed(np.column_stack([getattr(trees, c)[pick] for c in columns])) if len(pick) else [],
+    }
+
+
+def plan_of(site: Site) -> dict[str, Any]:
+    """:func:`scene` for a plan: no trees (foliage is in the levels), roofs alone of buildings."""
+    solid = scene(site)
+    return {**solid, "trees": [], "buildings": [faces[-1:] for faces in solid["buildings"]]}
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

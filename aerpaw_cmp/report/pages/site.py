@@ -1,0 +1,124 @@
+"""A site as a plan, and as a page that turns it in 3-D under the mouse.
+
+The page is one file with its script inside; it draws on a canvas and loads nothing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ...common.units import FloatArray
+from ...site.scenes import drawn_buildings
+from ...site.site import Site
+from ..content.flight import Track
+from ..kit import canvas
+from ..kit.files import write_file
+from ..kit.page import embedded, rendered
+from ..kit.shapes import at_height, listed
+from ..names import safe_name
+from .explorer import scene
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+TREES_IN_PAGE = 5000
+FLIGHT_POINTS = 2000
+
+
+def view_limits(site: Site, track: Track | None) -> FloatArray:
+    """(3, 2) lowest and highest east, north, up of everything that stands or flies, with a margin [m]."""
+    points = [tower.position_m for tower in site.towers.values()]
+    for building in drawn_buildings(site):
+        for corner in np.asarray(building.footprint.exterior.coords)[:, :2]:
+            points.append(np.array([*corner, building.base_m + building.height_m]))
+    for area in (*(forest.area for forest in site.forests), *(fence.area for fence in site.geofences)):
+        points += list(at_height(np.asarray(area.exterior.coords)[:, :2], 0.0))
+    if len(trees := site.trees):
+        points += list(np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m]))
+    if track is not None and len(track.time):
+        points += list(np.stack([track.east_m, track.north_m, track.up_m], axis=1)[:: max(1, len(track.time) // 500)])
+    if not points:
+        return np.array([[-100.0, 100.0], [-100.0, 100.0], [0.0, 50.0]])
+    cloud = np.array(points)
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    margin = 0.05 * max(high[0] - low[0], high[1] - low[1], 100.0)
+    ground = min(0.0, float(low[2]))
+    return np.array(
+        [[low[0] - margin, high[0] + margin], [low[1] - margin, high[1] + margin], [ground, max(high[2] * 1.1, 30.0)]]
+    )
+
+
+def plan(site: Site, track: Track | None = None) -> Figure:
+    """Plan view with everything on it, to scale."""
+    limits = view_limits(site, track)
+    width, height = np.ptp(limits[:2], axis=1)
+    shape = float(np.clip(width / height, 0.45, 2.2))
+    fig, ax = canvas.subplots((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
+    canvas.draw_site(ax, site)
+    if track is not None and len(track.time):
+        ax.plot(
+            *canvas.thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.3, label="flight", zorder=4
+        )
+    ax.set_axisbelow(True)
+    ax.set_xlim(*limits[0])
+    ax.set_ylim(*limits[1])
+    ax.set_title(site.name, wrap=True)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return fig
+
+
+def _view_of(site: Site, track: Track | None = None) -> dict[str, Any]:
+    """The site as plain lists for the page, rounded to 0.1 m."""
+    flight: list[Any] = []
+    if track is not None and len(track.time):
+        line = np.stack([track.east_m, track.north_m, track.up_m], axis=1)[:: max(1, len(track.time) // FLIGHT_POINTS)]
+        flight = listed(line[np.isfinite(line).all(axis=1)])
+    shown = scene(site, TREES_IN_PAGE)
+    walled = zip(drawn_buildings(site), shown["buildings"], strict=True)
+    return {
+        **shown,
+        "buildings": [{"name": b.name, "height": b.height_m, "faces": faces} for b, faces in walled],
+        "limits": listed(view_limits(site, track)),
+        "fences": [listed(g.area.exterior.coords) for g in site.geofences],
+        "flight": flight,
+    }
+
+
+def viewer(site: Site, track: Track | None = None) -> str:
+    """The page that shows the site in 3-D."""
+    content = _view_of(site, track)
+    return rendered(
+        "site_view",
+        site=site,
+        scene=embedded(content),
+        trees_shown=len(content["trees"]),
+        has_flight=bool(content["flight"]),
+    )
+
+
+def write_site_view(site: Site, folder: str | Path, *, track: Track | None = None) -> list[Path]:
+    """Write ``<site>.html`` and ``<site>_plan.svg|png``.
+
+    Parameters
+    ----------
+    site : Site
+    folder : path
+        Made when missing.
+    track : Track, optional
+        A flight to draw.
+
+    Returns
+    -------
+    list of Path
+        The page first.
+    """
+    folder, stem = Path(folder), safe_name(site.name)
+    written = [write_file(folder / f"{stem}.html", viewer(site, track))]
+    with canvas.style():
+        drawn = canvas.save_as(plan(site, track), ("svg", "png"))
+    return [*written, *(write_file(folder / f"{stem}_plan.{form}", picture) for form, picture in drawn.items())]

@@ -1,1 +1,0 @@
-"""Figures of a flight's report: of levels, of ranks, and the order of all."""

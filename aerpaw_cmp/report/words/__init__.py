@@ -1,0 +1,1 @@
+"""Sentences, named by their page."""

@@ -1,0 +1,556 @@
+"""The report's sentences: what the numbers say, in plain words and without flattery."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ...common.units import AnyArray
+from ...compare.judge.ladder import LadderRow
+from ...compare.level.detection import DetectionScore
+from ...compare.level.rss import ErrorSpan
+from ...compare.result import BASELINE_TITLE, AuditResult, RankResult, RssResult
+from ...compare.statistics.intervals import Interval
+from ..content.flight import ReportData
+from .phrases import filled
+
+# Name of the ladder's rung with the settings of the flight file.
+AS_SET = "as set in flight.yaml"
+
+# Below this a panel is called too short for a verdict.
+FEW_SAMPLES = 30
+
+
+def pretty(name: str) -> str:
+    """A baseline's name in words."""
+    return BASELINE_TITLE.get(name, name.replace("_", " "))
+
+
+def count(n: int) -> str:
+    """A whole number, thousands set apart as in the tables.
+
+    Examples
+    --------
+    >>> count(6608) == "6\N{NARROW NO-BREAK SPACE}608"
+    True
+    """
+    return f"{n:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def signed(value: float) -> str:
+    """A number with its sign, as in the tables.
+
+    Examples
+    --------
+    >>> signed(12.91), signed(-10.4)
+    ('+12.9', '−10.4')
+    """
+    return f"{value:+.1f}".replace("-", "−")
+
+
+def _within(value: Interval | None, decimals: int = 1) -> str:
+    if value is None:
+        return ""
+    if not all(map(math.isfinite, value)):
+        return " (too few samples for an interval)"
+    return f" (95 % interval {value[0]:.{decimals}f} to {value[1]:.{decimals}f})"
+
+
+def headline(data: ReportData) -> str:
+    """One paragraph: what was compared with what."""
+    parts = []
+    if data.rss:
+        towers = list(dict.fromkeys(panel.tower for panel in data.rss))
+        samples = sum(len(panel.time) for panel in data.rss)
+        panels = "1 channel" if len(data.rss) == 1 else f"{len(data.rss)} tower channels"
+        parts.append(f"received signal strength at {_listed(towers)} ({panels}, {count(samples)} samples)")
+    if data.rank:
+        samples = sum(len(panel.time) for panel in data.rank)
+        parts.append(f"channel rank at {_listed([panel.tower for panel in data.rank])} ({count(samples)} samples)")
+    if not parts:
+        return "This flight holds no radio measurement that could be compared; only its track and inputs are shown."
+    engine = "" if data.engine is None else f" by the {data.engine.engine} engine"
+    kind = "A synthetic" if data.synthetic else "The"
+    return f"{kind} flight {data.flight} was replayed{engine} at {data.site.name} and compared: {' and '.join(parts)}."
+
+
+# --- the first words -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """Ray tracing against one baseline: pooled RMSE [dB], and on how many channels a paired interval decides.
+
+    ``judged`` channels have an interval; on ``better`` and ``worse`` of them it excludes zero.
+    """
+
+    ray_db: float
+    channels: int
+    name: str = ""
+    other_db: float = math.nan
+    judged: int = 0
+    better: int = 0
+    worse: int = 0
+    unit: str = "channels"
+
+
+# What may follow the two errors, and when: the first whose condition holds. No other sentence says better or worse.
+SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
+    (lambda f: not f.name, "No baseline could be scored."),
+    (lambda f: not f.judged, "Too few samples for an interval of the difference."),
+    (lambda f: f.better > 0 and f.worse > 0,
+     "Ray tracing is significantly better on {better} and worse on {worse} of {channels} {unit} (95 %)."),
+    (lambda f: f.worse > 0 and f.channels == 1, "Ray tracing is significantly worse (95 %)."),
+    (lambda f: f.better > 0 and f.channels == 1, "Ray tracing is significantly better (95 %)."),
+    (lambda f: f.worse > 0, "Ray tracing is significantly worse on {worse} of {channels} {unit} (95 %)."),
+    (lambda f: f.better > 0, "Ray tracing is significantly better on {better} of {channels} {unit} (95 %)."),
+    (lambda f: f.channels == 1, "The difference is not significant (95 %)."),
+    (lambda f: f.channels == 2, "The difference is not significant on either channel (95 %)."),
+    (lambda f: f.channels > 2, "The difference is not significant on any of {channels} {unit} (95 %)."),
+)  # fmt: skip
+
+# Sentence on the ranking of settings, by what the intervals say of those behind the first.
+RANKING: tuple[tuple[Callable[[set[str]], bool], str], ...] = (
+    (lambda said: said == {"no interval"}, "Too few flights for an interval of the difference to another setting."),
+    (lambda said: said == {"worse"}, "Every other setting is significantly worse (95 %)."),
+    (bool, "Not significantly worse (95 %): {named}."),
+)
+
+
+def ranking_sentence(verdicts: Mapping[str, str], most: int) -> str:
+    """Sentence on what the intervals say of the settings behind the first, by name; at most ``most`` are named."""
+    alike = [name for name, word in verdicts.items() if word != "worse"]
+    named = ", ".join(alike[:most]) + (f" and {len(alike) - most} more" if len(alike) > most else "")
+    return next(text for holds, text in RANKING if holds(set(verdicts.values()))).format(named=named)
+
+
+NOTHING_COMPARED = "Nothing could be compared: no sample has a measurement, a pose and a path at once."
+TOO_FEW_COMPARED = "Nothing could be compared: no channel has 20 samples with measurement, pose and path (at most {n})."
+
+
+def first_sentence(facts: Judged) -> str:
+    """The two errors, and what the paired intervals allow to say.
+
+    Examples
+    --------
+    >>> first_sentence(Judged(ray_db=6.72, channels=2, name="free_space", other_db=6.0, judged=2))
+    'Ray tracing: RMSE 6.7 dB; free space: 6.0 dB. The difference is not significant on either channel (95 %).'
+    """
+    baseline = f"; {pretty(facts.name)}: {facts.other_db:.1f} dB" if facts.name else ""
+    text = next(text for holds, text in SIGNIFICANCE if holds(facts))
+    significance = text.format(better=facts.better, worse=facts.worse, channels=facts.channels, unit=facts.unit)
+    return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{baseline}. {significance}"
+
+
+def expected_sentence(panels: Sequence[RssResult]) -> str:
+    """The error to expect on another flight; nothing unless every scored channel has it from flights left out."""
+    known = [panel.further.elsewhere for panel in panels]
+    if not known or not all(item and "rmse_db" in item for item in known):
+        return ""
+    learned, free = (
+        math.sqrt(sum(item[name] ** 2 for item in known if item) / len(known))
+        for name in ("rmse_db", "free_space_rmse_db")
+    )
+    return f"Expect {learned:.1f} dB on another flight (free space {free:.1f} dB)."
+
+
+# Causes of :mod:`aerpaw_cmp.compare.judge.causes` in words, and what to do next.
+CAUSES: dict[str, tuple[str, str]] = {
+    "clock": (
+        "the radio clock is {size:.1f} s {side} the telemetry clock (95 %: {low:+.1f} to {high:+.1f} s)",
+        "`rss: {{lag: apply}}`",
+    ),
+    "heading": (
+        "the UAV antenna is turned clockwise by {value:.0f} (95 %: {low:.0f} to {high:.0f}) degrees",
+        "check the mount of the antenna and the logged yaw",
+    ),
+    "tower": ("the log is that of {where}", "check `node:` of this log"),
+    "pattern": (
+        "the antenna pattern of the UAV: the error follows the direction of the tower",
+        "`aerpaw-cmp calibrate`",
+    ),
+    "blocked": (
+        "a loss of {value:.0f} dB (95 %: {low:.0f} to {high:.0f} dB) at {where} degrees from the tower",
+        "add to the site what stands there",
+    ),
+    "floor": ("the receiver shows no level below {value:.0f} {unit}", "`floor_db: {typed}` for this log"),
+    "gain step": (
+        "the level steps by {value:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) at {at} UTC",
+        "check the gain of the receiver; compare the two parts apart",
+    ),
+}
+
+
+def cause_sentence(panel: RssResult) -> str:
+    """Effect, cause with its interval, and action; nothing where no likely cause was identified."""
+    cause = panel.further.likely_cause
+    if cause is None:
+        return ""
+    value, (low, high) = cause.estimate, cause.ci95
+    at = ""
+    if cause.name == "gain step" and len(panel.time):
+        instant = panel.time.min() + np.timedelta64(int(float(cause.where)), "s")
+        at = str(instant.astype("datetime64[s]"))[-8:]
+    text, action = filled(
+        CAUSES[cause.name], value=value, low=low, high=high, size=abs(value), unit=panel.unit, at=at,
+        side="ahead of" if value > 0 else "behind", where=cause.where, typed=f"{value:.0f}",
+    )  # fmt: skip
+    return (
+        f"Likely cause at {panel.name}: {text}. "
+        f"With it the RMSE is {cause.rmse_with_db:.1f} instead of {cause.rmse_db:.1f} dB (means over 1 s). "
+        f"Next: {action}."
+    )
+
+
+def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetime64]:
+    """Begin and end of a span of a series that was sampled at these times (n,)."""
+    first = time.min()
+    begin, end = (first + np.timedelta64(round(seconds * 1e9), "ns") for seconds in (span.start_s, span.end_s))
+    return begin, end
+
+
+def local_error(panel: RssResult, span: ErrorSpan) -> str:
+    """Sentences on where a channel is missed most, and what is known of the measurement that may explain it."""
+    known = []
+    if panel.clock_verdict == "cannot tell":
+        known.append("the radio clock could not be confirmed")
+    if lock_lost(panel) is not None:
+        known.append("the receiver lost its lock on this flight")
+    side = "above" if span.mean_db > 0 else "below"
+    start, end = (str(t.astype("datetime64[s]"))[-8:] for t in instants(panel.time, span))
+    return (
+        f"Largest local error: measured {abs(span.mean_db):.1f} dB {side} predicted, {panel.name}, "
+        f"{start}-{end} UTC. No likely cause was identified{'; ' + ' and '.join(known) if known else ''}."
+    )
+
+
+def _field_failures(data: ReportData) -> int:
+    audit = None if data.engine is None else data.engine.audit
+    return 0 if audit is None or audit.fields is None else len(audit.fields.failures)
+
+
+def audit_summary(audit: AuditResult) -> str:
+    """The audit in a few sentences: the card, the page, the terminal and metrics.json have these words alone.
+
+    Parameters
+    ----------
+    audit : AuditResult
+
+    Returns
+    -------
+    str
+    """
+    fields = audit.fields
+    texts = [f"Audit, {count(audit.links)} links against {audit.reference}: {audit_paths(audit)}."]
+    if fields is not None:
+        texts.append(
+            f"Field: {count(fields.paths)} paths against {audit.reference}'s own coefficients, worst "
+            f"{fields.power_max_db:.2g} dB and {fields.phase_max_rad:.2g} rad."
+        )
+        worst_db = max(fields.raw_level_max_db, fields.raw_measured_max_db)
+        texts.append(
+            f"Recomputed from raw bytes: {count(fields.raw_samples)} readings, {count(fields.raw_poses)} poses, "
+            f"{count(fields.raw_levels)} levels, worst {fields.raw_position_max_m:.2g} m, "
+            f"{fields.raw_attitude_max_rad:.2g} rad, {worst_db:.2g} dB."
+        )
+        texts.append(f"Checks failed: {count(len(fields.failures))}.")
+    return " ".join(texts)
+
+
+def audit_paths(audit: AuditResult) -> str:
+    """Paths that one engine alone has, and the level that they make: half a sentence of the card and of the summary."""
+    parts = [f"{count(audit.missing_paths)} paths missing"]
+    if audit.extra_paths:
+        tested = audit.fields is not None and not audit.fields.phantom_paths
+        parts.append(
+            f"{count(audit.extra_paths)} only in our engine ({audit.reference} did not sample them"
+            + ("; each passed a second test)" if tested else ")")
+        )
+    if math.isfinite(audit.rss_max_error_db):
+        parts.append(f"RSS of the two engines within {audit.rss_max_error_db:.2g} dB")
+    return ", ".join(parts)
+
+
+def _missing_paths(data: ReportData) -> int:
+    audit = None if data.engine is None else data.engine.audit
+    return 0 if audit is None else audit.missing_paths
+
+
+# What may be said against the numbers, and when.
+DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
+    (lambda d: bool(d.doubts), "{doubts}"),
+    (lambda d: any(p.score.at_edge for p in d.rss), "an offset lies at the edge of its search"),
+    (lambda d: any(not p.score.n and not p.training for p in d.rss), "a channel could not be scored"),
+    (lambda d: any(_moved_by_outliers(p) for p in d.rss), "{outliers}"),
+    (lambda d: d.engine is not None and d.engine.audit is None, "no audit"),
+    (lambda d: _missing_paths(d) > 0, "the audit misses {missing} paths"),
+    (lambda d: _field_failures(d) > 0, "the audit of the field failed {failed} times"),
+    (lambda d: any(p.clock_verdict == "cannot tell" for p in d.rss), "the radio clock could not be confirmed"),
+    (lambda d: d.synthetic, "synthetic data"),
+    (
+        lambda d: not d.synthetic and d.site.illustrative and bool(d.site.buildings),
+        "illustrative buildings",
+    ),
+)
+
+
+def trust(data: ReportData) -> str:
+    """Check whether the numbers can be believed, by the checks that were made."""
+    facts = {
+        "missing": count(_missing_paths(data)),
+        "failed": count(_field_failures(data)),
+        "outliers": _outliers_in_words(data),
+        "doubts": "; ".join(data.doubts),
+    }
+    doubts = [text.format_map(facts) for holds, text in DOUBTS if holds(data)]
+    return f"Caution: {'; '.join(doubts)}." if doubts else "Every check of this report passed."
+
+
+def _recommended(data: ReportData) -> str:
+    """Model that the ladder recommends; nothing without a ladder."""
+    return next((row.model for row in data.ladder if row.recommended), "")
+
+
+# What to do next where no likely cause says it.
+NEXT: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
+    (lambda d: _recommended(d) not in ("", AS_SET), "Next: `report --recommend FILE` writes the recommended model."),
+    (lambda d: bool(d.rss), "Next: `aerpaw-cmp calibrate` with two flights of this site."),
+)
+
+
+def next_step(data: ReportData) -> str:
+    """The first step whose condition holds."""
+    return next((text for holds, text in NEXT if holds(data)), "")
+
+
+# Outlying samples that move an RMSE by more than this [dB] are named in the first words.
+_MOVED_DB = 0.3
+
+
+def _moved_by_outliers(panel: RssResult) -> float:
+    """By how much outlying samples raise the RMSE of a channel [dB]; 0 below :data:`_MOVED_DB`."""
+    moved = panel.score.rmse_db - panel.further.rmse_without_outliers_db
+    return float(moved) if moved > _MOVED_DB else 0.0  # NaN moves nothing
+
+
+def _outliers_in_words(data: ReportData) -> str:
+    panel = max(data.rss, key=_moved_by_outliers, default=None)
+    if panel is None or not _moved_by_outliers(panel):
+        return ""
+    n, without = panel.further.n_outliers, panel.further.rmse_without_outliers_db
+    change = f"its RMSE from {without:.1f} to {panel.score.rmse_db:.1f} dB"
+    return f"{count(n)} outlying sample{'s raise' if n > 1 else ' raises'} at {panel.name} {change}"
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def verdicts(rss: Sequence[RssResult], rank: Sequence[RankResult]) -> list[str]:
+    """One or two sentences per panel: how well the ray tracing predicts, and against what."""
+    return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
+
+
+def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
+    """Root of the mean square error over all samples of several series, each after its own offset [dB]."""
+    weight = np.asarray(n, dtype=np.float64)
+    return float(np.sqrt((weight * np.asarray(rmse_db) ** 2).sum() / weight.sum()))
+
+
+def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
+    """Cross-validated errors of this replay, of the baselines and of the recommended model."""
+    rows = [row for row in ladder if math.isfinite(row.rmse_heldout_db)]
+    best = next((row for row in rows if row.recommended), None)
+    if best is None:
+        return ""
+    chosen = best.model
+    mine = {row.model: [r for r in rows if r.model == row.model] for row in rows}
+    error = {model: pooled_db([r.rmse_heldout_db for r in of], [r.n for r in of]) for model, of in mine.items()}
+    compared = [f"{name} {error[name]:.1f} dB" for name in (AS_SET, *BASELINE_TITLE.values()) if name in error]
+    least = min(error, key=lambda name: error[name])
+    text = f"Cross-validated RMSE: {', '.join(compared)}."
+    if least in (BASELINE_TITLE["log_distance"], BASELINE_TITLE["constant"]):
+        text += f" The {least}, which replays nothing, has the smallest error of all models."
+    how = "the simplest replay within one standard error of the best replay"
+    if best.elsewhere_db is not None:
+        how = "the best on other flights ({:.1f} dB, free space {:.1f} dB)".format(*best.elsewhere_db)
+    if chosen == AS_SET:
+        return f"{text} The settings of this flight file are {how}."
+    return (
+        f"{text} \u201c{chosen}\u201d is {how}: {error[chosen]:.1f} dB. "
+        "Next: report --recommend FILE writes its settings."
+    )
+
+
+def training_sentence(names: Sequence[str], what: str, digests: Sequence[str]) -> str:
+    """First words of a report on a log that something was learned from: no error of it is a prediction's."""
+    shown = ", ".join(f"{digest[:12]}..." for digest in digests[:3]) + (" and others" if len(digests) > 3 else "")
+    return (
+        f"Training flight: {what} of {_listed(list(names))} {'was' if what == 'the receiver' else 'were'} learned from "
+        f"this flight's own log (SHA-256 {shown}). No error of the learned model is given here: it would be the error "
+        "of the fit."
+    )
+
+
+def rss_verdict(panel: RssResult) -> str:
+    """Sentences on how well one channel is predicted, and whether the baselines do better."""
+    if panel.training:
+        return training_sentence([panel.name], "the antennas", panel.further.trained_on or ())
+    score = panel.score
+    if score.n == 0 or not math.isfinite(score.rmse_db):
+        return f"{panel.name}: nothing to score; all {count(len(panel.time))} samples are out of coverage on one side."
+    text = (
+        f"{panel.name}: RMSE of ray tracing {score.rmse_db:.1f} dB{_within(score.rmse_ci95_db)} "
+        f"after an offset of {signed(score.offset_db)} dB"
+    )
+    errors = {name: model.rmse_db for name, model in panel.baselines.items() if math.isfinite(model.rmse_db)}
+    if not errors:
+        return text + "."
+    best = min(errors, key=lambda name: errors[name])
+    paired = panel.further.compared_with.get(best)
+    if paired is None:
+        return f"{text}; {pretty(best)}: {errors[best]:.1f} dB."
+    words = paired.in_words(pretty(best))
+    words = words.replace("(-", "(\u2212").replace("[-", "[\u2212")
+    further = _detection_words(panel) + _snr_words(panel)
+    return f"{text}: {words}; {pretty(best)}: {errors[best]:.1f} dB.{further}"
+
+
+def _detection_words(panel: RssResult) -> str:
+    """Sentences added for a receiver that loses its lock or ends at a floor: both parts of its score."""
+    score = panel.further.detection
+    if score is None:
+        return ""
+    return (
+        f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of {score.n} samples. "
+        f"The predicted level gives P(detected) with a Brier score of {score.brier:.2f} ({learned_on(score)}; a "
+        f"constant: {score.constant_brier:.2f}). With a floor at {score.floor_db:.0f}, all samples: RMSE "
+        f"{score.rmse_db:.1f} dB (free space: {score.free_space_rmse_db:.1f} dB); detected samples, which are "
+        f"selected by their level: {score.detected_rmse_db:.1f} dB."
+    )
+
+
+def learned_on(score: DetectionScore) -> str:
+    """Origin of a probability of detection, in words."""
+    return {
+        "other flights": "learned on other flights",
+        "held-out segments": "learned in other segments of this flight",
+    }[score.learned_on]
+
+
+def lock_lost(panel: RssResult) -> DetectionScore | None:
+    """The score of a receiver whose log says when it was in lock; None of others, and of one that never lost it."""
+    score = panel.further.detection
+    return score if score is not None and score.locks else None
+
+
+def lock_sentence(panels: Sequence[RssResult]) -> str:
+    """Both parts of the score of a receiver that lost its lock; nothing where none did."""
+    sentences = []
+    for panel in panels:
+        score, known = lock_lost(panel), panel.further.elsewhere or {}
+        if score is None:
+            continue
+        floor, expected = f"{score.floor_db:.0f}".replace("-", "\N{MINUS SIGN}"), ""
+        if "floor_rmse_db" in known:
+            expected = (
+                f" Expect {known['floor_rmse_db']:.1f} dB on another flight (free space "
+                f"{known['free_space_floor_rmse_db']:.1f} dB)."
+            )
+        sentences.append(
+            f"{panel.name} lost its lock in {100 - 100 * score.n_detected / score.n:.0f} % of the samples. With lower "
+            f"levels counted as {floor} {panel.unit}: RMSE {score.rmse_db:.1f} dB; free space: "
+            f"{score.free_space_rmse_db:.1f} dB.{expected} P(locked), {learned_on(score)}: Brier score "
+            f"{score.brier:.2f}; a constant: {score.constant_brier:.2f}."
+        )
+    return " ".join(sentences)
+
+
+def _snr_words(panel: RssResult) -> str:
+    """Sentence added for a ratio to the noise: its error with nothing fitted."""
+    snr = panel.further.snr
+    if snr is None:
+        return ""
+    return (
+        f" As a signal-to-noise ratio over {snr.noise_dbm:.1f} dBm of noise, nothing fitted, it is "
+        f"{signed(snr.mean_error_db)} dB from the replay in the mean ({snr.rmse_db:.1f} dB RMSE)."
+    )
+
+
+def rank_verdict(panel: RankResult) -> str:
+    """Sentence on the K that comes nearest to the modem, and how near."""
+    k = nearest_k(panel)
+    if k is None:
+        return f"{panel.tower} rank: nothing to score; no sample has both a reported rank and a simulated one."
+    best, logs = panel.score.simulated[k], panel.further.trained_on
+    learned = f" {training_sentence([panel.tower], 'the receiver', logs)}" if logs else ""
+    agree = f" and agrees pose by pose in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
+    kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_kappa_references(panel)})" if math.isfinite(best.kappa) else ""
+    return (
+        f"{panel.tower} rank: of the K shown, K = {k:.10g} comes nearest to the reported distribution "
+        f"(total variation {best.total_variation:.2f}){agree}{kappa}.{learned}"
+    )
+
+
+def nearest_k(panel: RankResult) -> float | None:
+    """The K whose distribution comes nearest to the reported one; None where nothing could be scored."""
+    distance = {
+        k: fit.total_variation for k, fit in panel.score.simulated.items() if math.isfinite(fit.total_variation)
+    }
+    return min(distance, key=lambda k: distance[k], default=None)
+
+
+def _kappa_references(panel: RankResult) -> str:
+    """Agreement that needs no model, and the one that the modem's agreement with itself allows, in words."""
+    words = ""
+    commonest = panel.further.commonest
+    if commonest.rank:
+        words += f"; always saying {commonest.rank} would agree in {100 * commonest.agreement:.0f} %"
+    repeat = panel.further.repeat.get("same_heading") or panel.further.repeat.get("any_heading")
+    if repeat is not None and repeat.n and math.isfinite(repeat.kappa):
+        words += f"; the modem repeats itself at the same places to kappa {repeat.kappa:.2f}"
+    return words
+
+
+def warnings(data: ReportData) -> list[str]:
+    """Warnings that must be known before a number is believed; those of the data first."""
+    texts = list(data.warnings)
+    if data.synthetic:
+        texts.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")
+    trees = "" if data.engine is None else data.engine.settings.get("foliage", "")
+    if data.site.illustrative and (data.site.buildings or trees not in ("", "none")):
+        texts.append(
+            f"Buildings and forests of {data.site.name} are illustrative, not surveyed: reflections and blockage "
+            "show the method, not the place."
+        )
+    for panel in data.rss:
+        texts += _rss_warnings(panel)
+    audit = None if data.engine is None else data.engine.audit
+    if data.engine is not None and audit is None:
+        texts.append("The replay engine was not audited against the other engine in this report.")
+    if audit is not None and audit.missing_paths:
+        texts.append(audit_summary(audit))
+    if audit is not None and audit.fields is not None and audit.fields.failed:
+        texts.append(
+            "The audit of the field failed, so no level or rank below can be relied on: "
+            + "; ".join(audit.fields.failures[:3])
+            + (f"; and {audit.fields.failed - 3} more" if audit.fields.failed > 3 else "")
+            + "."
+        )
+    rejected = sum(f.rejected for f in data.inputs)
+    if rejected:
+        texts.append(f"{count(rejected)} log lines were rejected; see the account of the inputs.")
+    return texts
+
+
+def _rss_warnings(panel: RssResult) -> list[str]:
+    texts, score = [], panel.score
+    if 0 < score.n < FEW_SAMPLES:
+        texts.append(f"{panel.name}: only {score.n} samples were scored, too few for a verdict.")
+    if score.n_out_of_coverage > 0.2 * len(panel.time):
+        share = 100 * score.n_out_of_coverage / len(panel.time)
+        texts.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not part of the RMSE.")
+    return texts

@@ -1,0 +1,124 @@
+"""Sentences of a map's page, each with the condition under which it may stand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ...compare.judge.verdicts import Coverage, coverage_verdict
+from ...maps.grid import PAPER_SPACING_M
+from ..content.maps import JOINT, MapsData, RssMap
+from .phrases import said_of
+
+LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
+
+# Sentence and next step by :func:`~aerpaw_cmp.compare.judge.verdicts.coverage_verdict`.
+CAUSES: dict[str, tuple[str, str]] = {
+    "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
+    "trees": (LEAST + "; trees take most of the rest.", "fly higher, or map `--foliage attenuating` beside it"),
+    "level": (
+        LEAST + "; levels below {threshold:g} dBm take most of the rest.",
+        "raise the transmit power, or lower `--threshold-dbm`",
+    ),
+    "blocked": (LEAST + "; buildings and terrain take most of the rest.", "fly higher, or add a tower"),
+    "threshold": (
+        "No position reaches {threshold:g} dBm at {where}, though paths arrive at {reached:.1f} % of them.",
+        "raise the transmit power, or lower `--threshold-dbm`",
+    ),
+    "no path": ("No path arrives at any position at {where}.", "check the towers and the area of the site"),
+    "extrapolated": (
+        LEAST + ". {outside:.0f} % of the positions lie outside the flown places: there the correction is a guess.",
+        "`aerpaw-cmp plan` names the flight that helps most",
+    ),
+}
+
+
+def first_words(data: MapsData) -> str:
+    """Coverage at the best and at the worst height, what takes the rest, and what to do next."""
+    heights = coverage(data)
+    if not heights:
+        return ""
+    worst = min(heights, key=lambda height: height.covered)
+    sentence = said_of(
+        coverage_verdict(heights),
+        CAUSES,
+        percent=100.0 * worst.covered,
+        reached=100.0 * worst.reached,
+        outside=100.0 * worst.outside,
+        threshold=float(data.settings.get("threshold_dbm", -np.inf)),
+    )
+    best = max(heights, key=lambda height: height.covered)
+    more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
+    measured = "" if data.corrected else "Nothing here was measured. "
+    return f"{measured}{more}{sentence}"
+
+
+def coverage(data: MapsData) -> list[Coverage]:
+    """Each height of the map of the nearest tower, with the most trees that were mapped."""
+    shown = [item for item in data.rss if item.tower == JOINT] or list(data.rss)
+    if not shown:
+        return []
+    first = shown[0]
+    same_link = [item for item in shown if (item.tower, item.antennas) == (first.tower, first.antennas)]
+    clear = {item.altitude_m: item.coverage for item in same_link if item.foliage == "none" != first.foliage}
+    return [
+        Coverage(
+            height_m=item.altitude_m,
+            covered=item.coverage,
+            clear=clear.get(item.altitude_m, np.nan),
+            reached=_reached(data, item),
+            outside=data.outside_flown,
+        )
+        for item in same_link
+        if item.foliage == first.foliage
+    ]
+
+
+def _reached(data: MapsData, levels: RssMap) -> float:
+    """Share of positions that any path reaches: those with a rank."""
+    share = [1.0 - m.share[0] for m in data.rank if (m.altitude_m, m.foliage) == (levels.altitude_m, levels.foliage)]
+    return float(share[0]) if share else np.nan
+
+
+def warnings(data: MapsData) -> list[str]:
+    """Warnings that must be known before the maps are believed."""
+    out = []
+    if data.site.illustrative:
+        out.append(
+            f"Buildings and forests of {data.site.name} are illustrative, not surveyed: blockage and reflections show "
+            "the method, not the place."
+        )
+    if data.corrected_words:
+        out.append(f"Corrected: {data.corrected_words}")
+    for key, fit in data.metrics.get("correlation", {}).items():
+        if fit["degenerate"]:
+            out.append(f"Correlation fit ({key.replace('z_', 'Z ')}): {fit['message']}")
+    spacing = data.settings.get("spacing_m", 0.0)
+    if spacing > PAPER_SPACING_M:
+        out.append(
+            f"A spacing of {spacing:g} m is coarser than the paper's {PAPER_SPACING_M:g} m: errors of interpolation "
+            "and correlation are not comparable with it."
+        )
+    return [*out, *data.warnings]
+
+
+def notes(data: MapsData) -> list[str]:
+    """Notes on how the maps were made."""
+    how = list(_made(data)) if "foliage" in data.settings else []
+    return [*data.site.notes, *how, *data.notes]
+
+
+def _made(data: MapsData) -> Iterator[str]:
+    s = data.settings
+    yield (
+        f"Foliage {', '.join(s['foliage'])}: opaque stops whatever touches a crown or a trunk (the paper); attenuating "
+        "takes ITU-R P.833 over the path's length in crowns; none leaves the trees out."
+    )
+    yield "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element."
+    threshold = f", in maps of RSS above {s['threshold_dbm']:g} dBm" if np.isfinite(s["threshold_dbm"]) else ""
+    yield (
+        "No receiver bandwidth is assumed: a link is in coverage where a path arrives above the thermal noise of 1 Hz "
+        f"(-174 dBm){threshold}."
+    )
+    yield f"Spread, condition number, correlation and interpolation are those of foliage {data.rss[0].foliage}."

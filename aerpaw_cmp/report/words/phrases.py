@@ -1,0 +1,33 @@
+"""Sentences of tables filled with the numbers of a verdict."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from ...compare.judge.verdicts import Verdict
+
+MINUS = "\N{MINUS SIGN}"
+
+
+class _Number(float):
+    """A number whose minus is one in print; names that stand beside it keep their hyphens."""
+
+    def __format__(self, form: str) -> str:
+        return super().__format__(form).replace("-", MINUS)
+
+
+def filled(texts: Sequence[str], **facts: Any) -> list[str]:
+    """Texts with numbers and names put in."""
+    known = {name: _Number(fact) if isinstance(fact, float) else fact for name, fact in facts.items()}
+    return [text.format_map(known) for text in texts]
+
+
+def said_of(verdict: Verdict, table: Mapping[str, tuple[str, str]], **facts: Any) -> str:
+    """Sentence and action that a page's table has for the cause of a verdict; nothing where the table has none."""
+    if verdict.cause not in table:
+        return ""
+    low, high = verdict.interval
+    numbers = {"effect": verdict.effect, "size": abs(verdict.effect), "low": low, "high": high}
+    text, action = filled(table[verdict.cause], **numbers, where=verdict.where, **facts)
+    return f"{text} Next: {action}." if action else text

@@ -1,0 +1,1 @@
+"""Antennas: patterns, files of patterns, what flights taught."""

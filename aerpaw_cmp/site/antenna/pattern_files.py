@@ -1,0 +1,209 @@
+"""Antenna files of any kind that is known by its content: measured spheres, one great circle, planning tools' cuts.
+
+Cuts say nothing between them: a sphere is made of a horizontal and a vertical one by horizontal projection
+interpolation (F. Gil et al., IEEE Trans. Antennas Propag. 47, 1999, doi:10.1109/8.774131), which gives both cuts back.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ...common.errors import InputError
+from ...common.files import LARGEST_TABLE, read_input
+from ...common.units import FloatArray, power_from_db
+from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
+
+_DBI_OF_DBD = 2.15
+STEP_DEG = 3.0
+
+# Values of a cut may lie this far beyond the peak, and the peak this far from both cuts [dB].
+_RIPPLE_DB = 1.0
+
+# Mean gain over the sphere that the way between two cuts may add to that of an antenna without loss [dB].
+_MOST_OF_CUTS_DB = 1.5
+_PLANET = re.compile(r"(?im)^\s*(HORIZONTAL|VERTICAL)\s+(\d{1,4})\s*$")
+_GAIN = re.compile(r"(?im)^\s*GAIN\s+([-+]?\d{1,3}(?:\.\d{1,6})?)\s*(dBd|dBi)?\s*$")
+_FREQUENCY = re.compile(r"(?im)^\s*FREQUENCY\s+(\d{1,6}(?:\.\d{1,6})?)\s*(?:MHz)?\s*$")
+_NSMA = re.compile(r"(?im)^\s*PATCUT:\s*,\s*(AZ|H|EL|V)\b")
+_PHI_CUT = re.compile(r"(?im)^\s*Phi\s*=\s*(-?\d{1,3}(?:\.\d{1,6})?)\s*\(deg\)")
+_GAIN_TABLE = re.compile(r"(?im)^\s*Frequency\s+E ?Total\. ?dB\s*$")
+
+
+def read_pattern_file(path: str | Path, *, polarised: bool = True, carrier_hz: float | None = None) -> MeasuredPattern:
+    """An antenna pattern: AERPAW's text over the sphere or along one great circle, MSI Planet (.msi, .pln) or NSMA.
+
+    Parameters
+    ----------
+    path : str or Path
+    polarised : bool
+        False keeps the total gain only; cuts have no polarisation.
+    carrier_hz : float, optional
+        Which frequency of a file with several.
+
+    Returns
+    -------
+    MeasuredPattern
+
+    Raises
+    ------
+    InputError
+        Another kind of file, missing angles or units; with the line where there is one.
+    """
+    path = Path(path)
+    text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
+    name = path.stem
+    if _PLANET.search(text):
+        carrier = _FREQUENCY.search(text)
+        return _from_cuts(_planet(text, path), name, path, float(carrier[1]) * 1e6 if carrier else None)
+    if _NSMA.search(text):
+        return _from_cuts(_nsma(text, path), name, path, None)
+    if _PHI_CUT.search(text):
+        return _great_circle(text, name, path, carrier_hz)
+    if _GAIN_TABLE.search(text):
+        raise InputError(
+            "peak gain over frequency, without directions",
+            expected="a pattern of the same antenna, such as SA-1400-5900_F3300.txt",
+            path=path,
+        )
+    return read_pattern_text(path, polarised=polarised)
+
+
+def _planet(text: str, path: Path) -> dict[str, FloatArray]:
+    """Gain [dBi] of MSI Planet's cuts at each degree: clockwise from the front; from the front downwards."""
+    gain = _GAIN.search(text)
+    if gain is None:
+        raise InputError("no line 'GAIN value dBi'", expected="GAIN in dBi or dBd", path=path)
+    peak = float(gain[1]) + (0.0 if (gain[2] or "dBd").lower() == "dbi" else _DBI_OF_DBD)
+    cuts: dict[str, FloatArray] = {}
+    for cut in _PLANET.finditer(text):
+        rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]), path)
+        cuts[cut[1].upper()] = _each_degree(rows, cut[1], path)
+    return _about_peak(cuts, peak, path)
+
+
+def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dict[str, FloatArray]:
+    """Gain [dBi] of cuts that hold attenuations below the peak, of whichever sign the program wrote."""
+    values = np.concatenate(list(cuts.values()))
+    if min(-values.min(), values.max()) > _RIPPLE_DB:
+        raise InputError(
+            f"values from {values.min():g} to {values.max():g} dB below the peak",
+            expected="attenuations of one sign",
+            cause="gains in place of attenuations",
+            path=path,
+        )
+    if (least := np.abs(values).min()) > _RIPPLE_DB:
+        raise InputError(
+            f"no direction of the cuts is less than {least:.1f} dB below the gain of {peak_dbi:g} dBi",
+            expected="cuts through the peak",
+            cause="another gain, or gains in place of attenuations",
+            path=path,
+        )
+    return {name: peak_dbi - np.abs(cut) for name, cut in cuts.items()}
+
+
+def _nsma(text: str, path: Path) -> dict[str, FloatArray]:
+    """Gain [dBi] of NSMA's (TIA-804-B) first azimuth and elevation cut, as :func:`_planet` has them."""
+    fields = {key.upper(): value for key, value in re.findall(r"(?m)^\s*([A-Za-z]{4,7}):\s*,\s*([^\n,]*)", text)}
+    relative = "DBR" in fields.get("GUNITS", "DBI/DBR").upper().partition("/")[2]
+    gain = next((fields[key] for key in ("MDGAIN", "LWGAIN", "HGGAIN") if fields.get(key, "").strip()), None)
+    if gain is None:
+        raise InputError("no gain", expected="a line such as 'MDGAIN:,16.5' [dBi]", path=path)
+    unit = fields.get("GUNITS", "DBI").upper().partition("/")[0]
+    peak = float(gain) + (_DBI_OF_DBD if "DBD" in unit else 0.0)
+    cuts: dict[str, FloatArray] = {}
+    for cut in _NSMA.finditer(text):
+        kind = "HORIZONTAL" if cut[1].upper() in ("AZ", "H") else "VERTICAL"
+        if kind in cuts:
+            continue  # the first of each: others are of another frequency or cross-polarised
+        ends = re.search(r"(?m)^\s*(PATCUT|ENDFIL):", text[cut.end() :])
+        body = text[cut.end() : cut.end() + ends.start()] if ends else text[cut.end() :]
+        lines = [line.replace(",", " ") for line in body.split("\n") if re.match(r"\s*[-+]?\d", line)]
+        rows = _pairs(lines, len(lines), path)
+        if kind == "VERTICAL":
+            rows = rows * [-1.0, 1.0]  # elevation is positive upwards there
+        cuts[kind] = _each_degree(rows, cut[1], path)
+    return _about_peak(cuts, peak, path) if relative and cuts else cuts
+
+
+def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:
+    """Angle and value of the first lines that hold any."""
+    rows = []
+    for line in [line for line in lines if line.strip()][:count]:
+        cells = line.split()
+        try:
+            rows.append((float(cells[0]), float(cells[1])))
+        except (ValueError, IndexError):
+            raise InputError(f"'{line.strip()[:60]}'", expected="an angle and a value", path=path) from None
+    if len(rows) < count or count < 4:
+        raise InputError(f"a cut of {len(rows)} lines", expected=f"{max(count, 4)}", cause="a cut file", path=path)
+    return np.array(rows, dtype=np.float64)
+
+
+def _each_degree(rows: FloatArray, cut: str, path: Path) -> FloatArray:
+    """Values at 0 to 359 degrees of a cut over a full circle; half a vertical circle stands for both halves."""
+    angle, value = rows[:, 0] % 360.0, rows[:, 1]
+    if not np.isfinite(rows).all() or np.abs(value).max() > 10 * HIGHEST_DBI:
+        raise InputError(f"cut {cut} reaches {np.abs(value).max():g} dB", expected="attenuation in dB", path=path)
+    if np.ptp(rows[:, 0]) <= 180.0 and np.abs(rows[:, 0]).max() <= 90.0:  # front half alone: the back as the front
+        angle, value = np.concatenate((angle, (180.0 - rows[:, 0]) % 360.0)), np.concatenate((value, value))
+    order = np.argsort(angle, kind="stable")
+    if np.diff(np.append(angle[order], angle[order][0] + 360.0)).max() > 15.0:
+        raise InputError(f"cut {cut} has gaps above 15 deg", expected="a full circle", path=path)
+    return np.asarray(np.interp(np.arange(360.0), angle[order], value[order], period=360.0))
+
+
+def _from_cuts(cuts: dict[str, FloatArray], name: str, path: Path, frequency_hz: float | None) -> MeasuredPattern:
+    """A sphere of two cuts [dBi at each degree]; see the module text."""
+    for cut in ("HORIZONTAL", "VERTICAL"):
+        if cut not in cuts:
+            raise InputError(f"no cut {cut}", expected="a horizontal and a vertical cut", path=path)
+    horizontal, vertical = cuts["HORIZONTAL"], cuts["VERTICAL"]
+    theta, phi = _grid()
+    below = np.degrees(theta) - 90.0
+    around = np.degrees(phi)
+    share = np.minimum(around, 360.0 - around) / 180.0  # 0 in front, 1 behind
+    level = _at(horizontal, -around)[None, :] + (1.0 - share)[None, :] * (_at(vertical, below) - horizontal[0])[:, None]
+    level = level + share[None, :] * (_at(vertical, 180.0 - below) - horizontal[180])[:, None]
+    return _pattern(level, name, path, frequency_hz)
+
+
+def _at(cut: FloatArray, degrees: FloatArray) -> FloatArray:
+    return np.asarray(np.interp(degrees, np.arange(360.0), cut, period=360.0))
+
+
+def _grid() -> tuple[FloatArray, FloatArray]:
+    return np.radians(np.arange(0.0, 180.5, STEP_DEG)), np.radians(np.arange(0.0, 360.0, STEP_DEG))
+
+
+def _pattern(level_dbi: FloatArray, name: str, path: Path, frequency_hz: float | None) -> MeasuredPattern:
+    if level_dbi.max() > HIGHEST_DBI:
+        raise InputError(f"a gain of {level_dbi.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
+    pattern = MeasuredPattern(name, np.sqrt(power_from_db(level_dbi)).astype(np.complex128), None, frequency_hz)
+    check_power(pattern, path, most_db=_MOST_OF_CUTS_DB)
+    return pattern
+
+
+def _great_circle(text: str, name: str, path: Path, carrier_hz: float | None) -> MeasuredPattern:
+    """AERPAW's total gain along one great circle at several frequencies, theta from -pi to pi; both halves blended."""
+    rows = [line.split() for line in text.splitlines() if re.match(r"\s*\d{6,}(?:\.\d+)?\s", line)]
+    table = np.array([[float(cell) for cell in row[:3]] for row in rows if len(row) >= 3])
+    if not len(table):
+        raise InputError("no rows", expected="frequency [Hz], theta [rad], total gain [dBi], ...", path=path)
+    frequencies = np.unique(table[:, 0])
+    frequency = float(frequencies[0])
+    if len(frequencies) > 1:
+        if carrier_hz is None:
+            raise InputError(f"{len(frequencies)} frequencies", expected="a carrier that says which", path=path)
+        frequency = float(frequencies[np.argmin(np.abs(frequencies - carrier_hz))])
+    cut = table[table[:, 0] == frequency]
+    _, once = np.unique(np.round(cut[:, 1], 6), return_index=True)
+    angle, gain = cut[once, 1], cut[once, 2]
+    if len(angle) < 8 or angle[0] > -3.1 or angle[-1] < 3.1 or np.diff(angle).max() > 0.3:
+        raise InputError(f"{len(angle)} angles at {frequency / 1e6:g} MHz", expected="theta from -pi to pi", path=path)
+    theta, phi = _grid()
+    share = np.minimum(np.degrees(phi), 360.0 - np.degrees(phi)) / 180.0
+    front, back = np.interp(theta, angle, gain), np.interp(-theta, angle, gain)
+    return _pattern((1.0 - share) * front[:, None] + share * back[:, None], name, path, frequency)

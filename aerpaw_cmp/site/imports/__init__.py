@@ -1,0 +1,1 @@
+"""Maps of others: buildings, woods and heights from OSM, GeoJSON, KML."""

@@ -1,0 +1,1 @@
+"""Scenes of meshes: Mitsuba files and what they hold."""

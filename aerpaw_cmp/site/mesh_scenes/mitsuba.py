@@ -1,0 +1,395 @@
+"""Triangles and radio materials of a Mitsuba scene, as Sionna RT reads them; without Mitsuba.
+
+Read are shapes of type ``ply``, ``obj``, ``rectangle``, ``cube`` and ``merge`` with their ``to_world``, and the
+materials ``itu-radio-material``, ``radio-material``, ``absorber-radio-material`` or any other whose id begins with
+``itu_`` or ``mat-itu_``. A scene may name files in its own folder only.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ...common.errors import InputError, UsageError
+from ...common.files import inside, read_input
+from ...common.units import FloatArray, IntArray
+from ...common.xmlfiles import xml_root
+from ..materials import material, stated_name
+from .meshfiles import RawMesh, read_mesh
+
+# Of a slab without a stated thickness, as in Sionna RT.
+_DEFAULT_THICKNESS_M = 0.1
+
+_LARGEST_XML = 256 * 2**20
+_MOST_TRIANGLES = 20_000_000
+
+_SHAPES = ("ply", "obj", "rectangle", "cube", "merge")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangleScene:
+    """A scene as triangles.
+
+    Parameters
+    ----------
+    vertices_m : (vertices, 3)
+        East, north, up.
+    triangles : (triangles, 3) int
+        Indices of vertices.
+    shape : (triangles,) int
+        Index into ``shapes`` and ``materials``.
+    shapes : tuple of str
+        Names.
+    materials : tuple of str
+        Of each shape, as :func:`aerpaw_cmp.site.materials.material` knows them.
+    notes : tuple of str
+        What was repaired or not modelled.
+    sha256 : str
+        Of the scene's files.
+    """
+
+    vertices_m: FloatArray
+    triangles: IntArray
+    shape: IntArray
+    shapes: tuple[str, ...]
+    materials: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    sha256: str = ""
+
+    def __len__(self) -> int:
+        return len(self.triangles)
+
+
+@dataclass(slots=True)
+class _Reading:
+    """Data collected so far."""
+
+    path: Path
+    folder: Path
+    radio: dict[str, str]
+    vertices: list[FloatArray] = field(default_factory=list)
+    triangles: list[IntArray] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    materials: list[str] = field(default_factory=list)
+    bent: int = 0
+    total: int = 0
+    skipped: dict[str, int] = field(default_factory=dict)
+    digest: hashlib._Hash = field(default_factory=hashlib.sha256)
+
+
+def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> TriangleScene:
+    """Read a Mitsuba scene.
+
+    Parameters
+    ----------
+    path : str or Path
+        The XML file.
+    materials : mapping of str to str, optional
+        Radio materials of those of the scene, by id, that are none: ``{"wall": "concrete"}``.
+
+    Returns
+    -------
+    TriangleScene
+
+    Raises
+    ------
+    InputError
+        The XML or a mesh cannot be read, a file outside the scene's folder is named, there is no triangle.
+    UsageError
+        Materials that say nothing about radio.
+    """
+    path = Path(path)
+    root, data = _root(path)
+    parameters = dict(materials or {})
+    for name in parameters.values():
+        material(name)  # or say what is wrong with it
+    defaults = {item.get("name", ""): item.get("value", "") for item in root.iter("default")}
+    _substitute(root, defaults, path)
+    radio, unknown, notes = _materials(root, parameters, path)
+    reading = _Reading(path, path.parent.resolve(), radio)
+    reading.digest.update(data)
+    for shape in _shapes(root):
+        _add(reading, shape, unknown)
+    if not reading.triangles:
+        raise InputError("the scene has no triangle", expected="shapes of type " + ", ".join(_SHAPES), path=path)
+    return _gathered(reading, notes)
+
+
+def _gathered(reading: _Reading, notes: list[str]) -> TriangleScene:
+    starts = np.cumsum([0, *(len(v) for v in reading.vertices)])
+    triangles = [t + start for t, start in zip(reading.triangles, starts, strict=False)]
+    if reading.bent:
+        notes.append(f"{reading.bent} polygons are not flat: they were cut into triangles from their first corner")
+    for kind, count in reading.skipped.items():
+        notes.append(f"warning: {count} shapes of type '{kind}' were left out; read are {', '.join(_SHAPES)}")
+    return TriangleScene(
+        vertices_m=np.concatenate(reading.vertices),
+        triangles=np.concatenate(triangles),
+        shape=np.repeat(np.arange(len(triangles)), [len(t) for t in triangles]),
+        shapes=tuple(reading.names),
+        materials=tuple(reading.materials),
+        notes=tuple(notes),
+        sha256=reading.digest.hexdigest(),
+    )
+
+
+def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
+    data = read_input(path, _LARGEST_XML, "a scene")
+    root = xml_root(data, path, "a plain Mitsuba scene")
+    if root.tag != "scene":
+        raise InputError(f"XML of '{root.tag}'", expected="a Mitsuba scene ('scene')", path=path)
+    if root.find(".//include") is not None:
+        raise InputError("the scene includes another XML file", expected="one file: paste it in", path=path)
+    return root, data
+
+
+def _substitute(root: ElementTree.Element, defaults: Mapping[str, str], path: Path) -> None:
+    """Values of the ``$name`` parameters, which ``default`` gives."""
+    for item in root.iter():
+        for key, value in item.attrib.items():
+            for name in sorted(defaults, key=len, reverse=True) if "$" in value else ():
+                value = value.replace(f"${name}", defaults[name])
+            if "$" in value:
+                raise InputError(f"the parameter '{value}' has no default", path=path)
+            item.attrib[key] = value
+
+
+# ---------------------------------------------------------------- materials
+
+
+def _materials(
+    root: ElementTree.Element, parameters: Mapping[str, str], path: Path
+) -> tuple[dict[str, str], dict[str, str], list[str]]:
+    """Radio material by id; type by id of those that are none; notes."""
+    radio: dict[str, str] = {}
+    unknown: dict[str, str] = {}
+    rough: list[str] = []
+    for number, bsdf in enumerate((*root.findall("./bsdf"), *root.findall(".//shape/bsdf"))):
+        name = bsdf.get("id") or bsdf.get("name") or f"unnamed {number + 1}"
+        bsdf.set("id", name)
+        if name in parameters:
+            radio[name] = parameters[name]
+            continue
+        material = _radio_material(bsdf, name, path)
+        if material is None:
+            unknown[name] = bsdf.get("type", "?")
+        else:
+            radio[name] = material
+            if _float(bsdf, "scattering_coefficient", 0.0, path) > 0.0:
+                rough.append(name)
+    stray = sorted(set(parameters) - set(radio))
+    if stray:
+        raise UsageError(
+            f"the scene has no material '{stray[0]}'", expected="one of " + ", ".join([*radio, *unknown]), path=path
+        )
+    notes = []
+    if rough:
+        notes.append(f"diffuse scattering of {', '.join(rough)} is not modelled: they reflect as smooth surfaces")
+    return radio, unknown, notes
+
+
+def _radio_material(bsdf: ElementTree.Element, name: str, path: Path) -> str | None:
+    """Name of the radio material that a bsdf is, None where it says nothing about radio."""
+    kind, plain = bsdf.get("type", ""), name.removeprefix("mat-")
+    thickness = _float(bsdf, "thickness", _DEFAULT_THICKNESS_M, path)
+    stated = bsdf.find("string[@name='type']")
+    if kind == "itu-radio-material" or plain.startswith(("itu_", "itu-")):
+        itu = plain[4:] if plain.startswith(("itu_", "itu-")) else plain
+        if stated is not None:
+            itu = stated.get("value", "")
+        elif kind == "itu-radio-material" and itu == plain:
+            raise InputError(f"the material '{name}' has no type", expected='<string name="type" .../>', path=path)
+        try:
+            return material(f"{itu} with thickness={thickness:.9g}").name
+        except UsageError as error:
+            raise InputError(f"material '{name}': {error.found}", expected=error.expected, path=path) from None
+    if kind == "radio-material":
+        permittivity = _float(bsdf, "relative_permittivity", 1.0, path)
+        conductivity = _float(bsdf, "conductivity", 0.0, path)
+        if permittivity < 1.0 or conductivity < 0.0 or thickness < 0.0:
+            raise InputError(
+                f"material '{name}': permittivity {permittivity:g}, conductivity {conductivity:g} S/m, "
+                f"thickness {thickness:g} m",
+                expected="a permittivity of at least 1 and no negative number",
+                path=path,
+            )
+        return stated_name(permittivity, conductivity, thickness)
+    return "vacuum" if kind == "absorber-radio-material" else None
+
+
+def _float(parent: ElementTree.Element, name: str, default: float, path: Path) -> float:
+    item = parent.find(f"float[@name='{name}']")
+    if item is None:
+        return default
+    return _numbers(item.get("value", ""), 1, path)[0]
+
+
+def _numbers(text: str, count: int | None, path: Path) -> list[float]:
+    try:
+        values = [float(word) for word in text.replace(",", " ").split()]
+    except ValueError:
+        values = []
+    if not values or (count is not None and len(values) != count) or not all(math.isfinite(v) for v in values):
+        raise InputError(f"'{text[:60]}'", expected=f"{count or 'some'} finite numbers", path=path)
+    return values
+
+
+# ---------------------------------------------------------------- shapes
+
+
+def _shapes(root: ElementTree.Element) -> Iterator[ElementTree.Element]:
+    """Shapes, with those inside a ``merge`` in its place."""
+    for shape in root.findall("./shape"):
+        if shape.get("type") == "merge":
+            yield from _shapes(shape)
+        else:
+            yield shape
+
+
+def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, str]) -> None:
+    kind = shape.get("type", "?")
+    if kind not in _SHAPES:
+        reading.skipped[kind] = reading.skipped.get(kind, 0) + 1
+        return
+    name = shape.get("id") or f"shape {len(reading.names) + 1}"
+    mesh = _mesh(reading, shape, kind, name)
+    turn = _to_world(shape, reading.path)
+    vertices = mesh.vertices @ turn[:3, :3].T + turn[:3, 3]
+    reading.total += len(mesh.triangles)
+    if reading.total > _MOST_TRIANGLES:
+        raise InputError(
+            f"more than {_MOST_TRIANGLES} triangles",
+            expected="a scene that fits into memory",
+            cause="a terrain or scan that is finer than a wavelength asks for: simplify it first",
+            path=reading.path,
+        )
+    reading.vertices.append(vertices)
+    reading.triangles.append(mesh.triangles)
+    reading.names.append(name)
+    reading.materials.append(_of_shape(reading, shape, name, unknown))
+    reading.bent += mesh.bent
+
+
+def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown: Mapping[str, str]) -> str:
+    """Radio material of a shape."""
+    inner = shape.find("bsdf")
+    refs = [item.get("id", "") for item in shape.findall("ref") if item.get("name", "bsdf") == "bsdf"]
+    which = inner.get("id", "") if inner is not None else (refs[0] if refs else "")
+    if which in reading.radio:
+        return reading.radio[which]
+    if not which:
+        raise InputError(
+            f"the shape '{name}' has no material", expected='<ref id="..." name="bsdf"/>', path=reading.path
+        )
+    if which in unknown:
+        others = "" if len(unknown) == 1 else f" and {len(unknown) - 1} more ({', '.join(list(unknown)[:6])})"
+        raise UsageError(
+            f"the material '{which}'{others} is of type '{unknown[which]}', which says nothing about radio",
+            expected="itu-radio-material, radio-material, or an id such as 'mat-itu_concrete'",
+            cause=f"say what it is: --material '{which}=concrete'",
+            path=reading.path,
+        )
+    raise InputError(
+        f"the shape '{name}' names the material '{which}', which the scene has not",
+        expected="one of " + ", ".join([*reading.radio, *unknown][:20]),
+        path=reading.path,
+    )
+
+
+def _mesh(reading: _Reading, shape: ElementTree.Element, kind: str, name: str) -> RawMesh:
+    if kind == "rectangle":
+        corners = np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
+        return RawMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    if kind == "cube":
+        return _cube()
+    item = shape.find("string[@name='filename']")
+    wanted = "" if item is None else item.get("value", "")
+    if not wanted:
+        raise InputError(
+            f"the shape '{name}' names no file", expected='<string name="filename" .../>', path=reading.path
+        )
+    place = inside(reading.folder, wanted, reading.path)
+    if not place.is_file():
+        raise InputError(
+            f"the shape '{name}' names '{wanted}', which is not there",
+            expected=f"a mesh below {reading.folder}",
+            cause="the XML file was copied without its folder 'meshes'",
+            path=reading.path,
+        )
+    mesh, data = read_mesh(place)
+    reading.digest.update(hashlib.sha256(data).digest())
+    return mesh
+
+
+def _cube() -> RawMesh:
+    """The cube of Mitsuba, -1 to 1 on each axis."""
+    corners = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
+    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return RawMesh(corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]))
+
+
+def _to_world(shape: ElementTree.Element, path: Path) -> FloatArray:
+    """Homogeneous matrix (4, 4) of a shape; its steps apply in the order they are written."""
+    total = np.eye(4)
+    transform = shape.find("transform[@name='to_world']")
+    for item in () if transform is None else transform:
+        total = _step(item, path) @ total
+    if not abs(np.linalg.det(total[:3, :3])) > 0.0:
+        raise InputError(
+            f"the to_world of '{shape.get('id')}' is singular", expected="a matrix with an inverse", path=path
+        )
+    return total
+
+
+def _step(item: ElementTree.Element, path: Path) -> FloatArray:
+    """Homogeneous matrix (4, 4) of one step."""
+    matrix = np.eye(4)
+    if item.tag == "matrix":
+        return _matrix(item, path)
+    if item.tag == "translate":
+        matrix[:3, 3] = _vector(item, 0.0, path)
+    elif item.tag == "scale":
+        matrix[:3, :3] = np.diag(_vector(item, 1.0, path))
+    elif item.tag == "rotate":
+        matrix[:3, :3] = _rotation(item, path)
+    else:
+        raise InputError(f"the transform '{item.tag}'", expected="matrix, translate, scale or rotate", path=path)
+    return matrix
+
+
+def _matrix(item: ElementTree.Element, path: Path) -> FloatArray:
+    values = _numbers(item.get("value", ""), None, path)
+    if len(values) not in (9, 16):
+        raise InputError(f"a matrix of {len(values)} numbers", expected="9 or 16", path=path)
+    side = 3 if len(values) == 9 else 4
+    matrix = np.eye(4)
+    matrix[:side, :side] = np.reshape(values, (side, side))
+    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
+        raise InputError("a matrix that is a perspective", expected="0 0 0 1 as its last row", path=path)
+    return matrix
+
+
+def _rotation(item: ElementTree.Element, path: Path) -> FloatArray:
+    """Rotation (3, 3) about an axis, by Rodrigues' formula."""
+    axis = np.array(_vector(item, 0.0, path))
+    angle = math.radians(_numbers(item.get("angle", ""), 1, path)[0])
+    if not np.linalg.norm(axis) > 0.0:
+        raise InputError("a rotation without an axis", expected='<rotate x="1" angle="90"/>', path=path)
+    x, y, z = axis / np.linalg.norm(axis)
+    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
+
+
+def _vector(item: ElementTree.Element, default: float, path: Path) -> list[float]:
+    """Three numbers of an element: ``value``, or ``x``, ``y`` and ``z``."""
+    text = item.get("value")
+    if text is not None:
+        values = _numbers(text, None, path)
+        return values * 3 if len(values) == 1 else _numbers(text, 3, path)
+    return [_numbers(item.get(axis, str(default)), 1, path)[0] for axis in "xyz"]

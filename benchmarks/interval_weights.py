@@ -1,4 +1,4 @@
-"""Weights of the memories in ``aerpaw_cmp/compare/statistics/memory_weights.json``: those whose 95 % intervals hold in every cell.
+"""Weights of the memories in ``memory_weights.json``: those whose 95 % intervals hold in every cell.
 
 Sequences with AR(1) memory (and some with white noise besides) are simulated in cells of (samples, correlation of
 neighbours). The weights minimise the squared distance of every cell's coverage from 95 %, plus a little for the width

@@ -1,8 +1,8 @@
 """The tap: polls the modem, writes every answer down, survives what happens in a field.
 
 One polling thread, one command in flight. A record is in the kernel's hands before the next command goes out, unless
-the disk stalls (:mod:`~aerpaw_cmp.live.record.writer`). The port may vanish and come back under another number, the disk may
-fill, the clock may step, signals may come: each leaves its own record, and the polling goes on.
+the disk stalls (:mod:`~aerpaw_cmp.live.record.writer`). The port may vanish and come back under another number, the
+disk may fill, the clock may step, signals may come: each leaves its own record, and the polling goes on.
 """
 
 from __future__ import annotations

@@ -21,15 +21,15 @@ ROOT = Path(__file__).parents[2] / "aerpaw_cmp" / "report"
 TABLE = Path(__file__).with_name("sentences.md")
 GAP = "…"
 SOURCES = {
-    "report": ("words.py", "first_screen.py", "plots/flight.py", "plots/serving.py", "plots/against.py",
-               "plots/rss.py", "plots/rank.py",
+    "report": ("words/flight.py", "words/flight_verdict.py", "figures/flight.py", "figures/flight_serving.py",
+               "figures/flight_against.py", "figures/flight_rss.py", "figures/flight_rank.py",
                "templates/report.html.jinja", "templates/explorer.html.jinja",
                "templates/method.html.jinja", "templates/plates.html.jinja", "templates/site_view.html.jinja"),
-    "map": ("maps/words.py", "maps/figures.py", "templates/map.html.jinja", "templates/map_explorer.html.jinja"),
-    "campaign": ("campaign/words.py", "campaign/figures.py", "templates/campaign.html.jinja"),
-    "calibration": ("calibration/words.py", "calibration/html.py", "templates/calibration.html.jinja"),
-    "diff": ("diff/html.py", "diff/data.py", "templates/diff.html.jinja"),
-    "prediction": ("prediction_words.py", "prediction_html.py", "templates/prediction.html.jinja"),
+    "map": ("words/maps.py", "figures/maps.py", "templates/map.html.jinja", "templates/map_explorer.html.jinja"),
+    "campaign": ("words/campaign.py", "figures/campaign.py", "templates/campaign.html.jinja"),
+    "calibration": ("words/calibration.py", "pages/calibration.py", "templates/calibration.html.jinja"),
+    "diff": ("pages/diff.py", "content/diff.py", "templates/diff.html.jinja"),
+    "prediction": ("words/prediction.py", "pages/prediction.py", "templates/prediction.html.jinja"),
 }  # fmt: skip
 WORD = re.compile(r"[A-Za-z][A-Za-z'-]*")
 INLINE = {"b", "i", "em", "strong", "code", "a", "br", "sup", "sub", "abbr"}

@@ -111,8 +111,8 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     Notes
     -----
     Student's t over n flights; from :data:`_MANY_FLIGHTS` on over the effective number of
-    :func:`~aerpaw_cmp.compare.statistics.intervals.autocorrelation`, so that a season that drifts has no narrower interval than
-    its flights bear.
+    :func:`~aerpaw_cmp.compare.statistics.intervals.autocorrelation`, so that a season that drifts has no narrower
+    interval than its flights bear.
     """
     from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
 

@@ -317,8 +317,8 @@ class ErrorIntervals:
     Parameters
     ----------
     offset_db, rmse_db, correlation : (low, high)
-        NaN ("no interval") of fewer than :data:`~aerpaw_cmp.compare.statistics.memory.FEWEST` samples, or where the statistic does
-        not exist.
+        NaN ("no interval") of fewer than :data:`~aerpaw_cmp.compare.statistics.memory.FEWEST` samples, or where the
+        statistic does not exist.
     autocorrelation : Autocorrelation
         Of the residual.
     """

@@ -1,8 +1,8 @@
 """Parts of a flight's report that surround its numbers (:mod:`aerpaw_cmp.compare.result`).
 
-:mod:`aerpaw_cmp.report.content.flight_parts` fills these records; the rest of the room turns them into files. Whatever a flight may
-lack is optional: a flight with rank only has ``rss=()``, one without a path anywhere has NaN numbers, never invented
-ones.
+:mod:`aerpaw_cmp.report.content.flight_parts` fills these records; the rest of the room turns them into files.
+Whatever a flight may lack is optional: a flight with rank only has ``rss=()``, one without a path anywhere has NaN
+numbers, never invented ones.
 Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN (in ``metrics.json``: ``null``).
 """
 

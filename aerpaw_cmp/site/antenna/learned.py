@@ -116,10 +116,10 @@ class Entry(StrictModel):
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]]
     source: Source = Source()
     errors: Errors | None = None
-    series: list[LearnedSeries] = []
-    receivers: list[LearnedReceiver] = []
+    series: list[LearnedSeries] = Field(default_factory=list)
+    receivers: list[LearnedReceiver] = Field(default_factory=list)
     ground_roughness_m: float | None = None
-    tables: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = {}
+    tables: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
     """SHA-256 of the tables as they were written: nothing else is ever replaced or removed."""
 
     def about(self) -> str:
@@ -144,7 +144,7 @@ class Learned(StrictModel):
     """All that a site remembers, by name."""
 
     format: Literal["aerpaw-cmp learned 1", "aerpaw-cmp learned 2"] = FORMAT
-    entries: dict[Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")], Entry] = {}
+    entries: dict[Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")], Entry] = Field(default_factory=dict)
 
 
 def folder_of(site: str | Path) -> Path:

@@ -59,7 +59,7 @@ TESTS = (
     "tests/test_equations.py",
     "tests/test_public_face.py",
 )
-_GROWTH, _ALIKE, _EDGES = (f"tests/propagation/test_{name}.py::test_" for name in ("growth", "compiled", "edges"))
+_GROWTH, _ALIKE = (f"tests/propagation/test_{name}.py::test_" for name in ("growth", "compiled"))
 _BEAMS = (
     *(f"{_GROWTH}only_a_convex_face_leaves_out_what_its_outline_covers[{name}]" for name in ("an L", "a frame")),
     f"{_GROWTH}a_mirror_works_on_both_sides_and_hides_from_both", f"{_GROWTH}coincident_faces_give_one_path",
@@ -73,12 +73,6 @@ _BEAMS = (
     f"{_GROWTH}a_site_of_prisms_as_a_scene_has_the_paths_of_the_prism_engine",
     f"{_GROWTH}prisms_by_beams_have_the_paths_of_the_image_engine[True]",
 )  # fmt: skip
-_OVER_EDGES = (
-    f"{_EDGES}the_border_of_a_sheet_is_a_half_plane", f"{_EDGES}a_link_turned_round_is_the_same",
-    f"{_EDGES}a_box_of_triangles_diffracts_as_a_prism",
-    f"{_EDGES}compiled_search_and_field_are_those_of_numpy",
-    f"{_EDGES}paths_of_every_kind_by_force[2-all]", "tests/propagation/test_roof.py",
-)  # fmt: skip
 # Of compiled code no line is seen running: these tests call it, and it is interpreted for each mutant.
 COMPILED = {
     "aerpaw_cmp/maps/triangle_kernels.py": (
@@ -89,8 +83,6 @@ COMPILED = {
         f"{_ALIKE}compiled_equals_numpy[False-one each]", f"{_ALIKE}compiled_equals_numpy[True-foreign]",
         f"{_ALIKE}more_pairs_than_lanes_and_paths_in_any_order",
     ),
-    "aerpaw_cmp/propagation/field/edge_kernels.py": _OVER_EDGES,
-    "aerpaw_cmp/propagation/search/edge_kernels.py": _OVER_EDGES,
     "aerpaw_cmp/propagation/search/beams.py": _BEAMS,
     "aerpaw_cmp/propagation/search/boxtree.py": _BEAMS,
     "aerpaw_cmp/propagation/search/merging.py": _BEAMS,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,10 +16,10 @@ from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.drivers.moving import loss_along, replay_moving
 from ..propagation.drivers.parts import replay_in_parts
-from ..propagation.edges import EdgePaths
+from ..propagation.edges import diffracted
 from ..propagation.field.sum import Fields, channel_matrices
 from ..propagation.options import Engine, Field, Loss, Run, Search
-from ..propagation.paths import Faces, PathSet
+from ..propagation.paths import Faces, PathSet, RowsT
 from ..propagation.replay import PER_LINK, Replay, replay
 from ..propagation.search.effort import Estimate
 from ..site.site import Site
@@ -312,25 +312,21 @@ def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
     return Clock(result=result, applied_s=np.full(len(series.time), fit.correction_s if used else 0.0))
 
 
-PathsT = TypeVar("PathsT", PathSet, EdgePaths)
-
-
 def part_of(replayed: Replay, start: int, stop: int) -> Replay:
     """The replay of poses ``start`` to ``stop``."""
     if (start, stop) == (0, len(replayed.rss_dbm)):
         return replayed
 
-    def cut(paths: PathsT) -> PathsT:
+    def cut(paths: RowsT) -> RowsT:
         rows = (paths.pose >= start) & (paths.pose < stop)
-        return dataclasses.replace(paths.select(rows), pose=paths.pose[rows] - start)
+        return dataclasses.replace(paths.select(rows), pose=paths.pose[rows] - start)  # type: ignore[type-var]
 
     share = (stop - start) / max(len(replayed.rss_dbm), 1)
     columns: dict[str, Any] = {name: getattr(replayed, name)[start:stop] for name in PER_LINK}
     return dataclasses.replace(
         replayed,
         **columns,
-        paths=cut(replayed.paths),
-        edge_paths=None if replayed.edge_paths is None else cut(replayed.edge_paths),
+        contributions=tuple(map(cut, replayed.contributions)),
         seconds=replayed.seconds * share,
         search_seconds=replayed.search_seconds * share,
     )
@@ -418,8 +414,9 @@ def replay_poses(
     name = f"{engine} {towers}" if towers_m is None else f"replay {towers}, which moves"
     search = Search(
         engine,
-        **named(rt, "max_depth diffraction"),
+        max_depth=rt.max_depth,
         **named(rt.advanced, "samples device"),
+        further=diffracted(rt.diffraction),
     )
     # the image engine finds the paths of a pose whatever the others are; planes of terrain are numbered as they are met
     alone = engine == "image" and site.dem is None

@@ -400,7 +400,7 @@ class RtSettings(GroupedSettings):
 
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
-    diffraction: Literal["none", "edges", "all"] = "none"
+    diffraction: Literal["none", "edges"] = "none"
     """Paths over one edge of a building, in H, levels and ranks; ``all``: also with a wall or roof on one side."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""

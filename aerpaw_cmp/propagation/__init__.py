@@ -3,13 +3,13 @@
 ``replay.replay(site, link, poses, Search(...), Field(...), Run(...))`` is the door; ``search.sionna`` alone loads
 Sionna.
 
-Each law stands once; NumPy and the compiled loops (``field.kernels``, ``field.edge_kernels``) evaluate one source:
+Each law stands once; NumPy and the compiled loops (``field.kernels``) evaluate one source:
 
 ======================================  ==============================================================
 Fresnel coefficients of a face          ``field.fresnel.coefficients`` (``half_space``, ``slab``)
 slant of an element                     ``field.dyads.slant_rotation``; its parts ``arrays.Array.slant_parts``
 field of an element, dyad of a bounce   ``field.dyads.field_vector``, ``field.dyads.reflected``
-diffraction at a wedge                  ``field.wedge.wedge``; paths over edges ``field.edges``
+diffraction at a wedge                  ``field.wedge.wedge``; paths over edges, one file: ``edges``
 sum over paths                          ``field.sum.channel_matrices``
 mirror images                           ``search.mirror``; among thousands of faces ``search.beams``
 visibility                              ``search.occlusion.Occlusion``; of triangles ``search.beams.segment_cut``

@@ -35,20 +35,18 @@ from ..common.units import AnyArray
 ROOM = Path(__file__).parents[1]
 SWITCH = "AERPAW_CMP_COMPILED"
 FIELD, BEAMS = "propagation.field.kernels", "propagation.search.beams"
-EDGES, EDGE_FIELD = "propagation.search.edge_kernels", "propagation.field.edge_kernels"
 TRIANGLES = "maps.triangle_kernels"
 # Files of kernels, and those whose functions and constants they take in.
 SOURCES = (
     *(f"propagation/{name}.py" for name in (
-        "field/dyads", "field/fresnel", "field/kernels", "field/wedge", "field/edges", "field/edge_kernels",
-        "search/edge_kernels", "search/beams", "search/merging", "search/boxtree", "search/mirror", "edges",
-        "compiled", "numba_options",
+        "field/dyads", "field/fresnel", "field/kernels", "search/beams", "search/merging", "search/boxtree",
+        "search/mirror", "compiled", "numba_options",
     )),
     "maps/triangle_kernels.py",
 )  # fmt: skip
 
 # CPU seconds of the first compilation on a machine.
-COMPILE_S = {FIELD: 10.0, BEAMS: 25.0, EDGES: 20.0, EDGE_FIELD: 20.0, TRIANGLES: 1.6}
+COMPILE_S = {FIELD: 10.0, BEAMS: 25.0, TRIANGLES: 1.6}
 # CPU seconds of NumPy from which numba's import and reading what was compiled before pay off.
 READ_S = 0.4
 # A job that NumPy does in less stays there, whatever is loaded.
@@ -59,11 +57,6 @@ FIELD_S = 6e-7
 # CPU seconds of NumPy per link and face, sequences of two reflections.
 MIRRORS_S = 1.6e-7
 
-
-# CPU seconds of NumPy per candidate of a path over an edge.
-CANDIDATES_S = 1.2e-7
-# CPU seconds of NumPy per path over an edge.
-EDGE_FIELD_S = 7e-6
 # CPU seconds of NumPy per system and cube of its size.
 TRIANGLE_S = 4e-10
 
@@ -139,42 +132,6 @@ def beams() -> State:
     if switch() == "never":
         return State(None, f"{SWITCH}=never")
     return load(BEAMS)
-
-
-def edges_for(candidates: int, needed: bool = False) -> ModuleType | None:
-    """Compiled search of paths over edges, or None where NumPy is quicker.
-
-    Parameters
-    ----------
-    candidates : int
-        Of edges, links and mirrors.
-    needed : bool
-        NumPy cannot do it.
-
-    Returns
-    -------
-    module or None
-
-    Raises
-    ------
-    UsageError
-        If it is needed and does not run.
-    """
-    if not needed:
-        return _worth(EDGES, candidates * CANDIDATES_S)
-    state = State(None, f"{SWITCH}=never") if switch() == "never" else load(EDGES)
-    if state.kernels is None:
-        raise UsageError(
-            f"diffraction 'all', or in a scene of triangles, but {state.reason}",
-            expected="diffraction 'edges', or numba that works: pip install 'aerpaw-cmp[fast]'",
-            cause="these paths are searched by compiled code alone",
-        )
-    return state.kernels
-
-
-def edge_field_for(paths: int) -> ModuleType | None:
-    """Compiled field of paths over edges, or None where NumPy is quicker."""
-    return _worth(EDGE_FIELD, paths * EDGE_FIELD_S)
 
 
 def triangles_for(systems: int, size: int) -> ModuleType | None:

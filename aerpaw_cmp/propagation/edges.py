@@ -1,51 +1,194 @@
-"""Edges of buildings that diffract, and the record of paths over one of them.
+"""Paths over one edge of a building: their search, their part of H, their words.
 
 An edge is where two faces of a building meet at an exterior angle above 180 degrees: the rim of a flat roof and its
-upright corners.
+upright corners. A path runs from the source, or its image in the ground, to the point of the edge where both legs make
+the same angle with it (Keller's cone), and on to the target or its image in the ground. It exists when that point lies
+on the edge, both legs are free, and the point is on no other building's wall or inside one.
+
+A bent leg is straight in the space of the mirrored end, and over the edge the path is straight once both legs are
+turned into one plane: places of elements in that plane give the length of each pair. Directions, patterns and the
+diffraction matrix are those of the array centres, as the paths are: the field stays continuous where a direct or
+reflected path of the centres ends.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 
-from ..common.units import FloatArray, IntArray
-from .paths import Faces, PathSet, Rows
-from .surfaces import Surfaces
+from ..common.errors import UsageError
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, wavelength_m
+from .arrays import Array, Link, Poses
+from .faces import inside
+from .field import dyads
+from .field.fresnel import FaceMaterials, coefficients
+from .field.geometry import parts_of, pattern_fields, plain, rows_of
+from .field.sum import Fields, Further, parts_between_poses
+from .field.wedge import wedge
+from .paths import Faces, PathSet, legs
+from .scene import Scene
+from .search.mirror import scene_tolerance_m
+from .search.occlusion import Occlusion
 
 # An end nearer than this to an edge has no path over it: there is no far field.
 NEAREST_M = 0.01
 
-# Faces of triangles that meet at less than this make no edge: they are facets of a bowed surface.
-_BEND_RAD = np.radians(2.0)
-
-# Corners of triangles nearer than this are one [m].
-WELD_M = 1e-4
-
 # Exterior angles nearer than this to 180 degrees [rad] are a plane.
 _SHARPEST = 1e-6
 
+# The law is asymptotic: a face that is lower than this many wavelengths is no wedge, and the building no obstacle.
+_LEAST_WAVELENGTHS = 0.5
+
+# How far beside an edge point the air on both of its faces is looked for.
+_PROBE_M = 1e-3
+
+# Pairs of edge and pose that are looked at together; paths whose field is evaluated together.
+LINKS_AT_ONCE, PATHS_AT_ONCE = 200_000, 4096
+
 
 @dataclass(frozen=True, slots=True)
-class Edges:
-    """Convex edges of a scene.
+class EdgePaths(Further):
+    """Paths over one edge, sorted by pose and tower.
 
     Parameters
     ----------
-    start_m, end_m : (edges, 3)
-    along : (edges, 3)
-        Unit vector from start to end; ``face_axis x normal = along``.
-    face_axis : (edges, 3)
-        Unit vector in face 0, away from the edge.
-    normal : (edges, 3)
-        Outward normal of face 0.
-    normal_n : (edges, 3)
-        Outward normal of face n.
-    exterior : (edges,)
-        Exterior angle over pi, above 1.
-    face : (edges, 2) int
-        Faces 0 and n.
+    pose, tower : (paths,) int
+    wedge : (paths, 2) int
+        Faces 0 and n, which meet in the edge.
+    ground : (paths, 2) int
+        Ground planes that reflect before and after the edge; -1 where none does.
+    vertices_m : (paths, 3, 3)
+        Reflection, edge, reflection point for array centres; NaN where unused.
+    """
+
+    kind: ClassVar[str] = "over an edge"
+    missing: ClassVar[str] = (
+        "diffraction over two edges, at the tips of edges, after a reflection off a wall, and with more than one "
+        "reflection on a side"
+    )
+
+    pose: IntArray
+    tower: IntArray
+    wedge: IntArray
+    ground: IntArray
+    vertices_m: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    def lines(self) -> PathSet:
+        """The same polylines without faces."""
+        used = np.isfinite(self.vertices_m).all(axis=2)
+        first = np.argsort(~used, axis=1, kind="stable")
+        vertices = np.take_along_axis(self.vertices_m, first[..., None], axis=1)
+        nothing = np.full(self.vertices_m.shape[:2], -1, dtype=np.int64)
+        return PathSet(self.pose, self.tower, used.sum(axis=1), nothing, vertices)
+
+    def words(self, faces: Faces) -> list[str]:
+        """Corners of each path, from tower to UAV."""
+        label = (*faces.label, "")  # of -1, no face
+        edges = zip(self.wedge.tolist(), self.vertices_m[:, 1].tolist(), strict=True)
+        middle = (f"edge of {label[f]} and {label[n]} at {', '.join(f'{x:.1f}' for x in at)} m" for (f, n), at in edges)
+        steps = zip(self.ground.tolist(), middle, strict=True)
+        return [", ".join(filter(None, (label[before], edge, label[after]))) for (before, after), edge in steps]
+
+    def fields(
+        self, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
+    ) -> Fields:
+        """Part of the paths in H and in the powers.
+
+        Parameters
+        ----------
+        faces : Faces
+        sources_m : (towers, 3)
+            Centres of the tower arrays, in the order of ``link.tower_arrays`` [m].
+        poses : Poses
+        link : Link
+        loss_db : (paths,), optional
+            Further loss of each path, such as foliage.
+
+        Returns
+        -------
+        Fields
+        """
+        shape = (len(poses), len(sources_m))
+        h = np.zeros((shape[0] * shape[1], len(link.uav_array), len(next(iter(link.tower_arrays.values())))), complex)
+        path_power, key = np.zeros(len(self)), self.pose * shape[1] + self.tower
+        for part in parts_between_poses(self.pose, PATHS_AT_ONCE):
+            amplitude = amplitudes(self.select(part), faces, sources_m, poses, link)
+            if loss_db is not None:
+                amplitude *= amplitude_from_db(-loss_db[part])[:, None, None]
+            first = np.flatnonzero(np.diff(key[part], prepend=-1))
+            h[key[part][first]] = np.add.reduceat(amplitude, first, axis=0)
+            path_power[part] = (np.abs(amplitude) ** 2).mean(axis=(1, 2))
+        matrices = np.ascontiguousarray(h.swapaxes(1, 2)) if link.uav_transmits else h
+        power = np.bincount(key, weights=path_power, minlength=len(h)).astype(np.float64)
+        return Fields(matrices.reshape(*shape, *matrices.shape[1:]), path_power, power.reshape(shape))
+
+
+# ------------------------------------------------------------------------------------------------------- the search
+
+
+def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
+    """Paths over one edge of a building, with at most one reflection off the ground on either side.
+
+    Parameters
+    ----------
+    scene : Scene
+    poses : Poses
+    link : Link
+        Its carrier decides which buildings are too low to bend a wave.
+
+    Returns
+    -------
+    EdgePaths
+
+    Raises
+    ------
+    UsageError
+        In a scene of triangles.
+    """
+    if scene.surfaces is not None:
+        raise UsageError(
+            "diffraction in a scene of triangles",
+            expected="buildings with footprints, or diffraction: none",
+            cause="a triangle does not say which side of it is inside a building",
+        )
+    faces, sources, targets = scene.faces, scene.sources_m, poses.position_m
+    known = np.isfinite(targets).all(axis=1)
+    search = _Search(faces, Edges.of(faces, wavelength_m(link.carrier_hz)), sources, targets[known])
+    none = np.zeros(0, np.int64)
+    pieces = [EdgePaths(none, none, np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 3, 3)))]
+    for tower in range(len(sources)):
+        grounds = [-1, *np.flatnonzero(scene.usable[tower] & (faces.solid < 0)).tolist()]
+        rows = np.flatnonzero(known & ~scene.excluded[tower])
+        for ground in itertools.product(grounds, grounds) if len(search.edges) else ():
+            pieces += search.of_tower(tower, sources[tower], targets, rows, ground)
+    paths = EdgePaths.one_after_another(pieces)
+    (before, after), (first, last) = paths.ground.T, paths.wedge.T
+    return paths.select(np.lexsort((after, before, last, first, paths.tower, paths.pose)))
+
+
+# Values of ``rt.diffraction``, and the further paths that each searches.
+DIFFRACTION: dict[str, tuple[Callable[..., Further], ...]] = {"none": (), "edges": (over_edges,)}
+
+
+def diffracted(name: str) -> tuple[Callable[..., Further], ...]:
+    """Searches that ``rt.diffraction`` asks for; :class:`UsageError` of an unknown value."""
+    if name not in DIFFRACTION:
+        raise UsageError(f"unknown diffraction {name!r}", expected=" or ".join(map(repr, DIFFRACTION)))
+    return DIFFRACTION[name]
+
+
+class Edges(NamedTuple):
+    """Convex edges of a scene, a row each.
+
+    ``start_m``, ``end_m``, ``along`` (edges, 3) with ``face_axis x normal = along``; ``face_axis`` lies in face 0, away
+    from the edge; ``normal`` and ``normal_n`` point out of faces 0 and n; ``face`` (edges, 2).
     """
 
     start_m: FloatArray
@@ -54,7 +197,6 @@ class Edges:
     face_axis: FloatArray
     normal: FloatArray
     normal_n: FloatArray
-    exterior: FloatArray
     face: IntArray
 
     def __len__(self) -> int:
@@ -66,132 +208,36 @@ class Edges:
         return np.asarray(np.linalg.norm(self.end_m - self.start_m, axis=1))
 
     @classmethod
-    def of(cls, faces: Faces, ground_m: float = -np.inf) -> Edges:
-        """Edges of the solids of a scene.
+    def of(cls, faces: Faces, wavelength: float = 0.0) -> Edges:
+        """Edges of the prisms of a scene, but of those that are lower than half a wavelength [m].
 
-        Parameters
-        ----------
-        faces : Faces
-            Walls and roofs of prisms (``solid >= 0``).
-        ground_m : float
-            Upright corners begin here where their wall begins lower.
-
-        Returns
-        -------
-        Edges
+        Upright corners begin at the highest of the level grounds where their wall begins lower.
         """
-        rows = [row for solid in np.unique(faces.solid[faces.solid >= 0]) for row in _of_solid(faces, solid, ground_m)]
+        ground_m = max(0.0, float(faces.offset_m[faces.solid == -1].max(initial=0.0)))
+        least_m = _LEAST_WAVELENGTHS * wavelength
+        solids = np.unique(faces.solid[faces.solid >= 0])
+        rows = [row for solid in solids for row in _of_solid(faces, solid, ground_m, least_m)]
         starts, ends = (np.array([row[i] for row in rows]).reshape(-1, 3) for i in (0, 1))
         pairs = np.array([row[2] for row in rows], dtype=np.int64).reshape(-1, 2)
         normal, normal_n = faces.normal[pairs[:, 0]], faces.normal[pairs[:, 1]]
-        along = ends - starts
-        along = along / np.linalg.norm(along, axis=1, keepdims=True)
-        turn = np.arctan2(np.linalg.norm(np.cross(normal_n, normal), axis=1), (normal * normal_n).sum(axis=1))
+        along, face_axis, _ = wedge_axes(normal, normal_n)
         return cls(
-            start_m=starts,
-            end_m=ends,
-            along=along,
-            face_axis=np.cross(normal, along),
-            normal=normal,
-            normal_n=normal_n,
-            exterior=1.0 + turn / np.pi,
-            face=pairs,
+            start_m=starts, end_m=ends, along=along, face_axis=face_axis, normal=normal, normal_n=normal_n, face=pairs
         )
 
-    @classmethod
-    def of_surfaces(cls, surfaces: Surfaces) -> Edges:
-        """Edges of a scene of triangles: where faces meet at an angle, and borders that no other face touches.
 
-        The air is taken to be on the side of the larger angle: in an inner corner, which diffracts nothing that
-        reaches it, that is the inside of the building. Which way a triangle is turned does not matter.
-
-        Parameters
-        ----------
-        surfaces : Surfaces
-
-        Returns
-        -------
-        Edges
-            One per side of triangles; a border has the exterior angle 2 and one face twice. The outer border of level
-            ground is none.
-        """
-        corners, face = surfaces.corners_m, surfaces.face
-        _, corner = np.unique(np.round(corners.reshape(-1, 3) / WELD_M).astype(np.int64), axis=0, return_inverse=True)
-        corner = corner.reshape(-1, 3)
-        ends = np.sort(np.stack([corner, np.roll(corner, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
-        sides = np.stack([corners, np.roll(corners, -1, axis=1)], axis=2).reshape(-1, 2, 3)
-        opposite = np.roll(corners, -2, axis=1).reshape(-1, 3)
-        swap = corner.reshape(-1) != ends[:, 0]
-        sides[swap] = sides[swap][:, ::-1]
-        _, edge = np.unique(ends, axis=0, return_inverse=True)
-        owner = np.repeat(face, 3)
-        edge = edge.reshape(-1)
-        along = sides[:, 1] - sides[:, 0]
-        size = np.linalg.norm(along, axis=1)
-        good = (ends[:, 0] != ends[:, 1]) & (size > NEAREST_M)
-        along = along / np.where(good, size, 1.0)[:, None]
-        inward = opposite - sides[:, 0]
-        inward = inward - (inward * along).sum(axis=1)[:, None] * along
-        width = np.linalg.norm(inward, axis=1)
-        good &= width > 1e-9
-        inward = inward / np.where(good, width, 1.0)[:, None]
-        order = np.flatnonzero(good)[np.argsort(edge[good], kind="stable")]
-        level = np.abs(surfaces.faces.normal[owner, 2]) > 0.99
-        outer = np.array([corners.min(axis=(0, 1)), corners.max(axis=(0, 1))])[:, :2]
-        rim = (np.abs(sides[:, None, :, :2] - outer[None, :, None]) < WELD_M).all(axis=2).any(axis=(1, 2)) & level
-        runs = np.split(order, np.flatnonzero(np.diff(edge[order])) + 1) if len(order) else []
-        rows = [
-            row
-            for run in runs
-            if not (len(run) == 1 and rim[run[0]]) and (row := _widest(run, along[run[0]], inward, owner)) is not None
-        ]
-        first = np.array([row[0] for row in rows], dtype=np.int64)
-        last = np.array([row[1] for row in rows], dtype=np.int64)
-        angle = np.array([row[2] for row in rows])
-        axis = inward[first]
-        # out of face 0, into the air: across the edge, turned by a quarter from the axis towards the widest gap
-        out = np.cross(along[first], axis)
-        axis_n = np.where((angle < 2.0 * np.pi)[:, None], inward[last], axis)
-        return cls(
-            start_m=sides[first, 0],
-            end_m=sides[first, 1],
-            along=along[first],
-            face_axis=axis,
-            normal=out,
-            normal_n=np.cross(axis_n, along[first]),
-            exterior=angle / np.pi,
-            face=np.stack([owner[first], owner[last]], axis=1),
-        )
-
-    def pairs(self) -> tuple[IntArray, IntArray]:
-        """Pairs (pairs, 2) of edges of one plane face, and which of their faces (0 or 1) that is."""
-        face, side = self.face.reshape(-1), np.tile([0, 1], len(self))
-        edge = np.repeat(np.arange(len(self)), 2)
-        order = np.argsort(face, kind="stable")
-        pieces: list[IntArray] = [np.zeros((0, 4), np.int64)]
-        for run in np.split(order, np.flatnonzero(np.diff(face[order])) + 1) if len(order) else []:
-            first, second = (part.reshape(-1) for part in np.meshgrid(run, run, indexing="ij"))
-            apart = edge[first] != edge[second]
-            pieces.append(np.column_stack([edge[first], edge[second], side[first], side[second]])[apart])
-        rows = np.concatenate(pieces)
-        return rows[:, :2], rows[:, 2:]
+def wedge_axes(normal: FloatArray, normal_n: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Direction of edges, axes of their faces 0 (edges, 3) and exterior angles over pi, from both outward normals."""
+    cross = np.cross(normal, normal_n)
+    sine = np.linalg.norm(cross, axis=1)
+    along = cross / sine[:, None]
+    exterior = 1.0 + np.arctan2(sine, (normal * normal_n).sum(axis=1)) / np.pi
+    return along, np.cross(normal, along), exterior
 
 
-def _widest(run: IntArray, along: FloatArray, inward: FloatArray, owner: IntArray) -> tuple[int, int, float] | None:
-    """Sides of triangles on both ends of the widest gap round an edge, and its angle; None where no air bends there."""
-    axis = inward[run[0]]
-    across = np.cross(along, axis)
-    angle = np.mod(np.arctan2(inward[run] @ across, inward[run] @ axis), 2.0 * np.pi)
-    order = np.argsort(angle, kind="stable")
-    gap = np.diff(angle[order], append=angle[order[0]] + 2.0 * np.pi)
-    widest = int(np.argmax(gap))
-    first, last = run[order[widest]], run[order[(widest + 1) % len(run)]]
-    if gap[widest] < np.pi + _BEND_RAD or (len(run) > 1 and owner[first] == owner[last]):
-        return None
-    return int(first), int(last), float(gap[widest])
-
-
-def _of_solid(faces: Faces, solid: int, ground_m: float) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
+def _of_solid(
+    faces: Faces, solid: int, ground_m: float, least_m: float
+) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
     """Start, end and faces of each edge, so that the outward normal of face 0 and the direction are as in Edges."""
     members = np.flatnonzero(faces.solid == solid)
     walls = [int(i) for i in members if faces.normal[i, 2] == 0.0]
@@ -199,16 +245,15 @@ def _of_solid(faces: Faces, solid: int, ground_m: float) -> list[tuple[FloatArra
     rows: list[tuple[FloatArray, FloatArray, tuple[int, int]]] = []
     first = {_corner(faces, wall, 0): wall for wall in walls}
     for wall in walls:
-        top = faces.upper[wall, 1]
+        top, low = faces.upper[wall, 1], max(float(faces.lower[wall, 1]), ground_m)
+        if top - low <= least_m:
+            continue
         near, far = (_point(faces, wall, end, top) for end in (0, 1))
-        if top in roofs and top > ground_m:
+        if top in roofs:
             # t lies in the wall, pointing down: t x normal points along the wall
             rows.append((far, near, (wall, roofs[top])))
         following = first.get(_corner(faces, wall, 1))
-        low = max(float(faces.lower[wall, 1]), ground_m)
-        if following is None or top <= low:
-            continue
-        if np.cross(faces.along[wall], faces.along[following])[2] > np.sin(_SHARPEST):
+        if following is not None and np.cross(faces.along[wall], faces.along[following])[2] > np.sin(_SHARPEST):
             # t lies in the wall, away from the corner
             rows.append((_point(faces, wall, 1, low), _point(faces, wall, 1, top), (wall, following)))
     return rows
@@ -226,49 +271,248 @@ def _corner(faces: Faces, wall: int, end: int) -> tuple[float, float]:
     return round(float(point[0]), 4), round(float(point[1]), 4)
 
 
-@dataclass(frozen=True, slots=True)
-class EdgePaths(Rows):
-    """Paths over one or two edges, sorted by pose and tower.
+class _Search:
+    """Paths over the edges of a scene."""
+
+    def __init__(self, faces: Faces, edges: Edges, sources_m: FloatArray, targets_m: FloatArray) -> None:
+        self.faces, self.edges = faces, edges
+        self.hiding = Occlusion(faces, scene_tolerance_m(faces, sources_m, targets_m))
+        numbers = np.unique(faces.solid[faces.solid >= 0])
+        solid = np.searchsorted(numbers, faces.solid[edges.face[:, 0]])
+        low = np.minimum(edges.start_m, edges.end_m) - 2.0 * _PROBE_M
+        high = np.maximum(edges.start_m, edges.end_m) + 2.0 * _PROBE_M
+        touch = (self.hiding.low[None] <= high[:, None]) & (self.hiding.high[None] >= low[:, None])
+        near = np.asarray(touch.all(axis=2))
+        near[np.arange(len(edges)), solid] = False
+        # another building may touch a face of these
+        self.doubtful = np.asarray(near.any(axis=1))
+        axis_n = np.cross(edges.along, edges.normal_n)
+        self.sides = np.stack([edges.face_axis + 0.1 * edges.normal, axis_n + 0.1 * edges.normal_n], axis=1)
+
+    def of_tower(
+        self, tower: int, source_m: FloatArray, targets_m: FloatArray, poses: IntArray, ground: tuple[int, int]
+    ) -> list[EdgePaths]:
+        """Paths of one tower with the given ground reflections before and after the edge."""
+        images = (source_m, targets_m[poses])
+        source, ends = (p if g < 0 else self.faces.mirrored(g, p) for g, p in zip(ground, images, strict=True))
+        at_source, near = (part[:, 0] for part in self._round_edges(source[None]))
+        lit, pieces = np.flatnonzero(near >= 0.0), []
+        step = max(1, LINKS_AT_ONCE // max(1, len(lit)))
+        for first in range(0, len(poses), step):
+            some = ends[first : first + step]
+            at_target, far = (part[lit].T for part in self._round_edges(some))
+            at = at_source[lit] + (at_target - at_source[lit]) * (near[lit] / (near[lit] + far))
+            row, column = np.nonzero((at >= 0.0) & (at <= self.edges.length_m[lit]) & (far >= 0.0))
+            edge, pose = lit[column], poses[first + row]
+            point = self.edges.start_m[edge] + at[row, column][:, None] * self.edges.along[edge]
+            spots = [self._on_ground(g, end, point) for g, end in zip(ground, (source, some[row]), strict=True)]
+            target, vertices = targets_m[pose], np.stack([spots[0], point, spots[1]], axis=1)
+            good = self._free(source_m, vertices, target, edge, ground)
+            count = int(good.sum())
+            pieces.append(
+                EdgePaths(
+                    pose=pose[good],
+                    tower=np.full(count, tower),
+                    wedge=self.edges.face[edge[good]],
+                    ground=np.tile(np.array(ground), (count, 1)),
+                    vertices_m=vertices[good],
+                )
+            )
+        return pieces
+
+    def _free(
+        self,
+        source_m: FloatArray,
+        vertices_m: FloatArray,
+        target_m: FloatArray,
+        edge: IntArray,
+        ground: tuple[int, int],
+    ) -> BoolArray:
+        """Check whether paths (paths,) stay above their ground, bend in the air, and nothing cuts their legs."""
+        point, good = vertices_m[:, 1], np.ones(len(edge), np.bool_)
+        for index, spot, end in zip(ground, (vertices_m[:, 0], vertices_m[:, 2]), (source_m, target_m), strict=True):
+            if index >= 0:
+                good &= (self.faces.height_m(index, point) > NEAREST_M) & (self.faces.height_m(index, end) > 0.0)
+                rows = np.flatnonzero(good)
+                good[rows] = inside(self.faces, np.full(len(rows), index), spot[rows], 0.0)
+        good[good] &= self._exposed(edge[good], point[good])
+        for start, end in legs(source_m, vertices_m, target_m):
+            good[good] &= ~self.hiding.segments(start[good], end[good])
+        return good
+
+    def _exposed(self, edge: IntArray, points_m: FloatArray) -> BoolArray:
+        """Check whether points (paths, 3) of edges (paths,) have air beside both faces."""
+        good = np.ones(len(edge), dtype=np.bool_)
+        rows = np.flatnonzero(self.doubtful[edge])
+        for side in (0, 1):
+            step = _PROBE_M * self.sides[edge[rows], side]
+            good[rows] &= ~self.hiding.segments(points_m[rows] + 0.5 * step, points_m[rows] + step)
+        return good
+
+    def _round_edges(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Places (edges, points) along edges and distances from them; -1 inside the wedge or too near."""
+        edges = self.edges
+        axes = np.stack([edges.along, edges.face_axis, edges.normal, edges.normal_n])
+        start = (axes * edges.start_m).sum(axis=2)
+        along, down, up, up_n = axes @ points_m.T - start[..., None]
+        far = np.hypot(down, up)
+        return along, np.where((far >= NEAREST_M) & ((up >= 0.0) | (up_n >= 0.0)), far, -1.0)
+
+    def _on_ground(self, ground: int, image_m: FloatArray, points_m: FloatArray) -> FloatArray:
+        """Points where the lines from images to points (paths, 3) pass a ground plane; NaN for -1."""
+        if ground < 0:
+            return np.full_like(points_m, np.nan)
+        below, above = self.faces.height_m(ground, image_m), self.faces.height_m(ground, points_m)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.asarray(below / (below - above))
+        return np.asarray(image_m + share[..., None] * (points_m - image_m))
+
+
+# -------------------------------------------------------------------------------------------------------- the field
+
+
+class _End(NamedTuple):
+    """One end of paths in the space where its leg is straight.
+
+    ``centre_m`` (paths, 3), ``axes`` (paths, 3, 3) of the device as rows, ``normal`` (paths, 3) and ``face`` (paths, 3)
+    of the leg's mirror, ``bounced`` (paths,) whether there is one; places (paths or 1, 3, elements) and slants
+    (paths or 1, 2, elements) of the elements.
+    """
+
+    centre_m: FloatArray
+    axes: FloatArray
+    normal: FloatArray
+    face: FloatArray
+    bounced: BoolArray
+    places_m: FloatArray
+    slants: FloatArray
+
+
+def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link) -> ComplexArray:
+    """Complex amplitudes (paths, uav elements, tower elements) of paths.
 
     Parameters
     ----------
-    pose, tower : (paths,) int
-    edge : (paths, 2) int
-        The second is -1 over one edge.
-    shared : (paths, 2) int
-        Which face of each of two edges the path runs along between them: 0, or 1 for face n.
-    ground : (paths, 2) int
-        Faces that reflect before and after the edges, the ground as a rule; -1 where none does.
-    vertices_m : (paths, 4, 3)
-        Reflection, edge, edge, reflection point for array centres; NaN where unused.
+    paths : EdgePaths
+    faces : Faces
+    sources_m : (towers, 3)
+        [m]
+    poses : Poses
+    link : Link
+
+    Returns
+    -------
+    (paths, uav elements, tower elements) complex
+
+    Notes
+    -----
+    ``g_u . M_2 D M_1 . g_t  lambda / (4 pi) / sqrt(k s s' (s + s')) e^{-j k (s + s')}`` with s' and s the lengths
+    before and after the edge, D the diffraction matrix times the square root of k, and M the dyads of mirrors.
     """
+    wavelength = wavelength_m(link.carrier_hz)
+    wave_number, table = 2.0 * np.pi / wavelength, FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
+    face_0, face_n = paths.wedge.T
+    along, face_axis, exterior = wedge_axes(faces.normal[face_0], faces.normal[face_n])
+    frame, point = np.stack([along, face_axis, faces.normal[face_0]], axis=1), paths.vertices_m[:, 1]
+    ends = _ends(paths, faces, table, sources_m, poses, link)
+    place = [np.einsum("nij,nj->in", frame, end.centre_m - point) for end in ends]
+    near, far = (np.hypot(down, up) for _, down, up in place)
+    rise = place[1][0] - place[0][0]
+    total = np.hypot(near + far, rise)
+    sine, cosine = (near + far) / total, rise / total
+    phi_in, phi_out = (np.mod(np.arctan2(up, down), 2.0 * np.pi) for _, down, up in place)
+    distance, materials = wave_number * near * far / total, (tuple(table[face].T) for face in (face_0, face_n))
+    bb, bp, pp = wedge(phi_in, phi_out, cosine, exterior, distance, *materials)
+    # lambda / (4 pi) = 1 / 2k; the legs are near / sine and far / sine long, both bases lack a factor 1 / sine
+    spread = (1.0 / (2.0 * wave_number * sine * np.sqrt(wave_number * near * far)))[:, None]
+    ways = _unit(point - ends[0].centre_m), _unit(ends[1].centre_m - point)
+    towers = tuple(link.tower_arrays.values())
+    (b_in, p_in), (b_out, p_out) = (
+        _round_edge(ends[side], ways[side], 1.0 - 2.0 * side, along, cosine, _patterns(arrays, paths, ends[side], way))
+        for side, (arrays, way) in enumerate(((towers, ways[0]), ((link.uav_array,), -ways[1])))
+    )
+    b_mid = spread * (bb[:, None] * b_in + bp[:, None] * p_in)
+    p_mid = spread * (pp[:, None] * p_in - bp[:, None] * b_in)
+    (u_s, v_s), (u_t, v_t) = (_element_places(end, point, frame) for end in ends)
+    length = np.hypot(u_t[:, :, None] - u_s[:, None, :], v_t[:, :, None] + v_s[:, None, :])
+    # whole cycles go before the exponential: at 1 km they would take five digits of the phase
+    cycles = length / wavelength
+    carrier = np.exp(-2j * np.pi * (cycles - np.round(cycles))) / np.sqrt(length)
+    return np.asarray((b_out[:, :, None] * b_mid[:, None, :] + p_out[:, :, None] * p_mid[:, None, :]) * carrier)
 
-    pose: IntArray
-    tower: IntArray
-    edge: IntArray
-    shared: IntArray
-    ground: IntArray
-    vertices_m: FloatArray
 
-    def __len__(self) -> int:
-        return len(self.pose)
+def _unit(vector: FloatArray) -> FloatArray:
+    return np.asarray(vector / np.linalg.norm(vector, axis=1, keepdims=True))
 
-    @classmethod
-    def of(cls, index: IntArray, vertices_m: FloatArray) -> EdgePaths:
-        """Paths of rows (paths, 8): pose, tower, edges, shared faces, mirrors."""
-        return cls(
-            pose=index[:, 0],
-            tower=index[:, 1],
-            edge=index[:, 2:4],
-            shared=index[:, 4:6],
-            ground=index[:, 6:8],
-            vertices_m=vertices_m,
-        )
 
-    def as_path_set(self) -> PathSet:
-        """The same polylines without faces: what terrain and foliage ask for."""
-        used = np.isfinite(self.vertices_m).all(axis=2)
-        first = np.argsort(~used, axis=1, kind="stable")
-        vertices = np.take_along_axis(self.vertices_m, first[..., None], axis=1)
-        nothing = np.full(self.vertices_m.shape[:2], -1, dtype=np.int64)
-        return PathSet(self.pose, self.tower, used.sum(axis=1), nothing, vertices)
+def _ends(
+    paths: EdgePaths, faces: Faces, table: FloatArray, sources_m: FloatArray, poses: Poses, link: Link
+) -> tuple[_End, _End]:
+    """Source and target of each path, mirrored where their leg is bent."""
+    arrays, uav = list(link.tower_arrays.values()), link.uav_array
+    mounts = np.stack([array.mount.T for array in arrays])
+    axes = np.einsum("nij,jk->nki", poses.rotation[paths.pose], uav.mount)
+    places, slants = np.stack([a.positions_m.T for a in arrays]), np.stack([a.slant_parts for a in arrays])
+    rows = (
+        (sources_m[paths.tower], mounts[paths.tower], places[paths.tower], slants[paths.tower]),
+        (poses.position_m[paths.pose], axes, uav.positions_m.T[None], uav.slant_parts[None]),
+    )
+    ends = []
+    for side, (centre, turned, place, slant) in enumerate(rows):
+        ground = paths.ground[:, side]
+        bounced = ground >= 0
+        normal = np.where(bounced[:, None], faces.normal[ground], 0.0)
+        offset = np.where(bounced, faces.offset_m[ground], 0.0)
+        centre = centre - 2.0 * ((centre * normal).sum(axis=1) - offset)[:, None] * normal
+        turned = turned - 2.0 * np.einsum("nij,nj->ni", turned, normal)[..., None] * normal[:, None]
+        mirror = {"normal": normal, "face": table[ground], "bounced": bounced}
+        ends.append(_End(centre_m=centre, axes=turned, **mirror, places_m=place, slants=slant))
+    return ends[0], ends[1]
+
+
+def _patterns(
+    arrays: tuple[Array, ...], paths: EdgePaths, end: _End, toward: FloatArray
+) -> tuple[ComplexArray, ComplexArray]:
+    """E_theta and E_phi (paths, elements) of one end's elements ``toward`` directions (paths, 3) of the centres."""
+    count = len(arrays[0])
+    if all(plain(array.patterns) for array in arrays):
+        return np.ones((1, 1), complex), np.zeros((1, 1), complex)
+    fields = np.empty((len(paths), 4, count))
+    for number, array in enumerate(arrays):
+        rows = np.flatnonzero(paths.tower == number) if len(arrays) > 1 else np.arange(len(paths))
+        x, y, z = (np.repeat(part, count, axis=1) for part in parts_of(toward[rows]))
+        fields[rows] = pattern_fields(array, np.arange(count), rows_of(end.axes[rows]), (x, y, z))
+    return fields[:, 0] + 1j * fields[:, 1], fields[:, 2] + 1j * fields[:, 3]
+
+
+def _round_edge(
+    end: _End, way: FloatArray, sign: float, along: FloatArray, cosine: FloatArray,
+    pattern: tuple[ComplexArray, ComplexArray],
+) -> tuple[ComplexArray, ComplexArray]:  # fmt: skip
+    """Fields (paths, elements) of an end's elements in the edge-fixed basis, times the sine with the edge.
+
+    ``way`` (paths, 3) is the direction of the wave at the edge's end of the leg; ``sign`` is 1 at the source and -1 at
+    the target, which radiates against it.
+    """
+    flat, cross = along - cosine[:, None] * way, np.cross(along, way)
+    toward, normal = parts_of(way), parts_of(end.normal)
+    mirror = coefficients(dyads.incidence(toward, normal), parts_of(end.face))
+    slant_cosine, slant_sine = end.slants[:, 0], end.slants[:, 1]
+    e_theta, e_phi = dyads.slant_rotation(*pattern, slant_cosine, slant_sine)
+    beta: ComplexArray = np.zeros(1, complex)
+    phi: ComplexArray = np.zeros(1, complex)
+    for unit, field in (((1.0, 0.0), e_theta), ((0.0, 1.0), e_phi)):
+        wave = dyads.field_vector(rows_of(end.axes), tuple(sign * part for part in toward), *unit)  # type: ignore[arg-type]
+        re, im = dyads.reflected(wave, (0.0, 0.0, 0.0), toward, normal, *mirror)
+        after = np.hstack(re) + 1j * np.hstack(im)
+        vector = np.where(end.bounced[:, None], after, np.hstack(wave))
+        beta = beta + field * (vector * flat).sum(axis=1)[:, None]
+        phi = phi + field * (vector * cross).sum(axis=1)[:, None]
+    return beta, phi
+
+
+def _element_places(end: _End, point_m: FloatArray, frame: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Places of an end's elements along the edge and their distances from it (paths, elements) [m]."""
+    places = (end.centre_m - point_m)[:, :, None] + np.einsum("nji,njk->nik", end.axes, end.places_m)
+    along, down, up = np.einsum("nij,njk->ink", frame, places)
+    return along, np.hypot(down, up)

@@ -11,13 +11,13 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
+from .field.sum import Further
 from .paths import PathSet
 from .search.effort import SearchRun
 from .search.samples import Samples
 
 Engine = Literal["image", "sionna"]
 Device = Literal["auto", "cpu", "cuda"]
-Diffraction = Literal["none", "edges", "all"]
 # ``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target.
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 
@@ -37,9 +37,9 @@ class Search:
         (:mod:`aerpaw_cmp.propagation.search.samples`).
     batch : int
         ``sionna`` only: poses per call.
-    diffraction : {"none", "edges", "all"}
-        Paths over one edge of a building: with the ground on either side ("edges"), and also with one wall or roof on
-        one side ("all"). In H, levels and ranks, whichever engine finds the reflections.
+    further : tuple of callable
+        Searches ``(scene, poses, link)`` of further kinds of paths, such as
+        :func:`aerpaw_cmp.propagation.edges.over_edges`. In H, levels and ranks, whichever engine finds the reflections.
     device : {"auto", "cpu", "cuda"}
         Of Sionna's search; "auto" is a GPU where Dr.Jit finds one.
     links : (towers, poses) bool, optional
@@ -50,7 +50,7 @@ class Search:
     max_depth: int = 2
     samples: Samples = "auto"
     batch: int = 50
-    diffraction: Diffraction = "none"
+    further: tuple[Callable[..., Further], ...] = ()
     device: Device = "auto"
     links: BoolArray | None = None
 
@@ -76,12 +76,10 @@ class Search:
         Raises
         ------
         UsageError
-            An unknown engine or diffraction.
+            An unknown engine.
         """
         if self.engine not in ("image", "sionna"):
             raise UsageError(f"unknown engine {self.engine!r}", expected="'image' or 'sionna'")
-        if self.diffraction not in ("none", "edges", "all"):
-            raise UsageError(f"unknown diffraction {self.diffraction!r}", expected="'none', 'edges' or 'all'")
 
 
 @dataclass(frozen=True, slots=True)

@@ -129,6 +129,7 @@ class Rows:
 
     __slots__ = ()
     pose: IntArray
+    tower: IntArray
 
     def select(self: RowsT, rows: AnyArray | slice) -> RowsT:
         """The paths of a mask, of indices or of a slice."""
@@ -172,6 +173,10 @@ class PathSet(Rows):
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def lines(self) -> PathSet:
+        """The paths as polylines: themselves."""
+        return self
 
     @classmethod
     def from_tower(cls, tower: int, pose: IntArray, faces: IntArray, vertices_m: FloatArray, max_depth: int) -> PathSet:

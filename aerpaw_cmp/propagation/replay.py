@@ -13,15 +13,12 @@ from ..common.errors import UsageError
 from ..common.units import BoolArray, ComplexArray, FloatArray, wavelength_m
 from ..site.site import Site
 from .arrays import Link, Poses
-from .edges import EdgePaths, Edges
 from .engines import chosen_samples, path_cache, search_or_read
-from .field.edges import edge_channels
-from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
+from .field.sum import Fields, Further, channel_matrices, mean_pair_power, rss_dbm
 from .options import Field, Run, Search
 from .paths import Faces, PathSet, legs
 from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
-from .search.edges import find_edge_paths
 from .search.terrain import on_terrain
 from .surfaces import Surfaces
 
@@ -45,7 +42,9 @@ class Replay:
     h : (poses, towers, n_rx, n_tx) complex128
         Zero without a path.
     has_path : (poses, towers) bool
-    paths : PathSet
+    contributions : tuple
+        All that H and both levels are made of: the reflections and lines of sight, then the paths of each further kind
+        (:class:`~aerpaw_cmp.propagation.field.sum.Further`) that was asked for.
     faces : Faces
     seconds : float
         Of this call: path search (or reading the cache) and fields.
@@ -64,15 +63,13 @@ class Replay:
         Why so many, where the number was found by pilots.
     surfaces : Surfaces, optional
         What the faces are made of, where the site is a scene of triangles.
-    edge_paths : EdgePaths, optional
-        Paths over edges, where diffraction was asked for; they are in H and both levels.
     """
 
     rss_dbm: FloatArray
     rss_power_dbm: FloatArray
     h: ComplexArray
     has_path: BoolArray
-    paths: PathSet
+    contributions: tuple[Any, ...]
     faces: Faces
     seconds: float
     search_seconds: float
@@ -83,7 +80,16 @@ class Replay:
     samples: int = 0
     samples_reason: str = ""
     surfaces: Surfaces | None = None
-    edge_paths: EdgePaths | None = None
+
+    @property
+    def paths(self) -> PathSet:
+        """Reflections and lines of sight."""
+        return self.contributions[0]  # type: ignore[no-any-return]
+
+    @property
+    def further(self) -> tuple[Further, ...]:
+        """Paths of further kinds."""
+        return self.contributions[1:]
 
     @property
     def left_out(self) -> list[str]:
@@ -177,11 +183,10 @@ def replay(
     search = search if choice is None else replace(search, samples=choice.samples)
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
     notes += map(Omission, cache.warnings) if cache else []
-    bent, over, unmodelled = further_fields(site, scene, link, poses, search, field, run)
+    further = further_paths(site, scene, link, poses, search, field)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
-    result = _evaluated(scene, link, poses, paths, search, field, run, [] if over is None else [over])
-    result = replace(result, edge_paths=bent)
-    notes += [*stopped, *unmodelled]
+    result = _evaluated(scene, link, poses, (paths, *(some for some, _ in further)), search, field, run, further)
+    notes += [*stopped, *(Omission(some.missing) for some, _ in further)]
     return replace(
         result,
         seconds=time.perf_counter() - started,
@@ -223,6 +228,34 @@ def passed(
     return scene, paths, notes
 
 
+def further_paths(
+    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field
+) -> list[tuple[Further, Fields]]:
+    """Paths of the further kinds that are asked for, and what they add to H and to the powers.
+
+    Parameters
+    ----------
+    site, scene, link, poses, search, field
+        As for :func:`replay`.
+
+    Returns
+    -------
+    list of (Further, Fields)
+        Without paths that the terrain stops or that lose all.
+    """
+    pieces = []
+    for find in search.further:
+        paths, loss_db = find(scene, poses, link), None
+        if site.dem is not None or field.loss is not None:
+            lines = paths.lines()
+            clear = _clear_of_terrain(site, scene, poses, lines)
+            loss_db = field.loss_db(lines, scene.sources_m, poses.position_m)
+            clear &= True if loss_db is None else np.isfinite(loss_db)
+            paths, loss_db = paths.select(clear), None if loss_db is None else loss_db[clear]
+        pieces.append((paths, paths.fields(scene.faces, scene.sources_m, poses, link, loss_db)))
+    return pieces
+
+
 def _shaped_ground(
     site: Site, scene: Scene, link: Link, poses: Poses, paths: PathSet
 ) -> tuple[Scene, PathSet, PathSet, list[Omission]]:
@@ -256,73 +289,25 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
     return clear
 
 
-def further_fields(
-    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, run: Run
-) -> tuple[EdgePaths | None, Fields | None, list[Omission]]:
-    """Paths over edges, where they are asked for, what they add, and what of diffraction is not modelled.
-
-    Parameters
-    ----------
-    site, scene, link, poses, search, field, run
-        As for :func:`replay`.
-
-    Returns
-    -------
-    paths, fields, notes
-        None where they were not asked for.
-    """
-    if search.diffraction == "none":
-        return None, None, []
-    edges = edges_of(scene)
-    paths = find_edge_paths(
-        edges,
-        scene.faces,
-        (scene.sources_m, poses.position_m),
-        scene.usable,
-        scene.excluded,
-        surfaces=scene.surfaces,
-        every=search.diffraction == "all",
-        threads=run.threads,
-    )
-    loss_db = None
-    if site.dem is not None or field.loss is not None:
-        bends = paths.as_path_set()
-        clear = _clear_of_terrain(site, scene, poses, bends)
-        loss_db = field.loss_db(bends, scene.sources_m, poses.position_m)
-        clear &= True if loss_db is None else np.isfinite(loss_db)
-        paths, loss_db = paths.select(clear), None if loss_db is None else loss_db[clear]
-    h, power = edge_channels(paths, edges, scene.faces, scene.sources_m, poses, link, loss_db, run.threads)
-    missing = "three edges" if search.diffraction == "all" else "two edges, after a reflection off a wall,"
-    missing = f"diffraction over {missing} and with more than one reflection on a side"
-    return paths, Fields(h, power, power), [Omission(missing)]
-
-
-def edges_of(scene: Scene | Replay) -> Edges:
-    """Edges of the buildings or triangles of a scene or a replay."""
-    if scene.surfaces is not None:
-        return Edges.of_surfaces(scene.surfaces)
-    level = scene.faces.offset_m[scene.faces.solid == -1]
-    return Edges.of(scene.faces, float(level.max(initial=0.0)))
-
-
 def _evaluated(
     scene: Scene,
     link: Link,
     poses: Poses,
-    paths: PathSet,
+    contributions: tuple[Any, ...],
     search: Search,
     field: Field,
     run: Run,
-    more: Sequence[Fields] = (),
+    further: Sequence[tuple[Further, Fields]],
 ) -> Replay:
     """Fields of the paths; times are the caller's."""
+    paths = contributions[0]
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
     work = None if run.job is None else run.job.pairs
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads, work=work)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
-    for item in more:
+    for _, item in further:
         fields = Fields(fields.h + item.h, fields.path_power, fields.power + item.power)
         has_path |= item.power > 0.0
     level_dbm, power_dbm = _levels(fields, has_path, link)
@@ -331,7 +316,7 @@ def _evaluated(
         rss_power_dbm=power_dbm,
         h=fields.h,
         has_path=has_path,
-        paths=paths,
+        contributions=contributions,
         faces=scene.faces,
         seconds=0.0,
         search_seconds=0.0,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,7 +12,8 @@ from ..common.errors import UsageError
 from ..site.site import Site
 from ..site.siteyaml import load_site
 from .arrays import Link, Poses
-from .options import Diffraction, Engine, Field, Loss, Search
+from .edges import diffracted
+from .options import Engine, Field, Loss, Search
 from .replay import Replay, replay
 from .search.samples import Samples
 
@@ -25,7 +27,7 @@ def trace(
     *,
     loss: Loss | None = None,
     samples: Samples = "auto",
-    diffraction: Diffraction = "none",
+    diffraction: Literal["none", "edges"] = "none",
 ) -> Replay:
     """Paths, channel matrices and received power of poses at a site.
 
@@ -46,8 +48,8 @@ def trace(
         Further loss per path [dB], such as foliage.
     samples : int or "auto"
         ``sionna`` only: rays per tower; "auto" raises the number until two pilots agree.
-    diffraction : {"none", "edges", "all"}
-        Paths over one edge of a building, as :class:`~aerpaw_cmp.propagation.options.Search` has them.
+    diffraction : {"none", "edges"}
+        Paths over one edge of a building, with the ground on either side (:mod:`aerpaw_cmp.propagation.edges`).
 
     Returns
     -------
@@ -72,7 +74,7 @@ def trace(
     (1, 1)
     """
     place = site if isinstance(site, Site) else load_site(site)
-    search = Search(engine, max_depth=max_depth, samples=samples, diffraction=diffraction)
+    search = Search(engine, max_depth=max_depth, samples=samples, further=diffracted(diffraction))
     return replay(place, link, poses if isinstance(poses, Poses) else _level(poses), search, Field(loss))
 
 

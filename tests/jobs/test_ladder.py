@@ -187,7 +187,7 @@ def test_a_rung_with_diffraction_states_its_key() -> None:
     assert model.name == "incoherent ground reflection + buildings + diffraction"
     assert recommended_settings({"rt": {"max_depth": 1}}, model)["rt"]["diffraction"] == "edges"
     plain = Model(ground="power sum", buildings=True)
-    assert "diffraction" not in recommended_settings({"rt": {"max_depth": 1, "diffraction": "all"}}, plain)["rt"]
+    assert "diffraction" not in recommended_settings({"rt": {"max_depth": 1, "diffraction": "edges"}}, plain)["rt"]
 
 
 def test_the_rung_with_diffraction_is_what_its_settings_replay(tmp_path: Path) -> None:

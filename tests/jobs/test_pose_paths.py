@@ -9,13 +9,14 @@ from shapely.geometry import box
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.reporting.pose_paths import SHORTEST, pose_paths
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.edges import over_edges
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.report.content.flight import DIFFRACTED
+from aerpaw_cmp.report.content.flight import FURTHER
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 
-@pytest.mark.parametrize("asked", [{}, {"diffraction": "edges"}])
+@pytest.mark.parametrize("asked", [{}, {"further": (over_edges,)}])
 def test_bent_paths_are_drawn_from_tower_to_uav_where_they_were_asked_for(asked: dict[str, object]) -> None:
     house = Building("house", box(40.0, -10.0, 60.0, 10.0), 12.0, material="brick")
     site = Site("s", SiteFrame(35.7, -78.7), {"T": Tower("T", 35.7, -78.7, 0.0, 0.0)}, buildings=(house,))
@@ -33,7 +34,7 @@ def test_bent_paths_are_drawn_from_tower_to_uav_where_they_were_asked_for(asked:
     if not asked:
         assert behind <= {0, 1, 2}
         return
-    assert 0 < kinds[0].count(DIFFRACTED) <= SHORTEST
+    assert 0 < kinds[0].count(FURTHER) <= SHORTEST
     for lines, place in zip(paths.lines, poses.position_m, strict=True):
         for line, _ in lines:
             assert np.isfinite(line).all()

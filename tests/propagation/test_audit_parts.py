@@ -77,7 +77,7 @@ def test_paths_that_the_other_engine_lacks_are_invented_only_where_none_can_be()
     faces[row, 0] = np.flatnonzero(
         (replayed.faces.solid >= 0) & (replayed.faces.normal @ source < replayed.faces.offset_m - 1)
     )[0]
-    planted = dataclasses.replace(replayed, paths=dataclasses.replace(replayed.paths, faces=faces))
+    planted = dataclasses.replace(replayed, contributions=(dataclasses.replace(replayed.paths, faces=faces),))
     audit = impossible(SITE, POSES, planted, every, Expected.of(LINK))
     assert (audit.phantom_paths, audit.failures) == (1, ("1 paths that cannot exist",))
     assert impossible(SITE, POSES, planted, np.setdiff1d(every, row), Expected.of(LINK)).phantom_paths == 0
@@ -172,7 +172,9 @@ def test_paths_of_the_asked_poses_are_matched_and_those_that_are_lacking_counted
     clean = replay(SITE, link, poses, search)
     asked = int(np.isin(clean.paths.pose, chosen).sum())
     dropped = int(np.flatnonzero((clean.paths.pose == 2) & (clean.paths.depth == 1))[0])
-    fewer = dataclasses.replace(clean, paths=clean.paths.select(np.setdiff1d(np.arange(len(clean.paths)), dropped)))
+    fewer = dataclasses.replace(
+        clean, contributions=(clean.paths.select(np.setdiff1d(np.arange(len(clean.paths)), dropped)),)
+    )
     for replayed, lacking in ((clean, 0), (fewer, 1)):
         audit = against_sionna(SITE, link, poses, replayed, chosen, Expected.of(link), search, complete=complete)
         assert (audit.paths, audit.missing_paths) == (asked - lacking, lacking if complete else 0)
@@ -305,7 +307,7 @@ def test_an_audit_adds_up_its_checks(monkeypatch: pytest.MonkeyPatch, samples: o
     faces[row, 0] = np.flatnonzero((clean.faces.solid >= 0) & (clean.faces.normal @ source < clean.faces.offset_m - 1))[
         0
     ]
-    planted = dataclasses.replace(clean, paths=dataclasses.replace(clean.paths, faces=faces))
+    planted = dataclasses.replace(clean, contributions=(dataclasses.replace(clean.paths, faces=faces),))
     phantom = audit_module.audit(
         SITE, LINK, poses, planted, wanted, second=dataclasses.replace(second, reference_links=0)
     )
@@ -327,7 +329,7 @@ def test_audited_poses_are_spread_or_taken_for_the_kinds_of_their_paths() -> Non
     pose, face = np.array([(p, f) for p, several in kinds.items() for f in several]).T
     rows = some.paths.select(np.zeros(len(pose), dtype=np.int64))
     paths = dataclasses.replace(rows, pose=pose, faces=face[:, None])
-    many = dataclasses.replace(some, paths=paths)
+    many = dataclasses.replace(some, contributions=(paths,))
     for count, expected in ((1, [3]), (2, [1, 3]), (3, [1, 2, 3]), (4, [2, 0, 1, 3]), (9, [2, 0, 1, 3])):
         assert spread_over_paths(many, np.array([2, 0, 1, 3]), count).tolist() == expected
     places = np.full((7, 3), 5.0)

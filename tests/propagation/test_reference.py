@@ -317,13 +317,13 @@ def test_planted_fault_is_seen(monkeypatch, case, fault):
 def test_dropped_and_invented_paths_are_seen(case):
     site, link, poses = case
     clean = replay(site, link, poses)
-    fewer = replace(clean, paths=clean.paths.select(np.arange(len(clean.paths)) % 3 > 0))
+    fewer = replace(clean, contributions=(clean.paths.select(np.arange(len(clean.paths)) % 3 > 0),))
     assert audited(site, link, poses, fewer).missing_paths == len(clean.paths) - len(fewer.paths)
     assert audited(site, link, poses, fewer, complete=False).missing_paths == 0
     faces = clean.paths.faces.copy()
     row = int(np.flatnonzero(clean.paths.depth == 1)[0])
     faces[row, 0] = np.flatnonzero(clean.faces.normal[:, 2] == 0)[0]  # over a wall that it does not meet
-    moved = replace(clean, paths=replace(clean.paths, faces=faces))
+    moved = replace(clean, contributions=(replace(clean.paths, faces=faces),))
     assert audited(site, link, poses, moved).phantom_paths == 1
 
 

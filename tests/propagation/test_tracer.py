@@ -12,6 +12,7 @@ from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.cache import PathCache
 from aerpaw_cmp.propagation.check.audit import Second, audit
 from aerpaw_cmp.propagation.compiled import State
+from aerpaw_cmp.propagation.edges import over_edges
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene, within_reach
@@ -97,7 +98,7 @@ def test_anything_that_decides_paths_changes_the_key(case, tmp_path, scenes):
         key(engine="sionna", samples=9), key(engine="sionna", device="cpu"),
     ]  # fmt: skip
     assert len({key(), *others}) == 1 + len(others)
-    assert key() == key(carrier_hz=3.5e9) == key(Scene.of(metal, link, poses)) == key(diffraction="edges")
+    assert key() == key(carrier_hz=3.5e9) == key(Scene.of(metal, link, poses)) == key(further=(over_edges,))
 
 
 @pytest.mark.parametrize(

@@ -14,6 +14,7 @@ from aerpaw_cmp.propagation.arrays import Array, linear_array, tower_comparison_
 from aerpaw_cmp.propagation.check import field_audit
 from aerpaw_cmp.propagation.check.field_audit import per_pair
 from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
+from aerpaw_cmp.propagation.edges import over_edges
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import sionna
@@ -87,7 +88,7 @@ def test_paths_over_edges_are_no_difference_between_pairs(monkeypatch):
     monkeypatch.setattr(field_audit, "_explicit", lambda *_: field_audit.FieldAudit())
     site, link, poses = random_scene(20, buildings=8, seed=4)
     counts, fields = [], []
-    for search in (Search(), Search(diffraction="edges")):
+    for search in (Search(), Search(further=(over_edges,))):
         centre = replay(site, link, poses, search)
         audit = per_pair(site, link, poses, centre, np.arange(20), search, ks=(10.0, 1000.0))
         counts.append((audit.pairs_links, audit.pairs_differ, audit.pairs_rank_differs))

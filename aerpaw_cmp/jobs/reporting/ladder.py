@@ -30,6 +30,7 @@ from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import learned_here
 from ...propagation.arrays import Link, Poses
 from ...propagation.drivers.moving import replay_moving
+from ...propagation.edges import diffracted
 from ...propagation.field.sum import mean_pair_power, rss_dbm
 from ...propagation.options import Field, Run, Search
 from ...propagation.replay import Replay, replay
@@ -314,7 +315,7 @@ class _Climber:
         loss = path_loss(self._data.site, changed, link.carrier_hz)
         pair = pair_db(link, poses, self._sources(series))
         if model.diffraction:
-            search = Search(max_depth=changed.max_depth, diffraction="edges")
+            search = Search(max_depth=changed.max_depth, further=diffracted("edges"))
             bent = replay(self._data.site, link, poses, search, Field(loss), Run(cache_dir=""))
             level = bent.rss_power_dbm if model.ground == "power sum" else bent.rss_dbm
             return level[:, 0] + pair, series.step * bent.seconds

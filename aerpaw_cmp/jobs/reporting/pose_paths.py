@@ -9,13 +9,12 @@ import numpy as np
 from ...common.units import FloatArray
 from ...flight.data import FlightData
 from ...flight.replay import FlightReplay, Replayed
-from ...propagation.paths import PathSet
-from ...report.content.flight import DIFFRACTED, PosePaths
+from ...report.content.flight import FURTHER, PosePaths
 
 # Poses per tower whose paths are drawn.
 POSES = 300
 
-# Paths over edges that are drawn of a pose.
+# Paths of each further kind that are drawn of a pose.
 SHORTEST = 8
 
 
@@ -33,12 +32,10 @@ def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> t
 
 
 def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple[FloatArray, int]]:
-    """Polylines of a pose with their kind: number of reflections, or DIFFRACTED."""
+    """Polylines of a pose with their kind: number of reflections, or FURTHER."""
     replay, target_m = replayed.replay, replayed.poses.position_m[pose]
-    kinds: list[tuple[PathSet, int | None]] = [(replay.paths, None)]
-    if replay.edge_paths is not None:
-        kinds.append((replay.edge_paths.as_path_set(), DIFFRACTED))
-    for paths, kind in kinds:
+    for number, some in enumerate(replay.contributions):
+        paths, kind = some.lines(), FURTHER if number else None
         start, stop = np.searchsorted(paths.pose, [pose, pose + 1])
         lines = [
             np.concatenate([tower_m[None], paths.vertices_m[row, : paths.depth[row]], target_m[None]])

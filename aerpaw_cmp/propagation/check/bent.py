@@ -44,6 +44,8 @@ def _corners_of(reference: Reference) -> Iterator[Corner]:
         ring = list(building.footprint.normalize().exterior.coords)[:-1]
         ring = ring if building.footprint.normalize().exterior.is_ccw else ring[::-1]
         top = building.base_m + building.height_m
+        if top - max(ground, min(building.base_m, 0.0) - 0.5) <= C_MPS / reference.link.carrier_hz / 2:
+            continue
         for i, corner in enumerate(ring):
             a, b, before = (np.array(p[:2]) for p in (corner, ring[(i + 1) % len(ring)], ring[i - 1]))
             wall, last = (b - a) / np.linalg.norm(b - a), (a - before) / np.linalg.norm(a - before)
@@ -210,12 +212,12 @@ class _Bend:
         shadow = _cotangent(less, 1, n, kl) + _cotangent(less, -1, n, kl)
         faces = _cotangent(more, 1, n, kl) + _cotangent(more, -1, n, kl)
         half = (math.pi - less) / 2
-        flat = math.sin(first / n) * math.sin(last / n) * math.sin(half)
-        flat = min(max(flat / abs(math.sin(half / n) * math.sin((math.pi + less) / (2 * n))), -1.0), 1.0)
+        flat = math.sin(first / n) * math.sin(last / n) * abs(math.sin(half))
+        flat = min(flat / abs(math.sin(half / n) * math.sin((math.pi + less) / (2 * n))), 1.0)
         constants = permittivity(c.material, self.reference.link.carrier_hz)
         if constants is None:
             raise LookupError(c.material)
-        te, tm = fresnel(abs(flat) * sine, *constants, wavelength)
+        te, tm = fresnel(flat * sine, *constants, wavelength)
         size = math.hypot(cosine * flat, math.cos(half))
         a, b = math.cos(half) / size, cosine * flat / size
         face = np.array([[te * a * a - tm * b * b, (te + tm) * a * b], [-(te + tm) * a * b, tm * a * a - te * b * b]])

@@ -24,13 +24,11 @@ from ...common.units import (
     wavelength_m,
 )
 from ..arrays import Link, Poses
-from ..field.edges import Tables
-from ..field.edges import amplitudes as edge_amplitudes
 from ..field.fresnel import FaceMaterials, reflection_coefficients
 from ..field.geometry import Elements, geometry
 from ..field.sum import amplitudes, pattern_ends
 from ..paths import Faces, PathSet
-from ..replay import Replay, edges_of
+from ..replay import Replay
 from ..search.mirror import images_of, scene_tolerance_m, trace_back
 from ..search.occlusion import Occlusion
 from ..surfaces import Surfaces
@@ -129,7 +127,7 @@ def explain_paths(
 
 
 def further_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link: Link) -> list[str]:
-    """Paths over edges of a replay of one link in words, strongest first, with their levels before foliage.
+    """Paths of further kinds of a replay of one link in words, strongest first, with their levels before foliage.
 
     Parameters
     ----------
@@ -144,27 +142,12 @@ def further_path_lines(replay: Replay, source_m: FloatArray, poses: Poses, link:
     -------
     list of str
     """
-    bent, lines = replay.edge_paths, list[str]()
-    if bent is not None and len(bent):
-        edges, label = edges_of(replay), replay.faces.label
-        field = edge_amplitudes(bent, Tables.of(edges, replay.faces, source_m[None], poses, link), link)
-        words = []
-        for row in range(len(bent)):
-            steps = [
-                f"edge of {label[edges.face[edge, 0]]} and {label[edges.face[edge, 1]]} at "
-                + ", ".join(f"{x:.1f}" for x in bent.vertices_m[row, 1 + k]) + " m"
-                for k, edge in enumerate(bent.edge[row])
-                if edge >= 0
-            ]  # fmt: skip
-            before, after = ([label[face]] if face >= 0 else [] for face in bent.ground[row])
-            words.append([*before, *steps, *after])
-        lines += _strongest_first("diffracted path", (np.abs(field) ** 2).mean(axis=(1, 2)), words, link)
+    lines = []
+    for some in replay.further:
+        power = some.fields(replay.faces, source_m[None], poses, link).path_power
+        level, words = link.transmit_power_dbm + db_from_power(power), some.words(replay.faces)
+        lines += [f"path {some.kind} {level[row]:.2f} dBm: {words[row]}" for row in np.argsort(-level, kind="stable")]
     return lines
-
-
-def _strongest_first(kind: str, power: FloatArray, words: list[list[str]], link: Link) -> list[str]:
-    level = link.transmit_power_dbm + db_from_power(power)
-    return [f"{kind} {level[row]:.2f} dBm: {', '.join(words[row])}" for row in np.argsort(-level, kind="stable")]
 
 
 def _explained(

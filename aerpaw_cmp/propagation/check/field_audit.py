@@ -22,7 +22,7 @@ from ...site.site import Site
 from ..arrays import Array, Isotropic, Link, Poses
 from ..drivers.pairs import replay_pairs
 from ..edges import EdgePaths
-from ..field.sum import channel_matrices
+from ..field.sum import Further, channel_matrices
 from ..options import Field, Search
 from ..paths import Faces, PathSet
 from ..replay import Replay
@@ -266,7 +266,7 @@ class _OneLink:
         turn = matrix_of(self.poses.rotation[self.row])
         h, power = self.reference.matrix(paths, self.target, turn)
         failures: list[str] = []
-        bent = replay.edge_paths
+        bent = replay.further[0] if replay.further else None
         if bent is not None:
             if reason := self._beyond(bent):
                 return FieldAudit(not_covered=(reason,))
@@ -309,11 +309,11 @@ class _OneLink:
             failures=tuple(failures),
         )  # fmt: skip
 
-    def _beyond(self, bent: EdgePaths) -> str:
-        """Name the paths over edges that the second implementation does not know; "" where it knows all."""
+    def _beyond(self, bent: Further) -> str:
+        """Name the further paths that the second implementation does not know; "" where it knows all."""
         site = self.reference.site
-        if (bent.edge[:, 1] >= 0).any() or (np.append(self.replay.faces.solid, -1)[bent.ground] >= 0).any():
-            return "paths over two edges, or over an edge and a wall"
+        if not isinstance(bent, EdgePaths) or len(self.replay.further) > 1:
+            return f"paths {self.replay.further[-1].kind}"
         if site.dem is not None or (len(site.trees) and self.reference.loss.model != "none"):
             return "paths over edges through trees or over terrain"
         return "" if not any(b.footprint.interiors for b in site.buildings) else "edges of courtyards"

@@ -167,7 +167,7 @@ def _scene_of(
 
 def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     """Replay of a block as of one tower, which had its own place at each pose."""
-    row, bent = np.arange(len(block.rows)), replayed.edge_paths
+    row = np.arange(len(block.rows))
 
     def at_place(values: AnyArray) -> AnyArray:
         return np.ascontiguousarray(values[row, block.place][:, None])
@@ -176,8 +176,7 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     return replace(
         replayed,
         **columns,
-        paths=replace(replayed.paths, tower=np.zeros_like(replayed.paths.tower)),
-        edge_paths=None if bent is None else replace(bent, tower=np.zeros_like(bent.tower)),
+        contributions=tuple(replace(some, tower=np.zeros_like(some.tower)) for some in replayed.contributions),
         towers=(name,),
         omitted=[replace(item, tower=name if item.tower else "") for item in replayed.omitted],
     )

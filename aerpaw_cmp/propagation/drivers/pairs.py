@@ -13,7 +13,7 @@ from ..arrays import Array, Link, Poses
 from ..engines import search_paths
 from ..field.sum import channel_matrices, mean_pair_power, rss_dbm
 from ..options import Field, Run, Search
-from ..replay import further_fields, passed
+from ..replay import further_paths, passed
 from ..scene import Scene, within_reach
 
 
@@ -39,7 +39,7 @@ def replay_pairs(
 ) -> PairChannels:
     """Replay with paths of each element pair; as many searches as the UAV has elements.
 
-    Paths over edges are those of the array centres, as in a replay.
+    Paths of further kinds are those of the array centres, as in a replay.
 
     Parameters
     ----------
@@ -88,8 +88,7 @@ def replay_pairs(
         h[:, :, element] = fields.h[..., 0, 0].reshape(len(poses), towers, ports)
         power += fields.power.reshape(len(poses), towers, ports).sum(axis=2) / (ports * len(uav))
     h = np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
-    _, added, _ = further_fields(site, scene, link, poses, search, field, quiet)
-    if added is not None:
+    for _, added in further_paths(site, scene, link, poses, search, field):
         h, power = h + added.h, power + added.power
     level = rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm)
     h = np.where(np.isfinite(level)[:, :, None, None], h, 0.0)

@@ -65,13 +65,13 @@ def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
     first, count = parts[0], sum(map(len, rows))
     # planes of terrain are numbered as they are met: other blocks have others
     faces, shifted = _joined_faces(parts)
-    bent = [part.edge_paths for part in parts if part.edge_paths is not None]
+    pieces = [shifted, *zip(*(part.further for part in parts), strict=True)]
     further: dict[str, Any] = {
         "faces": faces,
         "seconds": sum(part.seconds for part in parts),
         "search_seconds": sum(part.search_seconds for part in parts),
         "omitted": _added(parts),
-        "edge_paths": _in_flight(bent, rows) if bent else None,
+        "contributions": tuple(_in_flight(piece, rows) for piece in pieces),
     }
     columns = {name: [getattr(part, name) for part in parts] for name in PER_LINK}
     parts.clear()
@@ -81,7 +81,7 @@ def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
         arrays[name] = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
         for at, value in zip(rows, values, strict=True):
             arrays[name][at] = value
-    return replace(first, **arrays, **further, paths=_in_flight(shifted, rows))
+    return replace(first, **arrays, **further)
 
 
 def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:

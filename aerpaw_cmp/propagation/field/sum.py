@@ -16,6 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,7 +24,7 @@ from ...common.errors import UsageError
 from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
 from .. import compiled
 from ..arrays import Array, Link, Poses
-from ..paths import Faces, PathSet
+from ..paths import Faces, PathSet, Rows
 from . import dyads
 from .fresnel import FaceMaterials, coefficients
 from .geometry import Elements, Ends, Geometry, directions, geometry, parts_of, pattern_fields, plain, rows_of
@@ -52,6 +53,41 @@ class Fields:
     h: ComplexArray
     path_power: FloatArray
     power: FloatArray
+
+
+class Further(Rows):
+    """Paths of a kind beside reflections, a row each: all that replays, their parts, drawings and words ask of them.
+
+    ``kind`` stands after "path" in words; ``missing`` is what of the kind is not modelled.
+    """
+
+    __slots__ = ()
+    kind: ClassVar[str]
+    missing: ClassVar[str]
+
+    def lines(self) -> PathSet:
+        """The same polylines without faces: what terrain, foliage and drawings ask for."""
+        raise NotImplementedError
+
+    def fields(
+        self, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
+    ) -> Fields:
+        """Part of the paths in H and in the powers, as :func:`channel_matrices` gives it.
+
+        Parameters
+        ----------
+        faces, sources_m, poses, link, loss_db
+            As there.
+
+        Returns
+        -------
+        Fields
+        """
+        raise NotImplementedError
+
+    def words(self, faces: Faces) -> list[str]:
+        """Corners of each path, from tower to UAV."""
+        raise NotImplementedError
 
 
 def channel_matrices(

@@ -87,8 +87,8 @@ class Source:
     line: IntArray
 
 
-# Kind of drawn paths beside a number of reflections: over edges.
-DIFFRACTED = -1
+# Kind of drawn paths beside a number of reflections: any further one, as over an edge.
+FURTHER = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,8 +22,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from xml.etree import ElementTree
 
+from ..common import kml
 from ..common.errors import InputError, about_file
+from ..common.xmlfiles import named, outermost, plain, xml_root
 from .ingest import as_utf8, read_bytes, read_file
 from .readers import HEAD_BYTES, ReadOptions, claims
 
@@ -91,7 +94,7 @@ def _route(data: bytes, path: str | Path) -> _Route:
     if any(reader.kinds for reader in claims(data)):
         return _log(path)
     if b"<kml" in head:
-        return _kml(data.decode("utf-8", "replace"))
+        return _kml(data)
     if b"\0" in head:
         raise InputError("binary content that is no route", expected=_EXPECTED)
     return _sheet(data.decode("utf-8", "replace"))
@@ -271,29 +274,31 @@ def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) 
 
 # --- KML ---------------------------------------------------------------------------------------------
 
-_SHAPE = re.compile(r"<(LineString|Point|gx:Track)\b[^>]*>(.*?)</\1>", re.DOTALL)
-_MODE = re.compile(r"<(?:gx:)?altitudeMode>\s*(\w+)\s*<")
-_COORDINATES = re.compile(r"<coordinates>(.*?)</coordinates>", re.DOTALL)
-_TRACK_POINT = re.compile(r"<gx:coord>(.*?)</gx:coord>", re.DOTALL)
-_TRACK_HEADING = re.compile(r"<gx:angles>\s*(-?[\d.]+)")
+_HEADING = re.compile(r"\s*(-?\d+(?:\.\d*)?)")
 
 
-def _kml(text: str) -> _Route:
+def _root(data: bytes) -> ElementTree.Element:
+    """The document; its bytes are UTF-8 whatever its first line declares."""
+    return xml_root(re.sub(rb"\A\s*<\?xml.*?\?>", b"", data, flags=re.DOTALL), None, "a plain KML")
+
+
+def _kml(data: bytes) -> _Route:
     """Lines and tracks of a map; where it has none, its points in their order."""
-    shapes = [match.groups() for match in _SHAPE.finditer(text)]
-    lines = [shape for shape in shapes if shape[0] != "Point"]
+    root = _root(data)
+    shapes = list(outermost(root, {"LineString", "Point", "Track"}))
+    lines = [shape for shape in shapes if plain(shape.tag) != "Point"]
     if not lines and len(shapes) < 2:
-        what = "a geofence, which has areas alone" if "<Polygon" in text else "a map without a line"
+        what = "a geofence, which has areas alone" if any(named(root, "Polygon")) else "a map without a line"
         raise InputError(f"no route: {what}", expected="a KML with a line (LineString, gx:Track) or points")
     route, sea_level = _Route(), False
     if len(lines) > 1:
         route.remark(f"{len(lines)} lines are flown one after the other.")
-    for kind, body in lines or shapes:
-        mode = _MODE.search(body)
-        sea_level |= mode is not None and mode[1] == "absolute"
-        clamped = mode is None or mode[1].startswith("clamp")
-        headings = [float(heading) for heading in _TRACK_HEADING.findall(body)]
-        for index, place in enumerate(_places(kind, body)):
+    for shape in lines or shapes:
+        modes = kml.modes_of(shape)
+        sea_level |= "absolute" in modes
+        clamped = not modes or any(mode.startswith("clamp") for mode in modes)
+        headings = [float(m[1]) for angles in named(shape, "angles") if (m := _HEADING.match(str(angles.text or "")))]
+        for index, place in enumerate(kml.places_of(shape)):
             yaw = headings[index] if index < len(headings) else math.nan
             height = math.nan if len(place) < 3 or (clamped and place[2] == 0.0) else place[2]
             route.add(place[1], place[0], height, yaw)
@@ -304,24 +309,6 @@ def _kml(text: str) -> _Route:
     return route
 
 
-def _places(kind: str, body: str) -> list[tuple[float, ...]]:
-    """Longitude, latitude and, where it is said, altitude of each point of a shape."""
-    if kind == "gx:Track":
-        texts = [match.split() for match in _TRACK_POINT.findall(body)]
-    else:
-        texts = [place.split(",") for match in _COORDINATES.findall(body) for place in match.split()]
-    try:
-        places = [tuple(float(cell) for cell in cells) for cells in texts]
-    except ValueError as error:
-        raise InputError(f"a coordinate that is no number ({error})", expected="longitude,latitude,altitude") from error
-    if any(len(place) < 2 for place in places):
-        raise InputError("a coordinate without latitude", expected="longitude,latitude,altitude")
-    return places
-
-
-_AREA = re.compile(r"<Polygon\b[^>]*>.*?<outerBoundaryIs>(.*?)</outerBoundaryIs>", re.DOTALL)
-
-
 def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
     """Outlines of the areas of a KML, such as a geofence: corners as latitude and longitude [deg].
 
@@ -330,16 +317,16 @@ def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
     InputError
         The file cannot be read, or has no area.
     """
-    text = as_utf8(read_bytes(path)[0]).decode("utf-8", "replace")
-    try:
-        areas = [[(place[1], place[0]) for place in _places("Polygon", body)] for body in _AREA.findall(text)]
-    except InputError as error:
-        raise InputError(error.found, expected=error.expected, path=path) from error
-    areas = [area for area in areas if len(area) >= 3]
-    if not areas:
-        raise InputError("a map without an area", expected="a KML with a Polygon: a geofence", path=path)
-    if not all(abs(latitude) <= 90 and abs(longitude) <= 180 for area in areas for latitude, longitude in area):
-        raise InputError("a corner that is no place on earth", expected="longitude,latitude", path=path)
+    with about_file(path):
+        data = as_utf8(read_bytes(path)[0])
+        polygons = outermost(_root(data), {"Polygon"}) if kml.is_kml(data) else ()
+        rings = [ring for polygon in polygons for ring in outermost(polygon, {"outerBoundaryIs"})]
+        areas = [[(place[1], place[0]) for place in kml.places_of(ring)] for ring in rings]
+        areas = [area for area in areas if len(area) >= 3]
+        if not areas:
+            raise InputError("a map without an area", expected="a KML with a Polygon: a geofence")
+        if not all(abs(latitude) <= 90 and abs(longitude) <= 180 for area in areas for latitude, longitude in area):
+            raise InputError("a corner that is no place on earth", expected="longitude,latitude")
     return areas
 
 

@@ -21,15 +21,15 @@ from typing import Any
 
 import numpy as np
 
+from ..common import kml
 from ..common.cells import guarded
 from ..common.cf import site_crs
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import json_safe
+from ..common.kml import CLASS_COLOURS
 from ..common.units import AnyArray, FloatArray
-from . import kml
 from .grid import Border, Grid, Layer
-from .kml import CLASS_COLOURS
 
 PIXELS_PER_CELL = 8
 
@@ -209,12 +209,8 @@ def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and r
     ]
     parts += [kml.mark(name, kml.coordinates(*maps.lonlat([place]).T)[0]) for name, place in maps.towers_m.items()]
     for border in maps.borders:
-        line = " ".join(kml.coordinates(*maps.lonlat(border.line_m).T))
-        parts.append(
-            f"<Placemark><name>{kml.xml_text(' / '.join(maps.towers_of(border)))}</name><Style><LineStyle>"
-            "<color>ffffffff</color><width>2</width></LineStyle></Style><LineString><tessellate>1</tessellate>"
-            f"<coordinates>{line}</coordinates></LineString></Placemark>"
-        )
+        at, name = kml.coordinates(*maps.lonlat(border.line_m).T), " / ".join(maps.towers_of(border))
+        parts.append(kml.line(name, at, "<tessellate>1</tessellate>", style=kml.line_style("ffffffff", 2)))
     pictures = {}
     for layer in maps.layers:
         low, high = _range(layer)

@@ -10,6 +10,7 @@ import re
 
 import numpy as np
 
+from aerpaw_cmp.common import kml
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
@@ -18,15 +19,13 @@ from aerpaw_cmp.logs.records import ReadResult
 from . import _sheet, drive_test
 
 _PLACEMARK = re.compile(rb"<Placemark\b")
-_DATA = re.compile(rb'<Data name="([A-Za-z][A-Za-z0-9 _-]{0,39})">\s{0,40}<value>([^<]{0,200})</value>')
-_POINT = re.compile(rb"<coordinates>\s{0,40}(-?[\d.]{1,20}),(-?[\d.]{1,20})(?:,(-?[\d.]{1,20}))?")
 _SIGNS = (re.compile(rb'<Data name="TIME">'), re.compile(rb'<Data name="(?:RSRP|LEVEL|NRXLEV\d?|SSRSRP)">'))
 _PLACE = ("Longitude", "Latitude", "Altitude above sea level")
 
 
 def sniff(head: bytes) -> bool:
     """Check whether it is a KML with times and levels in named data."""
-    return b"<kml" in head[:2048] and all(sign.search(head) for sign in _SIGNS)
+    return kml.is_kml(head) and all(sign.search(head) for sign in _SIGNS)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -69,8 +68,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 def _reading(text: bytes) -> dict[str, str]:
     """Names and values of a placemark."""
-    values = {name.decode(): value.decode("utf-8", "replace").strip() for name, value in _DATA.findall(text)}
-    if (point := _POINT.search(text)) is not None:
+    values = {name.decode(): value.decode("utf-8", "replace").strip() for name, value in kml.DATA.findall(text)}
+    if (point := kml.POINT.search(text)) is not None:
         place = [b"" if cell is None else cell for cell in point.groups()]
         values |= {name: cell.decode() for name, cell in zip(_PLACE, place, strict=True)}
     return values

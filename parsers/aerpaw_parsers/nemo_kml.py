@@ -10,6 +10,7 @@ import re
 
 import numpy as np
 
+from aerpaw_cmp.common import kml
 from aerpaw_cmp.common.units import BoolArray, IntArray
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
@@ -34,7 +35,7 @@ _POSITION = ("latitude_deg", "longitude_deg", "altitude_m")
 
 def sniff(head: bytes) -> bool:
     """Check whether it is a KML with a Nemo description."""
-    return b"<kml" in head[:2048] and _HINT.search(head) is not None and b"(lat, lon) = (" in head
+    return kml.is_kml(head) and _HINT.search(head) is not None and b"(lat, lon) = (" in head
 
 
 def _reason(line: bytes) -> str | None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 
+from aerpaw_cmp.common import kml
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.matfile import MAGIC
@@ -75,7 +76,7 @@ def _other_mat(head: bytes) -> bool:
 
 
 def _kml(head: bytes) -> bool:
-    return b"<kml" in head[:2048] and not nemo_kml.sniff(head) and not gnettrack_kml.sniff(head)
+    return kml.is_kml(head) and not nemo_kml.sniff(head) and not gnettrack_kml.sniff(head)
 
 
 def _plain_kml(head: bytes) -> bool:

@@ -21,7 +21,7 @@ from aerpaw_cmp.flight.pose.patterns import (
     waypoints_of,
     with_turns,
 )
-from aerpaw_cmp.flight.pose.route_files import kml_text, plan_text, waypoints_csv
+from aerpaw_cmp.flight.pose.route_files import plan_text, waypoints_csv
 from aerpaw_cmp.logs.route import read_areas, read_route
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -180,7 +180,7 @@ def test_files_hold_the_route_that_was_planned(tmp_path: Path):
         Waypoint(east_m=130.0, north_m=200.0, height_m=45.0, yaw_deg=10.0),
     ]
     for name, text in (
-        ("a.plan", plan_text(ways, frame, 8.0)), ("a.kml", kml_text(ways, frame, "a & b")), ("a.csv", waypoints_csv(ways, frame))
+        ("a.plan", plan_text(ways, frame, 8.0)), ("a.csv", waypoints_csv(ways, frame))
     ):  # fmt: skip
         (tmp_path / name).write_text(text)
         table = read_route(tmp_path / name)
@@ -188,8 +188,7 @@ def test_files_hold_the_route_that_was_planned(tmp_path: Path):
         np.testing.assert_allclose(east, [w.east_m for w in ways], atol=0.05)
         np.testing.assert_allclose(north, [w.north_m for w in ways], atol=0.05)
         np.testing.assert_allclose(table["altitude_m"], [w.height_m for w in ways])
-        if name != "a.kml":
-            np.testing.assert_allclose(table["yaw_deg"], [w.yaw_deg for w in ways])
+        np.testing.assert_allclose(table["yaw_deg"], [w.yaw_deg for w in ways])
 
 
 def test_a_geofence_is_read_and_what_is_none_is_one_message(tmp_path: Path):

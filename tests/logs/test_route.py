@@ -151,3 +151,10 @@ def test_what_is_no_route_says_so(name: str, content: bytes, message: str, tmp_p
         read_route(tmp_path / name)
     assert message in str(caught.value)
     assert caught.value.path == str(tmp_path / name)
+
+
+def test_a_route_cut_off_is_refused_with_its_line(tmp_path: Path) -> None:
+    file = tmp_path / "cut.kml"
+    file.write_bytes(FILES["line.kml"][:-60])
+    with pytest.raises(InputError, match=r"cut\.kml, line \d+: not XML"):
+        read_route(file)

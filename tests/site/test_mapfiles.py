@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 import shapely
 
+from aerpaw_cmp.common import kml as kml_module
+from aerpaw_cmp.common import xmlfiles
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.imports import mapfiles
@@ -432,13 +434,14 @@ def test_too_many_tags_are_refused_before_any_is_an_object(tmp_path: Path) -> No
 def test_tags_in_themselves_are_walked_through_once(tmp_path: Path, tag: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twenty thousand of them took minutes: each level was searched to the bottom again."""
     asked = [0]
-    plain = mapfiles._plain
+    plain = xmlfiles.plain
 
     def counted(name: str) -> str:
         asked[0] += 1
         return plain(name)
 
-    monkeypatch.setattr(mapfiles, "_plain", counted)
+    for module in (mapfiles, kml_module, xmlfiles):
+        monkeypatch.setattr(module, "plain", counted)
     path = tmp_path / "m.kml"
     path.write_bytes(
         b"<kml><Placemark>" + f"<{tag}>".encode() * 20_000 + f"</{tag}>".encode() * 20_000 + b"</Placemark></kml>"
@@ -464,7 +467,7 @@ def test_lines_of_many_broken_elements_are_found_in_one_reading(
     )
     path.write_text("<kml>\n" + bad * 500 + "</kml>")
     notes = read_map_file(path).notes
-    assert made[0] == 1
+    assert made[0] == 2  # the tree, and once for all lines
     assert "line 2:" in notes[0]
     assert "line 501:" in notes[-1]
 

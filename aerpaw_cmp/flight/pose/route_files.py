@@ -1,4 +1,4 @@
-"""A planned route as files that ground stations read: QGroundControl plan, KML, table of waypoints."""
+"""A planned route as files that ground stations read: QGroundControl plan, table of waypoints."""
 
 from __future__ import annotations
 
@@ -54,18 +54,6 @@ def plan_text(waypoints: Sequence[Waypoint], frame: SiteFrame, speed_mps: float)
 
 def _item(command: int, params: list[float | None], frame: int = _FRAME_ABOVE_HOME) -> dict[str, Any]:
     return {"autoContinue": True, "command": command, "frame": frame, "params": params, "type": "SimpleItem"}
-
-
-def kml_text(waypoints: Sequence[Waypoint], frame: SiteFrame, name: str) -> str:
-    """A KML with the route as one line, heights above the ground at take-off."""
-    from xml.sax.saxutils import escape
-
-    line = " ".join(f"{b:.7f},{a:.7f},{w.height_m:g}" for a, b, w in _places(waypoints, frame))
-    return (
-        '<?xml version="1.0" encoding="UTF-8"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>\n'
-        f"<Placemark><name>{escape(name)}</name><LineString><altitudeMode>relativeToGround</altitudeMode>\n"
-        f"<coordinates>{line}</coordinates></LineString></Placemark>\n</Document></kml>\n"
-    )
 
 
 def waypoints_csv(waypoints: Sequence[Waypoint], frame: SiteFrame) -> str:

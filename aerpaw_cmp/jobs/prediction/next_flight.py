@@ -20,7 +20,7 @@ from ...compare.gains.direction_gain import GainModel, LinkSamples
 from ...compare.learning.correction import choose
 from ...compare.learning.next_flight import Known, rms_db
 from ...flight.pose.patterns import NOSES, Pattern, Route, Waypoint, allowed_area, cut, flown, route_of
-from ...flight.pose.route_files import kml_text, plan_text, waypoints_csv
+from ...flight.pose.route_files import plan_text, waypoints_csv
 from ...flight.training import counted_once
 from ...logs.route import read_areas
 from ...report.names import safe_name
@@ -187,7 +187,6 @@ def _plan_flight(
         towers={name: np.asarray(t.position_m) for name, t in site.towers.items()},
         files={
             "route.plan": plan_text(ways, site.frame, speed),
-            "route.kml": kml_text(ways, site.frame, best.route.name),
             "route.csv": waypoints_csv(ways, site.frame),
         },
         warnings=remarks,

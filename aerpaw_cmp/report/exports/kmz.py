@@ -15,9 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from ...common import kml
+from ...common.kml import CLASS_COLOURS, xml_text
 from ...common.units import AnyArray, FloatArray, IntArray
-from ...maps import kml
-from ...maps.kml import CLASS_COLOURS, xml_text
 from ..kit.canvas import keep_extremes
 from ..names import iso_time
 from .points import Column, Export, latitude_longitude
@@ -106,8 +106,7 @@ def _flown(export: Export) -> Iterator[str]:
         else:
             shape = f"<LineString>{_AIR}<coordinates>{' '.join(at)}</coordinates></LineString>"
         yield (
-            f"<Placemark><name>Flown: {xml_text(line.flight)}</name><Style><LineStyle><color>99ffffff</color>"
-            f"<width>2</width></LineStyle></Style>{shape}</Placemark>"
+            f"<Placemark><name>Flown: {xml_text(line.flight)}</name>{kml.line_style('99ffffff', 2)}{shape}</Placemark>"
         )
 
 
@@ -127,11 +126,10 @@ def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterato
             continue
         number = int(bins[first])
         span = f"<TimeSpan><begin>{times[first]}</begin><end>{times[last]}</end></TimeSpan>" if clock else ""
-        yield (
-            f"<Placemark><name>{xml_text(_label(shown, values[first:last], number))}</name>"
-            f"<visibility>{int(visible)}</visibility>{span}<styleUrl>#{shown.scale.key}{number}</styleUrl>"
-            f"<LineString>{_AIR}<coordinates>{' '.join(at[first : last + 1])}</coordinates></LineString></Placemark>"
-        )
+        head = f"<visibility>{int(visible)}</visibility>{span}"
+        style = f"<styleUrl>#{shown.scale.key}{number}</styleUrl>"
+        name = _label(shown, values[first:last], number)
+        yield kml.line(name, at[first : last + 1], _AIR, head=head, style=style)
 
 
 def _label(shown: _Shown, values: AnyArray, number: int) -> str:

@@ -15,9 +15,10 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
 
+from ...common import kml
 from ...common.errors import InputError
 from ...common.files import read_input
-from ...common.xmlfiles import xml_root
+from ...common.xmlfiles import named, outermost, plain, xml_root
 from ...logs import archives
 from .osmfiles import read_elements
 from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
@@ -239,17 +240,12 @@ def _from_xml(data: bytes, path: Path) -> MapFile:
             path=path,
         )
     root = xml_root(data, path, "plain OSM or KML")
-    tag = _plain(root.tag)
+    tag = plain(root.tag)
     if tag == "kml":
         return _kml(root, path, data)
     if tag == "osm":
         return read_elements("OSM XML", _osm_elements(root), path, _xml_lines(data, None))
     raise InputError(f"XML of '{tag}'", expected="OSM ('osm') or KML ('kml')", path=path)
-
-
-def _plain(tag: str) -> str:
-    """A tag without its namespace."""
-    return tag.rpartition("}")[2]
 
 
 def _xml_lines(data: bytes, name: str | None) -> Callable[[int], int | None]:
@@ -278,22 +274,18 @@ def _osm_elements(root: ElementTree.Element) -> Iterator[dict[str, Any]]:
     """OSM XML as Overpass elements."""
     for item in root:
         element: dict[str, Any] = {
-            "type": _plain(item.tag),
+            "type": plain(item.tag),
             **{key: item.get(key) for key in _ATTRIBUTES if key in item.attrib},
         }
-        element["tags"] = {tag.get("k", ""): tag.get("v", "") for tag in _named(item, "tag")}
+        element["tags"] = {tag.get("k", ""): tag.get("v", "") for tag in named(item, "tag")}
         if element["type"] == "way":
-            element["nodes"] = [reference.get("ref") for reference in _named(item, "nd")]
+            element["nodes"] = [reference.get("ref") for reference in named(item, "nd")]
         elif element["type"] == "relation":
-            element["members"] = [dict(member.attrib) for member in _named(item, "member")]
+            element["members"] = [dict(member.attrib) for member in named(item, "member")]
         yield element
 
 
 _ATTRIBUTES = {"id", "lat", "lon", "visible", "action"}
-
-
-def _named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
-    return (element for element in root.iter() if _plain(element.tag) == name)
 
 
 # ---------------------------------------------------------------- KML
@@ -301,18 +293,18 @@ def _named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element
 
 def _kml(root: ElementTree.Element, path: Path, data: bytes) -> MapFile:
     result, lines, line_of = MapFile("KML"), Counter[str](), _xml_lines(data, "Placemark")
-    for number, placemark in enumerate(_outermost(root, {"Placemark"}), start=1):
-        name = next((str(n.text or "").strip() for n in placemark if _plain(n.tag) == "name"), "")
+    for number, placemark in enumerate(outermost(root, {"Placemark"}), start=1):
+        name = next((str(n.text or "").strip() for n in placemark if plain(n.tag) == "name"), "")
         identity = name or f"placemark {number}"
-        parts = list(_outermost(placemark, _PLACEMARK_PARTS)) if len(placemark) else []
-        outline = Outline(identity, f"{path.name}: {identity}", _kml_tags(parts))
+        parts = list(outermost(placemark, _PLACEMARK_PARTS)) if len(placemark) else []
+        outline = Outline(identity, f"{path.name}: {identity}", kml.data_of(iter(parts)))
         try:
-            polygons = [part for part in parts if _plain(part.tag) == "Polygon"]
+            polygons = [part for part in parts if plain(part.tag) == "Polygon"]
             _kml_height(polygons, outline)
             for polygon in polygons:
-                bounds = list(_outermost(polygon, {"outerBoundaryIs", "innerBoundaryIs"}))
-                outer = [_kml_ring(b, outline, path) for b in bounds if _plain(b.tag) == "outerBoundaryIs"]
-                holes = [_kml_ring(b, outline, path) for b in bounds if _plain(b.tag) == "innerBoundaryIs"]
+                bounds = list(outermost(polygon, {"outerBoundaryIs", "innerBoundaryIs"}))
+                outer = [_kml_ring(b, outline, path) for b in bounds if plain(b.tag) == "outerBoundaryIs"]
+                holes = [_kml_ring(b, outline, path) for b in bounds if plain(b.tag) == "innerBoundaryIs"]
                 outline.parts += [(ring, holes) for ring in outer]
         except BROKEN_ELEMENT as error:
             result.notes.append(left_out(path, line_of(number - 1), f"placemark '{identity}'", error))
@@ -320,7 +312,7 @@ def _kml(root: ElementTree.Element, path: Path, data: bytes) -> MapFile:
         if outline.parts:
             result.outlines.append(outline)
             continue
-        lines.update(tag for tag in (_plain(part.tag) for part in parts) if tag in _NO_AREAS)
+        lines.update(tag for tag in (plain(part.tag) for part in parts) if tag in _NO_AREAS)
     if listed := ", ".join(f"{count} {what}" for what, count in lines.most_common() if count):
         result.notes.append(f"{path.name}: left out, not areas: {listed}")
     return result
@@ -330,47 +322,17 @@ _NO_AREAS = ("LineString", "Point", "LinearRing", "Model", "Track")
 _PLACEMARK_PARTS = {*_NO_AREAS, "Polygon", "Data", "SimpleData"}
 
 
-def _outermost(root: ElementTree.Element, names: set[str]) -> Iterator[ElementTree.Element]:
-    """Elements below a root with one of the names, in order; what lies inside a found one is not looked at.
-
-    KML nests none of them in itself: a file that does would be walked through once per level.
-    """
-    walk = list(reversed(root))
-    while walk:
-        element = walk.pop()
-        if _plain(element.tag) in names:
-            yield element
-        else:
-            walk += reversed(element)
-
-
-def _kml_tags(parts: list[ElementTree.Element]) -> dict[str, str]:
-    tags = {}
-    for data in parts:
-        if _plain(data.tag) == "Data":
-            tags[data.get("name", "")] = next((str(v.text or "") for v in _named(data, "value")), "")
-        elif _plain(data.tag) == "SimpleData":
-            tags[data.get("name", "")] = str(data.text or "")
-    return tags
-
-
 def _kml_height(polygons: list[ElementTree.Element], outline: Outline) -> None:
     """Height tag of polygons drawn above the ground, extruded or not, where the placemark's data name none."""
-    modes = {str(m.text or "").strip() for polygon in polygons for m in _named(polygon, "altitudeMode")}
-    text = " ".join(_kml_coordinates(polygon) for polygon in polygons)
-    highest = max((float(height) for height in _KML_HEIGHT.findall(text)), default=0.0)
+    modes = {mode for polygon in polygons for mode in kml.modes_of(polygon)}
+    cells = [place[2] for polygon in polygons for place in kml.cells_of(polygon) if len(place) == 3]
+    highest = max((float(height) for height in cells if _HEIGHT.fullmatch(height)), default=0.0)
     if modes == {"relativeToGround"} and highest > 0.0:
         outline.tags = {"height": f"{highest:g}", **outline.tags}
 
 
-# The third number of a point.
-_KML_HEIGHT = re.compile(r"(?<!\S)[^,\s]+,[^,\s]+,(-?\d+(?:\.\d*)?)(?!\S)")
-
-
-def _kml_coordinates(element: ElementTree.Element) -> str:
-    text = " ".join(str(c.text or "") for c in _named(element, "coordinates"))
-    return re.sub(r"\s*,\s*", ",", text)  # 'longitude, latitude' with a blank is common and can mean nothing else
+_HEIGHT = re.compile(r"-?\d+(?:\.\d*)?")
 
 
 def _kml_ring(boundary: ElementTree.Element, outline: Outline, path: Path) -> list[Position]:
-    return [lonlat(point.split(","), outline.source, path) for point in _kml_coordinates(boundary).split()]
+    return [lonlat(cells, outline.source, path) for cells in kml.cells_of(boundary)]

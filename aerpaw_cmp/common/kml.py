@@ -1,18 +1,81 @@
-"""Pieces of KMZ files: text, coordinates, marks, lines, legends and the archive."""
+"""KML of others read, and KMZ files written: coordinates, marks, lines, legends and the archive.
+
+Logs in KML are read by pattern, line by line (:data:`DATA`, :data:`POINT`): each line has to be accounted for, also of
+a cut file. Maps and routes are read as XML.
+"""
 
 from __future__ import annotations
 
 import io
+import re
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
 import numpy as np
 
-from ..common.errors import one_line
-from ..common.units import FloatArray
+from .errors import InputError, one_line
+from .units import FloatArray
+from .xmlfiles import named, plain
+
+# --- reading -------------------------------------------------------------------------------------------------------
+
+# A named value, and the first place of a shape, on a line of a log.
+DATA = re.compile(rb'<Data name="([A-Za-z][A-Za-z0-9 _-]{0,39})">\s{0,40}<value>([^<]{0,200})</value>')
+POINT = re.compile(rb"<coordinates>\s{0,40}(-?[\d.]{1,20}),(-?[\d.]{1,20})(?:,(-?[\d.]{1,20}))?")
+
+
+def is_kml(head: bytes) -> bool:
+    """Check whether a file begins as KML."""
+    return b"<kml" in head[:2048]
+
+
+def data_of(parts: Iterator[ElementTree.Element]) -> dict[str, str]:
+    """Names and values of ``Data`` and ``SimpleData`` among elements."""
+    tags = {}
+    for part in parts:
+        if plain(part.tag) == "Data":
+            tags[part.get("name", "")] = next((str(v.text or "") for v in named(part, "value")), "")
+        elif plain(part.tag) == "SimpleData":
+            tags[part.get("name", "")] = str(part.text or "")
+    return tags
+
+
+def modes_of(shape: ElementTree.Element) -> set[str]:
+    """Altitude modes below an element: ``relativeToGround``, ``absolute``, ``clampToGround``."""
+    return {str(mode.text or "").strip() for mode in named(shape, "altitudeMode")}
+
+
+def cells_of(shape: ElementTree.Element) -> list[list[str]]:
+    """Texts of longitude, latitude and, where it is said, height of each place below an element."""
+    if plain(shape.tag) == "Track":
+        return [str(place.text or "").split() for place in named(shape, "coord")]
+    texts = " ".join(str(places.text or "") for places in named(shape, "coordinates"))
+    # 'longitude, latitude' with a blank is common and can mean nothing else
+    return [place.split(",") for place in re.sub(r"\s*,\s*", ",", texts).split()]
+
+
+def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
+    """Longitude, latitude [deg] and, where it is said, height [m] of each place below an element.
+
+    Raises
+    ------
+    InputError
+        A coordinate that is no number, or alone.
+    """
+    try:
+        places = [tuple(float(cell) for cell in cells) for cells in cells_of(shape)]
+    except ValueError as error:
+        raise InputError(f"a coordinate that is no number ({error})", expected="longitude,latitude,altitude") from error
+    if any(len(place) < 2 for place in places):
+        raise InputError("a coordinate without latitude", expected="longitude,latitude,altitude")
+    return places
+
+
+# --- writing -------------------------------------------------------------------------------------------------------
 
 # Z grey, then ranks 1 to 4 from dark to light (viridis), then spare ones.
 CLASS_COLOURS = ("#9e9e9e", "#440154", "#31688e", "#35b779", "#fde725", "#e66101", "#b2182b")
@@ -36,6 +99,35 @@ def mark(name: str, at: str, *, in_the_air: bool = False) -> str:
     height = "<extrude>1</extrude><altitudeMode>relativeToGround</altitudeMode>" if in_the_air else ""
     point = f"<Point>{height}<coordinates>{at}</coordinates></Point>"
     return f"<Placemark><name>{xml_text(name)}</name>{point}</Placemark>"
+
+
+def line(name: str, at: list[str], shape: str, *, style: str = "", head: str = "") -> str:
+    """A named line through places.
+
+    Parameters
+    ----------
+    name : str
+    at : list of str
+        Places as :func:`coordinates` writes them.
+    shape : str
+        KML before the coordinates.
+    style, head : str
+        KML before the line.
+
+    Returns
+    -------
+    str
+        KML.
+    """
+    return (
+        f"<Placemark><name>{xml_text(name)}</name>{head}{style}<LineString>{shape}"
+        f"<coordinates>{' '.join(at)}</coordinates></LineString></Placemark>"
+    )
+
+
+def line_style(colour: str, width: int) -> str:
+    """A style of lines; KML writes a colour as alpha, blue, green, red."""
+    return f"<Style><LineStyle><color>{colour}</color><width>{width}</width></LineStyle></Style>"
 
 
 def folder(name: str, legend: str, content: str, *, visible: bool) -> str:

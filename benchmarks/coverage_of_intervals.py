@@ -1,29 +1,220 @@
-"""How often the stated 95 % intervals hold the truth, over simulated flights whose truth is known.
+"""How often the stated 95 % intervals hold the truth, and how often a pooled verdict is false, on simulated flights.
 
-Each flight has a fixed route (the simulated level varies with it) and shadowing whose neighbouring samples correlate
-as stated, with or without white measurement noise; ranks come from thresholds on two shadowing processes; a pair is two
-models that share half of their shadowing, of equal true error or of errors as 3 to 2. "Truth" is the value of the
-process, not of the sample.
+Each flight has shadowing of one kind: rough (AR(1)) or smooth (AR(2)), with white noise, heavy tails (Student's t of
+four degrees of freedom), uneven spacing or a gap. Two tables:
 
-Per cell of (samples, correlation of neighbours): the share of given intervals that hold the truth, and their median
-width over the truth (offset: over the shadowing). Every flight is given an interval.
+* offset and RMSE of one channel: share of intervals that hold the mean of the process and the RMSE that such flights
+  have on average; median width over that of an interval of someone who knows the memory. Where a flight holds 20
+  memories and more, the ratio is to be at most 1.5.
+* two models over ten channels (4 dB): false verdicts on equal models, whose errors are random or whose predictions
+  differ along a route; power where the truth is 0.3 dB; the same of someone who knows the spread; flights on which a
+  channel is called better or worse, corrected for their number. And coverage where one model is right.
 
-    python benchmarks/coverage_of_intervals.py [--flights 400] [--json]
+Ranks come from thresholds on two shadowing processes.
+
+    python benchmarks/coverage_of_intervals.py [--flights 200] [--json]
 """
 
 import argparse
-import itertools
 import json
+from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal, norm
 
+from aerpaw_cmp.common.units import FloatArray, IntArray
 from aerpaw_cmp.compare.rank import compare_ranks
-from aerpaw_cmp.compare.statistics.intervals import error_intervals, paired_difference
+from aerpaw_cmp.compare.statistics.intervals import (
+    PairedDifference,
+    corrected,
+    error_intervals,
+    paired_difference,
+    pooled_difference,
+)
 
-OFFSET_DB, SHADOW_DB, NOISE_DB = 7.3, 4.0, 2.0
+SHADOW_DB, OFFSET_DB, CHANNELS, APART_DB = 4.0, 7.3, 10, 0.3
 CUTS = np.array([-0.8, 0.5, 1.6])
+
+
+@dataclass(frozen=True)
+class Shadowing:
+    """A kind of flight: ``roots`` of the autoregression, white noise over the standard deviation of the rest."""
+
+    n: int
+    roots: tuple[float, ...] = ()
+    noise: float = 0.0
+    tails: int | None = None
+    spacing: str = "even"
+
+    def __str__(self) -> str:
+        kind = {0: "white", 1: "AR(1)", 2: "AR(2)"}[len(self.roots)]
+        parts = [f"{self.n:5d}  {kind} {' '.join(f'{root:.4g}' for root in self.roots)}"]
+        parts += [f"noise {self.noise:g}"] if self.noise else []
+        parts += [f"t{self.tails}"] if self.tails else []
+        return ", ".join([*parts, *([self.spacing] if self.spacing != "even" else [])])
+
+    @property
+    def memories(self) -> float:
+        """Memories that the flight holds."""
+        return self.n * (1.0 - max(self.roots, default=0.0))
+
+    @cached_property
+    def places(self) -> IntArray:
+        """Instants (n,) at which the process is sampled."""
+        if self.spacing == "uneven":
+            return np.sort(np.random.default_rng(3).choice(4 * self.n, self.n, replace=False))
+        gap = self.n // 2 if self.spacing == "gap" else 0
+        return np.arange(self.n) + np.where(np.arange(self.n) < self.n // 3, 0, gap)
+
+    @cached_property
+    def response(self) -> FloatArray:
+        """Levels that one drive adds to the instants after it."""
+        length = int(min(40.0 / (1.0 - max(self.roots, default=0.0)), 2e5))
+        impulse = lfilter([1.0], np.poly(self.roots), np.eye(1, length)[0]) if self.roots else np.ones(1)
+        return impulse / np.sqrt((impulse**2).sum())
+
+    @property
+    def in_flight_variance(self) -> float:
+        """Mean square about its own mean that such flights have on average."""
+        reach, length = int(self.places[-1]) + 1, len(self.response)
+        size = 1 << (2 * max(reach, length)).bit_length()
+        covariance = np.fft.irfft(np.abs(np.fft.rfft(self.response, size)) ** 2, size)[:reach]
+        apart = np.bincount(np.abs(self.places[:, None] - self.places).ravel(), minlength=reach)
+        return float(1.0 - covariance @ apart / self.n**2 + self.noise**2 * (1.0 - 1.0 / self.n))
+
+    def sequences(self, rng: np.random.Generator, count: int) -> FloatArray:
+        """Errors (count, n): unit variance, and noise."""
+
+        def drawn(*shape: int) -> FloatArray:
+            if self.tails is None:
+                return rng.normal(size=shape)
+            return rng.standard_t(self.tails, size=shape) / np.sqrt(self.tails / (self.tails - 2.0))
+
+        long = int(self.places[-1]) + 1
+        if len(self.roots) == 1:
+            drive = drawn(count, long) * np.sqrt(1.0 - self.roots[0] ** 2)
+            drive[:, 0] /= np.sqrt(1.0 - self.roots[0] ** 2)
+            x = lfilter([1.0], [1.0, -self.roots[0]], drive, axis=1)
+        else:
+            settled = int(12.0 / (1.0 - max(self.roots, default=0.0)))
+            scale = self.response[0]
+            x = lfilter([1.0], np.poly(self.roots), scale * drawn(count, settled + long), axis=1)[:, settled:]
+        return np.asarray(x[:, self.places] + self.noise * drawn(count, self.n))
+
+
+SIZES, CORRELATIONS = (60, 100, 200, 300, 500, 1000, 2000, 3000), (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)
+GRID = tuple(
+    [Shadowing(n, (r,) if r else ()) for n in SIZES for r in CORRELATIONS]
+    + [Shadowing(n, (float(np.exp(-0.5 / n)),)) for n in SIZES]  # a memory of two flights
+    + [Shadowing(n, (r,), noise) for n in (200, 500, 1000, 3000) for r, noise in ((0.9, 0.5), (0.98, 0.5), (0.98, 2.0))]
+    + [Shadowing(n, r) for n in (100, 300, 1000, 3000) for r in ((0.8, 0.8), (0.9, 0.9), (0.97, 0.97), (0.97, 0.5))]
+    + [Shadowing(n, r, 0.0, 4) for n in (300, 1000) for r in ((), (0.9,))]
+    + [Shadowing(n, (r,), 0.0, None, s) for n in (300, 1000) for r in (0.9, 0.98) for s in ("uneven", "gap")]
+)
+POOLED = (
+    *(Shadowing(n, (r,) if r else ()) for n in (300, 1000) for r in CORRELATIONS[:-1]),
+    Shadowing(1000, (0.9,), 0.5), Shadowing(1000, (0.9,), 0.0, 4), Shadowing(1000, (0.9, 0.9)),
+    Shadowing(1000, (0.9,), 0.0, None, "gap"),
+)  # fmt: skip
+
+
+def shadowed_pair(
+    rng: np.random.Generator, shadowing: Shadowing, count: int, channels: int = CHANNELS, *,
+    larger: float = 1.0, shared: float = 0.0,
+) -> tuple[FloatArray, FloatArray]:  # fmt: skip
+    """Errors (count, n x channels) of two models that share half of their shadowing, the first ``larger`` times.
+
+    Samples of one instant stand together; ``shared`` is the part that all channels have in common.
+    """
+    both = [shadowing.sequences(rng, count) for _ in range(2)] if shared else [0.0, 0.0]
+    columns = []
+    for _ in range(channels):
+        own, other = (
+            np.sqrt(shared) * common + np.sqrt(1.0 - shared) * shadowing.sequences(rng, count) for common in both
+        )
+        columns.append((larger * own, 0.5 * own + np.sqrt(0.75) * other))
+    return _together(columns)
+
+
+def routed_pair(
+    rng: np.random.Generator, shadowing: Shadowing, count: int, channels: int, b: float
+) -> tuple[FloatArray, FloatArray]:
+    """The same where the predictions differ along a route and the measurement lies the share ``b`` between them."""
+    columns = []
+    for channel in range(channels):
+        phase, route = np.linspace(0.0, 2.0 * np.pi, shadowing.n), np.random.default_rng(channel)
+        apart = 0.5 * sum(
+            route.normal() * np.sin(k * phase + route.uniform(0.0, 6.0)) / np.sqrt(k) for k in (1, 2, 3, 5, 8, 13, 21)
+        )
+        noise = shadowing.sequences(rng, count)
+        columns.append((b * apart + noise, (b - 1.0) * apart + noise))
+    return _together(columns)
+
+
+def _together(columns: list[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    first, second = (
+        np.stack([e - e.mean(axis=1, keepdims=True) for e in model], axis=2) for model in zip(*columns, strict=True)
+    )
+    return first.reshape(len(first), -1), second.reshape(len(second), -1)
+
+
+def level_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
+    """Coverage and width of offset and RMSE."""
+    rng = np.random.default_rng([shadowing.n, GRID.index(shadowing)])
+    errors = SHADOW_DB * shadowing.sequences(rng, flights)
+    truth = SHADOW_DB * np.sqrt(shadowing.in_flight_variance)
+    ends = np.array(
+        [[i.offset_db, i.rmse_db] for i in (error_intervals(e - OFFSET_DB, np.zeros_like(e)) for e in errors)]
+    )
+    ends[:, 0] = np.sort(ends[:, 0] - OFFSET_DB, axis=1)
+    many = SHADOW_DB * shadowing.sequences(rng, 2000)
+    low, high = np.quantile(many.std(axis=1) / truth, [0.025, 0.975])
+    known = 3.92 * many.mean(axis=1).std(), truth * (1.0 / low - 1.0 / high)
+    width = np.median(np.where(np.isfinite(ends), ends, np.inf)[..., 1] - ends[..., 0], axis=0)
+    held = [((ends[:, i, 0] <= t) & (t <= ends[:, i, 1])).mean() for i, t in enumerate((0.0, truth))]
+    return {
+        "flight": str(shadowing), "memories": shadowing.memories,
+        **{f"{name}_{what}": float(value) for name, i in (("offset", 0), ("rmse", 1))
+           for what, value in (("coverage", held[i]), ("width_ratio", width[i] / known[i]))},
+    }  # fmt: skip
+
+
+def pooled_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
+    """False verdicts, power and coverage of two models over ten channels."""
+    rng = np.random.default_rng([shadowing.n, 7, POOLED.index(shadowing)])
+    time = np.arange(shadowing.n)
+
+    def pooled(pair: tuple[FloatArray, FloatArray]) -> list[PairedDifference]:
+        channels = (e.reshape(flights, shadowing.n, CHANNELS) for e in pair)
+        return [
+            pooled_difference([(time, SHADOW_DB * a, SHADOW_DB * b) for a, b in zip(first.T, second.T, strict=True)])
+            for first, second in zip(*channels, strict=True)
+        ]
+
+    def decided(pairs: list[PairedDifference]) -> float:
+        return float(np.mean([pair.verdict in ("better", "worse") for pair in pairs]))
+
+    equal = shadowed_pair(rng, shadowing, flights)
+    known = 1.96 * np.std([pair.mean_square_difference_db2 for pair in pooled(equal)])
+    size = np.sqrt(1.0 + shadowing.noise**2)
+    better = pooled(shadowed_pair(rng, shadowing, flights, larger=1.0 + APART_DB / SHADOW_DB / size))
+    right = pooled(routed_pair(rng, shadowing, flights, CHANNELS, 0.0))
+    by_channel = [
+        corrected([paired_difference(a, b) for a, b in zip(first.T, second.T, strict=True)])
+        for first, second in zip(*(e.reshape(flights, shadowing.n, CHANNELS) for e in equal), strict=True)
+    ]
+    return {
+        "flight": str(shadowing),
+        "false": decided(pooled(equal)),
+        "false_shared": decided(pooled(shadowed_pair(rng, shadowing, flights, shared=0.5))),
+        "false_route": decided(pooled(routed_pair(rng, shadowing, flights, CHANNELS, 0.5))),
+        "power": decided(better),
+        "power_known": float(np.mean([abs(pair.mean_square_difference_db2) > known for pair in better])),
+        "right_decided": decided(right),
+        "any_channel": float(np.mean([any(pair.verdict in ("better", "worse") for pair in row) for row in by_channel])),
+    }
 
 
 def remembering(rng: np.random.Generator, n: int, samples: float) -> np.ndarray:
@@ -55,60 +246,6 @@ def rank_truth(mix: float) -> dict[str, float]:
     }
 
 
-SIZES = (100, 200, 500, 1000, 2000, 5000)
-CORRELATIONS = (0.0, 0.5, 0.8, 0.9, 0.95, 0.98, 0.99)
-STATISTICS = ("offset_db", "rmse_db", "correlation", "paired", "paired_unequal")
-
-
-def shadowed(rng: np.random.Generator, n: int, neighbours: float) -> np.ndarray:
-    """Unit-variance AR(1) with this correlation of neighbours."""
-    return rng.normal(size=n) if neighbours == 0 else remembering(rng, n, -1.0 / np.log(neighbours))
-
-
-def rss_cell(flights: int, n: int, neighbours: float, noise_db: float) -> dict[str, object]:
-    """Given, held and width, per statistic, over so many flights."""
-    rng = np.random.default_rng([n, round(1000 * neighbours), round(10 * noise_db)])
-    t = np.linspace(0, 2 * np.pi, n, endpoint=False)
-    simulated = -80 + 8 * np.sin(3 * t) + 4 * np.cos(11 * t)
-    variance = SHADOW_DB**2 + noise_db**2
-    truth = np.array([OFFSET_DB, np.sqrt(variance), np.sqrt(simulated.var() / (simulated.var() + variance)), 0.0,
-                      0.5 * np.sqrt(variance)])  # fmt: skip
-    ends = np.empty((flights, len(STATISTICS), 2))
-    for row in ends:
-        error = SHADOW_DB * shadowed(rng, n, neighbours) + rng.normal(0, noise_db, n)
-        other = SHADOW_DB * shadowed(rng, n, neighbours) + rng.normal(0, noise_db, n)
-        intervals = error_intervals(simulated - OFFSET_DB + error, simulated)
-        second = 0.5 * error + np.sqrt(0.75) * other
-        pairs = [paired_difference(size * error, second).difference_ci95_db for size in (1.0, 1.5)]
-        row[:] = [intervals.offset_db, intervals.rmse_db, intervals.correlation, *pairs]
-    given = np.isfinite(ends[..., 0])
-    held = (ends[..., 0] <= truth) & (truth <= ends[..., 1])
-    width = np.nanmedian(np.ptp(ends, axis=2), axis=0) / np.sqrt(variance)
-    return {
-        "samples": n, "neighbours": neighbours, "noise_db": noise_db,
-        **{
-            name: {
-                "given": float(given[:, i].mean()),
-                "coverage": float(held[:, i].sum() / max(given[:, i].sum(), 1)),
-                "width": float(width[i]),
-            }
-            for i, name in enumerate(STATISTICS)
-        },
-    }  # fmt: skip
-
-
-def judged(row: dict[str, object], flights: int) -> list[str]:
-    """Statistics of a row that are not 92 to 97 %, give or take two standard errors."""
-    bad = []
-    for name in STATISTICS:
-        entry = row[name]
-        assert isinstance(entry, dict)
-        slack = 2 * np.sqrt(0.05 * 0.95 / max(flights * entry["given"], 1))
-        if entry["given"] and not 0.92 - slack <= entry["coverage"] <= 0.97 + slack:
-            bad.append(f"{name} {100 * entry['coverage']:.1f}")
-    return bad
-
-
 def rank_coverage(flights: int, n: int, memory: float, replicates: int) -> dict[str, float]:
     rng = np.random.default_rng(int(memory * 10) + n + 1)
     mix = 0.8
@@ -134,38 +271,41 @@ def rank_coverage(flights: int, n: int, memory: float, replicates: int) -> dict[
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--flights", type=int, default=400, help="simulated flights per cell")
+    parser.add_argument("--flights", type=int, default=200, help="simulated flights per cell")
     parser.add_argument("--replicates", type=int, default=300, help="of the ranks, which are resampled")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     flights, replicates = arguments.flights, arguments.replicates
-    cells = itertools.product((0.0, NOISE_DB), SIZES, CORRELATIONS)
-    rows = [rss_cell(flights, n, neighbours, noise) for noise, n, neighbours in cells]
-    ranks = [
+    ranks: list[dict[str, object]] = [
         {"samples": n, "memory_samples": memory, **rank_coverage(flights, n, memory, replicates)}
         for n, memory in ((1500, 5.0), (3000, 30.0))
     ]
-    bad = {f"{r['samples']}, {r['neighbours']}, {r['noise_db']} dB": b for r in rows if (b := judged(r, flights))}
+    tables: dict[str, list[dict[str, object]]] = {"level": [], "pooled": [], "rank": ranks}
+    for name, cell, kinds in (("level", level_cell, GRID), ("pooled", pooled_cell, POOLED)):
+        for kind in kinds:
+            tables[name].append(cell(kind, flights))
+            if not arguments.json:
+                show(tables[name])
     if arguments.json:
-        print(json.dumps({"flights": flights, "replicates": replicates, "rss": rows, "rank": ranks, "outside": bad}))
+        print(json.dumps({"flights": flights, "replicates": replicates, **tables}))
         return
-    print(f"{flights} simulated flights per cell, 95 % intervals: share that hold (median width over the error)")
-    head = ("samples", "neighbours", "noise dB", *STATISTICS)
-    print(" | ".join(f"{name:>13s}" for name in head))
-    for row in rows:
-        plain = [f"{row[name]:13.5g}" for name in ("samples", "neighbours", "noise_db")]
-        print(" | ".join([*plain, *(in_words(row[name]) for name in STATISTICS)]))
-    print(f"cells outside 92-97 % (two standard errors of {flights} flights allowed): {bad or 0}")
-    print("  ".join(f"{name:>15s}" for name in ranks[0]))
     for row in ranks:
-        print("  ".join(f"{value:15.3f}" for value in row.values()))
+        print("  ".join(f"{name} {value:.3f}" for name, value in row.items()))
+    slack = 2.0 * np.sqrt(0.05 * 0.95 / flights)
+    shares = ("offset_coverage", "rmse_coverage")
+    outside = [r["flight"] for r in tables["level"] if any(not 0.92 - slack <= r[k] <= 0.97 + slack for k in shares)]
+    wide = [r["flight"] for r in tables["level"] if r["memories"] >= 20 and r["rmse_width_ratio"] > 1.5]
+    print(
+        f"{flights} flights a cell; outside 92-97 % by two standard errors: {outside or 0}; wider than 1.5: {wide or 0}"
+    )
 
 
-def in_words(entry: object) -> str:
-    """One cell of the table."""
-    assert isinstance(entry, dict)
-    given = "" if entry["given"] == 1.0 else f" of {100 * entry['given']:.0f} %"
-    return f"{100 * entry['coverage']:6.1f} ({entry['width']:.2f}){given}"
+def show(rows: list[dict[str, object]]) -> None:
+    """The last row of a table, below its head where it is the first."""
+    if len(rows) == 1:
+        print(" ".join(f"{name.replace('_', ' '):>18s}" for name in rows[0] if name != "flight"), "  flight")
+    numbers = " ".join(f"{value:18.3f}" for value in rows[-1].values() if isinstance(value, float))
+    print(f"{numbers}   {rows[-1]['flight']}", flush=True)
 
 
 if __name__ == "__main__":

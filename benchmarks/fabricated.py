@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.compare.flight_verdict import flight_verdict
 from aerpaw_cmp.compare.level.rss import compare_rss, error_spans
 from aerpaw_cmp.compare.rank import channel_rank, commonest_rank, compare_rank, singular_values
 from aerpaw_cmp.compare.result import Fit, ModelLevel, RankFurther, RankResult, RssFurther, RssResult
@@ -205,5 +206,5 @@ def long_flight(samples: int = 50_000, channels: int = 10) -> ReportData:
     track = Track(time=time, east_m=east, north_m=north, up_m=up)
     return ReportData(
         title="A flight that was never flown", flight="long", site=site, generated="2026-11-21T00:00:00+00:00",
-        rss=tuple(panels), track=track, synthetic=True,
+        rss=tuple(panels), verdict=flight_verdict(panels), track=track, synthetic=True,
     )  # fmt: skip

@@ -1,96 +1,116 @@
 """Weights of the memories in ``memory_weights.json``: those whose 95 % intervals hold in every cell.
 
-Sequences with AR(1) memory (and some with white noise besides) are simulated in cells of (samples, correlation of
-neighbours). The weights minimise the squared distance of every cell's coverage from 95 %, plus a little for the width
-of the intervals and for weights that are not smooth over the rate. Prints the table of that file, in tenths.
+Sequences of the kinds of ``benchmarks/coverage_of_intervals.py`` are simulated. The weights minimise the squared
+distance of every cell's coverage from 95 %, plus something for the width of the intervals, where a sequence holds many
+memories, and a little for weights that are not smooth over the rate. Prints the coverage of each cell and the table of
+that file, in tenths.
 
     python benchmarks/interval_weights.py mean|power|ratio [--sequences 300]
 """
 
 import argparse
+from collections.abc import Iterator
 
 import numpy as np
+from coverage_of_intervals import GRID, routed_pair, shadowed_pair
 from scipy.optimize import minimize
-from scipy.signal import lfilter
 from scipy.special import expit, gammaincc, logit, ndtri, stdtr
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.statistics.memory import RATES, WHITE_SHARES, cosine_terms, likelihoods, memories
+from aerpaw_cmp.compare.statistics.intervals import undecided
+from aerpaw_cmp.compare.statistics.memory import (
+    CALM,
+    RATES,
+    WHITE_SHARES,
+    cosine_terms,
+    heavy_tails,
+    likelihoods,
+    memories,
+)
 
-COVERAGE, TAIL, STEEP, WIDTH, SMOOTH = 0.948, 0.025, 5.0, 5e-4, 1e-5
-SIZES, CORRELATIONS = (100, 200, 500, 1000, 2000, 5000), (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98, 0.99)
-SHAPE = (len(WHITE_SHARES), len(RATES))
+TAIL, STEEP, SMOOTH = 0.025, 5.0, 3e-5
+# Coverage aimed at; price of the width; price of a coverage that is too large, over that of one too small.
+AIM = {"mean": (0.952, 5e-3, 1.0), "power": (0.955, 1.4e-2, 1.0), "ratio": (0.951, 8e-3, 0.15)}
+SHAPE = (len(WHITE_SHARES) + 1, len(RATES))
 
 
-def sequences(rng: np.random.Generator, count: int, n: int, neighbours: float, noise: float) -> FloatArray:
-    """AR(1) of unit variance plus white noise (count, n)."""
-    drive = rng.normal(size=(count, n)) * np.sqrt(1.0 - neighbours**2)
-    drive[:, 0] /= np.sqrt(1.0 - neighbours**2)
-    return np.asarray(lfilter([1.0], [1.0, -neighbours], drive, axis=1) + noise * rng.normal(size=(count, n)))
+# Likelihood, probability that a draw lies below the truth, square of the width (each (count, memories)); weights of
+# coverage and width.
+Cell = tuple[FloatArray, FloatArray, FloatArray, float, float]
 
 
-# Likelihood, probability that a draw lies below the truth, square of the width (each (count, memories)); weight.
-Cell = tuple[FloatArray, FloatArray, FloatArray, float]
-
-
-def cell(kind: str, x: FloatArray, y: FloatArray, noise: float, size: float, weight: float) -> Cell:
-    """What the sequences of a cell say, under each memory."""
-    truth = 1.0 + noise**2
-    if kind == "ratio":
-        first, second = (e - e.mean(axis=1, keepdims=True) for e in (size * x, 0.5 * x + np.sqrt(0.75) * y))
-        squares = [(e * e).mean(axis=1, keepdims=True) for e in (first, second)]
-        away = (np.log(squares[0] / squares[1])[:, 0] - 2.0 * np.log(size))[:, None]
-        x = first**2 / squares[0] - second**2 / squares[1]
-    else:
-        away = x.mean(axis=1, keepdims=True)
-    terms = [cosine_terms(row) for row in x]
-    slow = np.array([t.slow for t in terms])
-    known, count = memories(slow.shape[1]), slow.shape[1]
+def mean_cell(x: FloatArray, away: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sequences (count, n) under each memory, on a mean that theirs is ``away`` (count,) from."""
+    slow = np.array([cosine_terms(row).slow for row in x])
+    known, terms = memories(slow.shape[1]), slow.shape[1]
     likelihood, square = likelihoods(slow)
-    if kind == "power":
-        third = 2.0 / (9.0 * np.array([t.fast_freedom for t in terms]))
-        fast = np.array([t.fast_power for t in terms])
-        below = np.zeros_like(square)
-        normals = ndtri((np.arange(32) + 0.5) / 32)
-        for z in normals:
-            rest = (truth - fast / np.maximum(1.0 - third + np.sqrt(third) * z, 0.05) ** 3)[:, None]
-            share = gammaincc(0.5 * count, 0.5 * square * known.power / np.maximum(rest, 1e-12))
-            below += np.where(rest > 0.0, share, 0.0) / len(normals)
-        width = square / count * known.power + fast[:, None]
-    else:
-        reach = np.sqrt(square / count * known.variance)
-        below = stdtr(count, (away - slow @ known.slope.T) / reach)
-        width = reach**2
-    return likelihood, below, width / np.median(width.min(axis=1)), weight
+    reach = np.sqrt(square / terms * known.variance)
+    return likelihood, stdtr(terms, (away[:, None] - slow @ known.slope.T) / reach), reach**2
 
 
-def cells(kind: str, count: int) -> list[Cell]:
-    """All cells, with white noise in some."""
+def power_cell(x: FloatArray, truth: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Sequences (count, n) under each memory, on their mean square."""
+    every = [cosine_terms(row) for row in x]
+    slow, fast, freedom = (np.array([getattr(t, k) for t in every]) for k in ("slow", "fast_power", "fast_freedom"))
+    tails = np.array([heavy_tails(row, t) for row, t in zip(x, every, strict=True)])
+    known, terms = memories(slow.shape[1]), slow.shape[1]
+    likelihood, square = likelihoods(slow)
+    third, below = 2.0 / (9.0 * freedom), np.zeros_like(square)
+    normals = ndtri((np.arange(48) + 0.5) / 48)
+    for z, other in zip(normals, np.random.default_rng(1).permutation(normals), strict=True):
+        rest = truth * np.exp(-tails * other * CALM[int(other > 0.0)])
+        rest = (rest - fast / np.maximum(1.0 - third + np.sqrt(third) * z, 0.05) ** 3)[:, None]
+        share = gammaincc(0.5 * terms, 0.5 * square * known.power / np.maximum(rest, 1e-12))
+        below += np.where(rest > 0.0, share, 0.0) / len(normals)
+    return likelihood, below, square / terms * known.power + fast[:, None]
+
+
+def cells(kind: str, count: int) -> Iterator[tuple[str, Cell]]:
+    """All cells, by name."""
     rng = np.random.default_rng(5)
-    plan = [(n, r, 0.0, size, 1.0 if size == 1.0 else 0.4)
-            for n in SIZES for r in CORRELATIONS for size in ((1.0, 2.0) if kind == "ratio" else (1.0,))]  # fmt: skip
-    plan += [(n, r, 0.5, 1.0, 0.3) for n in (100, 500, 3000) for r in (0.9, 0.98)]
-    made = []
-    for n, r, noise, size, weight in plan:
-        x, y = (sequences(rng, count, n, r, noise) for _ in range(2))
-        made.append(cell(kind, x, y, noise, size, weight))
-    return made
+    for shadowing in GRID:
+        of_width = 1.0 if shadowing.memories >= 20.0 else 0.3
+        if kind != "ratio":
+            x = shadowing.sequences(rng, count)
+            parts = mean_cell(x, x.mean(axis=1)) if kind == "mean" else power_cell(x, shadowing.in_flight_variance)
+            yield str(shadowing), scaled(parts, 1.0 if shadowing.tails is None else 0.5, of_width)
+            continue
+        for channels in (1, 10):
+            if channels * shadowing.n > 10_000:
+                continue
+            for b in (None, 0.5, 0.0) if shadowing.n in (300, 1000) and not shadowing.tails else (None,):
+                pairs = shadowed_pair(rng, shadowing, count, channels) if b is None else (
+                    routed_pair(rng, shadowing, count, channels, b)
+                )  # fmt: skip
+                first, second = pairs
+                truth = 0.0 if b is None else (2.0 * b - 1.0) * ((first - second) ** 2).mean(axis=1)
+                away = (first**2 - second**2).mean(axis=1) - truth
+                x = np.array([undecided(*both) for both in zip(first, second, strict=True)])
+                weight = 3.0 if channels > 1 and b is None else 1.0
+                yield f"{shadowing}, {channels} channels", scaled(mean_cell(x, away), weight, of_width)
 
 
-def loss(log_weight: FloatArray, made: list[Cell]) -> tuple[float, FloatArray]:
-    """What is minimised, and its gradient."""
+def scaled(parts: tuple[FloatArray, FloatArray, FloatArray], of_coverage: float, of_width: float) -> Cell:
+    likelihood, below, width = parts
+    return likelihood, below, width / np.median(width.min(axis=1)), of_coverage, of_width
+
+
+def loss(log_weight: FloatArray, made: list[Cell], kind: str) -> tuple[float, FloatArray]:
+    """Sum to be minimised, and its gradient."""
+    aim, price, idle = AIM[kind]
     prior, total, gradient = np.exp(log_weight - log_weight.max()), 0.0, np.zeros(log_weight.size)
-    for likelihood, below, width, weight in made:
+    for likelihood, below, width, weight, of_width in made:
         share = likelihood * prior
         share /= share.sum(axis=1, keepdims=True)
         chance = np.clip((share * below).sum(axis=1), 1e-7, 1 - 1e-7)
         over, under = (expit(STEEP * (sign * logit(chance) - logit(TAIL))) for sign in (1.0, -1.0))
-        excess = (over * under).mean() - COVERAGE
+        excess = (over * under).mean() - aim
+        cost = weight * (1.0 if excess < 0.0 else idle)
         slope = STEEP * over * under * (under - over) / (chance * (1.0 - chance)) / len(chance)
         size = (share * width).sum(axis=1)
-        total += weight * (excess**2 + 0.5 * WIDTH * np.log(size).mean())
-        gradient += weight * ((2.0 * excess * slope)[:, None] * share * (below - chance[:, None])).sum(axis=0)
-        gradient += weight * 0.5 * WIDTH * (share * (width - size[:, None]) / size[:, None]).mean(axis=0)
+        total += cost * excess**2 + of_width * 0.5 * price * np.log(size).mean()
+        gradient += cost * ((2.0 * excess * slope)[:, None] * share * (below - chance[:, None])).sum(axis=0)
+        gradient += of_width * 0.5 * price * (share * (width - size[:, None]) / size[:, None]).mean(axis=0)
     table = log_weight.reshape(SHAPE)
     bend, away = np.diff(table, 2, axis=1), table - table.mean()
     rough = np.zeros(SHAPE)
@@ -102,20 +122,19 @@ def loss(log_weight: FloatArray, made: list[Cell]) -> tuple[float, FloatArray]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("kind", choices=("mean", "power", "ratio"))
+    parser.add_argument("kind", choices=tuple(AIM))
     parser.add_argument("--sequences", type=int, default=300, help="per cell")
     arguments = parser.parse_args()
-    made = cells(arguments.kind, arguments.sequences)
-    start = np.where(np.array(WHITE_SHARES) > 0.0, -2.0, 0.0)[:, None] + 0.3 * np.log(RATES)
+    named = dict(cells(arguments.kind, arguments.sequences))
+    made = list(named.values())
     best = minimize(
-        lambda p: (lambda value: (1e3 * value[0], 1e3 * value[1]))(loss(p, made)), start.ravel(), jac=True,
-        method="L-BFGS-B", options={"maxiter": 150},
+        lambda p: (lambda value: (1e3 * value[0], 1e3 * value[1]))(loss(p, made, arguments.kind)),
+        np.zeros(SHAPE).ravel(), jac=True, method="L-BFGS-B", options={"maxiter": 150},
     )  # fmt: skip
     prior = np.exp(best.x - best.x.max())
-    for likelihood, below, *_ in made:
+    for name, (likelihood, below, *_) in named.items():
         chance = (likelihood * prior * below).sum(axis=1) / (likelihood * prior).sum(axis=1)
-        print(f"{100 * ((chance > TAIL) & (chance < 1 - TAIL)).mean():.1f}", end=" ")
-    print()
+        print(f"{100 * ((chance > TAIL) & (chance < 1 - TAIL)).mean():5.1f}  {name}")
     for row in np.round(10 * best.x.reshape(SHAPE)).astype(int).tolist():
         print(row)
 

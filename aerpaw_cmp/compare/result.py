@@ -332,6 +332,20 @@ class EngineResult:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class FlightVerdict:
+    """Ray tracing against the best baseline ``against``, over all channels of a flight at once.
+
+    ``difference_db`` is its RMSE minus that of the baseline, each channel after its own offset: negative where ray
+    tracing is better.
+    """
+
+    against: str
+    difference_db: float
+    ci95_db: Interval
+    channels: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
     """Everything that was found about one flight; empty where it has no such series.
 
@@ -344,6 +358,8 @@ class FlightResult:
     engine: EngineResult | None = None
     serving: ServingComparison | None = None
     ladder: tuple[LadderRow, ...] = ()
+    verdict: FlightVerdict | None = None
+    """None where no channel and baseline could be scored."""
 
     @property
     def clocks(self) -> dict[str, ClockResult]:

@@ -1,5 +1,7 @@
 """Autocorrelation, resampling and intervals."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.signal import lfilter
@@ -18,7 +20,6 @@ from aerpaw_cmp.compare.statistics.intervals import (
     paired_difference,
     share_interval,
 )
-from aerpaw_cmp.compare.statistics.memory import power_draws
 from aerpaw_cmp.compare.statistics.passes import Visit, repeatability, same_places
 
 
@@ -134,15 +135,43 @@ def test_half_width_is_students_widened_by_what_is_not_known(n, length, effectiv
             assert abs(end - 0.3) == pytest.approx(1.959964 * np.sqrt(end * (1 - end) / np.clip(size, 1, n)), rel=1e-6)
 
 
-@pytest.mark.parametrize(("first", "second"), [(2.0, 1.0), (1.0, 2.0)])
-def test_powers_of_a_pair_have_the_sum_of_the_larger_and_a_ratio_of_their_own(first, second, monkeypatch):
-    ratio, power = np.array([0.0, 0.7, -2.0]), np.array([3.0, 5.0, 9.0])
-    monkeypatch.setattr(statistics, "mean_draws", lambda values, kind: ratio + (kind != "ratio") + 1e-9 * values.sum())
-    monkeypatch.setattr(statistics, "power_draws", lambda values: power * values.var())
-    wave = np.tile([1.0, -1.0], 20)
-    first_power, second_power = statistics._power_pairs(first * wave, second * wave, first**2, second**2)
-    np.testing.assert_allclose(first_power / second_power, first**2 / second**2 * np.exp(ratio), rtol=1e-6)
-    np.testing.assert_allclose(first_power + second_power, power * (first**2 + second**2))
+def test_what_a_pair_may_add_by_chance_is_the_rest_of_regression_on_the_other_stretches():
+    """By hand: each of 24 stretches takes its share from the other 23; a stretch alone with a difference takes half."""
+    rng = np.random.default_rng(15)
+    first, second = rng.normal(size=(2, 240))
+    apart, expected = first - second, np.empty(240)
+    for stretch in range(24):
+        inside = np.arange(240) // 10 == stretch
+        even = 1e-3 * (apart @ apart)
+        share = (first[~inside] @ apart[~inside] + 0.5 * even) / (apart[~inside] @ apart[~inside] + even)
+        expected[inside] = 2.0 * (first[inside] - share * apart[inside]) * apart[inside]
+    np.testing.assert_allclose(statistics.undecided(first, second), expected)
+    alone = np.where(np.arange(240) // 10 == 5, second + 1.0, first)
+    np.testing.assert_allclose(statistics.undecided(first, alone), first**2 - alone**2, atol=1e-12)
+
+
+def test_the_channels_of_a_flight_are_one_test():
+    """Fading that ten channels share counts once; samples of one instant stand together whatever the channel."""
+    rng, time = np.random.default_rng(16), np.arange(600.0)
+    a, b = (shadowing(rng, 600, 8, 4.0) for _ in range(2))
+    alone = statistics.pooled_difference([(time, a, b)])
+    assert alone.difference_ci95_db == pytest.approx(paired_difference(a, b).difference_ci95_db)
+    copies = statistics.pooled_difference([(time + 1e-3 * k, a + 5.0 * k, b - 3.0 * k) for k in range(10)])
+    assert copies.n == 6000
+    assert copies.difference_db == pytest.approx(alone.difference_db)
+    assert np.ptp(copies.difference_ci95_db) == pytest.approx(np.ptp(alone.difference_ci95_db), rel=0.2)
+    apart = [(time, *(shadowing(rng, 600, 8, 4.0) for _ in range(2))) for _ in range(10)]
+    assert np.ptp(statistics.pooled_difference(apart).difference_ci95_db) < 0.5 * np.ptp(alone.difference_ci95_db)
+    assert statistics.pooled_difference([]).verdict == "no interval"
+
+
+def test_verdicts_of_channels_are_corrected_for_their_number():
+    """Holm by hand at 0.02: 0.004 x 4 and 0.006 x 3 stay, 0.012 x 2 does not, nor what comes behind it."""
+    pair = paired_difference(np.arange(30.0), 2.0 * np.arange(30.0))
+    pairs = [dataclasses.replace(pair, p_value=p, verdict="better") for p in (0.012, 0.004, 0.013, 0.006)]
+    none = dataclasses.replace(pair, p_value=1.0, verdict="no interval")
+    words = [entry.verdict for entry in statistics.corrected([*pairs, none])]
+    assert words == ["not significant", "better", "not significant", "better", "no interval"]
 
 
 def test_nineteen_samples_are_too_few_for_an_interval_and_twenty_are_not():
@@ -221,17 +250,16 @@ def test_ends_are_those_of_the_central_95_percent_of_the_draws(monkeypatch):
     monkeypatch.setattr(statistics, "mean_draws", lambda *_: normal)
     ramp = np.arange(30.0) - 14.5
     monkeypatch.setattr(statistics, "power_draws", lambda *_: (ramp.std() + normal) ** 2)
-    monkeypatch.setattr(statistics, "_power_pairs", lambda *_: ((5.0 + normal) ** 2, np.full(len(normal), 9.0)))
     white = Autocorrelation(n=10_000, block_length=1, n_effective=10_000.0, variance_factor=1.0)
     intervals = {
         "mean": (statistics.mean_interval(ramp), 0.0),
         "spread": (statistics.spread_interval(ramp), ramp.std()),
-        "pair": (paired_difference(ramp, 2 * ramp).difference_ci95_db, 2.0),
+        "pair": (paired_difference(ramp, 2 * ramp).mean_square_ci95_db2, -3.0 * ramp.var()),
         "resampled": (interval(0.0, normal, white), 0.0),
     }
     for name, (ends, middle) in intervals.items():
         assert ends == pytest.approx((middle - 1.96, middle + 1.96), abs=0.01), name
-    assert paired_difference(ramp, 2 * ramp).standard_error_db == pytest.approx(1.0, abs=0.001)
+    assert paired_difference(ramp, 2 * ramp).standard_error_db == pytest.approx(1.0 / (3.0 * ramp.std()), abs=0.001)
     low, high = share_interval(0.5, 0.01, white)
     assert high - low == pytest.approx(2 * 1.96 * 0.01, rel=0.01)
 
@@ -304,11 +332,10 @@ def test_a_paired_difference_sees_what_two_intervals_of_their_own_hide():
 
 def test_beside_a_model_without_error_the_whole_error_of_the_other_is_the_difference():
     error = shadowing(np.random.default_rng(14), 300, 5, 4.0)
-    low, high = np.quantile(power_draws(error - error.mean()), [0.025, 0.975])
     pair, back = paired_difference(error, np.zeros(300)), paired_difference(np.zeros(300), error)
     assert (pair.verdict, back.verdict) == ("worse", "better")
-    assert pair.mean_square_ci95_db2 == pytest.approx((low, high))
-    assert back.mean_square_ci95_db2 == pytest.approx((-high, -low))
+    assert pair.mean_square_ci95_db2 == pytest.approx((error.var(),) * 2, rel=1e-3)
+    assert back.difference_ci95_db == pytest.approx((-error.std(),) * 2, rel=1e-3)
     assert paired_difference(np.zeros(300), np.zeros(300)).difference_ci95_db == (0.0, 0.0)
 
 

@@ -8,6 +8,7 @@ import pytest
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.compare.flight_verdict import flight_verdict
 from aerpaw_cmp.compare.level.rss import ChannelDifference
 from aerpaw_cmp.compare.result import AuditResult, EngineResult, PairResult, RankResult, RssResult
 from aerpaw_cmp.logs.records import RejectedLine
@@ -149,7 +150,7 @@ def make_report() -> ReportData:
     return ReportData(
         title="Sample flight around LW1, 2024-07-15", flight="sample", site=site, generated="2026-11-21T00:00:00Z",
         versions={"aerpaw-cmp": "0.1.0", "numpy": np.__version__}, inputs=inputs, track=track, waypoints=waypoints,
-        rss=rss, rank=(make_rank(site, track),), pairs=(pair,), engine=engine, synthetic=True,
+        rss=rss, verdict=flight_verdict(rss), rank=(make_rank(site, track),), pairs=(pair,), engine=engine, synthetic=True,
         settings={"flight": "sample", "rt": {"max_depth": 2}}, stages_s={"ingest": 0.2, "replay": 0.71, "report": 6.0},
     )  # fmt: skip
 

@@ -5,15 +5,15 @@ import dataclasses
 import numpy as np
 import pytest
 
+from aerpaw_cmp.compare.flight_verdict import baseline_errors, flight_verdict, pooled_db
 from aerpaw_cmp.compare.judge.causes import Cause
 from aerpaw_cmp.compare.level.detection import DetectionScore
 from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.compare.level.rss import ErrorSpan
 from aerpaw_cmp.compare.ranks.forecast import score_forecast
-from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
-from aerpaw_cmp.compare.statistics.intervals import paired_difference
+from aerpaw_cmp.compare.result import ESTIMATED, ClockResult, FlightVerdict
 from aerpaw_cmp.report.pages.diff import DIFFERENCE
-from aerpaw_cmp.report.words.flight import CAUSES, Judged, first_sentence, pooled_db, pretty, ranking_sentence
+from aerpaw_cmp.report.words.flight import CAUSES, Judged, first_sentence, pretty, ranking_sentence
 from aerpaw_cmp.report.words.flight_verdict import headlines, verdict
 from benchmarks.fabricated import with_numbers
 
@@ -44,44 +44,44 @@ def with_errors(data, rmse_db, baseline_db):
     return dataclasses.replace(data, rss=panels)
 
 
-def judged_as(data, verdicts, rmse_db=8.4, baseline_db=7.9):
-    """The report whose paired intervals say this of every channel, by baseline."""
-    data = with_errors(data, rmse_db, baseline_db)
-    pair = paired_difference(np.arange(30.0), np.arange(30.0)[::-1])
-    panels = tuple(
-        with_numbers(
-            panel,
-            compared_with={
-                name: dataclasses.replace(pair, verdict=verdicts.get(name, "not significant"))
-                for name in panel.baselines
-            },
-        )
-        for panel in data.rss
-    )
-    return dataclasses.replace(data, rss=panels)
+def judged_as(data, difference_db, low, high, rmse_db=8.4, baseline_db=7.9):
+    """The report whose interval over all channels is this one."""
+    best, n = next(iter(data.rss[0].baselines)), len(data.rss)
+    pooled = FlightVerdict(against=best, difference_db=difference_db, ci95_db=(low, high), channels=n)
+    return dataclasses.replace(with_errors(data, rmse_db, baseline_db), verdict=pooled)
 
 
-def test_the_first_sentence_follows_from_the_paired_intervals(report_data):
-    first, second = report_data.rss[0].baselines
-    n = len(report_data.rss)
+def test_the_first_sentence_follows_from_the_interval_over_all_channels(report_data):
+    best, n = pretty(next(iter(report_data.rss[0].baselines))), len(report_data.rss)
     assert n > 2
-    lost = verdict(judged_as(report_data, {first: "worse"}))[0]
-    assert (
-        lost == f"Ray tracing: RMSE 8.4 dB; {pretty(first)}: 7.9 dB. "
-        f"Ray tracing is significantly worse on {n} of {n} channels (95 %)."
+    lost = judged_as(report_data, 0.5, 0.2, 0.8)
+    assert verdict(lost)[0] == (
+        f"Ray tracing (RMSE 8.4 dB) is 0.50 dB worse than {best} [0.20, 0.80] over {n} channels (95 %)."
     )
-    # it loses to the second-best baseline alone: that is what is said
-    assert pretty(second) in verdict(judged_as(report_data, {second: "worse"}))[0]
-    cards = {card.label: card for card in headlines(judged_as(report_data, {second: "worse"}))}
-    assert cards[f"Better than {pretty(second)}"].interval.startswith(
-        f"worse: {n},"
-    )  # the card has the sentence's model
-    same = verdict(judged_as(report_data, {}))[0]
-    assert f"The difference is not significant on any of {n} channels" in same
+    card = next(card for card in headlines(lost) if card.label == f"Against {best}, same samples")
+    assert (card.value, card.interval) == ("+0.50 dB", "95 %: +0.20 to +0.80 dB")
+    same = verdict(judged_as(report_data, 0.5, -0.2, 1.2))[0]
+    assert f"The difference of +0.50 dB [−0.20, +1.20] over {n} channels is not significant (95 %)." in same
     assert "better" not in same
     assert "worse" not in same
-    won = verdict(judged_as(report_data, dict.fromkeys((first, second), "better"), 3.0, 7.9))[0]
-    assert f"significantly better on {n} of {n}" in won
+    won = verdict(judged_as(report_data, -4.9, -6.0, -3.9, 3.0))[0]
+    assert won.startswith(f"Ray tracing (RMSE 3.0 dB) is 4.90 dB better than {best} [3.90, 6.00] over")
+    few = verdict(judged_as(report_data, 0.5, np.nan, np.nan))[0]
+    assert few.endswith(f"{best}: 7.9 dB. Too few samples for an interval of the difference.")
+    none = verdict(dataclasses.replace(lost, verdict=None))[0]
+    assert none == "Ray tracing: RMSE 8.4 dB. No baseline could be scored."
+
+
+def test_the_verdict_is_against_the_best_baseline_over_the_scored_channels(report_data):
+    """A channel that is too short for a sentence takes no part."""
+    pooled = flight_verdict(report_data.rss)
+    errors = baseline_errors(report_data.rss)
+    assert pooled.against == min(errors, key=errors.get)
+    total = pooled_db([p.score.rmse_db for p in report_data.rss], [p.score.n for p in report_data.rss])
+    assert pooled.difference_db == pytest.approx(total - errors[pooled.against], abs=0.05)  # offsets in steps of 0.1 dB
+    short = with_numbers(report_data.rss[0], n=19)
+    assert flight_verdict([short, *report_data.rss[1:]]).channels == len(report_data.rss) - 1
+    assert flight_verdict([short]) is None
 
 
 @pytest.mark.parametrize("better", range(4))

@@ -3,9 +3,9 @@
 Neighbouring errors of a flight repeat each other, and how long they do is itself hardly known from one flight. The
 sequence is described by its slowest cosine terms, after Mueller and Watson (2008),
 doi:10.1111/j.1468-0262.2008.00868.x: given a memory, they are normal with a known covariance. Memories from three times
-the flight's length to none at all, with and without white noise, are weighted by how well they explain the terms, and
-by weights that make 95 % intervals hold 95 % of the time whatever the memory is (``benchmarks/interval_weights.py``
-finds them by simulation). A flight that is one memory long gets a wide interval, not none.
+the flight's length to none at all, rough (exponential) with and without white noise and smooth (Matern 3/2), are
+weighted by how well they explain the terms, and by weights that make 95 % intervals hold 95 % of the time whatever the
+memory is (``benchmarks/interval_weights.py`` finds them by simulation).
 """
 
 from __future__ import annotations
@@ -18,10 +18,12 @@ from typing import Literal
 
 import numpy as np
 
-from ...common.units import FloatArray, IntArray
+from ...common.units import ComplexArray, FloatArray, IntArray
 
-# Cosine terms that the memory is judged by; faster ones tell about the power alone.
-TERMS = 24
+# Cosine terms that the memory is judged by, of a long sequence; faster ones tell about the power alone. Shorter
+# sequences take the largest of a few numbers: each has its own table of memories.
+TERMS = 48
+_FEWER = np.array([9, 12, 16, 24, 34, TERMS])
 
 # Samples below which nothing is said.
 FEWEST = 20
@@ -32,11 +34,17 @@ RATES = np.geomspace(0.3, 500.0, 18)
 # Share of white noise in the slowest fluctuations.
 WHITE_SHARES = (0.0, 2e-3, 3e-2)
 
+# White noise in the terms of a smooth memory, which fall by the fourth power of their order.
+_SMOOTH_FLOOR = 1e-7
+
 Kind = Literal["mean", "power", "ratio"]
 
-# Logarithms of the weights in tenths, by kind, white share and rate; from 300 sequences in each of 54 cells of
-# (samples, correlation of neighbours, white noise).
+# Logarithms of the weights in tenths, by kind, rough memories of each white share and smooth ones, and rate.
 _TENTHS = Path(__file__).with_name("memory_weights.json")
+
+# Standard deviations of the logarithm of the power below and above, in those that the fourth moment says; by
+# simulation with Student's t of four degrees of freedom. Most sequences with heavy tails look calmer than the process.
+CALM = 0.7, 1.8
 
 # Draws come in pairs of opposite sign, so that exchanging two models turns an interval about exactly.
 _PAIRS = 2048
@@ -48,7 +56,7 @@ class Memories:
 
     ``whiten`` (m, terms, terms) makes the terms independent, ``log_det`` (m,) is the logarithm of its determinant;
     ``slope`` (m, terms) and ``variance`` (m,) give mean and variance of the sequence's mean once the terms are known;
-    ``power`` (m,) is that of the mean and of the terms together.
+    ``power`` (m,) is that of the terms together; ``rate`` (m,) the length of the sequence over that of the memory.
     """
 
     whiten: FloatArray
@@ -56,23 +64,39 @@ class Memories:
     slope: FloatArray
     variance: FloatArray
     power: FloatArray
+    rate: FloatArray
 
 
 @cache
 def memories(terms: int = TERMS) -> Memories:
-    """All combinations of :data:`WHITE_SHARES` and :data:`RATES`, the latter running fastest."""
-    parts = []
-    for share in WHITE_SHARES:
-        for rate in RATES:
-            covariance = (1.0 - share) * 0.5 * rate * _exponential(rate, terms) + share * np.eye(terms + 1)
-            whiten = np.linalg.inv(np.linalg.cholesky(covariance[1:, 1:]))
-            slope = whiten.T @ (whiten @ covariance[0, 1:])
-            variance = covariance[0, 0] - covariance[0, 1:] @ slope
-            parts.append((whiten, np.log(np.diag(whiten)).sum(), slope, variance, np.trace(covariance)))
-    return Memories(*(np.array(column) for column in zip(*parts, strict=True)))
+    """Rough memories of each of :data:`WHITE_SHARES`, then smooth ones; :data:`RATES` run fastest."""
+    white = np.eye(terms + 1)
+    covariances = [
+        (1.0 - share) * 0.5 * rate * _exponential(rate, terms).real + share * white
+        for share in WHITE_SHARES for rate in RATES
+    ] + [0.25 * rate * _smooth(rate, terms) + _SMOOTH_FLOOR * white for rate in RATES]  # fmt: skip
+    every = np.array(covariances)
+    whiten = np.linalg.inv(np.linalg.cholesky(every[:, 1:, 1:]))
+    cross = every[:, 0, 1:]
+    slope = np.einsum("mij,mi->mj", whiten, np.einsum("mij,mj->mi", whiten, cross))
+    return Memories(
+        whiten=whiten,
+        log_det=np.log(np.diagonal(whiten, axis1=1, axis2=2)).sum(axis=1),
+        slope=slope,
+        variance=every[:, 0, 0] - (cross * slope).sum(axis=1),
+        power=np.trace(every[:, 1:, 1:], axis1=1, axis2=2),
+        rate=np.tile(RATES, len(WHITE_SHARES) + 1),
+    )
 
 
-def _exponential(rate: float, terms: int) -> FloatArray:
+def _smooth(rate: float, terms: int) -> FloatArray:
+    """The same of (1 + rate |s - t|) exp(-rate |s - t|): the exponential less rate times its slope over the rate."""
+    step = 1e-20  # along the imaginary axis: exact to rounding
+    covariance = _exponential(complex(rate, rate * step), terms)
+    return np.asarray(covariance.real - covariance.imag / step)
+
+
+def _exponential(rate: complex, terms: int) -> ComplexArray:
     """Covariance (terms + 1, terms + 1) of the cosine terms of exp(-rate |s - t|) on the unit interval."""
     order = np.arange(terms + 1)
     sign = np.where(order % 2 == 0, 1.0, -1.0)
@@ -106,7 +130,7 @@ def cosine_terms(values: FloatArray) -> Terms:
 
     n = len(values)
     every = dct(values - values.mean(), norm="ortho")[1:] / np.sqrt(n)
-    count = min(TERMS, (n - 1) // 2)
+    count = int(_FEWER[(n - 1) // 2 >= _FEWER].max())
     squares = every * every
     fast = squares[count:]
 
@@ -119,7 +143,7 @@ def cosine_terms(values: FloatArray) -> Terms:
 def likelihoods(slow: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Likelihood (..., m) of each memory, its scale integrated out, and the whitened sum of squares (..., m)."""
     known = memories(slow.shape[-1])
-    square = np.square(np.einsum("mij,...j->...mi", known.whiten, slow)).sum(axis=-1)
+    square = np.square(slow @ known.whiten.swapaxes(1, 2)).sum(axis=-1).T
     log = known.log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
     return np.exp(log - log.max(axis=-1, keepdims=True)), square
 
@@ -166,17 +190,25 @@ def mean_draws(values: FloatArray, kind: Kind = "mean") -> FloatArray:
     return np.asarray(np.concatenate([centre + reach, centre - reach]))
 
 
+def heavy_tails(values: FloatArray, terms: Terms) -> float:
+    """Standard deviation of the logarithm of the mean square (see :data:`CALM`) for tails heavier than normal."""
+    square = np.square(values - values.mean())
+    # a short normal sequence shows heavy tails by chance: only what is beyond counts
+    excess = float(np.mean(square * square)) / float(square.mean()) ** 2 - 3.0 - np.sqrt(24.0 / terms.freedom)
+    return float(np.sqrt(max(excess, 0.0) / terms.freedom))
+
+
 def power_draws(values: FloatArray) -> FloatArray:
-    """Draws of the mean square of the process about its own mean, in the order of :func:`mean_draws`.
+    """Draws of the mean square about their own mean that sequences of this length and spacing have on average.
+
+    In the order of :func:`mean_draws`. What a memory longer than the sequence adds to the mean does not count.
 
     Parameters
     ----------
     values : (n,)
         In time order, at least :data:`FEWEST`. Tails heavier than normal widen the draws.
     """
-    deviation = values - values.mean()
-    mean_square = float(np.mean(deviation * deviation))
-    if mean_square == 0.0:
+    if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
     terms = cosine_terms(values)
     index, scale = _picked(terms.slow, "power")
@@ -184,7 +216,5 @@ def power_draws(values: FloatArray) -> FloatArray:
     third = 2.0 / (9.0 * terms.fast_freedom)
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
-    # a short normal sequence shows heavy tails by chance: only what is beyond counts
-    excess = max(float(np.mean(deviation**4)) / mean_square**2 - 3.0 - np.sqrt(24.0 / terms.freedom), 0.0)
-    tails = np.exp(np.sqrt(excess / terms.freedom) * normal)
+    tails = np.exp(heavy_tails(values, terms) * np.where(normal > 0.0, CALM[1], CALM[0]) * normal)
     return np.tile((scale * memories(len(terms.slow)).power[index] + fast) * tails, 2)

@@ -21,6 +21,7 @@ from ...common.stages import give_memory_back
 from ...common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ...compare import offset as offsets
 from ...compare import rank as ranks
+from ...compare.flight_verdict import flight_verdict, with_corrected_verdicts
 from ...compare.gains.spread import StatedSpread, inside_shares
 from ...compare.judge.ladder import log_distance_level_db
 from ...compare.level import rss
@@ -73,8 +74,10 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     for series, replayed in zip(data.rss, replays.rss, strict=True):
         results.append(compare_rss_series(data, series, replayed))
         give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
+    results = with_corrected_verdicts(results)
     return FlightResult(
         rss=tuple(results),
+        verdict=flight_verdict(results),
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
         pairs=tuple(pairs_of(results)),
         serving=serving_of(data.rss, results),

@@ -6,11 +6,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ...compare.flight_verdict import pooled_db
 from ...compare.judge.verdicts import Verdict, campaign_verdict
 from ...compare.level.rss import LEARNED_HERE
 from ..content.campaign import CampaignData, RssRow
 from ..names import k_key
-from .flight import first_sentence, pooled_db, pretty, ranking_sentence
+from .flight import first_sentence, pretty, ranking_sentence
 from .flight_verdict import judge
 from .phrases import said_of
 

@@ -9,11 +9,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.units import AnyArray
+from ...compare.flight_verdict import pooled_db
 from ...compare.judge.ladder import LadderRow
 from ...compare.level.detection import DetectionScore
 from ...compare.level.rss import ErrorSpan
-from ...compare.result import BASELINE_TITLE, AuditResult, RankResult, RssResult
-from ...compare.statistics.intervals import Interval
+from ...compare.result import BASELINE_TITLE, AuditResult, FlightVerdict, RankResult, RssResult
+from ...compare.statistics.intervals import Interval, paired_verdict
 from ..content.flight import ReportData
 from .phrases import filled
 
@@ -143,6 +144,36 @@ def first_sentence(facts: Judged) -> str:
     text = next(text for holds, text in SIGNIFICANCE if holds(facts))
     significance = text.format(better=facts.better, worse=facts.worse, channels=facts.channels, unit=facts.unit)
     return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{baseline}. {significance}"
+
+
+_DECIDED = {
+    "better": "Ray tracing (RMSE {ray:.1f} dB) is {size:.2f} dB better than {name} {range}{over} (95 %).",
+    "worse": "Ray tracing (RMSE {ray:.1f} dB) is {size:.2f} dB worse than {name} {range}{over} (95 %).",
+}
+
+
+def flight_sentence(verdict: FlightVerdict | None, ray_db: float, baseline_db: float) -> str:
+    """The error of ray tracing, and what the interval over all channels says of the best baseline.
+
+    Examples
+    --------
+    >>> pooled = FlightVerdict(against="two_ray", difference_db=-0.23, ci95_db=(-0.33, -0.14), channels=10)
+    >>> flight_sentence(pooled, 2.0, 2.2)
+    'Ray tracing (RMSE 2.0 dB) is 0.23 dB better than two-ray ground [0.14, 0.33] over 10 channels (95 %).'
+    """
+    if verdict is None:
+        return f"Ray tracing: RMSE {ray_db:.1f} dB. No baseline could be scored."
+    name, over = pretty(verdict.against), f" over {verdict.channels} channels" if verdict.channels > 1 else ""
+    word = paired_verdict(*verdict.ci95_db)
+    if word in _DECIDED:
+        near, far = sorted(map(abs, verdict.ci95_db))
+        size, ends = abs(verdict.difference_db), f"[{near:.2f}, {far:.2f}]"
+        return _DECIDED[word].format(ray=ray_db, size=size, name=name, range=ends, over=over)
+    both = f"Ray tracing: RMSE {ray_db:.1f} dB; {name}: {baseline_db:.1f} dB."
+    if word == "no interval":
+        return f"{both} Too few samples for an interval of the difference."
+    change, low, high = (f"{v:+.2f}".replace("-", "−") for v in (verdict.difference_db, *verdict.ci95_db))
+    return f"{both} The difference of {change} dB [{low}, {high}]{over} is not significant (95 %)."
 
 
 def expected_sentence(panels: Sequence[RssResult]) -> str:
@@ -352,12 +383,6 @@ def _listed(names: list[str]) -> str:
 def verdicts(rss: Sequence[RssResult], rank: Sequence[RankResult]) -> list[str]:
     """One or two sentences per panel: how well the ray tracing predicts, and against what."""
     return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
-
-
-def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
-    """Root of the mean square error over all samples of several series, each after its own offset [dB]."""
-    weight = np.asarray(n, dtype=np.float64)
-    return float(np.sqrt((weight * np.asarray(rmse_db) ** 2).sum() / weight.sum()))
 
 
 def ladder_verdict(ladder: Sequence[LadderRow]) -> str:

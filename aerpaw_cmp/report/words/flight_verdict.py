@@ -7,10 +7,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ...common.provenance import union
+from ...compare.flight_verdict import baseline_errors, pooled_db, scored
 from ...compare.ranks.forecast import ForecastScore
-from ...compare.result import AuditResult, RankResult, RssResult
-from ...compare.statistics.intervals import Interval, PairedDifference
-from ...compare.statistics.memory import FEWEST
+from ...compare.result import AuditResult, FlightVerdict, RankResult, RssResult
+from ...compare.statistics.intervals import Interval
 from ..content.flight import ReportData
 from . import flight as words
 
@@ -32,19 +32,23 @@ class Headline:
 
 def verdict(data: ReportData) -> tuple[str, ...]:
     """Two sentences: how good against which baseline; where it fails, and whether to trust it."""
-    scored = _scored(data.rss)
-    comparison = judged(scored)
-    first = words.first_sentence(comparison) if comparison is not None else _rank_sentence(data.rank)
+    panels = scored(data.rss)
+    first = _level_sentence(data.verdict, panels) if panels else _rank_sentence(data.rank)
     if learned := _training(data):
         learned = " ".join(part for part in (learned, words.expected_sentence(data.rss)) if part)
         return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, words.trust(data)) if part)
     if not first:
         most = max([panel.score.n for panel in data.rss], default=0)
         return (words.NOTHING_COMPARED if not most else words.TOO_FEW_COMPARED.format(n=most), words.trust(data))
-    first = " ".join(part for part in (words.lock_sentence(scored), first, words.expected_sentence(scored)) if part)
-    cause = _causes(scored)
-    where = (cause,) if cause else (_fails(scored), words.next_step(data))
+    first = " ".join(part for part in (words.lock_sentence(panels), first, words.expected_sentence(panels)) if part)
+    cause = _causes(panels)
+    where = (cause,) if cause else (_fails(panels), words.next_step(data))
     return first, " ".join(part for part in (*where, words.trust(data)) if part)
+
+
+def _level_sentence(pooled: FlightVerdict | None, panels: Sequence[RssResult]) -> str:
+    baseline_db = math.nan if pooled is None else baseline_errors(panels)[pooled.against]
+    return words.flight_sentence(pooled, _pooled(panels), baseline_db)
 
 
 def _training(data: ReportData) -> str:
@@ -63,42 +67,14 @@ def _baseline_sentence(panels: Sequence[RssResult]) -> str:
     return "" if best is None else f"For comparison, {words.pretty(best[0])}: RMSE {best[1]:.1f} dB."
 
 
-def _scored(panels: Sequence[RssResult]) -> list[RssResult]:
-    return [panel for panel in panels if panel.score.n >= FEWEST and math.isfinite(panel.score.rmse_db)]
-
-
-def _baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:
-    """Pooled RMSE [dB] of each baseline that all of these series have."""
-    errors = {}
-    for name in panels[0].baselines if panels else ():
-        known = [p.baselines[name].rmse_db for p in panels if name in p.baselines]
-        if len(known) == len(panels) and all(map(math.isfinite, known)):
-            errors[name] = words.pooled_db(known, [panel.score.n for panel in panels])
-    return errors
-
-
 def _best_baseline(panels: Sequence[RssResult]) -> tuple[str, float] | None:
     """Name and pooled RMSE [dB] of the baseline with the smallest error; None without one that all have."""
-    return min(_baseline_errors(panels).items(), key=lambda item: item[1], default=None)
+    return min(baseline_errors(panels).items(), key=lambda item: item[1], default=None)
 
 
 def _pooled(panels: Sequence[RssResult]) -> float:
     """RMSE of the ray tracing over all samples of several series [dB]."""
-    return words.pooled_db([p.score.rmse_db for p in panels], [p.score.n for p in panels])
-
-
-def _paired(panels: Sequence[RssResult], name: str) -> list[PairedDifference]:
-    """Ray tracing against one baseline, where both were scored on the same samples."""
-    return [p.further.compared_with[name] for p in panels if name in p.further.compared_with]
-
-
-def judged(panels: Sequence[RssResult]) -> words.Judged | None:
-    """Ray tracing against the baseline that matters most; None without a scored channel."""
-    if not panels:
-        return None
-    scored = [(p.score.rmse_db, p.score.n) for p in panels]
-    verdicts = [{name: pair.verdict for name, pair in p.further.compared_with.items()} for p in panels]
-    return judge(scored, _baseline_errors(panels), verdicts)
+    return pooled_db([p.score.rmse_db for p in panels], [p.score.n for p in panels])
 
 
 def judge(
@@ -124,7 +100,7 @@ def judge(
     -------
     Judged
     """
-    total, count_of = words.pooled_db(*map(list, zip(*scored, strict=True))), len(scored)
+    total, count_of = pooled_db(*map(list, zip(*scored, strict=True))), len(scored)
     every = []
     for name, error in baselines_db.items():
         decided = [row[name] for row in verdicts if row.get(name, "no interval") != "no interval"]
@@ -216,9 +192,9 @@ def _fails(panels: Sequence[RssResult]) -> str:
 def headlines(data: ReportData) -> list[Headline]:
     """At most four numbers, each with its interval and what it must be held against."""
     lines = []
-    panels = _scored(data.rss)
+    panels = scored(data.rss)
     if panels:
-        lines += [_error(panels), *_difference(panels)]
+        lines += [_error(panels), *_difference(data.verdict)]
     for panel in data.rank:
         score, k = _forecast_of(panel), words.nearest_k(panel)
         if score is not None:
@@ -268,29 +244,15 @@ def _ends(panels: Sequence[RssResult]) -> str:
     return f"channels: {min(errors):.1f} to {max(errors):.1f} dB"
 
 
-def _difference(panels: Sequence[RssResult]) -> list[Headline]:
-    comparison = judged(panels)  # as the sentence above the cards
-    name = "" if comparison is None else comparison.name
-    paired = _paired(panels, name)
-    if not paired:
+def _difference(pooled: FlightVerdict | None) -> list[Headline]:
+    if pooled is None:
         return []
-    verdicts = [entry.verdict for entry in paired]
-    undecided = len(verdicts) - verdicts.count("better") - verdicts.count("worse")
-    if len(paired) == 1:
-        return [
-            Headline(
-                label=f"Against {words.pretty(name)}, same samples",
-                value=f"{paired[0].difference_db:+.1f} dB".replace("-", "−"),
-                interval=_interval(paired[0].difference_ci95_db, "+.1f", " dB"),
-                reference="negative: smaller error of ray tracing",
-            )
-        ]
     return [
         Headline(
-            label=f"Better than {words.pretty(name)}",
-            value=f"{verdicts.count('better')} of {len(verdicts)}",
-            interval=f"worse: {verdicts.count('worse')}, not significant: {undecided}",
-            reference="channels, by paired 95 % intervals",
+            label=f"Against {words.pretty(pooled.against)}, same samples",
+            value=f"{pooled.difference_db:+.2f} dB".replace("-", "−"),
+            interval=_interval(pooled.ci95_db, "+.2f", " dB"),
+            reference="negative: smaller error of ray tracing",
         )
     ]
 

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..common.cells import unguarded
-from ..common.errors import InputError, UsageError, one_line
+from ..common.errors import InputError, UsageError, one_line, parsing
 from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.outputs import OutputFolder, changed_files
 from ..common.provenance import KEY
@@ -21,13 +21,10 @@ from ..compare.judge import report_difference
 from ..report.content.diff import Entry, InputEntry, ReportDiff, ReportSide
 from ..report.names import RANK_COLUMNS, RSS_COLUMNS, links_of
 
-# Differences up to this count as none: the tables hold four decimals, offsets one.
-_TOLERANCE_DB = 0.01
-
-_NEEDED = ("flight", "versions", "inputs", "settings", "rss", "rank")
+_NEEDED: dict[str, type] = {
+    "flight": str, "versions": dict, "inputs": list, "settings": dict, "rss": dict, "rank": dict,
+}  # fmt: skip
 _SIMULATED = "simulated_rank_k"
-# What changes without meaning anything, or is compared on its own.
-_VOLATILE = ("generated", "stages", "versions", "inputs", "settings", "warnings", "speed", "title", "flight")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,9 +39,7 @@ class ReadReport:
     remarks: tuple[str, ...]
 
 
-def run_diff(
-    first: Path, second: Path, *, out: Path | None = None, tolerance_db: float = _TOLERANCE_DB, force: bool = False
-) -> ReportDiff:
+def run_diff(first: Path, second: Path, *, out: Path | None = None, force: bool = False) -> ReportDiff:
     """Compare two reports; with ``out`` also write ``diff.html`` and ``diff.json`` there.
 
     Parameters
@@ -53,8 +48,6 @@ def run_diff(
         Folders of reports.
     out : Path, optional
         Folder of the results.
-    tolerance_db : float
-        Differences of levels, offsets and errors up to it count as none.
     force : bool
         Write into a folder that holds files of others.
 
@@ -66,20 +59,18 @@ def run_diff(
     Raises
     ------
     UsageError
-        Reports of different flights; a negative tolerance.
+        Reports of different flights.
     InputError
         What is no report, is of an older version, or is damaged.
     """
-    if not tolerance_db >= 0:
-        raise UsageError(f"a tolerance of {tolerance_db} dB", expected="0 or more")
     first_report, second_report = _read_report(first), _read_report(second)
     _same_flight(first_report, second_report)
     if out is None:
-        return _compare_reports(first_report, second_report, tolerance_db)
+        return _compare_reports(first_report, second_report)
     from ..report.pages.diff import write_diff
 
     with OutputFolder(out, job="diff", inputs=[*first_report.files, *second_report.files], force=force) as output:
-        diff = _compare_reports(first_report, second_report, tolerance_db)
+        diff = _compare_reports(first_report, second_report)
         with output.filling() as place:
             write_diff(diff, place)
     return diff
@@ -105,103 +96,59 @@ def _read_report(place: Path) -> ReadReport:
         place=place,
         files=(place / "metrics.json", *files.values()),
         metrics=metrics,
-        remarks=(*remarks, *_against_metrics(metrics, rss, place)),
+        remarks=tuple(remarks),
         rss=rss,
         rank=rank,
     )
 
 
 def _metrics(file: Path, named: Path) -> dict[str, Any]:
-    try:
-        content = json.loads(read_bounded(file, LARGEST_TABLE, "metrics.json"))
-    except FileNotFoundError:
+    if not file.is_file():
         foreign = next((n for n in ("campaign.json", "diff.json") if (named / n).is_file()), None)
         raise InputError(
             "there is no metrics.json" if named.is_dir() else "there is no such file or folder",
             expected="the folder of a report, or its metrics.json",
             cause=None if foreign is None else f"the folder holds {foreign}: only reports of a flight can be compared",
             path=named,
-        ) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path=file) from error
-    except (ValueError, RecursionError) as error:
+        )
+    with parsing(file, "metrics.json of a report", "a torn copy"):
+        content = json.loads(read_bounded(file, LARGEST_TABLE, "metrics.json"))
+    missing = [
+        key for key in _NEEDED if not isinstance(content, dict) or not isinstance(content.get(key), _NEEDED[key])
+    ]
+    if not missing and not all(isinstance(i, dict) and isinstance(i.get("path"), str) for i in content["inputs"]):
+        missing = ["inputs"]
+    towers = [] if missing else list(content["rss"].values())
+    if not all(isinstance(t, dict) and all(isinstance(n, dict) for n in t.values()) for t in towers):
+        missing = ["rss"]
+    if missing:
         raise InputError(
-            f"is no JSON ({one_line(str(error))})", expected="metrics.json of a report", cause="a torn copy", path=file
-        ) from None
-    if not isinstance(content, dict):
-        raise InputError("is no metrics.json", expected="one JSON object", path=file)
-    missing = [key for key in _NEEDED if key not in content]
-    if "rss" in missing or "rank" in missing or "flight" in missing:
-        kind = "a map" if "grid" in content else "a calibration" if "scores" in content else "no report"
-        raise InputError(
-            f"holds the numbers of {kind}" if kind != "no report" else f"has no {', '.join(map(repr, missing))}",
+            f"has no {', '.join(map(repr, missing))} as a report writes it",
             expected="metrics.json of `aerpaw-cmp report`",
+            cause="a map, a calibration, or a report of another version: run the report again",
             path=file,
         )
-    wrong = [] if missing else _misshapen(content)
-    if missing or wrong:
-        fault = f"has no {', '.join(map(repr, missing))}" if missing else f"{wrong[0]!r} is not of its kind"
-        versions = content.get("versions")
-        version = versions.get("aerpaw-cmp", "unknown") if isinstance(versions, dict) else "unknown"
-        raise InputError(
-            fault,
-            expected="a report of this version",
-            cause=f"made by version {one_line(str(version))}: run the report again",
-            path=file,
-        )
-    return content
-
-
-def _misshapen(content: Mapping[str, Any]) -> list[str]:
-    """Keys whose value is not of the kind that a report writes."""
-    mappings = ("versions", "settings", "rss", "rank")
-    wrong = [key for key in mappings if not isinstance(content[key], dict)]
-    inputs = content["inputs"]
-    if not isinstance(inputs, list) or not all(isinstance(i, dict) and isinstance(i.get("path"), str) for i in inputs):
-        wrong.append("inputs")
-    if wrong:
-        return wrong
-    for tower in content["rss"].values():
-        links = tower.values() if isinstance(tower, dict) else [None]
-        if not all(isinstance(n, dict) and isinstance(n.get("offset_db"), (float, int, type(None))) for n in links):
-            return ["rss"]
-    return wrong
+    return content  # type: ignore[no-any-return]
 
 
 def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
     """A table of samples; every fault of it names its line."""
     import pandas as pd
 
-    try:
-        with path.open("rb") as stream:
-            stream.seek(0, 2)
-            size = stream.tell()
-            stream.seek(max(0, size - 1))
-            last_line_ends = size == 0 or stream.read() == b"\n"
-        if not size:
-            raise InputError("is empty", expected="a header at least", cause="a torn copy", path=path)
-        texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
-        table = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""], low_memory=False)
-    except FileNotFoundError:
-        raise InputError("there is no such table", expected=f"{kind}.csv beside metrics.json", path=path) from None
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror})", path=path) from error
-    except (ValueError, UnicodeError) as error:  # pandas' parser errors are ValueErrors
-        raise InputError(f"is no table ({one_line(str(error))})", cause="a damaged or edited file", path=path) from None
-    lines = len(table) + 1
-    if not last_line_ends:
-        raise InputError("the last line does not end", cause="a torn copy", path=path, line=lines)
-    missing = [name for name in columns if name not in table.columns]
-    if missing:
+    texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
+    with parsing(path, f"the table {kind}.csv beside metrics.json", "a damaged or edited file"):
+        content = read_bounded(path, LARGEST_TABLE, f"{kind}.csv")
+        table = pd.read_csv(BytesIO(content), dtype=texts, keep_default_na=False, na_values=[""], low_memory=False)
+    if not content.endswith(b"\n"):
+        raise InputError("the last line does not end", cause="a torn copy", path=path, line=len(table) + 1)
+    if missing := [name for name in columns if name not in table.columns]:
         raise InputError(
             f"has no column {missing[0]!r}", expected=f"the columns of {kind}.csv", cause="an older version", path=path
         )
-    for name in table.columns:
-        if name in texts:
-            continue
-        if not pd.api.types.is_numeric_dtype(table[name]) and len(table):
-            bad = pd.to_numeric(table[name], errors="coerce").isna() & table[name].notna()
-            row = int(np.flatnonzero(bad.to_numpy())[0]) if bad.any() else 0
+    for name in [name for name in table.columns if name not in texts and len(table)]:
+        bad = pd.to_numeric(table[name], errors="coerce").isna() & table[name].notna()
+        if bad.any():
+            row = int(np.flatnonzero(bad.to_numpy())[0])
             shown = one_line(str(table[name].iloc[row]))
             raise InputError(f"column {name!r}: {shown!r}", expected="a number", path=path, line=row + 2)
     torn = table["tower"].isna() | table["time_s"].isna()
@@ -211,19 +158,6 @@ def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
     text = [name for name in texts if name in table]
     table[text] = table[text].fillna("").map(unguarded)
     return table
-
-
-def _against_metrics(metrics: Mapping[str, Any], rss: Any, folder: Path) -> list[str]:
-    """Links whose table does not have the samples that metrics.json counts."""
-    wrong = []
-    scored = rss["residual_db"].notna().groupby([rss["tower"], rss["channel"]]).sum() if len(rss) else {}
-    for link, numbers in links_of(metrics["rss"]).items():
-        n = int(scored.get(link, 0))
-        if n != numbers.get("n") and not numbers.get(KEY):
-            wrong.append(f"{' '.join(link)} ({n} against {numbers.get('n')})")
-    if not wrong:
-        return []
-    return [f"{folder}: rss.csv and metrics.json do not have the same number of scored samples: {', '.join(wrong)}."]
 
 
 def _same_flight(first: ReadReport, second: ReadReport) -> None:
@@ -242,10 +176,9 @@ def _same_flight(first: ReadReport, second: ReadReport) -> None:
 # --- comparing ------------------------------------------------------------------------------------------------------
 
 
-def _compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float = _TOLERANCE_DB) -> ReportDiff:
+def _compare_reports(first: ReadReport, second: ReadReport) -> ReportDiff:
     """Everything that differs between two reports."""
     levels, residuals = _levels(first, second)
-    first_warnings, second_warnings = (list(side.metrics.get("warnings", ())) for side in (first, second))
     alone = [sorted(_links(a) - _links(b)) for a, b in ((first, second), (second, first))]
     return ReportDiff(
         first=_side(first),
@@ -253,15 +186,11 @@ def _compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float 
         settings=tuple(_entries(first.metrics["settings"], second.metrics["settings"])),
         inputs=tuple(_inputs(first.metrics["inputs"], second.metrics["inputs"])),
         versions=tuple(_entries(first.metrics["versions"], second.metrics["versions"])),
-        numbers=tuple(_numbers(first.metrics, second.metrics, tolerance_db)),
         levels=tuple(levels),
         ranks=tuple(_ranks(first, second)),
         pooled=report_difference.pooled_difference(residuals) if residuals else None,
-        new_warnings=tuple(text for text in second_warnings if text not in first_warnings),
-        gone_warnings=tuple(text for text in first_warnings if text not in second_warnings),
         links_first_only=tuple(alone[0]),
         links_second_only=tuple(alone[1]),
-        tolerance_db=tolerance_db,
         remarks=(*first.remarks, *second.remarks, *_learned_here(first, second)),
     )
 
@@ -309,45 +238,14 @@ def _entries(first: Any, second: Any) -> Iterator[Entry]:
 
 
 def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterator[InputEntry]:
-    """Files that were added, removed or changed; one that lies elsewhere with the same content is the same."""
-    first_inputs, second_inputs = ({(i.get("role", ""), i["path"]): i for i in side} for side in (first, second))
-    for key in dict.fromkeys([*first_inputs, *second_inputs]):
-        a, b = first_inputs.get(key), second_inputs.get(key)
-        if a is not None and b is not None and a.get("sha256") == b.get("sha256"):
+    """Files that were added, removed or changed; the same content elsewhere is the same."""
+    sides = [{(i.get("role", ""), i["path"]): i.get("sha256") for i in side} for side in (first, second)]
+    contents = [{(role, digest) for (role, _), digest in side.items()} for side in sides]
+    for role, path in dict.fromkeys([*sides[0], *sides[1]]):
+        before, after = (side.get((role, path)) for side in sides)
+        if ((role, before or after) in contents[0] & contents[1] and None in (before, after)) or before == after:
             continue
-        entry, mine, theirs = a or b or {}, a or {}, b or {}
-        if a is None or b is None:
-            opposite = first if a is None else second
-            if any(i.get("sha256") == entry.get("sha256") and i.get("role") == entry.get("role") for i in opposite):
-                continue
-        yield InputEntry(
-            role=key[0],
-            path=key[1],
-            what="added" if a is None else "removed" if b is None else "changed",
-            first_sha256=mine.get("sha256"),
-            second_sha256=theirs.get("sha256"),
-            first_lines=mine.get("lines"),
-            second_lines=theirs.get("lines"),
-        )
-
-
-def _numbers(first: Mapping[str, Any], second: Mapping[str, Any], tolerance_db: float) -> Iterator[Entry]:
-    """Reported numbers that differ by more than the tolerance; words, and numbers of time, take no part."""
-    reported = ({key: value for key, value in side.items() if key not in _VOLATILE} for side in (first, second))
-    for entry in _entries(*reported):
-        if "seconds" not in entry.key and _apart(entry.first, entry.second, tolerance_db):
-            yield entry
-
-
-def _apart(a: Any, b: Any, tolerance: float) -> bool:
-    if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
-        return any(_apart(x, y, tolerance) for x, y in zip(a, b, strict=True))
-    if isinstance(a, str) or isinstance(b, str):
-        return False
-    if isinstance(a, (int, float)) and isinstance(b, (int, float)):
-        # counts and shares: beyond rounding; what is large by its own size
-        return not math.isclose(a, b, rel_tol=1e-6, abs_tol=tolerance if not isinstance(a, int) else 0)
-    return bool(a != b)
+        yield InputEntry(role=role, path=path, what="changed" if before and after else "removed" if before else "added")
 
 
 # --- samples --------------------------------------------------------------------------------------------------------

@@ -93,9 +93,9 @@ def diff(_: Fixture) -> str:
     return diff_html.diff_page(
         ReportDiff(
             first=sides_of[0], second=sides_of[1], settings=(Entry(key="rt.max_depth", first=2, second=1),), inputs=(),
-            versions=(), numbers=(), levels=(level,), ranks=(),
-            pooled=pooled_difference([(time, first, second)]), new_warnings=(), gone_warnings=(),
-            links_first_only=(), links_second_only=(), tolerance_db=0.01, remarks=(),
+            versions=(), levels=(level,), ranks=(),
+            pooled=pooled_difference([(time, first, second)]),
+            links_first_only=(), links_second_only=(), remarks=(),
         )
     )  # fmt: skip
 

@@ -68,7 +68,7 @@ def test_equal_reports_have_no_difference(pair, capsys):
     change_metrics(pair[1], lambda m: m.update(generated="later", stages={"read_s": 99.0}))
     diff = run_diff(*pair)
     assert diff.differences == ()
-    assert (diff.settings, diff.inputs, diff.versions, diff.numbers) == ((), (), (), ())
+    assert (diff.settings, diff.inputs, diff.versions) == ((), (), ())
     assert verdict(diff).startswith("No difference: the numbers agree within 0.01 dB on 2")
     assert {row.rmse.difference_db for row in diff.levels} == {0.0}
     assert {row.kappa.difference for row in diff.ranks} == {0.0}
@@ -96,7 +96,6 @@ def test_inputs_are_compared_by_content(pair):
     change_metrics(pair[1], change)
     diff = run_diff(*pair)
     assert [(e.path, e.what) for e in diff.inputs] == [(diff.inputs[0].path, "changed"), ("new.txt", "added")]
-    assert diff.inputs[0].second_lines == diff.inputs[0].first_lines + 1
 
 
 @pytest.fixture
@@ -152,15 +151,6 @@ def test_the_other_way_round_has_the_other_sign(noisy):
     assert forth.pooled.verdict == "worse"
     assert reverse.pooled.verdict == "better"
     assert "significantly better: -" in verdict(reverse)
-
-
-def test_the_tolerance_decides_what_counts(noisy, capsys):
-    (first, second), _ = noisy
-    assert main(["diff", str(first), str(second), "--strict"]) == 1
-    assert main(["diff", str(first), str(second), "--strict", "--tolerance", "100"]) == 0
-    assert main(["diff", str(first), str(second)]) == 0
-    assert main(["diff", str(first), str(second), "--tolerance", "-1"]) == 2
-    assert "tolerance" in capsys.readouterr().err
 
 
 def test_a_replay_that_moved_without_harm_is_said_to_have_moved(pair):
@@ -281,17 +271,17 @@ BAD = {
     "a torn line": (tear_a_line, r"rss\.csv, line 6: .*torn", InputError),
     "a word": (word_for_number, r"rss\.csv, line 4: column 'measured_db': 'loud'; expected a number", InputError),
     "an older table": (lambda f: change_table(f, "rss", lambda t: t.drop(columns="up_m")), r"no column 'up_m'.*older", InputError),
-    "an empty table": (lambda f: (f / "rank.csv").write_text(""), r"rank\.csv: is empty", InputError),
+    "an empty table": (lambda f: (f / "rank.csv").write_text(""), r"rank\.csv: .*expected the table rank\.csv", InputError),
     "binary": (lambda f: (f / "rss.csv").write_bytes(b"\xff\xfe\x00\n"), r"rss\.csv: ", InputError),
-    "no table": (lambda f: (f / "rss.csv").unlink(), r"there is no such table", InputError),
+    "no table": (lambda f: (f / "rss.csv").unlink(), r"rss\.csv: cannot be read", InputError),
     "an older report": (without("settings"), r"no 'settings'.*run the report again", InputError),
     "no report": (without("rss", "rank"), r"expected metrics\.json of `aerpaw-cmp report`", InputError),
-    "a map": (lambda f: (f / "metrics.json").write_text('{"grid": {}, "rank": []}'), r"numbers of a map", InputError),
-    "a list": (lambda f: (f / "metrics.json").write_text("[]"), r"is no metrics\.json", InputError),
-    "deep": (lambda f: (f / "metrics.json").write_text("[" * 100_000), r"is no JSON", InputError),
-    "other kinds": (lambda f: change_metrics(f, lambda m: m.update(inputs=[1])), r"'inputs' is not of its kind", InputError),
-    "numbers for links": (lambda f: change_metrics(f, lambda m: m["rss"].update(LW1=[3])), r"'rss' is not of its kind", InputError),
-    "a torn json": (lambda f: (f / "metrics.json").write_text('{"flight": '), r"is no JSON.*torn", InputError),
+    "a map": (lambda f: (f / "metrics.json").write_text('{"grid": {}, "rank": []}'), r"a map, a calibration", InputError),
+    "a list": (lambda f: (f / "metrics.json").write_text("[]"), r"has no 'flight'", InputError),
+    "deep": (lambda f: (f / "metrics.json").write_text("[" * 100_000), r"metrics.json of a report", InputError),
+    "other kinds": (lambda f: change_metrics(f, lambda m: m.update(inputs=[1])), r"has no 'inputs' as a report", InputError),
+    "numbers for links": (lambda f: change_metrics(f, lambda m: m["rss"].update(LW1=[3])), r"has no 'rss' as a report", InputError),
+    "a torn json": (lambda f: (f / "metrics.json").write_text('{"flight": '), r"a torn copy", InputError),
     "a campaign": (lambda f: (f / "metrics.json").rename(f / "campaign.json"), r"no metrics\.json.*campaign\.json", InputError),
     "nothing": (shutil.rmtree, r"no such file or folder", InputError),
     "another flight": (

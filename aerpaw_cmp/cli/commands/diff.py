@@ -17,17 +17,14 @@ from ..shown import print_json, records, say, show
     examples=[
         "aerpaw-cmp diff reports/monday reports/friday",
         "aerpaw-cmp diff reports/a reports/b -o reports/a_and_b",
-        "aerpaw-cmp diff reports/a reports/b --strict --tolerance 0.05 --json",
+        "aerpaw-cmp diff reports/a reports/b --strict --json",
     ],
 )
 def diff(
     first: Annotated[Path, Argument(help="Folder of a report.")],
     second: Annotated[Path, Argument(help="The other report of the same flight.")],
     out: Annotated[Path | None, output("Folder for diff.html and diff.json  [default: none is written]")] = None,
-    tolerance: Annotated[float, Option(help="Largest difference that counts as equal [dB].")] = 0.01,
-    strict: Annotated[
-        bool, Option("--strict", help="Exit code 1 when a number differs by more than the tolerance.")
-    ] = False,
+    strict: Annotated[bool, Option("--strict", help="Exit code 1 when a number differs by more than 0.01 dB.")] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -35,7 +32,7 @@ def diff(
     from ...jobs.diff_reports import run_diff
     from ...report.pages.diff import diff_metrics
 
-    comparison = run_diff(first, second, out=out, tolerance_db=tolerance, force=force)
+    comparison = run_diff(first, second, out=out, force=force)
     if as_json:
         print_json(diff_metrics(comparison))
     else:
@@ -63,9 +60,6 @@ def _print_diff(comparison: Any) -> None:
     for item in comparison.inputs:
         show(one_line(f"input {item.path} ({item.role}): {item.what}"))
     _print_numbers(comparison)
-    for name, texts in (("second", comparison.new_warnings), ("first", comparison.gone_warnings)):
-        for text in texts:
-            show(one_line(f"warning only in the {name}: {text}"))
 
 
 def _value(value: Any) -> str:

@@ -9,6 +9,9 @@ from typing import Any
 from ...compare.judge.report_difference import LevelDifference, Overlap, RankDifference
 from ...compare.statistics.intervals import PairedDifference
 
+# Differences up to this count as none: the tables hold four decimals, offsets one.
+TOLERANCE_DB = 0.01
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Entry:
@@ -21,15 +24,11 @@ class Entry:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InputEntry:
-    """A file that either report was made from: its digest and lines; ``what`` is added, removed or changed."""
+    """A file that either report was made from; ``what`` is added, removed or changed."""
 
     role: str
     path: str
     what: str
-    first_sha256: str | None
-    second_sha256: str | None
-    first_lines: int | None
-    second_lines: int | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,17 +51,12 @@ class ReportDiff:
         Those that differ.
     inputs : tuple of InputEntry
         Those that differ.
-    numbers : tuple of Entry
-        Numbers of metrics.json, as reported, that differ by more than the tolerance.
     levels, ranks : tuple
         On common samples.
     pooled : PairedDifference, optional
         RMSE over all links.
-    new_warnings, gone_warnings : tuple of str
     links_first_only, links_second_only : tuple of str
         Links that one report alone has.
-    tolerance_db : float
-        Differences of levels, offsets and errors up to it count as none.
     remarks : tuple of str
         What the comparison could not do, and what looks wrong.
     """
@@ -72,15 +66,11 @@ class ReportDiff:
     settings: tuple[Entry, ...]
     inputs: tuple[InputEntry, ...]
     versions: tuple[Entry, ...]
-    numbers: tuple[Entry, ...]
     levels: tuple[LevelDifference, ...]
     ranks: tuple[RankDifference, ...]
     pooled: PairedDifference | None
-    new_warnings: tuple[str, ...]
-    gone_warnings: tuple[str, ...]
     links_first_only: tuple[str, ...]
     links_second_only: tuple[str, ...]
-    tolerance_db: float
     remarks: tuple[str, ...]
 
     @property
@@ -94,20 +84,18 @@ def _differences(diff: ReportDiff) -> Iterator[str]:
         if links:
             yield f"only the {name} report has {', '.join(links)}"
     for level in diff.levels:
-        yield from (f"{level.tower} {level.channel}: {text}" for text in _level_clauses(level, diff.tolerance_db))
+        yield from (f"{level.tower} {level.channel}: {text}" for text in _level_clauses(level))
     for rank in diff.ranks:
         yield from (f"{rank.tower} K = {rank.k}: {text}" for text in _rank_clauses(rank))
-    if diff.numbers:
-        yield f"{len(diff.numbers)} reported numbers, the first {diff.numbers[0].key}"
 
 
-def _level_clauses(level: LevelDifference, tolerance_db: float) -> Iterator[str]:
+def _level_clauses(level: LevelDifference) -> Iterator[str]:
     for what, value in (("measured", level.measured_max_db), ("replayed", level.simulated_max_db)):
-        if value > tolerance_db:
+        if value > TOLERANCE_DB:
             yield f"{what} level by up to {value:.3g} dB"
-    if abs(level.offset_db.difference) > tolerance_db:
+    if abs(level.offset_db.difference) > TOLERANCE_DB:
         yield f"offset by {level.offset_db.difference:+.3g} dB"
-    if abs(level.rmse.difference_db) > tolerance_db:
+    if abs(level.rmse.difference_db) > TOLERANCE_DB:
         yield f"RMSE by {level.rmse.difference_db:+.3g} dB"
     if level.samples.only_first or level.samples.only_second:
         yield _alone(level.samples)

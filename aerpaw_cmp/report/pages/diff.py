@@ -9,7 +9,7 @@ from typing import Any
 from ...common.jsonable import fields_of, json_object
 from ...compare.judge.report_difference import Changed
 from ...compare.judge.verdicts import changed_verdict
-from ..content.diff import ReportDiff
+from ..content.diff import TOLERANCE_DB, ReportDiff
 from ..kit.files import json_text, write_file
 from ..kit.page import rendered
 from ..words.flight import count
@@ -25,7 +25,7 @@ def diff_metrics(diff: ReportDiff) -> dict[str, Any]:
 
 def diff_page(diff: ReportDiff) -> str:
     """The whole page."""
-    return rendered("diff", diff=diff, verdict=verdict(diff))
+    return rendered("diff", diff=diff, tolerance_db=TOLERANCE_DB, verdict=verdict(diff))
 
 
 def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:
@@ -81,9 +81,9 @@ def verdict(diff: ReportDiff) -> str:
     if not diff.differences:
         samples = [f"{count(common)} RSS samples"] * bool(common) + [f"{count(ranked)} rank samples"] * bool(ranked)
         on = f" on {' and '.join(samples)}" if samples else ""
-        return f"No difference: the numbers agree within {diff.tolerance_db:g} dB{on}.{_cause(diff)}"
+        return f"No difference: the numbers agree within {TOLERANCE_DB:g} dB{on}.{_cause(diff)}"
     parts = [text for text in (_level_verdict(diff), _rank_verdict(diff)) if text]
-    return " ".join(parts or ["The reported numbers differ."]) + _cause(diff)
+    return " ".join(parts or ["Links differ."]) + _cause(diff)
 
 
 def _cause(diff: ReportDiff) -> str:
@@ -91,7 +91,7 @@ def _cause(diff: ReportDiff) -> str:
     kinds = {"setting": diff.settings, "input": diff.inputs, "version": diff.versions}
     changed = {name: len(items) for name, items in kinds.items()}
     moved = max((level.measured_max_db for level in diff.levels if math.isfinite(level.measured_max_db)), default=0.0)
-    cause = changed_verdict(diff.pooled, bool(diff.differences), moved > diff.tolerance_db, changed)
+    cause = changed_verdict(diff.pooled, bool(diff.differences), moved > TOLERANCE_DB, changed)
     listed = " and ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in changed.items() if n)
     verb = "differs" if sum(changed.values()) == 1 else "differ"
     if cause.cause == "none" and not listed:
@@ -108,9 +108,9 @@ def _level_verdict(diff: ReportDiff) -> str:
     scored = [level for level in diff.levels if level.rmse.n]
     if not scored or diff.pooled is None:
         return ""
-    if all(abs(item.rmse.difference_db) <= diff.tolerance_db for item in scored):
+    if all(abs(item.rmse.difference_db) <= TOLERANCE_DB for item in scored):
         moved = max((item.simulated_max_db for item in scored if math.isfinite(item.simulated_max_db)), default=0.0)
-        though = f", though the replay moved by up to {moved:.2g} dB" if moved > diff.tolerance_db else ""
+        though = f", though the replay moved by up to {moved:.2g} dB" if moved > TOLERANCE_DB else ""
         return f"RSS errors agree on the common samples{though}."
     pooled = diff.pooled
     common, most = (count(sum(getattr(item.samples, name) for item in scored)) for name in ("common", "first"))

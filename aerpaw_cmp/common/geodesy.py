@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .units import FloatArray
+from .units import FloatArray, unmasked
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +48,8 @@ class SiteFrame:
 
     def to_local(self, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """East and north [m] of WGS84 positions [deg]; NaN stays NaN."""
-        latitude = np.asarray(latitude_deg, dtype=np.float64)
-        longitude = np.asarray(longitude_deg, dtype=np.float64)
+        latitude = unmasked(latitude_deg)
+        longitude = unmasked(longitude_deg)
         east, north = in_shape(self._projection, longitude, latitude)
         bad = ~(np.isfinite(latitude) & np.isfinite(longitude))
         return np.where(bad, np.nan, east), np.where(bad, np.nan, north)
@@ -69,7 +69,7 @@ def in_shape(transform: Callable[[Any, Any], Any], x: ArrayLike, y: ArrayLike) -
     x, y : (...)
         In pyproj's order.
     """
-    first, second = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    first, second = np.broadcast_arrays(unmasked(x), unmasked(y))
     if first.size == 1:
         transformed = transform(float(first.reshape(-1)[0]), float(second.reshape(-1)[0]))
     else:

@@ -30,6 +30,22 @@ MINIMUM_HEIGHT_M = 0.5
 THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
 
 
+def unmasked(values: ArrayLike, dtype: Any = np.float64) -> Any:
+    """An array of numbers in which what NumPy's mask hides is missing (NaN), as gaps of NetCDF and GeoTIFF come.
+
+    Each function that takes arrays of callers begins with it: ``np.asarray`` would give what lies under the mask.
+
+    Examples
+    --------
+    >>> unmasked(np.ma.masked_values([1.0, -9999.0], -9999.0)), unmasked([2, 3])
+    (array([ 1., nan]), array([2., 3.]))
+    """
+    masks = isinstance(values, np.ma.MaskedArray) or (
+        isinstance(values, (list, tuple)) and any(isinstance(item, np.ma.MaskedArray) for item in values)
+    )
+    return np.ma.array(values, dtype=dtype).filled(np.nan) if masks else np.asarray(values, dtype=dtype)
+
+
 def noise_floor_dbm(bandwidth_hz: float, noise_figure_db: float = 0.0) -> float:
     """Noise power of a receiver [dBm]: k T B F at 290 K (ITU-R P.372, eq. 1 to 4).
 
@@ -49,12 +65,12 @@ def wavelength_m(frequency_hz: float) -> float:
 def db_from_power(power: ArrayLike) -> FloatArray:
     """10 log10 of a power ratio; zero gives -inf without a warning."""
     with np.errstate(divide="ignore"):
-        return np.asarray(10.0 * np.log10(np.asarray(power, dtype=np.float64)))
+        return np.asarray(10.0 * np.log10(unmasked(power)))
 
 
 def power_from_db(level_db: ArrayLike) -> FloatArray:
     """Power ratio of a level in dB."""
-    return np.asarray(10.0 ** (np.asarray(level_db, dtype=np.float64) / 10.0))
+    return np.asarray(10.0 ** (unmasked(level_db) / 10.0))
 
 
 def db_from_amplitude(amplitude: ArrayLike) -> FloatArray:
@@ -66,17 +82,17 @@ def db_from_amplitude(amplitude: ArrayLike) -> FloatArray:
     [20.0, -inf]
     """
     with np.errstate(divide="ignore", invalid="ignore"):
-        return np.asarray(20.0 * np.log10(np.asarray(amplitude, dtype=np.float64)))
+        return np.asarray(20.0 * np.log10(unmasked(amplitude)))
 
 
 def amplitude_from_db(level_db: ArrayLike) -> FloatArray:
     """Ratio of magnitudes of a level in dB."""
-    return np.asarray(10.0 ** (np.asarray(level_db, dtype=np.float64) / 20.0))
+    return np.asarray(10.0 ** (unmasked(level_db) / 20.0))
 
 
 def wrap_degrees(angle_deg: ArrayLike) -> FloatArray:
     """Angle wrapped to [-180, 180) degrees."""
-    return np.asarray((np.asarray(angle_deg, dtype=np.float64) + 180.0) % 360.0 - 180.0)
+    return np.asarray((unmasked(angle_deg) + 180.0) % 360.0 - 180.0)
 
 
 def finite_mean(values: ArrayLike) -> float:
@@ -87,7 +103,7 @@ def finite_mean(values: ArrayLike) -> float:
     >>> finite_mean([1.0, 3.0, np.nan]), finite_mean([])
     (2.0, nan)
     """
-    array = np.asarray(values, dtype=np.float64)
+    array = unmasked(values)
     finite = array[np.isfinite(array)]
     return float(finite.mean()) if finite.size else float("nan")
 

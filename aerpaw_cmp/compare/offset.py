@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.units import FloatArray
+from ..common.units import FloatArray, unmasked
 
 # Search span of arXiv 2502.10324, section V [dB].
 SPAN_DB = (-50.0, 50.0)
@@ -115,8 +115,8 @@ def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_
 
 def _difference(measured_db: ArrayLike, simulated_db: ArrayLike) -> FloatArray:
     """Simulated minus measured over the pairs that count [dB], flat."""
-    measured = np.asarray(measured_db, dtype=np.float64)
-    simulated = np.asarray(simulated_db, dtype=np.float64)
+    measured = unmasked(measured_db)
+    simulated = unmasked(simulated_db)
     if measured.shape != simulated.shape:
         raise ValueError(f"measured has shape {measured.shape}, simulated {simulated.shape}: they must be pairs")
     ok = np.isfinite(measured) & np.isfinite(simulated)
@@ -301,7 +301,7 @@ def censored_offset(
     ``residual < floor - measured``; both below say nothing. In Olsen's scale (doi:10.2307/1911275) the logarithm
     is concave, so the maximum is the only one; the offset is then the nearest one of the grid.
     """
-    measured, simulated = np.asarray(measured_db, dtype=np.float64), np.asarray(simulated_db, dtype=np.float64)
+    measured, simulated = unmasked(measured_db), unmasked(simulated_db)
     if measured.shape != simulated.shape:
         raise ValueError(f"measured has shape {measured.shape}, simulated {simulated.shape}: they must be pairs")
     low_m, low_s = ~(measured > measured_floor_db), ~(simulated > simulated_floor_db)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, power_from_db
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, power_from_db, unmasked
 from .statistics.inertia import LANES, LARGEST, certain_rank
 from .statistics.intervals import (
     NO_INTERVAL,
@@ -56,7 +56,7 @@ def singular_values(h: ArrayLike) -> FloatArray:
     >>> singular_values([[[4e-160, 0], [0, 1e-160]]]).shape
     (1, 2)
     """
-    matrix = np.asarray(h, dtype=np.complex128)
+    matrix = unmasked(h, np.complex128)
     if matrix.ndim < 2:
         raise ValueError(f"H must have shape (..., n_rx, n_tx), found {matrix.shape}")
     lead, (rows, columns) = matrix.shape[:-2], matrix.shape[-2:]
@@ -90,7 +90,7 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
     """
     if not k >= 1:
         raise ValueError(f"K is a ratio of singular values and must be >= 1, found {k}")
-    values = np.asarray(sigma, dtype=np.float64)
+    values = unmasked(sigma)
     if not values.shape[-1]:
         return np.zeros(values.shape[:-1], dtype=np.int64)
     largest = values.max(axis=-1, keepdims=True)
@@ -137,7 +137,7 @@ def channel_rank(h: ArrayLike, k: float) -> IntArray:
     >>> channel_rank(h, 10), channel_rank(1e-150 * h, 1000), channel_rank(0 * h, 10)
     (array(2), array(4), array(0))
     """
-    matrix = np.asarray(h, dtype=np.complex128)
+    matrix = unmasked(h, np.complex128)
     if matrix.ndim < 2 or not 1 <= min(matrix.shape[-2:]) <= LARGEST or not k >= 1:
         return rank_from_singular_values(singular_values(matrix), k)
     flat = matrix.reshape(-1, *matrix.shape[-2:])
@@ -155,7 +155,7 @@ def channel_rank(h: ArrayLike, k: float) -> IntArray:
 
 
 def _ranks(rank: ArrayLike) -> FloatArray:
-    return np.asarray(rank, dtype=np.float64).ravel()
+    return unmasked(rank).ravel()
 
 
 def histogram(rank: ArrayLike) -> FloatArray:
@@ -209,7 +209,7 @@ def total_variation(first: ArrayLike, second: ArrayLike) -> float:
     >>> total_variation([0.5, 0.5, 0, 0], [1, 0, 0, 0])
     0.5
     """
-    return float(0.5 * np.abs(np.asarray(first, dtype=np.float64) - np.asarray(second, dtype=np.float64)).sum())
+    return float(0.5 * np.abs(unmasked(first) - unmasked(second)).sum())
 
 
 def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
@@ -220,7 +220,7 @@ def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
     >>> wasserstein([1, 0, 0, 0], [0, 0, 0, 1])
     3.0
     """
-    step = np.cumsum(np.asarray(first, dtype=np.float64) - np.asarray(second, dtype=np.float64))
+    step = np.cumsum(unmasked(first) - unmasked(second))
     return float(np.abs(step[:-1]).sum())
 
 
@@ -419,9 +419,9 @@ def k_curve(
     KCurve
         Agreement and total variation by K; NaN where no pose has both ranks.
     """
-    grid = k_grid() if k is None else np.asarray(k, dtype=np.float64)
+    grid = k_grid() if k is None else unmasked(k)
     ri = _ranks(measured)
-    profile = np.asarray(sigma, dtype=np.float64)
+    profile = unmasked(sigma)
     paired = (ri >= 1) & (rank_from_singular_values(profile, 10.0) >= 1)
     ri, profile = ri[paired].astype(np.int64), profile[paired]
     if not len(ri):
@@ -524,7 +524,7 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike) -> IntArray:
     >>> capacity_rank(np.diag([1.0, 0.5, 0.1, 0.1]), [-10.0, 5.0])
     array([1, 2])
     """
-    matrix = np.asarray(h)
+    matrix = unmasked(h, np.complex128)
     sigma = singular_values(matrix)
     power = sigma**2
     total = power.sum(axis=-1, keepdims=True)
@@ -579,7 +579,7 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, further: Mapping[str, Arra
         RSRP and SINR hardly ever repeat by chance. Without them the hold is read off the changes of RI alone: if
         all changes keep to multiples of a period of several rows, the report comes once per period.
     """
-    time, ri = np.asarray(time_s, dtype=np.float64), _ranks(rank)
+    time, ri = unmasked(time_s), _ranks(rank)
     known = np.isfinite(ri)
     if not known.any():
         return Staleness(np.zeros(len(ri), dtype=bool), 0, float("nan"), "no rank")
@@ -735,7 +735,7 @@ def compare_rank(
     ri = _ranks(measured)
     if np.any(ri == 0):
         raise ValueError("measured rank 0 found: a reader must turn 'no CSI' into NaN")
-    matrix = np.asarray(h)
+    matrix = unmasked(h, np.complex128)
     if matrix.ndim != 3 or len(matrix) != len(ri):
         raise ValueError(f"H must have shape ({len(ri)}, n_rx, n_tx), found {matrix.shape}")
     sigma = singular_values(matrix)

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import AnyArray
+from ..common.units import AnyArray, unmasked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -133,7 +133,7 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str, *, foot
     -----
     Samples equal to the one before are suppressed: one ``*`` for the run, as ``od`` does without ``-v``.
     """
-    level = np.asarray(rss_db, dtype=np.float64)
+    level = unmasked(rss_db)
     level = np.where(np.isnan(level), _FLT_MIN_DB - _RX_GAIN_DB, level).astype(np.float32)
     stamps = local_text(times, timezone)
     if len(stamps) != len(level):
@@ -152,7 +152,7 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str, *, foot
 
 def _ri(values: ArrayLike) -> AnyArray:
     """RI as a Quectel writes it: layers from 1, and 0 for no CSI."""
-    rank = np.asarray(values, dtype=np.float64)
+    rank = unmasked(values)
     return np.where(np.isnan(rank), 0, rank).astype(np.int64)
 
 

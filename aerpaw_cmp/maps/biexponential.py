@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import FloatArray
+from ..common.units import FloatArray, unmasked
 
 TINY = 1e-300
 
@@ -49,7 +49,7 @@ class BiExponential:
 
     def __call__(self, distance_m: ArrayLike) -> FloatArray:
         """Correlation at distances [m]."""
-        d = np.asarray(distance_m, dtype=np.float64)
+        d = unmasked(distance_m)
         return np.asarray(self.c1 * np.exp(self.c2 * d) + self.c3 * np.exp(self.c4 * d))
 
     @property
@@ -127,9 +127,9 @@ class _Projection:
     @classmethod
     def of(cls, distance_m: ArrayLike, correlation: ArrayLike, weights: ArrayLike | None) -> _Projection:
         """The problem of one curve: pairs without a number or a weight take no part."""
-        d = np.asarray(distance_m, dtype=np.float64).ravel()
-        y = np.asarray(correlation, dtype=np.float64).ravel()
-        w = np.ones_like(d) if weights is None else np.asarray(weights, dtype=np.float64).ravel()
+        d = unmasked(distance_m).ravel()
+        y = unmasked(correlation).ravel()
+        w = np.ones_like(d) if weights is None else unmasked(weights).ravel()
         if not (d.shape == y.shape == w.shape):
             raise UsageError(f"{d.size} distances, {y.size} correlations and {w.size} weights")
         good = np.isfinite(d) & np.isfinite(y) & (w > 0) & (d >= 0)

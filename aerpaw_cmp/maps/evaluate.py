@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 from .grid import Grid
 
 
@@ -60,7 +60,7 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
 
     Source: arXiv 2502.10324 eq. 19.
     """
-    truth, guess = np.asarray(values, dtype=np.float64), np.asarray(estimate, dtype=np.float64)
+    truth, guess = unmasked(values), unmasked(estimate)
     if truth.shape != guess.shape:
         raise UsageError(f"values of shape {truth.shape}, estimates of shape {guess.shape}")
     known = np.isfinite(truth)
@@ -87,7 +87,7 @@ def leave_one_out(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> S
 
 def leave_one_out_estimate(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Leave-one-out estimate and variance in the shape of ``values`` (n, ...)."""
-    data = np.asarray(values, dtype=np.float64)
+    data = unmasked(values)
     estimate, variance = model.fit(points_m, data.reshape(len(data), -1)).leave_one_out()
     return estimate.reshape(data.shape), variance.reshape(data.shape)
 
@@ -109,7 +109,7 @@ def _held_out_estimate(
     -------
     (estimate, variance), each (n, ...)
     """
-    points, data = np.asarray(points_m, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    points, data = unmasked(points_m), unmasked(values)
     flat = data.reshape(len(data), -1)
     estimate, variance = np.full_like(flat, np.nan), np.full_like(flat, np.nan)
     if test.any() and not test.all():
@@ -146,7 +146,7 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     """
     if not block_m > 0:
         raise UsageError(f"blocks of {block_m} m", expected="a positive length")
-    points = np.asarray(points_m, dtype=np.float64)
+    points = unmasked(points_m)
     cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / block_m + 1e-9).astype(np.int64)
     _, block = np.unique(cell, axis=0, return_inverse=True)
     return grouped(model, points, values, block.ravel())
@@ -167,7 +167,7 @@ def grouped(model: Predictor, points_m: ArrayLike, values: ArrayLike, group: Int
     -------
     Score
     """
-    data = np.asarray(values, dtype=np.float64)
+    data = unmasked(values)
     return score(data, _group_estimate(model, points_m, data, group))
 
 
@@ -199,8 +199,8 @@ def altitude_held_out(model: Predictor, points_m: ArrayLike, altitudes_m: ArrayL
     Score
         Arrays of shape (altitudes, K).
     """
-    points, heights = np.asarray(points_m, dtype=np.float64), np.asarray(altitudes_m, dtype=np.float64)
-    data = np.asarray(values, dtype=np.float64)
+    points, heights = unmasked(points_m), unmasked(altitudes_m)
+    data = unmasked(values)
     if data.ndim != 3 or data.shape[:2] != (len(points), len(heights)):
         raise UsageError(f"values of shape {data.shape}", expected=f"({len(points)}, {len(heights)}, K)")
     space = np.column_stack([np.tile(points[:, :2], (len(heights), 1)), np.repeat(heights, len(points))])
@@ -240,7 +240,7 @@ def along_trajectory(model: Predictor, grid: Grid, values: ArrayLike, trajectory
         raise UsageError("the flight does not cross the map", expected="a trajectory in the site frame [m]")
     test = np.ones(len(grid), dtype=bool)
     test[visited] = False
-    data = np.asarray(values, dtype=np.float64)
+    data = unmasked(values)
     return score(data[test], _held_out_estimate(model, grid.points_m, data, test)[0][test])
 
 
@@ -339,7 +339,7 @@ def learning_curve(
     UsageError
         If a size leaves nothing to predict.
     """
-    points, data = np.asarray(points_m, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    points, data = unmasked(points_m), unmasked(values)
     wrong = [size for size in sizes if not 0 < size < len(points)]
     if wrong:
         raise UsageError(f"sample sizes {wrong} for {len(points)} positions", expected="at least one left to predict")

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import AnyArray, FloatArray, IntArray
+from ..common.units import AnyArray, FloatArray, IntArray, unmasked
 
 # Horizontal interval d_rx of the UAV positions.
 PAPER_SPACING_M = 30.0
@@ -114,12 +114,12 @@ class Grid:
 
     def raster(self, values: ArrayLike) -> AnyArray:
         """Values ``(n, ...)`` in index order as ``(rows, columns, ...)``; row 0 is the south."""
-        array = np.asarray(values)
+        array = unmasked(values) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
         return array.reshape(*self.shape, *array.shape[1:])
 
     def index_of(self, points_m: ArrayLike) -> IntArray:
         """Position index of the cell that holds each point (n, 2+); -1 outside the grid."""
-        points = np.asarray(points_m, dtype=np.float64)
+        points = unmasked(points_m)
         rows, columns = self.shape
         # a point on the border of two cells belongs to the eastern or northern one
         column = np.floor((points[..., 0] - self.east_m[0]) / self.spacing_m + 0.5)
@@ -142,8 +142,8 @@ def serving_tower(points_m: ArrayLike, towers_m: ArrayLike) -> IntArray:
     -------
     ndarray of int, (n,)
     """
-    points = np.asarray(points_m, dtype=np.float64)[:, :2]
-    towers = np.asarray(towers_m, dtype=np.float64)[:, :2]
+    points = unmasked(points_m)[:, :2]
+    towers = unmasked(towers_m)[:, :2]
     if len(towers) == 0:
         raise UsageError("the site has no tower", expected="at least one tower to serve the map")
     squared = ((points[:, None, :] - towers[None, :, :]) ** 2).sum(axis=-1)
@@ -177,7 +177,7 @@ def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, floa
     tuple of Border
         Pairs that share no border are left out.
     """
-    towers = np.asarray(towers_m, dtype=np.float64)[:, :2]
+    towers = unmasked(towers_m)[:, :2]
     borders = []
     for a in range(len(towers)):
         for b in range(a + 1, len(towers)):
@@ -221,13 +221,14 @@ def _bisector_segment(
 
 def without_coverage_as_nan(rank: ArrayLike) -> FloatArray:
     """Ranks as floats with 0 (no path, "Z") as NaN, so that no average takes it for a number."""
-    array = np.asarray(rank, dtype=np.float64)
+    array = unmasked(rank)
     return np.where(array > 0, array, np.nan)
 
 
 def class_shares(rank: ArrayLike, highest: int = 4) -> FloatArray:
-    """Shares of the classes Z (0), 1, ..., ``highest`` among ranks; shape (highest + 1,), sum 1."""
-    counts = np.bincount(np.asarray(rank, dtype=np.int64).ravel(), minlength=highest + 1)
+    """Shares of the classes Z (0), 1, ..., ``highest`` among ranks; shape (highest + 1,), sum 1; NaN does not count."""
+    values = unmasked(rank)
+    counts = np.bincount(values[np.isfinite(values)].astype(np.int64), minlength=highest + 1)
     if len(counts) > highest + 1:
         raise ValueError(f"rank {len(counts) - 1} exceeds the highest class {highest}")
     return np.asarray(counts / max(counts.sum(), 1))

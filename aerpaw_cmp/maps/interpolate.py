@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import FloatArray, IntArray
+from ..common.units import FloatArray, IntArray, unmasked
 from . import neighbours as choose
 from .grid import Grid, serving_tower
 from .kriging import coverage_patterns
@@ -149,8 +149,8 @@ def _hermite(x: FloatArray, y: FloatArray, tangent: FloatArray, at: FloatArray) 
 
 
 def _sorted(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
-    x = np.asarray(index, dtype=np.float64)
-    y = np.asarray(values, dtype=np.float64)
+    x = unmasked(index)
+    y = unmasked(values)
     if y.ndim != x.ndim + 1 or y.shape[:-1] != x.shape or x.shape[-1] < 1:
         raise UsageError(
             f"index of shape {x.shape}, values of shape {y.shape}", expected="(..., m) and (..., m, fields)"
@@ -159,7 +159,7 @@ def _sorted(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> tuple[FloatAr
     x = np.take_along_axis(x, order, -1)
     if (np.diff(x, axis=-1) <= 0).any():
         raise UsageError("two samples with the same position index", expected="distinct positions")
-    return x, np.take_along_axis(y, order[..., None], -2), np.asarray(at, dtype=np.float64)
+    return x, np.take_along_axis(y, order[..., None], -2), unmasked(at)
 
 
 # --- predictors -----------------------------------------------------------------------------------------------------
@@ -193,8 +193,8 @@ class _Local:
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
         """Store samples (n, dims) with values (n,) or (n, fields); NaN is out of coverage."""
-        self.points_m_ = np.asarray(points_m, dtype=np.float64)
-        fields = np.asarray(values, dtype=np.float64)
+        self.points_m_ = unmasked(points_m)
+        fields = unmasked(values)
         if len(fields) != len(self.points_m_):
             raise UsageError(f"{len(fields)} values for {len(self.points_m_)} points")
         self._one_field = fields.ndim == 1
@@ -203,7 +203,7 @@ class _Local:
 
     def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Estimate at targets (t, dims), ``(t,)`` or ``(t, fields)``, and NaN for the variance."""
-        return self._estimate(np.asarray(targets_m, dtype=np.float64), leave_out=False)
+        return self._estimate(unmasked(targets_m), leave_out=False)
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
         """Estimate at each sample from the others, and NaN for the variance."""
@@ -315,7 +315,7 @@ class ServingTowerMean:
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
         """Sum the samples (n, dims) with values (n,) or (n, fields) by tower; NaN does not count."""
-        fields = np.asarray(values, dtype=np.float64)
+        fields = unmasked(values)
         self._one_field = fields.ndim == 1
         self.values_ = fields[:, None] if self._one_field else fields
         self.tower_ = serving_tower(points_m, self.towers_m)

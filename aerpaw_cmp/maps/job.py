@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..common.errors import UsageError
-from ..common.units import BoolArray, FloatArray, IntArray, db_from_power
+from ..common.units import BoolArray, FloatArray, IntArray, db_from_power, unmasked
 from ..compare.rank import rank_from_singular_values
 from .grid import (
     Border,
@@ -221,7 +221,7 @@ def map_job(
 
 def rank_of_singular_values(singular_values: ArrayLike, ks: Sequence[float]) -> IntArray:
     """Channel rank (..., K): how many of ``sigma`` (..., r), descending, exceed ``sigma_1 / k``; 0 for no channel."""
-    sigma = np.asarray(singular_values, dtype=np.float64)
+    sigma = unmasked(singular_values)
     return np.stack([rank_from_singular_values(sigma, k) for k in ks], axis=-1)
 
 

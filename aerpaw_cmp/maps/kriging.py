@@ -37,7 +37,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 from ..propagation.compiled import triangles_for
 from . import neighbours as choose
 
@@ -168,7 +168,7 @@ class OrdinaryKriging:
         """
         self._check_settings()
         points = _as_points(points_m)
-        fields = np.asarray(values, dtype=np.float64)
+        fields = unmasked(values)
         if len(fields) != len(points) or fields.ndim not in (1, 2):
             raise UsageError(
                 f"values of shape {fields.shape} for {len(points)} points", expected="(n,) or (n, fields) with n points"
@@ -534,7 +534,7 @@ def _same_geometry(offset_m: FloatArray) -> tuple[IntArray | slice, IntArray | s
 
 
 def _as_points(points_m: ArrayLike) -> FloatArray:
-    points = np.asarray(points_m, dtype=np.float64)
+    points = unmasked(points_m)
     if points.ndim != 2 or points.shape[1] not in (2, 3):
         raise UsageError(f"points of shape {points.shape}", expected="(n, 2) or (n, 3): east, north (, up) in metres")
     if not np.isfinite(points).all():

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 from .biexponential import PAPER_BIEXPONENTIAL, BiExponential, fit_biexponential, least_on_axis
 
 __all__ = [
@@ -179,8 +179,8 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
     BinnedCorrelation
         ``positions`` counts altitudes, ``pairs`` pairs of altitudes and fields; constant maps are left out, counted.
     """
-    altitudes = np.asarray(altitudes_m, dtype=np.float64)
-    data = np.asarray(maps, dtype=np.float64)
+    altitudes = unmasked(altitudes_m)
+    data = unmasked(maps)
     if data.ndim == 2:
         data = data[:, None, :]
     if data.ndim != 3 or len(data) != len(altitudes):
@@ -410,8 +410,8 @@ def _is_constant(data: FloatArray, present: BoolArray) -> BoolArray:
 
 
 def _points_and_vectors(points_m: ArrayLike, vectors: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    points = np.asarray(points_m, dtype=np.float64)
-    data = np.asarray(vectors, dtype=np.float64)
+    points = unmasked(points_m)
+    data = unmasked(vectors)
     if points.ndim != 2 or points.shape[1] < 2 or len(data) != len(points):
         raise UsageError(
             f"points of shape {points.shape}, values of shape {data.shape}", expected="(n, 2+) and (n, ...)"

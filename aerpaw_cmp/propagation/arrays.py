@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray
+from ..common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, unmasked
 from ..site.antenna.antennas import Isotropic as Isotropic
 
 
@@ -121,9 +121,9 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
     [0.0, 1.0, 0.0]
     """
     yaw, pitch, roll = np.broadcast_arrays(
-        np.asarray(yaw_rad, dtype=np.float64),
-        np.asarray(pitch_rad, dtype=np.float64),
-        np.asarray(roll_rad, dtype=np.float64),
+        unmasked(yaw_rad),
+        unmasked(pitch_rad),
+        unmasked(roll_rad),
     )
     ca, sa = np.cos(yaw), np.sin(yaw)
     cb, sb = np.cos(pitch), np.sin(pitch)

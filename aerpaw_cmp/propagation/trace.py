@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
+from ..common.units import unmasked
 from ..site.site import Site
 from ..site.siteyaml import load_site
 from .arrays import Link, Poses
@@ -75,12 +76,16 @@ def trace(
     """
     place = site if isinstance(site, Site) else load_site(site)
     search = Search(engine, max_depth=max_depth, samples=samples, further=diffracted(diffraction))
-    return replay(place, link, poses if isinstance(poses, Poses) else _level(poses), search, Field(loss))
+    if isinstance(poses, Poses):
+        poses = Poses(unmasked(poses.position_m), unmasked(poses.rotation))
+    else:
+        poses = _level(poses)
+    return replay(place, link, poses, search, Field(loss))
 
 
 def _level(position_m: ArrayLike) -> Poses:
     """Poses of a level aircraft, nose to the east, at positions (poses, 3)."""
-    position = np.atleast_2d(np.asarray(position_m, dtype=np.float64))
+    position = np.atleast_2d(unmasked(position_m))
     if position.ndim != 2 or position.shape[1] != 3:
         raise UsageError(
             f"poses of shape {np.shape(position_m)}",

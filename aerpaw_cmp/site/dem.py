@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ..common.errors import InputError, UsageError, about_file
 from ..common.files import read_input
 from ..common.geodesy import SiteFrame, in_shape
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 
 EARTH_RADIUS_M = 6_371_000.0
 # Ground on Earth lies between; other values are gaps that the file does not declare, or other units.
@@ -92,7 +92,7 @@ class Dem:
 
     def _cell(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """Column and row, with fractions, of places."""
-        x, y = np.asarray(east_m, dtype=np.float64), np.asarray(north_m, dtype=np.float64)
+        x, y = unmasked(east_m), unmasked(north_m)
         if self._to_grid is not None:
             latitude, longitude = self.frame.to_geographic(x, y)
             x, y = in_shape(self._to_grid.transform, longitude, latitude)
@@ -119,8 +119,8 @@ class Dem:
 
     def place(self, column: ArrayLike, row: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """East and north [m] of places in the grid, counted in cells from the first."""
-        x = self.west + self.step_x * np.asarray(column, dtype=np.float64)
-        y = self.south + self.step_y * np.asarray(row, dtype=np.float64)
+        x = self.west + self.step_x * unmasked(column)
+        y = self.south + self.step_y * unmasked(row)
         if self._to_grid is None:
             return x, y
         longitude, latitude = self._to_grid.transform(x, y, direction="INVERSE")

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...common.units import FloatArray
+from ...common.units import FloatArray, unmasked
 from ..offset import SPAN_DB, STEP_DB, nearest_offset, offset_grid
 from ..statistics.intervals import autocorrelation
 
@@ -50,7 +50,7 @@ def left_out_offsets(
     >>> left_out_offsets([3, 1, 0], [2.0, 6.0, np.nan]).tolist()
     [6.0, 2.0, 3.0]
     """
-    count, mean = np.asarray(n, dtype=np.float64), np.asarray(mean_db, dtype=np.float64)
+    count, mean = unmasked(n), unmasked(mean_db)
     total = np.where(count > 0, count * np.nan_to_num(mean), 0.0)
     other_samples = count.sum() - count
     grid = offset_grid(step_db, span_db)
@@ -90,9 +90,9 @@ def error_at_offset(
     >>> float(error_at_offset(3.0, 1.0, 0.0, 0.0).round(6))
     3.162278
     """
-    mean = np.asarray(mean_db, dtype=np.float64)
-    variance = np.maximum(np.asarray(rmse_db) ** 2 - (np.asarray(own_offset_db) - mean) ** 2, 0.0)
-    return np.asarray(np.sqrt(variance + (np.asarray(offset_db, dtype=np.float64) - mean) ** 2))
+    mean = unmasked(mean_db)
+    variance = np.maximum(unmasked(rmse_db) ** 2 - (unmasked(own_offset_db) - mean) ** 2, 0.0)
+    return np.asarray(np.sqrt(variance + (unmasked(offset_db) - mean) ** 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -116,7 +116,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     """
     from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
 
-    array = np.asarray(values, dtype=np.float64)
+    array = unmasked(values)
     array = array[np.isfinite(array)]
     n = len(array)
     if not n:
@@ -176,7 +176,7 @@ def trend(days: ArrayLike, values: ArrayLike) -> Trend:
     """
     from scipy.special import stdtrit
 
-    when, level = np.asarray(days, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    when, level = unmasked(days), unmasked(values)
     dated = np.isfinite(when) & np.isfinite(level)
     t, y = when[dated] / _DAYS, level[dated]
     if len(t) < FEWEST_FLIGHTS or np.ptp(t) <= 0:

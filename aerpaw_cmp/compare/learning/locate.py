@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...common.units import BoolArray, FloatArray
+from ...common.units import BoolArray, FloatArray, unmasked
 
 # Exponent of the distance before a level was seen, and its standard deviation.
 _SLOPE, _SLOPE_SD = 3.0, 1.0
@@ -153,7 +153,7 @@ def fit_places(track: LevelTrack, places_m: ArrayLike) -> Fits:
     one below says P(level < floor). The evidence is Laplace's approximation at the maximum of the posterior
     (Rasmussen and Williams, 2006, section 3.4): exact where no level lies below the floor.
     """
-    places = np.asarray(places_m, dtype=np.float64).reshape(-1, 3)
+    places = unmasked(places_m).reshape(-1, 3)
     shadow, noise = _shadowing(track)
     parts = [_fit(track, places[i : i + _AT_ONCE], shadow, noise) for i in range(0, len(places), _AT_ONCE)]
     return Fits(*(np.concatenate(values) for values in zip(*parts, strict=True)))
@@ -257,7 +257,7 @@ class NodeEstimate:
 
     def __contains__(self, place_m: ArrayLike) -> bool:
         """Check whether a place lies within the 90 % region."""
-        step = np.asarray(place_m, dtype=np.float64)[:2] - self.place_m[:2]
+        step = unmasked(place_m)[:2] - self.place_m[:2]
         return bool(np.hypot(*step) <= self.radius90_m)
 
 
@@ -287,7 +287,7 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
     grid = _grid(track)
     places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
     evidence = fit_places(track, places).evidence + _log_prior(places)
-    candidates = np.asarray(candidates_m, dtype=np.float64).reshape(-1, 3)
+    candidates = unmasked(candidates_m).reshape(-1, 3)
     log_odds = _log_odds(track, candidates, float(logsumexp(evidence)) - np.log(len(grid)))
     places = places[evidence > evidence.max() - _POSSIBLE]
     if len(places) <= _MOST_REFINED:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...common.jsonable import named
-from ...common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db
+from ...common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
 from ..offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, trimmed_offset
 from ..statistics.intervals import NO_INTERVAL, ErrorIntervals, Interval, autocorrelation, correlation, error_intervals
 
@@ -205,7 +205,7 @@ def outliers(level_db: ArrayLike) -> BoolArray:
 
 def _levels(values: ArrayLike) -> FloatArray:
     """Levels as floats; infinities (no power) become NaN."""
-    array = np.asarray(values, dtype=np.float64)
+    array = unmasked(values)
     return np.where(np.isfinite(array), array, np.nan)
 
 
@@ -385,7 +385,7 @@ def link_geometry(
     ([90.0], [45.0])
     """
     place = np.asarray(position_m, dtype=np.float64)
-    ray = place - np.asarray(tower_m, dtype=np.float64)
+    ray = place - unmasked(tower_m)
     columns = {
         "distance_m": np.linalg.norm(ray, axis=1),
         "elevation_deg": np.degrees(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))),
@@ -453,11 +453,10 @@ def bin_residual(residual_db: ArrayLike, quantity: ArrayLike, edges: ArrayLike |
     ([2.0, -2.0], [2, 1])
     """
     residual = _levels(residual_db)
-    raw = np.asarray(quantity)
-    values = raw.astype(np.float64)
+    values = unmasked(quantity)
     ok = np.isfinite(residual) & np.isfinite(values)
     r, v = residual[ok], values[ok]
-    limits = np.array([-0.5, 0.5, 1.5]) if raw.dtype == bool else _edges(v, edges)
+    limits = np.array([-0.5, 0.5, 1.5]) if np.asarray(quantity).dtype == bool else _edges(v, edges)
     bins = len(limits) - 1
     where = np.clip(np.searchsorted(limits, v, side="right") - 1, -1, bins)
     where = np.where(v == limits[-1], bins - 1, where)  # the last bin is closed
@@ -487,7 +486,7 @@ def bin_residual(residual_db: ArrayLike, quantity: ArrayLike, edges: ArrayLike |
 
 def _edges(values: FloatArray, edges: ArrayLike | int) -> FloatArray:
     if not isinstance(edges, (int, np.integer)):
-        return np.asarray(edges, dtype=np.float64)
+        return unmasked(edges)
     if not len(values):
         return np.array([0.0, 1.0])
     low, high = float(values.min()), float(values.max())

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...common.units import FloatArray, IntArray
+from ...common.units import FloatArray, IntArray, unmasked
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,8 +71,8 @@ def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence
     >>> compare_serving([0, 1, 1, -1], [[-70, -80], [-75, -71], [-60, -90], [-60, -90]], ["a", "b"]).confusion.tolist()
     [[1, 0, 0], [1, 1, 0]]
     """
-    index = np.asarray(served, dtype=np.int64)
-    level: FloatArray = np.asarray(predicted_dbm, dtype=np.float64)
+    index = np.nan_to_num(unmasked(served), nan=-1.0).astype(np.int64)
+    level: FloatArray = unmasked(predicted_dbm)
     if level.shape != (len(index), len(cells)):
         raise ValueError(f"levels must have shape {(len(index), len(cells))}, found {level.shape}")
     if index.size and index.max() >= len(cells):
@@ -103,8 +103,8 @@ def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s:
     (n,)
         In the unit of ``values``.
     """
-    instants, sampled_s = np.asarray(time_s, dtype=np.float64), np.asarray(of_s, dtype=np.float64)
-    column = np.asarray(values, dtype=np.float64)
+    instants, sampled_s = unmasked(time_s), unmasked(of_s)
+    column = unmasked(values)
     if not len(sampled_s):
         return np.full(len(instants), np.nan)
     after = np.clip(np.searchsorted(sampled_s, instants), 0, len(sampled_s) - 1)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...common.units import FloatArray, IntArray
+from ...common.units import FloatArray, IntArray, unmasked
 from ..rank import MAX_RANK, cohen_kappa, kappa_of_means, one_hot, total_variation, variation_of_means
 from ..statistics.intervals import NO_INTERVAL, REPLICATES, Interval, autocorrelation, bootstrap_means, interval
 
@@ -59,7 +59,7 @@ def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
 
 def constant_forecast(rank: ArrayLike, ranks: int = MAX_RANK) -> FloatArray:
     """Histogram of training ranks (ranks,), each rank counted once more, so that none is impossible."""
-    values = np.asarray(rank, dtype=np.float64)
+    values = unmasked(rank)
     count = np.bincount(values[values >= 1].astype(np.int64), minlength=ranks + 1)[1:] + 1.0
     return np.asarray(count / count.sum())
 
@@ -144,7 +144,7 @@ def score_forecast(
     ValueError
         If the three are not of one length.
     """
-    ri, decision = np.asarray(measured, dtype=np.float64).ravel(), np.asarray(decided, dtype=np.float64).ravel()
+    ri, decision = unmasked(measured).ravel(), unmasked(decided).ravel()
     if not len(ri) == len(decision) == len(probability):
         raise ValueError(
             f"{len(ri)} measured ranks, {len(probability)} forecasts, {len(decision)} decisions: not in pairs"

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...common.errors import InputError
-from ...common.units import FloatArray, IntArray
+from ...common.units import FloatArray, IntArray, unmasked
 from ..rank import MAX_RANK, cohen_kappa, one_hot
 from ..statistics.intervals import REPLICATES, autocorrelation, bootstrap_means, interval
 from .forecast import constant_forecast, log_losses
@@ -60,7 +60,7 @@ def stream_features(sigma: ArrayLike) -> FloatArray:
     >>> stream_features([1.0, 0.1, 0.0]).tolist()
     [-20.0, -40.0, 0.0]
     """
-    values = np.asarray(sigma, dtype=np.float64)
+    values = unmasked(sigma)
     largest = values[..., :1]
     alive = (largest > 0) & np.isfinite(largest)
     safe = np.where(alive, largest, 1.0)
@@ -209,7 +209,7 @@ def _fitted(x: FloatArray, rank: IntArray, penalty: float) -> Receiver:
 
 def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
     """Features (geometries, n, features), ranks and groups of the samples that have a rank and all features."""
-    ri = np.asarray(rank, dtype=np.float64)
+    ri = unmasked(rank)
     if not len(ri) == features.shape[1] == len(groups):
         counts = f"{len(ri)} ranks, {features.shape[1]} rows of features, {len(groups)} groups"
         raise ValueError(f"{counts}: not of one length")

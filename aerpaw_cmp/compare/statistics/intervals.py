@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...common.units import FloatArray
+from ...common.units import FloatArray, unmasked
 from .memory import FEWEST, mean_draws, power_draws
 
 # Bootstrap replicates.
@@ -98,7 +98,7 @@ class Autocorrelation:
 
 def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
     """Biased autocovariance at lags 0 .. ``lags`` (by FFT); values (n,) without NaN."""
-    x = np.asarray(values, dtype=np.float64)
+    x = unmasked(values)
     n = len(x)
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.fft.rfft(x - x.mean(), size)
@@ -177,7 +177,7 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
     >>> autocorrelation([1.0, 1.0, 1.0]).block_length
     1
     """
-    x = np.asarray(values, dtype=np.float64)
+    x = unmasked(values)
     n = len(x)
     if n < 8 or np.ptp(x) == 0.0:
         return Autocorrelation(n, 1 if n else 0, float(n) if n > 1 else float("nan"), 1.0)
@@ -399,7 +399,7 @@ def _around(estimate: float, drawn: FloatArray) -> Interval:
 
 def correlation(first: ArrayLike, second: ArrayLike) -> float:
     """Pearson correlation over pairs without NaN; NaN where a side is constant or fewer than two pairs exist."""
-    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
+    a, b = unmasked(first), unmasked(second)
     ok = np.isfinite(a) & np.isfinite(b)
     if ok.sum() < 2 or np.ptp(a[ok]) == 0.0 or np.ptp(b[ok]) == 0.0:
         return float("nan")

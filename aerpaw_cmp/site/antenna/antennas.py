@@ -23,7 +23,15 @@ from numpy.typing import ArrayLike
 
 from ...common.errors import InputError, UsageError, about_file
 from ...common.files import LARGEST_TABLE, read_input
-from ...common.units import AnyArray, ComplexArray, FloatArray, amplitude_from_db, db_from_power, power_from_db
+from ...common.units import (
+    AnyArray,
+    ComplexArray,
+    FloatArray,
+    amplitude_from_db,
+    db_from_power,
+    power_from_db,
+    unmasked,
+)
 from ...logs.matfile import read_arrays
 
 # Peak directivity of a half-wave dipole (2.15 dBi): 4 / Cin(2 pi).
@@ -153,7 +161,7 @@ class MeasuredPattern:
 
     def gain_dbi(self, theta_rad: ArrayLike, phi_rad: ArrayLike) -> FloatArray:
         """Gain [dBi] in a direction."""
-        e_theta, e_phi = self.field(np.asarray(theta_rad, dtype=float), np.asarray(phi_rad, dtype=float))
+        e_theta, e_phi = self.field(unmasked(theta_rad), unmasked(phi_rad))
         return db_from_power(np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2)
 
 

@@ -564,7 +564,92 @@ def targets() -> list[Target]:
         out.append(Target("dem:tif", (tiff,), partial(_by_path, "d.tif", _dem)))
     pattern = partial(_by_path, "p.txt", _pattern)
     out.append(Target("antenna:text", (maps.PATTERN,), pattern))
+    for name, (seed, load) in SMALL_FILES.items():
+        out.append(Target(name, (seed,), partial(_by_path, name.replace(":", "."), load)))
     return out
+
+
+def _route(path: Path) -> None:
+    from aerpaw_cmp.logs.route import read_route
+
+    read_route(path, height_m=40.0)
+
+
+def _areas(path: Path) -> None:
+    from aerpaw_cmp.logs.route import read_areas
+
+    read_areas(path)
+
+
+def _mesh(path: Path) -> None:
+    from aerpaw_cmp.site.mesh_scenes.meshfiles import read_mesh
+
+    read_mesh(path)
+
+
+def _scene(path: Path) -> None:
+    from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
+
+    read_scene(path)
+
+
+def _sphere(path: Path) -> None:
+    from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv
+
+    read_sphere_csv(path)
+
+
+def _receiver(path: Path) -> None:
+    from aerpaw_cmp.jobs.learning.calibrate_rank import read_receiver
+
+    read_receiver(path)
+
+
+def _report(path: Path) -> None:
+    from aerpaw_cmp.jobs.diff_reports import run_diff
+
+    place = path.rename(path.with_name("metrics.json"))
+    run_diff(place, place)
+
+
+_VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
+PLY = (
+    b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
+    b"element face 1\nproperty list uint int vertex_indices\nend_header\n"
+    + _VERTICES + struct.pack("<I3i", 3, 0, 1, 2)
+)  # fmt: skip
+PLAN = json.dumps({
+    "fileType": "Plan", "mission": {"firmwareType": 3, "plannedHomePosition": [35.7275, -78.696, 100], "items": [
+        {"command": 16, "frame": 3, "params": [0, 0, 0, None, 35.7275, -78.696, 40], "type": "SimpleItem"},
+        {"command": 16, "frame": 3, "params": [0, 0, 0, None, 35.7285, -78.697, 40], "type": "SimpleItem"},
+    ]},
+}).encode()  # fmt: skip
+FENCE = (
+    b"<kml><Placemark><Polygon><outerBoundaryIs><LinearRing><coordinates>-78.69,35.72,0 -78.68,35.72,0 "
+    b"-78.68,35.73,0</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"
+)
+SCENE = (
+    b'<scene version="2.1.0"><bsdf type="itu-radio-material" id="w"><string name="type" value="concrete"/></bsdf>'
+    b'<shape type="cube"><ref id="w"/><transform name="to_world"><scale value="3"/></transform></shape></scene>'
+)
+SPHERE = b"azimuth_deg,elevation_deg,gain_dbi\n" + b"".join(
+    b"%d,%d,0.0\n" % (a, e) for a in range(0, 360, 60) for e in range(-90, 91, 30)
+)
+REPORT = json.dumps({"flight": "f", "rss": {}, "rank": {}, "inputs": [], "rt": {}, "versions": {}}).encode()
+RECEIVER = json.dumps({"format": "aerpaw-cmp receiver 1", "towers": {"LW1": {"weights": [1.0]}}}).encode()
+WAYPOINT = b"%d\t0\t%d\t16\t0\t0\t0\t0\t35.7275\t-78.696\t100\t1\n"
+# Files of one seed each: what the tool asks a stranger for beside logs and maps.
+SMALL_FILES: dict[str, tuple[bytes, Callable[[Path], Any]]] = {
+    "route:csv": (b"latitude,longitude,altitude\n35.7275,-78.696,40\n35.7285,-78.697,40\n", _route),
+    "route:plan": (PLAN, _route),
+    "route:wpl": (b"QGC WPL 110\n" + WAYPOINT % (0, 0) + WAYPOINT % (1, 3), _route),
+    "fence:kml": (FENCE, _areas),
+    "mesh:ply": (PLY, _mesh),
+    "scene:xml": (SCENE, _scene),
+    "sphere:csv": (SPHERE, _sphere),
+    "receiver:json": (RECEIVER, _receiver),
+    "report:json": (REPORT, _report),
+}
 
 
 def _in_a_fork(kind: str, data: bytes) -> tuple[int, bytes, bytes]:

@@ -15,9 +15,14 @@ Any other exception that reaches a user is a bug of ours.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
+from typing import Any, ParamSpec, TypeVar, cast
+
+_P = ParamSpec("_P")
+_T = TypeVar("_T")
 
 
 def one_line(text: str) -> str:
@@ -131,6 +136,13 @@ def about_file(path: str | Path) -> Iterator[None]:
         ) from error
 
 
+_IN_WORDS: dict[Any, str] = {
+    RecursionError: "it is nested too deep",
+    MemoryError: "it does not fit into the memory",
+    UnicodeError: "it is no UTF-8 text",
+}
+
+
 @contextmanager
 def parsing(path: str | Path, expected: str | None = None, cause: str = "a damaged file") -> Iterator[None]:
     """Whatever a file's content makes its parser raise is an :class:`InputError` about the file.
@@ -152,13 +164,28 @@ def parsing(path: str | Path, expected: str | None = None, cause: str = "a damag
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", expected=expected, path=path) from error
     except Exception as error:
-        reason = one_line(str(error)[:200])
+        words = f"{type(error).__name__}: {one_line(str(error)[:200])}"
+        words = next((text for kind, text in _IN_WORDS.items() if isinstance(error, kind)), words)
         raise InputError(
-            f"cannot be read ({type(error).__name__}{reason and ': ' + reason})",
+            f"cannot be read ({words})",
             expected=expected,
             cause=cause,
             path=path,
         ) from error
+
+
+def parsed(expected: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
+    """Decorator of a function that reads the file which its first argument names: :func:`parsing` around it."""
+
+    def decorate(function: Callable[_P, _T]) -> Callable[_P, _T]:
+        @wraps(function)
+        def run(*arguments: _P.args, **more: _P.kwargs) -> _T:
+            with parsing(cast("str | Path", (*arguments, *more.values())[0]), expected):
+                return function(*arguments, **more)
+
+        return run
+
+    return decorate
 
 
 class CheckError(AerpawCmpError):

@@ -30,7 +30,7 @@ MINIMUM_HEIGHT_M = 0.5
 THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
 
 
-def unmasked(values: ArrayLike, dtype: Any = np.float64) -> Any:
+def unmasked(values: ArrayLike, dtype: Any = np.float64) -> AnyArray:
     """An array of numbers in which what NumPy's mask hides is missing (NaN), as gaps of NetCDF and GeoTIFF come.
 
     Each function that takes arrays of callers begins with it: ``np.asarray`` would give what lies under the mask.

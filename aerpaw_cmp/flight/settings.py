@@ -21,7 +21,7 @@ from pydantic import (
     model_validator,
 )
 
-from ..common.errors import InputError, UsageError
+from ..common.errors import InputError, UsageError, parsing
 from ..common.files import inside
 from ..common.jsonable import named
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wavelength_m
@@ -690,10 +690,8 @@ def _receiver_file(named: Named) -> str:
     if not named.entry.receivers:
         raise UsageError("the entry has no rank receiver", expected="one learned from ranks")
     path = named.folder / named.entry.receivers[0].file
-    try:
+    with parsing(path, "a rank receiver"):
         content = json.loads(read_table(path, "a rank receiver"))
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot be read ({error})", expected="a rank receiver", path=path) from None
     check_logs(content.get("trained_on", []) if isinstance(content, dict) else [], named, path)
     return str(path)
 

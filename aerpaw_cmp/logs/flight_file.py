@@ -28,7 +28,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from ..common.errors import InputError, about_file
+from ..common.errors import InputError, parsed, parsing
 from ..common.outputs import OutputFile
 from .records import ReadResult, RejectedLine, RejectedReason, Stream
 
@@ -265,6 +265,7 @@ def _write_json(group: Any, name: str, content: Any) -> None:
     group.create_dataset(name, data=np.frombuffer(text, dtype=np.uint8))
 
 
+@parsed("a flight file of 'aerpaw-cmp ingest -o'")
 def read_flight(path: str | Path) -> list[IngestedFile]:
     """Read a flight file.
 
@@ -275,15 +276,11 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
     """
     from ..common import native
 
-    try:
-        content = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot be read ({error.strerror or error})", expected="a flight file", path=path) from error
+    content = Path(path).read_bytes()
     if not content.startswith(_MAGIC):
         raise InputError("no HDF5 file", expected="a flight file of 'aerpaw-cmp ingest -o'", path=path)
     _refuse_changed(content, path)
-    with about_file(path):
-        items, notes = native.read("hdf5", content)
+    items, notes = native.read("hdf5", content)
     form, version = notes["attributes"].get("format"), notes["attributes"].get("version")
     if form != FORMAT:
         raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
@@ -291,14 +288,8 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
         raise InputError(
             f"flight file of version {version}", expected=f"version {_VERSION}", cause="a newer tool", path=path
         )
-    try:
+    with parsing(path, "a flight file of 'aerpaw-cmp ingest -o'", "a cut copy: ingest the logs again"):
         return [_read_file(items, name) for name in _numbered(items, "files/")]
-    except (KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
-        raise InputError(
-            f"the flight file is damaged ({type(error).__name__}: {error})",
-            cause="a cut copy: ingest the logs again",
-            path=path,
-        ) from error
 
 
 def _numbered(items: Mapping[str, AnyArray], shelf: str) -> list[str]:

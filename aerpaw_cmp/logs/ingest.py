@@ -13,7 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..common.errors import InputError, UsageError, about_file, one_line
+from ..common.errors import InputError, UsageError, one_line, parsing
 from . import archives, chunks, packed
 from .flight_file import IngestedFile, read_flight
 from .pieces import join
@@ -462,7 +462,7 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     """Result of a reader, its impossible values flagged; messages name the file, which readers do not know."""
     from . import limits, origins  # load pandas, as any reader does
 
-    with about_file(path):
+    with parsing(path, f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"):
         result = origins.stated(limits.check(read()), reader, options)
     if not result.accepted:
         first = f": {result.rejected[0].reason}" if result.rejected else ""

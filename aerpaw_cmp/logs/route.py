@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
 from ..common import kml
-from ..common.errors import InputError, about_file
+from ..common.errors import InputError, parsing
 from ..common.xmlfiles import named, outermost, plain, xml_root
 from .ingest import as_utf8, read_bytes, read_file
 from .readers import HEAD_BYTES, ReadOptions, claims
@@ -65,9 +65,8 @@ def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFra
     InputError
         If the file is no route, or points have no height and ``height_m`` does not say it.
     """
-    data = as_utf8(read_bytes(path)[0])
-    with about_file(path):
-        return _table(_route(data, path), height_m)
+    with parsing(path, _EXPECTED):
+        return _table(_route(as_utf8(read_bytes(path)[0]), path), height_m)
 
 
 @dataclass(slots=True)
@@ -88,7 +87,7 @@ class _Route:
 def _route(data: bytes, path: str | Path) -> _Route:
     head = data[:HEAD_BYTES]
     if re.match(rb"\s*\{", head) and b'"fileType"' in data[: 1 << 20]:
-        return _plan(data)
+        return _plan(data, path)
     if re.match(rb"\s*QGC WPL \d+", head):
         return _waypoint_text(data.decode("utf-8", "replace"))
     if any(reader.kinds for reader in claims(data)):
@@ -167,15 +166,11 @@ class _Item:
     numbers: tuple[float, ...]
 
 
-def _plan(data: bytes) -> _Route:
-    try:
-        plan = json.loads(data)
-        mission = plan["mission"]
+def _plan(data: bytes, path: str | Path) -> _Route:
+    with parsing(path, "a mission with items", "a damaged QGroundControl plan"):
+        mission = json.loads(data)["mission"]
         home = _numbers(mission.get("plannedHomePosition") or ())
         items = list(_items(mission["items"]))
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        damage = f"a damaged QGroundControl plan ({type(error).__name__}: {error})"
-        raise InputError(damage, expected="a mission with items") from error
     route = _Route()
     _fly(route, items, home, named_yaw=mission.get("firmwareType") != _ARDUPILOT)
     return route
@@ -317,7 +312,7 @@ def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
     InputError
         The file cannot be read, or has no area.
     """
-    with about_file(path):
+    with parsing(path, "a KML with a Polygon: a geofence"):
         data = as_utf8(read_bytes(path)[0])
         polygons = outermost(_root(data), {"Polygon"}) if kml.is_kml(data) else ()
         rings = [ring for polygon in polygons for ring in outermost(polygon, {"outerBoundaryIs"})]

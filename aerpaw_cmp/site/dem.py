@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.errors import InputError, UsageError, about_file
+from ..common.errors import InputError, UsageError, parsing
 from ..common.files import read_input
 from ..common.geodesy import SiteFrame, in_shape
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
@@ -229,7 +229,7 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None, anch
     """
     path = Path(path)
     data = read_input(path, MAX_BYTES, "an elevation model")
-    with about_file(path):
+    with parsing(path, "an elevation model"):
         if data[:2] in (b"II", b"MM"):
             return _read_geotiff(data, frame, anchored)
         if crs is None:
@@ -238,10 +238,7 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None, anch
 
 
 def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str, anchored: bool) -> Dem:
-    try:
-        lines = data.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError:
-        raise InputError("not text", expected="an ESRI ASCII grid", path=path) from None
+    lines = data.decode("utf-8-sig").splitlines()
     header, begin = _ascii_header(lines, path)
     rows, columns, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
     gap = header.get("nodata_value", -9999.0)

@@ -12,7 +12,7 @@ from urllib.parse import quote
 
 import numpy as np
 
-from ...common.errors import InputError
+from ...common.errors import InputError, parsing
 from ...common.files import LARGEST_TABLE, read_bounded
 from ...common.units import FloatArray
 from ...compare.judge import season
@@ -231,7 +231,8 @@ def find_reports(flights: Iterable[str], folder: Path, places: Sequence[Path]) -
 
 def _flight_of(path: Path) -> str | None:
     try:
-        name = json.loads(read_bounded(path, LARGEST_TABLE)).get("flight")
-    except (InputError, OSError, ValueError, AttributeError):
+        with parsing(path):
+            name = json.loads(read_bounded(path, LARGEST_TABLE)).get("flight")
+    except InputError:
         return None
     return name if isinstance(name, str) else None

@@ -17,7 +17,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field
 
-from ...common.errors import InputError, UsageError
+from ...common.errors import InputError, UsageError, parsing
 from ...common.jsonable import json_safe
 from ...common.provenance import KEY, union
 from ...common.units import FloatArray, IntArray
@@ -190,17 +190,11 @@ def read_receiver(path: Path) -> dict[str, FittedReceiver]:
     InputError
         If it is no such file.
     """
-    try:
+    with parsing(path, f"a file of format {FORMAT!r}", "a file of another kind"):
         content = json.loads(read_table(path, "a receiver file"))
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
         return {tower: FittedReceiver.from_dict(tower, entry) for tower, entry in content["towers"].items()}
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", expected="a receiver file", path=path) from None
-    except (ValueError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"no receiver: {error}", expected=f"a file of format {FORMAT!r}", cause="a file of another kind", path=path
-        ) from None
 
 
 def _geometry(values: Mapping[str, Any]) -> Geometry:

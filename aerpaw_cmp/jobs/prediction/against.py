@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ...common.errors import InputError, UsageError
+from ...common.errors import UsageError, parsing
+from ...common.files import LARGEST_TABLE, read_bounded
 from ...common.provenance import KEY
 from ...common.units import FloatArray, IntArray
 from ...compare.learning.calibration import Observed
@@ -38,18 +39,12 @@ def score_against(data: FlightData, folder: Path) -> Against:
     InputError
         The folder holds no prediction.
     """
-    try:
-        about = json.loads((folder / "metrics.json").read_text(encoding="utf-8"))
+    with parsing(folder, "the output folder of 'aerpaw-cmp predict'"):
+        about = json.loads(read_bounded(folder / "metrics.json", LARGEST_TABLE))
         table = pd.read_csv(folder / "prediction.csv", low_memory=False)
         learned, marked, sentence = list(about[KEY]), list(about.get("marks", ())), str(about["sentence"])
         groups = dict(iter(table[table["level_db"].notna()].groupby(["tower", "channel"])))
         forecasts = dict(iter(table[table["channel"] == "rank"].groupby("tower")))
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise InputError(
-            f"no prediction ({getattr(error, 'strerror', None) or error})",
-            expected="the output folder of 'aerpaw-cmp predict'",
-            path=folder,
-        ) from None
     own = common(flight_logs(data), [learned])
     if own or any(shared(marked, marks_text(series)) for _, series in data.series):
         raise UsageError(

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from ...common.errors import InputError, UsageError
+from ...common.errors import InputError, UsageError, parsing
 from ...common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples
 from ...flight.data import FlightData, load_data
@@ -232,13 +232,11 @@ def _local_points(path: Path, heading_deg: float | None) -> Targets | None:
     """Points of a CSV with east_m, north_m and height_m (and yaw_deg, else the heading); None for another file."""
     if path.suffix.lower() != ".csv":
         return None
-    try:
+    with parsing(path, "columns east_m, north_m, height_m"):
         names = [n.strip() for n in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0].split(",")]
         if not {"east_m", "north_m", "height_m"} <= set(names):
             return None
         table = pd.read_csv(path, skipinitialspace=True)
-    except (OSError, pd.errors.ParserError) as error:
-        raise InputError(f"no table: {error}", expected="columns east_m, north_m, height_m", path=path) from None
     numbers = table.reindex(columns=["east_m", "north_m", "height_m", "yaw_deg"]).apply(pd.to_numeric, errors="coerce")
     position = numbers[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
     yaw = numbers["yaw_deg"].to_numpy(np.float64)

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from ...common.errors import InputError, parsing
 from ...common.units import FloatArray, IntArray, spread_out
 from ...compare.level.field_difference import FieldAudit
 from ...compare.result import APPLIED, GIVEN, RssResult
@@ -161,16 +162,14 @@ def _log(data: FlightData, settings: LogSettings, file: IngestedFile, account: _
 
 def _content(path: Path, sha256: str) -> bytes | None:
     """The bytes that the report names by their hash."""
-    try:
-        if path.stat().st_size > _LARGEST_LOG:
-            return None
-        content = path.read_bytes()
-        if content[:2] == b"\x1f\x8b":
-            with gzip.open(path) as book:
-                content = book.read(_LARGEST_LOG)
-    except (OSError, EOFError):
-        return None
-    return content if hashlib.sha256(content).hexdigest() == sha256 else None
+    with contextlib.suppress(InputError), parsing(path):
+        if path.stat().st_size <= _LARGEST_LOG:
+            content = path.read_bytes()
+            if content[:2] == b"\x1f\x8b":
+                with gzip.open(path) as book:
+                    content = book.read(_LARGEST_LOG)
+            return content if hashlib.sha256(content).hexdigest() == sha256 else None
+    return None
 
 
 def _path(data: FlightData, logs: Sequence[Log | None], account: _Account) -> RawPath | None:
@@ -215,10 +214,9 @@ def _site_file(data: FlightData) -> Mapping[str, Any]:
     path = data.folder / name
     if not path.is_file():
         path = Path(str(resources.files("aerpaw_cmp.site"))) / "data" / f"{name.lower().replace('-', '_')}.yaml"
-    try:
+    with contextlib.suppress(InputError), parsing(path):
         return dict(yaml.load(path.read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)))
-    except (OSError, ValueError, yaml.YAMLError):
-        return {}
+    return {}
 
 
 def _towers_checked(data: FlightData, account: _Account) -> dict[str, Tower]:

@@ -8,7 +8,6 @@ import hashlib
 import io
 import json
 import os
-import zipfile
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module, metadata
@@ -18,7 +17,7 @@ from typing import Any
 import numpy as np
 from pydantic import ConfigDict, TypeAdapter
 
-from ...common.errors import UsageError
+from ...common.errors import InputError, UsageError, parsing
 from ...common.files import atomic_path, seal, unseal
 from ...common.jsonable import named
 from ...common.units import AnyArray
@@ -30,7 +29,6 @@ LAYOUT = 5
 
 _SEAL = b"aerpaw-cmp outcome"
 
-_TORN = (OSError, EOFError, RecursionError, zipfile.BadZipFile)
 
 # Entry points of readers: those of other packages count with their version.
 READERS = "aerpaw_cmp.readers"
@@ -87,10 +85,10 @@ class OutcomeStore:
             self.warnings.append(f"a damaged outcome was not used, its task is computed anew: {file}")
             return None
         try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as parts:
+            with parsing(file), np.load(io.BytesIO(content), allow_pickle=False) as parts:
                 arrays = {name: parts[name] for name in parts.files}
-            return self._kind.validate_python([_with_arrays(json.loads(arrays["content"].tobytes()), arrays)])[0]
-        except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError, *_TORN):
+                return self._kind.validate_python([_with_arrays(json.loads(arrays["content"].tobytes()), arrays)])[0]
+        except InputError:
             self.warnings.append(f"an outcome that this tool did not write was not used: {file}")
             return None
 
@@ -113,10 +111,10 @@ class OutcomeStore:
 
     def manifest(self, key: str, *, failed: bool = False) -> dict[str, Any]:
         """Manifest beside an outcome (or a failure); empty where it cannot be read."""
-        try:
-            return dict(json.loads((self.folder / f"{key}{'.failed' if failed else ''}.json").read_bytes()))
-        except (OSError, ValueError, TypeError):
-            return {}
+        place = self.folder / f"{key}{'.failed' if failed else ''}.json"
+        with contextlib.suppress(InputError), parsing(place):
+            return dict(json.loads(place.read_bytes()))
+        return {}
 
     def has(self, key: str) -> bool:
         """Check whether there is an entry."""

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...common.errors import InputError, UsageError, about_file
+from ...common.errors import InputError, UsageError, about_file, parsed
 from ...common.files import LARGEST_TABLE, read_input
 from ...common.units import (
     AnyArray,
@@ -224,6 +224,7 @@ class _Rows:
     frequency_hz: float | None = None
 
 
+@parsed("an antenna pattern file")
 def read_pattern_text(path: str | Path, *, polarised: bool = True) -> MeasuredPattern:
     """An AERPAW antenna text file: complex E_phi and E_theta over phi x theta.
 
@@ -277,10 +278,7 @@ _FREQUENCY = re.compile(
 
 
 def _read_rows(path: Path) -> _Rows:
-    try:
-        text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError("not a text file", expected="an antenna pattern file", path=path) from None
+    text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig")
     rows = _Rows(np.zeros((0, 7)))
     values: list[list[float]] = []
     started = False

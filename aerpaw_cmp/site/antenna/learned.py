@@ -16,7 +16,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from ...common.errors import InputError, UsageError
+from ...common.errors import InputError, UsageError, parsing
 from ...common.files import LARGEST_TABLE, inside, locked, read_bounded, write_whole
 from ...common.outputs import explained_os_errors, file_digest
 from ...common.yamlfile import StrictModel, dump_yaml, load_yaml
@@ -254,11 +254,8 @@ def read_table(path: Path, expected: str) -> bytes:
     content = read_bounded(path, LARGEST_TABLE, expected)
     if not content.startswith(b"\x1f\x8b"):
         return content
-    try:
-        with gzip.open(path) as book:
-            unpacked = book.read(LARGEST_TABLE + 1)
-    except (OSError, EOFError) as error:
-        raise InputError(f"a damaged gzip file ({error})", expected=expected, cause="a cut copy", path=path) from None
+    with parsing(path, expected, "a cut copy"), gzip.open(path) as book:
+        unpacked = book.read(LARGEST_TABLE + 1)
     if len(unpacked) > LARGEST_TABLE:
         raise InputError(f"it unpacks to more than {LARGEST_TABLE} bytes", expected=expected, path=path)
     return unpacked

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...common.errors import InputError
+from ...common.errors import InputError, parsed
 from ...common.files import LARGEST_TABLE, read_input
 from ...common.units import FloatArray, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
@@ -32,6 +32,7 @@ _PHI_CUT = re.compile(r"(?im)^\s*Phi\s*=\s*(-?\d{1,3}(?:\.\d{1,6})?)\s*\(deg\)")
 _GAIN_TABLE = re.compile(r"(?im)^\s*Frequency\s+E ?Total\. ?dB\s*$")
 
 
+@parsed("an antenna pattern file")
 def read_pattern_file(path: str | Path, *, polarised: bool = True, carrier_hz: float | None = None) -> MeasuredPattern:
     """An antenna pattern: AERPAW's text over the sphere or along one great circle, MSI Planet (.msi, .pln) or NSMA.
 

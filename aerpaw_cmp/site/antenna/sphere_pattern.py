@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ...common.cf import CONVENTIONS, DB, dataset, netcdf_bytes
-from ...common.errors import InputError, UsageError
+from ...common.errors import InputError, UsageError, parsed
 from ...common.provenance import trained_on
 from ...common.units import BoolArray, FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
@@ -158,6 +158,7 @@ def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] =
     return "\n".join(lines) + "\n"
 
 
+@parsed("a table of gain over direction")
 def read_sphere_csv(path: str | Path) -> SpherePattern:
     """An antenna file of :func:`sphere_csv`; azimuth counter-clockwise from the device's x axis, elevation up.
 
@@ -167,12 +168,7 @@ def read_sphere_csv(path: str | Path) -> SpherePattern:
         Missing columns or directions, values that are no gains; with the line.
     """
     path = Path(path)
-    try:
-        text = read_table(path, "an antenna file").decode("utf-8-sig")
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(
-            f"cannot be read ({error})", expected="a text file of gain over direction", path=path
-        ) from None
+    text = read_table(path, "an antenna file").decode("utf-8-sig")
     numbered = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if line.strip() and line[0] != "#"]
     header = [cell.strip() for cell in numbered[0][1].split(",")] if numbered else []
     if header[:3] != list(COLUMNS[:3]):

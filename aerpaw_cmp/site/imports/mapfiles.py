@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 from ...common import kml
-from ...common.errors import InputError
+from ...common.errors import InputError, parsed
 from ...common.files import read_input
 from ...common.xmlfiles import named, outermost, plain, xml_root
 from ...logs import archives
@@ -41,6 +41,7 @@ _OTHER_KINDS: tuple[tuple[bytes, str, str], ...] = (
 )
 
 
+@parsed(FORMATS)
 def read_map_file(path: str | Path) -> MapFile:
     """Outlines of a map file; its kind is told by content.
 
@@ -99,8 +100,6 @@ def _from_json(data: bytes, path: Path) -> MapFile:
         raise InputError(
             "not JSON text: a byte that is not UTF-8", cause="save it as UTF-8", path=path, line=line
         ) from None
-    except (RecursionError, ValueError):
-        raise InputError("not JSON text: nested too deep, or a number too long", path=path) from None
     if isinstance(content, dict) and isinstance(content.get("elements"), list):
         result = read_elements("Overpass JSON", content["elements"], path, _lines_of(text, "elements"))
         if remark := content.get("remark"):

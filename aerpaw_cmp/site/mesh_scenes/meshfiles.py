@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...common.errors import InputError
+from ...common.errors import InputError, parsing
 from ...common.files import read_input
 from ...common.units import FloatArray, IntArray
 
@@ -57,8 +57,8 @@ def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
         No such file, too large, or damaged.
     """
     data = read_input(path, _LARGEST_FILE, "a mesh")
-    mesh = _read_obj(data, path) if path.suffix.lower() == ".obj" else read_ply(data, path)
-    return check(mesh, path), data
+    with parsing(path, "a mesh"):
+        return check(_read_obj(data, path) if path.suffix.lower() == ".obj" else read_ply(data, path), path), data
 
 
 def check(mesh: RawMesh, path: Path) -> RawMesh:

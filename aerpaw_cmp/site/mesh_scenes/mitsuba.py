@@ -16,7 +16,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...common.errors import InputError, UsageError
+from ...common.errors import InputError, UsageError, parsed
 from ...common.files import inside, read_input
 from ...common.units import FloatArray, IntArray
 from ...common.xmlfiles import xml_root
@@ -83,6 +83,7 @@ class _Reading:
     digest: hashlib._Hash = field(default_factory=hashlib.sha256)
 
 
+@parsed("a Mitsuba scene")
 def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> TriangleScene:
     """Read a Mitsuba scene.
 

@@ -1,6 +1,7 @@
 """One pose from the messages of any autopilot.
 
-Positions stand at their own times; attitude and velocity are those of the nearest message.
+Positions stand at their own times; attitude and velocity are those of the nearest message. Heights count from the home
+at take-off: a home that moves later, or stood elsewhere before, is no ground.
 """
 
 from __future__ import annotations
@@ -9,12 +10,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+
+from . import _pose
 
 # An attitude farther in time than this from a position is not that of the position.
 _NEAR_S = 0.5
@@ -74,11 +77,15 @@ class Flight:
         ``fix satellites``.
     utc_minus_clock_s : float or None
         See :func:`offset_s`.
-    messages : int
-        Sound messages; each of ``damaged`` comes on top.
-    damaged : list of RejectedLine
+    home : Series
+        ``altitude_m`` of home above sea level, each time that the log has it; with it the positions' altitude is above
+        sea level, without it above home or, for want of anything else, above the first position.
     source : str
         The program, for people.
+    name : str
+        Of the stream.
+    system : int, optional
+        Number of the vehicle where a log may hold several.
     """
 
     position: Series
@@ -86,44 +93,114 @@ class Flight:
     velocity: Series
     fix: Series
     utc_minus_clock_s: float | None
-    messages: int
-    damaged: list[RejectedLine]
     source: str
+    home: Series = field(default_factory=lambda: NONE)
+    name: str = "vehicle"
+    system: int | None = None
 
 
-def result(reader: str, options: ReadOptions, flight: Flight) -> ReadResult:
-    """Telemetry stream ``vehicle``; the lines of the account are messages, all but positions count as comments."""
-    zero_ns, offset = _time.origin_ns(options, needed_by=reader), flight.utc_minus_clock_s
+def result(
+    reader: str, options: ReadOptions, flights: list[Flight], messages: int, damaged: list[RejectedLine]
+) -> ReadResult:
+    """A telemetry stream per vehicle; the lines of the account are messages, all but positions count as comments.
+
+    Parameters
+    ----------
+    reader : str
+    options : ReadOptions
+    flights : list of Flight
+        Of each vehicle; one at least.
+    messages : int
+        Sound messages; each of ``damaged`` comes on top.
+    damaged : list of RejectedLine
+    """
+    zero_ns, offset = _time.origin_ns(options, needed_by=reader), flights[0].utc_minus_clock_s
     if offset is not None:
         zero_ns = round(offset * 1e6) * 1000  # autopilots count microseconds
-    time_s, number = flight.position.time_s, flight.position.number
+    time_s = np.concatenate([flight.position.time_s for flight in flights])
+    number = np.concatenate([flight.position.number for flight in flights])
+    owner = np.repeat(np.arange(len(flights)), [len(flight.position.time_s) for flight in flights])
     timed = np.abs(time_s) < _MOST_S
-    rejected = [*flight.damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in number[~timed])]
-    time_s, number = time_s[timed], number[timed]
-    lines = flight.messages + len(flight.damaged)
+    rejected = [*damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in np.sort(number[~timed]))]
+    lines = messages + len(damaged)
     rows = _rows.Rows(
         reader=reader,
         options=options,
         lines=lines,
-        row=number,
-        time=(np.round(time_s * 1e6).astype(np.int64) * 1000 + (zero_ns or 0)).astype("datetime64[ns]"),
-        flag=_lines.flags(len(number)),
-        blank=lines - len(number) - len(rejected),
+        row=number[timed],
+        at=np.arange(int(timed.sum())),
+        time=(np.round(time_s[timed] * 1e6).astype(np.int64) * 1000 + (zero_ns or 0)).astype("datetime64[ns]"),
+        flag=_lines.flags(int(timed.sum())),
+        blank=lines - int(timed.sum()) - len(rejected),
         rejected=rejected,
         relative=zero_ns is None,
     )
     if not len(rows):
         return rows.result([])
     rows.warnings += ["no message carries UTC: " + _rows.RELATIVE] if rows.relative else []
+    if len(flights) > 1:
+        systems = ", ".join(str(flight.system) for flight in flights)
+        rows.warnings.append(f"{len(flights)} vehicles (systems {systems}): a track of its own for each")
+    return rows.result(
+        [_track(rows.part(owner[timed] == i), flight, timed[owner == i]) for i, flight in enumerate(flights)]
+    )
+
+
+def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:
+    if not len(rows):
+        return None
+    time_s = flight.position.time_s[timed]
     values: dict[str, AnyArray] = {name: column[timed] for name, column in flight.position.columns.items()}
     lost = (np.abs(values["latitude_deg"]) < 1e-6) & (np.abs(values["longitude_deg"]) < 1e-6)
     rows.mark(lost, "no_fix")
-    for name in ("latitude_deg", "longitude_deg", "altitude_m"):
+    for name in _PLACE:
         values[name] = np.where(lost, np.nan, values[name])
+    values["altitude_m"] = _height(rows, flight, time_s, values)
+    heading = values.pop("heading_deg", np.full(len(rows), np.nan))
     for name in ("roll_deg", "pitch_deg", "yaw_deg"):
         values[name] = flight.attitude.near(name, time_s)
+    values["yaw_deg"] = np.where(np.isnan(values["yaw_deg"]), heading, values["yaw_deg"])
     for name in ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps"):
         values[name] = flight.velocity.near(name, time_s)
     for name in ("fix", "satellites"):
         values[name] = np.nan_to_num(flight.fix.near(name, time_s), nan=-1).clip(-1, 255).astype(np.int64)
-    return rows.result([rows.stream("telemetry", "vehicle", values, source=flight.source)])
+    return rows.stream("telemetry", flight.name, values, source=flight.source, system=flight.system)
+
+
+_PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
+_MOVED_M, _CLIMB_M = 0.5, 2.0
+
+
+def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> FloatArray:
+    """Height above home as it was at take-off; without a home above the ground at rest, else the first position."""
+    altitude: FloatArray = values["altitude_m"]
+    known = np.flatnonzero(np.isfinite(altitude))
+    if not len(known):
+        return altitude
+    home = np.isfinite(flight.home.columns.get("altitude_m", flight.home.time_s))
+    if not home.any():
+        rest = _pose.at_rest(rows.time[known], *(values[name][known] for name in _PLACE))
+        return altitude - float(altitude[known[0]] if rest is None else rest)
+    home_s, home_m = flight.home.time_s[home], flight.home.columns["altitude_m"][home]
+    climbs = altitude[known] - np.minimum.accumulate(altitude[known]) > _CLIMB_M
+    takeoff_s = time_s[known[int(np.argmax(climbs))]] if climbs.any() else home_s[-1]
+    at = max(int(np.searchsorted(home_s, takeoff_s, side="right")) - 1, 0)
+    if np.ptp(home_m) > _MOVED_M:
+        rows.warnings.append(
+            f"home moved ({np.min(home_m):.1f} .. {np.max(home_m):.1f} m above sea level): heights count from the home "
+            f"at take-off, {home_m[at]:.1f} m"
+        )
+    return np.asarray(altitude - home_m[at])
+
+
+def of_both(position: Series, above_home: str) -> Series:
+    """Home of positions that carry their altitude above sea level and their height above home.
+
+    Where home never moves the height above home is the log's own: it becomes the altitude, above a home at 0.
+    """
+    altitude, height = position.columns["altitude_m"], position.columns.pop(above_home)
+    home_m = altitude - height
+    finite = home_m[np.isfinite(home_m)]
+    if not len(finite) or np.ptp(finite) <= _MOVED_M:
+        position.columns["altitude_m"], home_m = height, np.zeros(len(height))
+    return Series(position.time_s, position.number, {"altitude_m": home_m})

@@ -11,6 +11,7 @@ from aerpaw_cmp.readers import dictionary
 
 from . import _sheet
 
+_PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
 _ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 _VELOCITIES = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
 # Attributes of a stream that say how its heights are known.
@@ -127,7 +128,7 @@ def above_takeoff(
     known = np.flatnonzero(np.isfinite(altitude) & ~lost)
     if datum in ("take-off", "ground") or not len(known):
         return altitude, about
-    rest = _at_rest(rows, values, known)
+    rest = at_rest(*(column[known] for column in (rows.time, *(values[name] for name in _PLACE))))
     first = float(altitude[known[0]]) if rest is None else rest
     climbs = rest is not None and float(altitude[known].max()) - rest > _CLIMB_M
     if datum == "unknown" and abs(first) < _NEAR_ZERO_M:
@@ -151,20 +152,17 @@ _REST_S, _REST_M, _REST_MPS, _CLIMB_M = 2.0, 3.0, 0.3, 5.0
 _DEGREE_M = 111_000.0
 
 
-def _at_rest(rows: _rows.Rows, values: dict[str, AnyArray], known: AnyArray) -> float | None:
-    """Height of the ground: where the track begins at one place and one height, the last of that; else None.
+def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> float | None:
+    """Height of the ground: where a track begins at one place and one height, the last of that; else None.
 
     Zeros before the first fix are none.
     """
-    altitude = values["altitude_m"][known]
     begun = int(np.argmax(altitude != 0)) if altitude[0] == 0 and np.abs(altitude).max() > _NEAR_ZERO_M else 0
     if begun and abs(altitude[begun]) < _NEAR_ZERO_M:
         begun = 0  # it rises from zero: that is no zero before the fix
-    known, altitude = known[begun:], altitude[begun:]
-    seconds = (rows.time[known] - rows.time[known[0]]) / np.timedelta64(1, "s")
-    east, north = (
-        (values[name][known] - values[name][known[0]]) * _DEGREE_M for name in ("longitude_deg", "latitude_deg")
-    )
+    time, altitude = time[begun:], altitude[begun:]
+    seconds = (time - time[0]) / np.timedelta64(1, "s")
+    north, east = ((column[begun:] - column[begun]) * _DEGREE_M for column in (latitude, longitude))
     step_s = np.maximum(np.diff(seconds, prepend=seconds[0] - 1.0), 0.1)
     rise = np.abs(np.diff(altitude, prepend=altitude[0])) / step_s
     still = (np.hypot(east, north) < _REST_M) & (rise < _REST_MPS)

@@ -3,7 +3,7 @@
 The format describes itself: every message begins with A3 95 and its number, ``FMT`` messages give the length and
 columns of each; in text each message is a line, ``NAME, value, value``.
 Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity) and ``GPS`` (UTC, fix).
-Heights are above home (``RelHomeAlt``), else above the first position. Source: ArduPilot
+Heights are above home at take-off (``RelHomeAlt``), else above the ground at rest or the first position. Source: ArduPilot
 ``libraries/AP_Logger/LogStructure.h``.
 """
 
@@ -29,6 +29,7 @@ _TYPES = {
     "L": ("i", 1e-7), "M": ("B", 1.0), "q": ("q", 1.0), "Q": ("Q", 1.0), "g": ("e", 1.0),
     "n": ("4s", 0.0), "N": ("16s", 0.0), "Z": ("64s", 0.0), "a": ("64s", 0.0),
 }  # fmt: skip
+_FIX_3D = 3
 _WANTED = ("POS", "GPS", "ATT", "XKF1", "NKF1", "EKF1")
 
 
@@ -120,7 +121,10 @@ def _number(cell: str) -> float:
 
 
 def _series(by_name: _Rows, name: str) -> _autopilot.Series:
-    """Messages of one name: of its descriptions the commonest, of instances (sensors, filters) the first."""
+    """Messages of one name: of its descriptions the commonest, of instances (filters) the first.
+
+    Of several GPS receivers it is the one with most fixes: the first may never have had one.
+    """
     timed = {names: rows for names, rows in by_name[name].items() if "TimeUS" in names}
     if not timed:
         return _autopilot.NONE
@@ -130,7 +134,11 @@ def _series(by_name: _Rows, name: str) -> _autopilot.Series:
     number = np.array([i for i, _ in rows], dtype=np.int64)
     for instance in ("I", "C", "Instance"):
         if instance in columns:
-            keep = columns[instance] == columns[instance][0]
+            fixed = columns.get("Status", np.zeros(len(table))) >= _FIX_3D
+            of_fix = {number: int(fixed[columns[instance] == number].sum()) for number in np.unique(columns[instance])}
+            most = max(of_fix.values())
+            best = columns[instance][0] if not most else next(key for key, count in of_fix.items() if count == most)
+            keep = columns[instance] == best
             columns, number = {key: column[keep] for key, column in columns.items()}, number[keep]
             break
     return _autopilot.Series(columns["TimeUS"] / 1e6, number, columns)
@@ -145,14 +153,16 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     column = place.columns
     if "Lat" not in column or "Lng" not in column:
         place, column = _autopilot.NONE, {"Lat": _autopilot.NONE.time_s, "Lng": _autopilot.NONE.time_s}
-    altitude = column.get("RelHomeAlt", column.get("Alt", np.full(len(place.time_s), np.nan)))
-    if "RelHomeAlt" not in column and len(altitude):
-        altitude = altitude - altitude[0]
+    altitude = column.get("Alt", np.full(len(place.time_s), np.nan))
     position = _autopilot.Series(
         place.time_s,
         place.number,
         {"latitude_deg": column["Lat"], "longitude_deg": column["Lng"], "altitude_m": altitude},
     )
+    home = _autopilot.NONE
+    if "RelHomeAlt" in column:
+        position.columns["above_home_m"] = column["RelHomeAlt"]
+        home = _autopilot.of_both(position, "above_home_m")
     filters = next((series[name] for name in ("XKF1", "NKF1", "EKF1") if len(series[name].time_s)), _autopilot.NONE)
     flight = _autopilot.Flight(
         position=position,
@@ -160,11 +170,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         velocity=_renamed(filters, {"VN": "velocity_north_mps", "VE": "velocity_east_mps", "VD": "velocity_down_mps"}),
         fix=_renamed(gps, {"Status": "fix", "NSats": "satellites"}),
         utc_minus_clock_s=_offset(gps),
-        messages=count,
-        damaged=damaged,
+        home=home,
         source="ArduPilot dataflash log",
     )
-    return _autopilot.result("ardupilot_bin", options, flight)
+    return _autopilot.result("ardupilot_bin", options, [flight], count, damaged)
 
 
 def _renamed(series: _autopilot.Series, names: dict[str, str]) -> _autopilot.Series:

@@ -1,7 +1,8 @@
 """MAVLink telemetry log of a ground station (``.tlog``): eight bytes of UTC in us, then one packet, and so on.
 
-Read are GLOBAL_POSITION_INT (33: position, height above home, velocity), ATTITUDE (30) and GPS_RAW_INT (24: fix) of
-the vehicle that sends most positions; checksums are checked. Source: MAVLink guide, "Packet Serialization".
+Read are GLOBAL_POSITION_INT (33: position, height above home, velocity, heading), ATTITUDE (30) and GPS_RAW_INT (24:
+fix) of each vehicle that sends positions, and of the component that does: a gimbal's attitude is not the aircraft's.
+Checksums are checked. Source: MAVLink guide, "Packet Serialization".
 """
 
 from __future__ import annotations
@@ -37,8 +38,8 @@ def _crc(data: bytes) -> int:
     return crc & 0xFFFF
 
 
-def _packet(data: bytes, at: int) -> tuple[int, int, int, bytes] | None:
-    """Length with its time, message number, system, and payload of the packet at a place; None if there is none."""
+def _packet(data: bytes, at: int) -> tuple[int, int, tuple[int, int], bytes] | None:
+    """Length with its time, message number, system and component, and payload of the packet at a place; None if there is none."""
     if at + 16 > len(data):
         return None
     stamp = int.from_bytes(data[at : at + 8], "big")
@@ -47,11 +48,11 @@ def _packet(data: bytes, at: int) -> tuple[int, int, int, bytes] | None:
     mark, size = data[at + 8], data[at + 9]
     if mark == 0xFE:
         # version 1: length, sequence, system, component, message; checksum
-        head, kind, system, tail = 6, data[at + 13], data[at + 11], 2
+        head, kind, source, tail = 6, data[at + 13], (data[at + 11], data[at + 12]), 2
     elif mark == 0xFD:
         if at + 18 > len(data):
             return None
-        head, system = 10, data[at + 13]
+        head, source = 10, (data[at + 13], data[at + 14])
         # a signature of 13 bytes stands behind the checksum where the first flag is set
         kind, tail = int.from_bytes(data[at + 15 : at + 18], "little"), 15 if data[at + 10] & 1 else 2
     else:
@@ -64,7 +65,11 @@ def _packet(data: bytes, at: int) -> tuple[int, int, int, bytes] | None:
         written = int.from_bytes(data[begin + size : begin + size + 2], "little")
         if _crc(data[at + 9 : begin + size] + bytes([_EXTRA[kind]])) != written:
             return None
-    return length, kind, system, data[begin : begin + size]
+    return length, kind, source, data[begin : begin + size]
+
+
+# Number, system and component, time [s], and values of a message.
+_Message = tuple[int, tuple[int, int], float, tuple[float, ...]]
 
 
 def sniff(head: bytes) -> bool:
@@ -82,7 +87,7 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Telemetry ``vehicle``."""
-    messages: dict[int, list[tuple[int, int, float, tuple[float, ...]]]] = {kind: [] for kind in _EXTRA}
+    messages: dict[int, list[_Message]] = {kind: [] for kind in _EXTRA}
     damaged: list[RejectedLine] = []
     count, at = 0, 0
     while at < len(data):
@@ -95,21 +100,18 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
                 RejectedLine(count + len(damaged) + 1, f"{at - begin} bytes at {begin} that are no packet", "")
             )
             continue
-        length, kind, system, payload = packet
+        length, kind, source, payload = packet
         if kind in _EXTRA:
             layout = _LAYOUT[kind]
             values = layout.unpack(payload[: layout.size].ljust(layout.size, b"\0"))  # trailing zeros are not sent
             messages[kind].append(
-                (count + len(damaged), system, int.from_bytes(data[at : at + 8], "big") / 1e6, values)
+                (count + len(damaged), source, int.from_bytes(data[at : at + 8], "big") / 1e6, values)
             )
         count += 1
         at += length
-    position, attitude, gps = _of_vehicle(messages)
-    flight = _autopilot.Flight(
-        position=position, attitude=attitude, velocity=position, fix=gps,
-        utc_minus_clock_s=0.0, messages=count, damaged=damaged, source="MAVLink telemetry log",
-    )  # fmt: skip
-    return _autopilot.result("mavlink_tlog", options, flight)
+    systems = sorted({item[1][0] for item in messages[_POSITION]})
+    flights = [_flight(messages, system, f"vehicle_{system}" if len(systems) > 1 else "vehicle") for system in systems]
+    return _autopilot.result("mavlink_tlog", options, flights or [_flight(messages, 0, "vehicle")], count, damaged)
 
 
 def _next_mark(data: bytes, at: int) -> int:
@@ -118,21 +120,30 @@ def _next_mark(data: bytes, at: int) -> int:
     return min(places) - 8 if places else len(data)
 
 
-def _of_vehicle(
-    messages: dict[int, list[tuple[int, int, float, tuple[float, ...]]]],
-) -> tuple[_autopilot.Series, _autopilot.Series, _autopilot.Series]:
-    systems = [item[1] for item in messages[_POSITION]]
-    vehicle = max(set(systems), key=systems.count) if systems else -1
-    series_of = []
+def _flight(messages: dict[int, list[_Message]], system: int, name: str) -> _autopilot.Flight:
+    """What a vehicle sends: that of the component whose positions they are, as far as it sends it."""
+    sources = [item[1] for item in messages[_POSITION] if item[1][0] == system]
+    autopilot = max(set(sources), key=sources.count) if sources else (system, 1)
+    series: dict[int, _autopilot.Series] = {}
     for kind in (_POSITION, _ATTITUDE, _GPS):
-        rows = [item for item in messages[kind] if item[1] == vehicle]
+        rows = [item for item in messages[kind] if item[1] == autopilot]
+        rows = rows or [item for item in messages[kind] if item[1][0] == system and item[1][1] not in _NO_AUTOPILOT]
         table = np.array([row[3] for row in rows], dtype=np.float64).reshape(len(rows), _FIELDS[kind])
-        series = _autopilot.Series(
-            np.array([row[2] for row in rows]), np.array([row[0] for row in rows], dtype=np.int64), {}
+        columns = _columns(kind, table) if len(rows) or kind == _POSITION else {}
+        series[kind] = _autopilot.Series(
+            np.array([row[2] for row in rows]), np.array([row[0] for row in rows], dtype=np.int64), columns
         )
-        series.columns = _columns(kind, table) if len(rows) or kind == _POSITION else {}
-        series_of.append(series)
-    return series_of[0], series_of[1], series_of[2]
+    position = series[_POSITION]
+    home = _autopilot.of_both(position, "above_home_m")
+    return _autopilot.Flight(
+        position=position, attitude=series[_ATTITUDE], velocity=position, fix=series[_GPS], utc_minus_clock_s=0.0,
+        home=home, source="MAVLink telemetry log", name=name, system=system,
+    )  # fmt: skip
+
+
+# MAV_COMPONENT: cameras, gimbals, and what else lies on its own axes.
+_NO_AUTOPILOT = {*range(100, 106), 154, *range(171, 176)}
+_NO_HEADING = 65535
 
 
 def _columns(kind: int, table: np.ndarray) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
@@ -141,7 +152,9 @@ def _columns(kind: int, table: np.ndarray) -> dict[str, np.ndarray]:  # type: ig
         return {
             "latitude_deg": table[:, 1] / 1e7,
             "longitude_deg": table[:, 2] / 1e7,
-            "altitude_m": table[:, 4] / 1e3,
+            "altitude_m": table[:, 3] / 1e3,
+            "above_home_m": table[:, 4] / 1e3,
+            "heading_deg": np.where(table[:, 8] == _NO_HEADING, np.nan, table[:, 8] / 100),
             "velocity_north_mps": table[:, 5] / 100,
             "velocity_east_mps": table[:, 6] / 100,
             "velocity_down_mps": table[:, 7] / 100,

@@ -3,7 +3,8 @@
 The format describes itself: ``F`` messages give the fields of each topic, ``A`` its number, ``D`` its data. Read
 are ``vehicle_global_position``, ``vehicle_attitude`` (quaternion), ``vehicle_local_position`` (velocity) and
 ``vehicle_gps_position`` or ``sensor_gps`` (UTC, fix; the position too, where the log has no global position);
-instance 0 of each. Heights are above ``home_position``, else above the first position.
+instance 0 of each, of receivers the one with most fixes. Heights are above ``home_position`` as it was at take-off, else
+above the ground at rest or the first position.
 Source: PX4 guide, "ULog File Format".
 """
 
@@ -74,9 +75,9 @@ def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
 def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int, list[RejectedLine]]:
     """Messages of the wanted topics, their numbers, the number of sound messages, and damaged stretches."""
     forms: dict[str, str] = {}
-    names: dict[int, str] = {}
-    bodies: dict[str, list[bytes]] = {name: [] for name in _WANTED}
-    numbers: dict[str, list[int]] = {name: [] for name in _WANTED}
+    names: dict[int, tuple[str, int]] = {}
+    bodies: dict[tuple[str, int], list[bytes]] = {}
+    numbers: dict[tuple[str, int], list[int]] = {}
     damaged: list[RejectedLine] = []
     count, at = 0, 16  # behind the mark, the version and the time of the start
     while at + 3 <= len(data):
@@ -90,15 +91,32 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
         if kind == ord("F"):
             name, _, text = body.decode("ascii", "replace").partition(":")
             forms[name] = text
-        if kind == ord("A") and size > 3 and body[0] == 0:
-            names[struct.unpack_from("<H", body, 1)[0]] = body[3:].decode("ascii", "replace")
-        topic = names.get(struct.unpack_from("<H", body)[0], "") if kind == ord("D") and size > 2 else ""
-        if topic in bodies:
-            bodies[topic].append(body[2:])
-            numbers[topic].append(count)
+        if kind == ord("A") and size > 3:
+            names[struct.unpack_from("<H", body, 1)[0]] = (body[3:].decode("ascii", "replace"), body[0])
+        topic = names.get(struct.unpack_from("<H", body)[0]) if kind == ord("D") and size > 2 else None
+        if topic is not None and topic[0] in _WANTED and (topic[1] == 0 or topic[0] in _RECEIVERS):
+            bodies.setdefault(topic, []).append(body[2:])
+            numbers.setdefault(topic, []).append(count)
         count += 1
         at += 3 + size
-    return {name: _table(bodies[name], forms.get(name, "")) for name in _WANTED}, numbers, count, damaged
+    tables = {topic: _table(content, forms.get(topic[0], "")) for topic, content in bodies.items()}
+    best = {name: _best([topic for topic in tables if topic[0] == name], tables) for name in _WANTED}
+    chosen = {name: _table([], "") if topic is None else tables[topic] for name, topic in best.items()}
+    of_chosen = {name: [] if topic is None else numbers[topic] for name, topic in best.items()}
+    return chosen, of_chosen, count, damaged
+
+
+def _best(topics: list[tuple[str, int]], tables: Mapping[tuple[str, int], AnyArray]) -> tuple[str, int] | None:
+    """The instance of a topic with most fixes, of equals the first; None where there is none."""
+
+    def fixes(topic: tuple[str, int]) -> int:
+        fix = _column(tables[topic], "fix_type")
+        return 0 if fix is None else int((fix >= _FIX_3D).sum())
+
+    return max(sorted(topics), key=fixes) if topics else None
+
+
+_RECEIVERS, _FIX_3D = ("vehicle_gps_position", "sensor_gps"), 3
 
 
 def _table(bodies: list[bytes], text: str) -> AnyArray:
@@ -131,9 +149,6 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         position, place_name = _position(gps), gps_name
     track = _autopilot.NONE
     if position is not None:
-        altitude = position["altitude_m"]
-        known = altitude[(position["latitude_deg"] != 0) & np.isfinite(altitude)]  # before the fix all is zero
-        position["altitude_m"] = altitude - _home(tables["home_position"], known)
         track = _series(tables[place_name], numbers[place_name], position)
     local, attitude = tables["vehicle_local_position"], tables["vehicle_attitude"]
     velocity = {
@@ -148,11 +163,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         velocity=_series(local, numbers["vehicle_local_position"], velocity),
         fix=_series(gps, numbers[gps_name], fix),
         utc_minus_clock_s=offset,
-        messages=count,
-        damaged=damaged,
+        home=_home(tables["home_position"], numbers["home_position"]),
         source="PX4 ULog" if place_name == "vehicle_global_position" else f"PX4 ULog, {place_name}",
     )
-    return _autopilot.result("px4_ulog", options, flight)
+    return _autopilot.result("px4_ulog", options, [flight], count, damaged)
 
 
 def _position(table: AnyArray) -> dict[str, FloatArray] | None:
@@ -170,9 +184,12 @@ def _position(table: AnyArray) -> dict[str, FloatArray] | None:
     return None
 
 
-def _home(table: AnyArray, altitude: FloatArray) -> float:
-    home = _column(table, "alt")
-    return float(home[0]) if home is not None and len(home) else float(altitude[0]) if len(altitude) else 0.0
+def _home(table: AnyArray, numbers: list[int]) -> _autopilot.Series:
+    """Altitude of home each time that it was set; NaN where the autopilot itself calls it not valid."""
+    altitude, valid = _column(table, "alt"), _column(table, "valid_alt")
+    if altitude is not None and valid is not None:
+        altitude = np.where(valid != 0, altitude, np.nan)
+    return _series(table, numbers, {"altitude_m": altitude})
 
 
 def _angles(table: AnyArray) -> dict[str, FloatArray | None]:

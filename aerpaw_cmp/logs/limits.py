@@ -60,8 +60,8 @@ LIMITS: tuple[Limit, ...] = (
     Limit(("sinr_db",), ((-100.0, 100.0),), "sinr_out_of_range"),
 )
 
-# Levels by unit: thermal noise of 1 Hz is -174 dBm, 50 dBm would burn the receiver; a ratio to the noise is wider.
-LEVEL_DB = {"dBm": (-200.0, 50.0), "dB": (-200.0, 200.0)}
+# Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver of a flight meets 30 dBm; a ratio to the noise is wider.
+LEVEL_DB = {"dBm": (-200.0, 30.0), "dB": (-200.0, 200.0)}
 
 # Levels re full scale, gain taken off: real sounder logs reach 33 dB.
 _LEVEL_OTHER_DB = (-200.0, 100.0)
@@ -102,12 +102,16 @@ def check(result: ReadResult) -> ReadResult:
 
 def _checked(stream: Stream, warnings: list[str]) -> Stream:
     frame, present = stream.frame, set(stream.frame.columns)
+    if stream.kind == "rss" and stream.attributes.get("unit") == "dBm":
+        frame = _no_index(stream, frame, warnings)
     for limit in _limits_of(stream):
         if not present.isdisjoint(limit.columns):
             frame = _apply(stream, frame, limit, warnings)
     if stream.kind == "rank":
         frame = _within_ports(stream, frame, warnings)
     frame = _near_in_time(stream, frame, warnings)
+    if stream.kind == "rss":
+        _two_levels(stream, frame, warnings)
     bad, sentence = jumps_of(stream if frame is stream.frame else replace(stream, frame=frame))
     if bad.any():
         frame = _marked(frame, bad, FLAG, [name for name in PLACE if name in frame.columns])
@@ -173,6 +177,39 @@ def _within_ports(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> p
     )
     warnings.append(_sentence(stream, int(bad.sum()), "rank_above_ports", text))
     return _marked(frame, bad, "rank_above_ports", ["rank"])
+
+
+def _no_index(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:
+    """Flag levels that are mostly at or above 0 dBm: an index of the standard (0 .. 127), or another unit."""
+    level = frame["rss_db"].to_numpy(dtype=np.float64)
+    bad = level >= 0
+    if 2 * bad.sum() <= np.isfinite(level).sum() or not bad.any():
+        return frame
+    row = int(np.argmax(bad))
+    text = (
+        f"the first: {level[row]:g} dBm in line {int(frame['line'].iloc[row])}, which is received nowhere "
+        "(another unit, or an index?); not scored"
+    )
+    warnings.append(_sentence(stream, int(bad.sum()), "level_out_of_range", text))
+    return _marked(frame, bad, "level_out_of_range", ["rss_db"])
+
+
+# Levels that alternate from record to record: further apart than fading, and back with the next.
+_APART_DB, _BACK_SHARE, _FEW_ALTERNATE = 10.0, 0.2, 6
+
+
+def _two_levels(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> None:
+    """Say where the levels of a series alternate between two: of two devices, SIMs or networks."""
+    level = frame["rss_db"].to_numpy(dtype=np.float64)[:10_000]
+    level = level[np.isfinite(level)]
+    if len(level) < _FEW_ALTERNATE:
+        return
+    step, back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in (1, 2))
+    if step > _APART_DB and back < _BACK_SHARE * step:
+        warnings.append(
+            f"rss {stream.name!r}: its levels alternate, {step:.0f} dB apart from record to record: two devices, SIMs "
+            "or networks in one series, which no column tells apart"
+        )
 
 
 def _near_in_time(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:

@@ -11,15 +11,15 @@ integers [ns]: UTC since 1970 and the monotonic clock.
 ``clock disk alarm prediction``  what else happened
 ``rotate end``  last line of a segment, and of the last one
 
-An exchange is accepted: as a record of rank (``nr5g_csi``, ``lte_csi``), of RSS (RSRP of ``servingcell``), or as a
-companion of these. Everything else that is sound counts as comment. The time of a record is the middle between
+An exchange is accepted: as a record of rank (``nr5g_csi``, ``lte_csi``), of RSS (RSRP of ``servingcell``, a series for
+each cell: PCI, ARFCN), or as a companion of these. Everything else that is sound counts as comment. The time of a record is the middle between
 command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR beside a rank are those of the last
 ``servingcell`` within 2 s.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -101,9 +101,7 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
                 Stream("rank", name, frame, {**common, "ri_base": ri_base, "channel": options.channel or name})
             )
     if rsrp is not None:
-        streams.append(
-            Stream("rss", "nr5g_rsrp", rsrp, {**common, "unit": "dBm", "channel": options.channel or "nr5g_rsrp"})
-        )
+        streams += _cells(rsrp, {**common, "unit": "dBm", "rat": "nr"}, options)
     return ReadResult(
         reader="tap_jsonl",
         streams=tuple(streams),
@@ -262,7 +260,24 @@ def _rsrp_columns(exchanges: list[tuple[int, dict[str, Any]]]) -> Columns:
         values = _json.inside(_json.inside(record, "decoded"), "nr")
         if record.get("query") == "servingcell" and values:
             answers.append((number, record, values, _flags(record)))
-    return _columns(answers, {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"})
+    return _columns(answers, {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"} | _IDENTITY)
+
+
+# Attributes of a cell, and the keys under which they were decoded.
+_IDENTITY = {"pci": "pcid", "arfcn": "arfcn", "band": "band"}
+
+
+def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOptions) -> Iterator[Stream]:
+    """Levels of each serving cell: a handover begins another series; of one cell alone the name says no more."""
+    identity = rsrp[list(_IDENTITY)]
+    cells = identity.drop_duplicates()
+    for values in cells.to_numpy().tolist():
+        mine = ((identity == values) | (identity.isna() & np.isnan(values))).all(axis=1)
+        about = {key: int(value) for key, value in zip(_IDENTITY, values, strict=True) if np.isfinite(value)}
+        words = [f"{key}{about[key]}" for key in ("pci", "arfcn") if key in about] if len(cells) > 1 else []
+        name = "_".join(["nr5g_rsrp", *words])
+        frame = rsrp[mine].drop(columns=list(_IDENTITY)).reset_index(drop=True)
+        yield Stream("rss", name, frame, {**common, **about, "channel": options.channel or name})
 
 
 def _with_serving_cell(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.DataFrame:

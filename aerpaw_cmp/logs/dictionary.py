@@ -137,7 +137,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     )),
     Quantity("network", "identity", (
         r"^(operator|carrier|network operator|operator ?name|network name|provider|plmn|sim)( ?(id|code|slot|no))?$",
-        r"^mcc$", r"^mnc$", r"^mcc ?mnc$",
+        r"^mcc$", r"^mnc$", r"^mcc ?mnc$", r"^(receiver|rx|cent(er|re)|carrier) freq(uency)?( hz| mhz| ghz)?$",
     )),
     Quantity("technology", "cell", (
         r"^(network ?(tech|mode|type)|net ?type|rat|technology|access technology|radio( type| access)?|act|cell type)$",
@@ -145,6 +145,9 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("serving", "cell", (r"^(is ?)?(registered|serving|connected)( cell)?$",)),
     Quantity("neighbouring", "cell", (r"^(is ?)?neighbou?r(ing)?( cell)?$",)),
     # how strong; 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
+    Quantity("power", "rss", (r"^link power$",), "dB re full scale"),
+    Quantity("quality", "rss", (r"^link quality$",), "dB"),
+    Quantity("SNR", "rss", (r"^link snr$",), "dB"),
     Quantity("rank", "rank", (
         r"\b(pdsch rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b",
     ), none=(0.0,), can_be=(0.0, 16.0)),
@@ -274,6 +277,9 @@ def in_brackets(name: str) -> tuple[str, str, str]:
     if written is None:
         return "", "", name
     inside, rest = written[1].strip(), name[: written.start()]
+    words = inside.split()
+    if len(words) == 2 and is_unit(words[0]):  # 'Altitude (ft MSL)'
+        return words[0].lower(), words[1], rest
     if is_unit(inside) or _A_UNIT.fullmatch(inside.lower()):
         return inside.lower(), "", rest
     return "", inside, rest
@@ -440,6 +446,8 @@ PROGRAMS: tuple[Program, ...] = (
     _program("CellMapper", "signal,psc or pci", datum="sea level", words={
         r"signal": "rsrp", r"psc or pci": "pci", r"type": "network type"}),
     _program("phone", "cellname", datum="sea level"),
+    _program("AERPAW monitoring", "transmitter,receiver,log type", words={
+        r"power": "link power", r"quality": "link quality", r"snr": "link snr"}),
 )  # fmt: skip
 
 

@@ -302,6 +302,8 @@ def _archive(
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     content = archives.members(read_bytes(place)[0], place)
+    if "xl/workbook.xml" in content:
+        raise InputError("a spreadsheet (.xlsx)", expected="its table saved as CSV", path=place)
     for name, member in content.items():
         path = place / name
         try:

@@ -60,7 +60,7 @@ LIMITS: tuple[Limit, ...] = (
     Limit(("sinr_db",), ((-100.0, 100.0),), "sinr_out_of_range"),
 )
 
-# Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver of a flight meets 30 dBm; a ratio to the noise is wider.
+# Levels by unit: thermal noise of 1 Hz is -174 dBm, no receiver in flight meets 30 dBm; a ratio to the noise is wider.
 LEVEL_DB = {"dBm": (-200.0, 30.0), "dB": (-200.0, 200.0)}
 
 # Levels re full scale, gain taken off: real sounder logs reach 33 dB.

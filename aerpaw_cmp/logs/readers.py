@@ -162,12 +162,12 @@ def claims(data: bytes) -> list[Reader]:
     """Readers whose sniffers accept the beginning of a file, blank lines in front of it aside.
 
     A console or a KML may hold what tells it apart behind much talk or many styles: where no log reader accepts the
-    first ``HEAD_BYTES``, the sniffers see ``DEEP_BYTES``.
+    first ``HEAD_BYTES``, all sniffers see ``DEEP_BYTES``.
     """
     data = _BLANK_LINES.sub(b"", data[:DEEP_BYTES])
     known = [reader for reader in catalogue() if reader.sniff(data[:HEAD_BYTES])]
     if len(data) > HEAD_BYTES and not any(reader.kinds for reader in known):
-        known = [reader for reader in catalogue() if reader.kinds and reader.sniff(data)] or known
+        known = [reader for reader in catalogue() if reader.sniff(data)] or known
     return known
 
 
@@ -239,10 +239,28 @@ def _way_out(head: bytes) -> str:
     first = head.lstrip(b"\xef\xbb\xbf \r\n").split(b"\n", 1)[0].decode("utf-8", "replace").strip()
     sign = max(",;\t|", key=first.count)
     names = [name.strip().strip('"') for name in first.split(sign)]
-    if len(names) > 1 and all(name and not name[0].isdigit() for name in names):
-        example = f"--map {names[0]!r}=time --map {names[-1]!r}=rss_db"
-        return f"a table of another kind: name what its columns hold, e.g. {example}"
+    if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
+        fits = {quantity: [name for name in names if _looks_like(name, words)] for quantity, words in _LIKE.items()}
+        pairs = [f"--map {named[0]!r}={quantity}" for quantity, named in fits.items() if named]
+        lacking = [quantity for quantity in ("time", "rss_db") if not fits[quantity]]
+        example = f": {' '.join(pairs)}" if pairs else ""
+        missing = f"; no column looks like {' or '.join(lacking)}" if lacking else ""
+        return f"a table of another kind: name what its columns hold{example}{missing}"
     return "a log of a kind that is not supported: docs/adding_a_reader.md"
+
+
+# Words that a column of a quantity may have in its name, where the dictionary does not know it.
+_LIKE = {
+    "time": r"time|date|clock|stamp|epoch|utc",
+    "rss_db": r"power|level|signal|strength|rss|dbm|rsrp",
+    "latitude_deg": r"\blat",
+    "longitude_deg": r"\b(lon|lng)",
+    "altitude_m": r"\b(alt|height|elev)",
+}
+
+
+def _looks_like(name: str, words: str) -> bool:
+    return re.search(words, name.lower().replace("_", " ")) is not None
 
 
 def _excerpt(head: bytes) -> str:

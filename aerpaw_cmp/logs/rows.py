@@ -55,6 +55,8 @@ class Rows:
         ``written`` where all times carry an offset or are epochs.
     height_from : str, optional
         Of the track, where the table says more than its format.
+    about : dict
+        Attributes of all streams: who wrote these rows.
     at : int array, shape (n,)
         Index of each row among those that were given to :func:`built`.
     data : bytes
@@ -74,6 +76,7 @@ class Rows:
     relative: bool = False
     clock_from: str | None = None
     height_from: str | None = None
+    about: dict[str, Attribute] = field(default_factory=dict)
     at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     data: bytes = field(default=b"", repr=False)
 
@@ -163,7 +166,7 @@ class Rows:
         if not len(row):
             return None
         frame = _frames.frame(kind, time, row + 1, shown, values)
-        shared = ({"clock": "relative"} if self.relative else {}) | {"clock_from": self.clock_from}
+        shared = ({"clock": "relative"} if self.relative else {}) | {"clock_from": self.clock_from} | self.about
         attributes = shared | dict(about or {}) | attributes
         return Stream(kind, name, frame, _frames.attributes(self.options, **attributes))
 

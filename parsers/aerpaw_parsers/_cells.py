@@ -101,7 +101,9 @@ def joined(tables: Sequence[Table]) -> Table:
     return Table(**{name: np.concatenate(column, axis=-1) for name, column in columns.items()})
 
 
-def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: str) -> list[Stream]:
+def streams(
+    rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: str, quantity: str = "RSRP"
+) -> list[Stream]:
     """A stream per cell: radio access, PCI and carrier. Every reading with a level is a record.
 
     A cell is serving from the moment that the log says so until it names another of the same radio access. A PCI that
@@ -113,6 +115,8 @@ def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: st
     rows : Rows
     readings : Table or iterable of Reading
     source : str
+    quantity : str
+        The level that they hold.
     """
     columns = readings if isinstance(readings, Table) else table(readings)
     order = np.argsort(columns.row, kind="stable")
@@ -131,19 +135,20 @@ def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: st
                 parts = [(of_pci[arfcn[of_pci] == carrier], carrier) for carrier in carriers.tolist()]
                 parts.append((of_pci[np.isnan(arfcn[of_pci])], np.nan))
             for pick, carrier in parts:
-                cell = Cell(RATS[rat], identity, carrier, several=len(carriers) > 1)
+                cell = Cell(RATS[rat], identity, carrier, several=len(carriers) > 1, quantity=quantity)
                 per_cell += [_stream(rows, columns, order[pick], served[pick], cell, source)] if len(pick) else []
     return per_cell
 
 
 @dataclass(frozen=True)
 class Cell:
-    """Identity of a cell: radio access, PCI (-1: unknown), carrier (NaN: unknown), and if others share its PCI."""
+    """A cell: radio access, PCI (-1: unknown), carrier (NaN: unknown), if others share its PCI, what is measured."""
 
     rat: str
     pci: float
     arfcn: float
     several: bool
+    quantity: str
 
     @property
     def name(self) -> str:
@@ -192,7 +197,7 @@ def _stream(rows: _rows.Rows, columns: Table, pick: IntArray, served: FloatArray
             values[name] = np.where(finite, quality, np.nan)
     stream = rows.stream(
         "rss", cell.name, values, pick=row, flag=flag, channel=rows.options.channel or cell.name,
-        unit=rows.options.unit or "dBm", quantity="RSRP", rat=cell.rat or None,
+        unit=rows.options.unit or "dBm", quantity=cell.quantity, rat=cell.rat or None,
         pci=int(cell.pci) if cell.pci >= 0 else None, arfcn=int(cell.arfcn) if np.isfinite(cell.arfcn) else None,
         source=source,
     )  # fmt: skip

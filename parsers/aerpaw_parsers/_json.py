@@ -37,19 +37,22 @@ class Objects:
         Lines that are no object.
     more : int array
         0-based further lines of objects that are written over several.
+    closed : bool
+        Does an array close all of them on its line?
     """
 
     row: IntArray
     values: list[dict[str, Any]]
     rejected: list[RejectedLine]
     more: IntArray
+    closed: bool = False
 
 
 def objects(lines: _lines.Lines) -> Objects:
     """The objects of a file, one per line or each over several (as programs print them for people).
 
-    A file that is one JSON array of them is read, too: brackets alone on a line and commas at the end of lines count
-    as nothing.
+    A file that is one JSON array of them is read, too, on one line or with brackets alone on a line; commas at the end
+    of lines count as nothing.
     """
     rows: list[int] = []
     values: list[dict[str, Any]] = []
@@ -72,12 +75,14 @@ def objects(lines: _lines.Lines) -> Objects:
                 value, _ = _loaded(several)
                 more += range(i + 1, last + 1) if isinstance(value, dict) else ()
                 tried += 0 if isinstance(value, dict) else len(several)
-        if isinstance(value, dict):
-            rows.append(i)
-            values.append(value)
+        listed = value if isinstance(value, list) else [value]  # an array of all of them on a line
+        if listed and all(isinstance(item, dict) for item in listed):
+            rows += [i] * len(listed)
+            values += listed
         else:
             rejected.append(lines.reject(i, "no JSON object (torn line?)" if value is None else "no JSON object"))
-    return Objects(np.array(rows, dtype=np.int64), values, rejected, np.array(more, dtype=np.int64))
+    closed = len(set(rows)) < len(rows)
+    return Objects(np.array(rows, dtype=np.int64), values, rejected, np.array(more, dtype=np.int64), closed)
 
 
 def _bare(text: bytes) -> bytes:

@@ -31,6 +31,7 @@ CLOCKS = {
     "controller_log": _TS,
     "srsenb_log": _TS,
     "srsue_log": _TS,
+    "cell_search": "program: cell_search's localtime(), or ts on the node",
     "srsran_gnb": _TS,
     "srsran_json": "program: srsRAN Project writes UTC",
     "oai_log": _TS,

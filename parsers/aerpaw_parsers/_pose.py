@@ -128,9 +128,11 @@ def above_takeoff(
     known = np.flatnonzero(np.isfinite(altitude) & ~lost)
     if datum in ("take-off", "ground") or not len(known):
         return altitude, about
+    altitude = _without_first_zeros(altitude)
+    known, values = known[np.isfinite(altitude[known])], values | {"altitude_m": altitude}
     rest = at_rest(*(column[known] for column in (rows.time, *(values[name] for name in _PLACE))))
-    first = float(altitude[known[0]]) if rest is None else rest
     climbs = rest is not None and float(altitude[known].max()) - rest > _CLIMB_M
+    first = rest if rest is not None and climbs else float(altitude[known[0]])
     if datum == "unknown" and abs(first) < _NEAR_ZERO_M:
         return altitude, about | {"height_datum": "take-off"}
     if datum == "unknown" and not climbs:
@@ -152,17 +154,18 @@ _REST_S, _REST_M, _REST_MPS, _CLIMB_M = 2.0, 3.0, 0.3, 5.0
 _DEGREE_M = 111_000.0
 
 
-def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> float | None:
-    """Height of the ground: where a track begins at one place and one height, the last of that; else None.
+def _without_first_zeros(altitude: FloatArray) -> FloatArray:
+    """Altitudes whose first rows are 0 and all others far from it: a receiver before its first fix; NaN there."""
+    begun = int(np.argmax(np.nan_to_num(altitude) != 0))
+    if not begun or np.nanmin(np.abs(altitude[begun:])) < _NEAR_ZERO_M:
+        return altitude
+    return np.where(np.arange(len(altitude)) < begun, np.nan, altitude)
 
-    Zeros before the first fix are none.
-    """
-    begun = int(np.argmax(altitude != 0)) if altitude[0] == 0 and np.abs(altitude).max() > _NEAR_ZERO_M else 0
-    if begun and abs(altitude[begun]) < _NEAR_ZERO_M:
-        begun = 0  # it rises from zero: that is no zero before the fix
-    time, altitude = time[begun:], altitude[begun:]
+
+def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> float | None:
+    """Height of the ground: where a track begins at one place and one height, the last of that; else None."""
     seconds = (time - time[0]) / np.timedelta64(1, "s")
-    north, east = ((column[begun:] - column[begun]) * _DEGREE_M for column in (latitude, longitude))
+    north, east = ((column - column[0]) * _DEGREE_M for column in (latitude, longitude))
     step_s = np.maximum(np.diff(seconds, prepend=seconds[0] - 1.0), 0.1)
     rise = np.abs(np.diff(altitude, prepend=altitude[0])) / step_s
     still = (np.hypot(east, north) < _REST_M) & (rise < _REST_MPS)

@@ -20,7 +20,7 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine
 from aerpaw_cmp.readers import ReadOptions, dictionary
 
 from . import _stamps
@@ -108,6 +108,8 @@ class Sheet:
     rejected : list of RejectedLine
     notes : dict
         Sentences about columns, by the column: read otherwise than written.
+    closed : bool
+        Do rows end with a mark of their own, whatever ends the line?
     """
 
     lines: _lines.Lines
@@ -117,6 +119,7 @@ class Sheet:
     blank_rows: IntArray
     rejected: list[RejectedLine] = field(default_factory=list)
     notes: dict[int, str] = field(default_factory=dict)
+    closed: bool = False
     _silent: dict[int, BoolArray] = field(default_factory=dict)
     _numbers: dict[int, FloatArray] = field(default_factory=dict)
     _cell_units: dict[int, str] = field(default_factory=dict)
@@ -459,11 +462,13 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         clock, cells, warnings = _times(sheet, column, options, mapped=mapped)
     timed = _rows.built(
         sheet.lines, sheet.row, {"time": cells}, options, reader=reader, reason=lambda _line: None, clock=clock,
-        extra=sheet.rejected, markup=sheet.blank_rows,
+        extra=sheet.rejected, markup=sheet.blank_rows, closed=sheet.closed,
     )  # fmt: skip
     timed.warnings += warnings
     if len(timed.row) < len(sheet.row):
-        timed_part = sheet.part(np.isin(sheet.row, timed.row))
+        inside = np.zeros(len(sheet.row), dtype=bool)
+        inside[timed.at] = True
+        timed_part = sheet.part(inside)
         sheet.row, sheet.cells, sheet._silent, sheet._numbers = timed_part.row, timed_part.cells, timed_part._silent, {}
     if (counter := sheet.named("time millisecond")) not in (None, column):
         _finer(timed, sheet.numbers(counter))
@@ -580,20 +585,40 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
         The name is empty where the table has one part.
     """
     columns = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name == key]
-    several = [i for i in columns if 1 < len({text for text in sheet.texts(i) if _says(text)}) <= _MOST_PARTS]
+    values_of = {i: {text for text in sheet.texts(i) if _says(text, key)} for i in columns}
+    several = [i for i, values in values_of.items() if 1 < len(values) <= _MOST_PARTS]
+    alone = {sheet.plain[i]: next(iter(values)) for i, values in values_of.items() if len(values) == 1}
     if not several:
-        yield "", rows, sheet
+        yield "", replace(rows, about=rows.about | _about(alone)), sheet
         return
     texts = [np.array(sheet.texts(i), dtype=object) for i in several]
     for values in product(*[dict.fromkeys(column.tolist()) for column in texts]):
         where = np.all([column == value for column, value in zip(texts, values, strict=True)], axis=0)
         if where.any():
-            words = [_label(sheet.plain[i], text) for i, text in zip(several, values, strict=True) if _says(text)]
-            yield "_".join(words), rows.part(where), sheet.part(where)
+            written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if _says(text, key)}
+            about = rows.about | _about(alone | written)
+            label = "_".join(_label(name, text) for name, text in written.items())
+            yield label, replace(rows.part(where), about=about), sheet.part(where)
 
 
-def _says(text: str) -> bool:
-    return text.lower() not in NO_VALUE and text not in ("0", "2147483647", "65535")
+def _about(written: dict[str, str]) -> dict[str, Attribute]:
+    """Attributes of a part: its identities as written, a frequency in Hz."""
+    about: dict[str, Attribute] = {}
+    for name, text in written.items():
+        value = _SI.fullmatch(text)
+        if "freq" in name and value is not None and (value[2] or float(value[1]) > 1e6):
+            about["frequency_hz"] = float(value[1]) * {"k": 1e3, "M": 1e6, "G": 1e9, None: 1.0}[value[2]]
+        else:
+            about[name.replace(" ", "_")] = text
+    return about
+
+
+_SI = re.compile(r"(\d{1,12}(?:\.\d{1,9})?) ?([kMG])?(?:Hz)?")
+
+
+def _says(text: str, key: str) -> bool:
+    """Check whether a cell names something; networks have no number 0."""
+    return text.lower() not in NO_VALUE and text not in ("2147483647", "65535") and (key == "device" or text != "0")
 
 
 def _label(name: str, value: str) -> str:

@@ -102,6 +102,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     rows = _rows.built(
         lines, answers.row, {"time": time}, options, reader="amarisoft_json", reason=_json.bracket,
         clock="epoch_s" if has_utc else "relative_s", extra=answers.rejected, markup=answers.more,
+        closed=answers.closed,
     )  # fmt: skip
     pairs: list[tuple[int, dict[str, Any]]] = [
         (i, {**ue, **cell})

@@ -3,8 +3,8 @@
 The format describes itself: every message begins with A3 95 and its number, ``FMT`` messages give the length and
 columns of each; in text each message is a line, ``NAME, value, value``.
 Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity) and ``GPS`` (UTC, fix).
-Heights are above home at take-off (``RelHomeAlt``), else above the ground at rest or the first position. Source: ArduPilot
-``libraries/AP_Logger/LogStructure.h``.
+Heights are above home at take-off (``RelHomeAlt``), else above the ground at rest or the first position.
+Source: ArduPilot ``libraries/AP_Logger/LogStructure.h``.
 """
 
 from __future__ import annotations

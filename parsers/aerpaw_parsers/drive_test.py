@@ -122,8 +122,10 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
     for cell in cells:
         assert cell.rsrp is not None
         level = sheet.numbers(cell.rsrp)
-        row = np.flatnonzero(np.isfinite(level))
-        pci, arfcn = (_or_nan(sheet, place, len(level))[row] for place in (cell.pci, cell.arfcn))
+        pci, arfcn = (_or_nan(sheet, place, len(level)) for place in (cell.pci, cell.arfcn))
+        none = _is_none(sheet, cell.rsrp) & ~(pci > 0) if cell.rat == "nr" or not cell.serving else False
+        row = np.flatnonzero(np.isfinite(level) & ~none)  # a leg or a neighbour that is not there is no reading
+        pci, arfcn = pci[row], arfcn[row]
         qualities = np.stack([_or_nan(sheet, cell.qualities.get(name), len(level))[row] for name in _cells.QUALITIES])
         pci = np.where(pci == np.round(pci), pci, np.nan)  # a fraction is no identity of a cell
         rat = np.full(len(row), _cells.RATS.index(cell.rat), dtype=np.int8)
@@ -156,8 +158,13 @@ def _rat(technology: str) -> int:
 def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:
     if column is None:
         return np.full(count, np.nan)
-    values, meaning = sheet.numbers(column), sheet.meanings[column]
-    return values if meaning is None else np.where(dictionary.is_none(meaning.quantity, values), np.nan, values)
+    return np.where(_is_none(sheet, column), np.nan, sheet.numbers(column))
+
+
+def _is_none(sheet: _sheet.Sheet, column: int) -> BoolArray:
+    meaning = sheet.meanings[column]
+    assert meaning is not None
+    return dictionary.is_none(meaning.quantity, sheet.numbers(column))
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

@@ -11,7 +11,6 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common import kml
-from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
@@ -20,7 +19,8 @@ from . import _sheet, drive_test
 
 _PLACEMARK = re.compile(rb"<Placemark\b")
 _SIGNS = (re.compile(rb'<Data name="TIME">'), re.compile(rb'<Data name="(?:RSRP|LEVEL|NRXLEV\d?|SSRSRP)">'))
-_PLACE = ("Longitude", "Latitude", "Altitude above sea level")
+_PLACE = ("Longitude", "Latitude")
+_MODE = re.compile(rb"<altitudeMode>\s{0,40}(\w{1,20})")
 
 
 def sniff(head: bytes) -> bool:
@@ -29,24 +29,10 @@ def sniff(head: bytes) -> bool:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Cells, KPIs and the track of the phone.
-
-    Raises
-    ------
-    InputError
-        If placemarks share a line.
-    UsageError
-        If no time zone is given.
-    """
+    """Cells, KPIs and the track of the phone; UsageError if no time zone is given."""
     lines = _lines.split(data)
     begin = [match.start() for match in _PLACEMARK.finditer(data)]
     row = lines.number_at(begin)
-    if len(np.unique(row)) < len(row):
-        raise InputError(
-            "several placemarks on a line",
-            expected="a line break before each <Placemark>, as G-NetTrack writes it",
-            cause="a KML that another program wrote anew: its XML has to be indented",
-        )
     texts = [data[first:last] for first, last in zip(begin, [*begin[1:], len(data)][: len(begin)], strict=True)]
     cut = [i for i, text in enumerate(texts) if b"</Placemark>" not in text]
     readings = [_reading(text) for text in texts]
@@ -58,7 +44,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         row=row[timed],
         cells=[[readings[i].get(name, "") for name in names] for i in timed],
         blank_rows=np.setdiff1d(np.flatnonzero(~lines.blank), row[[*timed, *cut]]),
-        rejected=lines.reject_all(row[cut], "a placemark without its end (a cut file?)"),
+        rejected=lines.reject_all(np.setdiff1d(row[cut], row[timed]), "a placemark without its end (a cut file?)"),
+        closed=True,
     )
     rows = _sheet.rows(sheet, options, reader="gnettrack_kml") if timed else None
     if rows is None:
@@ -71,7 +58,11 @@ def _reading(text: bytes) -> dict[str, str]:
     values = {name.decode(): value.decode("utf-8", "replace").strip() for name, value in kml.DATA.findall(text)}
     if (point := kml.POINT.search(text)) is not None:
         place = [b"" if cell is None else cell for cell in point.groups()]
-        values |= {name: cell.decode() for name, cell in zip(_PLACE, place, strict=True)}
+        mode = _MODE.search(text)
+        height = "Altitude AGL" if mode is not None and mode[1] == b"relativeToGround" else "Altitude above sea level"
+        if not place[2].strip(b"0.") or (mode is not None and mode[1].startswith(b"clamp")):
+            place[2] = b""  # on the ground, as KML draws it: no height
+        values |= {name: cell.decode() for name, cell in zip((*_PLACE, height), place, strict=True) if cell}
     return values
 
 

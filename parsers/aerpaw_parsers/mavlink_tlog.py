@@ -39,7 +39,7 @@ def _crc(data: bytes) -> int:
 
 
 def _packet(data: bytes, at: int) -> tuple[int, int, tuple[int, int], bytes] | None:
-    """Length with its time, message number, system and component, and payload of the packet at a place; None if there is none."""
+    """Length with its time, message number, system and component, and payload of a packet; None if there is none."""
     if at + 16 > len(data):
         return None
     stamp = int.from_bytes(data[at : at + 8], "big")
@@ -121,7 +121,7 @@ def _next_mark(data: bytes, at: int) -> int:
 
 
 def _flight(messages: dict[int, list[_Message]], system: int, name: str) -> _autopilot.Flight:
-    """What a vehicle sends: that of the component whose positions they are, as far as it sends it."""
+    """Messages of a vehicle: of the component whose positions they are, as far as it sends them."""
     sources = [item[1] for item in messages[_POSITION] if item[1][0] == system]
     autopilot = max(set(sources), key=sources.count) if sources else (system, 1)
     series: dict[int, _autopilot.Series] = {}

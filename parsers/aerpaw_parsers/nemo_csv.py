@@ -37,14 +37,17 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
         _cells.named(rows, name, values[column], where=np.isfinite(values[column]), about={"rat": "nr"})
         for column, name in _LEVELS
     ]  # before rows without a rank are flagged so
+    place = {name: values[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")}
+    track = rows.stream("telemetry", "phone", place, where=np.isfinite(place["latitude_deg"]), source="Nemo rows")
     yield _nemo.pdsch_rank(rows, dict(values))
     yield from levels
+    yield track
 
 
 READER = _text.reader(
     "nemo_csv",
     "Keysight Nemo NR rank and level, CSV with relative times",
-    kinds=("rank", "rss", "kpi"),
+    kinds=("rank", "rss", "kpi", "telemetry"),
     sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0",
     header=_nemo.HEADER,
     sniff=_nemo.sniff,

@@ -11,14 +11,15 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common import kml
-from aerpaw_cmp.common.units import BoolArray, IntArray
+from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs.jumps import FASTEST_MPS
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from aerpaw_cmp.readers import dictionary
 
-from . import _cells
+from . import _cells, _pose
 from ._nemo import pdsch_rank
 
 _N = rb"(" + _lines.NUMBER + rb"|nan)"
@@ -55,22 +56,40 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     lines = _lines.split(data)
     reports = list(_RECORD.finditer(data))
     row = lines.number_at(item.start() for item in reports)
-    row, first = np.unique(row, return_index=True)
-    texts = [cells[first] for cells in _lines.columns([item.groups(b"") for item in reports], 7)]
     names = ("time", "what", "value", "unit", *_POSITION)
+    column = dict(zip(names, _lines.columns([item.groups(b"") for item in reports], 7), strict=True))
+    in_seconds = _in_seconds(*(_lines.numbers(column[name]) for name in ("time", *_POSITION[:2])))
     rows = _rows.built(
-        lines, row, dict(zip(names, texts, strict=True)), options, reader="nemo_kml", reason=_reason,
-        clock="relative_ms", markup=_markup(lines, row),
+        lines, row, column, options, reader="nemo_kml", reason=_reason,
+        clock="relative_s" if in_seconds else "relative_ms", markup=_markup(lines, row),
     )  # fmt: skip
-    if len(reports) > len(row):
-        rows.warnings.append(f"{len(reports) - len(row)} further reports on lines that hold several were not read")
+    if in_seconds:
+        rows.warnings.append("the times say ms, but then the phone would fly faster than any aircraft: read as seconds")
     position = {name: rows.number(name) for name in _POSITION}
+    about: _pose.Height = {}
+    if np.isfinite(position["altitude_m"]).any():
+        rows.height_from, lost = "assumed", np.isnan(position["latitude_deg"])
+        position["altitude_m"], about = _pose.above_takeoff(rows, position, "unknown", lost)
     what = np.array(rows.text("what"), dtype=object)
     if _is_rank(what[0]) if len(what) else False:
         return rows.result([pdsch_rank(rows, {"ri_raw": rows.number("value"), **position})])
-    streams = [rows.stream("telemetry", "phone", position, source="Nemo placemarks")]
+    streams = [rows.stream("telemetry", "phone", position, source="Nemo placemarks", about=about)]
     streams += [_measured(rows, name, what == name) for name in dict.fromkeys(what.tolist())]
     return rows.result(streams)
+
+
+def _in_seconds(time_ms: FloatArray, latitude: FloatArray, longitude: FloatArray) -> bool:
+    """Check whether times called milliseconds are seconds: so read the phone is too fast, and in seconds it is not."""
+    if len(time_ms) < _FEW:
+        return False
+    step_m = 111_000.0 * np.hypot(np.diff(latitude), np.diff(longitude) * np.cos(np.radians(latitude[0])))
+    step_s = np.abs(np.diff(time_ms)) / 1e3
+    moving = (step_s > 0) & (step_m > 0)
+    speed_mps = float(np.median(step_m[moving] / step_s[moving])) if moving.sum() >= _FEW else 0.0
+    return FASTEST_MPS < speed_mps <= 1e3 * FASTEST_MPS
+
+
+_FEW = 4
 
 
 def _is_rank(name: str) -> bool:

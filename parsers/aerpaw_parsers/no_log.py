@@ -16,6 +16,7 @@ from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
 from . import (
+    cell_search,
     flight_mat,
     gnettrack_kml,
     gpx,
@@ -32,6 +33,10 @@ _PATTERN = re.compile(rb"Frequency ?= ?\d{1,6} ?\(MHz\)")
 _CUT = re.compile(rb"Phi ?= ?-?\d{1,3}(?:\.\d{1,6})? ?\(deg\)")
 _GAIN = re.compile(rb"\A(?:\d{1,3}\s*\n)?Frequency\tE ?Total\. ?dB")
 _LEVELS = re.compile(rb"(?i)g-?net ?track|\b(?:rsrp|rxlev|rscp|level)\b\W{0,20}-?\d{2,3}\b")
+_TIMED = re.compile(rb"(?i)\btime|<when>|\b\d\d:\d\d:\d\d\b")
+_WIFI = re.compile(rb'\A[\s\[]*\{[^\n]{0,400}"log_type"\s*:\s*"wifi"|\A[\s\[]*\{[^\n]{0,400}"connected_bssid"')
+_NMEA = re.compile(rb"\$[A-Z]{2}(?:GGA|RMC|GSA|GSV|GLL|VTG|ZDA),")
+_WEB = re.compile(rb"(?i)\A\s*(?:<!doctype html|<html\b)")
 _CELL_SEARCH = re.compile(rb"Found CELL \d{1,5}\.\d MHz, EARFCN=\d")
 _PLAN = re.compile(rb'"fileType"\s*:\s*"Plan"|\A\s*QGC WPL \d+')
 _PLANNING = re.compile(rb"(?im)^(?:HORIZONTAL\s+\d{1,4}|REVNUM:,TIA)")
@@ -85,6 +90,10 @@ def _plain_kml(head: bytes) -> bool:
 
 def _gpx(head: bytes) -> bool:
     return re.search(rb"<gpx\b", head[:4096]) is not None and not gpx.sniff(head)
+
+
+def _nmea(head: bytes) -> bool:
+    return _lines.mostly(head, _NMEA)
 
 
 def _transcript(head: bytes) -> bool:
@@ -165,8 +174,13 @@ _KINDS: tuple[tuple[str, str, _Test], ...] = (
     ("matlab_other", "MATLAB variables that are no flight", _other_mat),
     ("power_references", "a table of USRP reference powers", _POWER_REFS),
     ("antenna_gain", "antenna gain over frequency, without directions", _GAIN),
+    ("kml_untimed", "a KML of levels and positions without times: give the program's text log or CSV",
+     lambda head: _kml(head) and _LEVELS.search(head) is not None and _TIMED.search(head) is None),
     ("kml_levels", "a KML with levels in a layout that is not read: give the program's text log or CSV",
-     lambda head: _kml(head) and _LEVELS.search(head) is not None),
+     lambda head: _kml(head) and _LEVELS.search(head) is not None and _TIMED.search(head) is not None),
+    ("wifi_scan", "a Wi-Fi scan of PawPrints (access points, no cells)", _WIFI),
+    ("nmea", "NMEA sentences of a receiver: convert them to GPX (gpsbabel does)", _nmea),
+    ("web_page", "a web page (a login or an error page in place of the download?)", _WEB),
     ("kml_other", "a KML without measurements (a geofence, a map, a route for 'aerpaw-cmp predict')", _plain_kml),
     ("gpx_other", "a GPX without points", _gpx),
     ("at_transcript", "a modem transcript without times (AT answers; 'aerpaw-cmp tap' logs them with times)",
@@ -179,8 +193,8 @@ _KINDS: tuple[tuple[str, str, _Test], ...] = (
     ("positions", "a list of positions without times", _places),
     ("document", "a page of text", _document),
     ("flight_script", "the console of a flight script, without positions", _flight_talk),
-    ("cell_search", "a cell search of srsRAN: cells at one moment, without times",
-     _CELL_SEARCH),
+    ("cell_search_untimed", "a cell search of srsRAN: cells at one moment, without times",
+     lambda head: _CELL_SEARCH.search(head) is not None and not cell_search.sniff(head)),
     ("flight_plan", "a planned route, not a flight: 'aerpaw-cmp predict' reads it",
      _PLAN),
     ("flight_yaml", "a flight file of settings, not a log: give it to 'report'", _yaml),

@@ -1,5 +1,6 @@
 """PawPrints, AERPAW's logger of an Android phone: JSON lines with LTE and NR cells, or the text of 2023.
 
+Since autumn 2024 positions stand in a log of their own, ``location.txt``, as objects (2023: ``GPS_LOG_START,...``).
 ``companion_abs_time`` (ms of UTC, the clock of the aircraft's computer) is the time; where a line lacks it,
 ``abs_time``, the phone's own. A cell's level is its RSRP; 2147483647 and ``Unavailable`` mean that there is none.
 """
@@ -19,7 +20,7 @@ from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import _cells, _json, _pose
 
-_MARKS = (b'"cells"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_abs_time"')
+_MARKS = (b'"cells"', b'"latitude"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_abs_time"')
 
 # A second START on a line is that of the next reading behind a torn one, whose time is another.
 _TEXT = re.compile(rb"^CELL_LOG_START,(\d{13}),(?:(?!CELL_LOG_START).)*?,?CELL_LOG_STOP[ \t]*\r?$", re.MULTILINE)
@@ -33,7 +34,7 @@ _OF_TEXT = {
 
 def sniff(head: bytes) -> bool:
     """Check whether it is the text of 2023, or the first line is an object with a phone's cells and times."""
-    if head.startswith(b"CELL_LOG_START,"):
+    if head.startswith((b"CELL_LOG_START,", b"GPS_LOG_START,")):
         return True
     first = head.lstrip(b"\xef\xbb\xbf[ \r\n").split(b"\n", 1)[0]
     return (
@@ -103,6 +104,32 @@ def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result(_cells.streams(rows, readings, source="PawPrints"))
 
 
+_GPS_TEXT = re.compile(
+    rb"^GPS_LOG_START,(?:(\d{13}),)?([\d.]{1,20}),-?[\d.]{1,20},(-?[\d.]{1,20}),(-?[\d.]{1,20}),(-?[\d.]{1,20}),"
+    rb"[^\n]{0,80}?GPS_LOG_STOP[ \t]*\r?$",
+    re.MULTILINE,
+)
+
+
+def _read_location(data: bytes, options: ReadOptions) -> ReadResult:
+    """Positions of the text of 2023: seconds since the start, or milliseconds of UTC, and the place."""
+    lines = _lines.split(data)
+    row, groups = _lines.match(lines, _GPS_TEXT)
+    epoch, *column = _lines.columns(groups, 5)
+    dated = bool(len(row)) and bool((epoch != b"").all())
+    names = ("time", "latitude", "longitude", "altitude")
+    texts = dict(zip(names, [epoch if dated else column[0], *column[1:]], strict=True))
+    rows = _rows.built(
+        lines, row, texts, options, reader="pawprints",
+        reason=lambda _line: "not a whole 'GPS_LOG_START ... GPS_LOG_STOP' (torn line?)",
+        clock="epoch_ms" if dated else "relative_s",
+    )  # fmt: skip
+    places = [
+        {key: float(rows.columns[key][i]) for key in ("latitude", "longitude", "altitude")} for i in range(len(rows))
+    ]
+    return rows.result([_track(rows, places)])
+
+
 def _nr(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
     """Level of the NR leg: the phone tells it apart from the cells, without a PCI."""
     legs = [_json.inside(item, "nr_signal_strength") for item in entries]
@@ -137,16 +164,18 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """A level stream per LTE or NR cell, the level of the NR leg, and the phone's track where it is logged."""
     if data[:4096].lstrip().startswith(b"CELL_LOG_START,"):
         return _read_text(data, options)
+    if data[:4096].lstrip().startswith(b"GPS_LOG_START,"):
+        return _read_location(data, options)
     lines = _lines.split(data)
     parsed = _json.objects(lines)
     entries = parsed.values
     time = _json.column(entries, "companion_abs_time", "abs_time")
     rows = _rows.built(
         lines, parsed.row, {"time": time}, options, reader="pawprints", reason=_json.bracket, clock="epoch_ms",
-        extra=parsed.rejected, markup=parsed.more,
+        extra=parsed.rejected, markup=parsed.more, closed=parsed.closed,
     )  # fmt: skip
     timed = [entries[i] for i in rows.at.tolist()]
-    if any("companion_abs_time" not in item for item in timed):
+    if any("companion_abs_time" not in item and "cells" in item for item in timed):
         rows.warnings.append("some lines lack companion_abs_time: the phone's own clock was taken there")
     return rows.result(
         [_track(rows, timed), *_cells.streams(rows, _readings(timed), source="PawPrints"), _nr(rows, timed)]

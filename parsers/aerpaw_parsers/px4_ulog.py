@@ -3,8 +3,8 @@
 The format describes itself: ``F`` messages give the fields of each topic, ``A`` its number, ``D`` its data. Read
 are ``vehicle_global_position``, ``vehicle_attitude`` (quaternion), ``vehicle_local_position`` (velocity) and
 ``vehicle_gps_position`` or ``sensor_gps`` (UTC, fix; the position too, where the log has no global position);
-instance 0 of each, of receivers the one with most fixes. Heights are above ``home_position`` as it was at take-off, else
-above the ground at rest or the first position.
+instance 0 of each, of receivers the one with most fixes. Heights are above ``home_position`` as it was at take-off,
+else above the ground at rest or the first position.
 Source: PX4 guide, "ULog File Format".
 """
 

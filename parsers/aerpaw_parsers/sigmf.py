@@ -6,8 +6,10 @@ RSS in dB re full scale. A value is a list (a flight) or a number (a burst); a g
 for captures without it. Sounder: ``core:timestamp`` (epoch), ``core:rx_location``, ``core:rotation``,
 ``core:velocity``, ``core:frequency``.
 
-Without values the power of each 20 ms of samples is read from the ``.sigmf-data`` beside: 10 log10 of the mean of
-abs(x)^2 over all of the burst, dB re full scale of the data type. The lines of the account are those values.
+Captures of several frequencies give a series each; the bytes of headers (``core:header_bytes``) are no samples, and
+unsigned samples count from the middle of their range. Without values the power of each 20 ms of samples is read from
+the ``.sigmf-data`` beside: 10 log10 of the mean of abs(x)^2 over all of the burst, dB re full scale of the data type.
+The lines of the account are those values.
 """
 
 from __future__ import annotations
@@ -32,7 +34,9 @@ _MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 _BURST_S = 0.02
 _SAMPLES = {
     "cf64": ("f8", 1.0), "cf32": ("f4", 1.0), "ci32": ("i4", 2.0**31), "ci16": ("i2", 2.0**15), "ci8": ("i1", 2.0**7),
-    "cu8": ("u1", 2.0**7), "rf64": ("f8", 1.0), "rf32": ("f4", 1.0), "ri16": ("i2", 2.0**15),
+    "cu8": ("u1", 2.0**7), "cu16": ("u2", 2.0**15), "cu32": ("u4", 2.0**31), "ru8": ("u1", 2.0**7),
+    "ru16": ("u2", 2.0**15), "ru32": ("u4", 2.0**31), "ri8": ("i1", 2.0**7), "ri32": ("i4", 2.0**31),
+    "rf64": ("f8", 1.0), "rf32": ("f4", 1.0), "ri16": ("i2", 2.0**15),
 }  # fmt: skip
 _LEVELS = {"RSS1": "USRP1", "RSS2": "USRP2", "RSS": "USRP1", "rss1": "USRP1", "rss2": "USRP2"}
 _PLACE = (("latitude_deg", ("mY", "y", "latitude", "lat")), ("longitude_deg", ("mX", "x", "longitude", "lon")),
@@ -95,10 +99,20 @@ def _rows_of(texts: list[str], options: ReadOptions) -> _rows.Rows:
     )
 
 
-def _level(rows: _rows.Rows, channel: str, values: FloatArray) -> Stream | None:
+def _at_frequencies(rows: _rows.Rows, channel: str, values: FloatArray, frequency_hz: FloatArray) -> Iterator[Stream]:
+    """Levels of a channel, a series for each frequency of the captures."""
     level, flag = rows.level(np.where(np.isfinite(values), values, np.nan)[rows.at])
-    unit = rows.options.unit or "dB re full scale"
-    return rows.stream("rss", channel, {"rss_db": level}, flag=flag, channel=channel, unit=unit)
+    unit, tuned_hz = rows.options.unit or "dB re full scale", frequency_hz[rows.at]
+    known = np.unique(tuned_hz[np.isfinite(tuned_hz)]).tolist()
+    for carrier_hz in known if len(known) > 1 else [known[0] if known else np.nan]:
+        name = channel if len(known) < 2 else f"{channel}_{carrier_hz / 1e6:g}MHz"
+        where = tuned_hz == carrier_hz if len(known) > 1 else None
+        stream = rows.stream(
+            "rss", name, {"rss_db": level}, where=where, flag=flag, channel=name, unit=unit,
+            frequency_hz=rows.options.frequency_hz or (carrier_hz if np.isfinite(carrier_hz) else None),
+        )  # fmt: skip
+        if stream is not None:
+            yield stream
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -149,7 +163,9 @@ def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tu
         if len(values) != len(texts):
             raise InputError(f"{len(values)} values of {name} and {len(texts)} times", expected="as many of each")
         rows = _rows_of(texts, options)
-        if (stream := _level(rows, channel, values)) is not None:
+        counts = [len(_list(_json.inside(capture, "measurement:values").get(name))) for capture in captures]
+        tuned = [_json.number(capture.get("core:frequency")) for capture in captures]
+        for stream in _at_frequencies(rows, channel, values, np.repeat(tuned, counts)):
             yield rows, stream
 
 
@@ -197,50 +213,57 @@ def _powers(
     tuple of Rows and Stream
         Of each channel.
     """
-    samples = _samples(_json.inside(meta, "global"), options)
+    samples = _samples(meta, options)
     rate = _json.number(_json.inside(meta, "global").get("core:sample_rate"))
     if samples is None or not rate > 0:
         return
     size = max(1, round(_BURST_S * rate))
     texts: list[str] = []
     powers: list[FloatArray] = []
-    starts = [min(max(_integer(item.get("core:sample_start"), 0), 0), len(samples)) for item in captures]
+    frequencies: list[float] = []
+    middle = _full_scale(meta) - 0.5 if samples.dtype.kind == "u" else 0.0
+    zero = _integer(_json.inside(meta, "global").get("core:offset"), 0)
+    starts = [min(max(_integer(item.get("core:sample_start"), 0) - zero, 0), len(samples)) for item in captures]
     for capture, start, end in zip(captures, starts, [*starts[1:], len(samples)], strict=True):
         stamp = next((capture[key] for key in ("core:datetime", "core:timestamp", "core:time") if key in capture), None)
         if stamp is None:
             warnings.append("captures without core:datetime are left out")
             continue
         for at in range(start, end - size // 2, size):
-            piece = samples[at : min(at + size, end)].astype(np.float64)
+            piece = samples[at : min(at + size, end)].astype(np.float64) - middle
             texts.append(_later(str(stamp), (at - start) / rate))
+            frequencies.append(_json.number(capture.get("core:frequency")))
             with np.errstate(all="ignore"):  # damaged samples may be any number
                 powers.append((piece**2).sum(axis=2).mean(axis=0))
     if not texts:
         return
     with np.errstate(all="ignore"):
-        level = 10 * np.log10(np.array(powers)) - _full_scale_db(meta)
+        level = 10 * np.log10(np.array(powers)) - 20 * np.log10(_full_scale(meta))
     rows = _rows_of(texts, options)
     for i in range(level.shape[1]):
-        if (stream := _level(rows, f"USRP{i + 1}", level[:, i])) is not None:
+        for stream in _at_frequencies(rows, f"USRP{i + 1}", level[:, i], np.array(frequencies)):
             yield rows, stream
 
 
-def _samples(common: dict[str, Any], options: ReadOptions) -> AnyArray | None:
+def _samples(meta: dict[str, Any], options: ReadOptions) -> AnyArray | None:
     """The samples beside the meta file as they are stored, shape (n, channels, 1 or 2); None where there are none."""
-    kind = str(common.get("core:datatype", ""))
+    kind = str(_json.inside(meta, "global").get("core:datatype", ""))
     data = options.neighbour(_data_name(options)) if options.neighbour else None
+    common, captures = _json.inside(meta, "global"), _json.listed(meta, "captures")
     if data is None or kind.split("_")[0] not in _SAMPLES:
         return None
     stored = np.dtype((">" if kind.endswith("_be") else "<") + _SAMPLES[kind.split("_")[0]][0])
     shape = (min(max(_integer(common.get("core:num_channels"), 1), 1), 64), 2 if kind.startswith("c") else 1)
     frame_bytes = stored.itemsize * shape[0] * shape[1]
+    for capture in sorted(captures, key=lambda item: _integer(item.get("core:sample_start"), 0)):
+        begin = _integer(capture.get("core:sample_start"), 0) * frame_bytes
+        data = data[:begin] + data[begin + max(_integer(capture.get("core:header_bytes"), 0), 0) :]
     return np.frombuffer(data[: len(data) // frame_bytes * frame_bytes], dtype=stored).reshape(-1, *shape)
 
 
-def _full_scale_db(meta: dict[str, Any]) -> float:
-    """Level of the largest sample of the data type, as stored [dB]."""
-    kind = str(_json.inside(meta, "global").get("core:datatype", "")).split("_")[0]
-    return float(20 * np.log10(_SAMPLES[kind][1]))
+def _full_scale(meta: dict[str, Any]) -> float:
+    """Largest sample of the data type, as stored."""
+    return _SAMPLES[str(_json.inside(meta, "global").get("core:datatype", "")).split("_")[0]][1]
 
 
 def _integer(value: Any, default: int) -> int:

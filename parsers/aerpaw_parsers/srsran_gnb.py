@@ -106,6 +106,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
         clock=clock,
         extra=reports.rejected,
         markup=np.concatenate((mute, reports.more)),
+        closed=reports.closed,
     )
     rows.warnings += warnings
     pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(entries[with_ue[at]])]

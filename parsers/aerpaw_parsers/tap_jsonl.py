@@ -12,9 +12,9 @@ integers [ns]: UTC since 1970 and the monotonic clock.
 ``rotate end``  last line of a segment, and of the last one
 
 An exchange is accepted: as a record of rank (``nr5g_csi``, ``lte_csi``), of RSS (RSRP of ``servingcell``, a series for
-each cell: PCI, ARFCN), or as a companion of these. Everything else that is sound counts as comment. The time of a record is the middle between
-command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR beside a rank are those of the last
-``servingcell`` within 2 s.
+each cell: PCI, ARFCN), or as a companion of these. Everything else that is sound counts as comment. The time of a
+record is the middle between command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR beside a rank
+are those of the last ``servingcell`` within 2 s.
 """
 
 from __future__ import annotations

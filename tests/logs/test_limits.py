@@ -36,7 +36,7 @@ def test_absurd_levels_are_flagged_and_void(value: float, unit: str) -> None:
 
 
 def test_what_can_be_is_left_alone_object_and_all() -> None:
-    stream = Stream("rss", "s", frame_of("rss", rss_db=np.array([-200.0, 50.0, np.nan, 0.0, -0.0])), {"unit": "dBm"})
+    stream = Stream("rss", "s", frame_of("rss", rss_db=np.array([-200.0, 30.0, np.nan, -1.0, -0.0])), {"unit": "dBm"})
     result = ReadResult("r", (stream,), 5, 5, 0)
     assert check(result) is result
 

@@ -53,7 +53,7 @@ def tlog(version: int = 2, system: int = 1, count: int = COUNT) -> bytes:
     for i in range(count):
         boot = 30_000 + 1000 * i
         position = struct.pack(
-            "<IiiiihhhH", boot, 357_300_000 + i, -787_000_000 - i, 90_000, 1000 * i, 150, 250, -50, 9000
+            "<IiiiihhhH", boot, 357_300_000 + i, -787_000_000 - i, 90_000 + 1000 * i, 1000 * i, 150, 250, -50, 9000
         )
         attitude = struct.pack("<Iffffff", boot, 0.0261799388, -0.0436332313, 1.5707963268, 0.0, 0.0, 0.0)
         gps = struct.pack("<QiiiHHHHBB", boot * 1000, 357_300_000, -787_000_000, 90_000, 90, 90, 100, 0, 4, 14)

@@ -268,6 +268,13 @@ CONVERTED = (
     b"3,-78.7000001,35.73000\n"
 )
 VEHICLE_TITLE = b"num,Longitude,Latitude,Altitude,Volt,Battery Level,time,Fix,Number of Satellite\r\n" + VEHICLE_9
+CELL_SEARCH = (
+    b"Found CELL MHz, 3500.0,  EARFCN, 7399, PHYID, 1, PRB, 50,  ports, 1, PSS power dBm, -30.1,  PSR, 2.3, "
+    b"2025-03-02 10:00:00:250\n"
+    b"Found CELL MHz, 3500.0,  EARFCN, 7399, PHYID, 2, PRB, 50,  ports, 1, PSS power dBm, -35.1,  PSR, 2.1, "
+    b"2025-03-02 10:00:01:250\n"
+    b"Found CELL MHz, 3500.0,  EARFCN, 73\n"
+)
 QUECTEL_CONSOLE = (
     b"2025-03-02 10:00:00 Serving cell Params \n\n"
     b"2025-03-02 10:00:01 +----+--------------+\n"
@@ -519,6 +526,7 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     },
     "pose_csv": {"airdata": (AIRDATA, 2, 0), "dji": (DJI, 2, 0), "converted": (CONVERTED, 2, 1)},
     "quectel_console": {"tables": (QUECTEL_CONSOLE, 4, 1)},
+    "cell_search": {"table": (CELL_SEARCH, 2, 1)},
     "srsran_gnb": {
         "console": (SRSRAN_GNB, 3, 1),
         "old_console": (SRSRAN_GNB_OLD, 1, 0),
@@ -570,12 +578,19 @@ NO_LOGS: dict[str, bytes] = {
     "positions": b"35.7281, -78.6973\r\n35.7291, -78.6992\r\n",
     "document": b"# A page\n\n## Of text\n\nwords\n",
     "flight_script": b"[2025-03-02 10:00:00.000001] Taking off\n[2025-03-02 10:00:05.000001] Waypoint 0\n",
-    "kml_levels": (
+    "kml_untimed": (
         b"<?xml version='1.0'?>\n<kml><Document><Placemark><description>RSRP: -81 dBm</description>"
         b"<Point><coordinates>-78.7,35.7</coordinates></Point></Placemark></Document></kml>\n"
     ),
+    "wifi_scan": b'{"rel_time":1.0,"abs_time":1740927600000,"log_type":"wifi","aps":[]}\n',
+    "nmea": b"$GPGGA,140000.00,3543.68,N,07841.76,W,1,08,0.9,111.3,M,-32.0,M,,*50\r\n",
+    "web_page": b"<!DOCTYPE html>\n<html><body>Log in</body></html>\n",
+    "kml_levels": (
+        b"<?xml version='1.0'?>\n<kml><Document><Placemark><description>10:00:00 RSRP: -81 dBm</description>"
+        b"<Point><coordinates>-78.7,35.7</coordinates></Point></Placemark></Document></kml>\n"
+    ),
     "antenna_gain": b"1\r\nFrequency\tE Total. dB\r\n3300000000\t-1.25\r\n",
-    "cell_search": (
+    "cell_search_untimed": (
         b"Found 1 cells\nFound CELL 930.0 MHz, EARFCN=3500, PHYID=2, 50 PRB, 1 ports, PSS power=-21.3 dBm\n\nBye\n"
     ),
     "flight_plan": b'{\n    "fileType": "Plan",\n    "geoFence": {},\n    "mission": {"items": []}\n}\n',

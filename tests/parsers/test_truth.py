@@ -536,7 +536,7 @@ BINARY: dict[str, tuple[str, str, bytes, Truth, ReadOptions]] = {
     "MAVLink 1": ("mavlink_tlog", "x.tlog", autopilots.tlog(1), {"vehicle": POSE}, LOCAL),
     "MAVLink 2": ("mavlink_tlog", "x.tlog", autopilots.tlog(2), {"vehicle": POSE}, LOCAL),
     "MAVLink, a second vehicle for a short while": (
-        "mavlink_tlog", "x.tlog", autopilots.tlog(2) + autopilots.tlog(2, system=7, count=2), {"vehicle": POSE}, LOCAL
+        "mavlink_tlog", "x.tlog", autopilots.tlog(2) + autopilots.tlog(2, system=7, count=2), {"vehicle_1": POSE}, LOCAL
     ),
     **{
         f"PX4, position of the {place}": ("px4_ulog", "x.ulg", autopilots.ulog(place), {"vehicle": POSE}, LOCAL)

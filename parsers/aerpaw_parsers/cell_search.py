@@ -1,0 +1,66 @@
+"""AERPAW's cell search: ``Found CELL MHz, 3500.0, EARFCN, 7399, PHYID, 1, ... PSS power dBm, -30.1, PSR, 2.3, <time>``.
+
+Console and table of srsRAN's program as AERPAW changed it: a line per cell and sweep, its time behind it (milliseconds
+behind a colon, or as ``asctime`` prints it) or in front, from ``ts``. The level is the power of the synchronisation
+signal, no RSRP: a series per PCI and EARFCN.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult
+
+from . import _cells, _stamps
+
+_N = rb"(-?\d{1,9}(?:\.\d{1,9})?)"
+_ROW = re.compile(
+    rb"^(?:\[?([^\]\n]{8,40}?)\]? )?Found CELL (?:MHz, ?" + _N + rb"|" + _N + rb" MHz),\s{1,3}EARFCN[,=] ?" + _N
+    + rb", ?PHYID[,=] ?" + _N + rb",[^\n]{0,60}?PSS power(?: dBm, ?|= ?)" + _N + rb"(?: dBm)?"
+    + rb"(?:,\s{1,3}PSR[,=] ?" + _N + rb")?(?:,? ?([A-Z\d][^\n\r,]{14,40}?))?[ \t]*\r?$",
+    re.MULTILINE,
+)  # fmt: skip
+
+
+def sniff(head: bytes) -> bool:
+    """Check whether a cell stands in it with a time."""
+    first = _ROW.search(head)
+    return first is not None and bool(first[1] or first[8])
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """A level series per cell; UsageError if no time zone is given."""
+    lines = _lines.split(data)
+    row, groups = _lines.match(lines, _ROW)
+    texts = [(group[7] or group[0]).decode("ascii", "replace") for group in groups]
+    clock, time, warnings = _stamps.read(texts, options)
+    rows = _rows.built(
+        lines, row, {"time": time}, options, reader="cell_search", clock=clock,
+        reason=lambda line: "an incomplete cell (torn line?)" if b"Found CELL" in line else None,
+    )  # fmt: skip
+    rows.warnings += warnings
+    cells = [groups[i] for i in rows.at.tolist()]
+    readings = [
+        _cells.Reading(
+            row=i, rat="lte", pci=float(cell[4]), arfcn=float(cell[3]), rsrp_dbm=float(cell[5]), serving=None,
+            qualities=(np.nan,) * len(_cells.QUALITIES),
+        )
+        for i, cell in enumerate(cells)
+    ]  # fmt: skip
+    return rows.result(_cells.streams(rows, readings, source="cell search", quantity="PSS power"))
+
+
+READER = Reader(
+    name="cell_search",
+    title="AERPAW cell search (srsRAN), console or table: power of the synchronisation signal per cell",
+    kinds=("rss",),
+    sample="Found CELL MHz, 3500.0,  EARFCN, 7399, PHYID, 1, PRB, 50,  ports, 1, PSS power dBm, -30.1,  PSR, 2.3, "
+    "2025-01-01 12:00:07:250",
+    sniff=sniff,
+    read=read,
+)

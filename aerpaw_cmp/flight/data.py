@@ -493,7 +493,7 @@ def _check_place(data: FlightData, telemetry: Sequence[tuple[str, Stream]]) -> N
     ]
     for path, stream in flown:
         latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
-        near = _nearest_m(data.site, latitude, longitude)
+        near = nearest_m(data.site, latitude, longitude)
         if not near > FAR_M:
             continue
         turned = {
@@ -502,7 +502,7 @@ def _check_place(data: FlightData, telemetry: Sequence[tuple[str, Stream]]) -> N
             "the latitude lacks its sign (south is negative)": (-latitude, longitude),
             "latitude and longitude are exchanged and a sign is missing": (longitude, -latitude),
         }
-        causes = [why for why, angles in turned.items() if _nearest_m(data.site, *angles) <= FAR_M]
+        causes = [why for why, angles in turned.items() if nearest_m(data.site, *angles) <= FAR_M]
         raise InputError(
             f"the positions come no nearer than {near / 1000.0:.0f} km to any tower of site {data.site.name!r}",
             expected=f"a flight within {FAR_M / 1000.0:.0f} km of a tower",
@@ -511,7 +511,7 @@ def _check_place(data: FlightData, telemetry: Sequence[tuple[str, Stream]]) -> N
         )
 
 
-def _nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -> float:
+def nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -> float:
     """Least horizontal distance of positions to any tower [m]; NaN without a position."""
     can = (np.abs(latitude_deg) <= 90.0) & (np.abs(longitude_deg) <= 180.0)
     if not can.any():

@@ -256,9 +256,12 @@ def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) 
     if item.command in _LANDINGS:
         return 0.0
     if item.frame in _SEA_LEVEL_FRAMES:
-        if len(home) < 3 or math.isnan(home[2]):
-            cause = "set the planned home position"
-            raise InputError("heights above sea level without the take-off's", expected="heights", cause=cause)
+        if len(home) < 3 or math.isnan(home[2]) or home[2] == 0.0:  # programs write 0 where nobody set it
+            raise InputError(
+                f"a waypoint {height:g} m above sea level, and a home position without an altitude",
+                expected="heights above take-off, or the ground's height at the planned home position",
+                cause="the home position was not set: set it in the planning program and save again",
+            )
         return height - home[2]
     if item.frame in _TERRAIN_FRAMES:
         route.remark("Heights above the ground below each point are taken as heights above take-off.")
@@ -269,7 +272,18 @@ def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) 
 
 # --- KML ---------------------------------------------------------------------------------------------
 
+<<<<<<< HEAD
 _HEADING = re.compile(r"\s*(-?\d+(?:\.\d*)?)")
+=======
+# A line whose first point lies no farther below the others does not begin on the ground.
+_CLIMB_M = 5.0
+
+_SHAPE = re.compile(r"<(LineString|Point|gx:Track)\b[^>]*>(.*?)</\1>", re.DOTALL)
+_MODE = re.compile(r"<(?:gx:)?altitudeMode>\s*(\w+)\s*<")
+_COORDINATES = re.compile(r"<coordinates>(.*?)</coordinates>", re.DOTALL)
+_TRACK_POINT = re.compile(r"<gx:coord>(.*?)</gx:coord>", re.DOTALL)
+_TRACK_HEADING = re.compile(r"<gx:angles>\s*(-?[\d.]+)")
+>>>>>>> 21757957 (Ask for the take-off's height of routes above sea level)
 
 
 def _root(data: bytes) -> ElementTree.Element:
@@ -298,7 +312,13 @@ def _kml(data: bytes) -> _Route:
             height = math.nan if len(place) < 3 or (clamped and place[2] == 0.0) else place[2]
             route.add(place[1], place[0], height, yaw)
     if sea_level:
-        zero = route.points[0][2]
+        zero, highest = route.points[0][2], max(point[2] for point in route.points)
+        if highest - zero < _CLIMB_M:
+            raise InputError(
+                f"heights of {zero:g} to {highest:g} m above sea level, and nothing says how high the take-off is",
+                expected="altitudeMode relativeToGround, or a first point on the ground",
+                cause="a line drawn at one height",
+            )
         route.points = [(*point[:2], point[2] - zero, *point[3:]) for point in route.points]
         route.remark(f"Heights are above sea level: the first point's, {zero:.1f} m, is taken as the take-off's.")
     return route

@@ -81,6 +81,33 @@ def test_heights_above_sea_level_of_a_map_count_from_its_first_point_and_say_so(
     assert any("sea level" in text and "130.0 m" in text for text in route.attrs["remarks"])
 
 
+REPORTED = Path(__file__).parents[1] / "reported"
+
+
+@pytest.mark.parametrize("altitude", [0.0, None])
+def test_heights_above_sea_level_want_the_homes_altitude(altitude: float | None, tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="152 m above sea level, and a home position without an altitude"):
+        read_route(REPORTED / "route_amsl_home0/homeless.waypoints")
+    content = json.loads(plan(*(waypoint(place, frame=0) for place in POINTS)))
+    content["mission"]["plannedHomePosition"][2] = altitude
+    (tmp_path / "a.plan").write_text(json.dumps(content))
+    with pytest.raises(InputError, match="above sea level, and a home position without an altitude"):
+        read_route(tmp_path / "a.plan")
+    content["mission"]["items"] = [waypoint(place) for place in POINTS]  # heights above home need none
+    (tmp_path / "a.plan").write_text(json.dumps(content))
+    assert len(read_route(tmp_path / "a.plan")) == 3
+
+
+def test_a_line_at_one_height_above_sea_level_is_a_question(tmp_path: Path) -> None:
+    flat = " ".join(f"{lon},{lat},152" for lat, lon, _ in POINTS)
+    file = tmp_path / "a.kml"
+    file.write_bytes(
+        kml(f"<LineString><altitudeMode>absolute</altitudeMode><coordinates>{flat}</coordinates></LineString>")
+    )
+    with pytest.raises(InputError, match="nothing says how high the take-off is"):
+        read_route(file)
+
+
 def test_yaw_of_a_plan(tmp_path: Path) -> None:
     """A waypoint's own yaw counts on PX4 and not on ArduPilot, which turns by CONDITION_YAW."""
     file = tmp_path / "a.plan"

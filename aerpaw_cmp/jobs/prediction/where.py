@@ -12,7 +12,7 @@ import pandas as pd
 from ...common.errors import InputError, UsageError, parsing
 from ...common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples
-from ...flight.data import FlightData, load_data
+from ...flight.data import FAR_M, FlightData, load_data, nearest_m
 from ...flight.pose.track import interpolated
 from ...flight.settings import FlightFile, load_flight
 from ...flight.simulate import planned_poses
@@ -253,7 +253,16 @@ def _local_points(path: Path, heading_deg: float | None) -> Targets | None:
 
 def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
     table = read_route(where, height_m=options.heights_m[0])
-    east, north = site.frame.to_local(table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy())
+    place = table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy()
+    east, north = site.frame.to_local(*place)
+    if (away_m := nearest_m(site, *place)) > FAR_M:
+        exchanged = nearest_m(site, *place[::-1]) <= FAR_M
+        raise InputError(
+            f"the route comes no nearer than {away_m / 1000.0:.0f} km to any tower of site {site.name!r}",
+            expected="latitude, longitude near the site",
+            cause="latitude and longitude are exchanged" if exchanged else "a route of another place",
+            path=where,
+        )
     up = np.maximum(table["altitude_m"].to_numpy(np.float64) + site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
     position, yaw = np.column_stack([east, north, up]), table["yaw_deg"].to_numpy(np.float64)
     remarks = tuple(table.attrs.get("remarks", ()))

@@ -399,6 +399,7 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         with _at("towers", name):
             towers[name] = _tower(name=name, model=tower, site=model, frame=frame, datum=datum, dem=dem, notes=notes)
             _check_tower(towers[name], model.area_m, frame)
+    notes += _disagreements(model, towers, datum, dem)
     with _at("area_m"):
         area = _area(model.area_m, towers)
     buildings = tuple(_building(item, outline, dem) for item, outline in _outlines(model.buildings, "buildings", frame))
@@ -428,6 +429,30 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         scene=scene,
         merge_m=1e-3 if model.scene is None else model.scene.merge_m,
     )
+
+
+# Elevation models and surveys agree within this [m]; geoid and ellipsoid do not.
+_HEIGHTS_AGREE_M = 5.0
+
+
+def _disagreements(model: SiteModel, towers: Mapping[str, Tower], datum: VerticalDatum, dem: Dem | None) -> list[str]:
+    """Sentences on grounds that the file states and its elevation model contradicts."""
+    if dem is None or model.dem is None:
+        return []
+    pairs = []
+    if (ground := model.origin.ground) is not None and ground.reference is model.dem.reference:
+        pairs.append(("origin.ground", ground.height().value_m, float(dem.absolute_m(0.0, 0.0))))
+    for name, tower in model.towers.items():
+        stated = tower.ground_offset_m
+        if tower.ground is not None:
+            stated = datum.up_m(tower.ground.height(), name)
+        if stated is not None:
+            pairs.append((f"the ground of tower {name}", stated, float(towers[name].ground_m)))
+    return [
+        f"{what} is stated as {stated:.1f} m, the elevation model has {modelled:.1f} m: is one of another datum?"
+        for what, stated, modelled in pairs
+        if abs(stated - modelled) > _HEIGHTS_AGREE_M
+    ]
 
 
 def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[str]]:

@@ -119,11 +119,11 @@ def test_site_stands_on_its_ground(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("origin_m", "tower_m", "told"),
+    ("origin_m", "tower_m", "contradicted"),
     [(80.0, 78.0, []), (82.0, 76.0, []), (47.0, 45.0, ["origin.ground"]), (80.0, 90.0, ["the ground of tower T"])],
 )
 def test_grounds_that_the_elevation_model_contradicts_are_told(
-    tmp_path: Path, origin_m: float, tower_m: float, told: list[str]
+    tmp_path: Path, origin_m: float, tower_m: float, contradicted: list[str]
 ) -> None:
     """The plane is 80 m at the origin and 78 m at the tower."""
     asc(tmp_path / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10)
@@ -134,7 +134,7 @@ def test_grounds_that_the_elevation_model_contradicts_are_told(
     text = SITE.replace("longitude_deg: -78.696}\ntowers", f"longitude_deg: -78.696{ground(origin_m)}towers")
     (tmp_path / "site.yaml").write_text(text.replace("-78.696}\ndem", f"-78.696{ground(tower_m)}dem"))
     notes = [note for note in load_site(tmp_path / "site.yaml").notes if "the elevation model has" in note]
-    assert [note.split(" is stated")[0] for note in notes] == told
+    assert [note.split(" is stated")[0] for note in notes] == contradicted
 
 
 def test_bad_grids(tmp_path: Path) -> None:

@@ -272,18 +272,10 @@ def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) 
 
 # --- KML ---------------------------------------------------------------------------------------------
 
-<<<<<<< HEAD
-_HEADING = re.compile(r"\s*(-?\d+(?:\.\d*)?)")
-=======
 # A line whose first point lies no farther below the others does not begin on the ground.
 _CLIMB_M = 5.0
 
-_SHAPE = re.compile(r"<(LineString|Point|gx:Track)\b[^>]*>(.*?)</\1>", re.DOTALL)
-_MODE = re.compile(r"<(?:gx:)?altitudeMode>\s*(\w+)\s*<")
-_COORDINATES = re.compile(r"<coordinates>(.*?)</coordinates>", re.DOTALL)
-_TRACK_POINT = re.compile(r"<gx:coord>(.*?)</gx:coord>", re.DOTALL)
-_TRACK_HEADING = re.compile(r"<gx:angles>\s*(-?[\d.]+)")
->>>>>>> 21757957 (Ask for the take-off's height of routes above sea level)
+_HEADING = re.compile(r"\s*(-?\d+(?:\.\d*)?)")
 
 
 def _root(data: bytes) -> ElementTree.Element:

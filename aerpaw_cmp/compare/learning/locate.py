@@ -15,16 +15,36 @@ from numpy.typing import ArrayLike
 
 from ...common.units import BoolArray, FloatArray, unmasked
 
-# Exponent of the distance before a level was seen, and its standard deviation.
-_SLOPE, _SLOPE_SD = 3.0, 1.0
 
-# Gain that two antennas and the ground add over the elevation.
-_ELEVATION_SD_DB = 5.0
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelModel:
+    """Standard deviations of a level about its distance law, before it was seen.
 
-# Shadowing, how long it is remembered, and scatter of medians over some seconds.
-#
-# With them the regions hold the surveyed rover on the six AFAR and sounder flights that docs/formats.md names.
-_SHADOW_SD_DB, _SHADOW_S, _SCATTER_SD_DB = 8.0, 30.0, 4.0
+    Parameters
+    ----------
+    slope, slope_sd : float
+        Exponent of the distance.
+    elevation_sd_db : float
+        Gain that two antennas and the ground add over the elevation.
+    shadow_sd_db : float
+        Shadowing, remembered for half a minute.
+    scatter_sd_db : float
+        Of medians over some seconds.
+    """
+
+    slope: float = 3.0
+    slope_sd: float = 1.0
+    elevation_sd_db: float = 5.0
+    shadow_sd_db: float = 8.0
+    scatter_sd_db: float = 4.0
+
+
+# Of a node about which nothing is known: so the regions hold the surveyed rover on the six AFAR and sounder flights
+# that docs/formats.md names.
+UNKNOWN = LevelModel()
+
+# How long shadowing is remembered.
+_SHADOW_S = 30.0
 
 # Standard deviation per axis of what the model cannot see (a tilted antenna, a wall), of the same flights.
 SYSTEMATIC_M = 20.0
@@ -137,7 +157,7 @@ class Fits:
     slope_sd: FloatArray
 
 
-def fit_places(track: LevelTrack, places_m: ArrayLike) -> Fits:
+def fit_places(track: LevelTrack, places_m: ArrayLike, model: LevelModel = UNKNOWN) -> Fits:
     """Log evidence of the levels if the node stood at each of some places.
 
     Parameters
@@ -145,6 +165,8 @@ def fit_places(track: LevelTrack, places_m: ArrayLike) -> Fits:
     track : LevelTrack
     places_m : (m, 3)
         East, north, up.
+    model : LevelModel
+        Narrower where antennas are known.
 
     Notes
     -----
@@ -154,21 +176,21 @@ def fit_places(track: LevelTrack, places_m: ArrayLike) -> Fits:
     (Rasmussen and Williams, 2006, section 3.4): exact where no level lies below the floor.
     """
     places = unmasked(places_m).reshape(-1, 3)
-    shadow, noise = _shadowing(track)
-    parts = [_fit(track, places[i : i + _AT_ONCE], shadow, noise) for i in range(0, len(places), _AT_ONCE)]
+    shadow, noise = _shadowing(track, model)
+    parts = [_fit(track, places[i : i + _AT_ONCE], shadow, noise, model) for i in range(0, len(places), _AT_ONCE)]
     return Fits(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
-def _shadowing(track: LevelTrack) -> tuple[FloatArray, float]:
+def _shadowing(track: LevelTrack, model: LevelModel) -> tuple[FloatArray, float]:
     """Leading terms (n, k) of the shadowing's covariance, and the standard deviation of what else scatters."""
     lag = np.abs(track.time_s[:, None] - track.time_s)
-    variance, vectors = np.linalg.eigh(_SHADOW_SD_DB**2 * np.exp(-lag / _SHADOW_S))
+    variance, vectors = np.linalg.eigh(model.shadow_sd_db**2 * np.exp(-lag / _SHADOW_S))
     terms = vectors[:, -_TERMS:] * np.sqrt(np.maximum(variance[-_TERMS:], 0.0))
     unresolved = max(float(variance[:-_TERMS].sum()), 0.0) / len(lag)
-    return terms, float(np.hypot(_SCATTER_SD_DB, np.sqrt(unresolved)))
+    return terms, float(np.hypot(model.scatter_sd_db, np.sqrt(unresolved)))
 
 
-def _features(track: LevelTrack, places: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _features(track: LevelTrack, places: FloatArray, model: LevelModel) -> tuple[FloatArray, FloatArray]:
     """Mean (m, n) of the level before one was seen, and what coefficients of unit variance add (m, n, 4)."""
     ray = track.position_m[None] - places[:, None]
     across = np.hypot(ray[..., 0], ray[..., 1])
@@ -176,11 +198,11 @@ def _features(track: LevelTrack, places: FloatArray) -> tuple[FloatArray, FloatA
     elevation = np.arctan2(ray[..., 2], across)
     columns = [
         np.full(across.shape, _FREE_DB),
-        -10.0 * _SLOPE_SD * decades,
-        _ELEVATION_SD_DB * np.sin(elevation) ** 2,
-        0.5 * _ELEVATION_SD_DB * np.cos(4.0 * elevation),
+        -10.0 * model.slope_sd * decades,
+        model.elevation_sd_db * np.sin(elevation) ** 2,
+        0.5 * model.elevation_sd_db * np.cos(4.0 * elevation),
     ]
-    mean = _middle(track) - 10.0 * _SLOPE * decades
+    mean = _middle(track) - 10.0 * model.slope * decades
     if track.airframe_db is not None:
         mean = mean + track.airframe_db(-ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9))
     return mean, np.stack(columns, axis=-1)
@@ -190,8 +212,10 @@ def _middle(track: LevelTrack) -> float:
     return 0.5 * float(track.level_db.max() + track.level_db.min())
 
 
-def _fit(track: LevelTrack, places: FloatArray, shadow: FloatArray, noise: float) -> tuple[FloatArray, ...]:
-    mean, features = _features(track, places)
+def _fit(
+    track: LevelTrack, places: FloatArray, shadow: FloatArray, noise: float, model: LevelModel
+) -> tuple[FloatArray, ...]:
+    mean, features = _features(track, places, model)
     terms = np.concatenate([features, np.broadcast_to(shadow, (len(places), *shadow.shape))], axis=2)
     eye = np.eye(terms.shape[2])
     latent = np.broadcast_to(track.level_db, mean.shape)
@@ -207,8 +231,8 @@ def _fit(track: LevelTrack, places: FloatArray, shadow: FloatArray, noise: float
     if track.below.any():  # else the weight is that of the noise wherever the levels lie
         precision = eye + terms.swapaxes(1, 2) @ (weight[:, :, None] * terms)
     evidence = value - 0.5 * (coefficient**2).sum(axis=1) - 0.5 * np.linalg.slogdet(precision)[1]
-    slope_sd = _SLOPE_SD * np.sqrt(np.linalg.inv(precision)[:, 1, 1])
-    return evidence, _SLOPE + _SLOPE_SD * coefficient[:, 1], slope_sd
+    slope_sd = model.slope_sd * np.sqrt(np.linalg.inv(precision)[:, 1, 1])
+    return evidence, model.slope + model.slope_sd * coefficient[:, 1], slope_sd
 
 
 _LOG_ROOT_TAU = 0.5 * float(np.log(2.0 * np.pi))
@@ -243,6 +267,8 @@ class NodeEstimate:
         Exponent of the distance and its standard deviation.
     log_odds : (k,)
         Of the given candidates against any place within reach, at prior odds of one to one.
+    anywhere : float
+        Log evidence of any place within reach.
     at_edge : bool
         The likeliest place lies at the edge of the search: the node may stand farther away.
     """
@@ -253,6 +279,7 @@ class NodeEstimate:
     slope: float
     slope_sd: float
     log_odds: FloatArray
+    anywhere: float
     at_edge: bool
 
     def __contains__(self, place_m: ArrayLike) -> bool:
@@ -288,7 +315,8 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
     places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
     evidence = fit_places(track, places).evidence + _log_prior(places)
     candidates = unmasked(candidates_m).reshape(-1, 3)
-    log_odds = _log_odds(track, candidates, float(logsumexp(evidence)) - np.log(len(grid)))
+    anywhere = float(logsumexp(evidence)) - np.log(len(grid))
+    log_odds = _log_odds(track, candidates, anywhere)
     places = places[evidence > evidence.max() - _POSSIBLE]
     if len(places) <= _MOST_REFINED:
         places = _refined(places)
@@ -306,6 +334,7 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
         slope=float(fits.slope[best]),
         slope_sd=float(fits.slope_sd[best]),
         log_odds=log_odds,
+        anywhere=anywhere,
         at_edge=_on_edge(places[best], grid),
     )
 

@@ -30,7 +30,7 @@ from ..pose.time_origin import Origin, origin_of
 from ..settings import FlightFile, LogSettings, RssSettings, with_learned
 from .dry_run import DryRun, dry_run
 from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
-from .remembered import Nodes, Proposal, propose, searching_airframe
+from .remembered import Nodes, Proposal, propose, searching_airframe, taught
 
 _RADIO = re.compile(r"usrp-?([0-9]+)", re.IGNORECASE)
 
@@ -291,8 +291,13 @@ def _replay_lines(entries: _Entries, known: Proposal) -> list[str]:
             "# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n",
             f"rt: {{audit_links: {_QUICK_AUDIT}}}{_QUICK}\n",
         ]
-    if _has_attitude(entries.flown[0].frame):
+    frame = entries.flown[0].frame
+    if _has_attitude(frame):
         return [f"rt: {{attitude: logged{alone}, audit_links: {_QUICK_AUDIT}}}{_QUICK}\n"]
+    if _has_attitude(frame, ("yaw_deg",)):
+        return [
+            f"rt: {{attitude: level{alone}, audit_links: {_QUICK_AUDIT}}}{_QUICK}; level, with the logged heading\n"
+        ]
     return [
         f"rt: {{attitude: level{alone}, audit_links: {_QUICK_AUDIT}}}"
         "  # a quick audit; no attitude in the telemetry: the nose points along the track?\n"
@@ -323,10 +328,10 @@ def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, si
     return placer if placer.at_site else None
 
 
-def _has_attitude(frame: Any) -> bool:
+def _has_attitude(frame: Any, names: Sequence[str] = ("roll_deg", "pitch_deg", "yaw_deg")) -> bool:
     """Check whether most telemetry rows know how the aircraft is turned."""
-    names = ["roll_deg", "pitch_deg", "yaw_deg"]
-    return set(names) <= set(frame.columns) and bool(frame[names].notna().all(axis=1).mean() > 0.5)
+    known = set(names) <= set(frame.columns) and frame[list(names)].notna().all(axis=1).mean() > 0.5
+    return bool(known and frame["yaw_deg"].any())
 
 
 _CLIPPED_SHARE = 0.01
@@ -524,7 +529,8 @@ class _Entries:
             if level is not None:
                 series = _key(level, entry)[1], file.result.reader
                 airframe = searching_airframe(memory, placer.site.towers, series, file.sha256)
-                places[pci] = placer.propose(placer.levels(level, self._floor_db(level), airframe))
+                levels_on_track = placer.levels(level, self._floor_db(level), airframe)
+                places[pci] = placer.propose(levels_on_track, taught(memory, series))
         for pci, place in places.items():
             if place is None:
                 continue

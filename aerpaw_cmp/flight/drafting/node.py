@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from ...common.units import FloatArray
-from ...compare.learning.locate import FEWEST, LevelTrack, fit_places, level_track, locate
+from ...compare.learning.locate import FEWEST, LevelModel, LevelTrack, fit_places, level_track, locate
 from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
 from ...site.antenna.antennas import MeasuredPattern
@@ -87,6 +88,15 @@ class Placement:
     radius_m: float = 0.0
 
 
+@dataclass(frozen=True, slots=True)
+class Taught:
+    """Antennas of a tower and of an airframe that flights taught, and how levels scatter about them."""
+
+    tower: MeasuredPattern
+    uav: MeasuredPattern
+    model: LevelModel
+
+
 @dataclass
 class Placer:
     """Proposals for the logs of one flight."""
@@ -119,15 +129,17 @@ class Placer:
         track = level_track(time, place, level, floor_db=floor_db)
         if airframe is None or not len(track.time_s):
             return track
-        rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
+        return replace(track, airframe_db=self._airframe_db(track, airframe))
 
-        def gain_db(towards: FloatArray) -> FloatArray:
-            return airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", rotation, towards)))
+    def propose(self, track: LevelTrack, taught: Mapping[str, Taught] = MappingProxyType({})) -> Placement | None:
+        """Tower, listed place or estimated place that the levels fit; None where they are too few.
 
-        return replace(track, airframe_db=gain_db)
-
-    def propose(self, track: LevelTrack) -> Placement | None:
-        """Tower, listed place or estimated place that the levels fit; None where they are too few."""
+        Parameters
+        ----------
+        track : LevelTrack
+        taught : mapping of str to Taught
+            Gains of towers and airframe that other flights taught, by tower.
+        """
         if len(track.level_db) < FEWEST:
             return None
         towers = list(self.site.towers.values())
@@ -145,6 +157,11 @@ class Placer:
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:
             return Placement(towers[best].name, None, f"the levels fit {towers[best].name} best: is it this tower?")
+        known = {name: self._taught_odds(track, name, gains) - estimate.anywhere for name, gains in taught.items()}
+        likeliest = max(known, key=lambda name: known[name], default="")
+        if likeliest and known[likeliest] >= _TOWER_ODDS:
+            about = f"the levels fit {likeliest} with the antennas that flights taught: is it this tower?"
+            return Placement(likeliest, None, about)
         latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
         apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]
         near = [t.name for t, d in zip(towers, apart, strict=True) if d <= estimate.radius90_m]
@@ -156,6 +173,21 @@ class Placer:
         place = estimate.place_m
         node = self._node(place, float(latitude[0]), float(longitude[0]), float(place[2]), about)
         return replace(node, radius_m=estimate.radius90_m)
+
+    def _taught_odds(self, track: LevelTrack, tower: str, gains: Taught) -> float:
+        """Log evidence of a tower with the antennas at both ends that flights taught."""
+
+        def gain_db(towards: FloatArray) -> FloatArray:
+            uav_db = self._airframe_db(track, gains.uav)(towards)
+            return uav_db + gains.tower.gain_dbi(*sphere_angles(-towards))
+
+        place = self.site.towers[tower].position_m[None, :]
+        return float(fit_places(replace(track, airframe_db=gain_db), place, gains.model).evidence[0])
+
+    def _airframe_db(self, track: LevelTrack, airframe: MeasuredPattern) -> Callable[[FloatArray], FloatArray]:
+        """Gain of an airframe at each level of a track towards unit vectors (m, n, 3)."""
+        rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
+        return lambda towards: airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", rotation, towards)))
 
     def contradiction(self, track: LevelTrack, node: str) -> str | None:
         """Tower that the levels fit far better than the one that is named; None where none does."""

@@ -13,11 +13,13 @@ from ...common.errors import InputError, UsageError
 from ...common.units import FloatArray
 from ...compare.gains.direction_gain import LinkSamples
 from ...compare.gains.spread import NO_SPREAD, Spread
+from ...compare.learning.locate import LevelModel
 from ...site.antenna import learned
 from ...site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
 from ..data import FlightData, RssSeries, site_place
 from ..learned_gain import pair_and_sd_db, sphere_angles
 from ..settings import FlightFile, check_logs, with_learned
+from .node import Taught
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -69,6 +71,9 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
             out[f"{series.tower}.{series.channel}"] = Remembered(entry=entry, series=series, tower=tower, uav=uav)
     return out
 
+
+# Exponent of the distance beside antennas that were learned under free space.
+_TAUGHT_SLOPE_SD = 0.2
 
 # Tower, channel (``rank`` of rank) and reader of a series of the draft.
 _SeriesKey = tuple[str, str, str]
@@ -171,6 +176,33 @@ def searching_airframe(
         file = next((s.uav_file for s in every if (s.channel, s.reader) == series), None)
         return None if file is None else read_sphere_csv(learned.folder_of(site) / file)
     return None
+
+
+def taught(site: str | Path, series: tuple[str, str]) -> dict[str, Taught]:
+    """Antennas at both ends that flights taught for a channel and reader, by tower; a damaged memory has none.
+
+    Parameters
+    ----------
+    site : str or Path
+    series : (channel, reader)
+    """
+    with suppress(InputError, UsageError):
+        fit = [known for known in remembered(site).values() if (known.series.channel, known.series.reader) == series]
+        return {
+            known.series.tower: Taught(
+                tower=known.tower,
+                uav=known.uav,
+                model=LevelModel(
+                    slope=2.0,
+                    slope_sd=_TAUGHT_SLOPE_SD,
+                    elevation_sd_db=known.spread.own_sd_db,
+                    shadow_sd_db=float(np.hypot(known.spread.own_sd_db, known.series.sd_db)),
+                    scatter_sd_db=known.spread.noise_sd_db,
+                ),
+            )
+            for known in fit
+        }
+    return {}
 
 
 def offered(data: FlightData) -> FlightFile | None:

@@ -25,6 +25,13 @@ if TYPE_CHECKING:
 # Telemetry gaps longer than this are not bridged [s]; vehicleOut rows come every 1.0 s.
 _MAXIMUM_GAP_S = 3.0
 
+# Telemetry as sparse as this per fix is a straight line between fixes where nine of ten lie no farther apart [m]:
+# what a search at 2 m/s covers in 14 s, not what a fast flight does.
+_SPARSE_APART_M = 100.0
+
+# An interval this many times the usual one of sparse telemetry is a gap.
+_SPARSE_GAP = 2.0
+
 # Below this ground speed the course says nothing about the heading [m/s].
 _COURSE_SPEED_MPS = 1.0
 
@@ -60,6 +67,10 @@ class TrackAccount:
         Used rows with a heading and neither roll nor pitch.
     below_ground : int
         Used rows below the site's ground plane.
+    sparse_s : float
+        Usual interval of sparse telemetry whose fixes are joined by straight lines [s]; 0 of other telemetry.
+    sparse_error_m : (median, ninth of ten)
+        Error of those lines: half the distance of each fix from the line between its neighbours [m].
     gaps : int
         Intervals between used rows that are longer than the limit.
     longest_gap_s : float
@@ -80,6 +91,8 @@ class TrackAccount:
     steps_sorted: int = 0
     heading_alone: int = 0
     below_ground: int = 0
+    sparse_s: float = 0.0
+    sparse_error_m: tuple[float, float] = (0.0, 0.0)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -100,7 +113,12 @@ class TrackAccount:
                 "an elevation model, says how high the ground is",
             ),
         )
-        return tuple(f"{count} {text}" for count, text in reasons if count)
+        usual_m, high_m = self.sparse_error_m
+        sparse = (
+            f"the telemetry has a fix every {self.sparse_s:.0f} s: positions between are a straight line, wrong by about "
+            f"{usual_m:.0f} m in the median and {high_m:.0f} m in one of ten"
+        )
+        return (*([sparse] if self.sparse_s else []), *(f"{count} {text}" for count, text in reasons if count))
 
 
 @dataclass(frozen=True, slots=True)
@@ -312,6 +330,8 @@ class Track:
         self._known = known
         self._asked = np.zeros(0, np.int64), self._pose_at(np.zeros(0, np.int64))
         interval = np.diff(self._time_s)
+        sparse_s, sparse_error_m = self._sparse(interval)
+        self.maximum_gap_s = max(self.maximum_gap_s, _SPARSE_GAP * sparse_s)
         self.account = TrackAccount(
             rows=len(stamp),
             no_time=int((~timed).sum()),
@@ -325,6 +345,8 @@ class Track:
             steps_sorted=steps_sorted,
             heading_alone=int(heading_alone.sum()),
             below_ground=int(self._raised(position)[1].sum()),
+            sparse_s=sparse_s,
+            sparse_error_m=sparse_error_m,
         )
 
     def __len__(self) -> int:
@@ -391,6 +413,17 @@ class Track:
             reason_code=code.astype(np.int8),
             attitude_known=known,
         )
+
+    def _sparse(self, interval_s: FloatArray) -> tuple[float, tuple[float, float]]:
+        """Usual interval of telemetry that is sparse throughout and slow, and the error of lines between its fixes."""
+        usual_s = float(np.median(interval_s)) if len(interval_s) > 1 else 0.0
+        step_m = np.linalg.norm(np.diff(self._position, axis=0), axis=1)
+        if usual_s <= self.maximum_gap_s or np.quantile(step_m, 0.9) > _SPARSE_APART_M:
+            return 0.0, (0.0, 0.0)
+        others = np.arange(len(self)) % 2 == 0  # the fixes between are half as far from the line of their own interval
+        line = interpolated(self._time_s, self._time_s[others], self._position[others])
+        away_m = 0.5 * np.linalg.norm(line - self._position, axis=1)[~others]
+        return usual_s, (float(np.median(away_m)), float(np.quantile(away_m, 0.9)))
 
     def _raised(self, position: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Up of positions (n, 3), the lowest raised to just above the ground, and those that lie below it."""

@@ -9,14 +9,16 @@ import pytest
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.compare.learning.locate import NodeEstimate, level_track
+from aerpaw_cmp.compare.learning.locate import LevelModel, NodeEstimate, level_track
 from aerpaw_cmp.flight.drafting import node
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
 from aerpaw_cmp.flight.drafting.node import listed_places
+from aerpaw_cmp.flight.learned_gain import sphere_angles
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.logs.ingest import IngestedFile, ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Stream
+from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, sphere_grid, unit_mean_gain
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")
@@ -126,6 +128,7 @@ def test_a_place_wants_odds_of_two_and_a_listed_one_as_many_as_any_tower(
     odds[:2] = towers
     at = np.array([30.0, 40.0, 10.0]) if listed else np.array([*SITE.towers["LW1"].position_m[:2], 10.0])
     estimate = NodeEstimate(
+        anywhere=0.0,
         place_m=at, radius90_m=77.0, height_m=(1.5, 10.0), slope=3.0, slope_sd=0.2,
         log_odds=np.array([*odds, *listed]), at_edge=False,
     )  # fmt: skip
@@ -197,3 +200,37 @@ def test_levels_are_taken_in_flight_and_their_offset_is_that_to_free_space() -> 
     lost = placer.levels(Stream("rss", "power", frame), -90.0)
     assert lost.below.sum() == 25
     assert lost.time_s.max() - time[0].astype(np.int64) * 1e-9 < 300.0
+
+
+def _taught() -> node.Taught:
+    """Antennas with lobes at both ends, as flights would have taught them."""
+    _, _, v = sphere_grid()
+    tower, uav = (unit_mean_gain(5.0 * v[..., a] - 3.0 * v[..., b]) for a, b in ((0, 1), (1, 0)))
+    sd = np.zeros(v.shape[:2])
+    model = LevelModel(slope=2.0, slope_sd=0.2, elevation_sd_db=1.0, shadow_sd_db=1.6, scatter_sd_db=1.4)
+    return node.Taught(SpherePattern("tower", tower, sd), SpherePattern("uav", uav, sd), model)
+
+
+@pytest.mark.parametrize("part", [slice(100, 220), slice(300, 400), slice(0, 500)])
+@pytest.mark.parametrize(("at", "keeps"), [("LW1", True), (ROVER, False), ("LW2", False)])
+def test_a_cut_flight_keeps_a_tower_whose_antennas_flights_taught(
+    at: str | tuple[float, float, float], keeps: bool, part: slice
+) -> None:
+    """Free space and the gains of both ends, 2 dB of noise; of a node elsewhere the tower's antennas explain nothing."""
+    placer, gains = _placer(), _taught()
+    place = np.array(SITE.towers[at].position_m if isinstance(at, str) else at)
+    time = placer.telemetry.frame["time"].to_numpy()[part]
+    pose = placer.track.pose_at(time)
+    ray = pose.position_m - place
+    away = np.linalg.norm(ray, axis=1)
+    towards = -ray / away[:, None]
+    body = np.einsum("nji,nj->ni", pose.rotation, towards)
+    level = gains.tower.gain_dbi(*sphere_angles(-towards)) + gains.uav.gain_dbi(*sphere_angles(body))
+    level = level - 20.0 * np.log10(away) + np.random.default_rng(8).normal(0.0, 2.0, len(away))
+    track = level_track(time.astype(np.int64) * 1e-9, pose.position_m, level)
+    placement = placer.propose(track, {"LW1": gains})
+    assert placement is not None
+    assert (placement.node == "LW1") == keeps
+    if keeps:
+        assert "with the antennas that flights taught" in placement.question or "fit LW1 best" in placement.question
+        assert placement.tower is None

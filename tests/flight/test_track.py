@@ -321,3 +321,30 @@ def test_track_of_a_real_flight(name, height):
     speed = np.linalg.norm(track._velocity[:, :2], axis=1)
     assert 3 < np.nanmax(speed) < 25
     assert poses.attitude_known.mean() > 0.99
+
+
+@pytest.mark.parametrize(("speed_mps", "joined"), [(2.0, True), (15.0, False)])
+def test_sparse_fixes_of_a_slow_flight_are_joined_by_lines(speed_mps: float, joined: bool) -> None:
+    """Speed between fixes decides: 14 s are 28 m of a search, and 210 m of a survey."""
+    seconds = 14.0 * np.arange(40)
+    track = Track(telemetry(seconds, speed_mps * seconds, 0, 40), FRAME)
+    pose = track.pose_at(at(seconds[:-1] + 7.0))
+    assert pose.valid.all() == joined
+    assert any("a fix every 14 s: positions between are a straight line" in t for t in track.account.warnings) == joined
+    if joined:
+        np.testing.assert_allclose(pose.position_m[:, 0], speed_mps * (seconds[:-1] + 7.0), atol=1e-3)
+
+
+def test_the_error_of_lines_between_sparse_fixes_is_that_of_a_circle() -> None:
+    """A chord of 14 s at 2 m/s on a radius of 60 m: its sagitta is 1.6 m, and the stated error is that or above."""
+    seconds = 14.0 * np.arange(60)
+    angle = 2.0 * seconds / 60.0
+    track = Track(telemetry(seconds, 60 * np.cos(angle), 60 * np.sin(angle), 40), FRAME)
+    sagitta = 60.0 * (1.0 - np.cos(14.0 * 2.0 / 60.0 / 2.0))
+    assert sagitta < track.account.sparse_error_m[0] < 3.0 * sagitta
+
+
+def test_a_gap_of_sparse_telemetry_stays_a_gap() -> None:
+    seconds = np.append(14.0 * np.arange(20), 14.0 * np.arange(20) + 600.0)
+    track = Track(telemetry(seconds, 0.5 * seconds, 0, 40), FRAME)
+    assert track.pose_at(at([20.0, 400.0, 640.0])).valid.tolist() == [True, False, True]

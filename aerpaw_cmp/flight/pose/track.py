@@ -115,8 +115,8 @@ class TrackAccount:
         )
         usual_m, high_m = self.sparse_error_m
         sparse = (
-            f"the telemetry has a fix every {self.sparse_s:.0f} s: positions between are a straight line, wrong by about "
-            f"{usual_m:.0f} m in the median and {high_m:.0f} m in one of ten"
+            f"the telemetry has a fix every {self.sparse_s:.0f} s: positions between are a straight line, wrong by "
+            f"about {usual_m:.0f} m in the median and {high_m:.0f} m in one of ten"
         )
         return (*([sparse] if self.sparse_s else []), *(f"{count} {text}" for count, text in reasons if count))
 

@@ -1,0 +1,112 @@
+"""docs/formats.md shows the dictionary of columns: its tables are made of it (``python -m tests.logs.test_formats_page``).
+
+The example names are those of programs; each must mean what the table says.
+"""
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from aerpaw_cmp.logs import dictionary
+
+PAGE = Path(__file__).parents[2] / "docs" / "formats.md"
+BEGIN, END = "<!-- dictionary: made by tests/logs/test_formats_page.py -->\n", "<!-- end of dictionary -->\n"
+EXAMPLES = {
+    "time": ("Timestamp", "datetime(utc)", "abs_time", "gps_time", "measured_at", "time_boot_ms"),
+    "date": ("Date", "CUSTOM.date [local]"),
+    "gps_week": ("GPS week", "GWk"),
+    "gps_seconds": ("GPS seconds", "tow", "GMS"),
+    "latitude_deg": ("lat", "OSD.latitude", "GPS Latitude"),
+    "longitude_deg": ("lon", "Lng", "OSD.longitude"),
+    "altitude_m, take-off": ("RelHomeAlt", "relative_alt", "height_above_takeoff(feet)"),
+    "altitude_m, ground": ("altitude_agl", "height above ground"),
+    "altitude_m, sea level": ("altitude_msl", "Altitude (ft MSL)", "ele"),
+    "altitude_m, ellipsoid": ("alt_ellipsoid", "HAE"),
+    "altitude_m, unknown": ("alt", "Altitude [m]", "Height"),
+    "roll_deg": ("roll", "Roll [rad]"),
+    "pitch_deg": ("pitch", "pitch(degrees)"),
+    "yaw_deg": ("yaw", "compass_heading(degrees)", "hdg"),
+    "velocity_north_mps": ("VN", "vel_n_m_s", "xSpeed(mph)"),
+    "velocity_east_mps": ("VE", "vel_e_m_s", "ySpeed(mph)"),
+    "velocity_down_mps": ("VD", "vz", "zSpeed(mph)"),
+    "fix": ("fix_type", "GPSFix"),
+    "satellites": ("NumberOfSatellites", "satellites_used"),
+    "device": ("device_id", "IMEI", "sysid", "receiver_channel"),
+    "network": ("operator", "MCC", "MNC", "SIM slot"),
+    "technology": ("NetworkTech", "net_type", "RAT"),
+    "serving": ("is_registered", "serving"),
+    "neighbouring": ("neighboring",),
+    "power": ("link power",),
+    "quality": ("link quality",),
+    "SNR": ("link snr",),
+    "rank": ("PDSCH rank (NR)", "dl_ri", "NR RI"),
+    "RSRP": ("RSRP (LTE pcell)", "NR5G SS-RSRP [dBm]", "NB1_RSRP"),
+    "RSRQ": ("rsrq(dB)", "NRxRSRQ"),
+    "SINR": ("SINR", "RS SNR", "rssnr"),
+    "RSSI": ("RSSI", "E-UTRAN carrier RSSI"),
+    "RSCP": ("rscp",),
+    "RxLev": ("RxLev",),
+    "Ec/N0": ("ec_no",),
+    "PCI": ("LTEPCI", "Physical cell identity", "NB1_PCI"),
+    "ARFCN": ("EARFCN", "NR-ARFCN"),
+    "CQI": ("WB CQI",),
+    "path loss": ("Pathloss",),
+    "throughput": ("Mac DL Throughput", "DL_bitrate"),
+    "MCS": ("dl_mcs",),
+    "BLER": ("LTE BLER [%]",),
+}
+
+
+def label(row: dictionary.Quantity) -> str:
+    return f"{row.name}, {row.datum}" if row.datum else row.name
+
+
+ROWS = {label(row): row for row in dictionary.QUANTITIES if row.role != "other"}
+
+
+def table() -> str:
+    lines = ["| quantity | names such as | unit | can be | is none |", "| --- | --- | --- | --- | --- |"]
+    for name, row in ROWS.items():
+        low, high = row.can_be
+        limits = f"{low:g} .. {high:g}" if np.isfinite([low, high]).all() else ""
+        names = ", ".join(f"`{example}`" for example in EXAMPLES[name])
+        lines.append(f"| {name} | {names} | {row.unit} | {limits} | {', '.join(f'{value:g}' for value in row.none)} |")
+    lines += ["", "| program | known by the columns | its heights are above | angles |", "| --- | --- | --- | --- |"]
+    for program in dictionary.PROGRAMS:
+        signs = "; or ".join(", ".join(f"`{sign}`" for sign in sorted(part)) for part in program.signs[:2])
+        lines.append(f"| {program.name} | {signs} | {program.datum} | {program.angles} |")
+    none = ", ".join(f"{value:.0f}" for value in dictionary.UNAVAILABLE)
+    units = ", ".join(f"`{unit}`" for unit in dictionary.UNITS)
+    return "\n".join([*lines, "", f"Everywhere none: {none}. Units: {units}, `ddmm.mmmm`.", ""])
+
+
+def parts() -> tuple[str, str, str]:
+    """The page before the tables, the tables, and behind them."""
+    before, rest = PAGE.read_text(encoding="utf-8").split(BEGIN)
+    shown, after = rest.split(END)
+    return before + BEGIN, shown, END + after
+
+
+def test_every_row_has_examples_that_mean_it() -> None:
+    assert EXAMPLES.keys() == ROWS.keys()
+    for name, examples in EXAMPLES.items():
+        for example in examples:
+            meaning = dictionary.meaning(example)
+            assert meaning is not None, example
+            assert label(meaning.quantity) == name, example
+
+
+def test_the_page_shows_the_dictionary_as_it_is() -> None:
+    assert parts()[1] == table(), "run python -m tests.logs.test_formats_page"
+
+
+def test_no_pattern_is_hidden_by_a_row_above() -> None:
+    """A row whose examples are all taken by an earlier one would never be used."""
+    plain = [dictionary.plain(name) for names in EXAMPLES.values() for name in names]
+    for row in ROWS.values():
+        assert any(re.search(pattern, name) for pattern in row.names for name in plain), row.name
+
+
+if __name__ == "__main__":
+    PAGE.write_text(parts()[0] + table() + parts()[2], encoding="utf-8")

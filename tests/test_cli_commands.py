@@ -76,8 +76,9 @@ def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     loaded = load_site(site)
     assert [b.height_m for b in loaded.buildings] == [7.0]
     assert len(loaded.forests) == 1
-    assert len(loaded.trees) > 10
-    assert not loaded.illustrative
+    assert [wood.height_m for wood in loaded.forests] == [20.0]
+    assert len(loaded.trees) == 0
+    assert (site.with_suffix(".learned") / "learned.yaml").is_file()  # what its base learned goes with it
     written = out_of(capsys, "site", "show", site, "-o", tmp_path / "show", "--export").split()
     assert all(Path(path).stat().st_size > 100 for path in written)
     assert {Path(path).suffix for path in written} >= {".html", ".png", ".svg", ".xml"}

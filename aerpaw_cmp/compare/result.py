@@ -251,6 +251,8 @@ class RankFurther:
     receiver: ForecastScore | None = None
     trained_on: tuple[str, ...] | None = None
     """SHA-256 of the logs of these reports that the receiver was fitted on: then it has no score."""
+    agreement_sd_by_ground: Mapping[str, float] | None = None
+    """Standard deviation of the agreement, by K, over grounds within the errors of the known heights."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

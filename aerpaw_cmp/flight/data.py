@@ -135,7 +135,7 @@ def site_place(site: str, folder: Path) -> str | Path:
 
 def choose_site(choice: SiteChoice, folder: Path) -> Site:
     """The site of a flight, with the flight's own changes."""
-    site = load_site(site_place(choice.file, folder), coordinates=choice.coordinates)
+    site = load_site(site_place(choice.file, folder), coordinates=choice.coordinates, tower_ground=choice.tower_ground)
     if choice.antenna_height_m is not None:
         towers = {
             key: dataclasses.replace(tower, antenna_height_m=choice.antenna_height_m)

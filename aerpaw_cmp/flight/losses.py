@@ -6,11 +6,13 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import FloatArray, wavelength_m
+from ..propagation.arrays import Link, Poses, single_element
 from ..propagation.field.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
-from ..propagation.field.stands import stand_loss_db
-from ..propagation.options import Loss
+from ..propagation.field.stands import stand_depth_m, stand_loss_db
+from ..propagation.options import Loss, Run, Search
 from ..propagation.paths import PathSet
-from ..site.site import Site, Trees
+from ..propagation.replay import replay
+from ..site.site import Site
 from .settings import RtSettings
 
 
@@ -49,6 +51,9 @@ def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
 
     return loss
 
+
+# Lines of sight are the same at any carrier.
+_ANY_HZ = 3.4e9
 
 # A reflection this near to a ground plane of the site is one off the ground.
 _ON_GROUND_M = 1e-6
@@ -115,24 +120,38 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
 def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
     if not site.wooded or rt.foliage == "none":
         return None
-    model = foliage_model(
-        rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
-        carrier_hz,
-        in_leaf=rt.leaves == "in",
-        gamma_db_per_m=rt.advanced.gamma_db_per_m,
-        maximum_db=rt.advanced.maximum_loss_db,
+    site = site.under(rt.foliage)
+    model, evergreen = (
+        foliage_model(
+            rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
+            carrier_hz,
+            in_leaf=in_leaf,
+            gamma_db_per_m=rt.advanced.gamma_db_per_m,
+            maximum_db=rt.advanced.maximum_loss_db,
+        )
+        for in_leaf in (rt.leaves == "in", True)
     )
     index, wavelength = crown_index(site.trees), wavelength_m(carrier_hz)
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
         source, target = sources_m[paths.tower], targets_m[paths.pose]
         trees_db = foliage_loss_db(source, paths.vertices_m, target, index, model)
-        return trees_db + stand_loss_db(site, source, paths.vertices_m, target, model, wavelength)
+        return trees_db + stand_loss_db(site, source, paths.vertices_m, target, model, wavelength, evergreen)
 
     return loss
 
 
-def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, trees: Trees) -> FloatArray:
-    """Length (n,) [m] inside tree crowns of the direct lines from a tower (3,), or (n, 3), to poses (n, 3) [m]."""
+def sight_shares(site: Site, tower: str, poses_m: FloatArray) -> tuple[float, float]:
+    """Shares of the direct lines from a tower to poses (n, 3) [m] that woods shade, and that buildings hide."""
+    source = site.towers[tower].position_m
+    array = single_element()
+    poses = Poses(poses_m, np.broadcast_to(np.eye(3), (len(poses_m), 3, 3)))
+    seen = replay(site, Link(_ANY_HZ, {tower: array}, array), poses, Search(max_depth=0), run=Run(cache_dir=""))
+    return float((direct_foliage_m(source, poses_m, site) > 0.0).mean()), float(1.0 - len(seen.paths) / len(poses_m))
+
+
+def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, site: Site) -> FloatArray:
+    """Length (n,) [m] in crowns and stands of the direct lines from a tower (3,), or (n, 3), to poses (n, 3) [m]."""
     source = np.broadcast_to(tower_m, poses_m.shape)
-    return foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, trees)
+    in_crowns = foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, site.trees)
+    return in_crowns + stand_depth_m(site, source, poses_m)

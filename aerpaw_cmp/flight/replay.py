@@ -272,10 +272,11 @@ def _levels_along(data: FlightData, link: Link, tower: str, instants: Times) -> 
     place, known = data.tower_at(tower, instants)
     track = data.poses_at(instants).where(known)
     poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
+    field = Field(path_loss(data.site, data.settings.rt, link.carrier_hz))
     if tower in data.nodes:
-        replayed = replay_moving(data.site, link, poses, place[track.valid], Search(max_depth=depth))
+        replayed = replay_moving(data.site, link, poses, place[track.valid], Search(max_depth=depth), field)
     else:
-        replayed = replay(data.site, link, poses, Search("image", max_depth=depth))
+        replayed = replay(data.site, link, poses, Search("image", max_depth=depth), field)
     line = track.position_m - place
     distance = np.linalg.norm(line, axis=1)
     unit = line / distance[:, None]

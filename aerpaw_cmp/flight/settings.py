@@ -343,6 +343,8 @@ class SiteChoice(StrictModel):
     antenna_height_m: Positive | None = None
     """Antenna height of every tower, in place of the site's."""
     without_buildings: bool = False
+    tower_ground: Literal["flat", "offsets", "surface", "dem"] | None = None
+    """Ground at the towers and below the paths, in place of the site's."""
 
 
 class GroundNode(StrictModel):

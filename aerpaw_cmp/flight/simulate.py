@@ -27,11 +27,10 @@ from ..common.yamlfile import dump_yaml
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
 from ..propagation.arrays import Poses, rotation_from_aircraft
-from ..propagation.options import Search
-from ..propagation.replay import replay
 from ..site.site import Site
 from .data import site_place
 from .pose.track import interpolated
+from .replay import replay_poses
 from .settings import FlightFile, LogSettings, PlanSettings, files_of
 
 # What was planted.
@@ -358,9 +357,7 @@ class FlightSimulator:
         time_s = np.arange(0.0, self.trajectory.duration_s, plan.rss_interval_s)
         links = self.settings.link
         link = links.channels.get(log.channel, links.rss).build([log.node], self.folder)
-        rt = self.settings.rt
-        search = Search(rt.engine, max_depth=rt.max_depth, samples=rt.advanced.samples)
-        result = replay(self.site, link, self._poses(time_s), search)
+        result = replay_poses(self.site, self.settings.rt, link, self._poses(time_s))
         offset = plan.offsets_db.get(log.node, {}).get(log.channel, 0.0)
         summed = result.rss_power_dbm if self.settings.rss.field == "power" else result.rss_dbm
         level = summed[:, 0] - offset
@@ -390,7 +387,7 @@ class FlightSimulator:
         time_s = np.arange(0.0, self.trajectory.duration_s, plan.rank_interval_s)
         link = self.settings.link.rank.build([tower], self.folder)
         poses = self._poses(time_s)
-        result = replay(self.site, link, poses, Search(self.settings.rt.engine, max_depth=self.settings.rt.max_depth))
+        result = replay_poses(self.site, self.settings.rt, link, poses)
         truth = channel_rank(result.h[:, 0], plan.rank_k)
         reported = self._reported(truth, min(result.h.shape[-2:]))
         latitude, longitude = self.site.frame.to_geographic(poses.position_m[:, 0], poses.position_m[:, 1])

@@ -246,7 +246,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
         record = report_data(
             data,
             flight_run.result,
-            notes=foliage_notes(len(data.site.trees), settings.rt, carriers),
+            notes=foliage_notes(data.site.wooded, settings.rt, carriers),
             other_inputs=other_inputs(settings, flight, options.logs_root, learned),
             paths=pose_paths(data, replays),
         )
@@ -334,6 +334,7 @@ def run_site_import(
     untagged: str | None = None,
     canopy: Path | None = None,
     surface: Path | None = None,
+    trees: bool = False,
     force: bool = False,
 ) -> list[str]:
     """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them.
@@ -350,6 +351,8 @@ def run_site_import(
         What areas without a tag are: building, forest or geofence.
     canopy, surface : Path, optional
         Canopy-height model that gives stands and trees; surface model that gives buildings their heights.
+    trees : bool
+        Woods are single trees at random places, not media.
     force : bool
         Replace a file that this tool did not write.
 
@@ -358,19 +361,20 @@ def run_site_import(
     list of str
         A line per thing that was done.
     """
+    from ..site.antenna.learned import carry_memory
     from ..site.imports.canopy import with_canopy, with_heights
     from ..site.imports.footprints import import_site, site_yaml
 
     rasters = [path for path in (canopy, surface) if path is not None]
     with OutputFile(out, own=is_sealed, inputs=[*files, *rasters, Path(base)], force=force) as output:
-        model, actions = import_site(files, base=base, untagged=untagged, maps_needed=not rasters)
+        model, actions = import_site(files, base=base, untagged=untagged, trees=trees, maps_needed=not rasters)
         for path, with_raster in ((canopy, with_canopy), (surface, with_heights)):
             if path is not None:
                 model, more = with_raster(model, path)
                 actions += more
         text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
         output.write(sealed(text))
-    return actions
+    return [*actions, *carry_memory(base, out)]
 
 
 def run_site_show(

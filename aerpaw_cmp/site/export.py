@@ -37,7 +37,7 @@ def export_scene(site: Site, folder: str | Path, *, trees: bool = True) -> list[
     list of Path
         The files written, the XML file first.
     """
-    folder = Path(folder)
+    folder, site = Path(folder), site.under("opaque")  # crowns have a shape, a medium has none
     parts = _parts(site, trees)
     lines = ['<scene version="2.1.0">', f"<!-- {_comment(site)} -->"]
     lines += [_bsdf(name) for name in dict.fromkeys(name for _, name, _ in parts)]
@@ -85,7 +85,7 @@ def _plain(name: str) -> str:
 def _comment(site: Site) -> str:
     frame = site.frame
     text = f"{site.name}: x east, y north, z up [m] from {frame.latitude_deg:.8f}, {frame.longitude_deg:.8f}" + (
-        "; buildings and forests are illustrative" if site.illustrative else ""
+        f"; {site.credit}" if site.credit else ""
     )
     return text.replace("--", "- -")
 

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from shapely.geometry import Polygon
 
 from ..common.errors import UsageError
-from .materials import material
+from ..common.units import FloatArray
+from .materials import CROWN, material
 from .mesh_scenes.mitsuba import TriangleScene, read_scene
-from .site import Building, Site
+from .site import Building, Forest, Site
 
 # A ground plane that is added reaches this many times the size of the scene beyond it.
 _PLANE_MARGIN = 10.0
@@ -146,6 +149,95 @@ def ground_share(scene: TriangleScene) -> float:
             signs.append((c - a) * (y - b) - (d - b) * (x - a))
         covered[columns, rows] |= ((np.stack(signs) >= 0).all(axis=0)) | ((np.stack(signs) <= 0).all(axis=0))
     return float(covered.mean())
+
+
+# A mesh this narrow in plan whose box comes this near to an antenna is its mast, bracket or housing.
+_MAST_M, _TOUCHES_M = 4.0, 0.5
+
+
+def without_traps(
+    scene: TriangleScene, antennas_m: Mapping[str, FloatArray]
+) -> tuple[TriangleScene, tuple[Forest, ...], list[str]]:
+    """A scene without meshes that are no mirrors or would hide an antenna from everything.
+
+    Parameters
+    ----------
+    scene : TriangleScene
+    antennas_m : mapping of str to (3,)
+        Antennas by tower [m].
+
+    Returns
+    -------
+    TriangleScene
+        Without vegetation, and without what an antenna stands in or on.
+    tuple of Forest
+        Each part of a mesh of vegetation as a medium: its outline from above, from its lowest to its highest corner, as
+        full as its volume says. Trunks are left out.
+    list of str
+        What was done.
+    """
+    notes: list[str] = []
+    out = np.zeros(len(scene.shapes), dtype=np.bool_)
+    for number in np.unique(scene.shape).tolist():
+        corners = scene.vertices_m[scene.triangles[scene.shape == number]]
+        low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
+        for tower, place in antennas_m.items():
+            if np.any(place < low - _TOUCHES_M) or np.any(place > high + _TOUCHES_M):
+                continue
+            inside = _encloses(corners, place)
+            if inside or (high - low)[:2].max() <= _MAST_M:
+                out[number] = True
+                where = "inside" if inside else "at"
+                notes.append(
+                    f"the antenna of {tower} stands {where} mesh {scene.shapes[number]}, which hides nothing and is no "
+                    "mirror"
+                )
+    green = np.array([name == CROWN for name in scene.materials])
+    trunk = green & np.array(["trunk" in name.lower() for name in scene.shapes])
+    woods = [wood for number in np.flatnonzero(green & ~trunk).tolist() for wood in _media(scene, number)]
+    if green.any():
+        notes.append(
+            f"{int((green & ~trunk).sum())} meshes of vegetation are media, by the chord, and no mirrors; "
+            f"{int(trunk.sum())} meshes of trunks are left out"
+        )
+    remaining = ~(out | green)[scene.shape]
+    return replace(scene, triangles=scene.triangles[remaining], shape=scene.shape[remaining]), tuple(woods), notes
+
+
+def _encloses(corners_m: FloatArray, place_m: FloatArray) -> bool:
+    """Check whether a point lies in a mesh of triangles (n, 3, 3): lines upward meet it an odd number of times."""
+    across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    if np.linalg.norm(across.sum(axis=0)) > 1e-3 * np.linalg.norm(across, axis=1).sum():
+        return False  # open, such as terrain
+    votes = 0
+    for shift in ((1e-4, 2e-4), (-3e-4, 1e-4), (2e-4, -3e-4)):  # an edge that one line meets, the others miss
+        a, b, c = (corners_m[:, k] - place_m - np.array([*shift, 0.0]) for k in range(3))
+        turns = np.stack([p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0] for p, q in ((b, c), (c, a), (a, b))])
+        over = (turns > 0).all(axis=0) | (turns < 0).all(axis=0)
+        heights = np.stack([a[:, 2], b[:, 2], c[:, 2]])[:, over]
+        votes += int(((turns[:, over] * heights).sum(axis=0) / turns[:, over].sum(axis=0) > 0).sum()) % 2
+    return votes >= 2
+
+
+def _media(scene: TriangleScene, number: int) -> Iterator[Forest]:
+    """Connected parts of a mesh of vegetation as media."""
+    corners = scene.vertices_m[scene.triangles[scene.shape == number]]
+    point = np.unique(corners.reshape(-1, 3).round(4), axis=0, return_inverse=True)[1].reshape(-1, 3)
+    size = int(point.max()) + 1
+    links = coo_array((np.ones(2 * len(point)), (point[:, :2].ravel(), point[:, 1:].ravel())), shape=(size, size))
+    part = connected_components(links, directed=False)[1][point[:, 0]]
+    for index in range(int(part.max()) + 1):
+        mine = corners[part == index]
+        outline = shapely.convex_hull(shapely.multipoints(mine.reshape(-1, 3)[:, :2]))
+        low, high = float(mine[..., 2].min()), float(mine[..., 2].max())
+        if outline.geom_type != "Polygon" or not high > low:
+            continue
+        volume = abs(float(np.linalg.det(mine - mine.mean(axis=(0, 1))).sum())) / 6.0
+        yield Forest(
+            name=scene.shapes[number] if index == 0 else f"{scene.shapes[number]} ({index + 1})", area=outline,
+            height_m=high - low, crown_base_fraction=0.0, base_m=low,
+            filled=min(volume / (outline.area * (high - low)), 1.0),
+        )  # fmt: skip
 
 
 _DRAWN_SIMPLER_M = 0.5

@@ -7,7 +7,7 @@ tower's own ground height says otherwise (one reflecting plane per tower).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
 from shapely.geometry import Polygon
@@ -79,9 +79,17 @@ class Forest:
         Of the placement.
     source : str
     height_m : float, optional
-        Of the canopy above the ground; then no trees are placed.
+        Of the canopy above the ground.
+    trees : bool
+        With a height: trees are placed too, for opaque foliage alone. Without one they always are.
+    evergreen_share : float
+        Of the trees, those that keep their leaves: 0 to 1.
     crown_base_fraction : float
         Height of the crowns' base as a share of the canopy's.
+    base_m : float
+        Up of the ground below it, where the site has no elevation model.
+    filled : float
+        Share of the canopy's prism that is canopy.
     """
 
     name: str
@@ -90,7 +98,11 @@ class Forest:
     minimum_spacing_m: float = 4.0
     source: str = ""
     height_m: float | None = None
+    trees: bool = False
+    evergreen_share: float = 0.0
     crown_base_fraction: float = 0.25
+    base_m: float = 0.0
+    filled: float = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,13 +153,17 @@ class Site:
     buildings, forests, geofences : tuples
         May be empty.
     trees : Trees
-        Placed trees (from forests and single points).
+        Placed trees (from forests without a height and single points).
+    opaque_trees : Trees
+        The same, and those of stands that carry trees.
     ground_material : str
         Name in ``site.materials``.
     area_m : (east_min, east_max, north_min, north_max)
         Extent for maps.
-    illustrative : bool
-        True when buildings and forests are invented for demonstration; shown wherever they are drawn.
+    credit : str
+        Whose map it is: shown wherever buildings and forests are drawn.
+    assumed : str
+        Sizes on the map that nobody measured.
     notes : tuple of str
         For the report.
     datum : VerticalDatum
@@ -166,10 +182,12 @@ class Site:
     buildings: tuple[Building, ...] = ()
     forests: tuple[Forest, ...] = ()
     trees: Trees = field(default_factory=Trees.none)
+    opaque_trees: Trees = field(default_factory=Trees.none)
     geofences: tuple[Geofence, ...] = ()
     ground_material: str = "medium_dry_ground"
     area_m: tuple[float, float, float, float] = (-540.0, 540.0, -1065.0, 1065.0)
-    illustrative: bool = False
+    credit: str = ""
+    assumed: str = ""
     notes: tuple[str, ...] = ()
     datum: VerticalDatum = field(default_factory=VerticalDatum)
     dem: Dem | None = None
@@ -189,6 +207,13 @@ class Site:
             return ground
         terrain = self.dem.ground_m(east_m, north_m)
         return np.where(np.isnan(terrain), ground, terrain)
+
+    def under(self, foliage: str) -> Site:
+        """The site as a kind of foliage sees it: to ``opaque`` a stand that carries trees is those trees."""
+        if foliage != "opaque" or not any(forest.height_m is not None and forest.trees for forest in self.forests):
+            return self
+        woods = tuple(replace(forest, height_m=None) if forest.trees else forest for forest in self.forests)
+        return replace(self, trees=self.opaque_trees, forests=woods)
 
     def _repr_html_(self) -> str:
         """Towers and their places, for notebooks."""

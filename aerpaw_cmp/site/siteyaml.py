@@ -12,7 +12,7 @@ from dataclasses import replace
 from functools import cache
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
 import shapely
@@ -28,8 +28,9 @@ from .dem import Dem, read_dem
 from .heights import Height, HeightReference, VerticalDatum
 from .materials import material
 from .mesh_scenes.mitsuba import TriangleScene
-from .scenes import placed_scene
+from .scenes import placed_scene, without_traps
 from .site import Building, Forest, Geofence, Site, Tower, Trees
+from .surface import Surface, surface_through
 from .trees import Distribution, TreeSizes, join_trees, place_trees, trees_at, wanted_trees
 
 # Sites that come with the package, by name.
@@ -44,8 +45,13 @@ _FAR_POLYGON_M = 100_000.0
 # Buildings that overlap by less, everywhere, are not told of.
 OVERLAP_M = 0.5
 
+# A tower with nothing of the map nearer stands outside it.
+_MAPPED_M = 500.0
+
 # No tree is placed at random closer to a tower: masts stand clear.
 MAST_CLEARANCE_M = 8.0
+
+_TALLEST_TREE_M = 120.0
 
 # A higher building or mast is in feet or centimetres; no structure on Earth reaches it.
 TALLEST_M = 1000.0
@@ -54,7 +60,8 @@ Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Positive = Annotated[float, Field(gt=0)]
 _NotNegative = Annotated[float, Field(ge=0)]
-Ground = Literal["flat", "offsets", "dem"]
+Ground = Literal["flat", "offsets", "surface", "dem"]
+GroundPoint = tuple[float, float, float, Annotated[float, Field(gt=0)]]
 Area = tuple[float, float, float, float]
 Ring = Annotated[list[tuple[float, float]], Field(min_length=3)]
 
@@ -191,12 +198,14 @@ class BuildingModel(PolygonModel):
 
 
 class ForestModel(PolygonModel):
-    """A wooded area; with a height a medium in place of single trees."""
+    """A wooded area; with a height a medium, and then with ``trees`` single trees for opaque foliage."""
 
     trees_per_hectare: _NotNegative = 100.0
     minimum_spacing_m: _NotNegative = 4.0
     source: str = ""
-    height_m: _Structure | None = None
+    height_m: Annotated[Positive, Field(le=_TALLEST_TREE_M)] | None = None
+    trees: bool = False
+    evergreen_share: Annotated[float, Field(ge=0, le=1)] = 0.0
 
 
 OutlineT = TypeVar("OutlineT", bound=PolygonModel)
@@ -287,6 +296,7 @@ class SiteModel(StrictModel):
     coordinates: str | None = None
     tower_ground: Ground | None = None
     dem: DemModel | None = None
+    ground_points: list[GroundPoint] = Field(default_factory=list)
     scene: SceneModel | None = None
     ground_material: _MaterialName = "medium_dry_ground"
     area_m: tuple[float, float, float, float] | None = None
@@ -294,7 +304,8 @@ class SiteModel(StrictModel):
     forests: list[ForestModel] = Field(default_factory=list)
     trees: TreesModel = Field(default_factory=TreesModel)
     geofences: list[PolygonModel] = Field(default_factory=list)
-    illustrative: bool = False
+    credit: str = ""
+    assumed: str = ""
     notes: list[str] = Field(default_factory=list)
 
 
@@ -312,10 +323,10 @@ def load_site(
         ``"lake_wheeler"`` or a file.
     coordinates : str, optional
         Which published positions to use where a tower has several; overrides the file.
-    tower_ground : {"flat", "offsets", "dem"}, optional
+    tower_ground : {"flat", "offsets", "surface", "dem"}, optional
         ``flat`` puts the ground everywhere at up = 0 (the paper), ``offsets`` that of each tower at its stated
-        height, ``dem`` takes towers, buildings and trees from the elevation model. Overrides the file, where it is
-        ``dem`` when there is one, else ``flat``.
+        height, ``surface`` takes towers, buildings and trees from a smooth surface through ``ground_points``, ``dem``
+        from the elevation model. Overrides the file, where it is ``dem`` when there is one, else ``flat``.
 
     Returns
     -------
@@ -357,6 +368,14 @@ def _at(*location: Any) -> Iterator[None]:
         raise _PlacedError(error, location) from None
 
 
+def known_grounds(name_or_path: str | Path) -> tuple[Ground, ...]:
+    """Values of ``tower_ground`` that a site has the data for."""
+    model = site_model(name_or_path)
+    offsets = any(tower.ground_offset_m or tower.ground for tower in model.towers.values())
+    has_data = {"flat": True, "offsets": offsets, "surface": bool(model.ground_points), "dem": model.dem is not None}
+    return tuple(kind for kind in get_args(Ground) if has_data[kind])
+
+
 def site_model(name_or_path: str | Path) -> SiteModel:
     """The checked settings of a packaged site or a site.yaml, before trees are placed."""
     return _find(name_or_path)[1]
@@ -389,8 +408,12 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
     with _at("dem"):
         dem = _dem(model, frame, folder or Path())
-    datum = VerticalDatum(_origin_ground(model, dem), model.origin.takeoff_ground_m)
     notes = list(model.notes)
+    if model.tower_ground == "surface":
+        notes.append(_about_surface(ground_surface(model, frame)))
+    datum = VerticalDatum(_origin_ground(model, dem), model.origin.takeoff_ground_m)
+    if model.credit or model.assumed:
+        notes.insert(0, f"Map: {'; '.join(text for text in (model.credit, model.assumed) if text)}.")
     with _at("scene"):
         scene, scene_notes = _scene(model, folder or Path())
         notes += scene_notes
@@ -402,25 +425,32 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     notes += _disagreements(model, towers, datum, dem)
     with _at("area_m"):
         area = _area(model.area_m, towers)
+    woods: tuple[Forest, ...] = ()
+    if scene is not None:
+        scene, woods, scene_notes = without_traps(scene, {name: tower.position_m for name, tower in towers.items()})
+        notes += scene_notes
     buildings = tuple(_building(item, outline, dem) for item, outline in _outlines(model.buildings, "buildings", frame))
     notes += _buried(towers, buildings) + _overlaps(buildings)
     forests = tuple(
         Forest(
-            **named(item, "name trees_per_hectare minimum_spacing_m source height_m"),
+            **named(item, "name trees_per_hectare minimum_spacing_m source height_m trees evergreen_share"),
             area=outline,
             crown_base_fraction=model.trees.crown_base_fraction,
         )
         for item, outline in _outlines(model.forests, "forests", frame)
     )
+    forests += woods
+    notes += _unmapped(towers, [item.footprint for item in buildings] + [item.area for item in forests])
     with _at("trees"):
-        trees = _on_ground(_trees(model.trees, forests, buildings, towers, frame, notes), dem)
+        trees, of_stands = _trees(model.trees, forests, buildings, towers, frame, notes)
     return Site(
-        **named(model, "name ground_material illustrative"),
+        **named(model, "name ground_material credit assumed"),
         frame=frame,
         towers=towers,
         buildings=buildings,
         forests=forests,
-        trees=trees,
+        trees=_on_ground(trees, dem),
+        opaque_trees=_on_ground(join_trees([trees, of_stands]), dem),
         geofences=tuple(Geofence(item.name, area) for item, area in _outlines(model.geofences, "geofences", frame)),
         area_m=area,
         notes=tuple(notes),
@@ -490,15 +520,53 @@ def _dem(model: SiteModel, frame: SiteFrame, folder: Path) -> Dem | None:
     if model.tower_ground == "dem" and model.dem is None:
         with _at("tower_ground"):
             raise UsageError("tower_ground is 'dem', but there is no elevation model", expected="the key 'dem'")
+    if model.tower_ground == "surface":
+        with _at("ground_points"):
+            return ground_surface(model, frame).dem()
     if model.dem is None or model.tower_ground not in (None, "dem"):
         return None
     return read_dem(folder / model.dem.path, frame, crs=model.dem.crs)
 
 
+# The surface reaches so far beyond the area of the site.
+_SURFACE_MARGIN_M = 250.0
+
+
+def ground_surface(model: SiteModel, frame: SiteFrame) -> Surface:
+    """The surface through the ``ground_points`` of a site, which covers its area and its towers.
+
+    Raises
+    ------
+    UsageError
+        Too few points, two that contradict, or points of another place.
+    """
+    points = np.array(model.ground_points, dtype=np.float64).reshape(-1, 4)
+    if len(points):
+        _check_near([(float(east), float(north)) for east, north in points[:, :2]], "ground_points")
+    places = [_chosen_position(name, tower, model.coordinates, frame, []) for name, tower in model.towers.items()]
+    east, north = np.array([frame.to_local(p.latitude_deg, p.longitude_deg) for p in places]).T
+    area = extent_m(model, frame)
+    reach = (
+        min(area[0], east.min()) - _SURFACE_MARGIN_M, max(area[1], east.max()) + _SURFACE_MARGIN_M,
+        min(area[2], north.min()) - _SURFACE_MARGIN_M, max(area[3], north.max()) + _SURFACE_MARGIN_M,
+    )  # fmt: skip
+    return surface_through(points, frame, reach)
+
+
+def _about_surface(surface: Surface) -> str:
+    west, east, south, north = surface.reach_m
+    at = np.stack(np.meshgrid(np.linspace(west, east, 30), np.linspace(south, north, 30)), axis=-1).reshape(-1, 2)
+    low, middle, high = np.percentile(surface.sd_m(*at.T), (10, 50, 90))
+    return (
+        f"Ground: a smooth surface through {len(surface.height_m)} points of known height; standard deviation "
+        f"{low:.1f} / {middle:.1f} / {high:.1f} m at 10 / 50 / 90 % of the area."
+    )
+
+
 def _origin_ground(model: SiteModel, dem: Dem | None) -> Height | None:
     if model.origin.ground is not None:
         return model.origin.ground.height()
-    if dem is not None and model.dem is not None:
+    if dem is not None and model.dem is not None and model.tower_ground != "surface":
         return Height(float(dem.absolute_m(0.0, 0.0)), model.dem.reference)
     return None
 
@@ -549,6 +617,15 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
     first = " and ".join(f"'{buildings[i].name}'" for i in overlapping[0])
     more = "" if len(overlapping) == 1 else f" and {len(overlapping) - 1} more pairs"
     return [f"warning: the buildings {first}{more} overlap; 'aerpaw-cmp site import' makes outlines disjoint"]
+
+
+def _unmapped(towers: Mapping[str, Tower], shapes: list[Polygon]) -> list[str]:
+    """Name the towers of a mapped site that have nothing of the map near: the ground there is unknown, not bare."""
+    place = shapely.union_all(shapes)
+    bare = [t.name for t in towers.values() if place.distance(Point(t.east_m, t.north_m)) > _MAPPED_M]
+    if not shapes or not bare:
+        return []
+    return [f"no map here: no building and no wood is known within {_MAPPED_M:g} m of {', '.join(bare)}"]
 
 
 def _buried(towers: Mapping[str, Tower], buildings: tuple[Building, ...]) -> list[str]:
@@ -637,14 +714,17 @@ def _trees(
     towers: Mapping[str, Tower],
     frame: SiteFrame,
     notes: list[str],
-) -> Trees:
+) -> tuple[Trees, Trees]:
+    """Trees that stand for themselves, and those of stands, which only opaque foliage sees."""
     clear = shapely.union_all(
         [building.footprint for building in buildings]
         + [Point(tower.east_m, tower.north_m).buffer(MAST_CLEARANCE_M) for tower in towers.values()]
     )
-    sizes, parts = model.sizes(), []
+    sizes = model.sizes()
+    parts: list[Trees] = []
+    of_stands: list[Trees] = []
     for index, forest in enumerate(forests):
-        if forest.height_m is not None:
+        if forest.height_m is not None and not forest.trees:
             continue
         with _at("forests", index):
             placed = place_trees(forest, sizes, seed=model.seed, keep_clear=clear)
@@ -653,7 +733,7 @@ def _trees(
             notes.append(
                 f"{forest.name}: {len(placed)} of {wanted} trees fit at {forest.minimum_spacing_m:g} m spacing"
             )
-        parts.append(placed)
+        (parts if forest.height_m is None else of_stands).append(placed)
     points = list(model.points_m)
     if points:
         _check_near(points, "trees.points_m")
@@ -664,7 +744,7 @@ def _trees(
         parts.append(trees_at(east, north, sizes))  # type: ignore[arg-type]
     if model.single:
         parts.append(_single(model.single, sizes, frame))
-    return join_trees(parts)
+    return join_trees(parts), join_trees(of_stands)
 
 
 def _single(models: list[SingleTreeModel], sizes: TreeSizes, frame: SiteFrame) -> Trees:

@@ -166,7 +166,7 @@ def test_a_log_of_a_plan_holds_replayed_levels_less_offset_at_the_times_of_its_c
     written: list[Any] = []
     poses: list[Any] = []
 
-    def replayed(_site: Any, _link: Any, at: Any, _search: Any) -> Any:
+    def replayed(_site: Any, _rt: Any, _link: Any, at: Any) -> Any:
         poses.append(at)
         level = -60.0 - np.arange(len(at.position_m), dtype=float)
         level[3] = -np.inf
@@ -175,7 +175,7 @@ def test_a_log_of_a_plan_holds_replayed_levels_less_offset_at_the_times_of_its_c
         h[:, 0, 0, 0] = h[:, 0, 1, 1] = 1.0
         return SimpleNamespace(rss_power_dbm=level[:, None], rss_dbm=level[:, None] + 0.5, h=h)
 
-    monkeypatch.setattr(simulate, "replay", replayed)
+    monkeypatch.setattr(simulate, "replay_poses", replayed)
     monkeypatch.setattr(simulate, "format_power_log", lambda *given: written.append(given) or b"")
     monkeypatch.setattr(simulate, "format_ri_csv", lambda *given: written.append(given) or b"")
     for log in made.settings.logs:

@@ -220,7 +220,7 @@ def test_the_report_says_where_foliage_models_are_stretched_or_assumed(tmp_path:
 
     def notes(*carriers_hz: float, **rt: Any) -> str:
         data = gathered(flight(tmp_path, 20, rss=series, rt=rt))
-        return " ".join(foliage_notes(len(data.site.trees), data.settings.rt, carriers_hz))
+        return " ".join(foliage_notes(data.site.wooded, data.settings.rt, carriers_hz))
 
     attenuating = {"foliage": "attenuating"}
     assert notes(3.4e9) == notes(3.4e9, foliage="opaque") == notes(2.0e9, **attenuating) == ""

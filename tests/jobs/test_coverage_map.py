@@ -231,7 +231,7 @@ def test_the_page_shows_every_figure_of_the_paper_rows(made):
     assert named <= stems
     for name in named:
         assert f'id="figure-{name}"' in html
-    assert "illustrative" in html
+    assert "(c) OpenStreetMap contributors, ODbL" in html
     what = {row["what"] for row in printed["paper"]}
     assert {"out of coverage at 3 m", "c1 of the bi-exponential model"} <= what
     states = next(row for row in printed["paper"] if row["what"] == "UAV locations")

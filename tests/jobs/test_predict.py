@@ -34,7 +34,7 @@ from tests.json_page import unlisted
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
 POINTS = """east_m,north_m,height_m,yaw_deg
--300,150,45,20
+-300,150,30,20
 -300,150,,20
 -210,330,50,
 5000,5000,40,0
@@ -298,16 +298,16 @@ def test_a_planned_flight_faces_its_course():
 
 
 def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(prediction):
-    targets = dataclasses.replace(prediction.targets, heights_m=(45.0,))
+    targets = dataclasses.replace(prediction.targets, heights_m=(30.0,))
     on_grid = dataclasses.replace(prediction, targets=targets)
     (levels,) = corrected_map._levels(on_grid, prediction.sources["LW1.USRP1"], len(targets))
     level = rows_of(prediction, "LW1", "USRP1")["level_db"].to_numpy()
     np.testing.assert_allclose((levels.corrected_dbm - level)[[0, 2, 3]], 12.3, atol=0.7)
-    raw = trace("lake_wheeler", Link(3.3e9, {"LW1": single_element()}, single_element()), [[-300.0, 150.0, 45.0]])
+    raw = trace("lake_wheeler", Link(3.3e9, {"LW1": single_element()}, single_element()), [[-300.0, 150.0, 30.0]])
     assert levels.raw_dbm[0] == pytest.approx(raw.rss_dbm[0, 0], abs=1e-6)
     maps = corrected_map.CorrectedMaps(levels=(levels,), ranks={}, prediction=prediction.page)
     assert [layer.name for layer in maps.layers()] == [
-        f"rss_{kind}_h045m_LW1_USRP1" for kind in ("raw", "corrected", "sd")
+        f"rss_{kind}_h030m_LW1_USRP1" for kind in ("raw", "corrected", "sd")
     ]
 
 

@@ -13,7 +13,10 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs.mapping.site_scene import SceneOptions, is_scene, run_scene_import, run_site_export
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.field.stands import stand_depth_m
 from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
+from aerpaw_cmp.site.scenes import without_traps
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.simulated import planned, simulate, write_yaml
 
@@ -181,3 +184,62 @@ def test_an_option_of_the_other_kind_is_refused(
     assert main(arguments) == 2
     assert f"{option.split()[0]} with " in capsys.readouterr().err
     assert not (tmp_path / "site.yaml").exists()
+
+
+TWIN = """<scene version="2.1.0">
+<bsdf type="itu-radio-material" id="mat-metal"><string name="type" value="metal"/></bsdf>
+<bsdf type="radio-material" id="mat-ground"><float name="relative_permittivity" value="3"/><float name="conductivity" value="0.005"/><float name="thickness" value="1"/></bsdf>
+<bsdf type="radio-material" id="mat-tree_canopy"><float name="relative_permittivity" value="1.2"/><float name="scattering_coefficient" value="0.4"/></bsdf>
+<shape type="rectangle" id="Terrain"><transform name="to_world"><scale value="200"/></transform><ref id="mat-ground" name="bsdf"/></shape>
+<shape type="cube" id="mast"><transform name="to_world"><scale x="0.4" y="0.4" z="6"/><translate z="6"/></transform><ref id="mat-metal" name="bsdf"/></shape>
+<shape type="cube" id="sector"><transform name="to_world"><scale x="0.1" y="0.1" z="0.7"/><translate x="0.6" z="10"/></transform><ref id="mat-metal" name="bsdf"/></shape>
+<shape type="cube" id="street"><transform name="to_world"><scale x="5" y="5" z="4"/><translate x="-40" z="4"/></transform><ref id="mat-metal" name="bsdf"/></shape>
+<shape type="cube" id="a_canopy"><transform name="to_world"><scale x="3" y="9" z="4"/><translate x="50" z="10"/></transform><ref id="mat-tree_canopy" name="bsdf"/></shape>
+<shape type="cube" id="tree_1__trunk"><transform name="to_world"><scale x="0.2" y="0.2" z="3"/><translate x="50" z="3"/></transform><ref id="mat-ground" name="bsdf"/></shape>
+</scene>"""
+
+
+def test_masts_hide_nothing_and_meshes_of_trees_are_media(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """An antenna inside its mast and beside its sector sees all round; a canopy takes what its chord does."""
+    (tmp_path / "twin.xml").write_text(TWIN)
+    out = tmp_path / "site.yaml"
+    arguments = ["site", "import", str(tmp_path / "twin.xml"), "--origin", "35.7,-78.7", "--tower", "T=0,0,10"]
+    assert main([*arguments, "-o", str(out)]) == 0
+    first = capsys.readouterr().err.splitlines()[:3]
+    assert first[0] == "the antenna of T stands inside mesh mast, which hides nothing and is no mirror"
+    assert first[1] == "the antenna of T stands at mesh sector, which hides nothing and is no mirror"
+    assert first[2].startswith("1 meshes of vegetation are media, by the chord, and no mirrors; 1 meshes of trunks")
+    site = load_site(out)
+    assert all(text in site.notes for text in first)
+    assert site.scene is not None
+    assert {site.scene.shapes[shape] for shape in site.scene.shape} == {"Terrain", "street"}
+    [canopy] = site.forests
+    assert (canopy.base_m, canopy.height_m, canopy.filled) == pytest.approx((6.0, 8.0, 1.0))
+    angles = np.radians(np.arange(0, 360, 15))
+    spots = np.column_stack([120 * np.cos(angles), 120 * np.sin(angles), np.full(len(angles), 10.0)])
+    link = Link(3.4e9, {"T": single_element()}, single_element())
+    poses = Poses(spots, np.tile(np.eye(3), (len(spots), 1, 1)))
+    clear = replay(site, link, poses).rss_dbm[:, 0]
+    assert np.isfinite(clear).all()
+    depth = stand_depth_m(site, np.tile([0.0, 0.0, 10.0], (len(spots), 1)), spots)
+    np.testing.assert_allclose(depth[0], 6.0)  # of 3 + 3 m, at any slope none
+    np.testing.assert_allclose(depth[1:-1], 0.0)
+
+
+def test_a_mesh_is_as_full_as_its_volume_and_its_parts_stand_apart() -> None:
+    """Two pyramids in one mesh: two media, each a third of its prism; a hill is no mesh that encloses."""
+    corners = np.array([[-3, -3, 0], [3, -3, 0], [3, 3, 0], [-3, 3, 0], [0, 0, 9.0]])
+    faces = np.array([[0, 2, 1], [0, 3, 2], [0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    hill = np.array([[-90, -90, 0], [90, -90, 0], [90, 90, 0], [-90, 90, 0], [0, 0, 9.0]])
+    scene = TriangleScene(
+        vertices_m=np.concatenate([corners, corners + np.array([50, 0, -2]), hill]),
+        triangles=np.concatenate([faces, faces + 5, faces[2:] + 10]),
+        shape=np.repeat([0, 1], [12, 4]),
+        shapes=("crowns", "hill"),
+        materials=("vegetation", "concrete"),
+    )
+    without, woods, notes = without_traps(scene, {"T": np.array([0.0, 0.0, 5.0])})
+    assert [wood.filled for wood in woods] == pytest.approx([1 / 3, 1 / 3])
+    assert [wood.base_m for wood in woods] == pytest.approx([0.0, -2.0])
+    assert set(without.shape.tolist()) == {1}
+    assert not any("antenna" in note for note in notes if "hill" in note)

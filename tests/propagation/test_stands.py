@@ -1,5 +1,6 @@
 """Forests as a medium against closed forms and against counting points along the rays."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,15 +10,15 @@ from scipy.special import fresnel
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.flight.losses import path_loss
+from aerpaw_cmp.flight.losses import path_loss, sight_shares
 from aerpaw_cmp.flight.settings import RtSettings
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.field.foliage import P833, FoliageModel, NoFoliage, Opaque, foliage_model
-from aerpaw_cmp.propagation.field.stands import TRUNKS, stand_loss_db
+from aerpaw_cmp.propagation.field.stands import TRUNKS, over_stands, stand_loss_db
 from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.dem import Dem
-from aerpaw_cmp.site.site import Forest, Site, Tower
+from aerpaw_cmp.site.site import Building, Forest, Site, Tower
 from aerpaw_cmp.site.siteyaml import load_site
 
 FRAME, WAVELENGTH = SiteFrame(35.7, -78.7), 0.09
@@ -183,3 +184,33 @@ def test_a_forest_of_a_site_file_with_a_height_is_a_medium(tmp_path: Any) -> Non
     fall = clear.rss_power_dbm - shaded.rss_power_dbm
     assert fall[0, 0] > 5.0
     assert shaded.rss_dbm[1, 0] == pytest.approx(clear.rss_dbm[1, 0], abs=3.0)
+
+
+def test_the_evergreen_share_keeps_its_leaves() -> None:
+    """Out of leaf a stand loses between what leafless trees lose and what trees in leaf do, in proportion."""
+    ends = np.array([[0.0, 0, 15]]), np.zeros((1, 0, 3)), np.array([[400.0, 0, 15]])
+    leafed, bare = WEAK, P833(0.8e-3, 1e3)
+
+    def lost(share: float) -> float:
+        site = wood(box(100.0, -900.0, 200.0, 900.0))
+        site = replace(site, forests=(replace(site.forests[0], evergreen_share=share),))
+        return float(stand_loss_db(site, *ends, bare, WAVELENGTH, leafed)[0])
+
+    assert lost(0.0) == pytest.approx(0.08, abs=3e-3)
+    assert lost(1.0) == pytest.approx(0.10, abs=3e-3)
+    assert lost(0.5) == pytest.approx((lost(0.0) + lost(1.0)) / 2)
+
+
+def test_sight_lines_through_woods_and_behind_buildings_are_counted() -> None:
+    """Of eight poses around a tower two lie behind a wood, one more behind a barn, one of them behind both."""
+    site = wood(box(100.0, -300.0, 200.0, 300.0))
+    site = replace(
+        site, buildings=(Building("barn", box(-60, -20, -50, 20), 12.0), Building("shed", box(50, -5, 60, 5), 12.0))
+    )
+    angle = np.radians([0, 10, 90, 120, 150, 180, 240, 270])
+    poses = np.column_stack([400 * np.cos(angle), 400 * np.sin(angle), np.full(8, 10.0)])
+    assert sight_shares(site, "T", poses) == (2 / 8, 2 / 8)
+    above = poses + np.array([0.0, 0.0, 500.0])
+    assert sight_shares(site, "T", above) == (0.0, 0.0)
+    seen = over_stands(site, np.tile([0.0, 0.0, 10.0], (8, 1)), np.zeros((8, 0, 3)), above)
+    assert seen.tolist() == [True, True] + [False] * 6  # at any height

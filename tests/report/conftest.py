@@ -54,7 +54,7 @@ def make_site() -> Site:
         ),
         trees=trees,
         geofences=(Geofence("fence", box(-250, -120, 250, 330)),),
-        illustrative=True,
+        credit="(c) mapmakers",
         notes=("Tower heights are 10 m.",),
     )
 

@@ -116,15 +116,13 @@ def test_first_screen_says_what_and_how_well(report_data):
     head = text[: text.index("The flight")]
     panel = report_data.rss[0]
     errors = (panel.score.rmse_db, *(panel.baselines[name].rmse_db for name in ("free_space", "two_ray")))
-    for piece in (f"{panel.score.offset_db:.1f}", *(f"{error:.2f}" for error in errors), "synthetic", "illustrative"):
+    for piece in (f"{panel.score.offset_db:.1f}", *(f"{error:.2f}" for error in errors), "synthetic"):
         assert piece in head
 
 
-def test_not_called_synthetic_or_illustrative_when_it_is_neither(report_data):
-    site = dataclasses.replace(report_data.site, illustrative=False, name="here")
-    text = render(dataclasses.replace(report_data, synthetic=False, site=site, rss=(), rank=())).text
+def test_not_called_synthetic_when_it_is_not(report_data):
+    text = render(dataclasses.replace(report_data, synthetic=False, rss=(), rank=())).text
     assert "synthetic" not in text
-    assert "illustrative" not in text
 
 
 def hostile_report(data: ReportData, text: str) -> ReportData:

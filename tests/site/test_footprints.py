@@ -139,11 +139,15 @@ def test_one_village_in_four_formats(tmp_path: Path, writer: object) -> None:
 
 
 def test_round_trip_through_site_yaml(tmp_path: Path) -> None:
-    model, actions = import_site([village_geojson(tmp_path / "v.json")])
+    model, actions = import_site([village_geojson(tmp_path / "v.json")], trees=True)
     (tmp_path / "site.yaml").write_text(site_yaml(model, header=["imported", *actions]), encoding="utf-8")
     site, again = load_site(tmp_path / "site.yaml"), build_site(model)
-    assert not site.illustrative
-    assert not any("illustrative" in note for note in site.notes)
+    assert site.assumed == (
+        "height assumed: 1 of 3 buildings have none in the map, 6 m each: hut; "
+        "trees assumed: 100 per hectare at random places in 1 woods"
+    )
+    assert site.assumed in actions
+    assert any(site.assumed in note for note in site.notes)
     assert list(site.towers) == ["LW1", "LW2", "LW3", "LW4", "LW5"]
     assert [b.height_m for b in site.buildings] == [b.height_m for b in again.buildings]
     for first, second in zip(site.buildings, again.buildings, strict=True):

@@ -18,7 +18,8 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.imports import mapfiles
 from aerpaw_cmp.site.imports.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.imports.mapfiles import MAX_TAGS, read_map_file
-from aerpaw_cmp.site.siteyaml import load_site
+from aerpaw_cmp.site.imports.outlines import OSM_CREDIT
+from aerpaw_cmp.site.siteyaml import build_site, load_site
 from tests.geojson import collection, feature, polygon
 
 FRAME = SiteFrame(35.7275, -78.696)
@@ -93,7 +94,7 @@ def test_clearings_stay_empty_of_trees(tmp_path: Path, style: str) -> None:
     members = [(outer, roles[0]), *((way, roles[1]) for way in inner), (island, roles[0])]
     osm.relation(members, type="multipolygon", **({} if style == "tags on the outer way" else wood))
     (tmp_path / "w.osm").write_text(osm.xml())
-    model, _ = import_site([tmp_path / "w.osm"])
+    model, _ = import_site([tmp_path / "w.osm"], trees=True)
     (tmp_path / "site.yaml").write_text(site_yaml(model), encoding="utf-8")
     site = load_site(tmp_path / "site.yaml")
     # the site's origin is LW1, a metre or so from FRAME's
@@ -296,7 +297,8 @@ def test_parts_of_a_building_have_their_own_heights(tmp_path: Path) -> None:
 def test_unusual_heights_are_used_or_said(tmp_path: Path, tags: dict[str, Any], metres: float, words: str) -> None:
     footprints = read(tmp_path, collection(feature(polygon(square(0, 0)), building="yes", **tags)))
     assert footprints.buildings[0].height_m == pytest.approx(metres, abs=0.01)
-    assert said(footprints, words) if words else not footprints.actions
+    assert said(footprints, words) if words else not [text for text in footprints.actions if "assumed" not in text]
+    assert ("1 of 1 buildings have none in the map, 6 m each" in footprints.assumed) == (metres == 6)
 
 
 def test_false_is_no_building_and_the_way_out_is_named(tmp_path: Path) -> None:
@@ -398,13 +400,28 @@ def test_control_characters_do_not_spoil_the_file(tmp_path: Path) -> None:
     assert load_site(tmp_path / "site.yaml").buildings[0].name == "bell\u0007"
 
 
-def test_openstreetmap_is_named_in_the_notes(tmp_path: Path) -> None:
+def test_openstreetmap_is_credited_in_file_and_notes(tmp_path: Path) -> None:
     osm = Osm()
     osm.way(square(50, 0), **BARN)
     (tmp_path / "a.osm").write_text(osm.xml())
-    (tmp_path / "b.json").write_text(json.dumps(collection(feature(polygon(square(100, 0)), **BARN))))
-    model, _ = import_site([tmp_path / "a.osm", tmp_path / "b.json"])
-    assert [note for note in model.notes if "OpenStreetMap" in note] == ["a.osm: (c) OpenStreetMap contributors, ODbL"]
+    plain, made_of_osm = feature(polygon(square(100, 0)), **BARN), feature(polygon(square(0, 90)), **BARN)
+    (tmp_path / "b.json").write_text(json.dumps(collection(plain)))
+    (tmp_path / "c.json").write_text(json.dumps(collection({**made_of_osm, "id": "way/5"})))
+    for files, credit in ((["a.osm", "b.json"], OSM_CREDIT), (["b.json"], ""), (["b.json", "c.json"], OSM_CREDIT)):
+        model, _ = import_site([tmp_path / name for name in files])
+        assert model.credit == credit
+        assert any("OpenStreetMap" in note for note in build_site(model).notes) == bool(credit)
+
+
+def test_a_wood_takes_its_height_and_leaves_from_its_tags(tmp_path: Path) -> None:
+    woods = [
+        feature(polygon(square(200 * k, 0)), natural="wood", **tags)
+        for k, tags in enumerate([{}, {"height": "12", "leaf_type": "needleleaved"}, {"height": "60 km"}])
+    ]
+    footprints = read(tmp_path, collection(*woods))
+    assert [(f.height_m, f.evergreen_share) for f in footprints.forests] == [(20.0, 0.0), (12.0, 1.0), (20.0, 0.0)]
+    assert footprints.assumed == "height assumed: 2 of 3 woods have none in the map, 20 m each"
+    assert {f.height_m for f in read(tmp_path, collection(*woods), trees=True).forests} == {None}
 
 
 def test_a_kmz_with_any_byte_damaged_is_read_or_refused(tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def test_crowns_are_closed_and_lie_inside_the_cone() -> None:
 
 
 def test_one_mesh_per_material_with_owners() -> None:
-    site = load_site("lake_wheeler")
+    site = load_site("lake_wheeler").under("opaque")
     meshes = site_meshes(site)
     assert set(meshes) == {"medium_dry_ground", "concrete", "wood", "vegetation"}
     concrete = meshes["concrete"]
@@ -89,7 +89,7 @@ def test_export_is_well_formed(tmp_path: Path) -> None:
         head, _, body = content.partition(b"end_header\n")
         vertices, faces = (int(line.split()[2]) for line in head.decode().splitlines() if line.startswith("element"))
         assert len(body) == 12 * vertices + 13 * faces
-    assert "illustrative" in path.read_text()
+    assert "(c) OpenStreetMap contributors, ODbL" in path.read_text()
     with pytest.raises(UsageError, match="cannot be written"):
         export_scene(load_site("lake_wheeler"), path)  # a file is in the way
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pyproj import Geod
+from shapely.geometry import Point
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
@@ -58,13 +59,38 @@ def test_lake_wheeler_area_is_the_papers() -> None:
     assert {b.material for b in site.buildings} == {"concrete"}
 
 
-def test_illustrative_things_are_marked() -> None:
+def test_the_packaged_map_is_openstreetmaps_and_says_so() -> None:
     site = load_site("lake_wheeler")
-    assert site.illustrative
-    assert {b.source for b in site.buildings} == {"illustrative"} == {f.source for f in site.forests}
-    assert any("illustrative" in note for note in site.notes)
-    near = [b for b in site.buildings if b.footprint.centroid.x < 0 < b.footprint.centroid.y]
-    assert any(math.hypot(b.footprint.centroid.x, b.footprint.centroid.y) < 150 for b in near)  # north-west of LW1
+    assert site.credit == "(c) OpenStreetMap contributors, ODbL"
+    assert any(site.credit in note and "assumed" in note for note in site.notes)
+    assert [b.source[:8] for b in site.buildings].count("OSM way ") == 21
+    assert [b.height_m for b in site.buildings if "LiDAR" in b.source] == [6.8, 5.5, 4.2, 6.7, 5.8, 5.5]
+    assert sum(f.area.area for f in site.forests) / 1e4 == pytest.approx(91.6, abs=0.1)  # of the extract, in hectares
+    assert any("no map here" in note and "LW5" in note for note in site.notes)
+    # neither the barn north-west of LW1 nor any other building stands there on the map
+    at_lw1 = [b for b in site.buildings if b.footprint.distance(Point(0, 0)) < 150]
+    assert len(at_lw1) >= 6
+    assert not [b for b in at_lw1 if b.footprint.centroid.x < 0 < b.footprint.centroid.y]
+
+
+def test_woods_are_media_and_only_opaque_foliage_sees_their_trees() -> None:
+    site = load_site("lake_wheeler")
+    assert {f.height_m for f in site.forests} == {20.0}
+    assert len(site.trees) == 0
+    assert site.under("attenuating") is site
+    opaque = site.under("opaque")
+    assert {f.height_m for f in opaque.forests} == {None}
+    assert len(opaque.trees) == pytest.approx(9160, rel=0.01)  # 100 per hectare
+
+
+def test_a_wood_may_be_trees_or_a_medium_alone(tmp_path: Path) -> None:
+    wood = "forests:\n- {name: w, polygon_m: [[50, 0], [150, 0], [150, 100], [50, 100]]%s}"
+    trees = load_site(site_file(tmp_path, MINIMAL + wood % ""))
+    assert len(trees.trees) == 100
+    assert trees.under("opaque") is trees
+    medium = load_site(site_file(tmp_path, MINIMAL + wood % ", height_m: 15"))
+    assert len(medium.under("opaque").trees) == 0
+    assert medium.under("opaque").forests[0].height_m == 15.0
 
 
 def test_ground_is_flat_unless_offsets_are_asked_for() -> None:
@@ -78,13 +104,14 @@ def test_trees_stand_in_forests_and_clear_of_masts() -> None:
     import shapely
 
     site = load_site("lake_wheeler")
+    trees = site.opaque_trees
     woods = shapely.union_all([f.area for f in site.forests])
-    assert shapely.contains_xy(woods, site.trees.east_m, site.trees.north_m).all()
+    assert shapely.contains_xy(woods, trees.east_m, trees.north_m).all()
     for tower in site.towers.values():
-        away = np.hypot(site.trees.east_m - tower.east_m, site.trees.north_m - tower.north_m)
+        away = np.hypot(trees.east_m - tower.east_m, trees.north_m - tower.north_m)
         assert away.min() >= MAST_CLEARANCE_M * 0.98  # the buffer is a polygon
     again = load_site("lake_wheeler")
-    np.testing.assert_array_equal(again.trees.east_m, site.trees.east_m)
+    np.testing.assert_array_equal(again.opaque_trees.east_m, trees.east_m)
 
 
 def test_antenna_inside_a_building_is_noted(tmp_path: Path) -> None:
@@ -169,7 +196,7 @@ def test_the_documented_site_is_valid() -> None:
 
 def test_the_documented_differences_are_the_computed_ones() -> None:
     text = (Path(__file__).parents[2] / "docs" / "lake_wheeler.md").read_text(encoding="utf-8")
-    notes = load_site("lake_wheeler").notes[2:]
+    notes = [note for note in load_site("lake_wheeler").notes if " lies " in note]
     assert len(notes) == 5
     for note in notes:
         tower, metres = note[:3], note.split(" lies ")[1].split(" from")[0]

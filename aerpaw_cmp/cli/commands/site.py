@@ -55,6 +55,7 @@ def site_import(
         Path | None,
         Option(metavar="FILE", help="Surface model (GeoTIFF) that gives the buildings their heights."),
     ] = None,
+    trees: Annotated[bool, Option("--trees", help="Woods as single trees at random places, not as media.")] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -65,7 +66,7 @@ def site_import(
     files = files or []
     scene = len(files) == 1 and site_scene.is_scene(files[0])
     of_scenes = {"--origin": origin, "--tower": tower, "--material": material, "--turn": turn}
-    of_maps = {"--untagged": untagged, "--canopy": canopy, "--buildings": buildings}
+    of_maps = {"--untagged": untagged, "--canopy": canopy, "--buildings": buildings, "--trees": trees}
     for option in (name for name, value in (of_maps if scene else of_scenes).items() if value):
         kinds = ("a Mitsuba scene", "map files") if scene else ("map files", "one Mitsuba XML")
         raise UsageError(f"{option} with {kinds[0]}", expected=f"{kinds[1]}, or no {option}")
@@ -77,7 +78,7 @@ def site_import(
     else:
         base = base or "lake_wheeler"
         actions = run.run_site_import(
-            files, out, base=base, untagged=untagged, canopy=canopy, surface=buildings, force=force
+            files, out, base=base, untagged=untagged, canopy=canopy, surface=buildings, trees=trees, force=force
         )
     if as_json:
         print_json({"file": str(out), "base": base, "actions": actions})

@@ -22,6 +22,7 @@ from ...site.site import Site
 from ...site.siteyaml import load_site
 from ..data import is_ratio, site_place
 from ..lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
+from ..losses import sight_shares
 from ..pose.cross_checks import questions
 from ..pose.grouping import Span, flights, stream_span
 from ..pose.heights import height_in_name, lacks_height
@@ -286,22 +287,48 @@ def _replay_lines(entries: _Entries, known: Proposal) -> list[str]:
     if entries.flown is None:
         return []
     alone = ", max_depth: 0" if known.antennas else ""  # the gains were learned beside line of sight alone
+    shaded, why = _shaded(entries)
+    alone += shaded
     if "rank" in entries.kinds:
         return [
+            *why,
             "# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n",
-            f"rt: {{audit_links: {_QUICK_AUDIT}}}{_QUICK}\n",
+            f"rt: {{audit_links: {_QUICK_AUDIT}{shaded}}}{_QUICK}\n",
         ]
-    frame = entries.flown[0].frame
+    frame, keys = entries.flown[0].frame, f"{alone}, audit_links: {_QUICK_AUDIT}"
     if _has_attitude(frame):
-        return [f"rt: {{attitude: logged{alone}, audit_links: {_QUICK_AUDIT}}}{_QUICK}\n"]
-    if _has_attitude(frame, ("yaw_deg",)):
-        return [
-            f"rt: {{attitude: level{alone}, audit_links: {_QUICK_AUDIT}}}{_QUICK}; level, with the logged heading\n"
-        ]
-    return [
-        f"rt: {{attitude: level{alone}, audit_links: {_QUICK_AUDIT}}}"
-        "  # a quick audit; no attitude in the telemetry: the nose points along the track?\n"
-    ]
+        line = f"rt: {{attitude: logged{keys}}}{_QUICK}\n"
+    elif _has_attitude(frame, ("yaw_deg",)):
+        line = f"rt: {{attitude: level{keys}}}{_QUICK}; level, with the logged heading\n"
+    else:
+        line = (
+            f"rt: {{attitude: level{keys}}}"
+            "  # a quick audit; no attitude in the telemetry: the nose points along the track?\n"
+        )
+    return [*why, line]
+
+
+# Positions at which sight lines are looked along, and the share of lines from which woods or buildings count.
+_SIGHTS, _SHADED_SHARE = 200, 0.01
+
+
+def _shaded(entries: _Entries) -> tuple[str, list[str]]:
+    """Keys of ``rt`` for links through woods or behind buildings, and comments with the share of their sight lines."""
+    if entries.placer is None:
+        return "", []
+    site, positions = entries.placer.site, entries.placer.positions_m(_SIGHTS)
+    names = sorted({tower for tower, *_ in entries.series} & set(site.towers))
+    if not names or not len(positions):
+        return "", []
+    wooded, hidden = (float(share) for share in np.mean([sight_shares(site, n, positions) for n in names], axis=0))
+    keys, comments = "", []
+    if wooded >= _SHADED_SHARE:
+        keys += ", foliage: attenuating"
+        comments.append(f"# {wooded:.0%} of the sight lines pass through woods: woods attenuate.\n")
+    if hidden >= _SHADED_SHARE:
+        keys += ", diffraction: edges"
+        comments.append(f"# {hidden:.0%} of the sight lines are behind buildings: edges diffract.\n")
+    return keys, comments
 
 
 # Of the searched offsets about those that free space expects.

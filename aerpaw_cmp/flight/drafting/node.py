@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.units import FloatArray
+from ...common.units import FloatArray, spread_out
 from ...compare.learning.locate import FEWEST, LevelModel, LevelTrack, fit_places, level_track, locate
 from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
@@ -117,6 +117,12 @@ class Placer:
     def at_site(self) -> bool:
         """True if the flight was flown near a tower of the site."""
         return any(self._near(tower.latitude_deg, tower.longitude_deg) for tower in self.site.towers.values())
+
+    def positions_m(self, count: int) -> FloatArray:
+        """About ``count`` positions (n, 3) of the flight [m], spread over it, above the ground."""
+        times = self.telemetry.frame["time"]
+        place = self.track.pose_at(times.iloc[spread_out(len(times), count)]).position_m
+        return place[place[:, 2] > self.track.ground_m + _LOW_M]
 
     def levels(self, stream: Stream, floor_db: float = -np.inf, airframe: MeasuredPattern | None = None) -> LevelTrack:
         """Levels of a log where the UAV flew, with the gain of its airframe where it is known."""

@@ -42,7 +42,7 @@ from ...maps.study import HeldOutStudy, Study, held_out_study, interpolation_stu
 from ...maps.tiles import Budget, Reach, Tiling
 from ...maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ...propagation.arrays import Link, Poses, linear_array, single_element
-from ...propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
+from ...propagation.field.foliage import crown_index, foliage_loss_db, foliage_model
 from ...propagation.field.stands import stand_loss_db
 from ...propagation.field.sum import channel_matrices, rss_dbm
 from ...propagation.options import Engine, Job, Run, Search
@@ -179,7 +179,7 @@ class SiteChannels:
 
     def __init__(self, site: Site, settings: MapSettings) -> None:
         self.settings, self.names = settings, tuple(site.towers)
-        self.crowns = CrownIndex(site.trees)
+        self.crowns = {mode: crown_index(site.under(mode).trees) for mode in settings.foliage}
         budget = Budget(
             carrier_hz=settings.carrier_hz,
             transmit_power_dbm=settings.transmit_power_dbm,
@@ -299,9 +299,9 @@ class SiteChannels:
             return None
         model = foliage_model(mode, self.settings.carrier_hz)
         source, target = self.sources_m[paths.tower], poses.position_m[paths.pose]
-        trees_db = foliage_loss_db(source, paths.vertices_m, target, self.crowns, model)
+        trees_db = foliage_loss_db(source, paths.vertices_m, target, self.crowns[mode], model)
         wavelength = wavelength_m(self.settings.carrier_hz)
-        return trees_db + stand_loss_db(self.site, source, paths.vertices_m, target, model, wavelength)
+        return trees_db + stand_loss_db(self.site.under(mode), source, paths.vertices_m, target, model, wavelength)
 
     def _shaded(
         self, clear: ComplexArray, replayed: Replay, poses: Poses, link: Link, loss_db: FloatArray | None

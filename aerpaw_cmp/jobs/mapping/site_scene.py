@@ -119,7 +119,8 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
             content["notes"] = [*content.get("notes", []), _LOCAL_NOTE]
             actions.append(_LOCAL_NOTE)
         model = SiteModel.model_validate(content)
-        build_site(model, out.resolve().parent)  # what does not fit is said now
+        site = build_site(model, out.resolve().parent)  # what does not fit is said now
+        actions = [*(note for note in site.notes if " mesh" in note), *actions]
         output.write(sealed(site_yaml(model, header=["made by 'aerpaw-cmp site import' from a scene", *actions])))
     return actions
 

@@ -144,9 +144,10 @@ _MOMENTS = 6
 
 def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected]]:
     """Replays with towers that stand, with what the settings say of them: of a tower that moves some moments."""
+    site = data.site.under(data.settings.rt.foliage)
     for replayed, expected in zip(replays, expectations(data, replays), strict=True):
         if replayed.tower_m is None:
-            yield data.site, replayed, expected
+            yield site, replayed, expected
             continue
         (tower,) = replayed.link.tower_arrays
         count = len(replayed.poses)
@@ -160,7 +161,7 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
                 track=None,
                 tower_m=None,
             )
-            yield site_with_tower_at(data.site, tower, replayed.tower_m[at]), moment, expected
+            yield site_with_tower_at(site, tower, replayed.tower_m[at]), moment, expected
 
 
 def _rays(parts: Sequence[Audit]) -> list[str]:

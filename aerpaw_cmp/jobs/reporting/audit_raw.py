@@ -30,6 +30,7 @@ from ...logs.ingest import IngestedFile
 from ...propagation.check.field_audit import Expected
 from ...propagation.check.raw import LOWEST_M, Log, Matrix, Pose, RawPath, Reading, east_north_m, level, read_log
 from ...propagation.check.reference import Mirror, Reference
+from ...propagation.field.stands import over_stands
 from ...site.site import Tower
 
 # Of all RSS series together, at least three of each; and moments of the track between its rows.
@@ -261,7 +262,8 @@ def _reference(
     if data.site.scene is not None or data.site.dem is not None or rt.diffraction != "none":
         account.leave("levels over terrain, in scenes of triangles, with diffraction")
         return None
-    return Reference(replace(data.site, towers={tower: towers[tower]}), tower, expected.link, expected.loss)
+    site = replace(data.site.under(rt.foliage), towers={tower: towers[tower]})
+    return Reference(site, tower, expected.link, expected.loss)
 
 
 # ---------------------------------------------------------------- track
@@ -385,6 +387,10 @@ class _Series:
             grounds[n] = all(face < 0 or replay.faces.solid[face] < 0 for face in row.tolist())
         if not len(mine) or not grounds.all() or (replay.paths.depth[mine] > 1).any():
             self.account.leave("levels of samples with paths off walls (the second implementation has those)")
+            return
+        ends = np.array([reference.source]), np.zeros((1, 0, 3)), np.array([pose.place_m])
+        if reference.loss.model != "none" and over_stands(reference.site, *ends).any():
+            self.account.leave("levels of samples behind forests that are a medium")
             return
         ground = next(m for m in reference.mirrors if m.solid < 0)
         paths = []

@@ -51,6 +51,7 @@ from ...flight.settings import RssSettings, RtSettings
 from ...flight.training import learned_here
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ...site.site import Site
+from .ground_error import agreement_by_ground
 from .levels import Levels, at_samples, levels_of, stated_spread
 from .likely_cause import cause_of
 
@@ -507,8 +508,8 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
         out[name] = replayed.spread(directions[name])
     if replayed.track is not None:
         out["heading_deg"] = replayed.spread(replayed.track.heading_deg)
-    if len(site.trees) and rt.foliage != "none":
-        depth = direct_foliage_m(replayed.source_m(site), replayed.poses.position_m, site.trees)
+    if site.wooded and rt.foliage != "none":
+        depth = direct_foliage_m(replayed.source_m(site), replayed.poses.position_m, site.under(rt.foliage))
         out["foliage_depth_m"] = replayed.spread(depth)
     return out
 
@@ -577,6 +578,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
             repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], heading),
             receiver=forecast,
             trained_on=trained or None,
+            agreement_sd_by_ground=agreement_by_ground(data, replayed, series.rank[rows], poses, settings.k) or None,
         ),
         probability=probability,
     )

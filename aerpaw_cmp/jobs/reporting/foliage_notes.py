@@ -8,9 +8,9 @@ from ...flight.settings import RtSettings
 from ...propagation.field.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
 
 
-def foliage_notes(trees: int, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
+def foliage_notes(wooded: bool, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
     """Notes a report must give on its foliage models, if the site has trees: how far they are stretched or assumed."""
-    if not trees or rt.foliage != "attenuating":
+    if not wooded or rt.foliage != "attenuating":
         return ()
     notes = []
     if rt.foliage_model == "p833" and (rt.advanced.gamma_db_per_m is None or rt.advanced.maximum_loss_db is None):

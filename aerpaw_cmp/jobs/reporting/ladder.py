@@ -1,7 +1,7 @@
 """The ladder of models of a flight: which antennas, attitude, ground, buildings and trees its measurement asks for.
 
-Stages come one after the other (antennas, ground, buildings, trees); each adds its variants to the best model so far,
-by the RMSE on held-out segments. Everything but the offset is fixed beforehand.
+Stages come one after the other (antennas, ground, buildings, woods, relief); each adds variants to the best model
+so far, by the RMSE on held-out segments. Everything but the offset is fixed beforehand.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from ...common.units import FloatArray
 from ...common.yamlfile import parse_yaml
 from ...compare.judge.ladder import Ladder, Rung, climb
 from ...compare.result import BASELINE_TITLE
-from ...flight.data import FlightData, RssSeries
+from ...flight.data import FlightData, RssSeries, choose_site, site_place
 from ...flight.drafting.remembered import errors_elsewhere, offered
 from ...flight.learned_gain import pair_db
 from ...flight.losses import path_loss
@@ -37,6 +37,7 @@ from ...propagation.replay import Replay, replay
 from ...site.antenna.antennas import Isotropic
 from ...site.antenna.sphere_pattern import SpherePattern
 from ...site.site import Site
+from ...site.siteyaml import known_grounds
 from .levels import Levels, levels_of
 
 # Loss of the weakened ground reflection: a smooth half-space reflects more than any field.
@@ -56,6 +57,7 @@ LEARNED_HERE = " (its antennas were learned on this flight, too: not scored)"
 Antennas = Literal["isotropic", "measured", "learned"]
 Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
 Trees = Literal["none", "p833", "weissberger", "opaque"]
+Relief = Literal["flat", "offsets", "surface"]
 
 # What the ladder calls the sums and losses of the ground reflection.
 _GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "rough": "rough", "power sum": "incoherent"}
@@ -70,6 +72,10 @@ class Model:
     ground: Ground = "none"
     buildings: bool = False
     trees: Trees = "none"
+    media: bool = False
+    """The woods that attenuate are media, not single trees."""
+    relief: Relief = "flat"
+    """Ground at the towers and below the paths, in place of that of the flight file."""
     diffraction: bool = False
     """Paths over one edge of a building, with the ground on either side."""
     roughness_m: float = 0.0
@@ -87,7 +93,9 @@ class Model:
         parts += ["buildings"] if self.buildings else []
         parts += ["diffraction"] if self.diffraction else []
         if self.trees != "none":
-            parts.append("opaque trees" if self.trees == "opaque" else f"trees ({self.trees})")
+            woods = "woods as media" if self.media else "trees"
+            parts.append("opaque trees" if self.trees == "opaque" else f"{woods} ({self.trees})")
+        parts += [] if self.relief == "flat" else [f"relief ({self.relief})"]
         return _FREE_SPACE if not parts else " + ".join(parts)
 
     def settings(self, max_depth: int) -> dict[str, dict[str, Any]]:
@@ -107,7 +115,10 @@ class Model:
         return {
             "rt": rt,
             "rss": {"field": "power" if self.ground == "power sum" else "coherent"},
-            "site": {"without_buildings": not self.buildings},
+            "site": {
+                "without_buildings": not self.buildings,
+                **({} if self.relief == "flat" else {"tower_ground": self.relief}),
+            },
         }
 
 
@@ -163,7 +174,7 @@ class _Climber:
     def __init__(self, data: FlightData, series: Sequence[_Series]) -> None:
         self._data, self._series = data, series
         self._measured = [s.levels.measured_db[s.rows] for s in series]
-        self._traced: dict[tuple[int, bool], tuple[Replay, float]] = {}
+        self._traced: dict[tuple[int, bool, Relief], tuple[Replay, float]] = {}
         patterns = [p for s in series for a in _arrays(s.replayed.link) for p in a.patterns]
         self._offer = offered(data) if all(p.name == "iso" for p in patterns) else None
         links = [s.replayed.link for s in series]
@@ -174,7 +185,7 @@ class _Climber:
         rungs = self._lines()
         models: list[Model | None] = [None] * len(rungs)
         best = Model()
-        for stage in (self._antennas, self._ground, self._buildings, self._edges, self._trees):
+        for stage in (self._antennas, self._ground, self._buildings, self._edges, self._trees, self._relief):
             for model in stage(best):
                 if model not in models:
                     models.append(model)
@@ -257,13 +268,34 @@ class _Climber:
         if not self._data.site.wooded:
             return []
         kinds: tuple[Trees, ...] = ("p833", "weissberger", "opaque")
-        return [dataclasses.replace(best, trees=kind) for kind in kinds]
+        media = any(forest.height_m is not None for forest in self._data.site.forests)
+        return [dataclasses.replace(best, trees=kind, media=media and kind != "opaque") for kind in kinds]
+
+    def _relief(self, best: Model) -> list[Model]:
+        return [dataclasses.replace(best, relief=kind) for kind in self._reliefs]
+
+    @cached_property
+    def _reliefs(self) -> dict[Relief, Site]:
+        """The site with other grounds that its file knows, where the flight has flat ground and no own node."""
+        data, flat = self._data, self._data.site
+        if flat.dem or flat.scene or data.settings.towers or any(t.ground_m for t in flat.towers.values()):
+            return {}
+        kinds = known_grounds(site_place(data.settings.site.file, data.folder))
+        chosen: dict[Relief, Site] = {}
+        for kind in ("offsets", "surface"):
+            if kind in kinds:
+                choice = data.settings.site.model_copy(update={"tower_ground": kind})
+                chosen[kind] = choose_site(choice, data.folder)
+        return chosen
+
+    def _site(self, relief: Relief) -> Site:
+        return self._data.site if relief == "flat" else self._reliefs[relief]
 
     # levels
 
     def _lines(self) -> list[Rung]:
         zeros = tuple(np.zeros(len(s.rows)) for s in self._series)
-        ray_m = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s) for s in self._series)
+        ray_m = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s, self._data.site) for s in self._series)
         range_db = tuple(10.0 * np.log10(np.maximum(np.linalg.norm(a, axis=1), 0.1)) for a in ray_m)
         return [
             Rung(model=name, level_db=zeros, seconds=0.0, regressor_db=x)
@@ -304,43 +336,46 @@ class _Climber:
 
     def _level(self, index: int, model: Model) -> tuple[FloatArray, float]:
         """Level (m,) [dBm] at the thinned samples of a series, and the seconds that the whole series would take."""
-        series, rt = self._series[index], self._data.settings.rt
-        traced, search_s = self._paths(index, model.buildings)
+        series, rt, site = self._series[index], self._data.settings.rt, self._site(model.relief)
+        traced, search_s = self._paths(index, model.buildings, model.relief)
         begin = time.perf_counter()
         poses, link = self._poses(series, model.attitude), self._links[index]
         if model.antennas == "isotropic":
             link = _isotropic_link(link)
         paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
         changed = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
-        loss = path_loss(self._data.site, changed, link.carrier_hz)
-        pair = pair_db(link, poses, self._sources(series))
+        loss = path_loss(site, changed, link.carrier_hz)
+        sources = self._sources(series, site)
+        pair = pair_db(link, poses, sources)
         if model.diffraction:
             search = Search(max_depth=changed.max_depth, further=diffracted("edges"))
-            bent = replay(self._data.site, link, poses, search, Field(loss), Run(cache_dir=""))
+            bent = replay(site, link, poses, search, Field(loss), Run(cache_dir=""))
             level = bent.rss_power_dbm if model.ground == "power sum" else bent.rss_dbm
             return level[:, 0] + pair, series.step * bent.seconds
-        fields = fields_from(self._sources(series), traced.faces, paths, link, poses, loss)
+        fields = fields_from(sources, traced.faces, paths, link, poses, loss)
         power = fields.power if model.ground == "power sum" else mean_pair_power(fields.h)
         level = rss_dbm(power, link.transmit_power_dbm)[:, 0] + pair
         return level, series.step * (search_s + time.perf_counter() - begin)
 
-    def _paths(self, index: int, buildings: bool) -> tuple[Replay, float]:
-        if (index, buildings) not in self._traced:
+    def _paths(self, index: int, buildings: bool, relief: Relief) -> tuple[Replay, float]:
+        key = index, buildings, relief
+        if key not in self._traced:
             begin = time.perf_counter()
-            site: Site = self._data.site if buildings else dataclasses.replace(self._data.site, buildings=())
+            site = self._site(relief)
+            site = site if buildings else dataclasses.replace(site, buildings=())
             depth = max(self._data.settings.rt.max_depth, 1) if buildings else 1
             series = self._series[index]
-            link, poses, sources = series.replayed.link, self._poses(series, "ignored"), self._sources(series)
+            link, poses, sources = series.replayed.link, self._poses(series, "ignored"), self._sources(series, site)
             if series.replayed.tower_m is not None:
                 replayed = replay_moving(site, link, poses, sources, Search(max_depth=depth))
             else:
                 replayed = replay(site, link, poses, Search(max_depth=depth), run=Run(cache_dir=""))
-            self._traced[index, buildings] = replayed, time.perf_counter() - begin
-        return self._traced[index, buildings]
+            self._traced[key] = replayed, time.perf_counter() - begin
+        return self._traced[key]
 
-    def _sources(self, series: _Series) -> FloatArray:
+    def _sources(self, series: _Series, site: Site) -> FloatArray:
         """Place of the tower: (1, 3), or (m, 3) at the thinned samples where it moves."""
-        places = series.replayed.source_m(self._data.site)
+        places = series.replayed.source_m(site)
         return places if series.replayed.tower_m is None else places[series.picked]
 
     def _poses(self, series: _Series, attitude: str) -> Poses:

@@ -23,6 +23,7 @@ from ...site.site import Site
 from ..arrays import Array, Isotropic, Link, Poses
 from ..drivers.pairs import replay_pairs
 from ..edges import EdgePaths
+from ..field.stands import over_stands
 from ..field.sum import Further, channel_matrices
 from ..options import Field, Search
 from ..paths import Faces, PathSet, legs
@@ -133,12 +134,17 @@ def against_reference(
     -------
     FieldAudit
     """
-    stands = expected.loss.model != "none" and any(forest.height_m is not None for forest in site.forests)
     total, beyond = FieldAudit(reference_links=len(chosen) * len(replay.towers)), _over_terrain(replay)
+    in_woods = np.zeros(len(replay.paths), dtype=np.bool_)
+    if expected.loss.model != "none":
+        places = np.array([site.towers[name].position_m for name in replay.towers])
+        source, target = places[replay.paths.tower], poses.position_m[replay.paths.pose]
+        in_woods = over_stands(site, source, replay.paths.vertices_m, target)
     for number, name in enumerate(replay.towers):
         reference = Reference(site, name, expected.link, expected.loss)
         for row in chosen:
             mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
+            stands = in_woods[mine].any()
             if beyond[mine].any() or stands:
                 total += FieldAudit(not_covered=(_STANDS if stands else _ON_TERRAIN,))
                 continue

@@ -10,11 +10,12 @@ top, and detours pass what it lacks, so that the level has no step where a ray l
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 import shapely
 
-from ...common.units import FloatArray, IntArray
+from ...common.units import BoolArray, FloatArray, IntArray
 from ...site.site import Forest, Site
 from ..paths import legs
 from .foliage import FoliageModel, NoFoliage, Opaque
@@ -26,7 +27,8 @@ TRUNKS = 0.3
 _CLEAR = 0.55
 
 _UPRIGHT_M = 1e-6
-_SEGMENTS_AT_ONCE = 20_000
+# Of a segment and a side of a stand; about 100 MB of temporary arrays.
+_PAIRS_AT_ONCE = 1_000_000
 
 
 def stand_loss_db(
@@ -36,6 +38,7 @@ def stand_loss_db(
     target_m: FloatArray,
     model: FoliageModel,
     wavelength_m: float,
+    in_leaf: FoliageModel | None = None,
 ) -> FloatArray:
     """Loss of paths at the stands of a site.
 
@@ -51,82 +54,176 @@ def stand_loss_db(
     model : FoliageModel
         Depth in crowns to loss. Nothing gets through, over or around where it is opaque.
     wavelength_m : float
+    in_leaf : FoliageModel, optional
+        Of the evergreen share of a stand; by default ``model``.
 
     Returns
     -------
     (paths,)
         [dB]
     """
-    stands = [forest for forest in site.forests if forest.height_m is not None]
     loss = np.zeros(len(source_m))
-    if not stands or isinstance(model, NoFoliage):
+    if isinstance(model, NoFoliage):
         return loss
-    tree = shapely.STRtree([stand.area for stand in stands])
     for start, end in legs(source_m, vertices_m, target_m):
-        moved = np.flatnonzero(
-            np.isfinite(start).all(axis=1) & np.isfinite(end).all(axis=1) & (start != end).any(axis=1)
-        )
-        for first in range(0, len(moved), _SEGMENTS_AT_ONCE):
-            rows = moved[first : first + _SEGMENTS_AT_ONCE]
-            for some, db in _of_segments(site, stands, tree, start[rows], end[rows], model, wavelength_m):
-                loss[rows[some]] += db
+        for crossing in _crossings(site, start, end):
+            loss[crossing.segment] += _loss_db(crossing, model, in_leaf or model, wavelength_m)
     return loss
 
 
-def _of_segments(
-    site: Site, stands: list[Forest], tree: shapely.STRtree, start: FloatArray, end: FloatArray, model: FoliageModel,
-    wavelength_m: float,
-) -> Iterator[tuple[IntArray, FloatArray]]:  # fmt: skip
-    """Segments that a stand shades, and their loss [dB], one stand after another."""
-    flat = end[:, :2].copy()
-    flat[np.hypot(*(flat - start[:, :2]).T) < _UPRIGHT_M, 0] += _UPRIGHT_M  # a line has a length
-    lines = shapely.linestrings(np.stack([start[:, :2], flat], axis=1))
-    segment, stand = tree.query(lines, predicate="intersects")
+def over_stands(site: Site, source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> BoolArray:
+    """Find the paths that run over the area of a stand, at any height.
+
+    Parameters
+    ----------
+    site : Site
+    source_m, target_m : (paths, 3)
+        Ends [m].
+    vertices_m : (paths, depth, 3)
+        Points of reflection [m]; NaN where unused.
+
+    Returns
+    -------
+    (paths,) bool
+    """
+    mask = np.zeros(len(source_m), dtype=np.bool_)
+    for start, end in legs(source_m, vertices_m, target_m):
+        for crossing in _crossings(site, start, end):
+            mask[crossing.segment] = True
+    return mask
+
+
+def stand_depth_m(site: Site, source_m: FloatArray, target_m: FloatArray) -> FloatArray:
+    """Length (lines,) [m] in the stands of a site of straight lines between points (lines, 3)."""
+    depth = np.zeros(len(source_m))
+    for crossing in _crossings(site, source_m, target_m):
+        depth[crossing.segment] += crossing.depth_m(np.zeros(len(crossing.segment)))
+    return depth
+
+
+@dataclass(frozen=True, slots=True)
+class _Crossing:
+    """Segments over the area of one stand.
+
+    Parameters
+    ----------
+    stand : Forest
+    segment : (k,) int
+        Of the segments that were asked about.
+    start, end : (k, 3)
+        Their ends [m].
+    piece : (n,) int
+        Which of the ``k`` each piece within the area belongs to.
+    share : (n, 2)
+        Where it begins and ends, as shares of the way.
+    ground_m : (n,)
+        Up of the ground below it.
+    """
+
+    stand: Forest
+    segment: IntArray
+    start: FloatArray
+    end: FloatArray
+    piece: IntArray
+    share: FloatArray
+    ground_m: FloatArray
+
+    @property
+    def height_m(self) -> float:
+        """Height of the canopy above the ground."""
+        assert self.stand.height_m is not None
+        return self.stand.height_m
+
+    def depth_m(self, lowered_m: FloatArray) -> FloatArray:
+        """Length (k,) in the canopy, what runs between trunks in part, of segments lowered by (k,) [m]."""
+        way = self.end - self.start
+        up, rise = (self.start[:, 2] - lowered_m)[self.piece] - self.ground_m, way[self.piece, 2]
+        base = self.height_m * self.stand.crown_base_fraction
+        depth = _between(self.share, up, rise, base, self.height_m) + TRUNKS * _between(self.share, up, rise, 0.0, base)
+        in_all = np.bincount(self.piece, depth, len(self.segment)).astype(np.float64)
+        return np.asarray(self.stand.filled * in_all * np.linalg.norm(way, axis=1))
+
+
+def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_Crossing]:
+    """Segments between points (segments, 3) [m] over each stand of a site; those without a length cross none."""
+    stands = [forest for forest in site.forests if forest.height_m is not None]
+    if not stands:
+        return
+    tree = shapely.STRtree([stand.area for stand in stands])
+    moved = np.flatnonzero(
+        np.isfinite(start_m).all(axis=1) & np.isfinite(end_m).all(axis=1) & (start_m != end_m).any(axis=1)
+    )
+    flat = end_m[moved, :2].copy()
+    flat[np.hypot(*(flat - start_m[moved, :2]).T) < _UPRIGHT_M, 0] += _UPRIGHT_M  # a line has a length
+    near, stand = tree.query(shapely.linestrings(np.stack([start_m[moved, :2], flat], axis=1)))
     for number in np.unique(stand):
-        mine = segment[stand == number]
-        forest = stands[number]
-        parts, owner = shapely.get_parts(shapely.intersection(lines[mine], forest.area), return_index=True)
-        line = shapely.get_type_id(parts) == 1
-        row, parts = mine[owner[line]], parts[line]
-        ends = [shapely.get_coordinates(shapely.get_point(parts, at)) for at in (0, -1)]
-        way = flat[row] - start[row, :2]
-        share = np.sort(
-            np.stack([((e - start[row, :2]) * way).sum(axis=1) / (way**2).sum(axis=1) for e in ends], axis=1), axis=1
+        mine, edges = near[stand == number], _edges(stands[number])
+        step = max(1, _PAIRS_AT_ONCE // len(edges))
+        for some in (mine[first : first + step] for first in range(0, len(mine), step)):
+            row, share = _pieces(start_m[moved[some], :2], flat[some], edges)
+            crossing, piece = np.unique(row, return_inverse=True)
+            if not len(crossing):
+                continue
+            rows = moved[some[crossing]]
+            start, end = start_m[rows], end_m[rows]
+            ground = np.full(len(piece), stands[number].base_m)
+            if site.dem is not None:
+                middle = start[piece, :2] + share.mean(axis=1, keepdims=True) * (end - start)[piece, :2]
+                ground = np.nan_to_num(site.dem.ground_m(*middle.T))
+            yield _Crossing(
+                stand=stands[number], segment=rows, start=start, end=end, piece=piece, share=share, ground_m=ground
+            )
+
+
+def _edges(stand: Forest) -> FloatArray:
+    """Ends (edges, 2, 2) of the sides of a stand, holes included."""
+    rings = [shapely.get_coordinates(ring) for ring in (stand.area.exterior, *stand.area.interiors)]
+    return np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
+
+
+def _pieces(start: FloatArray, end: FloatArray, edges: FloatArray) -> tuple[IntArray, FloatArray]:
+    """Pieces of lines (k, 2) inside an outline of edges: their lines (n,), and where they begin and end (n, 2)."""
+    way = end - start
+    off = edges - start[:, None, None]  # k, edges, ends, 2
+    left = way[:, None, None, 0] * off[..., 1] - way[:, None, None, 1] * off[..., 0]
+    side = edges[:, 1] - edges[:, 0]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = (off[..., 0, 0] * side[:, 1] - off[..., 0, 1] * side[:, 0]) / (
+            way[:, :1] * side[:, 1] - way[:, 1:] * side[:, 0]
         )
-        yield _loss(site, forest, start, end, row, share, model, wavelength_m)
+    crosses = (left[..., 0] > 0) != (left[..., 1] > 0)  # a corner belongs to one of its sides alone
+    inside = (crosses & (share <= 0.0)).sum(axis=1) % 2 == 1
+    share = np.sort(np.where(crosses & (share > 0.0) & (share < 1.0), share, 1.0), axis=1)
+    bounds = np.pad(share[:, : int((share < 1.0).sum(axis=1).max(initial=0)) + 1], ((0, 0), (1, 0)))
+    odd = np.arange(bounds.shape[1] - 1) % 2 == 1
+    line, at = np.nonzero((inside[:, None] != odd) & (bounds[:, 1:] > bounds[:, :-1]))
+    return line, np.stack([bounds[line, at], bounds[line, at + 1]], axis=1)
 
 
-def _loss(
-    site: Site, stand: Forest, start: FloatArray, end: FloatArray, row: IntArray, share: FloatArray,
-    model: FoliageModel, wavelength_m: float,
-) -> tuple[IntArray, FloatArray]:  # fmt: skip
-    """Segments that cross a stand in shares (pieces, 2) of their way, and what they lose there."""
-    assert stand.height_m is not None
-    ground = np.zeros(len(row))
-    if site.dem is not None:
-        middle = start[row, :2] + share.mean(axis=1, keepdims=True) * (end - start)[row, :2]
-        ground = np.nan_to_num(site.dem.ground_m(*middle.T))
-    some, place = np.unique(row, return_inverse=True)
-    enter, leave, top = np.full(len(some), np.inf), np.full(len(some), -np.inf), np.full(len(some), -np.inf)
-    np.minimum.at(enter, place, share[:, 0])
-    np.maximum.at(leave, place, share[:, 1])
-    np.maximum.at(top, place, stand.height_m + ground)
-    source, target, lower = start[some], end[some], np.zeros(len(some))
+def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wavelength_m: float) -> FloatArray:
+    """Loss (k,) of segments that cross a stand [dB]."""
+    source, target, stand = crossing.start, crossing.end, crossing.stand
+    count = len(source)
+    enter, leave, top = np.full(count, np.inf), np.full(count, -np.inf), np.full(count, -np.inf)
+    np.minimum.at(enter, crossing.piece, crossing.share[:, 0])
+    np.maximum.at(leave, crossing.piece, crossing.share[:, 1])
+    np.maximum.at(top, crossing.piece, crossing.height_m + crossing.ground_m)
+    lower = np.zeros(count)
     outside = ((enter > 1e-9) | (source[:, 2] > top)) & ((leave < 1.0 - 1e-9) | (target[:, 2] > top))
     ways = [] if isinstance(model, Opaque) else list(_detours(stand, source, target, enter, leave, top))
     if ways:
         top_way = ways[0]
         zone = _CLEAR * np.sqrt(wavelength_m * top_way.length_m * top_way.share * (1.0 - top_way.share))
         lower = np.where(outside, np.maximum((zone - top_way.intrusion_m).min(axis=0), 0.0), 0.0)
-    up, rise = start[row, 2] - ground - lower[place], (end - start)[row, 2]
-    base, way = stand.height_m * stand.crown_base_fraction, np.linalg.norm((end - start)[row], axis=1)
-    depth = _between(share, up, rise, base, stand.height_m) + TRUNKS * _between(share, up, rise, 0.0, base)
-    through = model.loss_db(np.bincount(place, depth * way, len(some)).astype(np.float64))
+    depth_m = crossing.depth_m(lower)
+    through = model.loss_db(depth_m)
+    if stand.evergreen_share and not isinstance(model, Opaque):
+        through = through + stand.evergreen_share * (in_leaf.loss_db(depth_m) - through)
     if not ways:
-        return some, through
+        return through
     power = sum(10.0 ** (-deygout_db(detour, wavelength_m) / 10.0) for detour in ways)
     blocked = (1.0 - 10.0 ** (-through / 10.0)) * (1.0 - np.where(outside, np.minimum(power, 1.0), 0.0))
-    return some, -10.0 * np.log10(1.0 - blocked)
+    return np.asarray(-10.0 * np.log10(1.0 - blocked))
 
 
 def _between(share: FloatArray, up: FloatArray, rise: FloatArray, low: float, high: float) -> FloatArray:

@@ -37,7 +37,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score
     result: dict[str, Any] = {
         **named(data, "flight title synthetic settings warnings"),
-        "site": {"name": data.site.name, "illustrative": data.site.illustrative},
+        "site": named(data.site, "name credit assumed"),
         "inputs": [
             named(f, "path sha256 reader lines accepted rejected blank role warnings")
             | ({"learned_on": f.learned_on} if f.learned_on else {})

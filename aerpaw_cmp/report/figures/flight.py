@@ -60,15 +60,9 @@ def _figures(data: ReportData) -> Iterator[FigureSpec]:
 
 
 def _track_specs(data: ReportData, track: Track) -> Iterator[FigureSpec]:
-    present = [word for word, some in (("buildings", data.site.buildings), ("forests", data.site.forests)) if some]
-    invented = (
-        f" {' and '.join(present).capitalize()} are illustrative: they do not exist and show the method."
-        if data.site.illustrative and present
-        else ""
-    )
     yield FigureSpec(
         "trajectory", "flight", "Where the UAV flew",
-        f"Left: the site with its towers. Right: the flight, coloured by height.{invented}",
+        "Left: the site with its towers. Right: the flight, coloured by height.",
         partial(rss_figures.trajectory, data, track),
     )  # fmt: skip
     dotted = " Dotted lines are waypoints." if data.waypoints else ""

@@ -13,7 +13,17 @@ from ...site.scenes import drawn_buildings
 from ...site.site import Site
 from ..content.flight import RANKS
 from ..content.maps import JOINT, Correlation, LearningCurve, MapError, MapLayer, MapsData, RankMap, RssMap
-from ..kit.canvas import RANK_HATCH, TOWER, FigureSpec, beyond, colour_bar, plain_ticks, rank_colour, subplots
+from ..kit.canvas import (
+    RANK_HATCH,
+    TOWER,
+    FigureSpec,
+    beyond,
+    colour_bar,
+    draw_credit,
+    plain_ticks,
+    rank_colour,
+    subplots,
+)
 from ..names import k_key, safe_name
 
 if TYPE_CHECKING:
@@ -98,6 +108,7 @@ def _draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
     """Outlines of buildings and forests, and the towers; only the named tower when one is named."""
     from matplotlib.collections import PolyCollection
 
+    draw_credit(ax, site)
     for forest in site.forests:
         outline = np.asarray(forest.area.exterior.coords)
         ax.plot(outline[:, 0], outline[:, 1], color="white", linewidth=1.4, zorder=2)
@@ -117,13 +128,12 @@ def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
-    invented = " (illustrative)" if data.site.illustrative else ""
     entries: list[Any] = [Patch(**MISSING, label="Z: out of coverage")]
     entries.append(Line2D([], [], marker="^", color=TOWER, markeredgecolor="white", linestyle="none", label="tower"))
     if drawn_buildings(data.site):
-        entries.append(Patch(facecolor="white", edgecolor="black", label=f"building{invented}"))
+        entries.append(Patch(facecolor="white", edgecolor="black", label="building"))
     if data.site.forests:
-        entries.append(Line2D([], [], color="#2F5D28", linestyle=(0, (2, 1)), label=f"forest{invented}"))
+        entries.append(Line2D([], [], color="#2F5D28", linestyle=(0, (2, 1)), label="forest"))
     if borders and data.borders_m:
         entries.append(Line2D([], [], color="black", linestyle=(0, (4, 2)), label="border of the towers' areas"))
     return entries

@@ -501,6 +501,15 @@ def rank_colour(rank: int) -> Any:
 # --- site ---------------------------------------------------------------------------------------
 
 
+def draw_credit(ax: Axes, site: Site) -> None:
+    """Name whose map is drawn, in small type in a corner."""
+    if site.credit:
+        ax.text(
+            0.995, 0.005, site.credit, transform=ax.transAxes, ha="right", va="bottom", fontsize=5, color="#444444",
+            zorder=7, gid="credit", bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.6},
+        )  # fmt: skip
+
+
 def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None) -> None:
     """Forests, trees, buildings, geofences and towers on a plan (east, north) [m].
 
@@ -519,18 +528,20 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None) -> N
         outline = Outline.make_compound_path(*(Outline(np.asarray(r.coords)[:, :2], closed=True) for r in rings))
         ax.add_patch(PathPatch(outline, **options))
 
-    invented = " (illustrative)" if site.illustrative else ""
+    draw_credit(ax, site)
+    if not (site.forests or site.buildings or len(site.trees) or site.scene is not None):
+        ax.text(0.5, 0.02, "no map here", transform=ax.transAxes, ha="center", color="#777777", fontsize=8, zorder=7)
     for number, forest in enumerate(site.forests):
         patch(
             forest.area, facecolor=_FOREST, edgecolor="#7FA873", hatch="..", linewidth=0.6, alpha=0.7, zorder=0.3,
-            label=f"forest{invented}" if number == 0 else None,
+            label="forest" if number == 0 else None,
         )  # fmt: skip
     if len(site.trees):
-        _draw_crowns(ax, site.trees, f"tree{invented}")
+        _draw_crowns(ax, site.trees, "tree")
     for number, building in enumerate(drawn_buildings(site)):
         patch(
             building.footprint, facecolor=_BUILDING, edgecolor="black", linewidth=0.7, zorder=0.6,
-            label=f"building{invented}" if number == 0 else None,
+            label="building" if number == 0 else None,
         )  # fmt: skip
     for number, fence in enumerate(site.geofences):
         patch(

@@ -26,7 +26,7 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
     numbers = json_object(
         name=data.name,
         title=data.title,
-        site={"name": data.site.name, "illustrative": data.site.illustrative},
+        site=named(data.site, "name credit assumed"),
         grid={"columns": columns, "rows": rows, "positions": columns * rows},
         coverage=[named(m, "tower antennas foliage altitude_m coverage") for m in data.rss],
         rank=[

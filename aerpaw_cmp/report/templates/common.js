@@ -45,6 +45,14 @@ const common = (() => {
     return [pen, w, h];
   }
 
+  // whose map it is, in the lower right corner
+  function credit(pen, right, bottom, text) {
+    if (!text) return;
+    pen.save(); pen.font = "10px system-ui, sans-serif"; pen.textAlign = "right"; pen.lineWidth = 3;
+    pen.strokeStyle = css("--paper"); pen.strokeText(text, right - 4, bottom - 4); pen.fillStyle = css("--soft"); pen.fillText(text, right - 4, bottom - 4);
+    pen.restore();
+  }
+
   // names of points inside an area [left, top, right, bottom]: beside their points, clear of its edges and of each other
   function names(pen, area, points, font = "bold 12px system-ui, sans-serif") {
     const [left, top, right, bottom] = area, placed = [], high = 13;
@@ -171,5 +179,5 @@ const common = (() => {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => later(job));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar };
+  return { at, css, number, unpack, values, cells, fill, frame, credit, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar };
 })();

@@ -123,6 +123,7 @@
       const own = !tower || tower === data.joint || tower === t.name;
       common.tower(pen, project.x(t.at[0]), project.y(t.at[1]), own ? 1 : 0.35);
     }
+    common.credit(pen, w - 16, h - 32, data.site.credit);
     labels = common.names(pen, [46, 8, w - 16, h - 32], data.site.towers.map(t => ({ text: t.name, at: [project.x(t.at[0]), project.y(t.at[1])], colour: "#8f0f18", halo: "#fff", alpha: !tower || tower === data.joint || tower === t.name ? 1 : 0.35 })));
     if (state.cell) {
       const [r, c] = state.cell, x = project.x(east[c] - data.half[0]), y = project.y(north[r] + data.half[1]), wide = 2 * data.half[0] * project.scale, high = 2 * data.half[1] * project.scale;

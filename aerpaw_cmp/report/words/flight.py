@@ -321,10 +321,6 @@ DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
     (lambda d: _field_failures(d) > 0, "the audit of the field failed {failed} times"),
     (lambda d: any(p.clock_verdict == "cannot tell" for p in d.rss), "the radio clock could not be confirmed"),
     (lambda d: d.synthetic, "synthetic data"),
-    (
-        lambda d: not d.synthetic and d.site.illustrative and bool(d.site.buildings),
-        "illustrative buildings",
-    ),
 )
 
 
@@ -516,7 +512,18 @@ def rank_verdict(panel: RankResult) -> str:
     kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_kappa_references(panel)})" if math.isfinite(best.kappa) else ""
     return (
         f"{panel.tower} rank: of the K shown, K = {k:.10g} comes nearest to the reported distribution "
-        f"(total variation {best.total_variation:.2f}){agree}{kappa}.{learned}"
+        f"(total variation {best.total_variation:.2f}){agree}{kappa}.{_ground_error(panel, k)}{learned}"
+    )
+
+
+def _ground_error(panel: RankResult, k: float) -> str:
+    """Sentence on how far the agreement hangs on a ground that is known at points alone."""
+    sd = (panel.further.agreement_sd_by_ground or {}).get(f"{k:g}")
+    if sd is None:
+        return ""
+    return (
+        f" Grounds within the errors of the known heights change the agreement by +-{100 * sd:.0f} percentage points "
+        "(one standard deviation): smaller differences say nothing."
     )
 
 
@@ -545,12 +552,6 @@ def warnings(data: ReportData) -> list[str]:
     texts = list(data.warnings)
     if data.synthetic:
         texts.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")
-    trees = "" if data.engine is None else data.engine.settings.get("foliage", "")
-    if data.site.illustrative and (data.site.buildings or trees not in ("", "none")):
-        texts.append(
-            f"Buildings and forests of {data.site.name} are illustrative, not surveyed: reflections and blockage "
-            "show the method, not the place."
-        )
     for panel in data.rss:
         texts += _rss_warnings(panel)
     audit = None if data.engine is None else data.engine.audit

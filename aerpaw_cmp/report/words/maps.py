@@ -84,11 +84,6 @@ def _reached(data: MapsData, levels: RssMap) -> float:
 def warnings(data: MapsData) -> list[str]:
     """Warnings that must be known before the maps are believed."""
     out = []
-    if data.site.illustrative:
-        out.append(
-            f"Buildings and forests of {data.site.name} are illustrative, not surveyed: blockage and reflections show "
-            "the method, not the place."
-        )
     if data.corrected_words:
         out.append(f"Corrected: {data.corrected_words}")
     for key, fit in data.metrics.get("correlation", {}).items():

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import shutil
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -222,6 +223,16 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
                 if file not in used and (folder / file).is_file() and file_digest(folder / file) == digest:
                     (folder / file).unlink()
     return [folder / _INDEX, *(folder / file for file in files)]
+
+
+def carry_memory(base: str | Path, site: Path) -> list[str]:
+    """Copy the memory of a base beside a site made of it, which has none yet; a line that says so."""
+    origin, folder = folder_of(base), folder_of(site)
+    if not origin.is_dir() or folder.exists():
+        return []
+    names = ", ".join(read_learned(base).entries)
+    shutil.copytree(origin, folder, copy_function=shutil.copyfile)
+    return [f"learned antennas and receivers of the base were copied to {folder.name}: {names}"]
 
 
 def memory_lines(site: str | Path) -> list[str]:

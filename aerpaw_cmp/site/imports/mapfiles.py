@@ -21,7 +21,7 @@ from ...common.files import read_input
 from ...common.xmlfiles import named, outermost, plain, xml_root
 from ...logs import archives
 from .osmfiles import read_elements
-from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
+from .outlines import BROKEN_ELEMENT, OSM_CREDIT, MapFile, Outline, Position, TreeLine, left_out, lonlat
 
 # A map of a whole county is smaller; a site needs a few kilometres.
 MAX_BYTES = 256 * 1024 * 1024
@@ -30,6 +30,9 @@ MAX_BYTES = 256 * 1024 * 1024
 MAX_TAGS = 1_500_000
 
 FORMATS = "GeoJSON, OSM XML, Overpass JSON, KML or KMZ"
+
+# How GeoJSON and KML made of OpenStreetMap give themselves away: its name, its ids, its tags of ids.
+_OF_OSM = re.compile(rb'openstreetmap|"osm_(way_)?id"|"(way|relation|node)/[0-9]+"', re.IGNORECASE)
 
 _OTHER_KINDS: tuple[tuple[bytes, str, str], ...] = (
     (b"\x1f\x8b", "gzip-compressed data", "unpack it with gunzip"),
@@ -59,10 +62,11 @@ def read_map_file(path: str | Path) -> MapFile:
         raise InputError("the file is empty", expected=FORMATS, path=path)
     if start.startswith(b"version https://git-lfs"):
         raise InputError("a Git-LFS pointer in place of the data", cause="'git lfs pull' was not run", path=path)
-    if start[:1] in (b"{", b"["):
-        return _from_json(data, path)
-    if start[:1] == b"<":
-        return _from_xml(data, path)
+    if start[:1] in (b"{", b"[", b"<"):
+        content = _from_xml(data, path) if start[:1] == b"<" else _from_json(data, path)
+        if _OF_OSM.search(data):
+            content.credit = OSM_CREDIT
+        return content
     for magic, what, remedy in _OTHER_KINDS:
         if data.startswith(magic):
             raise InputError(f"{what}, not a map file of text", expected=FORMATS, cause=remedy, path=path)

@@ -11,7 +11,7 @@ from typing import Any
 import shapely
 from shapely.geometry import Polygon
 
-from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, is_tangled, left_out, lonlat
+from .outlines import BROKEN_ELEMENT, OSM_CREDIT, MapFile, Outline, Position, TreeLine, is_tangled, left_out, lonlat
 from .tags import kind_of
 
 Element = dict[str, Any]
@@ -48,7 +48,7 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
     MapFile
         Outlines, trees, and a note per thing that was left out.
     """
-    result, data = MapFile(kind), _Data(path)
+    result, data = MapFile(kind, OSM_CREDIT), _Data(path)
     for index, element in enumerate(elements):
         try:
             _sort(element, index, data)

@@ -14,6 +14,9 @@ from shapely.geometry import Polygon
 
 from ...common.errors import InputError
 
+# As OpenStreetMap's licence asks for it.
+OSM_CREDIT = "(c) OpenStreetMap contributors, ODbL"
+
 # Latitude, longitude [deg].
 Position = tuple[float, float]
 
@@ -57,9 +60,10 @@ class TreeLine:
 
 @dataclass(slots=True)
 class MapFile:
-    """All outlines and trees of a file, and sentences about what is neither."""
+    """All outlines and trees of a file, sentences about what is neither, and whose data they are where that shows."""
 
     kind: str
+    credit: str = ""
     outlines: list[Outline] = field(default_factory=list)
     trees: list[TreeLine] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -20,7 +21,7 @@ from ...common.errors import InputError, UsageError, parsed
 from ...common.files import inside, read_input
 from ...common.units import FloatArray, IntArray
 from ...common.xmlfiles import xml_root
-from ..materials import material, stated_name
+from ..materials import CROWN, material, stated_name
 from .meshfiles import RawMesh, read_mesh
 
 # Of a slab without a stated thickness, as in Sionna RT.
@@ -28,6 +29,11 @@ _DEFAULT_THICKNESS_M = 0.1
 
 _LARGEST_XML = 256 * 2**20
 _MOST_TRIANGLES = 20_000_000
+
+# Names and materials of meshes that are vegetation, as words: no street, no treehouse.
+_VEGETATION = re.compile(
+    r"(?<![a-z])(trees?|canop(y|ies)|crowns?|foliage|vegetation|lea(f|ves)|hedges?|bush(es)?|shrubs?|trunks?)(?![a-z])"
+)
 
 _SHAPES = ("ply", "obj", "rectangle", "cube", "merge")
 
@@ -182,7 +188,7 @@ def _materials(
             unknown[name] = bsdf.get("type", "?")
         else:
             radio[name] = material
-            if _float(bsdf, "scattering_coefficient", 0.0, path) > 0.0:
+            if _float(bsdf, "scattering_coefficient", 0.0, path) > 0.0 and not _VEGETATION.search(name.lower()):
                 rough.append(name)
     stray = sorted(set(parameters) - set(radio))
     if stray:
@@ -282,6 +288,8 @@ def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown:
     inner = shape.find("bsdf")
     refs = [item.get("id", "") for item in shape.findall("ref") if item.get("name", "bsdf") == "bsdf"]
     which = inner.get("id", "") if inner is not None else (refs[0] if refs else "")
+    if _VEGETATION.search(f"{name} {which}".lower()):
+        return CROWN
     if which in reading.radio:
         return reading.radio[which]
     if not which:

@@ -1,0 +1,170 @@
+"""A smooth ground through points of known height: a Gaussian process, its standard deviation, and draws of it.
+
+The covariance of two places falls with their distance as a Matern function of order 3/2 (slopes are continuous,
+curvature is not); its variance and length are those under which the points are most likely.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
+
+from ..common.errors import UsageError
+from ..common.geodesy import SiteFrame
+from ..common.units import FloatArray
+from .dem import Dem
+
+# Cells of the surface as an elevation model, and how many at most.
+_CELL_M, _MOST_CELLS = 25.0, 40_000
+
+# Lengths and standard deviations [m] that are tried.
+_LENGTHS_M = np.geomspace(30.0, 2000.0, 9)
+_DEVIATIONS_M = np.geomspace(1.0, 50.0, 9)
+
+# Heights at places this near are of one place; they contradict where they differ by so many standard deviations.
+_SAME_PLACE_M, _CONTRADICTION = 1.0, 4.0
+
+# Waves of which a drawn surface is the sum.
+_WAVES = 500
+
+
+@dataclass(frozen=True, slots=True)
+class Surface:
+    """Ground through points.
+
+    Parameters
+    ----------
+    place_m : (n, 2)
+        East, north of the points [m].
+    height_m, error_m : (n,)
+        Their heights in any one reference, and the standard deviations of these [m].
+    deviation_m, length_m : float
+        Of the process.
+    level_m : float
+        Its mean.
+    frame : SiteFrame
+        Of the site.
+    reach_m : (east_min, east_max, north_min, north_max)
+        What the elevation model covers.
+    """
+
+    place_m: FloatArray
+    height_m: FloatArray
+    error_m: FloatArray
+    deviation_m: float
+    length_m: float
+    level_m: float
+    frame: SiteFrame
+    reach_m: tuple[float, float, float, float]
+
+    def dem(self, drawn: np.random.Generator | None = None) -> Dem:
+        """The most likely surface as an elevation model, or one drawn from those that the points allow."""
+        west, east, south, north = self.reach_m
+        cell = max(_CELL_M, float(np.sqrt((east - west) * (north - south) / _MOST_CELLS)))
+        columns, rows = (int(np.ceil(span / cell)) + 1 for span in (east - west, north - south))
+        at = np.stack(np.meshgrid(west + cell * np.arange(columns), south + cell * np.arange(rows)), axis=-1)
+        place = at.reshape(-1, 2)
+        off = self.height_m - self.level_m
+        prior = np.zeros(len(place))
+        if drawn is not None:  # what was drawn, corrected by what the points say of it
+            waves = self._waves(drawn)
+            prior = waves(place)
+            off = off + drawn.normal(0.0, self.error_m) - waves(self.place_m)
+        height = self.level_m + prior + self._between(place) @ cho_solve(self._factor(), off)
+        return Dem(
+            height_m=height.reshape(rows, columns), west=west, south=south, step_x=cell, step_y=cell, crs="local",
+            frame=self.frame,
+        )  # fmt: skip
+
+    def sd_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
+        """Standard deviation (places,) of the surface [m]."""
+        near = self._between(np.column_stack([east_m, north_m]))
+        known = (near * cho_solve(self._factor(), near.T).T).sum(axis=1)
+        return np.asarray(np.sqrt(np.maximum(self.deviation_m**2 - known, 0.0)))
+
+    def _between(self, place_m: FloatArray) -> FloatArray:
+        return self.deviation_m**2 * _matern(cdist(place_m, self.place_m), self.length_m)
+
+    def _factor(self) -> tuple[FloatArray, bool]:
+        factor: tuple[FloatArray, bool] = cho_factor(self._between(self.place_m) + np.diag(self.error_m**2))
+        return factor
+
+    def _waves(self, random: np.random.Generator) -> _Waves:
+        """A draw before any point is known: waves whose vectors have the process' spectrum, Student's t of 3."""
+        vector = random.standard_normal((2, _WAVES)) / (self.length_m * np.sqrt(random.chisquare(3, _WAVES) / 3.0))
+        height = self.deviation_m * np.sqrt(2.0 / _WAVES)
+        return _Waves(vector, random.uniform(0.0, 2.0 * np.pi, _WAVES), height)
+
+
+@dataclass(frozen=True, slots=True)
+class _Waves:
+    """Sum of cosines of one height [m] with wave vectors (2, waves) [rad/m] and phases (waves,)."""
+
+    vector: FloatArray
+    phase: FloatArray
+    height_m: float
+
+    def __call__(self, place_m: FloatArray) -> FloatArray:
+        return np.asarray(self.height_m * np.cos(place_m @ self.vector + self.phase).sum(axis=1))
+
+
+def _matern(distance_m: FloatArray, length_m: float) -> FloatArray:
+    scaled = np.sqrt(3.0) * distance_m / length_m
+    return np.asarray((1.0 + scaled) * np.exp(-scaled))
+
+
+def surface_through(points_m: FloatArray, frame: SiteFrame, reach_m: tuple[float, float, float, float]) -> Surface:
+    """The surface through points (n, 4) of east, north, height, standard deviation [m].
+
+    Parameters
+    ----------
+    points_m : (n, 4)
+        At least three.
+    frame : SiteFrame
+    reach_m : (east_min, east_max, north_min, north_max)
+        What the elevation model is to cover.
+
+    Returns
+    -------
+    Surface
+
+    Raises
+    ------
+    UsageError
+        Too few points, or two that contradict.
+    """
+    if len(points_m) < 3:
+        raise UsageError(f"ground_points has {len(points_m)} points", expected="3 or more")
+    place, height, error = points_m[:, :2], points_m[:, 2], points_m[:, 3]
+    for i, j in sorted(cKDTree(place).query_pairs(_SAME_PLACE_M)):
+        if abs(height[i] - height[j]) > _CONTRADICTION * np.hypot(error[i], error[j]):
+            raise UsageError(
+                f"ground_points {i + 1} and {j + 1} contradict: {height[i]:g} and {height[j]:g} m at one place "
+                f"({place[i, 0]:g} m east, {place[i, 1]:g} m north)",
+                expected=f"heights at one place within {_CONTRADICTION:g} standard deviations",
+                cause="another vertical datum, or an error that is too small",
+            )
+    apart = cdist(place, place)
+    best = max(product(_LENGTHS_M, _DEVIATIONS_M), key=lambda sizes: _likelihood(apart, height, error, *sizes)[0])
+    level = _likelihood(apart, height, error, *best)[1]
+    return Surface(
+        place_m=place, height_m=height, error_m=error, deviation_m=float(best[1]), length_m=float(best[0]),
+        level_m=level, frame=frame, reach_m=reach_m,
+    )  # fmt: skip
+
+
+def _likelihood(
+    apart_m: FloatArray, height_m: FloatArray, error_m: FloatArray, length_m: float, deviation_m: float
+) -> tuple[float, float]:
+    """Log likelihood of the points under a process, and its most likely mean [m]."""
+    covariance = deviation_m**2 * _matern(apart_m, length_m) + np.diag(error_m**2)
+    factor = cho_factor(covariance)
+    ones = np.ones(len(height_m))
+    level = float(ones @ cho_solve(factor, height_m) / (ones @ cho_solve(factor, ones)))
+    off = height_m - level
+    return float(-0.5 * off @ cho_solve(factor, off) - np.log(np.diag(factor[0])).sum()), level

@@ -320,58 +320,6 @@ def test_no_module_takes_a_private_name_of_another() -> None:
     assert private_imports(ast.parse("from .replay import Replay, _poses\nfrom . import __version__")) == ["_poses"]
 
 
-# verbs, pronouns and numerals: they do not say what a thing is
-EMPTY_NAMES = {
-    "found", "one", "kept", "whole", "beside", "told", "came", "look", "thin", "miss", "grow", "heard", "two",
-}  # fmt: skip
-# of a contract: what a message states, a key of JSON, a key of calibration.yaml
-WRITTEN_OUTSIDE = {
-    ("aerpaw_cmp/common/errors.py", "found"),
-    ("aerpaw_cmp/machine/doctor.py", "found"),
-    ("aerpaw_cmp/jobs/campaigns/campaign_plan.py", "kept"),
-    ("aerpaw_cmp/jobs/learning/calibrate_rank.py", "thin"),
-}
-
-
-def empty_names(tree: ast.AST) -> list[tuple[int, str]]:
-    """Lines that give one of :data:`EMPTY_NAMES` to a value, a parameter, a field, a function or a class."""
-    bound: list[tuple[int, str]] = []
-    for node in ast.walk(tree):
-        if isinstance(node, (ast.Name, ast.Attribute)) and isinstance(node.ctx, ast.Store):
-            bound.append((node.lineno, node.id if isinstance(node, ast.Name) else node.attr))
-        elif isinstance(node, ast.arg):
-            bound.append((node.lineno, node.arg))
-        elif isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef, ast.ExceptHandler)):
-            bound.append((node.lineno, node.name or ""))
-    return [(line, name) for line, name in bound if name.strip("_").lower() in EMPTY_NAMES]
-
-
-def test_a_name_says_what_the_thing_is() -> None:
-    """An audit, a level, the rows: not what was found, kept or told, nor one and two."""
-    empty, seen = [], set()
-    for room in ("aerpaw_cmp", "parsers", "tests", "benchmarks", "tools"):
-        for path in sorted((ROOT / room).rglob("*.py")):
-            home = path.relative_to(ROOT).as_posix()
-            for line, name in empty_names(ast.parse(path.read_text())):
-                seen.add((home, name))
-                if (home, name) not in WRITTEN_OUTSIDE:
-                    empty.append(f"{home}:{line}: {name} does not say what the thing is")
-    assert empty == []
-    assert seen == WRITTEN_OUTSIDE
-
-
-@pytest.mark.parametrize(
-    "planted",
-    ["{} = 1", "for {}, b in []: pass", "[{} for {} in c]", "with c as {}: pass", "if ({} := 1): pass", "self._{} = 1",
-     "try: pass\nexcept E as {}: pass", "def f(a, *, {}): pass", "lambda *{}: 1", "def _{}(): pass", "class {}: pass",
-     "class C:\n  {}: int"],
-)  # fmt: skip
-def test_an_empty_name_is_seen_wherever_it_is_given(planted: str) -> None:
-    lines = len(planted.splitlines())
-    assert empty_names(ast.parse(planted.format(*["whole"] * 2)))[0][0] == lines
-    assert not empty_names(ast.parse(planted.format(*["level_db"] * 2) + "\nx(found=c.kept)"))
-
-
 def test_the_files_that_run_first_are_there() -> None:
     tree = parsed(ROOT / "tests" / "conftest.py")
     (named,) = [

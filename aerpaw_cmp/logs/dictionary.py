@@ -81,10 +81,10 @@ QUANTITIES: tuple[Quantity, ...] = (
     ), "s"),
     # where
     Quantity("latitude_deg", "position", (
-        r"^(osd |gps )?(lat|latitude)( deg| degrees| int)?( ?1?e ?7)?$", r" (lat|latitude)( deg)?$",
+        r"^(osd |gps )?(lat|latitude)( deg| degrees| int)?( ?1?e ?[67])?$", r" (lat|latitude)( deg)?$",
     ), "deg", can_be=(-90.0, 90.0)),
     Quantity("longitude_deg", "position", (
-        r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int)?( ?1?e ?7)?$", r" (lon|lng|longitude)( deg)?$",
+        r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int)?( ?1?e ?[67])?$", r" (lon|lng|longitude)( deg)?$",
     ), "deg", can_be=(-180.0, 180.0)),
     # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
     Quantity("home", "other", (
@@ -343,8 +343,8 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     **{word: ("deg", _times(factor)) for word, factor in (
         ("deg", 1.0), ("degree", 1.0), ("degrees", 1.0), ("\u00b0", 1.0), ("rad", 180 / np.pi),
         ("radians", 180 / np.pi), ("1e-7 deg", 1e-7), ("1e-7deg", 1e-7), ("dege7", 1e-7), ("deg e7", 1e-7),
-        ("degrees e7", 1e-7), ("e7", 1e-7),
-        ("deg*1e7", 1e-7), ("1e7", 1e-7), ("cdeg", 0.01), ("centidegrees", 0.01), ("mrad", 0.18 / np.pi))},
+        ("degrees e7", 1e-7), ("e7", 1e-7), ("deg*1e7", 1e-7), ("1e7", 1e-7), ("e6", 1e-6), ("1e-6 deg", 1e-6),
+        ("microdegrees", 1e-6), ("cdeg", 0.01), ("centidegrees", 0.01), ("mrad", 0.18 / np.pi))},
     **{word: ("bit/s", _times(factor)) for word, factor in (
         ("bps", 1.0), ("bit/s", 1.0), ("kbps", 1e3), ("kbit/s", 1e3), ("mbps", 1e6), ("mbit/s", 1e6), ("gbps", 1e9),
         ("gbit/s", 1e9))},
@@ -357,7 +357,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
 # Units that may end a name without brackets: 'alt_ft', 'rsrp_dbm'.
 _SUFFIXES = {"ft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps", "dbm",
-             "dbw", "mw", "uw", "nw", "e7", "cdeg", "kbps", "mbps", "db"}  # fmt: skip
+             "dbw", "mw", "uw", "nw", "e6", "e7", "cdeg", "kbps", "mbps", "db"}  # fmt: skip
 
 
 def is_unit(text: str) -> bool:

@@ -128,12 +128,12 @@ def above_takeoff(
     known = np.flatnonzero(np.isfinite(altitude) & ~lost)
     if datum in ("take-off", "ground") or not len(known):
         return altitude, about
-    altitude = _without_first_zeros(altitude)
+    altitude = altitude if datum == "unknown" else _without_first_zeros(altitude)
     known, values = known[np.isfinite(altitude[known])], values | {"altitude_m": altitude}
-    rest = at_rest(*(column[known] for column in (rows.time, *(values[name] for name in _PLACE))))
-    climbs = rest is not None and float(altitude[known].max()) - rest > _CLIMB_M
-    first = rest if rest is not None and climbs else float(altitude[known[0]])
-    if datum == "unknown" and abs(first) < _NEAR_ZERO_M:
+    rest = _ground(*(column[known] for column in (rows.time, *(values[name] for name in _PLACE))))
+    first = float(altitude[known[0]]) if rest is None else rest
+    climbs = rest is not None
+    if datum == "unknown" and abs(first if climbs else np.abs(altitude[known]).min()) < _NEAR_ZERO_M:
         return altitude, about | {"height_datum": "take-off"}
     if datum == "unknown" and not climbs:
         rows.warnings.append(
@@ -141,7 +141,7 @@ def above_takeoff(
             "the track begin on the ground: read as above take-off"
         )
         return altitude, about
-    how = "that at rest before the climb" if climbs else "that of the first position"
+    how = "that at rest on the ground" if climbs else "that of the first position"
     zero = "the ellipsoid" if datum == "ellipsoid" else "sea level"
     rows.warnings.append(f"altitudes are above {zero}: {first:.1f} m, {how}, was taken off")
     about |= {"takeoff_from": "rest" if climbs else "first position", "height_taken_off_m": round(first, 3)}
@@ -162,11 +162,23 @@ def _without_first_zeros(altitude: FloatArray) -> FloatArray:
     return np.where(np.arange(len(altitude)) < begun, np.nan, altitude)
 
 
+def _ground(*track: AnyArray) -> float | None:
+    """Height at rest of a track (time, latitude, longitude, altitude) that climbs from it or comes back to it.
+
+    A hover is no ground: the aircraft then flies lower than that.
+    """
+    altitude = track[3]
+    for rest in (at_rest(*track), at_rest(*(column[::-1] for column in track))):
+        if rest is not None and altitude.max() - rest > _CLIMB_M and altitude.min() - rest > -_REST_M:
+            return rest
+    return None
+
+
 def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> float | None:
     """Height of the ground: where a track begins at one place and one height, the last of that; else None."""
-    seconds = (time - time[0]) / np.timedelta64(1, "s")
+    seconds = np.abs((time - time[0]) / np.timedelta64(1, "s"))
     north, east = ((column - column[0]) * _DEGREE_M for column in (latitude, longitude))
-    step_s = np.maximum(np.diff(seconds, prepend=seconds[0] - 1.0), 0.1)
+    step_s = np.maximum(np.abs(np.diff(seconds, prepend=seconds[0] - 1.0)), 0.1)
     rise = np.abs(np.diff(altitude, prepend=altitude[0])) / step_s
     still = (np.hypot(east, north) < _REST_M) & (rise < _REST_MPS)
     end = len(still) if still.all() else int(np.argmin(still))

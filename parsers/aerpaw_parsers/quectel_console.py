@@ -41,7 +41,8 @@ def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, 
     """Line, time, title and named values of each row that holds a level or a CSI."""
     time = b""
     names: dict[bytes, list[str]] = {}
-    entries, rejected = [], []
+    entries: list[tuple[int, bytes, str, dict[str, float]]] = []
+    rejected = []
     for i in range(len(lines)):
         line = lines.raw(i)
         if stamp := _STAMP.match(line):
@@ -58,7 +59,8 @@ def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, 
         if not time or len(cells) != len(heads):
             rejected.append(lines.reject(i, "a table row without a time, or of another width than its head (torn?)"))
             continue
-        entries.append((i, time, title.decode("ascii"), dict(zip(heads, map(_number, cells), strict=True))))
+        kind = next((word for word in (b"LTE", b"NR5G") if word in row[3] and title == b"servingcell"), title)
+        entries.append((i, time, kind.decode("ascii"), dict(zip(heads, map(_number, cells), strict=True))))
     return entries, rejected
 
 

@@ -261,6 +261,7 @@ COUSINS: dict[str, tuple[str, Right]] = {
     "above ground in feet": height("Alt_AGL_ft", "{a}", [30.48, 30.7848, 31.0896, 31.3944]),
     "above take-off beside sea level": height("alt_msl,relative_alt", "{a},{i}", [0, 1, 2, 3]),
     "feet above sea level": height("Altitude (ft MSL)", "{a}", [0, 0.3048, 0.6096, 0.9144], said="sea level"),
+    "a height from 0": height("Height [ft]", "{i}00", [0, 30.48, 60.96, 91.44]),
     "home and terrain are not the aircraft": height("home_alt,terrain_alt,height above ellipsoid (m)", "5,6,{a}", [0, 1, 2, 3], said="ellipsoid"),
     "ArduPilot's height above home": height("TimeUS,Alt,RelHomeAlt,RelOriginAlt", "1,{a},{i},9", [0, 1, 2, 3]),
     "MAVLink's integers": (
@@ -309,6 +310,18 @@ def test_heights_count_from_the_ground_before_the_climb(name: str, first: list[f
     (tmp_path / "x.csv").write_text(climb(first, 110.0).format(name))
     shown = read(tmp_path / "x.csv", (), {}).streams[0].frame["altitude_m"].to_numpy()
     np.testing.assert_allclose(shown, [*[NAN] * len(first), *[0.0] * 6, 5, 10, 15, 20, 25])
+
+
+@pytest.mark.parametrize(
+    ("name", "heights", "ground"),
+    [("alt_msl", [140.0] * 6 + [150, 130] + [110.0] * 6, 110.0), ("altitude", [30.0] * 6 + [40, 20] + [0.0] * 6, 0.0)],
+)
+def test_a_hover_at_the_start_is_no_ground(name: str, heights: list[float], ground: float, tmp_path: Path) -> None:
+    """The aircraft comes down to where it then rests: that is the ground."""
+    rows = "".join(f"{1749564000 + i},35.728,-78.696,{h}\n" for i, h in enumerate(heights))
+    (tmp_path / "x.csv").write_text(f"time,lat,lon,{name}\n{rows}")
+    shown = read(tmp_path / "x.csv", (), {}).streams[0].frame["altitude_m"].to_numpy()
+    np.testing.assert_allclose(shown, np.array(heights) - ground)
 
 
 SHIFTED = "the rows do not fit the header"

@@ -278,7 +278,8 @@ class LogSettings(StrictModel):
         """The reader options, with the flight's zone as default."""
         return ReadOptions(
             timezone=self.timezone or timezone,
-            **named(self, "clock time_origin ri_base columns kind node channel frequency_hz unit floor_db"),
+            ri_base=self.ri_base,
+            **named(self, "clock time_origin columns kind node channel frequency_hz unit floor_db"),
         )
 
 

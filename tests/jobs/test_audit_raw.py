@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common import geodesy
-from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.compare.result import APPLIED, ClockResult
 from aerpaw_cmp.flight import data as flight_data
 from aerpaw_cmp.flight import replay as flight_replay
@@ -20,11 +19,11 @@ from aerpaw_cmp.flight.pose import track as flight_track
 from aerpaw_cmp.flight.replay import Clock, FlightReplay, replay_flight
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.audit_flight import expectations
-from aerpaw_cmp.jobs.reporting.audit_raw import raw_checked
 from aerpaw_cmp.jobs.reporting.compare_flight import compare_flight
 from aerpaw_cmp.site import site
 from aerpaw_cmp.site.antenna import antennas
 from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv, sphere_grid, unit_mean_gain
+from tests.raw_checks import RawAudit, raw_checked
 
 ORIGIN = (35.7275, -78.696)
 # Height of the take-off point above the ground of the origin.
@@ -98,14 +97,14 @@ def write_flight(folder: Path) -> Path:
     return flight
 
 
-def checked(flight: Path, scores: bool = False, clocks: Any = None) -> FieldAudit:
+def checked(flight: Path, scores: bool = False, clocks: Any = None) -> RawAudit:
     """The flight read, replayed and audited from its bytes."""
     data = load_data(load_flight(flight), flight.parent)
     replays = replay_flight(data, clocks=None if clocks is None else clocks(data))
     return audited(data, replays, scores)
 
 
-def audited(data: FlightData, replays: FlightReplay, scores: bool = False) -> FieldAudit:
+def audited(data: FlightData, replays: FlightReplay, scores: bool = False) -> RawAudit:
     results = compare_flight(data, replays).rss if scores else ()
     return raw_checked(data, replays.all, expectations(data, replays.all), results)
 
@@ -119,13 +118,13 @@ def test_a_right_flight_is_recomputed_to_rounding(flight: Path) -> None:
     audit = checked(flight, scores=True)
     assert audit.failures == ()
     assert audit.not_covered == ()
-    assert audit.raw_samples >= 40
-    assert audit.raw_levels >= 80
-    assert audit.raw_poses >= 100
-    assert audit.raw_position_max_m < 1e-3
-    assert audit.raw_attitude_max_rad < 1e-9
-    assert audit.raw_measured_max_db < 1e-9
-    assert audit.raw_level_max_db < 1e-3
+    assert audit.samples >= 40
+    assert audit.levels >= 80
+    assert audit.poses >= 100
+    assert audit.position_max_m < 1e-3
+    assert audit.attitude_max_rad < 1e-9
+    assert audit.measured_max_db < 1e-9
+    assert audit.level_max_db < 1e-3
 
 
 def no_takeoff(patch: pytest.MonkeyPatch) -> None:
@@ -307,5 +306,5 @@ def test_what_cannot_be_read_a_second_time_is_named(flight: Path, tmp_path: Path
     (tmp_path / "flight.yaml").write_text(text)
     audit = checked(tmp_path / "flight.yaml")
     assert any("T2_power_log.txt" in line for line in audit.not_covered)
-    assert audit.raw_samples >= 20
+    assert audit.samples >= 20
     assert audit.failures == ()

@@ -10,8 +10,9 @@ from pyproj import Geod
 from scipy.io import savemat
 from scipy.spatial.transform import Rotation, Slerp
 
-from aerpaw_cmp.propagation.check import raw
+from aerpaw_cmp.propagation.check.reference import gain_table
 from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv, sphere_csv
+from tests import raw_bytes as raw
 
 ZONE = "America/New_York"
 LW1 = (35.72750947, -78.69595819)
@@ -72,7 +73,7 @@ def test_a_table_of_gain_is_looked_up_alike_everywhere(tmp_path) -> None:
     gain = rng.uniform(-15, 5, (19, 36))
     file = tmp_path / "antenna.csv"
     file.write_text(sphere_csv(gain, np.ones_like(gain), ("a note",)), encoding="utf-8")
-    pattern, mine = read_sphere_csv(file), raw.gain_table(file.read_bytes())
+    pattern, mine = read_sphere_csv(file), gain_table(file.read_bytes())
     for _ in range(200):
         theta, phi = math.acos(rng.uniform(-1, 1)), rng.uniform(-7, 7)
         expected = complex(pattern.field(np.array(theta), np.array(phi))[0])

@@ -27,9 +27,6 @@ class FieldAudit:
         the better half of the links (float32 loses or finds a pair's path at an edge).
     attitude_rows, attitude_max_rad
         Logged attitudes turned into rotations a second time.
-    raw_samples, raw_poses, raw_levels, raw_position_max_m, raw_attitude_max_rad, raw_measured_max_db, raw_level_max_db
-        Recomputed from the bytes of the logs by code of its own: readings, poses with attitude (between telemetry rows
-        too), levels, and the largest differences.
     missing_paths, phantom_paths : int
         Paths that a reference has and whose existence is beyond doubt; paths that cannot exist.
     doubtful : int
@@ -59,13 +56,6 @@ class FieldAudit:
     explicit_max_error: float = 0.0
     attitude_rows: int = 0
     attitude_max_rad: float = 0.0
-    raw_samples: int = 0
-    raw_poses: int = 0
-    raw_levels: int = 0
-    raw_position_max_m: float = 0.0
-    raw_attitude_max_rad: float = 0.0
-    raw_measured_max_db: float = 0.0
-    raw_level_max_db: float = 0.0
     missing_paths: int = 0
     phantom_paths: int = 0
     doubtful: int = 0

@@ -18,7 +18,7 @@ from ...common.jsonable import named
 from ...common.stages import Progress, silent
 from ...common.units import AnyArray, FloatArray, spread_out
 from ...compare.level.field_difference import FieldAudit
-from ...compare.result import AuditResult, EngineResult, RssResult
+from ...compare.result import AuditResult, EngineResult
 from ...flight.data import FlightData
 from ...flight.losses import path_loss
 from ...flight.replay import Replayed, attitude_rotation, part_of
@@ -28,12 +28,10 @@ from ...propagation.arrays import Poses
 from ...propagation.check import reference
 from ...propagation.check.audit import Audit, Second, audit
 from ...propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
-from ...propagation.check.raw import gain_table
 from ...propagation.drivers.moving import site_with_tower_at
 from ...propagation.options import Field, Run, Search
 from ...propagation.search.sionna import free_memory
 from ...site.site import Site
-from .audit_raw import raw_checked
 
 # Logged attitudes that are turned into rotations a second time.
 _ATTITUDE_ROWS = 200
@@ -54,9 +52,7 @@ _NOT_COVERED = (
 )
 
 
-def audit_replays(
-    data: FlightData, replays: Sequence[Replayed], progress: Progress = silent, results: Sequence[RssResult] = ()
-) -> EngineResult:
+def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progress = silent) -> EngineResult:
     """The engine record, with the audit where ``rt.audit_links`` asks for one.
 
     Parameters
@@ -65,8 +61,6 @@ def audit_replays(
     replays : sequence of Replayed
         Of its RSS series, then of its ranks.
     progress : Progress
-    results : sequence of RssResult
-        What was made of the RSS series; their scores are checked too.
 
     Returns
     -------
@@ -83,13 +77,11 @@ def audit_replays(
             "samples": max((r.replay.samples for r in replays), default=0) or rt.advanced.samples,
         },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
-        audit=_audit(data, replays, results, progress) if rt.audit_links else None,
+        audit=_audit(data, replays, progress) if rt.audit_links else None,
     )
 
 
-def _audit(
-    data: FlightData, replays: Sequence[Replayed], results: Sequence[RssResult], progress: Progress
-) -> AuditResult | None:
+def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:
     """One audit over all series: links are shared out in proportion to their poses."""
     ks = data.settings.rank.k
     total = sum(len(r.poses) for r in replays)
@@ -108,8 +100,6 @@ def _audit(
     errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
     links = sum(p.links for p in parts)
     fields = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))
-    progress("audit from raw bytes")
-    fields += raw_checked(data, replays, expectations(data, replays), results)
     return AuditResult(
         reference=parts[0].reference,
         links=links,
@@ -238,7 +228,7 @@ def _pattern(settings: AntennaSettings, folder: Path, carrier_hz: float) -> refe
         return reference.PATTERNS[settings.model]
     if settings.model == "sphere":
         content = (folder / str(settings.file)).read_bytes()
-        return gain_table(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
+        return reference.gain_table(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
     pattern: reference.Pattern = scalar_pattern(load_pattern(settings, folder, carrier_hz))
     return pattern
 

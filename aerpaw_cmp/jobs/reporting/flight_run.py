@@ -74,7 +74,7 @@ def run_flight(
         result = compare_flight(data, replays)
     if audit:
         with stages("audit"):
-            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress, result.rss))
+            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
     climbed: FlightLadder | None = None
     if ladder:
         with stages("ladder"):

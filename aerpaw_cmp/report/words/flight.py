@@ -281,12 +281,6 @@ def audit_summary(audit: AuditResult) -> str:
             f"Field: {count(fields.paths)} paths against {audit.reference}'s own coefficients, worst "
             f"{fields.power_max_db:.2g} dB and {fields.phase_max_rad:.2g} rad."
         )
-        worst_db = max(fields.raw_level_max_db, fields.raw_measured_max_db)
-        texts.append(
-            f"Recomputed from raw bytes: {count(fields.raw_samples)} readings, {count(fields.raw_poses)} poses, "
-            f"{count(fields.raw_levels)} levels, worst {fields.raw_position_max_m:.2g} m, "
-            f"{fields.raw_attitude_max_rad:.2g} rad, {worst_db:.2g} dB."
-        )
         texts.append(f"Checks failed: {count(len(fields.failures))}.")
     return " ".join(texts)
 

@@ -217,7 +217,6 @@ def _audit(audit: AuditResult) -> Headline:
         value = f"{words.count(audit.missing_paths)} paths missing"
     else:
         value = f"{words.count(len(fields.failures))} failed"
-        extent += f"; {words.count(fields.raw_poses)} poses, {words.count(fields.raw_levels)} levels from raw bytes"
     return Headline(label="Audit", value=value, interval=words.audit_paths(audit), reference=extent)
 
 

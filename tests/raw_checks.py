@@ -1,6 +1,6 @@
 """The way from the bytes of the logs to positions, attitude and levels, walked a second time at some samples.
 
-What is compared with is made by :mod:`aerpaw_cmp.propagation.check.raw` and
+What is compared with is made by :mod:`tests.raw_bytes` and
 :mod:`aerpaw_cmp.propagation.check.reference`, which share no code with readers, track, geodesy, antennas and replay.
 Taken from this package are the settings and, per sample, which paths there are: those have an audit of their own.
 """
@@ -19,19 +19,18 @@ from typing import Any
 
 import numpy as np
 
-from ...common.errors import InputError, parsing
-from ...common.units import FloatArray, IntArray, spread_out
-from ...compare.level.field_difference import FieldAudit
-from ...compare.result import APPLIED, GIVEN, RssResult
-from ...flight.data import FlightData, RankSeries, RssSeries
-from ...flight.replay import Replayed, attitude_rotation
-from ...flight.settings import LogSettings
-from ...logs.ingest import IngestedFile
-from ...propagation.check.field_audit import Expected
-from ...propagation.check.raw import LOWEST_M, Log, Matrix, Pose, RawPath, Reading, east_north_m, level, read_log
-from ...propagation.check.reference import Mirror, Reference
-from ...propagation.field.stands import over_stands
-from ...site.site import Tower
+from aerpaw_cmp.common.errors import InputError, parsing
+from aerpaw_cmp.common.units import FloatArray, IntArray, spread_out
+from aerpaw_cmp.compare.result import APPLIED, GIVEN, RssResult
+from aerpaw_cmp.flight.data import FlightData, RankSeries, RssSeries
+from aerpaw_cmp.flight.replay import Replayed, attitude_rotation
+from aerpaw_cmp.flight.settings import LogSettings
+from aerpaw_cmp.logs.ingest import IngestedFile
+from aerpaw_cmp.propagation.check.field_audit import Expected
+from aerpaw_cmp.propagation.check.reference import Mirror, Reference
+from aerpaw_cmp.propagation.field.stands import over_stands
+from aerpaw_cmp.site.site import Tower
+from tests.raw_bytes import LOWEST_M, Log, Matrix, Pose, RawPath, Reading, east_north_m, level, read_log
 
 # Of all RSS series together, at least three of each; and moments of the track between its rows.
 SAMPLES = 48
@@ -48,6 +47,21 @@ _TOLERANCES = {
     "simulated level": (0.01, "dB"), "compared level": (1e-6, "dB"), "offset": (1e-6, "dB"), "RMSE": (1e-6, "dB"),
     "tower": (0.005, "m"), "rank": (0.5, ""), "clock": (1e-6, "s"),
 }  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RawAudit:
+    """Readings, poses with attitude (between telemetry rows too) and levels, and the largest differences."""
+
+    samples: int
+    poses: int
+    levels: int
+    position_max_m: float
+    attitude_max_rad: float
+    measured_max_db: float
+    level_max_db: float
+    failures: tuple[str, ...]
+    not_covered: tuple[str, ...]
 
 
 @dataclass(slots=True)
@@ -73,8 +87,8 @@ class _Account:
         if text not in self.not_covered:
             self.not_covered.append(text)
 
-    def result(self) -> FieldAudit:
-        """As a part of the audit of fields."""
+    def result(self) -> RawAudit:
+        """All of it as one record."""
         failures = []
         for kind, count in self.failed.items():
             if count:
@@ -83,14 +97,14 @@ class _Account:
                 share = f"{count} of {self.count[kind]}"
                 failures.append(f"from raw bytes: {kind} differs {shown} at {where} ({share} differ)")
         most = {kind: self.worst.get(kind, (0.0, ""))[0] for kind in _TOLERANCES}
-        return FieldAudit(
-            raw_samples=self.count.get("measured level", 0),
-            raw_poses=self.count.get("rotation", 0),
-            raw_levels=self.count.get("simulated level", 0),
-            raw_position_max_m=most["position"],
-            raw_attitude_max_rad=most["rotation"],
-            raw_measured_max_db=most["measured level"],
-            raw_level_max_db=most["simulated level"],
+        return RawAudit(
+            samples=self.count.get("measured level", 0),
+            poses=self.count.get("rotation", 0),
+            levels=self.count.get("simulated level", 0),
+            position_max_m=most["position"],
+            attitude_max_rad=most["rotation"],
+            measured_max_db=most["measured level"],
+            level_max_db=most["simulated level"],
             failures=(*failures, *self.broken),
             not_covered=tuple(f"from raw bytes: {text}" for text in self.not_covered),
         )
@@ -98,7 +112,7 @@ class _Account:
 
 def raw_checked(
     data: FlightData, replays: Sequence[Replayed], expected: Sequence[Expected], results: Sequence[RssResult] = ()
-) -> FieldAudit:
+) -> RawAudit:
     """Positions, datum, attitude, readings, levels and scores of some samples, from the bytes of the logs.
 
     Parameters
@@ -113,8 +127,8 @@ def raw_checked(
 
     Returns
     -------
-    FieldAudit
-        The ``raw_`` numbers, what is out of tolerance, and what could not be checked.
+    RawAudit
+        The numbers, what is out of tolerance, and what could not be checked.
     """
     account = _Account()
     logs = _logs(data, account)

@@ -1,0 +1,33 @@
+"""Real flights recomputed from the bytes of their logs, by code that shares nothing with the package's readers."""
+
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.flight.data import load_data
+from aerpaw_cmp.flight.replay import replay_flight
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.reporting.audit_flight import expectations
+from aerpaw_cmp.jobs.reporting.compare_flight import compare_flight
+from tests.raw_checks import raw_checked
+from tests.real_logs import REAL
+
+pytestmark = pytest.mark.field
+FLIGHTS = sorted(Path(__file__).parent.glob("*.yaml"))
+
+
+@pytest.mark.parametrize("path", FLIGHTS, ids=lambda path: path.stem)
+def test_times_levels_positions_and_scores_are_those_of_the_bytes(path: Path) -> None:
+    data = load_data(load_flight(path), REAL)
+    replays = replay_flight(data)
+    audit = raw_checked(data, replays.all, expectations(data, replays.all), compare_flight(data, replays).rss)
+    assert audit.failures == ()
+    assert audit.samples + audit.poses > 40 or path.stem.startswith("nr_rank")
+    assert audit.position_max_m < 0.005
+    assert audit.attitude_max_rad < 1e-5
+    assert audit.measured_max_db < 1e-3
+    assert audit.level_max_db < 0.01
+
+
+def test_there_are_flights() -> None:
+    assert len(FLIGHTS) == 5

@@ -20,7 +20,7 @@ from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, drafts
 from aerpaw_cmp.flight.pose.clock import CANNOT_TELL, SHIFTED, ClockEstimate, judge_clock
-from aerpaw_cmp.flight.replay import clock_channels
+from aerpaw_cmp.flight.replay import clock_channels, same_computer
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
@@ -45,9 +45,9 @@ def drafted(path: Path, timezone: str) -> FlightData | None:
 
 
 def judged(data: FlightData) -> Iterator[tuple[float, ClockEstimate]]:
-    """The estimate of each planted lag, receiver by receiver."""
-    for tower in dict.fromkeys(series.tower for series in data.rss):
-        channels = clock_channels(data, [s for s in data.rss if s.tower == tower])
+    """The estimate of each planted lag, computer by computer."""
+    for members in same_computer(data):
+        channels = clock_channels(data, [data.rss[i] for i in members])
         for planted in PLANTED_S:
             yield planted, judge_clock([replace(c, time_s=c.time_s + planted) for c in channels])
 

@@ -185,7 +185,7 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
 
 
 def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock | None]:
-    """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; the channels of a tower share one.
+    """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; series of one computer share it.
 
     Predictions are the image engine's RSS along the track with at most one reflection.
     """
@@ -194,13 +194,24 @@ def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock
         return [None] * len(data.rss)
     if isinstance(lag, float):
         return [_given_clock(series.tower, lag, len(series.time)) for series in data.rss]
-    estimated = dict[str, ClockEstimate]()
-    towers = list(dict.fromkeys(series.tower for series in data.rss))
-    for tower in towers:
-        progress(f"clock {tower}")
-        channels = clock_channels(data, [s for s in data.rss if s.tower == tower])
-        estimated[tower] = judge_clock(channels, window_s=data.settings.rss.advanced.lag_window_s)
-    return [_clock_of(series, estimated[series.tower], apply=lag == "apply") for series in data.rss]
+    estimated = dict[int, ClockEstimate]()
+    for members in same_computer(data):
+        progress(f"clock {', '.join(dict.fromkeys(data.rss[i].tower for i in members))}")
+        channels = clock_channels(data, [data.rss[i] for i in members])
+        estimated |= dict.fromkeys(members, judge_clock(channels, window_s=data.settings.rss.advanced.lag_window_s))
+    return [_clock_of(series, estimated[i], apply=lag == "apply") for i, series in enumerate(data.rss)]
+
+
+def same_computer(data: FlightData) -> list[list[int]]:
+    """RSS series by number, in groups that one computer stamped: those of one tower and those of one file."""
+    groups: list[tuple[set[tuple[str, str]], list[int]]] = []
+    for index, series in enumerate(data.rss):
+        keys = {("file", str(data.settings.logs[log].path)) for log in np.unique(series.log)}
+        keys.add(("tower", series.tower))
+        shared = [group for group in groups if group[0] & keys]
+        groups = [group for group in groups if not group[0] & keys]
+        groups.append((keys.union(*(k for k, _ in shared)), [*(i for _, many in shared for i in many), index]))
+    return [members for _, members in groups]
 
 
 def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) -> Clock:
@@ -227,7 +238,7 @@ _MOVING_CLOCK_STEP_S = 0.25
 
 
 def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[ClockChannel]:
-    """Levels of one receiver and what they depend on along the telemetry, to judge its clock by.
+    """Levels that one computer stamped and what they depend on along the telemetry, to judge its clock by.
 
     Ratios (the sounder's ``quality``, an SNR) saturate and lose lock where levels do not: they take part only where
     nothing else was logged.
@@ -235,21 +246,22 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
     assert data.track is not None
     channels = [series for series in channels if series.unit != "dB"] or channels
     start, end = data.track.start_ns, data.track.end_ns
-    step = _MOVING_CLOCK_STEP_S if channels[0].tower in data.nodes else _CLOCK_STEP_S
+    towers = dict.fromkeys(series.tower for series in channels)
+    step = _MOVING_CLOCK_STEP_S if any(tower in data.nodes for tower in towers) else _CLOCK_STEP_S
     step = max(step, (end - start) * 1e-9 / _CLOCK_INSTANTS)
     instants = (start + np.round(np.arange(0.0, (end - start) * 1e-9, step) * 1e9).astype(np.int64)).astype(
         "datetime64[ns]"
     )
-    along: dict[str, Along] = {}
+    along: dict[tuple[str, str], Along] = {}
     for series in channels:
-        if series.settings_key not in along:
-            along[series.settings_key] = _along(data, series, instants, step)
+        if (series.tower, series.settings_key) not in along:
+            along[series.tower, series.settings_key] = _along(data, series, instants, step)
     return [
         ClockChannel(
-            name=series.channel,
+            name=series.channel if len(towers) == 1 else f"{series.tower} {series.channel}",
             time_s=(nanoseconds(series.time) - start) * 1e-9,
             measured_db=_clock_levels(data, series),
-            along=along[series.settings_key],
+            along=along[series.tower, series.settings_key],
         )
         for series in channels
     ]

@@ -64,3 +64,12 @@ def test_channels_of_a_receiver_share_a_clock() -> None:
     clock = _clock_of(SERIES, estimate("ok"), apply=False).result
     channels: Any = [SimpleNamespace(further=SimpleNamespace(clock=clock)) for _ in "ab"]
     assert FlightResult(rss=tuple(channels)).clocks == {"LW1": clock}
+
+
+def test_towers_of_one_computer_have_one_sentence() -> None:
+    clock, other = (
+        _clock_of(SERIES, estimate("shifted", ci95_s=ends), apply=False).result for ends in ((2, 3), (1, 3))
+    )
+    first, second = clock_warnings({"LW1": clock, "LW2": other, "LW4": clock})
+    assert first.startswith("LW1, LW4: the radio clock is 2.50 s ahead")
+    assert second.startswith("LW2: ")

@@ -54,6 +54,16 @@ _WHITE = (0.1, 0.3, 0.9)
 # Tried for :class:`_Parts`.
 _GAIN = (0.05, 0.5, 1.0, 2.0)
 
+# Parts of the flight of which any two neighbours may be left out: a shift must be shown without them, too, by so much
+# [nat]. A dip, a jump of the position or a frozen track shifts no clock.
+_LEFT_OUT, _WITHOUT_NAT = 10, 2.0
+
+# A level whose middle 80 % span less than this share of the predicted ones is flat: a floor, a dead input.
+_FLAT = 0.2
+
+# A mean so many (robust) standard deviations from the median of as many neighbours counts as one so far.
+_LONE, _NEIGHBOURS = 4.0, 9
+
 # Lags whose systems are held in memory.
 _AT_ONCE = 16
 
@@ -170,12 +180,12 @@ class ClockEstimate:
 
 
 def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> ClockEstimate:
-    """One estimate for the channels of a receiver, which share a clock.
+    """One estimate for the channels that one computer stamped.
 
     Parameters
     ----------
     channels : sequence of ClockChannel
-        At least one, all with the same models.
+        At least one; the models that all of them have count.
     window_s : float
         Lags searched on either side [s].
 
@@ -191,8 +201,10 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     (Ornstein-Uhlenbeck) and a white one. Offset, slope and gains are integrated out, the scale is profiled; memory,
     white share and gain are those of largest likelihood on a small grid, per channel, at lag 0 or at the likeliest lag
     of a model. Each lag counts with the model that explains it best: one that is no likelier than another, at another
-    lag, excludes nothing. A level that depends on no position must be less likely than that.
+    lag, excludes nothing. A level that depends on no position must be less likely than that. A shift must be shown
+    without any fifth of the flight, too: one dip, jump of the position or frozen track decides nothing.
     """
+    channels = _same_models(channels)
     models = list(channels[0].along.predicted_db)
     groups = _at_one_time(channels)
     places = {place: group[0].along for (place, *_), group in groups.items()}
@@ -204,6 +216,8 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     }
     if not bins:
         return _nothing(_NO_OVERLAP, window_s)
+    if all(b.flat for b in bins.values()):
+        return _nothing(_FLAT_LEVEL, window_s)
     lags = _symmetric(window_s, _STEP_S)
     first = np.sum([b.likelihood(lags, [[_START]] * len(names)).sum(axis=0) for names, b in bins.items()], axis=0)
     starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # of each model, and of clocks that agree
@@ -221,11 +235,45 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     explained = total.max() - sum(b.constant() for b in bins.values())
     if explained < EVIDENCE_NAT + np.log(len(lags)):  # so much is had by trying as many lags
         return replace(estimate, verdict=CANNOT_TELL, reason=_NO_DEPENDENCE)
-    return estimate
+    if estimate.verdict != SHIFTED or _shown_without(bins, parts, estimate.radio_minus_telemetry_s):
+        return estimate
+    low, high = min(estimate.ci95_s[0], 0.0), max(estimate.ci95_s[1], 0.0)
+    agree = low >= -_AGREE_S - STAMPS_S and high <= _AGREE_S + STAMPS_S
+    verdict, reason = (OK, "") if agree else (CANNOT_TELL, _ONE_PLACE)
+    return replace(estimate, verdict=verdict, reason=reason, ci95_s=(low, high))
+
+
+def _shown_without(
+    bins: Mapping[tuple[str, ...], _Bins], parts: Mapping[tuple[str, ...], list[list[_Parts]]], lag_s: float
+) -> bool:
+    """True if a lag is likelier than none whatever two neighbouring parts of the flight are left out."""
+    start, end = min(b.mean_s[0] for b in bins.values()), max(b.mean_s[-1] for b in bins.values())
+    lags = np.array([lag_s, 0.0, *((-_SAME_S, _SAME_S) if abs(lag_s) > _AGREE_S else ())])
+    for part in range(_LEFT_OUT - 1):
+        nats = []
+        for names, b in bins.items():
+            away = (b.mean_s - start) / max(end - start, 1e-9) * _LEFT_OUT - part
+            nats.append(b.likelihood(lags, parts[names], (away < 0.0) | (away >= 2.0)).sum(axis=0))
+        shifted, *same = np.sum(nats, axis=0).max(axis=0)
+        if shifted - max(same) < _WITHOUT_NAT:
+            return False
+    return True
 
 
 _NO_OVERLAP = "too few samples at which the telemetry gives a position for every lag of the window"
+_FLAT_LEVEL = "the level stays flat where the model predicts that it varies"
+_ONE_PLACE = "a fifth of the flight alone speaks for a shift"
 _NO_DEPENDENCE = "the level hardly depends on the position of the UAV"
+
+
+def _same_models(channels: Sequence[ClockChannel]) -> list[ClockChannel]:
+    """The channels with the models alone that all of them have."""
+    common = set.intersection(*(set(channel.along.predicted_db) for channel in channels))
+    alongs = {
+        id(c.along): replace(c.along, predicted_db={k: v for k, v in c.along.predicted_db.items() if k in common})
+        for c in channels
+    }
+    return [replace(channel, along=alongs[id(channel.along)]) for channel in channels]
 
 
 def _at_one_time(channels: Sequence[ClockChannel]) -> dict[tuple[Hashable, ...], list[ClockChannel]]:
@@ -279,12 +327,13 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
     first, last = lags[max(near[0] - 1, 0)], lags[min(near[-1] + 1, len(lags) - 1)]
     low, high = max(float(first) - STAMPS_S, -window_s), min(float(last) + STAMPS_S, window_s)
     against = -float(total[np.abs(lags) <= _SAME_S + 1e-9].max())
+    agree = first >= -_AGREE_S and last <= _AGREE_S
     verdict, reason = CANNOT_TELL, f"lags from {low:+.1f} to {high:+.1f} s explain the level about as well"
     if against > EVIDENCE_NAT and (near[0] == 0 or near[-1] == len(lags) - 1):
         reason = f"the best lag lies near the edge of the window ({window_s:g} s): widen rss.advanced.lag_window_s"
-    elif against > EVIDENCE_NAT and not low <= 0.0 <= high:
+    elif not low <= 0.0 <= high and (against > EVIDENCE_NAT or agree):
         verdict, reason = SHIFTED, ""
-    elif first >= -_AGREE_S and last <= _AGREE_S:
+    elif agree:
         verdict, reason = OK, ""
     return ClockEstimate(
         radio_minus_telemetry_s=float(lags[total.argmax()]),
@@ -318,6 +367,13 @@ class _Bins:
     def n(self) -> int:
         return len(self.mean_s)
 
+    @property
+    def flat(self) -> bool:
+        """True if the levels hardly vary where every model predicts that they do."""
+        predicted = self._between(self.mean_s, self.levels)
+        measured, expected = (np.ptp(np.percentile(v, (10, 90), axis=0), axis=0) for v in (self.mean_db, predicted))
+        return bool(measured.max() < _FLAT * expected.min())
+
     @classmethod
     def of(cls, channels: Sequence[ClockChannel], features: FloatArray, window_s: float) -> _Bins | None:
         """Bins of channels that share all but the levels, and whose every shift within the window has a prediction.
@@ -347,7 +403,7 @@ class _Bins:
         place = np.arange(len(t)) - np.repeat(first, count)
         few = place % np.repeat(-(-count // _PER_BIN), count) == 0
         starts = np.concatenate([[0], np.cumsum(few)])[first]
-        mean_db = np.stack([np.add.reduceat(v, first) / count for v in y.T], axis=1)
+        mean_db = np.stack([_calm(np.add.reduceat(v, first) / count) for v in y.T], axis=1)
         return cls(
             mean_db=mean_db, mean_s=np.add.reduceat(t, first) / count, at_s=t[few], first=starts, along=along,
             features=_averaged(features, width / along.step_s), levels=levels,
@@ -372,12 +428,14 @@ class _Bins:
             out[:, row, features:] = residual - residual.mean(axis=0)
         return out
 
-    def likelihood(self, lags: FloatArray, parts: Sequence[Sequence[_Parts]]) -> FloatArray:
-        """Log likelihood (channels, models, lags), of the likeliest of each channel's parts."""
+    def likelihood(
+        self, lags: FloatArray, parts: Sequence[Sequence[_Parts]], kept: BoolArray | None = None
+    ) -> FloatArray:
+        """Log likelihood (channels, models, lags), of the likeliest of each channel's parts; of the means ``kept``."""
         every = list(dict.fromkeys(chain(*parts)))
         belongs = np.array([[part in mine for mine in parts] for part in every])[:, None, :, None]
         blocks = np.array_split(lags, -(-len(lags) // _AT_ONCE))
-        tried = [np.where(belongs, self._tried(block, every), -np.inf).max(axis=0) for block in blocks]
+        tried = [np.where(belongs, self._tried(block, every, kept), -np.inf).max(axis=0) for block in blocks]
         return np.moveaxis(np.concatenate(tried), 0, -1)
 
     def fitted(self, lags: FloatArray) -> list[list[_Parts]]:
@@ -386,9 +444,10 @@ class _Bins:
         best = self._tried(lags, parts).argmax(axis=0)
         return [[parts[at] for at in set(best[:, channel].flat)] for channel in range(best.shape[1])]
 
-    def _tried(self, lags: FloatArray, parts: Sequence[_Parts]) -> FloatArray:
+    def _tried(self, lags: FloatArray, parts: Sequence[_Parts], kept: BoolArray | None = None) -> FloatArray:
         """Log likelihood (parts, lags, channels, models)."""
-        tried = _likelihood(self.systems(lags), self.mean_s, self.predicted.size, parts)
+        rows = np.ones(self.n, dtype=bool) if kept is None else kept
+        tried = _likelihood(self.systems(lags)[rows], self.mean_s[rows], self.predicted.size, parts)
         return tried.reshape(*tried.shape[:2], *self.predicted.shape)
 
     def constant(self) -> float:
@@ -397,6 +456,15 @@ class _Bins:
         columns = np.column_stack([np.ones(self.n), np.zeros(self.n), levels])
         parts = [_Parts(*memory, 0.0) for memory in product(_MEMORY_S, _WHITE)]
         return float(_likelihood(columns[:, None], self.mean_s, levels.shape[1], parts).max(axis=0).sum())
+
+
+def _calm(mean_db: FloatArray) -> FloatArray:
+    """Means (n,) of which none lies farther from its neighbours than chance takes it: a lone dip decides nothing."""
+    from scipy.ndimage import median_filter
+
+    middle = median_filter(mean_db, _NEIGHBOURS, mode="nearest")
+    reach = _LONE * 1.4826 * float(np.median(np.abs(mean_db - middle)))
+    return np.asarray(np.clip(mean_db, middle - reach, middle + reach))
 
 
 def _averaged(table: FloatArray, width: float) -> FloatArray:

@@ -79,10 +79,14 @@ def report_data(
 
 
 def clock_warnings(clocks: Mapping[str, ClockResult]) -> tuple[str, ...]:
-    """Clocks that were corrected, should be, or cannot be judged; a correction that was not made comes first."""
-    receivers = sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED)
-    sentences = {receiver: _clock_warning(clocks[receiver]) for receiver in receivers}
-    return tuple(f"{receiver}: {text}" for receiver, text in sentences.items() if text)
+    """Clocks that were corrected, should be, or cannot be judged; a correction that was not made comes first.
+
+    Receivers of one computer have one clock, and one sentence.
+    """
+    receivers: dict[str, list[str]] = {}
+    for receiver in sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED):
+        receivers.setdefault(_clock_warning(clocks[receiver]), []).append(receiver)
+    return tuple(f"{', '.join(names)}: {text}" for text, names in receivers.items() if text)
 
 
 def _clock_warning(clock: ClockResult) -> str:

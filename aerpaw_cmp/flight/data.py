@@ -310,6 +310,11 @@ def is_ratio(stream: Stream, names: Sequence[str] = RATIOS) -> bool:
     return stream.kind == "rss" and any(name is not None and name.lower() in names for name in known)
 
 
+def rank_quantity(stream: Stream, reader: str) -> str:
+    """Rank that a stream holds, as its reader names it; the reader where that names none."""
+    return _text(stream, "source") or reader
+
+
 def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettings]:
     """Noise [dBm] under an SNR, where the flight file gives it, and the link as such a receiver hears it.
 

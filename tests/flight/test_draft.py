@@ -2,6 +2,7 @@
 
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -22,6 +23,7 @@ from aerpaw_cmp.logs import ingest as ingest_module
 from aerpaw_cmp.logs.flight_file import read_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.site.siteyaml import load_site
 from tests.log_texts import nemo_csv
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
@@ -451,3 +453,79 @@ def test_a_flight_file_keeps_and_names_five_flights(logs: Path, capsys: pytest.C
     flight = open_flight(book, flight=names[2])
     assert flight.settings.flight.name == names[2]
     assert str(flight.track["time"].iloc[0]).startswith(days[2])
+
+
+def test_a_ratio_to_the_noise_gets_a_span_from_its_levels(logs: Path) -> None:
+    """The SNR of LW1 stands for its level: an offset of -80 dB lies outside the usual span."""
+    lines = [line.rsplit(" ", 1) for line in (logs / "LW1/USRP1_power_log.txt").read_text().splitlines()]
+    shifted = [f"{head} {float(level) + 60.0:.3f}" for head, level in lines if level.startswith("-")]
+    assert len(shifted) > 50
+    (logs / "LW1/snr_log.txt").write_text("\n".join(shifted) + "\n")
+    for name in ("USRP1", "USRP2"):
+        (logs / f"LW1/{name}_power_log.txt").unlink()
+    files = ingest([logs / "LW1", *logs.glob("UAV/*vehicleOut.txt")], options=OPTIONS)
+    text, _ = draft(files, logs, DraftOptions(timezone=ZONE))
+    settings = parse_yaml(text, FlightFile)
+    (series,) = load_data(settings, logs).rss
+    placed = drafting.Placer(load_site("lake_wheeler"), next(f for f in files if "UAV" in f.path).result.streams[0])
+    level = next(s for f in files if "snr" in f.path for s in f.result.streams)
+    expected = placed.offset_db(placed.levels(level), "LW1")
+    assert series.channel
+    assert expected is not None
+    low, high = settings.rss.span_db
+    assert low + 10.0 < expected < high - 10.0
+    assert (low, high) != (-50.0, 50.0)
+
+
+def test_what_a_phone_reports_is_drafted_as_downlink(logs: Path) -> None:
+    rows = [
+        f"2025-06-01 14:0{n // 60}:{n % 60:02d},{35.7275 + n * 1e-5:.6f},-78.696,{20 + n % 9},{-80 - n % 7}"
+        for n in range(120)
+    ]
+    phone = logs / "phone.csv"
+    phone.write_text("t,lat,lon,alt,p\n" + "\n".join(rows) + "\n")
+    named = {"time": "t", "rss_db": "p"}
+    of_level = ReadOptions(timezone="UTC", kind="rss", columns=named, unit="dBm")
+    (file,) = ingest([phone], reader="generic_csv", options=of_level)
+    (stream,) = file.result.streams
+    modem = replace(stream, attributes={**stream.attributes, "quantity": "RSRP"})
+    files = [
+        replace(file, result=replace(file.result, streams=(modem,))),
+        *ingest(logs.glob("UAV/*vehicleOut.txt"), options=OPTIONS),
+    ]
+    entries = drafting.draft(
+        files, logs, DraftOptions(timezone=ZONE, mapping={"columns": named, "kind": "rss", "unit": "dBm"})
+    )
+    assert "uav_transmits: false" in entries[0]
+    assert "the power is unknown" in entries[0]
+    assert parse_yaml(entries[0], FlightFile).link.rss.uav_transmits is False
+
+
+@pytest.mark.parametrize("form", ["csv", "kml"])
+def test_the_rank_receiver_goes_with_the_quantity_in_any_format(logs: Path, form: str) -> None:
+    frame = pd.DataFrame({"rank": [1.0, 2.0] * 150, "n": range(300)})
+    lat, lon = 35.7275 + frame["n"] * 1e-6, np.full(300, -78.696)
+    if form == "csv":
+        head = "index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi\n"
+        text = head + "".join(
+            f"{n},{500 * n},{a},{o},30,{r:g},-90,20,12\n"
+            for n, a, o, r in zip(frame["n"], lat, lon, frame["rank"], strict=True)
+        )
+    else:
+        marks = "".join(
+            f"<Placemark><description><p>rel_time = {500.0 * n} ms</p><p>PDSCH rank (NR) = {r} </p><p>(lat, lon) = ({a},{o})"
+            f"</p><p> altitude = 30.0 m</p></description></Placemark>\n"
+            for n, a, o, r in zip(frame["n"], lat, lon, frame["rank"], strict=True)
+        )
+        text = (
+            f'<?xml version="1.0"?>\n<kml xmlns="http://www.opengis.net/kml/2.2"><Document>\n{marks}</Document></kml>\n'
+        )
+    (logs / f"LW1/nemo.{form}").write_text(text)
+    origin = "2025-06-01T14:00:00Z"
+    options = ReadOptions(timezone=ZONE, time_origin=origin)
+    files = [
+        *ingest([logs / f"LW1/nemo.{form}"], options=options),
+        *ingest(logs.glob("UAV/*vehicleOut.txt"), options=options),
+    ]
+    text, _ = draft(files, logs, DraftOptions(timezone=ZONE, time_origin=origin))
+    assert "receiver: lake_wheeler/nr_rank" in text

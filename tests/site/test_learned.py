@@ -144,7 +144,7 @@ def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: b
     ],
 )
 def test_a_damaged_receiver_is_left_out_and_said(folder: Path, content: bytes | None, said: str) -> None:
-    receiver = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=CARRIER_HZ, file="r.json.gz")
+    receiver = LearnedReceiver(tower="LW1", quantity="scheduled PDSCH rank", carrier_hz=CARRIER_HZ, file="r.json.gz")
     remember(
         folder / "mine.yaml",
         "nr",
@@ -261,7 +261,7 @@ def test_learned_antennas_are_found_from_any_working_folder(
     """The flight file is named relative to the working folder, and its site's memory lies beside it."""
     (folder / "rl" / "deep").mkdir(parents=True)
     folder_of(folder / "mine.yaml").rename(folder / "rl" / "mine.learned")
-    receiver = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=CARRIER_HZ, file="r.json.gz")
+    receiver = LearnedReceiver(tower="LW1", quantity="scheduled PDSCH rank", carrier_hz=CARRIER_HZ, file="r.json.gz")
     ranked = entry("A").model_copy(update={"series": [], "receivers": [receiver]})
     remember(folder / "rl" / "mine.yaml", "nr", ranked, {"r.json.gz": b"{}"})
     path = flight(folder / "rl", {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"})
@@ -298,10 +298,12 @@ def test_a_draft_takes_only_what_fits(folder: Path) -> None:
         assert own.antennas == (proposal.antennas if fits else {})
     for other in (("LW1", "A", "sounder_log"), ("LW1", "B", "flight_mat"), ("LW1", "rank", "flight_mat")):
         assert propose(known, "mine", [other]).antennas == {}
-    receiver = LearnedReceiver(tower="LW1", reader="nemo_csv", carrier_hz=3.4e9, file="r.json.gz", kappa=0.4)
+    receiver = LearnedReceiver(
+        tower="LW1", quantity="scheduled PDSCH rank", carrier_hz=3.4e9, file="r.json.gz", kappa=0.4
+    )
     ranked = known.model_copy(update={"entries": {"nr": entry("Z").model_copy(update={"receivers": [receiver]})}})
-    assert propose(ranked, "mine", [("LW1", "rank", "nemo_csv")]).receiver == "mine/nr"
-    assert propose(ranked, "mine", [("LW2", "rank", "nemo_csv")]).receiver is None
+    assert propose(ranked, "mine", [("LW1", "rank", "scheduled PDSCH rank")]).receiver == "mine/nr"
+    assert propose(ranked, "mine", [("LW2", "rank", "scheduled PDSCH rank")]).receiver is None
 
 
 def test_the_packaged_memory_is_small_and_says_where_it_comes_from() -> None:

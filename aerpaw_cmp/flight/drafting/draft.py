@@ -20,7 +20,7 @@ from ...logs.records import Stream, has_wall_clock
 from ...site.antenna.learned import Learned, read_learned
 from ...site.site import Site
 from ...site.siteyaml import load_site
-from ..data import is_ratio, site_place
+from ..data import is_ratio, rank_quantity, site_place
 from ..lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
 from ..losses import sight_shares
 from ..pose.cross_checks import questions
@@ -41,6 +41,10 @@ HEAD = """\
 LINK = (
     f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: true,"
     " bandwidth_hz: 20e6}  # out of coverage below the noise of this bandwidth; all as in your experiment?\n"
+)
+_DOWNLINK = (
+    f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: false}}"
+    "  # downlink: the UAV receives, the power is unknown and stands in the offset; which carrier?\n"
 )
 _NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
 RANK = (
@@ -130,7 +134,8 @@ def draft(
     parts += [_NO_TRACK] if entries.without_track else []
     parts += [f"  # left out: {remark}\n" for remark in entries.out]
     known = _remembered(entries, site, folder)
-    parts += _learned_lines(known) if "rss" in entries.kinds else []
+    link = _DOWNLINK if entries.downlink and all(entries.downlink) else LINK
+    parts += _learned_lines(known, link) if "rss" in entries.kinds else []
     parts += [RANK] if "rank" in entries.kinds else []
     parts += _settings(entries, known)
     text = "".join(parts)
@@ -250,14 +255,14 @@ def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
     return propose(known, str(Path(site).with_suffix("")), series, Nodes(placed=frozenset(entries.sure), fixed=fixed))
 
 
-def _learned_lines(known: Proposal) -> list[str]:
+def _learned_lines(known: Proposal, link: str) -> list[str]:
     """``antennas`` and ``link``."""
     if not known.antennas:
-        return [LINK]
+        return [link]
     assert known.carrier_hz is not None
     return [
-        f"antennas: {_plain(dict(known.antennas))}  # {known.antennas_about}\n",
-        LINK.replace(f"{CARRIER_HZ / 1e9:g}e9", f"{known.carrier_hz / 1e9:g}e9", 1),
+        f"antennas: {_plain(dict(known.antennas))}  # {known.antennas_about}; the same airframe?\n",
+        link.replace(f"{CARRIER_HZ / 1e9:g}e9", f"{known.carrier_hz / 1e9:g}e9", 1),
     ]
 
 
@@ -412,6 +417,8 @@ class _Entries:
     """Expected of each level."""
     sure: set[str] = field(default_factory=set)
     """Those of them whose place is known well enough for the directions of an antenna."""
+    downlink: list[bool] = field(default_factory=list)
+    """Of each level: what a phone or modem reports of its cell."""
     tops_m: list[float] = field(default_factory=list)
     """Greatest height of each log that has positions of its own and is compared at them."""
 
@@ -491,7 +498,10 @@ class _Entries:
             self.offsets_db += [o for s in compared if (o := self._offset_db(s, entry, self.placer)) is not None]
         self.kinds |= {s.kind for s in compared}
         self.tops_m += [_top_m(s) for s in compared if _has_positions(s)]
-        self.series += [(*_key(s, entry), file.result.reader) for s in compared if s.kind in ("rss", "rank")]
+        reader = file.result.reader
+        self.series += [(*_key(s, entry), reader) for s in compared if s.kind == "rss"]
+        self.series += [(*_key(s, entry), rank_quantity(s, reader)) for s in compared if s.kind == "rank"]
+        self.downlink += [s.attributes.get("quantity") == "RSRP" for s in compared if s.kind == "rss"]
         self.without_track |= self.flown is None and not all(_has_positions(s) for s in compared)
 
     def _ask_heights_and_floor(self, compared: Sequence[Stream], entry: dict[str, Any], path: str, comment: str) -> str:
@@ -586,7 +596,7 @@ class _Entries:
         return -np.inf if floor is None else floor
 
     def _offset_db(self, level: Stream, entry: Mapping[str, Any], placer: Placer) -> float | None:
-        if level.kind != "rss" or is_ratio(level):
+        if level.kind != "rss":
             return None
         home = entry.get("cells", {}).get(level.attributes.get("pci"))
         node = home or entry.get("node") or level.attributes.get("node")

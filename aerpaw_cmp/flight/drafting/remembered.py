@@ -75,7 +75,7 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
 # Exponent of the distance beside antennas that were learned under free space.
 _TAUGHT_SLOPE_SD = 0.2
 
-# Tower, channel (``rank`` of rank) and reader of a series of the draft.
+# Tower, channel and reader of a level of the draft; tower, ``rank`` and its quantity of a rank.
 _SeriesKey = tuple[str, str, str]
 
 
@@ -136,11 +136,11 @@ def propose(known: learned.Learned, site: str, series: Sequence[_SeriesKey], nod
         about = entry.about() if antennas else alone.format(entry.about())
         antennas["uav"] = f"{site}/{best}_uav"
         carrier = alike[0].carrier_hz
-    ranked = {(tower, reader) for tower, channel, reader in series if channel == "rank"}
+    ranked = {(tower, quantity) for tower, channel, quantity in series if channel == "rank"}
     receivers = [
         (name, entry)
         for name, entry in known.entries.items()
-        if any((r.tower, r.reader) in ranked for r in entry.receivers)
+        if any((r.tower, r.quantity) in ranked for r in entry.receivers)
     ]
     return Proposal(
         antennas=antennas,

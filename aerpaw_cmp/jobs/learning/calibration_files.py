@@ -23,7 +23,7 @@ from ...common.versions import utc_now
 from ...compare.gains.direction_gain import Frame, directed
 from ...compare.learning.calibration import Learned, mean_rmse
 from ...compare.learning.learning_curve import with_one_more
-from ...flight.data import FlightData, RankSeries, RssSeries
+from ...flight.data import FlightData, RankSeries, RssSeries, rank_quantity
 from ...flight.training import flight_logs, marks_note
 from ...logs.records import has_wall_clock
 from ...report.content.calibration import AntennaMap, CalibrationData
@@ -406,7 +406,7 @@ def receiver_entry(
         }
         link = first[0].settings.link.rank
         receivers.append(
-            LearnedReceiver(tower=tower, reader=_reader_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
+            LearnedReceiver(tower=tower, quantity=_quantity_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
         )
     return Entry(**_provenance(settings, flights, command), receivers=receivers), {file: ranked.text().encode()}
 
@@ -414,6 +414,12 @@ def receiver_entry(
 def _reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
     """Reader of the log that holds a series."""
     return data.files[int(series.log[0]) if len(series.log) else 0].result.reader
+
+
+def _quantity_of(data: FlightData, series: RankSeries) -> str:
+    """Rank that a series holds, as its log calls it."""
+    file = data.files[int(series.log[0]) if len(series.log) else 0]
+    return next(rank_quantity(stream, file.result.reader) for stream in file.result.streams if stream.kind == "rank")
 
 
 def _provenance(settings: CalibrationFile, flights: Sequence[FlightData], command: str) -> dict[str, Any]:

@@ -99,7 +99,8 @@ class LearnedReceiver(StrictModel):
     """A rank receiver of one tower: error on flights left out as kappa and log score beside the constant forecast."""
 
     tower: str
-    reader: str
+    quantity: str
+    """Rank that it was learned from, such as ``scheduled PDSCH rank``; whatever reader reads it."""
     carrier_hz: float
     file: str
     kappa: float | None = None

@@ -32,11 +32,11 @@ help:
 setup: $(READY_DEV) $(LLVM)
 
 # running needs the package alone; testing needs the developers' tools on top
-$(READY): pyproject.toml constraints.txt tools/setup_venv
+$(READY): pyproject.toml requirements/run.txt tools/setup_venv
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv
 	@touch $@
 
-$(READY_DEV): $(READY)
+$(READY_DEV): $(READY) requirements/dev.txt
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv dev
 	@touch $@
 
@@ -62,7 +62,7 @@ test: setup
 	echo "$(BIN)/mypy"; wait $$types; typed=$$?; cat "$$said"; rm -f "$$said"; \
 	[ $$tested -eq 0 ] && [ $$typed -eq 0 ]
 
-$(READY_DOCS): $(READY)
+$(READY_DOCS): $(READY) requirements/docs.txt
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv docs
 	@touch $@
 

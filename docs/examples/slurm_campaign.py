@@ -34,7 +34,8 @@ def main() -> int:
         # the nodes get this environment: PATH, PYTHONPATH
         job_extra_directives=["--export=ALL"],
         job_script_prologue=["export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1"],
-        scheduler_options={"dashboard_address": ":0"},
+        scheduler_options={"dashboard_address": "127.0.0.1:0"},
+        worker_extra_args=["--dashboard-address", "127.0.0.1:0"],
     ) as cluster:
         if "--show-job" in sys.argv:
             print(cluster.job_script())

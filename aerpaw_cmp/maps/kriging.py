@@ -11,8 +11,7 @@ Rules, each with a test:
 
 nugget
     ``1 - Phi(0+)``. It is a jump, not a smoothing: gamma of a sample with itself is 0, so that a target at the
-    place of a sample takes its value with variance 0. ``exact=False`` takes the nugget for measurement noise
-    instead and predicts the smooth field there.
+    place of a sample takes its value with variance 0.
 places
     Samples at the same place (to a micrometre) become one, their mean; leaving one out leaves out the place.
 near-singular systems
@@ -29,6 +28,7 @@ too few samples
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -45,6 +45,8 @@ from . import neighbours as choose
 Correlation = Callable[[FloatArray], FloatArray]
 
 CONDITION_LIMIT = 1e10
+# Sum of magnitudes beyond which an estimate is said to be doubtful; correlations that fall from 0 on stay below 3.
+LARGEST_WEIGHTS = 100.0
 # Targets whose neighbours' offsets agree to this share one set of weights.
 _SHARE_M = 1e-9
 # Below this bound of the condition number a Cholesky solution has 9 digits and more, and needs no second look.
@@ -97,8 +99,6 @@ class OrdinaryKriging:
         Of the random selection.
     sill : float or (fields,), optional
         v^2 of the variance; by default the sample variance of each field.
-    exact : bool
-        Whether the nugget is variation of the field (True) or measurement noise (False).
     vertical_scale : float
         In 3-D one metre of height counts as this many horizontal metres (geometric anisotropy).
     vertical_correlation : callable, optional
@@ -135,7 +135,6 @@ class OrdinaryKriging:
         selection: Literal["nearest", "random"] = "nearest",
         seed: int = 0,
         sill: ArrayLike | None = None,
-        exact: bool = True,
         vertical_scale: float = 1.0,
         vertical_correlation: Correlation | None = None,
         outside: Literal["nan", "nearest"] = "nan",
@@ -146,7 +145,6 @@ class OrdinaryKriging:
         self.selection = selection
         self.seed = seed
         self.sill = sill
-        self.exact = exact
         self.vertical_scale = vertical_scale
         self.vertical_correlation = vertical_correlation
         self.outside = outside
@@ -241,6 +239,13 @@ class OrdinaryKriging:
         for covered, columns in coverage_patterns(self.values_):
             skip = None if place is None else choose.renumbered(covered)[place]
             rule = self._weights(self.points_m_[covered], targets, skip)
+            if (largest := np.abs(rule.weight).sum(axis=1).max(initial=0.0)) > LARGEST_WEIGHTS:
+                warnings.warn(
+                    f"weights of samples add up to {largest:.0e}: estimates may lie as far outside the samples. "
+                    "Likely cause: a correlation that is flat at 0 (Gaussian) without a nugget",
+                    RuntimeWarning,
+                    stacklevel=3,
+                )
             estimate[:, columns] = _apply(rule, self.values_[np.ix_(covered, columns)])
             variance[:, columns] = rule.variance[:, None] * self.sill_[columns]
         return estimate, variance
@@ -319,8 +324,7 @@ class OrdinaryKriging:
         m, t = offset_m.shape[1:]
         to_target = self._semivariance(offset_m)
         here = np.einsum("dmt,dmt->mt", offset_m, offset_m) < choose.TIE_M**2
-        if self.exact:
-            to_target[here] = 0.0
+        to_target[here] = 0.0
         weight, variance, regularised = np.empty((m, t)), np.empty(t), np.zeros(t, dtype=bool)
         semivariances = self._between(samples, near)
         solve, lanes = (solve_schur, LANES) if kernels is None else (kernels.solve_schur, COMPILED_LANES)
@@ -333,10 +337,8 @@ class OrdinaryKriging:
                 w, v, r = _solve_doubtful(_square(between[:, ~sound], m), right.T[~sound])
                 weight[:, hard], variance[hard], regularised[hard] = w.T, v, r
         variance = np.maximum(variance, 0.0)
-        if self.exact:
-            # the solution is known there; rounding must not blur it
-            at = here.any(axis=0)
-            weight[:, at], variance[at] = here[:, at], 0.0
+        at = here.any(axis=0)  # the solution is known there; rounding must not blur it
+        weight[:, at], variance[at] = here[:, at], 0.0
         return weight, variance, regularised
 
 

@@ -333,9 +333,17 @@ def test_nugget_is_a_jump_unless_it_is_noise():
     near, variance = OrdinaryKriging(noisy, sill=1.0).fit(points, values).predict(points + 1e-3)
     assert (np.abs(near - values) > 1e-3).mean() > 0.9
     assert (variance > 0.4).all()
-    smooth, smooth_variance = OrdinaryKriging(noisy, sill=1.0, exact=False).fit(points, values).predict(points)
-    np.testing.assert_allclose(smooth, near, atol=1e-3)
-    np.testing.assert_allclose(smooth_variance, variance, atol=1e-3)
+
+
+def test_estimates_that_a_smooth_correlation_throws_far_outside_are_said():
+    def gaussian(d):
+        return np.exp(-((d / 100.0) ** 2))
+
+    points, targets = np.random.default_rng(3).uniform(0.0, 300.0, (2, 200, 2))
+    model = OrdinaryKriging(gaussian, radius_m=np.inf).fit(points, np.random.default_rng(4).uniform(-1.0, 1.0, 200))
+    with pytest.warns(RuntimeWarning, match="weights of samples add up to"):
+        estimate, _ = model.predict(targets)
+    assert np.abs(estimate).max() > 10.0
 
 
 def test_cells_without_coverage_take_no_part():
@@ -420,7 +428,6 @@ def by_hand(
     radius,
     correlation,
     sill,
-    exact=True,
     scale=1.0,
     vertical=None,
     outside="nan",
@@ -454,14 +461,14 @@ def by_hand(
         system[a, b] = 0.0 if a == b else max(0.0, 1.0 - phi(points[chosen[a]], points[chosen[b]]))
     for a in range(m):
         here = apart(points[chosen[a]], target) == 0.0
-        right[a] = 0.0 if here and exact else max(0.0, 1.0 - phi(points[chosen[a]], target))
+        right[a] = 0.0 if here else max(0.0, 1.0 - phi(points[chosen[a]], target))
     solved = np.linalg.solve(system, right)
     return float(solved[:m] @ values[chosen]), float(max(solved @ right, 0.0) * sill)
 
 
 CASES = [
     {"dims": 2, "neighbours": 6, "radius": 60.0},
-    {"dims": 2, "neighbours": 20, "radius": 90.0, "exact": False},
+    {"dims": 2, "neighbours": 20, "radius": 90.0},
     {"dims": 2, "neighbours": 4, "radius": 15.0, "outside": "nearest"},
     {"dims": 2, "neighbours": 1, "radius": 40.0},
     {"dims": 3, "neighbours": 8, "radius": 80.0, "scale": 2.5},
@@ -472,7 +479,6 @@ CASES = [
         "radius": 70.0,
         "vertical": vertical,
         "scale": 3.0,
-        "exact": False,
         "outside": "nearest",
     },
 ]
@@ -490,7 +496,7 @@ def test_every_target_is_that_of_its_own_system(case, seed):
     values[3, 2] = 1.5
     targets = np.concatenate([rng.uniform(-20, 220, (25, case["dims"])) * ([1, 1, 0.3][: case["dims"]]), points[:3]])
     options = {
-        "exact": case.get("exact", True), "vertical_scale": case.get("scale", 1.0),
+        "vertical_scale": case.get("scale", 1.0),
         "vertical_correlation": case.get("vertical"), "outside": case.get("outside", "nan"),
     }  # fmt: skip
     model = OrdinaryKriging(with_nugget, case["neighbours"], case["radius"], **options).fit(points, values)
@@ -499,7 +505,7 @@ def test_every_target_is_that_of_its_own_system(case, seed):
         np.var(column[np.isfinite(column)], ddof=1) if np.isfinite(column).sum() > 1 else 0.0 for column in values.T
     ]
     np.testing.assert_allclose(model.sill_, sill, rtol=1e-12)
-    rules = {key: case[key] for key in ("neighbours", "radius", "exact", "scale", "vertical", "outside") if key in case}
+    rules = {key: case[key] for key in ("neighbours", "radius", "scale", "vertical", "outside") if key in case}
     for field in range(3):
         expected = [
             by_hand(points, values[:, field], t, correlation=with_nugget, sill=sill[field], **rules) for t in targets
@@ -523,7 +529,7 @@ def test_what_is_not_said_is_twenty_neighbours_within_150_m_the_nearest_and_exac
     points, values = rng.uniform(0, 300, (80, 2)), rng.normal(size=80)
     targets = np.concatenate([rng.uniform(0, 300, (10, 2)), points[:2], [[900.0, 0.0]]])
     said = OrdinaryKriging(
-        with_nugget, 20, 150.0, selection="nearest", seed=0, sill=None, exact=True, vertical_scale=1.0,
+        with_nugget, 20, 150.0, selection="nearest", seed=0, sill=None, vertical_scale=1.0,
         vertical_correlation=None, outside="nan",
     )  # fmt: skip
     usual = OrdinaryKriging(with_nugget)

@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.compare.learning import field_gp
-from aerpaw_cmp.compare.learning.field_gp import FieldFit, FieldModel, Rows, fit_field, left_out
+from aerpaw_cmp.compare.learning.field_gp import PARTS, FieldFit, FieldModel, Rows, fit_field, left_out
 
 STILL = FieldModel(
     place_sd_db=3.0, length_m=40.0, height_m=20.0, turn=math.inf, offset_sd_db=0.0, drift_sd_db=0.0, noise_sd_db=1e-4
@@ -320,3 +320,23 @@ def test_targets_of_a_quarter_of_a_scale_go_together_where_they_are_eight():
     assert sorted((int(cells[0]), len(cells)) for cells in together) == [(1, 8), (2, 10), (2, 20)]
     assert all(np.ptp(cells) == 0 for cells in together)
     assert sum(len(part) for part, shared in parts if not shared) == 8
+
+
+@pytest.mark.parametrize("parts", [("place", "drift"), PARTS])
+def test_the_nearest_rows_state_the_sd_of_a_flown_flight(parts):
+    """The level of the flight is not known exactly: taken as known, half the standard deviation of its rest was lost."""
+    time_s = 0.5 * np.arange(1200)
+    position = np.column_stack([200 * np.sin(time_s / 60), 200 * np.sin(time_s / 43), np.full(1200, 40.0)])
+
+    def rows(position_m, time):
+        toward = -position_m / np.linalg.norm(position_m, axis=1)[:, None]
+        return Rows(position_m=position_m, direction=toward, time_s=time, flight=np.zeros(len(time), dtype=int))
+
+    fit = FieldFit(FieldModel(), rows(position, time_s))
+    chance = np.random.default_rng(2)
+    some = chance.choice(1200, 40)
+    for shift_m in (0.0, 30.0):
+        targets = rows(position[some] + shift_m * chance.normal(size=(40, 3)), time_s[some])
+        ratio = fit.predict(targets, parts, exact=False)[1] / fit.predict(targets, parts, exact=True)[1]
+        assert ratio.min() > 0.94
+        assert np.median(ratio) < 1.08

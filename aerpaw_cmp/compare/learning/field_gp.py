@@ -293,10 +293,12 @@ class FieldFit:
         from scipy.spatial import cKDTree
 
         levels, level_sd = self._levels(targets, parts)
-        row_levels, _ = self._levels(self.rows, ("mean", "offset"))
+        row_levels, row_sd = self._levels(self.rows, ("mean", "offset"))
         value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db - row_levels
         near: list[Part] = ["place", "drift"]
         near_parts = [part for part in near if part in parts]
+        # levels alone come from all rows; the level of another flight than the targets' own tells them nothing
+        row_sd = row_sd * (np.isin(self.rows.flight, targets.flight) & bool(near_parts))
         prior = prior_sd_db(self.model, near_parts) ** 2 if near_parts else 0.0
         turned = math.isfinite(self.model.turn) and targets.direction.ndim == 2
         tree, places = cKDTree(self._scaled(self.rows, turned)), self._scaled(targets, turned)
@@ -304,18 +306,20 @@ class FieldFit:
             most = min(_NEAREST * len(part) ** (1 / 3), _MOST_NEAREST) if shared else _NEAREST
             count = np.arange(1, min(round(most), len(self.rows)) + 1)
             index = tree.query(places[part].mean(axis=0) if shared else places[part], k=count)[1]
-            rows, some = self.rows.part(index), targets.part(part)
+            rows, some, sd = self.rows.part(index), targets.part(part), row_sd[index]
+            # a flight's level is known to its sd only: that error is common to what its rows have left
+            common = sd[..., :, None] * sd[..., None, :] * (rows.flight[..., :, None] == rows.flight[..., None, :])
+            matrix = _noisy(self.model, covariance(self.model, rows, rows, near) + common)
+            own = level_sd[part][:, None] * sd * (some.flight[:, None] == rows.flight)
             if shared:  # (targets, rows) of one set of rows
-                across = covariance(self.model, some, rows, near_parts)
-                matrix = _noisy(self.model, covariance(self.model, rows, rows, near))
+                across = covariance(self.model, some, rows, near_parts) + own
                 weight = np.linalg.solve(matrix, across.T).T
             else:  # a set of rows per target
-                across = covariance(self.model, some.part((slice(None), None)), rows, near_parts)[:, 0, :]
-                matrix = _noisy(self.model, covariance(self.model, rows, rows, near))
+                across = covariance(self.model, some.part((slice(None), None)), rows, near_parts)[:, 0, :] + own
                 weight = np.linalg.solve(matrix, across[..., None])[..., 0]
-            variance = prior - np.einsum("tm,tm->t", weight, across)
+            variance = prior + level_sd[part] ** 2 - np.einsum("tm,tm->t", weight, across)
             mean = levels[part] + np.einsum("tm,tm->t", weight, np.broadcast_to(value[index], weight.shape))
-            yield part, mean, np.sqrt(np.maximum(variance, 0.0) + level_sd[part] ** 2)
+            yield part, mean, np.sqrt(np.maximum(variance, 0.0))
 
     def _scaled(self, rows: Rows, turned: bool) -> FloatArray:
         """Coordinates in which the place part falls off evenly, with or without the direction."""

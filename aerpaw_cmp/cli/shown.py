@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -202,5 +203,6 @@ def _cell(item: Any, what: str) -> str:
     name, _, form = what.partition(":")
     value = item[name] if isinstance(item, Mapping) else attrgetter(name)(item)
     if isinstance(value, (tuple, list)):  # an interval
-        return "-" if any(end is None or end != end for end in value) else " .. ".join(format(e, form) for e in value)
+        known = [format(end, form) for end in value if end is not None and math.isfinite(end)]
+        return " .. ".join(known) if len(known) == len(value) else f">= {known[0]}" if known else "-"
     return "-" if value is None else format(value, form)

@@ -127,6 +127,8 @@ class RssFurther:
     explained_by: Mapping[str, float]
     likely_cause: Cause | None = None
     """Of the error, where one is shown."""
+    rmse_bound: str | None = None
+    """Reason why the interval of the RMSE is a lower bound alone, where it is."""
     simulated_sd_db: float | None = None
     """Mean of what learned antennas state for one sample: gain, the flight's own nuisance, noise, fading."""
     error_bars: Mapping[str, float] | None = None

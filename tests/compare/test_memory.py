@@ -5,6 +5,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from scipy.optimize import brentq
+from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
 from aerpaw_cmp.compare.statistics import memory
@@ -183,3 +184,10 @@ def test_only_tails_beyond_chance_widen_the_power(share: float, widened: bool, m
     usual, drawn = memory.power_draws(values), memory._random(TERMS)
     monkeypatch.setattr(memory, "_random", lambda _: (*drawn[:2], 0.0 * drawn[2], drawn[3]))
     assert np.array_equal(memory.power_draws(values), usual) != widened
+
+
+@pytest.mark.parametrize("samples", [20, 80])
+def test_the_likeliest_memory_is_about_that_of_the_sequence(samples: int) -> None:
+    rng, keep = np.random.default_rng(samples), np.exp(-1.0 / samples)
+    shares = [memory.memory_share(lfilter([1.0], [1.0, -keep], rng.normal(size=2000))) for _ in range(20)]
+    assert np.median(shares) * 2000 == pytest.approx(samples, rel=0.6)

@@ -264,6 +264,16 @@ def test_ends_are_those_of_the_central_95_percent_of_the_draws(monkeypatch):
     assert high - low == pytest.approx(2 * 1.96 * 0.01, rel=0.01)
 
 
+def test_an_interval_wider_than_twice_its_value_is_a_bound(monkeypatch):
+    ramp = np.arange(30.0) - 14.5
+    for factor, bound in ((1.9, False), (2.1, True)):
+        drawn = np.square(np.linspace(0.0, factor / 0.95 * ramp.std(), 20_001) + 0.5 * ramp.std())
+        monkeypatch.setattr(statistics, "power_draws", lambda _, drawn=drawn: drawn)
+        low, high = statistics.spread_interval(ramp)
+        assert low == pytest.approx((0.5 + 0.025 * factor / 0.95) * ramp.std(), rel=1e-3)
+        assert np.isinf(high) == bound
+
+
 def test_a_significant_difference_of_a_flight_of_few_correlation_times_is_found():
     """Twice the error of another model, ten correlation times: 0.3 gave no verdict."""
     rng = np.random.default_rng(7)

@@ -12,8 +12,9 @@ from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.compare.level.rss import ErrorSpan
 from aerpaw_cmp.compare.ranks.forecast import score_forecast
 from aerpaw_cmp.compare.result import ESTIMATED, ClockResult, FlightVerdict
+from aerpaw_cmp.report.exports.tables import metrics
 from aerpaw_cmp.report.pages.diff import DIFFERENCE
-from aerpaw_cmp.report.words.flight import CAUSES, Judged, first_sentence, pretty, ranking_sentence
+from aerpaw_cmp.report.words.flight import CAUSES, Judged, first_sentence, pretty, ranking_sentence, rss_verdict
 from aerpaw_cmp.report.words.flight_verdict import headlines, verdict
 from benchmarks.fabricated import with_numbers
 
@@ -70,6 +71,18 @@ def test_the_first_sentence_follows_from_the_interval_over_all_channels(report_d
     assert few.endswith(f"{best}: 7.9 dB. Too few samples for an interval of the difference.")
     none = verdict(dataclasses.replace(lost, verdict=None))[0]
     assert none == "Ray tracing: RMSE 8.4 dB. No baseline could be scored."
+
+
+def test_a_bound_is_given_with_its_reason(report_data):
+    reason = "the flight is too short for its memory of 40 s"
+    panel = with_numbers(report_data.rss[0], rmse_bound=reason)
+    intervals = dataclasses.replace(panel.score.intervals, rmse_db=(5.46, np.inf))
+    panel = dataclasses.replace(panel, score=dataclasses.replace(panel.score, intervals=intervals))
+    assert f"dB (95 %: at least 5.5 dB; {reason}) after an offset" in rss_verdict(panel)
+    data = dataclasses.replace(report_data, rss=(panel,))
+    assert headlines(data)[0].interval == "95 %: at least 5.5 dB"
+    (tower,) = metrics(data)["rss"].values()
+    assert (tower[panel.channel]["rmse_ci95_db"], tower[panel.channel]["rmse_bound"]) == ([5.46, None], reason)
 
 
 def test_the_verdict_is_against_the_best_baseline_over_the_scored_channels(report_data):

@@ -38,6 +38,9 @@ _FEWEST_INDEPENDENT = 10.0
 # on simulated flights).
 _UNSURE = 3.0
 
+# Width of an interval over its value from which its lower end alone is given.
+_BOUND = 2.0
+
 # Stretches of a flight; the share of each comes from the others.
 _STRETCHES = 24
 
@@ -383,10 +386,14 @@ def mean_interval(values: FloatArray) -> Interval:
 
 
 def spread_interval(values: FloatArray) -> Interval:
-    """95 % interval of the standard deviation of the process that a sequence (n,) in time order comes from."""
+    """95 % interval of the standard deviation that sequences such as this one (n,), in time order, have on average.
+
+    Wider than :data:`_BOUND` times the value, it is given as a bound: its upper end is infinite.
+    """
     if len(values) < FEWEST:
         return NO_INTERVAL
-    return _around(float(values.std()), np.sqrt(power_draws(values)))
+    low, high = _around(float(values.std()), np.sqrt(power_draws(values)))
+    return low, np.inf if high - low > _BOUND * values.std() else high
 
 
 def _around(estimate: float, drawn: FloatArray) -> Interval:

@@ -56,7 +56,7 @@ class Memories:
 
     ``whiten`` (m, terms, terms) makes the terms independent, ``log_det`` (m,) is the logarithm of its determinant;
     ``slope`` (m, terms) and ``variance`` (m,) give mean and variance of the sequence's mean once the terms are known;
-    ``power`` (m,) is that of the terms together; ``rate`` (m,) the length of the sequence over that of the memory.
+    ``power`` (m,) is that of the terms together.
     """
 
     whiten: FloatArray
@@ -64,7 +64,6 @@ class Memories:
     slope: FloatArray
     variance: FloatArray
     power: FloatArray
-    rate: FloatArray
 
 
 @cache
@@ -85,7 +84,6 @@ def memories(terms: int = TERMS) -> Memories:
         slope=slope,
         variance=every[:, 0, 0] - (cross * slope).sum(axis=1),
         power=np.trace(every[:, 1:, 1:], axis1=1, axis2=2),
-        rate=np.tile(RATES, len(WHITE_SHARES) + 1),
     )
 
 
@@ -168,6 +166,12 @@ def _picked(slow: FloatArray, kind: Kind) -> tuple[IntArray, FloatArray]:
     uniform, chi_squared, *_ = _random(len(slow))
     index = np.minimum(np.searchsorted(running, uniform * running[-1]), len(running) - 1)
     return index, square[index] / chi_squared
+
+
+def memory_share(values: FloatArray) -> float:
+    """Length of the likeliest memory of a sequence (n,), over that of the sequence."""
+    likelihood, _ = likelihoods(cosine_terms(values).slow)
+    return float(1.0 / np.tile(RATES, len(WHITE_SHARES) + 1)[int(np.argmax(likelihood * weights("power")))])
 
 
 def mean_draws(values: FloatArray, kind: Kind = "mean") -> FloatArray:

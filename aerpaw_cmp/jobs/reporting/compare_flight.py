@@ -41,6 +41,7 @@ from ...compare.result import (
     SnrScore,
 )
 from ...compare.statistics import intervals as statistics
+from ...compare.statistics.memory import memory_share
 from ...compare.statistics.passes import Visit, repeatability
 from ...flight.data import FlightData, RankSeries, RssSeries
 from ...flight.drafting.remembered import errors_elsewhere, lock_elsewhere
@@ -241,6 +242,7 @@ def _further(
         error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
         elsewhere=_elsewhere(case.data, series),
         trained_on=case.trained or None,
+        rmse_bound=_bound(series, score),
     )
     if case.trained:
         return further
@@ -253,6 +255,16 @@ def _further(
         snr=_snr(series, levels),
         likely_cause=cause_of(case.data.site, series, replayed, levels, case.simple["free_space"]),
     )
+
+
+def _bound(series: RssSeries, score: rss.RssComparison) -> str | None:
+    """Reason of an interval of the RMSE that has no upper end."""
+    if not np.isposinf(score.rmse_ci95_db[1]):
+        return None
+    known = np.isfinite(score.residual_db)
+    order = np.argsort(series.time[known], kind="stable")
+    length_s = np.ptp(series.time[known]) / np.timedelta64(1, "s")
+    return f"the flight is too short for its memory of {memory_share(score.residual_db[known][order]) * length_s:.0f} s"
 
 
 def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score: rss.RssComparison) -> float:

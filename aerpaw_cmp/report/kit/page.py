@@ -46,12 +46,15 @@ def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
 
 
 def interval(value: tuple[float, float] | None, decimals: int = 1) -> str:
-    """An interval as ``[low, high]``, or nothing; "n/a" where there are too few independent samples."""
+    """An interval as ``[low, high]``, a bound as ``≥ low``, or nothing; "n/a" where there is neither."""
     if value is None:
         return ""
-    if not all(map(math.isfinite, value)):
+    low, high = (math.nan if end is None else end for end in value)
+    if not math.isfinite(low):
         return "n/a"
-    return f"[{number(value[0], decimals)}, {number(value[1], decimals)}]"
+    return (
+        f"[{number(low, decimals)}, {number(high, decimals)}]" if math.isfinite(high) else f"≥ {number(low, decimals)}"
+    )
 
 
 def percent(share: float | None, decimals: int = 0) -> str:

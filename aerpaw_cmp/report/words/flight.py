@@ -52,12 +52,13 @@ def signed(value: float) -> str:
     return f"{value:+.1f}".replace("-", "−")
 
 
-def _within(value: Interval | None, decimals: int = 1) -> str:
-    if value is None:
-        return ""
-    if not all(map(math.isfinite, value)):
+def _within(value: Interval, bound: str | None) -> str:
+    low, high = value
+    if not math.isfinite(low):
         return " (too few samples for an interval)"
-    return f" (95 % interval {value[0]:.{decimals}f} to {value[1]:.{decimals}f})"
+    if not math.isfinite(high):
+        return f" (95 %: at least {low:.1f} dB; {bound})"
+    return f" (95 % interval {low:.1f} to {high:.1f})"
 
 
 def headline(data: ReportData) -> str:
@@ -418,7 +419,8 @@ def rss_verdict(panel: RssResult) -> str:
     if score.n == 0 or not math.isfinite(score.rmse_db):
         return f"{panel.name}: nothing to score; all {count(len(panel.time))} samples are out of coverage on one side."
     text = (
-        f"{panel.name}: RMSE of ray tracing {score.rmse_db:.1f} dB{_within(score.rmse_ci95_db)} "
+        f"{panel.name}: RMSE of ray tracing {score.rmse_db:.1f} dB"
+        f"{_within(score.rmse_ci95_db, panel.further.rmse_bound)} "
         f"after an offset of {signed(score.offset_db)} dB"
     )
     errors = {name: model.rmse_db for name, model in panel.baselines.items() if math.isfinite(model.rmse_db)}

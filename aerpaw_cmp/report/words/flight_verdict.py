@@ -231,8 +231,10 @@ def _error(panels: Sequence[RssResult]) -> Headline:
 
 
 def _interval(ends: Interval, form: str, unit: str = "") -> str:
-    if not all(map(math.isfinite, ends)):
+    if not math.isfinite(ends[0]):
         return NO_INTERVAL
+    if not math.isfinite(ends[1]):
+        return f"95 %: at least {format(ends[0], form)}{unit}"
     return "95 %: " + " to ".join(format(end, form).replace("-", "−") for end in ends) + unit
 
 

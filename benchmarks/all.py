@@ -73,6 +73,7 @@ SMALLEST: dict[str, list[str]] = {
     "planted_fields": ["--sets", "1", "--targets", "200"],
     "planted_faults": ["--only", "foliage", "--every", "20"],
     "published": ["tasks", "--data", "sample_logs"],
+    "real_ground": ["--only", "aadm", "--no-fit"],
     "predict_scale": ["--points", "500", "--flights", "2"],
     "replay": ["--quick"],
     "report": ["--quick"],
@@ -84,7 +85,7 @@ SMALLEST: dict[str, list[str]] = {
     "tap_web_soak": ["--quick"],
 }
 
-ON_FIELD_DATA = ("learned_map", "left_out_reports")
+ON_FIELD_DATA = ("learned_map", "left_out_reports", "real_ground")
 
 AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 

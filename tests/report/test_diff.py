@@ -111,6 +111,21 @@ def noisy(pair):
     return pair, tables
 
 
+def test_the_site_alone_is_the_cause_where_nothing_else_differs(noisy):
+    """Another site is a key of the flight file, that file, and the site's own: one cause, not three."""
+
+    def other_site(metrics):
+        metrics["settings"]["site"] = {"file": "farm.yaml"}
+        for role, path in (("flight file", "flight.yaml"), ("site file", "farm.yaml")):
+            metrics["inputs"].append({"role": role, "path": path, "sha256": "e" * 64})
+
+    (first, second), _ = noisy
+    change_metrics(second, other_site)
+    assert "Likely cause: the site differs (farm.yaml)." in verdict(run_diff(first, second))
+    change_metrics(second, lambda m: m["settings"]["rt"].update(max_depth=1))
+    assert "no single cause" in verdict(run_diff(first, second))
+
+
 def test_noise_on_one_link_is_found_there_and_sized(noisy):
     pair, tables = noisy
     diff = run_diff(*pair)

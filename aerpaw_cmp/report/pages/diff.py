@@ -65,6 +65,7 @@ CAUSES: dict[str, tuple[str, str]] = {
     ),
     "setting": ("Likely cause: {listed} {verb} ({names}).", "{keep}"),
     "input": ("Likely cause: {listed} {verb} ({names}).", "{keep}"),
+    "site": ("Likely cause: the site differs ({names}).", "{keep}"),
     "version": ("Likely cause: {listed} {verb} ({names}).", "make both reports with one version to judge a setting"),
     "several": ("{listed} {verb}, so no single cause is shown.", "change one of them at a time"),
     "unexplained": (
@@ -86,9 +87,21 @@ def verdict(diff: ReportDiff) -> str:
     return " ".join(parts or ["Links differ."]) + _cause(diff)
 
 
+# Its settings are compared one by one.
+_FLIGHT_FILE = "flight file"
+
+
+def _site_alone(diff: ReportDiff) -> bool:
+    """Check whether settings and inputs differ by the site alone: its name, its file, or what that names."""
+    keys, roles = {entry.key for entry in diff.settings}, {entry.role for entry in diff.inputs} - {_FLIGHT_FILE}
+    return bool(keys or roles) and all(name.startswith("site") for name in (*keys, *roles))
+
+
 def _cause(diff: ReportDiff) -> str:
     """Sentence on what else differs, which may be the reason."""
     kinds = {"setting": diff.settings, "input": diff.inputs, "version": diff.versions}
+    if _site_alone(diff):
+        kinds = {"site": [i for i in diff.inputs if i.role != _FLIGHT_FILE] or diff.settings, "version": diff.versions}
     changed = {name: len(items) for name, items in kinds.items()}
     moved = max((level.measured_max_db for level in diff.levels if math.isfinite(level.measured_max_db)), default=0.0)
     cause = changed_verdict(diff.pooled, bool(diff.differences), moved > TOLERANCE_DB, changed)

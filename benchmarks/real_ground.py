@@ -1,0 +1,140 @@
+"""Each part of Lake Wheeler's map and ground, and its effect on every field flight: levels, rank agreement, variation.
+
+Each part is added alone to free ground without buildings and woods, at one reflection. Levels: RMSE with it minus RMSE
+without it, each with its own offset, paired (95 %). Rank: agreement and total variation, paired by eighths of the
+flight (95 %, Student's t of 7). Then a fit of the woods' specific attenuation and height on the four towers of AADM.
+
+Run: AERPAW_CMP_FIELD_DATA=DIR python benchmarks/real_ground.py [--only NAME ...] [--no-fit] [-o FILE]
+"""
+
+import argparse
+import dataclasses
+import os
+import sys
+from collections.abc import Iterator
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import t as student
+
+import aerpaw_cmp
+from aerpaw_cmp.compare.statistics.intervals import paired_difference
+from aerpaw_cmp.flight.data import FlightData
+from aerpaw_cmp.flight.replay import replay_flight
+
+FLIGHTS = Path(__file__).parents[1] / "tests" / "field"
+NAMES = ("dataset12_40m", "dataset12_70m", "nr_rank_flight1", "nr_rank_flight3", "aadm")
+
+_BARE = {"site.without_buildings": True, "rt.foliage": "none", "rt.max_depth": 1, "rss.field": "power"}
+PARTS = {
+    "buildings": {"site.without_buildings": False},
+    "woods as trees": {"rt.foliage": "opaque"},
+    "woods as media": {"rt.foliage": "attenuating"},
+    "relief (offsets)": {"site.tower_ground": "offsets"},
+    "relief (surface)": {"site.tower_ground": "surface"},
+}
+EIGHTHS = 8
+GAMMAS_DB_PER_M, HEIGHTS_M = (0.1, 0.2, 0.3, 0.47, 0.7, 1.0), (10.0, 15.0, 20.0, 25.0, 30.0)
+
+
+def flight(name: str) -> aerpaw_cmp.Flight:
+    """A field flight as its file has it."""
+    return aerpaw_cmp.open_flight(FLIGHTS / f"{name}.yaml", logs_root=os.environ["AERPAW_CMP_FIELD_DATA"])
+
+
+def by_eighths(change: np.ndarray) -> str:
+    """Mean of a change by eighths and its 95 % interval."""
+    means = np.array([np.mean(part) for part in np.array_split(change, EIGHTHS)])
+    half = student.ppf(0.975, EIGHTHS - 1) * means.std(ddof=1) / np.sqrt(EIGHTHS)
+    return f"{means.mean():+.3f} [{means.mean() - half:+.3f}, {means.mean() + half:+.3f}]"
+
+
+def variation(measured: np.ndarray, rank: np.ndarray) -> float:
+    """Total variation of two samples of ranks."""
+    known = np.isfinite(measured) & (rank > 0)
+    shares = [np.bincount(x[known].astype(int), minlength=5)[1:5] / max(known.sum(), 1) for x in (measured, rank)]
+    return float(np.abs(shares[0] - shares[1]).sum() / 2)
+
+
+def rows_of(name: str) -> Iterator[list[str]]:
+    """Rows of the table for a flight."""
+    opened = flight(name)
+    bare = opened.compare(**_BARE).result
+    for part, keys in PARTS.items():
+        added = opened.compare(**{**_BARE, **keys}).result
+        for a, b in zip(bare.rss, added.rss, strict=True):
+            errors = [x.measured_db - x.simulated_dbm for x in (b, a)]
+            level = paired_difference(*errors)
+            low, high = level.difference_ci95_db
+            lost = int(np.isnan(errors[0]).sum() - np.isnan(errors[1]).sum())
+            change = f"{level.difference_db:+.2f} [{low:+.2f}, {high:+.2f}]"
+            yield [name, f"{a.tower} {a.channel}", part, f"{level.other_rmse_db:.2f}", change, str(lost), "", ""]
+        for a, b in zip(bare.rank, added.rank, strict=True):
+            known = np.isfinite(a.measured)
+            for k in (10.0, 100.0):
+                first, second = ((x.rank[k] == a.measured)[known].astype(float) for x in (a, b))
+                shift = variation(a.measured, b.rank[k]) - variation(a.measured, a.rank[k])
+                what = f"{a.tower} rank, K = {k:g}"
+                yield [name, what, part, f"{first.mean():.3f}", "", "", by_eighths(second - first), f"{shift:+.3f}"]
+
+
+def fit_woods() -> Iterator[str]:
+    """Lines on the attenuation and height that AADM's towers ask for, each eighth of the flight left out in turn."""
+    data = flight("aadm").replay(**{**_BARE, "rt.foliage": "attenuating"}).data
+    rt = data.settings.rt
+    errors: dict[str, dict[tuple[float, float], np.ndarray]] = {s.tower: {} for s in data.rss}
+    for gamma, height in product(GAMMAS_DB_PER_M, HEIGHTS_M):
+        advanced = rt.advanced.model_copy(update={"gamma_db_per_m": gamma})
+        settings = data.settings.model_copy(update={"rt": rt.model_copy(update={"advanced": advanced})})
+        woods = tuple(dataclasses.replace(wood, height_m=height) for wood in data.site.forests)
+        changed: FlightData = dataclasses.replace(
+            data, settings=settings, site=dataclasses.replace(data.site, forests=woods)
+        )
+        for series, replayed in zip(changed.rss, replay_flight(changed).rss, strict=True):
+            simulated = np.full(len(series.time), np.nan)
+            simulated[replayed.valid] = replayed.replay.rss_power_dbm[:, 0]
+            up = replayed.spread(replayed.poses.position_m)[:, 2]
+            with np.errstate(invalid="ignore"):
+                errors[series.tower][gamma, height] = np.where(up >= 5, series.measured_db - simulated, np.nan)
+    yield "| tower | fitted on | RMSE at 0.47, 20 | RMSE left out | gamma [dB/m] by eighth | height [m] by eighth |"
+    yield "| --- | --- | --- | --- | --- | --- |"
+    for tower, fitted_on in [*((t, (t,)) for t in errors), ("LW3", ("LW4",)), ("LW4", ("LW3",))]:
+        left_out, usual, chosen = [], [], []
+        parts = np.array_split(np.arange(len(next(iter(errors[tower].values())))), EIGHTHS)
+        for part in parts:
+            rest = np.setdiff1d(np.arange(sum(map(len, parts))), part)
+            best = min(errors[tower], key=lambda size: sum(np.nanvar(errors[t][size][rest]) for t in fitted_on))
+            chosen.append(best)
+            for sizes, squares in ((best, left_out), ((0.47, 20.0), usual)):
+                error = errors[tower][sizes]
+                squares.append((error[part] - np.nanmean(error[rest])) ** 2)
+        rmse = [float(np.sqrt(np.nanmean(np.concatenate(s)))) for s in (usual, left_out)]
+        gammas, heights = (" ".join(f"{size[k]:g}" for size in chosen) for k in (0, 1))
+        yield f"| {tower} | {', '.join(fitted_on)} | {rmse[0]:.2f} | {rmse[1]:.2f} | {gammas} | {heights} |"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", nargs="*", default=NAMES, choices=NAMES)
+    parser.add_argument("--no-fit", action="store_true")
+    parser.add_argument("-o", "--out", type=Path)
+    options = parser.parse_args()
+    lines = [
+        "| flight | series | part | without [dB or share] | RMSE [dB] | samples lost | agreement | total variation |",
+        "| --- | --- | --- | --- | --- | --- | --- | --- |",
+    ]
+    for name in options.only:
+        for row in rows_of(name):
+            lines.append("| " + " | ".join(row) + " |")
+            print(lines[-1], file=sys.stderr, flush=True)
+    if not options.no_fit:
+        lines += ["", *fit_woods()]
+    text = "\n".join(lines) + "\n"
+    print(text)
+    if options.out is not None:
+        options.out.write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

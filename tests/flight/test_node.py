@@ -1,5 +1,6 @@
 """A draft says which tower, or which place, the levels of a log fit."""
 
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -62,6 +63,29 @@ def test_levels_of_a_tower_name_the_tower(tmp_path: Path) -> None:
     assert "the levels fit LW1 best" in remarks
 
 
+@pytest.mark.parametrize(("first", "apart_m"), [(True, 400.0), (False, 400.0), (True, 3.0)])
+def test_of_two_vehicles_the_levels_name_the_one_that_carried_the_radio(
+    tmp_path: Path, first: bool, apart_m: float
+) -> None:
+    """Another aircraft flew the same pattern beside the one with the radio; a second log of one aircraft is no other."""
+    files = _logs(tmp_path, tuple(SITE.towers["LW1"].position_m), -60.0, slope=2.0)
+    (stream,) = files[0].result.streams
+    moved = stream.frame.assign(longitude_deg=stream.frame["longitude_deg"] - apart_m / 90_400.0)
+    other = replace(
+        files[0], path=str(tmp_path / "other.csv"), sha256="0" * 64,
+        result=replace(files[0].result, streams=(replace(stream, name="other", frame=moved),)),
+    )  # fmt: skip
+    (tmp_path / "other.csv").write_text("x")
+    both = [files[0], other] if first else [other, files[0]]
+    _, remarks = draft([*both, files[1]], tmp_path, DraftOptions(time_origin=ORIGIN))
+    asked = [remark for remark in remarks if "which carried the radio?" in remark]
+    assert len(asked) == (apart_m > 30.0)
+    if asked:
+        assert "pose.csv" in asked[0]
+        assert f"m apart, and the levels fit {stream.name}: which" in asked[0]
+        assert "left out: other.csv: the track is that of other telemetry" in remarks
+
+
 ROVER = (-120.0, 90.0, 1.5)
 
 
@@ -87,7 +111,7 @@ def test_a_position_list_is_tried_first(tmp_path: Path) -> None:
     assert "line 2 of rover_positions.txt" in remarks
 
 
-@pytest.mark.parametrize(("level_100_m", "moved"), [(-45.0, False), (20.0, True), (-140.0, True)])
+@pytest.mark.parametrize(("level_100_m", "moved"), [(-45.0, False), (5.0, True), (-140.0, True)])
 def test_the_span_of_offsets_holds_the_expected_one(tmp_path: Path, level_100_m: float, moved: bool) -> None:
     settings, _ = _drafted(tmp_path, tuple(SITE.towers["LW1"].position_m), level_100_m)
     low, high = settings.rss.span_db

@@ -10,7 +10,7 @@ import pytest
 import aerpaw_cmp
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, _entry, draft
-from aerpaw_cmp.flight.pose.cross_checks import doubts
+from aerpaw_cmp.flight.pose.cross_checks import doubts, questions
 from aerpaw_cmp.flight.replay import estimate_clocks
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest
@@ -176,3 +176,14 @@ def test_a_folder_names_a_tower_of_the_users_site(tmp_path: Path, folder: str, n
     (log,) = (f for f in ingest([tmp_path / "c/own"], options=ReadOptions(timezone="UTC")) if "power" in f.path)
     assert _entry(log, log.path, ("North_Mast", "T2"))[0]["node"] == node
     assert load_site(site).towers.keys() == {"North_Mast", "T2"}
+
+
+def test_a_track_with_its_times_in_another_unit_is_asked_about(tmp_path: Path) -> None:
+    rows = "".join(f"{n / 1000:.3f},{35.7275 + n * 5e-5:.6f},-78.696,30\n" for n in range(200))
+    (tmp_path / "pose.csv").write_text("t,lat,lon,alt\n" + rows)
+    named = {"time": "t", "latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt"}
+    options = ReadOptions(time_origin="2025-06-01T14:00:00Z", kind="telemetry", columns=named)
+    (file,) = ingest([tmp_path / "pose.csv"], reader="generic_csv", options=options)
+    assert any("times in another unit" in text for text in file.result.warnings)
+    asked = questions(file, file.result.streams, None)
+    assert any("m/s throughout: are its times in another unit" in text and text.endswith("?") for text in asked)

@@ -28,6 +28,7 @@ from ..pose.grouping import Span, flights, stream_span
 from ..pose.heights import height_in_name, lacks_height
 from ..pose.hour_shift import clock_trap
 from ..pose.time_origin import Origin, origin_of
+from ..pose.track import interpolated, positions_over_time
 from ..settings import FlightFile, LogSettings, RssSettings, with_learned
 from .dry_run import DryRun, dry_run
 from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
@@ -100,12 +101,14 @@ def draft(
     UsageError
         If no log has what a flight needs.
     """
-    flown, site = _flown(files), options.site
+    site = options.site
     place = load_site(site_place(site, folder))
+    flown, which = _carrier(files, _flown(files), place)
     every = [stream for file in files for stream in file.result.streams]
     entries = _Entries(
         folder=folder,
         flown=flown,
+        which=which,
         has_level=_has_level(files, flown),
         options=options,
         positioned=any(_has_positions(stream) for stream in every),
@@ -406,6 +409,8 @@ class _Entries:
     """Path by SHA-256."""
     positioned: bool = False
     """Some log to compare has positions of its own."""
+    which: str = ""
+    """Question about the vehicle, where several flew."""
     towers_known: Sequence[str] = ()
     """Towers of the site."""
     placer: Placer | None = None
@@ -491,7 +496,8 @@ class _Entries:
         if refused:
             entry["skip"] = sorted(refused)
         comment = self._ask_heights_and_floor(compared, entry, path, comment)
-        for question in questions(file, compared, self.options.timezone):
+        asked = [self.which] if self.which and self.leads(file) else []
+        for question in (*asked, *questions(file, compared, self.options.timezone)):
             comment = _also(comment, question)
         self.lines[file.path] = f"  - {_flow(entry)}{comment}\n"
         if self.placer is not None:
@@ -748,6 +754,56 @@ def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
 
     # without any wall clock, a log that holds both levels and positions is a flight in its own time
     return max(telemetry or relative[:1], key=worth, default=None)
+
+
+# Telemetry of one aircraft, as its autopilot and another program write it, stays within this [m].
+_ONE_VEHICLE_M = 30.0
+
+# Log evidence a bin by which the levels must fit one vehicle better.
+_SURE_OF_VEHICLE = 0.1
+
+
+def _carrier(
+    files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None, site: Site
+) -> tuple[tuple[Stream, Span] | None, str]:
+    """Of several vehicles at the time of the flight, the one whose track the levels fit best at any tower; a question.
+
+    Parameters
+    ----------
+    files : sequence of IngestedFile
+    flown : (Stream, Span), optional
+        Telemetry that the times of the logs choose.
+    site : Site
+    """
+    if flown is None:
+        return None, ""
+    tracks = [flown]
+    for stream in (s for file in files for s in file.result.streams if s.kind == "telemetry" and s is not flown[0]):
+        span = stream_span(stream)
+        if span is not None and _meet(span, flown[1]) and _apart_m(stream, flown[0]) > _ONE_VEHICLE_M:
+            tracks.append((stream, span))
+    if len(tracks) == 1:
+        return flown, ""
+    levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
+    evidence = [max((Placer(site, s).evidence(level) for level in levels), default=-np.inf) for s, _ in tracks]
+    order = np.argsort(evidence)
+    sure = np.isfinite(evidence).all() and evidence[order[-1]] - evidence[order[-2]] > _SURE_OF_VEHICLE
+    best = tracks[order[-1]] if sure else flown
+    named = " and ".join(stream.name for stream, _ in tracks)
+    apart = max(_apart_m(stream, flown[0]) for stream, _ in tracks[1:])
+    fit = f", and the levels fit {best[0].name}" if sure else ""
+    return best, f"{named} flew at this time, {apart:.0f} m apart{fit}: which carried the radio?"
+
+
+def _apart_m(first: Stream, second: Stream) -> float:
+    """Median distance of two tracks while both were logged [m]; 0 where that is not known."""
+    (time, place), (at, other) = (positions_over_time(stream.frame) for stream in (first, second))
+    if len(time) < 2 or len(at) < 2:
+        return 0.0
+    both = (time >= at[0]) & (time <= at[-1])
+    away = (place[both] - interpolated(time[both], at, other)) * 111_200.0
+    away[:, 1] *= np.cos(np.radians(other[0, 0]))
+    return float(np.median(np.linalg.norm(away, axis=1))) if both.any() else 0.0
 
 
 def _meet(first: Span, second: Span) -> bool:

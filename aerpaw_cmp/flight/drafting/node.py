@@ -28,6 +28,10 @@ _TOWER_ODDS = 2.0
 # with learned antennas must explain them better than any other place; at LW1 it is 37 to 81 on thirds of flights.
 CONTRADICTED = 8.0
 
+# Bins of a level that say which of two vehicles carried the radio, and the model that they are judged by.
+_FEWEST_OF_VEHICLE = 8
+_NEAR_FREE_SPACE = LevelModel(slope=2.0, slope_sd=0.3, elevation_sd_db=2.0, shadow_sd_db=2.0, scatter_sd_db=1.5)
+
 # Places of a list whose log odds differ by less are both named.
 _UNDECIDED = 3.0
 
@@ -195,6 +199,14 @@ class Placer:
         """Gain of an airframe at each level of a track towards unit vectors (m, n, 3)."""
         rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
         return lambda towards: airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", rotation, towards)))
+
+    def evidence(self, stream: Stream) -> float:
+        """Log evidence a bin of levels along this track at the best tower; -inf where they are too few."""
+        track = self.levels(stream)
+        if len(track.level_db) < _FEWEST_OF_VEHICLE:
+            return -np.inf
+        towers = [tower.position_m for tower in self.site.towers.values()]
+        return float(fit_places(track, towers, _NEAR_FREE_SPACE).evidence.max()) / len(track.level_db)
 
     def contradiction(self, track: LevelTrack, node: str) -> str | None:
         """Tower that the levels fit far better than the one that is named; None where none does."""

@@ -14,6 +14,7 @@ import numpy as np
 from ...common.units import AnyArray
 from ...logs import archives
 from ...logs.ingest import IngestedFile, read_bytes
+from ...logs.jumps import jumps_of
 from ...logs.records import Stream, has_wall_clock
 from .grouping import stream_span
 from .track import Track
@@ -60,6 +61,8 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     if any(s.attributes.get("height_from") == "assumed" for s in streams):
         texts.append(f"the heights are read as {_source(streams, 'height') or 'above take-off'}: right?")
     for stream in streams:
+        sentence = "" if (jumps := jumps_of(stream))[0].any() else jumps[1]
+        texts += [f"{sentence.rstrip('?')}?"] if sentence else []
         if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > _GROUND_M:
             texts.append(f"the lowest height is {low:.0f} m, expected 0 m: does the track begin in the air?")
     return list(dict.fromkeys(texts))

@@ -253,6 +253,12 @@ def good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatA
     return np.asarray(finite & possible & ~((latitude == 0.0) & (longitude == 0.0)))
 
 
+def positions_over_time(frame: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) [s since 1970], ascending, and latitude and longitude (n, 2) [deg] of the rows that have both."""
+    known = frame[["time", "latitude_deg", "longitude_deg"]].dropna().drop_duplicates("time").sort_values("time")
+    return nanoseconds(known["time"]) * 1e-9, known[["latitude_deg", "longitude_deg"]].to_numpy(np.float64)
+
+
 class Track:
     """The flight path of one telemetry stream in a site frame.
 

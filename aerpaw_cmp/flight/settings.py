@@ -525,6 +525,8 @@ class FlightFile(StrictModel):
     timezone: str | None = None
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = []
     """SHA-256 of the logs that settings of this file were learned from: nothing is scored on them."""
+    marks: list[str] = []
+    """Marks of the same logs, by which their copies are known."""
     logs: Annotated[list[LogSettings], Field(min_length=1)]
     antennas: dict[str, str] = {}
     """Learned antennas of a site by name, of the ``uav`` and of ``TOWER.CHANNEL``, in place of those of link."""
@@ -569,6 +571,7 @@ class LearnedSettings(StrictModel):
     """calibrated.yaml: the part of a flight.yaml that a calibration knows."""
 
     trained_on: list[str] = []
+    marks: list[str] = []
     link: dict[str, Any] = {}
     rt: dict[str, Any] = {}
     rank: dict[str, Any] = {}
@@ -632,7 +635,8 @@ def _joined(settings: FlightFile, learned: Mapping[str, Any], path: Path) -> Fli
     stated["link"] = {**link, **({"channels": channels} if channels else {})}
     for key in ("rt", "rank"):
         stated[key] = {**stated.get(key, {}), **learned.get(key, {})}
-    stated["trained_on"] = [*stated.get("trained_on", []), *learned.get("trained_on", [])]
+    for key in ("trained_on", "marks"):
+        stated[key] = [*stated.get(key, []), *learned.get(key, [])]
     try:
         return FlightFile.model_validate(stated)
     except ValueError as error:

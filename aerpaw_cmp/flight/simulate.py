@@ -283,7 +283,8 @@ class FlightSimulator:
         if self.settings.timezone is None:
             raise UsageError("the flight file names no time zone", expected="timezone: America/New_York, say")
         self.plan = plan
-        self.generator = np.random.default_rng(plan.seed)
+        # by name too: two flights of one seed must not share their fading, which would make them copies of one log
+        self.generator = np.random.default_rng([plan.seed, *self.settings.flight.name.encode()])
         self.trajectory = plan_trajectory(plan)
         start = _local_start(plan.start, self.settings.timezone)
         self.start_utc = start.tz_convert("UTC").tz_localize(None)

@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+import gzip
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
 
+from ..common.errors import InputError
 from ..common.provenance import union
-from ..common.units import AnyArray, FloatArray
 from ..propagation.arrays import Link
-from ..site.antenna.sphere_pattern import SpherePattern
-from .data import FlightData, RankSeries, RssSeries
+from ..site.antenna.antennas import MeasuredPattern
+from ..site.antenna.learned import folder_of
+from ..site.antenna.sphere_pattern import LEARNED, SpherePattern, read_sphere_csv
+from .data import FlightData, RankSeries, RssSeries, site_place
+from .marks import among, mark_of
+from .settings import FlightFile
 
 
 def logs_of(data: FlightData, series: RssSeries | RankSeries) -> tuple[str, ...]:
@@ -26,10 +34,25 @@ def flight_logs(data: FlightData) -> tuple[str, ...]:
     return union(*(logs_of(data, s) for s in data.rss), *(logs_of(data, s) for s in data.rank))
 
 
-def learned_patterns(link: Link) -> list[SpherePattern]:
-    """Antennas of both ends that were learned from flights."""
+def learned_patterns(link: Link, folder: Path, site: str | Path) -> list[MeasuredPattern]:
+    """Antennas of both ends that were learned from flights, as their file or their numbers say.
+
+    Parameters
+    ----------
+    link : Link
+    folder : Path
+        Of the antenna files, where calibrations lie too.
+    site : str or Path
+        Whose memory may hold the table of an antenna without a word on its logs.
+
+    Returns
+    -------
+    list of MeasuredPattern
+    """
     arrays = [*link.tower_arrays.values(), link.uav_array]
-    return [p for array in arrays for p in array.patterns if isinstance(p, SpherePattern)]
+    patterns = [p for array in arrays for p in array.patterns if isinstance(p, MeasuredPattern)]
+    known = (p if p.trained_on or p.learned_from else _original(p, folder, folder_of(site)) for p in patterns)
+    return [pattern for pattern in known if pattern is not None]
 
 
 def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, ...]:
@@ -37,69 +60,65 @@ def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, 
 
     Antenna files of 0.3 name flights, not logs: there the name decides.
     """
-    logs, patterns = logs_of(data, series), learned_patterns(link)
-    if any(not p.trained_on and data.settings.flight.name in p.learned_from for p in patterns):
+    logs, settings = logs_of(data, series), data.settings
+    patterns = learned_patterns(link, data.folder, site_place(settings.site.file, data.folder))
+    if any(not p.trained_on and settings.flight.name in p.learned_from for p in patterns):
         return logs
-    if learned_of(series, patterns):
+    if among(series_mark(series), union(settings.marks, *(p.marks for p in patterns))):
         return logs
-    return common(logs, [data.settings.trained_on, *(p.trained_on for p in patterns)])
+    return common(logs, [settings.trained_on, *(p.trained_on for p in patterns)])
 
 
-# Readings of a run; marks that a learned file keeps of a log; marks that two logs share if one is of the other.
-_RUN, MARKS, _SHARED = 32, 32, 3
-
-# The same of ranks: in a run, and how many of them must differ. Of 4 000 random reports no two of 8 850 pairs share a
-# run; two real flights have 103 and 167 and share none, any half of one shares 8 and more of the 32 that are kept.
-_HOLDS, _DIFFERING = 12, 6
-
-# Runs that are hashed at a time: bounds the memory.
-AT_ONCE = 8192
-
-_WEIGHTS = np.array([pow(0x9E3779B97F4A7C15, j, 2**64) for j in range(1, _RUN + 1)], dtype=np.uint64)
+def knows(data: FlightData, learned: Sequence[MeasuredPattern | FlightFile]) -> bool:
+    """Check whether antennas or settings were learned from a log of a flight."""
+    known = union(*(item.marks for item in learned))
+    own = common(flight_logs(data), (item.trained_on for item in learned))
+    return bool(own) or any(among(mark, known) for mark in marks_of([data]))
 
 
-def marks(series: RssSeries | RankSeries) -> AnyArray:
-    """Hashes of all runs of readings, sorted: a part of a log has those of the log, in any format or zone.
+def series_mark(series: RssSeries | RankSeries) -> str:
+    """Mark of the readings of a series."""
+    return mark_of(series.time, series.measured_db if isinstance(series, RssSeries) else series.rank)
 
-    Readings are levels, or, of ranks, which mostly repeat, for how many reports each holds.
+
+def marks_of(flights: Iterable[FlightData]) -> tuple[str, ...]:
+    """Marks of every series of some flights that has one."""
+    return tuple(mark for data in flights for _, series in data.series if (mark := series_mark(series)))
+
+
+@lru_cache(maxsize=64)
+def _original(pattern: MeasuredPattern, folder: Path, memory: Path) -> SpherePattern | None:
+    """The learned table with the numbers of an antenna whose file names no log; None where none is near.
+
+    Tables of the memory of the site and of those in the package, and of calibrations in the folder.
     """
-    if isinstance(series, RssSeries):
-        return _hashes(np.round(10.0 * series.measured_db), _RUN, _RUN // 4 + 1)
-    rank = series.rank[np.isfinite(series.rank)]
-    return _hashes(np.diff(np.flatnonzero(np.diff(rank))).astype(np.float64), _HOLDS, _DIFFERING)
+    packaged = folder_of("lake_wheeler").parent.glob("*.learned/*.csv.gz")
+    places = dict.fromkeys([*memory.glob("*.csv.gz"), *packaged, *folder.glob("*.csv"), *folder.glob("*/*.csv")])
+    tables = (table for place in places if (table := _learned_table(place)) is not None)
+    return next((table for table in tables if _same_numbers(pattern, table)), None)
 
 
-def _hashes(readings: FloatArray, run: int, differing: int) -> AnyArray:
-    """Of runs of finite readings of which so many differ: levels at a floor would be alike in any flight."""
-    every = np.lib.stride_tricks.sliding_window_view(np.concatenate([readings, np.full(run, np.nan)]), run)
-    out = []
-    for start in range(0, len(every), AT_ONCE):
-        runs = every[start : start + AT_ONCE]
-        runs = runs[np.isfinite(runs).all(axis=1)]
-        telling = (np.diff(np.sort(runs, axis=1), axis=1) != 0).sum(axis=1) >= differing - 1
-        out.append((runs[telling].astype(np.int64).view(np.uint64) * _WEIGHTS[:run]).sum(axis=1, dtype=np.uint64))
-    return np.unique(np.concatenate(out))
+@lru_cache(maxsize=64)
+def _learned_table(place: Path) -> SpherePattern | None:
+    """The table of a calibration; None of any other file."""
+    with suppress(InputError, OSError, EOFError):
+        with gzip.open(place) if place.suffix == ".gz" else place.open("rb") as book:
+            learned = book.read(len(LEARNED)) == LEARNED.encode()
+        return read_sphere_csv(place) if learned else None
+    return None
 
 
-def marks_text(series: RssSeries | RankSeries, most: int | None = None) -> tuple[str, ...]:
-    """Marks as learned files write them; at most some, those of the smallest hashes."""
-    return tuple(f"{mark:016x}" for mark in marks(series)[:most])
+def _same_numbers(pattern: MeasuredPattern, table: SpherePattern) -> bool:
+    """Check whether two antennas agree on both principal cuts but for a level, to a tenth of a dB.
 
-
-def marks_note(flights: Sequence[FlightData]) -> str:
-    """Comment of an antenna table: marks of the logs that it was learned from, of all channels: they share a fit."""
-    return "marks: " + " ".join(mark for data in flights for s in data.rss for mark in marks_text(s, MARKS))
-
-
-def learned_of(series: RssSeries, patterns: Iterable[SpherePattern]) -> bool:
-    """Check whether antennas were learned from the readings of a series, whatever its log is now."""
-    lines = [line for p in patterns for line in p.notes.splitlines() if line.startswith("# marks:")]
-    return bool(lines) and shared((mark for line in lines for mark in line.split()[2:]), marks_text(series))
-
-
-def shared(learned: Iterable[str], readings: Iterable[str]) -> bool:
-    """Check whether the marks of some readings are those that something was learned from."""
-    return len({*learned} & {*readings}) >= _SHARED
+    Every third degree: between them, files of cuts are read as splines.
+    """
+    angle = np.radians(np.arange(3.0, 358.0, 3.0))
+    theta = np.concatenate([np.full(len(angle), np.pi / 2), np.where(angle < np.pi, angle, 2 * np.pi - angle)])
+    phi = np.concatenate([angle, np.where(angle < np.pi, 0.0, np.pi)])
+    gain, other = pattern.gain_dbi(theta, phi), table.gain_dbi(theta, phi)
+    apart = np.abs(gain - other - np.median(gain - other))
+    return bool(np.ptp(other) > 1.0 and np.mean(apart < 0.06) > 0.95)
 
 
 def common(logs: Sequence[str], learned: Iterable[Iterable[str]]) -> tuple[str, ...]:
@@ -116,19 +135,19 @@ def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[
     home: dict[str, str] = {}
     counted: list[FlightData] = []
     remarks: list[str] = []
-    known: list[tuple[str, AnyArray]] = []
+    known: list[tuple[str, str]] = []
     for data in flights:
         name = data.settings.flight.name
         again = {digest: home[digest] for digest in flight_logs(data) if digest in home}
         for digest, first in again.items():
             remarks.append(f"{name} holds the same log as {first} (SHA-256 {digest[:12]}...): it is counted once")
-        marked = [(s, logs_of(data, s), marks(s)) for _, s in data.series]
-        for _, logs, ours in marked:
-            earlier = [flight for flight, earlier_marks in known if len(np.intersect1d(earlier_marks, ours)) >= _SHARED]
-            if earlier and not set(logs) & set(again):
+        marked = [(logs_of(data, s), series_mark(s)) for _, s in data.series]
+        for logs, ours in marked:
+            earlier = [] if set(logs) & set(again) else [flight for flight, mark in known if among(ours, [mark])]
+            if earlier:
                 remarks.append(f"{name} holds readings of {earlier[0]} in another log: they are counted once")
                 again |= dict.fromkeys(logs, earlier[0])
-        known += [(name, ours) for _, _, ours in marked]
+        known += [(name, ours) for _, ours in marked]
         rss = tuple(s for s in data.rss if not set(logs_of(data, s)) & set(again))
         rank = tuple(s for s in data.rank if not set(logs_of(data, s)) & set(again))
         if not again:

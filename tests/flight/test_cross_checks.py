@@ -1,6 +1,7 @@
 """What contradicts a log is a question with both values; what agrees is none."""
 
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -61,6 +62,13 @@ def test_a_nemo_summary_beside_a_log_is_compared_with_its_start(tmp_path: Path, 
     assert bool(remarks) is asked
     if asked:
         assert "Measurement start in 24Feb09_172055.1.csv says 2024-02-09 17:20" in remarks[0]
+
+
+def test_nothing_is_read_beside_a_path_that_a_flight_file_names(tmp_path: Path) -> None:
+    (tmp_path / "a.1.csv").write_text("Measurement start;2024 Jun 24 14:13\n")
+    log = _log(tmp_path / "a.1.gpx", "2025-06-24T16:13:00")
+    assert any("a.1.csv says" in text for text in _asked(log))
+    assert not any("a.1.csv says" in text for text in _asked(replace(log, holder=str(tmp_path / "flight.h5"))))
 
 
 def test_a_nemo_summary_in_the_zip_that_holds_the_log(tmp_path: Path) -> None:

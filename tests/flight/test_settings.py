@@ -1,12 +1,14 @@
 """Limits of flight.yaml: the last value that is taken and the first that is not."""
 
 from functools import reduce
+from pathlib import Path
 from typing import Any
 
 import pytest
 from pydantic import ValidationError
 
-from aerpaw_cmp.flight.settings import ArraySettings, FlightFile
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.flight.settings import ArraySettings, FlightFile, load_flight
 
 POINT = {"east_m": 0, "north_m": 0, "height_m": 5}
 PLAN = {"start": "2025-06-01T10:00:00", "waypoints": [POINT, POINT]}
@@ -103,3 +105,17 @@ def test_what_a_flight_file_does_not_say() -> None:
     for both in (floor | {"bandwidth_hz": 1.0}, figure, floor | figure):
         with pytest.raises(ValidationError):
             FlightFile.model_validate(flight("link.rss", {"carrier_hz": 3e9, **both}))
+
+
+@pytest.mark.parametrize("name", ["../secret.csv", "/etc/passwd", "link.csv"])
+def test_learned_settings_name_no_file_outside_their_folder(tmp_path: Path, name: str) -> None:
+    flight, folder = tmp_path / "flight.yaml", tmp_path / "handed_on"
+    folder.mkdir()
+    (tmp_path / "secret.csv").write_text("mine")
+    (folder / "link.csv").symlink_to(tmp_path / "secret.csv")
+    flight.write_text("flight: f\nlogs: [{path: x.txt}]\n")
+    antenna = f"{{antenna: {{model: sphere, file: {name}}}}}"
+    text = f"link: {{channels: {{A: {{carrier_hz: 3.3e9, tower: {antenna}}}}}}}\n"
+    (folder / "calibrated.yaml").write_text(text)
+    with pytest.raises(InputError, match=r"leaves its folder|no file of its folder"):
+        load_flight(flight, folder / "calibrated.yaml")

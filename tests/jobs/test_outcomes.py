@@ -261,7 +261,7 @@ from pathlib import Path
 from aerpaw_cmp.jobs.campaigns import campaign_tasks
 from aerpaw_cmp.jobs.campaigns.campaign_plan import compute, kept_outcomes
 from aerpaw_cmp.jobs.tasks.workers import InProcess
-from aerpaw_cmp.report.campaign_data import FlownTrack
+from aerpaw_cmp.report.content.campaign import FlownTrack
 import numpy as np
 
 def compute_but_f2(task):

@@ -234,7 +234,10 @@ def test_a_prediction_that_learned_from_the_flight_is_refused(said):
 def test_a_prediction_that_learned_from_the_flight_refuses_half_of_it(said, prediction):
     """The half has another digest; its readings are those that the prediction keeps marks of."""
     data, folder = said
-    halves = [dataclasses.replace(s, measured_db=s.measured_db[: len(s.time) // 2]) for s in data.rss]
+    halves = [
+        dataclasses.replace(s, time=s.time[: len(s.time) // 2], measured_db=s.measured_db[: len(s.time) // 2])
+        for s in data.rss
+    ]
     data = dataclasses.replace(data, rss=tuple(halves), rank=())
     about = json.loads((folder / "metrics.json").read_text())
     marks = prediction_metrics(prediction.page)["marks"]

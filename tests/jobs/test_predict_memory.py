@@ -30,6 +30,7 @@ from tests.jobs.calibrated import OFFSET_DB, past_sector_antenna
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
 SPREAD = Spread(own_sd_db=1.0, noise_sd_db=2.0, fading_sd_db=3.0, fading_kurtosis=0.0, bin_s=4.0)
+MARK = "3497f" + "07e7" * 40
 LEVEL = LearnedLevel(offset_db=-7.0, sd_db=1.5, transmit_power_dbm=30.0, unit="dBm")
 
 
@@ -63,7 +64,7 @@ def entry(level: LearnedLevel | None) -> Entry:
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A site that remembers one channel at LW1: cosines of 4 dB and 2 dB at its ends."""
     place = copied(tmp_path_factory.mktemp("memory"))
-    files = {"t.csv.gz": table(4.0, (1.0, 5.0), SPREAD.text()), "u.csv.gz": table(2.0, (0.5, 0.5))}
+    files = {"t.csv.gz": table(4.0, (1.0, 5.0), SPREAD.text()), "u.csv.gz": table(2.0, (0.5, 0.5), f"marks: {MARK}")}
     remember(place, "planted", entry(LEVEL), files)
     tower = load_site("lake_wheeler").towers["LW1"].position_m
     ends = (300.0, 90.0), (300.0, 270.0), (-300.0, 90.0), (9000.0, 90.0)
@@ -85,6 +86,7 @@ def test_levels_are_free_space_and_the_remembered_gains(site: Path) -> None:
     np.testing.assert_allclose(levels["slow_sd_db"], slow, atol=0.01)
     np.testing.assert_allclose(levels["sd_db"], np.hypot(slow, 3.0), atol=0.01)
     assert said.page.trained_on == ("a" * 64,)
+    assert said.page.marks == (MARK,)  # report --against knows a copy of the training log by them
     assert "expect an RMSE of 3.7 dB on another flight, free space 6.1 dB" in said.page.verdict
     assert said.page.units == {"LW1 A": "dBm"}
 

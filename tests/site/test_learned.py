@@ -13,6 +13,7 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.flight.drafting.remembered import Nodes, propose, searching_airframe
+from aerpaw_cmp.flight.marks import mark_of
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.site.antenna.learned import (
     Entry,
@@ -27,6 +28,10 @@ from aerpaw_cmp.site.antenna.learned import (
 from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, sphere_csv
 
 CARRIER_HZ = 3.3e9
+SECONDS = np.arange(0, 300, 0.5)
+MARK = mark_of(
+    np.datetime64("2025-06-01") + (SECONDS * 1e9).astype("timedelta64[ns]"), np.random.default_rng(1).normal(size=600)
+)
 
 
 def entry(channel: str, reader: str = "flight_mat", tower: str = "LW1") -> Entry:
@@ -44,7 +49,8 @@ def entry(channel: str, reader: str = "flight_mat", tower: str = "LW1") -> Entry
 def folder(tmp_path: Path) -> Path:
     """A site that remembers one channel, its tower antenna 3 dB below its UAV antenna."""
     text = {
-        end: sphere_csv(np.full((7, 8), level), np.ones((7, 8))).encode() for end, level in (("t", -3.0), ("u", 0.0))
+        end: sphere_csv(np.full((7, 8), level), np.ones((7, 8)), (f"marks: {MARK}",)).encode()
+        for end, level in (("t", -3.0), ("u", 0.0))
     }
     remember(tmp_path / "mine.yaml", "d12", entry("A"), {f"A.{end}.csv.gz": content for end, content in text.items()})
     return tmp_path
@@ -67,10 +73,11 @@ def flight(folder: Path, antennas: dict[str, str], carrier_hz: float = CARRIER_H
         ("mine.yaml", [], ("A", "flight_mat"), "a" * 64, False),  # learned from this very log
         ("mine.yaml", [], ("B", "flight_mat"), "b" * 64, False),
         ("none.yaml", [], ("A", "flight_mat"), "b" * 64, False),
+        ("mine.yaml", [], ("A", "flight_mat"), "copy", False),  # learned from these readings in another log
     ],
 )
 def test_a_search_takes_the_airframe_of_other_flights_alone(folder, site, towers, series, log, fits) -> None:
-    airframe = searching_airframe(folder / site, towers, series, log)
+    airframe = searching_airframe(folder / site, towers, series, (log, MARK if log == "copy" else ""))
     assert (airframe is not None) == fits
     assert airframe is None or airframe.gain_dbi(0.3, 0.4) == pytest.approx(0.0, abs=1e-6)
 
@@ -109,7 +116,7 @@ OTHER_LOGS = sphere_csv(np.zeros((7, 8)), np.ones((7, 8)), (f"trained_on: {'b' *
     ("content", "said"),
     [
         (b"", "the columns are none"),
-        (b"\x1f\x8bgarbage", "a damaged gzip file"),
+        (b"\x1f\x8bgarbage", "cannot be read"),
         (b"azimuth_deg,elevation_deg,gain_dbi\n0,0,nan\n", "'0,0,nan' in A."),
         (b"\xff\xfe\x00", "cannot be read"),
         (None, "cannot be read"),
@@ -138,7 +145,7 @@ def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: b
     ("content", "said"),
     [
         (b"{", "cannot be read"),
-        (b"\x1f\x8bgarbage", "a damaged gzip file"),
+        (b"\x1f\x8bgarbage", "cannot be read"),
         (json.dumps({"trained_on": ["b" * 64]}).encode(), "that its entry does not name"),
         (None, "nothing learned is called"),
     ],
@@ -235,7 +242,7 @@ def test_a_table_that_no_calibration_wrote_is_neither_replaced_nor_removed(folde
 
 def test_two_processes_store_all_of_their_entries(tmp_path: Path) -> None:
     script = (
-        "import sys; from pathlib import Path; from aerpaw_cmp.site.learned import Entry, remember;"
+        "import sys; from pathlib import Path; from aerpaw_cmp.site.antenna.learned import Entry, remember;"
         "site, who, entry = sys.argv[1:]; input();"
         "[remember(Path(site), name, Entry.model_validate_json(entry.replace('A.', f'{name}.')),"
         " {f'{name}.{end}.csv.gz': b'table' for end in 'tu'}) for name in (f'{who}{i}' for i in range(20))]"

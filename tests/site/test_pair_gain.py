@@ -29,8 +29,9 @@ def planted(n: int = 40) -> PairGain:
 
 
 def pattern(pair: PairGain | None, trained_on: str) -> SpherePattern:
-    notes = "\n".join(f"# {line}" for line in pair.notes()) if pair else ""
-    return SpherePattern("a", np.zeros((19, 36)), np.full((19, 36), 2.0), trained_on=(trained_on,), notes=notes)
+    lines = (f"trained_on: {trained_on}", *(pair.notes() if pair else ()))
+    notes = "\n".join(f"# {line}" for line in lines)
+    return SpherePattern("a", np.zeros((19, 36)), np.full((19, 36), 2.0), notes=notes)
 
 
 def array(sphere: SpherePattern) -> Array:

@@ -23,6 +23,7 @@ from ...site.siteyaml import load_site
 from ..data import is_ratio, rank_quantity, site_place
 from ..lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
 from ..losses import sight_shares
+from ..marks import mark_of
 from ..pose.cross_checks import questions
 from ..pose.grouping import Span, flights, stream_span
 from ..pose.heights import height_in_name, lacks_height
@@ -571,7 +572,8 @@ class _Entries:
             level = next((s for s in levels if s.attributes.get("pci") == pci), None)
             if level is not None:
                 series = _key(level, entry)[1], file.result.reader
-                airframe = searching_airframe(memory, placer.site.towers, series, file.sha256)
+                mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
+                airframe = searching_airframe(memory, placer.site.towers, series, (file.sha256, mark))
                 levels_on_track = placer.levels(level, self._floor_db(level), airframe)
                 places[pci] = placer.propose(levels_on_track, taught(memory, series))
         for pci, place in places.items():

@@ -18,6 +18,7 @@ from ...site.antenna import learned
 from ...site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
 from ..data import FlightData, RssSeries, site_place
 from ..learned_gain import pair_and_sd_db, sphere_angles
+from ..marks import among
 from ..settings import FlightFile, check_logs, with_learned
 from .node import Taught
 
@@ -152,7 +153,7 @@ def propose(known: learned.Learned, site: str, series: Sequence[_SeriesKey], nod
 
 
 def searching_airframe(
-    site: str | Path, towers: Collection[str], series: tuple[str, str], log: str
+    site: str | Path, towers: Collection[str], series: tuple[str, str], log: tuple[str, str]
 ) -> SpherePattern | None:
     """The airframe that flights taught with a node of theirs, for the search of a node; None where none fits.
 
@@ -163,18 +164,19 @@ def searching_airframe(
     towers : collection of str
         Of the site: what was learned with one of them says little about a search.
     series : (channel, reader)
-    log : str
-        SHA-256 of the log, which must not have been learned from.
+    log : (SHA-256, mark)
+        Of the log, which must not have been learned from.
 
     Returns
     -------
     SpherePattern or None
     """
     with suppress(InputError, UsageError):
-        unseen = (entry for entry in learned.read_learned(site).entries.values() if log not in entry.trained_on)
+        unseen = (entry for entry in learned.read_learned(site).entries.values() if log[0] not in entry.trained_on)
         every = (s for entry in unseen for s in entry.series if s.tower not in towers)
-        file = next((s.uav_file for s in every if (s.channel, s.reader) == series), None)
-        return None if file is None else read_sphere_csv(learned.folder_of(site) / file)
+        files = (s.uav_file for s in every if (s.channel, s.reader) == series)
+        airframes = (read_sphere_csv(learned.folder_of(site) / file) for file in files)
+        return next((airframe for airframe in airframes if not among(log[1], airframe.marks)), None)
     return None
 
 

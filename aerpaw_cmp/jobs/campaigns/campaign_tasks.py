@@ -21,10 +21,11 @@ from ...common.units import AnyArray, FloatArray
 from ...common.versions import utc_now, versions
 from ...compare import offset
 from ...compare.result import FlightResult, RankResult, RssResult
-from ...flight.data import FlightData, gather, read_logs
+from ...flight.data import FlightData, RankSeries, RssSeries, gather, read_logs
+from ...flight.marks import among
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, RssSettings, load_flight
-from ...flight.training import logs_of
+from ...flight.training import logs_of, series_mark
 from ...report.content.campaign import Failure, FlownRank, FlownTrack, RankRow, RssRow
 from ..reporting.flight_run import run_flight
 from ..tasks.outcomes import OutcomeStore, code_digest, task_inputs, task_key
@@ -60,13 +61,23 @@ def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Out
     A log that comes twice, renamed, copied or packed, would be pooled twice and predicted from itself.
     """
     home: dict[str, str] = {}
+    marked: dict[str, str] = {}
     counted = []
     for task, outcome in zip(tasks, outcomes, strict=True):
-        logs = {digest for rows in (outcome.rss, outcome.rank) for row in rows for digest in row.logs}  # type: ignore[attr-defined]
-        again = sorted(digest for digest in logs if home.setdefault(digest, task.flight) != task.flight)
-        if again:
-            message = f"it holds the same log as {home[again[0]]} (SHA-256 {again[0][:12]}...): it is counted once"
-            outcome = Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))
+        rows: list[RssRow | RankRow] = [*outcome.rss, *outcome.rank]
+        again = sorted({log for row in rows for log in row.logs if home.setdefault(log, task.flight) != task.flight})
+        message = f"the same log as {home[again[0]]} (SHA-256 {again[0][:12]}...)" if again else ""
+        marks = {row.mark for row in rows if row.mark}
+        others = [mark for mark, name in marked.items() if name != task.flight and not message]
+        if copied := next((mark for mark in others if any(among(own, [mark]) for own in marks)), ""):
+            message = f"readings of {marked[copied]} in another log"
+        if message:
+            failure = Failure(
+                flight=task.flight, setting=task.setting, message=f"it holds {message}: it is counted once"
+            )
+            outcome = Outcome(failure=failure)
+        else:
+            marked |= dict.fromkeys(marks, task.flight)
         counted.append(outcome)
     return counted
 
@@ -126,13 +137,13 @@ def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
     """Outcome of a flight that was compared."""
     return Outcome(
         rss=tuple(
-            _rss_row(task, data.settings.rss, compared, logs_of(data, series))
+            _rss_row(task, data.settings.rss, compared, _identity(data, series))
             for compared, series in zip(result.rss, data.rss, strict=True)
         ),
         rank=tuple(
             row
             for compared, series in zip(result.rank, data.rank, strict=True)
-            for row in _rank_rows(task, compared, logs_of(data, series))
+            for row in _rank_rows(task, compared, _identity(data, series))
         ),
         track=_flown(task, result),
         flown=tuple(
@@ -294,7 +305,12 @@ def _elapsed_s(time: AnyArray) -> FloatArray:
     return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
 
 
-def _rss_row(task: Task, rules: RssSettings, result: RssResult, logs: tuple[str, ...]) -> RssRow:
+def _identity(data: FlightData, series: RssSeries | RankSeries) -> dict[str, Any]:
+    """Fields of a row that say which log it is of, whatever the log is called or packed in."""
+    return {"logs": logs_of(data, series), "mark": series_mark(series)}
+
+
+def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mapping[str, Any]) -> RssRow:
     score, clock = result.score, result.further.clock
     # nothing is pooled or ranked from the flight that its antennas were learned from
     measured_db = np.full_like(result.measured_db, np.nan) if result.further.trained_on else result.measured_db
@@ -323,11 +339,11 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, logs: tuple[str,
         heading_deg=result.geometry.get("heading_deg"),
         within=result.further.repeatability,
         difference=offset.difference_moments(measured_db, result.simulated_dbm),
-        logs=logs,
+        **identity,
     )
 
 
-def _rank_rows(task: Task, result: RankResult, logs: tuple[str, ...]) -> list[RankRow]:
+def _rank_rows(task: Task, result: RankResult, identity: Mapping[str, Any]) -> list[RankRow]:
     score = result.score
     return [
         RankRow(
@@ -340,7 +356,7 @@ def _rank_rows(task: Task, result: RankResult, logs: tuple[str, ...]) -> list[Ra
             n_out_of_coverage=fit.out_of_coverage,
             **named(fit, "agreement agreement_ci95 kappa total_variation total_variation_ci95 wasserstein"),
             commonest_agreement=result.further.commonest.agreement,
-            logs=logs,
+            **identity,
         )
         for k, fit in score.simulated.items()
     ]

@@ -27,7 +27,7 @@ from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ...flight.learned_gain import sphere_angles
 from ...flight.lock import LOCK_FLOOR_DB
 from ...flight.settings import AntennaSettings, load_flight, load_pattern
-from ...flight.training import counted_once, flight_logs
+from ...flight.training import counted_once, flight_logs, marks_of
 from ...propagation.arrays import rotation_from_yaw_pitch_roll
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ...report.words.calibration import sentences
@@ -136,6 +136,11 @@ class Calibration:
     def trained_on(self) -> tuple[str, ...]:
         """SHA-256 of every log that was learned from."""
         return union(*map(flight_logs, self.flights))
+
+    @property
+    def marks(self) -> tuple[str, ...]:
+        """Marks of their series."""
+        return marks_of(self.flights)
 
 
 def load_calibration(path: Path) -> CalibrationFile:

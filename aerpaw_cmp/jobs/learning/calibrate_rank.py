@@ -19,15 +19,16 @@ from pydantic import Field
 
 from ...common.errors import InputError, UsageError, parsing
 from ...common.jsonable import json_safe
-from ...common.provenance import KEY, union
+from ...common.provenance import KEY, MARKS, union
 from ...common.units import FloatArray, IntArray
 from ...common.yamlfile import StrictModel
 from ...compare.level.rss import seconds
 from ...compare.ranks import receiver
 from ...compare.ranks.forecast import ForecastScore, constant_forecast, score_forecast
 from ...flight.data import FlightData, RankSeries, rank_positions
+from ...flight.marks import among
 from ...flight.replay import attitude_rotation
-from ...flight.training import MARKS, logs_of, marks_text, shared
+from ...flight.training import logs_of, series_mark
 from ...propagation.arrays import Link, Poses
 from ...propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
 from ...site.antenna.learned import read_table
@@ -81,8 +82,8 @@ class RankSamples:
     time_s: FloatArray
     logs: tuple[str, ...] = ()
     """SHA-256 of the logs that hold the reports."""
-    marks: tuple[str, ...] = ()
-    """Of these reports, whatever their log is: :func:`~aerpaw_cmp.flight.training.marks`."""
+    mark: str = ""
+    """Of these reports, whatever their log is."""
 
     def part(self, rows: Any) -> RankSamples:
         """Some of the samples."""
@@ -114,7 +115,7 @@ class FittedReceiver:
     trained_on: tuple[str, ...] = ()
     """SHA-256 of their logs: no score there is worth anything; receivers of 0.3 have none."""
     marks: tuple[str, ...] = ()
-    """Some of their reports; receivers of 0.3 have none."""
+    """Of their reports; receivers of 0.3 have none."""
     mixture: receiver.ReceiverMixture
     timing: Timing = Timing()
 
@@ -122,7 +123,7 @@ class FittedReceiver:
         """Check whether it was fitted on these reports: by their logs or readings, or, in 0.3, the flight's name."""
         if not self.trained_on:
             return samples.flight in self.flights
-        return not set(self.trained_on).isdisjoint(samples.logs) or shared(self.marks, samples.marks)
+        return not set(self.trained_on).isdisjoint(samples.logs) or among(samples.mark, self.marks)
 
     def forecast(self, samples: RankSamples) -> tuple[FloatArray, IntArray]:
         """Probability (n, 4) of each rank, and the one that is said."""
@@ -136,7 +137,7 @@ class FittedReceiver:
             "tied": self.tied,
             "flights": list(self.flights),
             KEY: list(self.trained_on),
-            "marks": list(self.marks),
+            MARKS: list(self.marks),
             "members": json_safe(self.mixture.members),
             "decision_weight": self.mixture.decision_weight.tolist(),
             "shift_s": self.timing.shift_s,
@@ -152,7 +153,7 @@ class FittedReceiver:
             tied=int(content["tied"]),
             flights=tuple(str(name) for name in content["flights"]),
             trained_on=tuple(str(digest) for digest in content.get(KEY, ())),
-            marks=tuple(str(mark) for mark in content.get("marks", ())),
+            marks=tuple(str(mark) for mark in content.get(MARKS, ())),
             mixture=receiver.ReceiverMixture(
                 members=tuple(receiver.Receiver.from_dict(m) for m in content["members"]),
                 decision_weight=np.asarray(content["decision_weight"], dtype=np.float64),
@@ -233,7 +234,7 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
         link=link,
         time_s=seconds(series.time[keep]),
         logs=logs_of(data, series),
-        marks=marks_text(series),
+        mark=series_mark(series),
     )
 
 
@@ -365,7 +366,7 @@ class Tried:
             tied=len(choice.tied),
             flights=tuple(item.flight for item in train),
             trained_on=union(*(item.logs for item in train)),
-            marks=union(*(item.marks[:MARKS] for item in train)),
+            marks=tuple(item.mark for item in train if item.mark),
             mixture=mixture,
             timing=timing,
         )

@@ -17,14 +17,14 @@ from ... import __version__
 from ...common.cf import file_attributes
 from ...common.gaussian import determining, gaussian_kernel
 from ...common.jsonable import named
-from ...common.provenance import KEY, union
+from ...common.provenance import KEY, MARKS, union
 from ...common.units import FloatArray, spread_out
 from ...common.versions import utc_now
 from ...compare.gains.direction_gain import Frame, directed
 from ...compare.learning.calibration import Learned, mean_rmse
 from ...compare.learning.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries, rank_quantity
-from ...flight.training import flight_logs, marks_note
+from ...flight.training import flight_logs, marks_of
 from ...logs.records import has_wall_clock
 from ...report.content.calibration import AntennaMap, CalibrationData
 from ...report.kit.files import write_file
@@ -101,12 +101,12 @@ def _antenna_files(
         stem = safe_name(f"{antenna}.{end}")
         out[f"{stem}.csv"] = sphere_csv(gains.gain_dbi, gains.sd_db, (*notes, *_notes(calibration, antenna, end)))
         pattern = SpherePattern(stem, gains.gain_dbi, gains.sd_db)
-        out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz)
+        out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz, _provenance_notes(calibration))
         source = f"learned from the flights {names}, calibration {calibration.settings.calibration}"
         attributes = file_attributes(
             f"{antenna}, antenna at the {end}", source, utc_now(), __version__, "; ".join(notes[1:])
         )  # fmt: skip
-        attributes[KEY] = " ".join(calibration.trained_on)
+        attributes |= {KEY: " ".join(calibration.trained_on), MARKS: " ".join(calibration.marks)}
         sphere = sphere_netcdf(gains.gain_dbi, gains.sd_db, attributes, carrier_hz)
         if sphere is not None:
             out[f"{stem}.nc"] = sphere
@@ -115,8 +115,13 @@ def _antenna_files(
 
 def _notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
     """Notes of an antenna file that its readers use: training logs and marks, spread, the gain towards both ends."""
-    logs, marked = f"{KEY}: {' '.join(calibration.trained_on)}", marks_note(calibration.flights)
-    return (logs, marked, calibration.learned.spread(antenna).text(), *_pair_notes(calibration, antenna, end))
+    notes = _provenance_notes(calibration)
+    return (*notes, calibration.learned.spread(antenna).text(), *_pair_notes(calibration, antenna, end))
+
+
+def _provenance_notes(calibration: Calibration) -> Sequence[str]:
+    """Training logs of every channel: they share a fit."""
+    return f"{KEY}: {' '.join(calibration.trained_on)}", f"{MARKS}: {' '.join(calibration.marks)}"
 
 
 def _pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
@@ -203,7 +208,7 @@ def _record_of(
     return CalibrationData(
         name=calibration.settings.calibration,
         flights=calibration.names,
-        **named(calibration, "trained_on words warnings"),
+        **named(calibration, "trained_on marks words warnings"),
         scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
         controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
         mounts=mounts,
@@ -276,12 +281,14 @@ def write_files(
         )
         write_calibration(record, folder)
         metrics = calibration_metrics(record)
+        text += f"# marks of the training logs, by which their copies are known\n{MARKS}:\n"
+        text += "".join(f"  - '{mark}'\n" for mark in calibration.marks)
     else:
         text = _MARK + "\n"
         metrics = {
             "scores": {}, "controls": {}, "words": [], "antennas": [], "calibration": calibrated.settings.calibration,
             "rank": rank, "warnings": [*calibrated.remarks, *rank_warnings], "flights": calibrated.settings.flights,
-            KEY: list(union(*map(flight_logs, calibrated.flights))),
+            KEY: list(union(*map(flight_logs, calibrated.flights))), MARKS: list(marks_of(calibrated.flights)),
         }  # fmt: skip
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
     if ranked is not None:

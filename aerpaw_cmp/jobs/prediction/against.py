@@ -11,12 +11,13 @@ import pandas as pd
 
 from ...common.errors import UsageError, parsing
 from ...common.files import LARGEST_TABLE, read_bounded
-from ...common.provenance import KEY
+from ...common.provenance import KEY, MARKS
 from ...common.units import FloatArray, IntArray
 from ...compare.learning.calibration import Observed
 from ...compare.ranks.forecast import ForecastScore, score_forecast
 from ...flight.data import FlightData
-from ...flight.training import common, flight_logs, marks_text, shared
+from ...flight.marks import among
+from ...flight.training import common, flight_logs, marks_of
 from ...report.content.against import Against, AgainstSeries
 from ...report.words.prediction import against_words
 from ..learning.calibrate import observe
@@ -42,11 +43,11 @@ def score_against(data: FlightData, folder: Path) -> Against:
     with parsing(folder, "the output folder of 'aerpaw-cmp predict'"):
         about = json.loads(read_bounded(folder / "metrics.json", LARGEST_TABLE))
         table = pd.read_csv(folder / "prediction.csv", low_memory=False)
-        learned, marked, sentence = list(about[KEY]), list(about.get("marks", ())), str(about["sentence"])
+        learned, marked, sentence = list(about[KEY]), tuple(map(str, about.get(MARKS, ()))), str(about["sentence"])
         groups = dict(iter(table[table["level_db"].notna()].groupby(["tower", "channel"])))
         forecasts = dict(iter(table[table["channel"] == "rank"].groupby("tower")))
     own = common(flight_logs(data), [learned])
-    if own or any(shared(marked, marks_text(series)) for _, series in data.series):
+    if own or any(among(mark, marked) for mark in marks_of([data])):
         raise UsageError(
             f"the prediction learned from this flight's own {f'log (SHA-256 {own[0][:12]}...)' if own else 'readings'}",
             expected="a prediction made before the flight, or from other flights",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
 from pathlib import Path
@@ -15,7 +15,7 @@ import pandas as pd
 from ...common.errors import InputError, UsageError
 from ...common.jsonable import named
 from ...common.outputs import OutputFolder
-from ...common.provenance import union
+from ...common.provenance import KEY, MARKS, union
 from ...common.stages import Progress, Stages
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...compare.gains.direction_gain import LinkSamples
@@ -23,13 +23,14 @@ from ...compare.gains.spread import BAND
 from ...compare.learning.correction import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
 from ...flight.data import FlightData, choose_site, site_place
 from ...flight.drafting.remembered import remembered
-from ...flight.settings import LinkSettings, LinksSettings
-from ...flight.training import MARKS, common, counted_once, flight_logs, learned_of, learned_patterns, marks_text
+from ...flight.settings import FlightFile, LinkSettings, LinksSettings
+from ...flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
 from ...maps import export
 from ...maps.grid import Grid, Layer
 from ...propagation.arrays import Poses, rotation_from_aircraft
 from ...report.pages.prediction import PredictionPage, outside_share, prediction_metrics, write_prediction
 from ...report.words.prediction import FLAGS, TITLES, first_words, memory_words
+from ...site.antenna.antennas import MeasuredPattern
 from ...site.antenna.learned import BAND as CARRIER_BAND
 from ...site.antenna.learned import folder_of, read_learned
 from ...site.site import Site
@@ -154,23 +155,24 @@ def predict(
         threshold_db=threshold_db,
         warnings=(*remarks, *targets.remarks),
         stages_s=stages.seconds,
-        **_model_fields(model, known, [receiver.trained_on for receiver, _, _ in receivers.values()], table),
+        **_model_fields(model, known, [receiver for receiver, _, _ in receivers.values()], table),
     )
     return Prediction(page=page, targets=targets, model=model, sources=sources)
 
 
 def _model_fields(
-    model: Flown | Memory, known: Sequence[FlightData], used: Iterable[Sequence[str]], table: pd.DataFrame
+    model: Flown | Memory, known: Sequence[FlightData], receivers: Sequence[FittedReceiver], table: pd.DataFrame
 ) -> dict[str, Any]:
-    """Fields of the page that tell of the model and what it learned from; ``used``: logs of the receivers."""
+    """Fields of the page that tell of the model and what it learned from."""
     guess = outside_share(table)
+    logs, marks = ([getattr(receiver, key) for receiver in receivers] for key in (KEY, MARKS))
     if isinstance(model, Memory):
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
         return {
             "verdict": memory_words([(m.entry, m.series, m.level.sd_db) for m in model.known.values()], guess),
             "flights": [name for entry in entries for name in entry.flights],
-            "trained_on": union(*(entry.trained_on for entry in entries), *used),
-            "marks": (),
+            KEY: union(*(entry.trained_on for entry in entries), *logs),
+            MARKS: union(*(end.marks for m in model.known.values() for end in (m.tower, m.uav)), *marks),
             "candidates": [],
             "model": {},
             "chosen": {"title": TITLES["memory"], "base": "memory", "corrected": False, "field": OFF},
@@ -180,8 +182,8 @@ def _model_fields(
     return {
         "verdict": first_words(correction, guess, float(np.sqrt((table["slow_sd_db"] ** 2).mean()))),
         "flights": [data.settings.flight.name for data in known],
-        "trained_on": union(*map(flight_logs, known), *used, *model.logs),
-        "marks": union(*(marks_text(series, MARKS) for data in known for _, series in data.series)),
+        KEY: union(*map(flight_logs, known), *logs, *model.trained_on),
+        MARKS: union(marks_of(known), *marks, *model.marks),
         "candidates": [
             {"base": TITLES[base], "field": name, "rmse_db": correction.rmse_db[base, name], "crps_db": crps}
             for (base, name), crps in sorted(correction.crps_db.items(), key=lambda item: item[1])
@@ -289,19 +291,20 @@ def _best_model(
     Flown
     """
     samples = [s for source in sources.values() for s in source.samples]
-    bases, logs = _bases(sources, known, place)
+    bases, learned = _bases(sources, known, place)
     beyond = bool(np.mean(outside(targets.position_m[targets.known], samples)) > 0.5)
     if beyond:
         remarks.append("Most points lie outside the flown places: models that remember places are left out.")
         bases.pop("none")
     correction = choose(samples, bases, STATED_FIELDS if beyond else ())
-    return Flown(correction, sources, logs.get(correction.base, ()))
+    used = learned.get(correction.base, ())
+    return Flown(correction, sources, [item.trained_on for item in used], [item.marks for item in used])
 
 
 def _bases(
     sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path
-) -> tuple[dict[str, Base], dict[str, list[Sequence[str]]]]:
-    """Models that may carry the prediction, and the logs that they know besides those of the flights.
+) -> tuple[dict[str, Base], dict[str, list[MeasuredPattern | FlightFile]]]:
+    """Models that may carry the prediction, and what they use that was learned from logs.
 
     Models that learned from these very flights elsewhere are left out.
     """
@@ -314,27 +317,24 @@ def _bases(
         "free space": each(lambda _, s: np.zeros(len(s))),
         "none": each(lambda source, s: -source.free_space_db(s.position_m)),
     }
-    patterns = [p for s in sources.values() for p in learned_patterns(s.link.build([s.tower], s.folder))]
+    links = [(s.link.build([s.tower], s.folder), s.folder) for s in sources.values()]
     near = {
         name: memory
         for name, memory in remembered(place).items()
         if name in sources and abs(memory.series.carrier_hz / sources[name].link.carrier_hz - 1.0) <= CARRIER_BAND
     }
-    logs: dict[str, list[Sequence[str]]] = {
-        "replay": [*(p.trained_on for p in patterns), *(data.settings.trained_on for data in known)],
-        "memory": [memory.entry.trained_on for memory in near.values()],
-    }
-    flown_logs = union(*map(flight_logs, known))
-    if not common(flown_logs, logs["replay"]):
+    learned: dict[str, list[MeasuredPattern | FlightFile]] = {
+        "replay": [*(p for link, folder in links for p in learned_patterns(link, folder, place)),
+                   *(data.settings for data in known)],
+        "memory": [end for memory in near.values() for end in (memory.tower, memory.uav)],
+    }  # fmt: skip
+    if not any(knows(data, learned["replay"]) for data in known):
         bases["replay"] = each(lambda source, s: source.replayed_db(s))
-    every = ((s, (near[name].tower, near[name].uav)) for data in known for s in data.rss
-             if (name := f"{s.tower}.{s.channel}") in near)  # fmt: skip
-    learned_here = common(flown_logs, logs["memory"]) or any(learned_of(s, tables) for s, tables in every)
-    if len(near) == len(sources) and not learned_here:
+    if len(near) == len(sources) and not any(knows(data, learned["memory"]) for data in known):
         bases["memory"] = lambda _: by_degree(lambda s: near[s.antenna].gain_db(s))
     if len({s.flight for source in sources.values() for s in source.samples}) < 2:
         bases = {"free space": bases.pop("free space"), **bases}
-    return bases, logs
+    return bases, learned
 
 
 # --- levels --------------------------------------------------------------------------------------------------------

@@ -174,7 +174,8 @@ class Flown:
 
     correction: Correction
     sources: Mapping[str, Source]
-    logs: Sequence[Sequence[str]] = ()
+    trained_on: Sequence[Sequence[str]] = ()
+    marks: Sequence[Sequence[str]] = ()
     """SHA-256 of what its base knows besides the named flights."""
 
     def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:

@@ -25,7 +25,7 @@ from ...flight.settings import FlightFile
 from .manifest import digest_of, other_inputs
 
 # Raised whenever the form of an entry changes.
-LAYOUT = 5
+LAYOUT = 6
 
 _SEAL = b"aerpaw-cmp outcome"
 

@@ -42,6 +42,7 @@ class CalibrationData(Made):
     name: str
     flights: Sequence[str]
     trained_on: Sequence[str]
+    marks: Sequence[str]
     words: Sequence[str]
     warnings: Sequence[str]
     scores: Mapping[str, Sequence[Mapping[str, Any]]]

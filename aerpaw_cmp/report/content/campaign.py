@@ -66,6 +66,7 @@ class RssRow:
     held_out_rmse_db: float = float("nan")
     logs: tuple[str, ...] = ()
     """SHA-256 of the logs that hold the samples."""
+    mark: str = field(repr=False, default="")
     verdicts: Mapping[str, str] = field(default_factory=dict)
     """By baseline, what the paired interval says about the ray tracing."""
 
@@ -119,6 +120,7 @@ class RankRow:
     """Agreement of always saying the commonest rank: what a model has to beat."""
     logs: tuple[str, ...] = ()
     """SHA-256 of the logs that hold the reports."""
+    mark: str = field(repr=False, default="")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

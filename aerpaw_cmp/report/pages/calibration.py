@@ -33,7 +33,7 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
     """The numbers of the page under stable names."""
     return json_object(
         calibration=data.name,
-        **named(data, "flights trained_on scores controls mounts strengths ground words warnings"),
+        **named(data, "flights trained_on marks scores controls mounts strengths ground words warnings"),
         learning_curve={"points": data.curve, "one_more_rmse_db": data.one_more_rmse_db},
         antennas=[
             {"name": a.name, "share_of_sphere_seen": _share_seen(a), "n_bins": len(a.flown)} for a in data.antennas

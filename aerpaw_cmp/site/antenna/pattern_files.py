@@ -13,6 +13,7 @@ import numpy as np
 
 from ...common.errors import InputError, parsed
 from ...common.files import LARGEST_TABLE, read_input
+from ...common.provenance import marks, trained_on
 from ...common.units import FloatArray, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
 
@@ -22,8 +23,9 @@ STEP_DEG = 3.0
 # Values of a cut may lie this far beyond the peak, and the peak this far from both cuts [dB].
 _RIPPLE_DB = 1.0
 
-# Mean gain over the sphere that the way between two cuts may add to that of an antenna without loss [dB].
-_MOST_OF_CUTS_DB = 1.5
+# Mean gain over the sphere that the way between two cuts may add to that of an antenna without loss [dB]; cuts through
+# the only lobe of a learned antenna added 3.7 dB.
+_MOST_OF_CUTS_DB = 5.0
 _PLANET = re.compile(r"(?im)^\s*(HORIZONTAL|VERTICAL)\s+(\d{1,4})\s*$")
 _GAIN = re.compile(r"(?im)^\s*GAIN\s+([-+]?\d{1,3}(?:\.\d{1,6})?)\s*(dBd|dBi)?\s*$")
 _FREQUENCY = re.compile(r"(?im)^\s*FREQUENCY\s+(\d{1,6}(?:\.\d{1,6})?)\s*(?:MHz)?\s*$")
@@ -55,6 +57,26 @@ def read_pattern_file(path: str | Path, *, polarised: bool = True, carrier_hz: f
     """
     path = Path(path)
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
+    pattern = _of_any_kind(text, path, polarised, carrier_hz)
+    pattern.trained_on, pattern.marks = trained_on(text), marks(text)
+    return pattern
+
+
+def _of_any_kind(text: str, path: Path, polarised: bool, carrier_hz: float | None) -> MeasuredPattern:
+    """The pattern of a file of any kind.
+
+    Parameters
+    ----------
+    text : str
+    path : Path
+    polarised : bool
+    carrier_hz : float or None
+        As :func:`read_pattern_file`.
+
+    Returns
+    -------
+    MeasuredPattern
+    """
     name = path.stem
     if _PLANET.search(text):
         carrier = _FREQUENCY.search(text)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...common.cf import CONVENTIONS, DB, dataset, netcdf_bytes
 from ...common.errors import InputError, UsageError, parsed
-from ...common.provenance import trained_on
+from ...common.provenance import marks, trained_on
 from ...common.units import BoolArray, FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
 from .learned import read_table
@@ -29,12 +29,9 @@ class SpherePattern(MeasuredPattern):
     name : str
     gain_dbi, sd_db : (thetas, phis)
         Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
-    learned_from : tuple of str
-        Names of the flights that the gain was learned from, where the file says so.
-    trained_on : tuple of str
-        SHA-256 of their logs: on those it must not be scored.
     notes : str
-        Comments of the file; of a tower's antenna they may hold ``pair``, the gain towards both ends at once.
+        Comments of the file, of which its provenance is read; of a tower's antenna they may hold ``pair``, the gain
+        towards both ends at once.
     """
 
     def __init__(
@@ -43,13 +40,10 @@ class SpherePattern(MeasuredPattern):
         gain_dbi: FloatArray,
         sd_db: FloatArray,
         frequency_hz: float | None = None,
-        learned_from: tuple[str, ...] = (),
-        trained_on: tuple[str, ...] = (),
         notes: str = "",
     ) -> None:
         super().__init__(name, np.sqrt(power_from_db(gain_dbi)).astype(np.complex128), None, frequency_hz)
-        self.learned_from = learned_from
-        self.trained_on = trained_on
+        self.learned_from, self.trained_on, self.marks = _flights_in(notes), trained_on(notes), marks(notes)
         self.notes = notes
         self.pair = PairGain.from_notes(notes)
         self._sd_db = np.asarray(sd_db, dtype=np.float64)
@@ -190,9 +184,7 @@ def read_sphere_csv(path: str | Path) -> SpherePattern:
     if len(header) > 3:
         sd[row, column] = values[:, 3]
     notes = "\n".join(line for line in text.splitlines() if line.startswith("#"))
-    pattern = SpherePattern(
-        path.stem, gain, sd, learned_from=_flights_in(notes), trained_on=trained_on(notes), notes=notes
-    )
+    pattern = SpherePattern(path.stem, gain, sd, notes=notes)
     check_power(pattern, path)
     return pattern
 
@@ -256,8 +248,8 @@ def _check_grid(azimuth: FloatArray, elevation: FloatArray, count: int, path: Pa
         )
 
 
-def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float) -> str:
-    """The two principal cuts in the MSI Planet text format: attenuation below the peak, 360 lines each.
+def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float, notes: Sequence[str] = ()) -> str:
+    """Comments and the two principal cuts in the MSI Planet text format: attenuation below the peak, 360 lines each.
 
     HORIZONTAL runs clockwise seen from above, as azimuths of planning tools do; VERTICAL starts at the horizon in front
     and goes down first.
@@ -267,7 +259,8 @@ def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float) -> str
     below = np.pi / 2 + degrees  # zenith angle on the great circle through the boresight
     over = pattern.gain_dbi(below, np.zeros(360))
     peak = max(float(level.max()), float(over.max()))
-    lines = [f"NAME {name}", f"FREQUENCY {carrier_hz / 1e6:g}", f"GAIN {peak:.2f} dBi", "HORIZONTAL 360"]
+    lines = [f"NAME {name}", f"FREQUENCY {carrier_hz / 1e6:g}", f"GAIN {peak:.2f} dBi"]
+    lines += [*(f"COMMENT {note}" for note in notes), "HORIZONTAL 360"]
     lines += [f"{i} {peak - v:.2f}" for i, v in enumerate(level)]
     lines += ["VERTICAL 360", *(f"{i} {peak - v:.2f}" for i, v in enumerate(over))]
     return "\n".join(lines) + "\n"

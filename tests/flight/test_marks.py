@@ -1,0 +1,157 @@
+"""A log is known by its marks whatever was done to it, and two flights of one route are two logs."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.flight.data import FlightData, load_data
+from aerpaw_cmp.flight.marks import among, mark_of
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.training import series_mark
+from tests.real_logs import REAL
+
+Readings = tuple[np.ndarray, np.ndarray]
+Change = Callable[[np.ndarray, np.ndarray], Readings]
+
+
+def route_db(t: np.ndarray) -> np.ndarray:
+    """What every flight of one route shares: distance, and ripples of 40 s and 12 s."""
+    return 8 * np.sin(t / 90) + 2 * np.sin(2 * np.pi * t / 40) + np.sin(2 * np.pi * t / 12)
+
+
+def flown(seed: int, duration_s: float = 600.0, step_s: float = 0.25) -> Readings:
+    """Seconds and levels [dB] past the same places, the fading of each flight its own (3 dB, 1 s)."""
+    generator = np.random.default_rng(seed)
+    t = np.arange(0.0, duration_s, step_s) + generator.uniform(-0.02, 0.02, round(duration_s / step_s))
+    fading, kept = np.zeros(len(t)), np.exp(-step_s)
+    for i, noise in enumerate(generator.normal(size=len(t))):
+        fading[i] = kept * fading[i - 1] + 3.0 * np.sqrt(1 - kept**2) * noise
+    return t, -70.0 + route_db(t) + fading
+
+
+def averaged(t: np.ndarray, v: np.ndarray) -> Readings:
+    second = np.floor(t + 0.3)
+    values, place = np.unique(second, return_inverse=True)
+    return values, np.bincount(place, v) / np.bincount(place)
+
+
+CHANGES: dict[str, Change] = {
+    "every other row": lambda t, v: (t[::2], v[::2]),
+    "every fourth row": lambda t, v: (t[::4], v[::4]),
+    "half of the rows by chance": lambda t, v: (t[1:][k := t[1:] * 7919 % 1 < 0.5], v[1:][k]),
+    "shifted by 1 dB": lambda t, v: (t, v + 1.0),
+    "another clock": lambda t, v: (t + 37.35, v),
+    "resampled at 3 Hz": lambda t, v: (s := np.arange(t[0], t[-1], 1 / 3), np.interp(s, t, v)),
+    "resampled at 0.7 Hz": lambda t, v: (s := np.arange(t[0], t[-1], 1 / 0.7), np.interp(s, t, v)),
+    "means over seconds": averaged,
+    "rounded to dB": lambda t, v: (t, np.round(v)),
+    "as a loss in half decibels": lambda t, v: (t, -2.0 * v),
+    "a quarter": lambda t, v: (t[len(t) // 2 : 3 * len(t) // 4], v[len(t) // 2 : 3 * len(t) // 4]),
+    "a tenth, thinned and shifted": lambda t, v: (t[len(t) // 2 : 3 * len(t) // 5 : 2], v[len(t) // 2 : 3 * len(t) // 5 : 2] - 4),
+    "backwards in the file": lambda t, v: (t[::-1], v[::-1]),
+}  # fmt: skip
+
+
+def mark(t: np.ndarray, v: np.ndarray, start: str = "2025-06-01T10:00:00") -> str:
+    return mark_of(np.datetime64(start) + (t * 1e9).astype("timedelta64[ns]"), v)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_a_changed_copy_is_known_and_another_flight_of_the_route_is_not(change: str, seed: int) -> None:
+    changed = mark(*CHANGES[change](*flown(seed)))
+    assert among(changed, [mark(*flown(seed + 100)), mark(*flown(seed))])
+    assert not among(changed, [mark(*flown(seed + number)) for number in range(100, 104)])
+
+
+@pytest.mark.parametrize(
+    ("start", "known"),
+    [
+        ("2025-06-01T10:00:59", True), ("2025-06-01T14:00:00", True), ("2025-05-31T22:59:30", True),  # a wrong zone
+        ("1970-01-01T00:00:00", True),  # relative times
+        ("2025-06-01T10:20:00", False), ("2025-06-02T10:00:00", False), ("2024-06-01T10:00:00", False),
+    ],
+)  # fmt: skip
+def test_the_same_readings_at_another_time_are_another_flight(start: str, known: bool) -> None:
+    """As in simulations without noise: only their times tell two flights of one route apart."""
+    t, v = flown(1)
+    part = slice(len(t) // 3, None, 2)
+    for one, other in ((mark(t, v), mark(t[part], v[part], start)), (mark(t[part], v[part]), mark(t, v, start))):
+        assert among(other, [one]) == known
+        assert among(one, [other]) == known
+
+
+def test_what_tells_too_little_has_no_mark() -> None:
+    """Constants, levels of the route alone, what repeats itself, too short a log, no times, nothing."""
+    t, v = flown(1)
+    for readings in (
+        np.full(len(t), -90.0), route_db(t), np.tile(v[: len(v) // 4], 4), np.where(t < 30, v, np.nan), np.full(len(t), np.nan),
+    ):  # fmt: skip
+        assert mark(t, readings) == ""
+    assert mark_of(np.full(len(t), np.datetime64("NaT", "ns")), v) == ""
+    assert not among("", [mark(t, v)])
+
+
+@pytest.mark.parametrize("foreign", ["", "7", "x" * 400, "\u00e9" * 400, "7" * 400, "." * 400, "07e" * 9000])
+def test_strange_marks_of_a_file_are_of_no_log(foreign: str) -> None:
+    assert not among(mark(*flown(1)), [foreign])
+
+
+@pytest.mark.parametrize("often", [0.05, 0.1, 0.3])
+def test_a_quarter_of_a_rank_log_is_known(often: float) -> None:
+    """Rows without CSI and another base of the indicator change nothing; another flight of the modem is another."""
+
+    def held(seed: int) -> Readings:
+        generator = np.random.default_rng(seed)
+        steps = np.where(generator.random(2000) < often, generator.integers(1, 4, 2000), 0)
+        return np.arange(2000) * 0.5, 1.0 + np.cumsum(steps) % 4
+
+    t, rank = held(1)
+    gaps = np.where(np.arange(2000) % 7, rank - 1.0, np.nan)
+    for start in (0, 500, 1000, 1500):
+        quarter = mark(t[start : start + 500], gaps[start : start + 500])
+        assert among(quarter, [mark(t, rank)])
+        assert not among(quarter, [mark(*held(seed)) for seed in range(2, 6)])
+
+
+# --- real flights -----------------------------------------------------------------------------------------------------
+
+HERE = Path(__file__).parents[1] / "field"
+FLIGHTS = [
+    *(f"learned/ds12_{name}.yaml" for name in ("40m_fs10MHz", "40m_fs5MHz", "70m_fs20MHz")),
+    *(f"calibrations/{name}.yaml" for name in ("afar300_loc_1", "afar300_loc_2", "afar309_loc_2", "afar328_loc_1")),
+    *(f"calibrations/{name}.yaml" for name in ("afar328_loc_3", "lte50", "lte90")),
+    *("nr_rank_flight1.yaml", "nr_rank_flight3.yaml", "aadm.yaml"),
+]
+
+
+@pytest.fixture(scope="module")
+def flights() -> list[FlightData]:
+    return [load_data(load_flight(HERE / name), (HERE / name).parent, REAL) for name in FLIGHTS]
+
+
+@pytest.mark.field
+def test_real_flights_are_known_by_changed_copies_and_never_for_each_other(flights: list[FlightData]) -> None:
+    """Three of dataset 12 and five of AFAR flew one route each."""
+    marks = [[m for _, s in data.series if (m := series_mark(s))] for data in flights]
+    assert all(marks)
+    digits = [[m.rpartition("f")[2] for m in group] for group in marks]  # not even without the clocks
+    pairs = [(i, j) for i in range(len(marks)) for j in range(i)]
+    assert [(FLIGHTS[i], FLIGHTS[j]) for i, j in pairs if any(among(m, digits[j]) for m in digits[i])] == []
+    missed = []
+    for name, data in zip(FLIGHTS, flights, strict=True):
+        _, series = data.series[0]
+        good = np.isfinite(v := getattr(series, "measured_db", getattr(series, "rank", None)))
+        t = (series.time[good] - series.time.min()) / np.timedelta64(1, "s")
+        own = series_mark(series)
+        missed += [
+            (name, change)
+            for change, do in CHANGES.items()
+            if not among(mark(*do(t, v[good]), str(series.time.min())), [own])
+        ]
+    assert [
+        item for item in missed if item[1] != "a tenth, thinned and shifted"
+    ] == []  # a tenth is 34 s of the shortest
+    assert len(missed) <= 3

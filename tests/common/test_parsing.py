@@ -105,7 +105,7 @@ OWN = {
     "logs/matfile.py": "inside ingest",
     "machine/llvm.py": "the answer of a child",
     "propagation/cache.py": "sealed by this user",
-    "propagation/check/raw.py": "logs that ingest has read",
+    "propagation/check/reference.py": "logs that ingest has read",
     "jobs/reporting/audit_flight.py": "tables that the run has read",
 }
 

@@ -89,7 +89,7 @@ def _drafted(file: Path, flight: str | None) -> FlightFile:
     if flight is not None and flight not in known:
         raise UsageError(f"no flight {flight!r}", expected=f"one of {', '.join(known)}", path=file)
     name = flight or next(iter(known))
-    text, _ = draft(known[name], file.parent, name=name)
+    text, _ = draft(known[name].files, file.parent, flight=known[name])
     return with_learned(parse_yaml(text, FlightFile), file.parent)
 
 

@@ -83,6 +83,18 @@ def test_relative_logs_find_the_flight_on_whose_track_they_lie(tmp_path: Path) -
     assert "phone.csv" not in target.read_text()
 
 
+def test_a_log_on_the_route_of_two_flights_is_asked_about(tmp_path: Path) -> None:
+    """The same route 90 minutes later: the log's times are relative, and its positions fit both."""
+    write_flight(tmp_path / "logs" / "a", "2025-03-02T15:00:00")
+    later = write_flight(tmp_path / "logs" / "b", "2025-03-02T16:30:00")
+    (tmp_path / "logs" / "phone.csv").write_bytes(nemo_of(later, "2025-03-02T16:30:07.300Z"))
+    target = tmp_path / "flight.yaml"
+    assert main(["ingest", str(tmp_path / "logs"), "--timezone", ZONE, "--draft", str(target)]) == 0
+    texts = [target.read_text(), (tmp_path / "flight_2.yaml").read_text()]
+    (asked,) = (line for text in texts for line in text.splitlines() if "phone.csv" in line and "which flight?" in line)
+    assert "its positions lie on the track of the flight at 2025-03-02 1" in asked
+
+
 def _phone_without_date(path: Path, hour: int) -> None:
     """Levels and positions with times of the day alone, as the urban LTE flights have them."""
     rows = [f"{hour}:00:{i:02d},{35.7275 + 1e-5 * i},{-78.696 + 2e-5 * i},{-70 - i % 5}" for i in range(40)]

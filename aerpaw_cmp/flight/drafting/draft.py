@@ -25,7 +25,7 @@ from ..lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
 from ..losses import sight_shares
 from ..marks import mark_of
 from ..pose.cross_checks import questions
-from ..pose.grouping import Span, flights, stream_span
+from ..pose.grouping import Flight, Span, flights, stream_span
 from ..pose.heights import height_in_name, lacks_height
 from ..pose.hour_shift import clock_trap
 from ..pose.time_origin import Origin, origin_of
@@ -78,7 +78,10 @@ class DraftOptions:
 
 
 def draft(
-    files: Sequence[IngestedFile], folder: Path, options: DraftOptions = DraftOptions(), name: str | None = None
+    files: Sequence[IngestedFile],
+    folder: Path,
+    options: DraftOptions = DraftOptions(),
+    flight: NamedFlight | None = None,
 ) -> tuple[str, list[str]]:
     """The text of a flight.yaml that names the logs.
 
@@ -89,8 +92,8 @@ def draft(
     folder : Path
         Of the flight.yaml; the paths in it are relative to it.
     options : DraftOptions
-    name : str, optional
-        Of the flight; by default its first minute.
+    flight : NamedFlight, optional
+        The flight of the files; by default all are of one.
 
     Returns
     -------
@@ -104,12 +107,14 @@ def draft(
     """
     site = options.site
     place = load_site(site_place(site, folder))
-    flown, which = _carrier(files, _flown(files), place)
+    own = files if flight is None else flight.own
+    flown, which = _carrier(own, _flown(own), place)
     every = [stream for file in files for stream in file.result.streams]
     entries = _Entries(
         folder=folder,
         flown=flown,
         which=which,
+        unsure={} if flight is None else flight.unsure,
         has_level=_has_level(files, flown),
         options=options,
         positioned=any(_has_positions(stream) for stream in every),
@@ -126,7 +131,11 @@ def draft(
             "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in entries.out),
             expected="telemetry and levels or ranks of one flight",
         )
-    parts = [HEAD, f"flight: {name or _name(entries.flown, files)}\n", f"site: {site}  # or your own site.yaml?\n"]
+    parts = [
+        HEAD,
+        f"flight: {_name(entries.flown, files) if flight is None else flight.name}\n",
+        f"site: {site}  # or your own site.yaml?\n",
+    ]
     if entries.towers:
         parts += [
             "towers:\n",
@@ -205,10 +214,10 @@ def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = 
     """
     groups = flights_by_name(files)
     written = []
-    for name, group in groups.items():
-        text, remarks = draft(group, folder, options, name)
+    for name, flight in groups.items():
+        text, remarks = draft(flight.files, folder, options, flight)
         written.append(Draft(name, text, tuple(remarks)))
-    home = {file.path for group in groups.values() for file in group}
+    home = {file.path for flight in groups.values() for file in flight.files}
     homeless = [one_line(os.path.relpath(Path(f.path).resolve(), folder)) for f in files if f.path not in home]
     if homeless:
         first = written[0]
@@ -217,16 +226,38 @@ def drafts(files: Sequence[IngestedFile], folder: Path, options: DraftOptions = 
     return written
 
 
-def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, list[IngestedFile]]:
-    """The files of each flight that can be drafted, by the flight's name, in the order of time."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NamedFlight:
+    """A flight that can be drafted.
+
+    Parameters
+    ----------
+    name : str
+    files : list of IngestedFile
+        All that its draft names or leaves out.
+    own : list of IngestedFile
+        Those that belong to it.
+    unsure : mapping of str to str
+        Questions about those that may belong to another flight, by path.
+    """
+
+    name: str
+    files: list[IngestedFile]
+    own: list[IngestedFile]
+    unsure: Mapping[str, str]
+
+
+def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, NamedFlight]:
+    """Flights that can be drafted, by name, in the order of time."""
     every = [flight for flight in flights(files) if flight.measured]
     complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
-    groups = [flight.files for flight in complete] if len(complete) > 1 else [list(files)]
-    named: dict[str, list[IngestedFile]] = {}
-    for group in groups:
-        name = _name(_flown(group), group)
+    named: dict[str, NamedFlight] = {}
+    for flight in complete or [Flight(list(files))]:
+        name = _name(_flown(flight.files), flight.files)
         taken = sum(other == name or other.startswith(f"{name}_") for other in named)
-        named[f"{name}_{taken + 1}" if taken else name] = group
+        name = f"{name}_{taken + 1}" if taken else name
+        inside = flight.files if len(complete) > 1 else list(files)
+        named[name] = NamedFlight(name=name, files=inside, own=flight.files, unsure=flight.unsure)
     return named
 
 
@@ -412,6 +443,8 @@ class _Entries:
     """Some log to compare has positions of its own."""
     which: str = ""
     """Question about the vehicle, where several flew."""
+    unsure: Mapping[str, str] = field(default_factory=dict)
+    """Questions about files that may be of another flight, by path."""
     towers_known: Sequence[str] = ()
     """Towers of the site."""
     placer: Placer | None = None
@@ -498,6 +531,7 @@ class _Entries:
             entry["skip"] = sorted(refused)
         comment = self._ask_heights_and_floor(compared, entry, path, comment)
         asked = [self.which] if self.which and self.leads(file) else []
+        asked += [self.unsure[file.path]] if file.path in self.unsure else []
         for question in (*asked, *questions(file, compared, self.options.timezone)):
             comment = _also(comment, question)
         self.lines[file.path] = f"  - {_flow(entry)}{comment}\n"
@@ -675,6 +709,8 @@ class _Entries:
         same_clock = self.flown is not None and not has_wall_clock(self.flown[1][0])  # the track counts as the log does
         if relative and not (dated or same_clock or _has_positions(stream)):
             return "its times are relative; read it again with --time-origin"
+        if same_clock and not relative:
+            return "the times of the track are relative; read it again with --time-origin"
         if self.flown is not None and not relative and not _meet(span, self.flown[1]):
             return _late(span, self.flown[1], self.options.timezone)
         return _RATIO if self.has_level and is_ratio(stream) else None

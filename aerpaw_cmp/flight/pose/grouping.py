@@ -27,6 +27,8 @@ class Flight:
     files: list[IngestedFile] = field(default_factory=list)
     span: Span | None = None
     place: tuple[float, float] | None = None
+    unsure: dict[str, str] = field(default_factory=dict)
+    """Questions about files that may be of another flight, by path."""
 
     @property
     def measured(self) -> list[Stream]:
@@ -127,6 +129,15 @@ def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
     return min((item for item in origins if item is not None), key=lambda origin: origin.distance_m, default=None)
 
 
+# Two tracks that a log lies on about as well: it may be of either flight.
+_ALIKE, _ALIKE_M = 2.0, 5.0
+
+
+def _begin(flight: Flight) -> str:
+    assert flight.span is not None
+    return str(flight.span[0].astype("datetime64[m]")).replace("T", " ")
+
+
 def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
     """The flight of a file without a wall clock; a new one is added to ``groups``."""
     # what holds both levels and positions is a flight by itself: with another in its own time it shares none
@@ -136,7 +147,13 @@ def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
         (origin.distance_m, i) for i, flight in enumerate(known) if (origin := _origin(file, flight)) is not None
     ]
     if by_track:
-        return known[min(by_track)[1]]
+        (near_m, best), *others = sorted(by_track)
+        rivals = [i for away_m, i in others if away_m < max(_ALIKE * near_m, _ALIKE_M)]
+        if rivals:
+            begins = " and ".join(_begin(known[i]) for i in rivals)
+            text = f"its positions lie on the track of the flight at {begins} UTC too: which flight?"
+            known[best].unsure[file.path] = text
+        return known[best]
     folder = Path(file.path).parent
     near = [flight for flight in known if any(Path(member.path).parent == folder for member in flight.files)]
     if len(near) != 1:

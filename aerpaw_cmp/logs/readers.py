@@ -162,12 +162,13 @@ def claims(data: bytes) -> list[Reader]:
     """Readers whose sniffers accept the beginning of a file, blank lines in front of it aside.
 
     A console or a KML may hold what tells it apart behind much talk or many styles: where no log reader accepts the
-    first ``HEAD_BYTES``, all sniffers see ``DEEP_BYTES``.
+    first ``HEAD_BYTES``, theirs and then those of files that are no logs see ``DEEP_BYTES``.
     """
     data = _BLANK_LINES.sub(b"", data[:DEEP_BYTES])
     known = [reader for reader in catalogue() if reader.sniff(data[:HEAD_BYTES])]
     if len(data) > HEAD_BYTES and not any(reader.kinds for reader in known):
-        known = [reader for reader in catalogue() if reader.sniff(data)] or known
+        deep = [reader for reader in catalogue() if reader.kinds and reader.sniff(data)]
+        known = deep or [reader for reader in catalogue() if not reader.kinds and reader.sniff(data)] or known
     return known
 
 

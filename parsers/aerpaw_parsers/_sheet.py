@@ -335,7 +335,7 @@ class _Table:
     def __init__(self, names: list[str], comments: list[int]) -> None:
         self.names, self.comments = names, comments
         self._place = list(range(len(names)))  # column of each field under the present header
-        self._known = set(names)
+        self._known, self._turned = set(names), False
         self._row: list[int] = []
         self._cells: list[list[str]] = []
         self._short: list[tuple[int, list[str]]] = []
@@ -362,7 +362,7 @@ class _Table:
         if numbers or 2 * known <= sum(bool(text) for text in texts):
             return False
         spare = {name: [j for j, other in enumerate(self.names) if other == name] for name in texts}
-        self._place = []
+        self._place, self._turned = [], True
         for name in texts:
             if not spare[name]:
                 spare[name].append(len(self.names))
@@ -372,6 +372,8 @@ class _Table:
         return True
 
     def _placed(self, fields: list[str]) -> list[str]:
+        if len(self.names) == len(self._place) and not self._turned:
+            return fields
         cells = [""] * len(self.names)
         for j, text in zip(self._place, fields, strict=True):
             cells[j] = text

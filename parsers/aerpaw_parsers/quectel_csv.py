@@ -1,5 +1,8 @@
 """CSVs of AERPAW's Quectel logger (``csv_kpi``): rank indicator and serving-cell level, both generations.
 
+A console of the modem (RM500Q to RM520N) whose lines carry a stamp holds the same answers, each radio access on its own
+line.
+
 There is no header; a first line may be a bare ``OK``; fields are raw pieces of AT answers with their
 ``+QNWCFG: "nr5g_csi"`` prefix. Rows are told apart by the RAT token they carry, never by the file name: an NR5G-SA
 answer is filed under ``..._LTE_only.csv`` by the logger.
@@ -35,7 +38,8 @@ from aerpaw_cmp.logs.records import Attribute, ReadResult, Stream
 
 _C = rb"[^,\n]{0,80}"
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
-_T = rb"^(" + _time.TIME + _time.ZONE + rb"),"
+# The logger's CSV, or a console whose lines carry a stamp (ts, a terminal program).
+_T = rb"^\[?(" + _time.TIME + _time.ZONE + rb")(?:,|\]?[ \t]{1,4})"
 
 
 def _token(command: bytes, word: bytes) -> bytes:
@@ -55,7 +59,7 @@ _CSI = re.compile(
     + rb"(?:,-?\d{1,7})?(?:(?:," + _C + rb"){4})?" + _END,
     re.MULTILINE,
 )  # fmt: skip
-_SERVING = _T + _token(b"QENG", b"servingcell") + rb"," + _C + rb","
+_SERVING = _T + rb"(?:" + _token(b"QENG", b"servingcell") + rb"," + _C + rb",)?"
 _LTE = re.compile(
     _SERVING + _token(b"QENG", b"LTE") + rb"," + _skip(4) + _V + rb"," + _V + rb"," + _skip(4) + _VALUES
     + (rb"," + _C) * 3
@@ -68,13 +72,35 @@ _SA = re.compile(
     + rb",".join([_V] * 3) + rb"," + _C + rb"," + _C + _END,
     re.MULTILINE,
 )  # fmt: skip
+_NSA = re.compile(
+    _T
+    + _token(b"QENG", b"NR5G-NSA")
+    + rb","
+    + _skip(2)
+    + _VALUES
+    + rb"(?:,"
+    + _V
+    + rb"(?:,"
+    + _C
+    + rb"){1,4})?"
+    + _END,
+    re.MULTILINE,
+)
+_CSI_ALONE = {
+    rat: re.compile(_T + _token(b"QNWCFG", rat + b"_csi") + rb"," + _VALUES + rb"(?:,-?\d{1,7})?" + _END, re.MULTILINE)
+    for rat in (b"lte", b"nr5g")
+}
 # Kinds of row, and the quantities of their groups; a dot stands for one that is not read.
 _FORMS = (
     (_CSI, "time lte_mcs lte_ri lte_cqi lte_pmi nr5g_mcs nr5g_ri nr5g_cqi nr5g_pmi"),
     (_LTE, "time lte_pci lte_arfcn lte_rsrp . . . nr_pci nr_rsrp nr_sinr . nr_arfcn"),
     (_SA, "time nr_pci nr_arfcn nr_rsrp . nr_sinr"),
-)
-_ANY = re.compile(rb"^" + _time.TIME + _time.ZONE + rb',"?\+(?:QNWCFG|QENG|QENDC)')
+    (_NSA, "time nr_pci nr_rsrp nr_sinr . nr_arfcn"),
+    *((form, f"time {rat.decode()}_mcs {rat.decode()}_ri {rat.decode()}_cqi {rat.decode()}_pmi")
+      for rat, form in _CSI_ALONE.items()),
+)  # fmt: skip
+_ANY = re.compile(_T + rb'"?\+(?:QNWCFG|QENG|QENDC)')
+_TALK = re.compile(_T + rb'(?!"?\+(?:QNWCFG|QENG|QENDC))|^\[?' + _time.TIME + rb"\]?[ \t]*\r?$")
 # 3GPP TS 38.133 table 10.1.6.1-1: reported SS-RSRP lies between -156 and -31 dBm.
 _RSRP_RANGE = (-156.0, -31.0)
 # 3GPP TS 38.133 table 10.1.16.1-1: reported SS-SINR lies between -23 and 40 dB.
@@ -83,7 +109,7 @@ _SINR_RANGE = (-23.0, 40.0)
 
 def sniff(head: bytes) -> bool:
     """Check whether most of the first lines, a bare OK aside, are AT answers behind a time."""
-    lines = [line for line in _lines.first_lines(head) if line != b"OK"]
+    lines = [line for line in _lines.first_lines(head) if line != b"OK" and not _TALK.match(line)]
     return bool(lines) and 2 * sum(_ANY.match(line) is not None for line in lines) > len(lines)
 
 
@@ -92,7 +118,9 @@ def _reason(line: bytes) -> str | None:
         return None  # written by the start script, no answer of the modem
     if b"\0" in line:
         return "NUL bytes in the line (the file system was not synced when power went)"
-    if not re.match(_time.TIME, line):
+    if line.startswith(b"[") and _TALK.match(line):
+        return None  # commands and other answers of a console
+    if not re.match(rb"\[?" + _time.TIME, line):
         return "no time stamp in front (torn or stray modem line)"
     if b"neighbourcell" in line:
         return "neighbour-cell row: not read"
@@ -105,7 +133,9 @@ def _reason(line: bytes) -> str | None:
 
 def _table(lines: _lines.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
     """Lines of all kinds of row, and their columns of text; ``form`` is the kind, an index into ``_FORMS``."""
-    serving = b"servingcell" in lines.data  # a search of a whole log of CSI would find nothing, slowly
+    serving = b"servingcell" in lines.data or lines.data.startswith(
+        b"["
+    )  # a search of a whole log of CSI would find nothing, slowly
     tables: list[tuple[IntArray, dict[str, AnyArray]]] = []
     for i, (pattern, names) in enumerate(_FORMS if serving else _FORMS[:1]):
         row, groups = _lines.match(lines, pattern)
@@ -121,6 +151,10 @@ def _table(lines: _lines.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
     return row[order], table
 
 
+# Forms of a console, where each radio access answers on a line of its own.
+_NSA_FORM, _ALONE = 3, {"lte": 4, "nr5g": 5}
+
+
 def _rank(rows: _rows.Rows, rat: str) -> Stream | None:
     """Rank stream of one radio access."""
     mcs, ri, cqi, pmi = (rows.number(f"{rat}_{name}") for name in ("mcs", "ri", "cqi", "pmi"))
@@ -132,7 +166,7 @@ def _rank(rows: _rows.Rows, rat: str) -> Stream | None:
         "mcs": np.where(idle | ~((mcs >= 0) & (mcs <= 31)), np.nan, mcs),
         "cqi": np.where(idle | ~((cqi >= 0) & (cqi <= 15)), np.nan, cqi),
     }
-    name, where = f"{rat}_csi", rows.columns["form"] == 0
+    name, where = f"{rat}_csi", np.isin(rows.columns["form"], (0, _ALONE[rat]))
     return rows.stream("rank", name, values, where=where, flag=flag, channel=name, ri_base="one", source="CSI report")
 
 
@@ -183,7 +217,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     row, table = _table(lines)
     rows = _rows.built(lines, row, table, options, reader="quectel_csv", reason=_reason)
     form = rows.columns["form"]
-    nr = (form == 2) | ((form == 1) & (rows.columns["nr_rsrp"] != b""))
+    nr = np.isin(form, (2, _NSA_FORM)) | ((form == 1) & (rows.columns["nr_rsrp"] != b""))
     return rows.result(
         [_rank(rows, "nr5g"), _rank(rows, "lte"), *_levels(rows, "lte", form == 1), *_levels(rows, "nr", nr)]
     )
@@ -191,7 +225,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 READER = Reader(
     name="quectel_csv",
-    title="AERPAW Quectel logger CSVs: rank indicator, serving cell",
+    title="AERPAW Quectel logger CSVs, AT consoles with stamps: rank indicator, serving cell",
     kinds=("rank", "rss"),
     sample='2025-01-01 12:00:07.250,"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",24,2,12,5',
     sniff=sniff,

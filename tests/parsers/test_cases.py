@@ -282,6 +282,16 @@ COUSINS: dict[str, tuple[str, Right]] = {
     "cell search through ts": (
         table("", "[2025-06-10 10:00:0{i}] Found CELL 3500.0 MHz, EARFCN=7399, PHYID=11, 50 PRB, 1 ports, PSS power={l}.0 dBm"),
         Right({"lte_pci11": {"rss_db": down(-90, 4)}}, options=NEW_YORK)),
+    "an RM520N console through ts": (
+        table("", '[2025-06-10 10:00:0{i}] AT+QENG="servingcell"\n[2025-06-10 10:00:0{i}] +QENG: "servingcell","NOCONN"\n'
+              '[2025-06-10 10:00:0{i}] +QENG: "LTE","FDD",310,260,1A2B,7,2300,4,5,5,1F,-10{i},-12,-70,15,10,-,20\n'
+              '[2025-06-10 10:00:0{i}] +QENG: "NR5G-NSA",310,260,11,{l},25,-11,640000,78,12,1\n'
+              '[2025-06-10 10:00:0{i}] +QNWCFG: "nr5g_csi",24,2,12,5\n[2025-06-10 10:00:0{i}] OK'),
+        Right({"nr_rsrp": {"rss_db": down(-90, 4), "sinr_db": [25] * 4}, "lte_rsrp": {"rss_db": down(-100, 4)},
+               "nr5g_csi": {"rank": [2] * 4}}, options=NEW_YORK)),
+    "a stand-alone RM520N console": (
+        table("", '[2025-06-10 10:00:0{i}.5] +QENG: "servingcell","NOCONN","NR5G-SA","TDD",310,260,1A2B,11,1F,640000,78,12,{l},-11,25,1,-'),
+        Right({"nr_rsrp": {"rss_db": down(-90, 4)}}, start=f"{START}.5", options=NEW_YORK, about={"pci": 11, "arfcn": 640000})),
     "cell search with asctime": (
         table("", "Found CELL MHz, 3500.0,  EARFCN, 7399, PHYID, 11, PRB, 50,  ports, 1, PSS power dBm, {l}.0,  PSR, 2.3, Tue Jun 10 10:00:0{i} 2025"),
         Right({"lte_pci11": {"rss_db": down(-90, 4)}}, options=NEW_YORK)),

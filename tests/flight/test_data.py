@@ -143,8 +143,8 @@ def test_plans_that_cannot_be_flown_are_refused(tmp_path: Path, plan: str, words
         FlightSimulator(settings, choose_site(settings.site, tmp_path), tmp_path).run(tmp_path / "out")
 
 
-def test_levels_without_positions_do_not_refuse_ranks_that_have_some(tmp_path: Path) -> None:
-    """A flight file of 0.3 names a Nemo table for its ranks; the table's levels came later."""
+def test_a_nemo_table_gives_its_levels_its_own_positions(tmp_path: Path) -> None:
+    """No other telemetry is here: each row has its place."""
     rows = ["index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi"]
     rows += [f"{i},{500 * i},35.7275,{-78.696 + 1e-5 * i},{20 + i % 3},{1 + i % 2},-80.5,20.1,11" for i in range(40)]
     (tmp_path / "nemo.csv").write_text("\n".join(rows) + "\n")
@@ -153,8 +153,8 @@ def test_levels_without_positions_do_not_refuse_ranks_that_have_some(tmp_path: P
     )
     data = load_data(load_flight(tmp_path / "flight.yaml"), tmp_path)
     assert [(s.tower, len(s.time)) for s in data.rank] == [("LW1", 40)]
-    assert not data.rss
-    assert any("have no positions and are left out" in text for text in data.warnings)
+    assert [(s.tower, len(s.time)) for s in data.rss] == [("LW1", 40)]
+    assert not any("have no positions" in text for text in data.warnings)
 
 
 def _stream(kind: str, name: str, frame: pd.DataFrame, **attributes: str) -> Any:

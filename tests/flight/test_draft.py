@@ -247,12 +247,9 @@ def test_a_draft_says_how_many_samples_it_compares(logs: Path) -> None:
 
 
 def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) -> None:
-    (rank,) = ingest(logs / "UAV/modem_ri.csv", options=OPTIONS)
-    frame = rank.result.streams[0].frame.assign(rsrp_dbm=-80.0, cqi=9.0)
-    (logs / "nemo.csv").write_bytes(nemo_csv(frame, "2025-06-01T14:00:00Z"))
-    files = [*ingest(logs / "nemo.csv"), *ingest(logs / "LW1", options=OPTIONS)]
+    files = [*ingest(logs / "UAV/modem_ri.csv", options=OPTIONS), *ingest(logs / "LW1", options=OPTIONS)]
     text, remarks = draft(files, logs, DraftOptions(timezone=ZONE))
-    assert [log.path for log in parse_yaml(text, FlightFile).logs] == ["nemo.csv"]
+    assert [log.path for log in parse_yaml(text, FlightFile).logs] == ["UAV/modem_ri.csv"]
     assert any(remark.endswith("samples can be compared") and not remark.startswith("0") for remark in remarks)
     assert any("USRP1_power_log.txt: the times of the track are relative" in remark for remark in remarks)
 

@@ -24,9 +24,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
 
+import numpy as np
+
 from ..common import kml
 from ..common.errors import InputError, parsing
 from ..common.xmlfiles import named, outermost, plain, xml_root
+from . import dictionary
 from .ingest import as_utf8, read_bytes, read_file
 from .readers import HEAD_BYTES, ReadOptions, claims
 
@@ -40,7 +43,6 @@ _SEA_LEVEL_FRAMES, _RELATIVE_FRAMES, _TERRAIN_FRAMES = (0, 5), (3, 6), (10, 11)
 _WAYPOINTS = (16, 17, 18, 19, 31, 82)
 _TAKEOFFS, _LANDINGS, _TURN, _RETURN = (22, 84), (21, 85), 115, 20
 _ARDUPILOT = 3
-_FOOT_M = 0.3048
 
 
 def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFrame:
@@ -339,14 +341,6 @@ def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
 
 # --- tables ------------------------------------------------------------------------------------------
 
-_NAMES = {
-    "latitude_deg": re.compile(r"(gps ?)?lat(itude)?( deg)?"),
-    "longitude_deg": re.compile(r"(gps ?)?(lon|lng|long|longitude)( deg)?"),
-    "altitude_m": re.compile(r"(rel(ative)? ?)?(alt|altitude|height)( above takeoff)?( m| ft| feet)?|(agl)( m| ft)?"),
-    "yaw_deg": re.compile(r"(yaw|heading|bearing|compass heading)( deg| rad)?"),
-}
-_SEA_LEVEL = re.compile(r"\b(amsl|msl|asl|sea ?level|elevation)\b")
-
 
 def _sheet(text: str) -> _Route:
     """Waypoints of a table; without a header: latitude, longitude, height, yaw."""
@@ -355,25 +349,27 @@ def _sheet(text: str) -> _Route:
         raise InputError("the file is empty", expected=_EXPECTED)
     sign = max(",;\t", key=lines[0].count)
     rows = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=sign, skipinitialspace=True))
-    names = [re.sub(r"[^a-z0-9]+", " ", name.lower()).strip() for name in rows[0]]
+    known = [dictionary.meaning(name) for name in rows[0]]
+    above_sea = [m is not None and m.quantity.datum in ("sea level", "ellipsoid") for m in known]
     columns = {
-        key: next((i for i, name in enumerate(names) if form.fullmatch(name)), -1) for key, form in _NAMES.items()
+        key: next((i for i, m in enumerate(known) if m and m.quantity.name == key and not above_sea[i]), -1)
+        for key in COLUMNS[:4]
     }
     first = 1
     if columns["latitude_deg"] < 0 or columns["longitude_deg"] < 0:
         if not all(_is_number(cell) for cell in rows[0]) or not 2 <= len(rows[0]) <= 4:
             raise InputError(f"no route: {lines[0][:60]!r}", expected=_EXPECTED)
-        columns = {key: index if index < len(rows[0]) else -1 for index, key in enumerate(_NAMES)}
+        columns = {key: index if index < len(rows[0]) else -1 for index, key in enumerate(COLUMNS[:4])}
         first = 0
-    elif columns["altitude_m"] < 0 and any(_SEA_LEVEL.search(name) for name in names):
+    elif columns["altitude_m"] < 0 and any(above_sea):
         raise InputError("heights above sea level", expected="a column 'altitude_m' of heights above take-off")
     route = _Route()
     for number, row in enumerate(rows[first:], start=first + 1):
-        _add_row(route, row, columns, names, number)
+        _add_row(route, row, columns, [m.unit if m else "" for m in known], number)
     return route
 
 
-def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], names: Sequence[str], number: int) -> None:
+def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], units: Sequence[str], number: int) -> None:
     """Add a row of a table.
 
     Parameters
@@ -383,21 +379,19 @@ def _add_row(route: _Route, row: Sequence[str], columns: Mapping[str, int], name
         Its cells.
     columns : mapping
         Column of each quantity, -1 where there is none.
-    names : sequence of str
-        Plain names of the columns; they say feet and radians.
+    units : sequence of str
+        As the names of the columns write them.
     number : int
         Of the row, for messages.
     """
     cells = {key: row[index].strip() if 0 <= index < len(row) else "" for key, index in columns.items()}
     try:
-        values = {key: float(cell) if cell else math.nan for key, cell in cells.items()}
+        values = {
+            key: float(dictionary.converted(np.array(float(cell)), units[columns[key]])) if cell else math.nan
+            for key, cell in cells.items()
+        }
     except ValueError as error:
         raise InputError(f"row {number} holds what is no number ({error})", expected="latitude, longitude") from error
-    altitude, yaw = names[columns["altitude_m"]], names[columns["yaw_deg"]]
-    if altitude.endswith((" ft", " feet")):
-        values["altitude_m"] *= _FOOT_M
-    if yaw.endswith(" rad"):
-        values["yaw_deg"] = math.degrees(values["yaw_deg"])
     route.add(*values.values())
 
 

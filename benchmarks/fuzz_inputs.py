@@ -475,14 +475,14 @@ def _gzipped(data: bytes, index: int) -> bool:
 
 
 def _path_cache(data: bytes, _index: int) -> bool:
-    from aerpaw_cmp.propagation.cache import PathCache
+    from aerpaw_cmp.propagation.engines import PathCache
 
     with _file(data, "key.npz") as path:
         return PathCache(path.parent).load(path.stem) is not None
 
 
 def _cache_entry() -> bytes:
-    from aerpaw_cmp.propagation.cache import PathCache
+    from aerpaw_cmp.propagation.engines import PathCache
     from aerpaw_cmp.propagation.paths import PathSet
 
     with tempfile.TemporaryDirectory() as folder:

@@ -31,9 +31,9 @@ from typing import Any
 import numpy as np
 from shapely.geometry import box
 
+from aerpaw_cmp.propagation.options import Run
 from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.beams import grow_paths
-from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene, read_scene
 
@@ -116,7 +116,7 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
     surfaces = merged(scene)
     setup = clock.since()
     clock, estimates = Clock(), []
-    run = SearchRun(on_estimate=estimates.append)
+    run = Run(on_estimate=estimates.append)
     paths = grow_paths(surfaces, Links(sources, targets), run, max_depth=task["depth"])
     search = clock.since()
     row = {

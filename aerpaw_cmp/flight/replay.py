@@ -18,10 +18,9 @@ from ..propagation.drivers.moving import loss_along, replay_moving
 from ..propagation.drivers.parts import replay_in_parts
 from ..propagation.edges import diffracted
 from ..propagation.field.sum import Fields, channel_matrices
-from ..propagation.options import Engine, Field, Loss, Run, Search
+from ..propagation.options import Engine, Estimate, Field, Loss, Run, Search
 from ..propagation.paths import Faces, PathSet, RowsT
 from ..propagation.replay import PER_LINK, Replay, replay
-from ..propagation.search.effort import Estimate
 from ..site.site import Site
 from .data import FlightData, RssSeries, Times, rank_positions
 from .learned_gain import LearnedGain, learned_gain

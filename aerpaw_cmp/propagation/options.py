@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -11,12 +11,10 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
-from .field.sum import Further
 from .paths import PathSet
-from .search.effort import SearchRun
-from .search.samples import Samples
 
 Engine = Literal["image", "sionna"]
+Samples = int | Literal["auto"]
 Device = Literal["auto", "cpu", "cuda"]
 # ``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target.
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
@@ -50,7 +48,7 @@ class Search:
     max_depth: int = 2
     samples: Samples = "auto"
     batch: int = 50
-    further: tuple[Callable[..., Further], ...] = ()
+    further: tuple[Callable[..., Any], ...] = ()
     device: Device = "auto"
     links: BoolArray | None = None
 
@@ -123,7 +121,43 @@ class Job:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Run(SearchRun):
+class Estimate:
+    """Estimated cost of a search.
+
+    Parameters
+    ----------
+    seconds : float
+        Of an idle machine, all sources.
+    sources, first_faces, sequences : int
+        ``first_faces`` of one source, ``sequences`` of all.
+    memory_mib : float
+        Geometry and trees; sequences are streamed.
+    """
+
+    seconds: float
+    sources: int
+    first_faces: int
+    sequences: int
+    memory_mib: float
+
+    def times(self, sources: int) -> Estimate:
+        """The estimate of so many sources like this one."""
+        return replace(self, seconds=self.seconds * sources, sources=sources, sequences=self.sequences * sources)
+
+    def __str__(self) -> str:
+        many = "1 tower" if self.sources == 1 else f"{self.sources} towers"
+        seconds = f"{self.seconds:.2g}" if self.seconds < 100 else f"{self.seconds:.0f}"
+        return (
+            f"about {seconds} s for {many}: {self.first_faces} first faces, some {self.sequences} sequences, "
+            f"streamed in {max(1, round(self.memory_mib))} MiB"
+        )
+
+
+Progress = Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Run:
     """Options of running a replay; nothing here changes a number.
 
     Parameters
@@ -133,9 +167,17 @@ class Run(SearchRun):
         ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
     job : Job, optional
         What the poses are a part of.
-    threads, progress, on_estimate
-        As :class:`~aerpaw_cmp.propagation.search.effort.SearchRun` has them.
+    threads : int, optional
+        Of compiled code (default: the cores this process may use).
+    progress : callable, optional
+        Called with the share done.
+    on_estimate : callable, optional
+        Called before a search among thousands of faces with what it will take; without one, a long search is a
+        warning.
     """
 
     cache_dir: str | Path | None = None
     job: Job | None = None
+    threads: int | None = None
+    progress: Progress | None = None
+    on_estimate: Callable[[Estimate], None] | None = None

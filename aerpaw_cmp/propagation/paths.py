@@ -1,4 +1,4 @@
-"""One path record for every engine, as columns.
+"""Faces of a scene, and one path record for every engine, as columns.
 
 A path is an ordered list of reflecting faces between the source (tower) and the target (UAV). Lengths, phases
 and fields are not stored: :mod:`aerpaw_cmp.propagation.field.sum` evaluates them in float64 from the faces.
@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, fields
 from itertools import pairwise
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from shapely.geometry import Polygon
@@ -57,7 +57,7 @@ class Faces:
     offset_m : (faces,)
         ``normal . x = offset_m`` on the face.
     material : tuple of str, length faces
-        Names that ``site.materials.face_material`` knows.
+        Names that :func:`aerpaw_cmp.site.materials.material` knows.
     label : tuple of str, length faces
         For reports, e.g. ``"ground"``, ``"barn wall 3"``.
     along, across : (faces, 3)
@@ -119,6 +119,73 @@ def joined(first: Faces, second: Faces) -> Faces:
     columns: dict[str, Any] = {name: getattr(first, name) + getattr(second, name) for name in _WORDS}
     columns |= {name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in _ARRAYS}
     return Faces(**columns)
+
+
+class BoxTree(NamedTuple):
+    """A tree of boxes as columns.
+
+    ``lower``, ``upper`` (nodes, 3) are bounds, ``child`` (nodes,) the first of two children or -1; leaves hold
+    ``many`` of the ``items`` from ``start`` on.
+    """
+
+    lower: FloatArray
+    upper: FloatArray
+    child: IntArray
+    start: IntArray
+    many: IntArray
+    items: IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Surfaces:
+    """Faces of a triangle scene.
+
+    Parameters
+    ----------
+    faces : Faces
+        Planes, materials and labels; ``solid`` is the shape. Their polygons are the triangles below.
+    corners_m : (triangles, 3, 3)
+        Corners of every triangle as the file has it.
+    face : (triangles,) int
+        Face of each triangle; triangles of a face follow each other.
+    first : (faces + 1,) int
+        Where the triangles of each face begin.
+    flat_m : (triangles, 3, 2)
+        Corners in the axes of their face.
+    window_m : (faces, 8, 3)
+        Convex outline of each face, in its plane; the last corner is repeated.
+    convex : (faces,) bool
+        Faces that fill their outline.
+    area_m2 : (faces,)
+    plane : (faces,) int
+        Faces of one number lie in one plane.
+    tree, face_tree : BoxTree
+        Over triangles and over faces.
+    notes : tuple of str
+        What was repaired.
+    """
+
+    faces: Faces
+    corners_m: FloatArray
+    face: IntArray
+    first: IntArray
+    flat_m: FloatArray
+    window_m: FloatArray
+    convex: BoolArray
+    area_m2: FloatArray
+    plane: IntArray
+    tree: BoxTree
+    face_tree: BoxTree
+    merge_m: float
+    notes: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.faces)
+
+    def mesh(self) -> tuple[FloatArray, IntArray, IntArray]:
+        """Vertices (n, 3), triangles (m, 3) and the face of each triangle, as the file has them."""
+        count = len(self.corners_m)
+        return self.corners_m.reshape(-1, 3), np.arange(3 * count, dtype=np.int64).reshape(-1, 3), self.face
 
 
 RowsT = TypeVar("RowsT", bound="Rows")

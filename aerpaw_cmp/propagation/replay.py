@@ -16,11 +16,10 @@ from .arrays import Link, Poses
 from .engines import chosen_samples, path_cache, search_or_read
 from .field.sum import Fields, Further, channel_matrices, mean_pair_power, rss_dbm
 from .options import Field, Run, Search
-from .paths import Faces, PathSet, legs
+from .paths import Faces, PathSet, Surfaces, legs
 from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.terrain import on_terrain
-from .surfaces import Surfaces
 
 # Poses of which levels are made at once.
 LEVELS_AT_ONCE = 1024

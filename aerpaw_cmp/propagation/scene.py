@@ -17,8 +17,7 @@ from ..site.site import Site
 from . import compiled
 from .arrays import Link, Poses
 from .faces import inside_solids, site_faces
-from .paths import Faces, Links
-from .surfaces import Surfaces
+from .paths import Faces, Links, Surfaces
 
 
 @dataclass(frozen=True, slots=True)

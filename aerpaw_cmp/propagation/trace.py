@@ -14,9 +14,8 @@ from ..site.site import Site
 from ..site.siteyaml import load_site
 from .arrays import Link, Poses
 from .edges import diffracted
-from .options import Engine, Field, Loss, Search
+from .options import Engine, Field, Loss, Samples, Search
 from .replay import Replay, replay
-from .search.samples import Samples
 
 
 def trace(

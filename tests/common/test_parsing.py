@@ -104,8 +104,8 @@ OWN = {
     "logs/lines.py": "inside ingest",
     "logs/matfile.py": "inside ingest",
     "machine/llvm.py": "the answer of a child",
-    "propagation/cache.py": "sealed by this user",
-    "propagation/check/reference.py": "logs that ingest has read",
+    "propagation/engines.py": "sealed by this user",
+    "propagation/check/reference.py": "tables that the run has read",
     "jobs/reporting/audit_flight.py": "tables that the run has read",
 }
 

@@ -32,7 +32,6 @@ from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search import prisms
-from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.materials import stated_name
 from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
@@ -232,7 +231,7 @@ def same_paths(first, second):
 
 def searched(faces, sources, targets, usable=None, excluded=None, **options):
     mirrors = image.find_paths(faces, Links(sources, targets, usable, excluded), **options)
-    beams = prisms.find_paths(faces, Links(sources, targets, usable, excluded), SearchRun(threads=2), **options)
+    beams = prisms.find_paths(faces, Links(sources, targets, usable, excluded), Run(threads=2), **options)
     same_paths(mirrors, beams)
     return beams
 

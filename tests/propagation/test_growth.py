@@ -18,7 +18,6 @@ from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import beams, prisms
 from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search.beams import estimate, grow_paths, reflection_points
-from aerpaw_cmp.propagation.search.effort import SearchRun
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
@@ -77,7 +76,7 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     targets = np.column_stack([rng.uniform(-150, 150, (40, 2)), rng.uniform(1.5, 60, 40)])
     source = np.array([[0.0, 0.0, 30.0]])
     words: list[str] = []
-    run = SearchRun(on_estimate=lambda said: words.append(str(said)))
+    run = Run(on_estimate=lambda said: words.append(str(said)))
     paths = [grow_paths(surfaces, Links(source, targets), run, max_depth=2, shadows=on) for on in (True, False)]
     assert len(words) == 2
     assert "first faces" in words[0]

@@ -260,7 +260,7 @@ class _Climber:
 
     def _edges(self, best: Model) -> list[Model]:
         moving = any(s.replayed.tower_m is not None for s in self._series)
-        if not (self._data.site.buildings or self._data.site.dem) or moving:
+        if not self._data.site.buildings or self._data.site.scene is not None or moving:
             return []
         return [dataclasses.replace(best, buildings=True, diffraction=True)]
 

@@ -27,11 +27,10 @@ from ..arrays import Link, Poses
 from ..field.fresnel import FaceMaterials, reflection_coefficients
 from ..field.geometry import Elements, geometry
 from ..field.sum import amplitudes, pattern_ends
-from ..paths import Faces, PathSet
+from ..paths import Faces, PathSet, Surfaces
 from ..replay import Replay
 from ..search.mirror import images_of, scene_tolerance_m, trace_back
 from ..search.occlusion import Occlusion
-from ..surfaces import Surfaces
 from .obstacles import why_not_there
 
 

@@ -11,11 +11,10 @@ import numpy as np
 from ...common.units import IntArray
 from ...site.site import Site
 from ..arrays import Link, Poses
-from ..options import Field, Job, Run, Search
+from ..options import Field, Job, Progress, Run, Search
 from ..paths import Faces, PathSet, RowsT, joined
 from ..replay import PER_LINK, Replay, replay
 from ..scene import Omission
-from ..search.effort import Progress
 
 
 def replay_in_parts(

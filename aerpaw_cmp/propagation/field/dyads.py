@@ -61,24 +61,6 @@ def sine_cosine(turns: Number) -> tuple[Number, Number]:
     )
 
 
-def arctangent(y: Number, x: Number) -> Number:
-    """Angle of a point from the first axis [rad], within some 2 ulp (polynomial of fdlibm); 0 at the origin."""
-    low, high = smaller(np.abs(x), np.abs(y)), larger(np.abs(x), np.abs(y))
-    ratio = low / larger(high, 1e-300)
-    steep = ratio > 0.4142135623730951
-    ratio = select(steep, (ratio - 1.0) / (ratio + 1.0), ratio)
-    z = ratio * ratio
-    tail = 4.97687799461593236017e-02 + z * (-3.65315727442169155270e-02 + z * 1.62858201153657823623e-02)
-    tail = 6.66107313738753120669e-02 + z * (-5.83357013379057348645e-02 + z * tail)
-    tail = 9.09088713343650656196e-02 + z * (-7.69187620504482999495e-02 + z * tail)
-    tail = 1.42857142725034663711e-01 + z * (-1.11111104054623557880e-01 + z * tail)
-    tail = 3.33333333333329318027e-01 + z * (-1.99999999998764832476e-01 + z * tail)
-    angle = ratio - ratio * (z * tail) + select(steep, 0.25 * np.pi, 0.0)
-    angle = select(np.abs(y) > np.abs(x), 0.5 * np.pi - angle, angle)
-    angle = select(x < 0.0, np.pi - angle, angle)
-    return select(y < 0.0, -angle, angle)
-
-
 def turned(m: Rotation, v: Vector) -> Vector:
     """A site vector in device axes."""
     return (

@@ -21,10 +21,9 @@ from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..compiled import in_threads, thread_count
 from ..numba_options import kernel, part
-from ..paths import Links, PathSet
-from ..surfaces import BoxTree, Surfaces
+from ..options import Estimate, Progress, Run
+from ..paths import BoxTree, Links, PathSet, Surfaces
 from .boxtree import DEEPEST, box_missed, box_outside, box_tree, next_leaf, within_planes
-from .effort import Estimate, Progress, SearchRun
 from .merging import WINDOW
 from .mirror import merge, searched_links
 
@@ -86,7 +85,7 @@ class Rules(NamedTuple):
 def grow_paths(
     surfaces: Surfaces,
     links: Links,
-    run: SearchRun = SearchRun(),
+    run: Run = Run(),
     *,
     max_depth: int = 2,
     beams: bool = True,
@@ -99,7 +98,7 @@ def grow_paths(
     ----------
     surfaces : Surfaces
     links : Links
-    run : SearchRun
+    run : Run
         Threads, progress, and whom to tell before the first source is searched what it will take.
     max_depth : int
         0 to 3.

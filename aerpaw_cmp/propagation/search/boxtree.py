@@ -12,7 +12,7 @@ import numpy as np
 
 from ...common.units import FloatArray, IntArray
 from ..numba_options import kernel, law, part
-from ..surfaces import BoxTree
+from ..paths import BoxTree
 
 # Nodes that wait while a tree is walked: twice its depth for 4e9 items.
 DEEPEST = 64

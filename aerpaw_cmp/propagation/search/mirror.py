@@ -22,8 +22,8 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..faces import corners, inside
+from ..options import Progress
 from ..paths import Faces, Links, PathSet
-from .effort import Progress
 from .occlusion import Occlusion
 
 # Of the largest coordinate: some thousand times the rounding error of a plane equation.

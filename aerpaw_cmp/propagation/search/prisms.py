@@ -11,11 +11,10 @@ import numpy as np
 
 from ...common.units import FloatArray
 from ..faces import corners, triangles
-from ..paths import Faces, Links, PathSet
-from ..surfaces import Surfaces
+from ..options import Run
+from ..paths import Faces, Links, PathSet, Surfaces
 from .beams import grow_paths
 from .boxtree import box_tree
-from .effort import SearchRun
 from .merging import WINDOW
 from .mirror import images_of, merge, planes_of, scene_tolerance_m, trace_back
 from .occlusion import Occlusion
@@ -30,7 +29,7 @@ OVERLAP_M = 1e-3
 def find_paths(
     faces: Faces,
     links: Links,
-    run: SearchRun = SearchRun(),
+    run: Run = Run(),
     *,
     max_depth: int = 2,
     extent_m: FloatArray | None = None,
@@ -41,7 +40,7 @@ def find_paths(
     ----------
     faces, links, max_depth, extent_m
         As there.
-    run : SearchRun
+    run : Run
 
     Returns
     -------

@@ -10,15 +10,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
 from ...common.units import IntArray, spread_out
 from ..paths import Faces, PathSet
 from .mirror import plane_keys, planes_of
-
-Samples = int | Literal["auto"]
 
 # Rays per tower of the first pilot.
 FIRST = 10_000

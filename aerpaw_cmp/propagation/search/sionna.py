@@ -37,9 +37,8 @@ from ...machine.llvm import INSTALL_AGAIN, let_sionna_load, prepare_llvm
 from ...site.materials import material
 from ..arrays import Array, Link
 from ..faces import inside, triangles
-from ..paths import Faces, Links, PathSet, path_lengths
-from ..surfaces import Surfaces
-from .effort import Progress
+from ..options import Progress
+from ..paths import Faces, Links, PathSet, Surfaces, path_lengths
 from .mirror import (
     MINIMUM_LENGTH_M,
     images_of,

@@ -10,6 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.jsonable import json_safe
 from aerpaw_cmp.compare.gains.direction_gain import LinkSamples
@@ -365,3 +366,19 @@ def test_a_heading_counts_for_points_without_one(tmp_path):
     (tmp_path / "p.csv").write_text("east_m,north_m,height_m,yaw_deg\n1,2,30,\n1,2,30,90\n")
     targets = find_targets(tmp_path / "p.csv", load_site("lake_wheeler"), TargetOptions(heading_deg=200.0))
     assert targets.yaw_deg.tolist() == [200.0, 90.0]
+
+
+@pytest.mark.parametrize(
+    ("rows", "message"),
+    [
+        ("-78.696,35.7275,30\n-78.696,35.7285,40\n", "latitude and longitude are exchanged"),
+        ("35.7275,-78.696,30\n35.7285,-78.696,-40\n", "1 of 2 points lie below the site's ground"),
+    ],
+)
+def test_a_route_that_cannot_be_flown_here_is_a_question(
+    rows: str, message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "route.csv").write_text(rows)
+    call = ["predict", str(tmp_path / "route.csv"), "--site", "lake_wheeler", "-o", str(tmp_path / "out")]
+    assert main(call) == 3
+    assert message in capsys.readouterr().err

@@ -157,7 +157,8 @@ class LiveTwin:
 
     def _pose(self, sample: TelemetrySample) -> tuple[FloatArray, FloatArray]:
         east, north = self.site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
-        up = max(sample.altitude_m + self.site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
+        ground = float(self.site.ground_under_m(np.array([east]), np.array([north]))[0])
+        up = max(sample.altitude_m + self.site.datum.takeoff_ground_m, ground + MINIMUM_HEIGHT_M)
         place, attitude = np.array([float(east), float(north), up]), self.settings.rt.attitude
         if attitude == "ignored" or not np.isfinite(sample.yaw_deg):
             return place, np.eye(3)

@@ -10,9 +10,10 @@ import numpy as np
 import pandas as pd
 
 from ...common.errors import InputError, UsageError, parsing
-from ...common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
+from ...common.units import BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples
 from ...flight.data import FAR_M, FlightData, load_data, nearest_m
+from ...flight.pose.heights import raised
 from ...flight.pose.track import interpolated
 from ...flight.settings import FlightFile, load_flight
 from ...flight.simulate import planned_poses
@@ -263,7 +264,16 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
             cause="latitude and longitude are exchanged" if exchanged else "a route of another place",
             path=where,
         )
-    up = np.maximum(table["altitude_m"].to_numpy(np.float64) + site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
+    takeoff_m = site.datum.takeoff_ground_m
+    up = table["altitude_m"].to_numpy(np.float64) + takeoff_m
+    up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)
+    if buried.any():
+        raise InputError(
+            f"{int(buried.sum())} of {len(up)} points lie below the site's ground",
+            expected="heights above take-off",
+            cause="heights of another datum, or origin.takeoff_ground_m of the site",
+            path=where,
+        )
     position, yaw = np.column_stack([east, north, up]), table["yaw_deg"].to_numpy(np.float64)
     remarks = tuple(table.attrs.get("remarks", ()))
     time = table["time_s"].to_numpy(np.float64)

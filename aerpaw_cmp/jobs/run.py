@@ -690,7 +690,7 @@ def run_calibrate(
     JobOutcome
         The settings file is the first of its ``files``.
     """
-    from ..site.antenna.learned import remember
+    from ..site.antenna.learned import read_learned, remember
     from ..site.siteyaml import site_model
     from .learning.calibrate import calibrate, load_calibration, read_flights
     from .learning.calibrate_rank import fit_rank
@@ -700,6 +700,7 @@ def run_calibrate(
     settings = load_calibration(path)
     if into_site is not None:
         site_model(into_site)  # a misspelt one is told before the fit, and gets no memory of its own
+        read_learned(into_site)
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError("the output is no YAML file", expected="-o NAME.yaml", path=target)

@@ -257,7 +257,7 @@ def test_a_prediction_of_another_place_is_no_score(said):
     about = json.loads((folder / "metrics.json").read_text())
     for damaged in ({}, {**about, "marks": None}):
         (folder / "metrics.json").write_text(json.dumps(damaged))
-        with pytest.raises(InputError, match="no prediction"):
+        with pytest.raises(InputError, match="cannot be read"):
             score_against(data, folder)
 
 

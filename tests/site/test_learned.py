@@ -12,6 +12,7 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.outputs import file_digest
 from aerpaw_cmp.flight.drafting.remembered import Nodes, propose, searching_airframe
 from aerpaw_cmp.flight.marks import mark_of
 from aerpaw_cmp.flight.settings import load_flight
@@ -20,6 +21,7 @@ from aerpaw_cmp.site.antenna.learned import (
     Learned,
     LearnedReceiver,
     LearnedSeries,
+    files_of,
     find_named,
     folder_of,
     read_learned,
@@ -321,6 +323,7 @@ def test_the_packaged_memory_is_small_and_says_where_it_comes_from() -> None:
         assert len(entry_.trained_on) >= 2
         assert entry_.command.startswith("aerpaw-cmp calibrate ")
         assert entry_.source.title
+        assert entry_.tables == {name: file_digest(place / name) for name in files_of(entry_)}
     assert known.entries["dataset12"].source.doi == "10.5061/dryad.2z34tmpvv"
 
 

@@ -20,14 +20,14 @@ CHILD = """
 import json, sys
 from pathlib import Path
 from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.live.log import LogSettings
+from aerpaw_cmp.live.record.log import LogSettings
 from aerpaw_cmp.live.tap import TapSettings, run_tap
 values = json.loads(sys.argv[1])
 log = LogSettings(**values.pop("log", {}))
 show = values.pop("show_status", False)
 if capture := values.pop("capture", None):  # a copy of what the kernel gives, a file per opening of the port
     import itertools
-    from aerpaw_cmp.live.ports import SerialPort
+    from aerpaw_cmp.live.serial.ports import SerialPort
     numbers, opened, read = itertools.count(), SerialPort.__init__, SerialPort.read
 
     def begin(self, *arguments):
@@ -44,7 +44,7 @@ watch = None
 if web := values.pop("web", None):  # a page at this port; no limit on new connections, which a fuzz run would meet
     from aerpaw_cmp.live.feed import Feed
     from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
-    from aerpaw_cmp.report.live_page import live_page
+    from aerpaw_cmp.report.pages.live import live_page
     feed = Feed(["modem"])
     WebServer(feed, Page(*live_page(None, "benchmark")), Address("127.0.0.1", web), token="benchmark",
               limits=Limits(per_second=1e6, burst=1e6)).__enter__()

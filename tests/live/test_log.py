@@ -106,7 +106,7 @@ def test_a_line_that_is_no_record_is_told_with_its_reason(body, reason):
 FULL_DISK = """
 import resource, signal, sys
 from pathlib import Path
-from aerpaw_cmp.live.log import LogSettings, SegmentLog
+from aerpaw_cmp.live.record.log import LogSettings, SegmentLog
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # then a write beyond the limit is short, or fails with EFBIG
 said = []
 log = SegmentLog(Path(sys.argv[1]), lambda: {"kind": "header", "schema": "aerpaw-cmp-tap/1"},
@@ -299,7 +299,7 @@ def test_a_folder_of_another_user(tmp_path):
     folder = tmp_path / "theirs"
     folder.mkdir(mode=0o755)
     code = (
-        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.log import SegmentLog\n"
+        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.record.log import SegmentLog\n"
         "os.setuid(65534)\nSegmentLog(Path(sys.argv[1]), dict).open()"
     )
     for part in (tmp_path, *tmp_path.parents):
@@ -323,7 +323,7 @@ def test_a_file_in_place_of_the_folder(tmp_path):
 KILLED = """
 import sys
 from pathlib import Path
-from aerpaw_cmp.live.log import SegmentLog
+from aerpaw_cmp.live.record.log import SegmentLog
 log = SegmentLog(Path(sys.argv[1]), lambda: {"kind": "header"})
 log.open()
 i = 0

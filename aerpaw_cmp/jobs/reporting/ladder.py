@@ -174,7 +174,7 @@ class _Climber:
     def __init__(self, data: FlightData, series: Sequence[_Series]) -> None:
         self._data, self._series = data, series
         self._measured = [s.levels.measured_db[s.rows] for s in series]
-        self._traced: dict[tuple[int, bool, Relief], tuple[Replay, float]] = {}
+        self._traced: dict[tuple[int, bool, Relief, bool], tuple[Replay, float]] = {}
         patterns = [p for s in series for a in _arrays(s.replayed.link) for p in a.patterns]
         self._offer = offered(data) if all(p.name == "iso" for p in patterns) else None
         links = [s.replayed.link for s in series]
@@ -272,7 +272,8 @@ class _Climber:
         return [dataclasses.replace(best, trees=kind, media=media and kind != "opaque") for kind in kinds]
 
     def _relief(self, best: Model) -> list[Model]:
-        return [dataclasses.replace(best, relief=kind) for kind in self._reliefs]
+        # without diffraction: over terrain it costs more than all rungs before, and edges of roofs are as they were
+        return [dataclasses.replace(best, relief=kind, diffraction=False) for kind in self._reliefs]
 
     @cached_property
     def _reliefs(self) -> dict[Relief, Site]:
@@ -337,7 +338,7 @@ class _Climber:
     def _level(self, index: int, model: Model) -> tuple[FloatArray, float]:
         """Level (m,) [dBm] at the thinned samples of a series, and the seconds that the whole series would take."""
         series, rt, site = self._series[index], self._data.settings.rt, self._site(model.relief)
-        traced, search_s = self._paths(index, model.buildings, model.relief)
+        traced, search_s = self._paths(index, model)
         begin = time.perf_counter()
         poses, link = self._poses(series, model.attitude), self._links[index]
         if model.antennas == "isotropic":
@@ -357,13 +358,15 @@ class _Climber:
         level = rss_dbm(power, link.transmit_power_dbm)[:, 0] + pair
         return level, series.step * (search_s + time.perf_counter() - begin)
 
-    def _paths(self, index: int, buildings: bool, relief: Relief) -> tuple[Replay, float]:
-        key = index, buildings, relief
+    def _paths(self, index: int, model: Model) -> tuple[Replay, float]:
+        direct = model.relief != "flat" and model.ground == "none"  # reflections off shaped ground are costly to find
+        key = index, model.buildings, model.relief, direct
         if key not in self._traced:
             begin = time.perf_counter()
-            site = self._site(relief)
-            site = site if buildings else dataclasses.replace(site, buildings=())
-            depth = max(self._data.settings.rt.max_depth, 1) if buildings else 1
+            site = self._site(model.relief)
+            site = site if model.buildings else dataclasses.replace(site, buildings=())
+            depth = max(self._data.settings.rt.max_depth, 1) if model.buildings else 1
+            depth = 0 if direct else depth
             series = self._series[index]
             link, poses, sources = series.replayed.link, self._poses(series, "ignored"), self._sources(series, site)
             if series.replayed.tower_m is not None:

@@ -500,12 +500,12 @@ def _scores_checked(data: FlightData, series: RssSeries, result: RssResult, acco
     if result.further.trained_on or not len(error):
         return
     account.add("RMSE", abs(len(error) - result.score.n), f"the number of samples of {where}")
-    low, high = (round(end / settings.advanced.step_db) for end in settings.span_db)
-    mean = -float(error.mean()) / settings.advanced.step_db
+    low, high = (round(end / 0.1) for end in settings.span_db)
+    mean = -float(error.mean()) / 0.1
     steps = (math.floor(mean), math.floor(mean) + 1)
     nearest = min(steps, key=lambda n: (round(abs(n - mean), 9), abs(n)))
-    offset = min(max(nearest, low), high) * settings.advanced.step_db
-    account.add("offset", abs(offset - result.score.offset_db), where, spare=1e-3 * settings.advanced.step_db)
+    offset = min(max(nearest, low), high) * 0.1
+    account.add("offset", abs(offset - result.score.offset_db), where, spare=1e-3 * 0.1)
     rmse = math.sqrt(float(((error + result.score.offset_db) ** 2).mean()))
     account.add("RMSE", abs(rmse - result.score.rmse_db), where)
 

@@ -160,7 +160,7 @@ def test_the_page_lists_every_knob_with_its_default() -> None:
     assert f"floor_db: {log.floor_db:g}" in first
     assert f"antenna_height_m: {config.GroundNode(track=log).antenna_height_m:g}}}" in first
     listed = parse_yaml("flight: f\nlogs: [{path: a}]\n" + block, config.FlightFile)
-    for knobs in (listed.rt.advanced, listed.rss.advanced, listed.rank.advanced):
+    for knobs in (listed.rt.advanced, listed.rss.advanced):
         assert knobs == type(knobs)()
         assert knobs.model_fields_set == set(type(knobs).model_fields)
 

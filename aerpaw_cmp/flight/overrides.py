@@ -57,8 +57,6 @@ def _set(plain: dict[str, Any], key: str, value: Any) -> None:
             continue
         if not isinstance(level, dict):
             raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which is a value")
-        if part not in level and part in level.get("advanced", ()):
-            level = level["advanced"]  # as dotted keys of 0.3 name it
         if part not in level:
             _add(plain, level, parts[:depth], part, key)
         if last:

@@ -10,13 +10,11 @@ import json
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
     Field,
-    ModelWrapValidatorHandler,
-    PrivateAttr,
     field_validator,
     model_validator,
 )
@@ -42,49 +40,13 @@ from ..site.antenna.learned import BAND, Named, find_named, read_table
 from ..site.antenna.sphere_pattern import read_sphere_csv
 
 if TYPE_CHECKING:
-    from typing_extensions import Self
+    pass
 
 Positive = Annotated[float, Field(gt=0)]
 
 
-class GroupedSettings(StrictModel):
-    """Settings whose numerical knobs stand below ``advanced``.
-
-    Files of 0.3 and before have the knobs beside it, and keys that are gone: both are read, and :func:`load_flight`
-    says so.
-    """
-
-    WITHOUT_EFFECT: ClassVar[tuple[str, ...]] = ()
-    """Keys of earlier releases that do nothing any more."""
-    _old: dict[str, str] = PrivateAttr(default_factory=dict)
-    """What became of the keys that stand at their old place, by key."""
-
-    @classmethod
-    def refuse_gone(cls, data: Mapping[str, Any]) -> None:
-        """Raise a ValueError where a key of an earlier release asks for what is gone."""
-
-    @model_validator(mode="wrap")
-    @classmethod
-    def _from_old_places(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
-        if not isinstance(data, dict):
-            return handler(data)
-        group = cls.model_fields.get("advanced")
-        knobs = set(type(group.default).model_fields) if group else set()
-        cls.refuse_gone(data)
-        moved = {key: data[key] for key in data if key in knobs}
-        without_effect = [key for key in data if key in cls.WITHOUT_EFFECT]
-        content = {key: value for key, value in data.items() if key not in moved and key not in without_effect}
-        if moved:
-            content["advanced"] = {**dict(data.get("advanced") or {}), **moved}
-        settings = handler(content)
-        settings._old = {key: f"write advanced.{key}" for key in moved} | dict.fromkeys(without_effect, "has no effect")
-        return settings
-
-
-class AntennaSettings(GroupedSettings):
+class AntennaSettings(StrictModel):
     """An element pattern: a named model, or a measured file."""
-
-    WITHOUT_EFFECT = ("installed_db",)
 
     model: Literal["iso", "dipole", "tr38901", "file", "gain_grid", "sphere"] = "iso"
     file: str | None = None
@@ -92,15 +54,6 @@ class AntennaSettings(GroupedSettings):
     """Name of the grid inside a .mat file."""
     polarised: bool = True
     """Use both field components of a text pattern; false: its total gain on the element's slant."""
-
-    @classmethod
-    def refuse_gone(cls, data: Mapping[str, Any]) -> None:
-        """Gain per azimuth written by hand."""
-        if data.get("installed_db"):
-            raise ValueError(
-                "installed_db is gone: 'aerpaw-cmp calibrate' writes the gain of mast and airframe as an antenna file "
-                "(model: sphere, file: ...)"
-            )
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
@@ -310,11 +263,8 @@ class PlanSettings(StrictModel):
     fading_db: Annotated[float, Field(ge=0)] = 0.0
     """Standard deviation of log-normal fading."""
     fading_correlation_s: Positive = 2.0
-    noise_floor_db: float | None = None
-    """Logged RSS does not fall below this (before the offset)."""
     clock_shift_s: dict[str, float] = {}
     """By tower: the radio clock shows this much more than the telemetry clock."""
-    clock_drift_s_per_s: dict[str, float] = {}
     bad_lines: Annotated[int, Field(ge=0)] = 0
     """Deliberately broken lines per log file."""
     rank_k: Positive = 100.0
@@ -393,13 +343,8 @@ class AdvancedRt(StrictModel):
     """Of compiled code; by default the cores this process may use. Results do not depend on it."""
 
 
-class RtSettings(GroupedSettings):
+class RtSettings(StrictModel):
     """Settings of the replay of the flight."""
-
-    WITHOUT_EFFECT = (
-        "batch", "interactions", "paired_foliage", "power_cut_db", "relevance_db", "scattering_coefficient",
-        "visibility",
-    )  # fmt: skip
 
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
@@ -417,30 +362,20 @@ class RtSettings(GroupedSettings):
     audit_links: Annotated[int, Field(ge=0)] = 200
     advanced: AdvancedRt = AdvancedRt()
 
-    @classmethod
-    def refuse_gone(cls, data: Mapping[str, Any]) -> None:
-        """Interactions that Sionna's search added to RSS."""
-        if data.get("interactions", ["reflection"]) != ["reflection"]:
-            raise ValueError("interactions of Sionna are no longer added to RSS; use diffraction: edges")
 
-
-# The offset grid of a report may not be longer: 100 dB in steps of 0.0001 dB.
-MAXIMUM_OFFSETS = 1_000_000
+# Offsets are tried by 0.1 dB.
+_WIDEST_DB = 100_000.0
 
 
 class AdvancedRss(StrictModel):
     """Knobs of the level's comparison that few flights need."""
 
-    step_db: Positive = 0.1
-    """Step of the offset search."""
     lag_window_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     """Largest clock difference that is looked for."""
 
 
-class RssSettings(GroupedSettings):
+class RssSettings(StrictModel):
     """Settings of the comparison of RSS."""
-
-    WITHOUT_EFFECT = ("bootstrap", "reference_powers")
 
     span_db: tuple[float, float] = (-50.0, 50.0)
     lag: Literal["off", "estimate", "apply"] | float = "estimate"
@@ -453,21 +388,10 @@ class RssSettings(GroupedSettings):
     """Samples below this height are left out of the comparison, and counted."""
     advanced: AdvancedRss = AdvancedRss()
 
-    @property
-    def offsets(self) -> dict[str, Any]:
-        """Step and span of the search for an offset, as options of :mod:`aerpaw_cmp.compare.offset`."""
-        return {"step_db": self.advanced.step_db, "span_db": self.span_db}
-
     @model_validator(mode="after")
     def _window_of_local_mean(self) -> RssSettings:
         if self.field == "local_mean" and self.window_s <= 0:
             raise ValueError("field: local_mean averages over window_s, which must be above 0")
-        return self
-
-    @model_validator(mode="after")
-    def _countable(self) -> RssSettings:
-        if (self.span_db[1] - self.span_db[0]) / self.advanced.step_db > MAXIMUM_OFFSETS:
-            raise ValueError(f"span_db over advanced.step_db gives more than {MAXIMUM_OFFSETS} offsets to try")
         return self
 
     @field_validator("span_db")
@@ -475,17 +399,12 @@ class RssSettings(GroupedSettings):
     def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
         if not value[0] < value[1]:
             raise ValueError("span_db must be [lowest, highest]")
+        if value[1] - value[0] > _WIDEST_DB:
+            raise ValueError(f"span_db is wider than {_WIDEST_DB:g} dB: more than 1000000 offsets to try")
         return value
 
 
-class AdvancedRank(StrictModel):
-    """Knobs of the rank's comparison that few flights need."""
-
-    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
-    """Resamples for its intervals."""
-
-
-class RankSettings(GroupedSettings):
+class RankSettings(StrictModel):
     """Settings of the comparison of rank."""
 
     tower: str = "LW1"
@@ -494,7 +413,6 @@ class RankSettings(GroupedSettings):
     """Samples below this height are left out, and counted (the README of a data set may ask for it)."""
     receiver: str | None = None
     """Receiver file of ``calibrate``: gives a probability of each rank."""
-    advanced: AdvancedRank = AdvancedRank()
 
     @field_validator("k")
     @classmethod
@@ -504,10 +422,8 @@ class RankSettings(GroupedSettings):
         return value
 
 
-class ReportSettings(GroupedSettings):
+class ReportSettings(StrictModel):
     """Contents of the report."""
-
-    WITHOUT_EFFECT = ("speed_table", "audit")
 
     title: str | None = None
     waypoints: list[Waypoint] = []
@@ -535,11 +451,6 @@ class FlightFile(StrictModel):
     rss: RssSettings = RssSettings()
     rank: RankSettings = RankSettings()
     report: ReportSettings = ReportSettings()
-
-    def old_keys(self) -> list[str]:
-        """Fate of each key that stands at the place of an earlier release."""
-        groups = {"rt": self.rt, "rss": self.rss, "rank": self.rank, "report": self.report}
-        return [f"{name}.{key} ({fate})" for name, group in groups.items() for key, fate in group._old.items()]
 
     @model_validator(mode="before")
     @classmethod
@@ -596,10 +507,6 @@ def load_flight(path: str | Path, learned: Path | None = None) -> FlightFile:
         Unknown or duplicate keys, wrong types, wrong ranges: with the line and the nearest valid key.
     """
     settings = load_yaml(Path(path), FlightFile)
-    if old := settings.old_keys():
-        note = f"keys of an earlier release: {'; '.join(old)}. The next release refuses them."
-        flight = settings.flight.model_copy(update={"notes": [*settings.flight.notes, note]})
-        settings = settings.model_copy(update={"flight": flight})
     if learned is not None:
         knowledge = load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True)
         settings = _joined(settings, files_of(knowledge, learned.parent, learned), learned)

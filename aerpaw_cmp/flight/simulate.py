@@ -365,15 +365,12 @@ class FlightSimulator:
         level = level + correlated_noise(
             self.generator, len(level), plan.fading_db, plan.rss_interval_s, plan.fading_correlation_s
         )
-        if plan.noise_floor_db is not None:
-            level = np.fmax(level, plan.noise_floor_db)
         out_of_coverage = ~np.isfinite(level) | (level < _LOWEST_DBM)
-        shift = plan.clock_shift_s.get(log.node, 0.0) + plan.clock_drift_s_per_s.get(log.node, 0.0) * time_s
+        shift = plan.clock_shift_s.get(log.node, 0.0)
         self.truth_["rss"].setdefault(log.node, {})[log.channel] = {
             "offset_db": offset,
             "fading_db": plan.fading_db,
             "clock_shift_s": plan.clock_shift_s.get(log.node, 0.0),
-            "clock_drift_s_per_s": plan.clock_drift_s_per_s.get(log.node, 0.0),
             "samples": len(level),
             "out_of_coverage": int(out_of_coverage.sum()),
         }

@@ -24,7 +24,7 @@ def test_a_key_changes_itself_alone(settings: FlightFile) -> None:
     assert after["rt"].pop("max_depth") == 1 != before["rt"].pop("max_depth")
     assert before == after
     assert overridden(settings, {}) is settings
-    assert overridden(settings, {"rt.maximum_gap_s": 7.0}).rt.advanced.maximum_gap_s == 7.0  # as 0.3 named it
+    assert overridden(settings, {"rt.advanced.maximum_gap_s": 7.0}).rt.advanced.maximum_gap_s == 7.0
     log = overridden(settings, {"logs.1.channel": "Z"})
     assert [entry.channel for entry in log.logs] == [
         "Z" if k == 1 else entry.channel for k, entry in enumerate(settings.logs)

@@ -220,7 +220,7 @@ def test_json_is_alone_on_standard_output(folder: Path, capsys: pytest.CaptureFi
         ({"settings": {"x": {"rt.max_depth.y": 1}}}, "which is a value"),
         ({"settings": {"x": {"logs.7.path": "y"}}}, "no element '7'"),
         ({"settings": {"x": {"link.rss.towr.yaw_deg": 10}}}, "tower"),
-        ({"held_out": {"fit": {YAW: [0, 10]}}}, "held_out is gone"),
+        ({"settigns": {}}, "did you mean 'settings'"),
         ({"flights": ["first.yaml", "first.yaml"]}, "two flights are named 'first'"),
         ({"calibratoin": "all"}, "calibration"),
         ({"keep": "s3://lab/season"}, "object stores are not written any more"),
@@ -384,7 +384,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
             settings["flight"]["plan"]["waypoints"].reverse()
         track = {**settings["logs"][0], "path": f"rank_{name}/vehicleOut.txt"}  # not over that of the other tests
         settings["logs"] = [track, {"path": f"{name}/ri.csv", "reader": "quectel_ri", "node": "LW1"}]
-        settings["rank"] = {"k": [10, 100], "advanced": {"bootstrap": 20}}
+        settings["rank"] = {"k": [10, 100]}
         simulate(write_yaml(folder / f"rank_{name}.yaml", settings))
     campaign = result(folder, "ranks", "--export", "geojson", flights=["rank_first.yaml", "rank_second.yaml"])
     points = json.loads((folder / "ranks_out" / "exports" / "rank.geojson").read_text(encoding="utf-8"))["features"]

@@ -42,7 +42,7 @@ def flight(
     logs += [rank_log(folder, *rank)] if rank is not None else []
     return write_yaml(folder / "flight.yaml", {
         "flight": "hard", "site": {"file": "lake_wheeler", "without_buildings": True}, "timezone": "America/New_York",
-        "logs": logs, "rank": {"advanced": {"bootstrap": 50}},
+        "logs": logs,
         "rt": {"engine": "image", "max_depth": 1, "audit_links": 0, "attitude": "logged", **(rt or {})},
         "rss": {"span_db": [-100, 100], "lag": "off", **(rss_keys or {})}, **keys,
     })  # fmt: skip

@@ -153,7 +153,7 @@ def key_of(settings: FlightFile, flight: Path) -> str:
 
 def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path) -> None:
     """One task of the sample flight, through the store and back: the same numbers, the same nested records."""
-    changes = {"rss.lag": "off", "rss.advanced.lag_window_s": 10, "rank.advanced.bootstrap": 10}
+    changes = {"rss.lag": "off", "rss.advanced.lag_window_s": 10}
     task = Task(flight, "f", "as written", changes, None)
     (first,) = run_tasks([task], InProcess(), keep=tmp_path)
     assert first.failure is None

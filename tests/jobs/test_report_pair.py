@@ -14,7 +14,7 @@ from tests.simulated import planned, simulate, write_yaml
 SETTINGS = planned(
     "small", [(-40, 10, 30), (-250, 60, 30), (-100, 260, 40)], {"LW1": {"USRP1": 12.3}}, ranks=True,
     plan={"rss_interval_s": 0.5, "rank_k": 10, "rank_interval_s": 1.0, "fading_db": 1.0, "fading_correlation_s": 0.5},
-    rt={"max_depth": 1, "audit_links": 0}, rank={"k": [10, 100], "advanced": {"bootstrap": 20}},
+    rt={"max_depth": 1, "audit_links": 0}, rank={"k": [10, 100]},
     report={"export": ["kmz"]},
 )  # fmt: skip
 

@@ -15,9 +15,9 @@ from pydantic import Field
 from ...common.errors import InputError, UsageError
 from ...common.jsonable import named
 from ...common.stages import Stages
-from ...common.yamlfile import load_yaml
+from ...common.yamlfile import StrictModel, load_yaml
 from ...flight.overrides import Overrides, overridden
-from ...flight.settings import FlightFile, GroupedSettings, load_flight
+from ...flight.settings import FlightFile, load_flight
 from ...report.content.campaign import CampaignData, Failure
 from ..options import DEFAULT, RunOptions
 from ..tasks.workers import open_workers
@@ -29,7 +29,7 @@ from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, t
 _AS_WRITTEN = "as written"
 
 
-class CampaignFile(GroupedSettings):
+class CampaignFile(StrictModel):
     """The whole campaign.yaml."""
 
     campaign: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
@@ -42,12 +42,6 @@ class CampaignFile(GroupedSettings):
     """Folder of outcomes, against this file's."""
     export: list[str] = Field(default_factory=list)
     """Formats of the samples: those of ``report.export`` of a flight."""
-
-    @classmethod
-    def refuse_gone(cls, data: Mapping[str, Any]) -> None:
-        """Raise a ValueError where a campaign of 0.3 asks for a fit."""
-        if "held_out" in data:
-            raise ValueError("held_out is gone: list the values under settings, or learn with aerpaw-cmp calibrate")
 
 
 def load_campaign(path: Path) -> CampaignFile:

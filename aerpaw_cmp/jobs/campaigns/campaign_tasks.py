@@ -331,7 +331,7 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mappin
             for name in result.baselines
             if name in result.further.compared_with
         },
-        **rules.offsets,
+        span_db=rules.span_db,
         measured_db=measured_db,
         time_s=_elapsed_s(result.time),
         start_ns=_start_ns(result.time),

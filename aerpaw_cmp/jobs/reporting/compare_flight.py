@@ -150,7 +150,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         levels.simulated_db,
         baselines=case.simple,
         posed=levels.posed,
-        **settings.offsets,
+        span_db=settings.span_db,
     )
     if clock is not None:
         also = ("lag_s",) if clock.result.applied == APPLIED else ()
@@ -272,7 +272,7 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
     if not wild.any():
         return score.rmse_db
     inliers_db = np.where(wild, np.nan, levels.measured_db)
-    return offsets.grid_offset(inliers_db, levels.simulated_db, **settings.offsets).rmse_db
+    return offsets.grid_offset(inliers_db, levels.simulated_db, span_db=settings.span_db).rmse_db
 
 
 def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
@@ -343,7 +343,7 @@ def _averaged(
     }
     averages = {f"{w:g} s": partial(rss.local_mean_db, series.time, window_s=w) for w in _AVERAGING_WINDOWS_S}
     averages |= {name: partial(rss.stretch_means_db, rss.stretches(position_m, m)) for name, m in lengths.items()}
-    fits = rss.averaged_fits(levels.measured_db, simulations, averages, **settings.offsets)
+    fits = rss.averaged_fits(levels.measured_db, simulations, averages, span_db=settings.span_db)
     return {
         name: {
             average: Fit(offset_db=fit.offset_db, rmse_db=fit.rmse_db, n=fit.n if average in lengths else None)
@@ -410,7 +410,7 @@ def _censored(settings: RssSettings, levels: Levels) -> offsets.Censored | None:
         # the weakest level itself is a measurement: it is no "below"
         measured_floor_db=floors[0] - 1e-9,
         simulated_floor_db=floors[1] - 1e-9,
-        **settings.offsets,
+        span_db=settings.span_db,
     )
 
 
@@ -566,7 +566,6 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         settings.k,
         time_s=(series.time[rows] - series.time[:1]) / np.timedelta64(1, "s") if len(rows) else None,
         sinr_db=sinr_db,
-        replicates=max(settings.advanced.bootstrap, 1),
     )
     sigma, towers = ranks.singular_values(h), tower_places(replayed)
     probability, forecast, trained = _receiver_forecast(data, series)
@@ -617,8 +616,7 @@ def _receiver_forecast(
     if receiver.knows(samples):  # nothing is scored where it was fitted
         return probability, None, samples.logs
     constant = receiver.mixture.members[0].constant
-    replicates = max(data.settings.rank.advanced.bootstrap, 2)
-    return probability, score_forecast(samples.rank, probability, decided, constant, replicates=replicates), ()
+    return probability, score_forecast(samples.rank, probability, decided, constant), ()
 
 
 def _repeated_rank(

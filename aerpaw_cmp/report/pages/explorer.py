@@ -13,6 +13,7 @@ import numpy as np
 from ...common.jsonable import named
 from ...common.units import BoolArray, IntArray, spread_out
 from ...compare.level.rss import RssComparison
+from ...compare.offset import STEP_DB
 from ...compare.result import ModelLevel, RankResult, RssResult
 from ...logs.records import has_wall_clock
 from ...site.scenes import drawn_buildings
@@ -49,7 +50,7 @@ def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
     rss_settings = data.settings.get("rss") or {}
     return {
         "start": str(start.astype("datetime64[ms]")) if has_wall_clock(start) else "",
-        "step_db": rss_settings.get("advanced", {}).get("step_db", 0.1),
+        "step_db": STEP_DB,
         "span_db": list(rss_settings.get("span_db", (-50.0, 50.0))),
         "rss": [_rss(p, data.sources.get(p.name), start, arrays, share(len(p.time))) for p in data.rss],
         "rank": [_rank(p, start, arrays, share(len(p.time))) for p in data.rank],

@@ -75,6 +75,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(rel|relative|elapsed) ?time( ms| s)?$", r"^time boot ms$", r"^(epoch|unix)( ms| s)?$", r"^utc$", r"^t$",
     )),
     Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$",)),
+    Quantity("zone", "time", (r"^(time ?)?zone$", r"^tz$", r"^utc offset$", r"^gmt offset$")),
     Quantity("gps_week", "time", (r"^gps ?(week|wk)( number| no)?$", r"^gwk$", r"^(week|wn)( number| no)?$")),
     Quantity("gps_seconds", "time", (
         r"^(gps ?)?(tow|i ?tow|seconds? of week|week seconds?|sow|gps seconds?)( s| ms)?$", r"^gms$",
@@ -136,7 +137,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(transmitter|tx)( ?(id|name|channel|port|antenna))?$",
     )),
     Quantity("network", "identity", (
-        r"^(operator|carrier|network operator|operator ?name|network name|provider|plmn|sim)( ?(id|code|slot|no))?$",
+        r"^(network )?(operator|carrier|provider|plmn|sim)( ?(id|name|code|slot|no))?$", r"^network name$",
         r"^mcc$", r"^mnc$", r"^mcc ?mnc$", r"^(receiver|rx|cent(er|re)|carrier) freq(uency)?( hz| mhz| ghz)?$",
     )),
     Quantity("technology", "cell", (

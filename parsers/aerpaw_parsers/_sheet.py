@@ -335,7 +335,7 @@ class _Table:
     def __init__(self, names: list[str], comments: list[int]) -> None:
         self.names, self.comments = names, comments
         self._place = list(range(len(names)))  # column of each field under the present header
-        self._known, self._turned = set(names), False
+        self._known, self._turned = {dictionary.plain(name) for name in names}, False
         self._row: list[int] = []
         self._cells: list[list[str]] = []
         self._short: list[tuple[int, list[str]]] = []
@@ -344,7 +344,11 @@ class _Table:
     def add(self, i: int, fields: list[str]) -> None:
         """The next line that is not blank."""
         width = len(self._place)
-        if fields[0].strip() in self._known and self._is_header([text.strip() for text in fields]):
+        if (
+            fields[0][:1].isalpha()
+            and dictionary.plain(fields[0]) in self._known
+            and self._is_header([text.strip() for text in fields])
+        ):
             self.comments.append(i)  # files joined by hand
         elif len(fields) == width:
             self._row.append(i)
@@ -357,17 +361,20 @@ class _Table:
 
     def _is_header(self, texts: list[str]) -> bool:
         """Check whether a line is a header, of the same columns or of others; what follows is read under it."""
-        known = sum(text in self._known or dictionary.meaning(text) is not None for text in texts if text)
+        known = sum(
+            dictionary.plain(text) in self._known or dictionary.meaning(text) is not None for text in texts if text
+        )
         numbers = any(np.isfinite(_number(text)[0]) for text in texts)
         if numbers or 2 * known <= sum(bool(text) for text in texts):
             return False
-        spare = {name: [j for j, other in enumerate(self.names) if other == name] for name in texts}
+        plain = [dictionary.plain(name) for name in self.names]
+        spare = {name: [j for j, other in enumerate(plain) if other == dictionary.plain(name)] for name in texts}
         self._place, self._turned = [], True
         for name in texts:
             if not spare[name]:
                 spare[name].append(len(self.names))
                 self.names.append(name)
-                self._known.add(name)
+                self._known.add(dictionary.plain(name))
             self._place.append(spare[name].pop(0))
         return True
 
@@ -491,8 +498,9 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     zone = _stamps.header_zone(sheet.names[column], dictionary.in_brackets(sheet.names[column])[1])
     if day is not None and not zone:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
-    if "/" in zone:
-        options, zone = replace(options, timezone=zone), ""
+    if (beside := None if mapped else sheet.find("zone")) is not None:
+        zones = [text if _stamps.is_zone(text) else "" for text in sheet.texts(beside)]
+        texts = [f"{time} {own}".strip() for time, own in zip(texts, zones, strict=True)]
     gps = re.search(r"\bgps", name) is not None
     return _stamps.read(texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps)
 

@@ -196,7 +196,8 @@ class _Zones:
 
     def offset(self, written: str | None, date: str) -> str:
         """``+hh:mm`` of a zone at a date, ``Z``, or an empty text where nothing says it."""
-        word = (written or self._header).strip().upper()
+        word = (written or self._header).strip()
+        word = word if "/" in word else word.upper()
         if not word:
             return ""
         key = word, date[:10]
@@ -215,8 +216,8 @@ class _Zones:
             return ""  # no date of the calendar: who reads it says so
         if self._own and (here := _at(self._own, moment)) is not None and here[1] == word:
             return _shown(here[0])
-        if word in _WITH_SUMMER:
-            here = _at(_WITH_SUMMER[word], moment)
+        if word in _WITH_SUMMER or "/" in word:
+            here = _at(_WITH_SUMMER.get(word, word), moment)
             return "" if here is None else _shown(here[0])
         if word not in _STANDARD:
             raise UsageError(
@@ -275,7 +276,12 @@ def header_zone(name: str, brackets: str) -> str:
     words = re.split(r"[^A-Za-z0-9+]+", name)
     if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu"}:
         return "UTC"
-    return next((word for word in words if word in _HOURS or word in _STANDARD), "")
+    return next((word for word in words if word in _HOURS or word in _STANDARD or word in _WITH_SUMMER), "")
+
+
+def is_zone(text: str) -> bool:
+    """Check whether a cell is a time zone that can stand behind a time."""
+    return re.fullmatch(_NAMED_ZONE, text) is not None
 
 
 def read(

@@ -143,9 +143,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     for device, of_device, table in _sheet.parts(rows, sheet, "device"):
         for label, part, cells in _divided(of_device, table, kind):
             values = {name: _values(cells, column, name, options) for name, column in where.items()}
+            about = _lifted(part, cells, values, where)
             odd = np.any([_odd(cells, where[name]) for name in _VALUE[kind]], axis=0)
             words = "_".join(word for word in (options.channel or kind, label, device) if word)
-            streams.append(_stream(part, kind, words, values, odd, options.unit or unit))
+            streams.append(_stream(part, kind, words, values, odd, options.unit or unit, about))
         if kind == "rss":
             streams.append(_track(of_device, table, where, device))
     rows.warnings += sheet.unread()
@@ -164,8 +165,9 @@ def _divided(rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind) -> list[tuple[st
 
 
 def _stream(
-    rows: _rows.Rows, kind: Kind, name: str, values: dict[str, AnyArray], odd: BoolArray, unit: str
-) -> Stream | None:
+    rows: _rows.Rows, kind: Kind, name: str, values: dict[str, AnyArray], odd: BoolArray, unit: str,
+    about: _pose.Height,
+) -> Stream | None:  # fmt: skip
     """Columns by the rules of the kind, and the attributes that go with them; words in place of numbers are flagged."""
     options, flag = rows.options, rows.flag.copy()
     _lines.add_flag(flag, odd, "no_number")
@@ -196,7 +198,19 @@ def _stream(
         values |= {key: np.where(lost, np.nan, values[key]) for key in place}
         for key in {"fix", "satellites"} & set(values):
             values[key] = np.where(np.isnan(values[key]), -1, values[key]).clip(-1, 255).astype(np.int64)
-    return rows.stream(kind, name, values, flag=flag, about=attributes)
+    return rows.stream(kind, name, values, flag=flag, about=attributes | about)
+
+
+def _lifted(rows: _rows.Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:
+    """Bring altitudes that the file's own header puts above sea level or the ellipsoid to heights above take-off."""
+    height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where else None
+    if height is None or height.quantity.datum not in ("sea level", "ellipsoid") or "latitude_deg" not in values:
+        return {}
+    rows.height_from = "written"
+    values["altitude_m"], about = _pose.above_takeoff(
+        rows, values, height.quantity.datum, np.isnan(values["latitude_deg"])
+    )
+    return about
 
 
 def _track(rows: _rows.Rows, sheet: _sheet.Sheet, where: dict[str, int], device: str) -> Stream | None:
@@ -205,12 +219,7 @@ def _track(rows: _rows.Rows, sheet: _sheet.Sheet, where: dict[str, int], device:
     if not {"latitude_deg", "longitude_deg"} <= set(names):
         return None
     values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in names}
-    about: _pose.Height = {}
-    height = sheet.meanings[where["altitude_m"]] if "altitude_m" in where else None
-    if height is not None and height.quantity.datum in ("sea level", "ellipsoid"):
-        rows.height_from = "written"
-        lost = np.isnan(values["latitude_deg"])
-        values["altitude_m"], about = _pose.above_takeoff(rows, values, height.quantity.datum, lost)
+    about = _lifted(rows, sheet, values, where)
     flag = _lines.flags(len(rows))
     name = f"vehicle_{device}" if device else "vehicle"
     return rows.stream("telemetry", name, values, flag=flag, source="mapped columns", about=about)

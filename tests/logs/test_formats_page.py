@@ -15,6 +15,7 @@ BEGIN, END = "<!-- dictionary: made by tests/logs/test_formats_page.py -->\n", "
 EXAMPLES = {
     "time": ("Timestamp", "datetime(utc)", "abs_time", "gps_time", "measured_at", "time_boot_ms"),
     "date": ("Date", "CUSTOM.date [local]"),
+    "zone": ("Timezone", "UTC offset"),
     "gps_week": ("GPS week", "GWk"),
     "gps_seconds": ("GPS seconds", "tow", "GMS"),
     "latitude_deg": ("lat", "OSD.latitude", "GPS Latitude"),

@@ -232,6 +232,18 @@ COUSINS: dict[str, tuple[str, Right]] = {
     "a second header under --map": (
         table("t;p;q", f"{EPOCH};{{l}};1") + table("t;q;p", "174956401{i};1;{l}"),
         Right({"rss": {"rss_db": down(-90, 4) * 2}}, maps=("t=time", "p=rss_db"), options={"unit": "dBm"})),
+    "a second header in capitals": (
+        table("time,pci,rsrp", f"{EPOCH},11,{{l}}") + table("TIME,RSRP,PCI", "174956401{i},{l},12"),
+        Right({**LEVELS, "pci12": {"rss_db": down(-90, 4)}})),
+    "networks by their name": (alternating("Network Operator Name", "AT&T", "Verizon"), Right({"pci11_AT_T": HIGH, "pci11_Verizon": LOW})),
+    "zone of a header by its place": phone("Time (America/New_York)", LOCAL, timezone="Asia/Tokyo"),
+    "zone of a header with its summer": phone("Time (ET)", LOCAL, timezone="Asia/Tokyo"),
+    "zone in a column of its own": (
+        table("Time,Timezone,pci,rsrp", f"{LOCAL},EDT,11,{{l}}"), Right(LEVELS, options={"timezone": "Asia/Tokyo"})),
+    "above sea level under --map": (
+        table("t,lat,lon,alt_msl", f"{EPOCH},{PLACE},{{a}}"),
+        Right({"telemetry": {"altitude_m": [0, 1, 2, 3]}}, said="sea level",
+              maps=("t=time", "lat=latitude_deg", "lon=longitude_deg", "alt_msl=altitude_m"))),
     "networks by their code": (alternating("mnc", 410, 260), Right({"pci11_mnc410": HIGH, "pci11_mnc260": LOW})),
     "SIMs": (alternating("SIM slot", 1, 2), Right({"pci11_sim1": HIGH, "pci11_sim2": LOW})),
     "two networks that nothing tells apart": (alternating("note", "", ""), Right({"pci11": {"rss_db": [-70, -110] * 4}}, said="alternate")),

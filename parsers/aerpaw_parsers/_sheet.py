@@ -344,11 +344,9 @@ class _Table:
     def add(self, i: int, fields: list[str]) -> None:
         """The next line that is not blank."""
         width = len(self._place)
-        if (
-            fields[0][:1].isalpha()
-            and dictionary.plain(fields[0]) in self._known
-            and self._is_header([text.strip() for text in fields])
-        ):
+        begins = fields[0].strip()
+        may_be = not begins[:1].isdigit() and dictionary.plain(begins) in self._known
+        if may_be and self._is_header([text.strip() for text in fields]):
             self.comments.append(i)  # files joined by hand
         elif len(fields) == width:
             self._row.append(i)

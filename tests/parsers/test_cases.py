@@ -233,7 +233,7 @@ COUSINS: dict[str, tuple[str, Right]] = {
         table("t;p;q", f"{EPOCH};{{l}};1") + table("t;q;p", "174956401{i};1;{l}"),
         Right({"rss": {"rss_db": down(-90, 4) * 2}}, maps=("t=time", "p=rss_db"), options={"unit": "dBm"})),
     "a second header in capitals": (
-        table("time,pci,rsrp", f"{EPOCH},11,{{l}}") + table("TIME,RSRP,PCI", "174956401{i},{l},12"),
+        table("@time,pci,rsrp", f"{EPOCH},11,{{l}}") + table("@TIME,RSRP,PCI", "174956401{i},{l},12"),
         Right({**LEVELS, "pci12": {"rss_db": down(-90, 4)}})),
     "networks by their name": (alternating("Network Operator Name", "AT&T", "Verizon"), Right({"pci11_AT_T": HIGH, "pci11_Verizon": LOW})),
     "zone of a header by its place": phone("Time (America/New_York)", LOCAL, timezone="Asia/Tokyo"),

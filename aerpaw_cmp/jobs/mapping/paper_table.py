@@ -52,7 +52,7 @@ def _setup(outcome: MapOutcome) -> dict[str, str]:
     west, east, south, north = site.area_m
     columns, rows = len(grid.east_m), len(grid.north_m)
     buildings = sorted({building.material for building in site.buildings}) or ["none"]
-    tree = site.trees
+    tree = site.under("opaque").trees
     return {
         "carrier": f"{s.carrier_hz / 1e9:g} GHz",
         "base_height": ", ".join(f"{h:g} m" for h in sorted({t.antenna_height_m for t in site.towers.values()})),

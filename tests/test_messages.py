@@ -89,7 +89,7 @@ COMMANDS = {
 
 
 # Commands of each kind of fault that the page shows.
-ON_PAGE = 5
+ON_PAGE = 3
 
 # Command lines that meet each kind of fault.
 KINDS = {kind: lines.split("; ") for kind, lines in COMMANDS.items()}

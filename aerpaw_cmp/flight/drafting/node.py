@@ -168,7 +168,8 @@ class Placer:
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:
             return Placement(towers[best].name, None, f"the levels fit {towers[best].name} best: is it this tower?")
-        known = {name: self._taught_odds(track, name, gains) - estimate.anywhere for name, gains in taught.items()}
+        of_site = {name: gains for name, gains in taught.items() if name in self.site.towers}  # else of a node
+        known = {name: self._taught_odds(track, name, gains) - estimate.anywhere for name, gains in of_site.items()}
         likeliest = max(known, key=lambda name: known[name], default="")
         if likeliest and known[likeliest] >= CONTRADICTED:
             about = f"the levels fit {likeliest} with the antennas that flights taught: is it this tower?"

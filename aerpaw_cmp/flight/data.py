@@ -408,15 +408,15 @@ def gather(
     )
     _check_place(data, [(path, stream) for path, stream in telemetry[:1]])
     _check_overlap(data)
-    if track is not None:
-        on_track = [
-            (f"{kind} of {s.tower} {s.channel}" if isinstance(s, RssSeries) else f"{kind} of {s.tower}", s.time)
-            for kind, s in data.series
-            if isinstance(s, RssSeries) or s.position_m is None
-        ]
-        asked = doubts(track, telemetry[0][1], on_track)
-        data = dataclasses.replace(data, doubts=asked, warnings=(*data.warnings, *(f"{text}." for text in asked)))
+    asked = () if track is None else doubts(track, telemetry[0][1], _times_on_track(data))
+    data = dataclasses.replace(data, doubts=asked, warnings=(*data.warnings, *(f"{text}." for text in asked)))
     return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
+
+
+def _times_on_track(data: FlightData) -> list[tuple[str, Times]]:
+    """Names and times of the series whose positions are those of the telemetry."""
+    levels = [(f"RSS of {series.tower} {series.channel}", series.time) for series in data.rss]
+    return levels + [(f"rank of {series.tower}", series.time) for series in data.rank if series.position_m is None]
 
 
 def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> FlightData:

@@ -185,7 +185,7 @@ class _Climber:
         rungs = self._lines()
         models: list[Model | None] = [None] * len(rungs)
         best = Model()
-        for stage in (self._antennas, self._ground, self._buildings, self._edges, self._trees, self._relief):
+        for stage in (self._antennas, self._ground, self._buildings, self._trees, self._edges, self._relief):
             for model in stage(best):
                 if model not in models:
                     models.append(model)

@@ -25,8 +25,8 @@ import aerpaw_cmp
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.bench import random_scene
-from aerpaw_cmp.propagation import compiled
-from aerpaw_cmp.propagation.arrays import Poses, single_element
+from aerpaw_cmp.propagation.geometry.arrays import Poses, single_element
+from aerpaw_cmp.propagation.native import compiled
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
 

@@ -47,7 +47,7 @@ from aerpaw_cmp.common import native  # noqa: E402
 from aerpaw_cmp.common.errors import AerpawCmpError  # noqa: E402
 from aerpaw_cmp.common.geodesy import SiteFrame  # noqa: E402
 from aerpaw_cmp.logs import limits  # noqa: E402
-from aerpaw_cmp.logs.chunks import whole_lines  # noqa: E402
+from aerpaw_cmp.logs.files.chunks import whole_lines  # noqa: E402
 from aerpaw_cmp.logs.readers import HEAD_BYTES, Reader, ReadOptions, catalogue  # noqa: E402
 from aerpaw_cmp.logs.records import ReadResult  # noqa: E402
 
@@ -444,7 +444,7 @@ def _map(path: Path) -> Any:
 
 
 def _dem(path: Path) -> Any:
-    from aerpaw_cmp.site.dem import read_dem
+    from aerpaw_cmp.site.relief.dem import read_dem
 
     return read_dem(path, FRAME, crs="local" if path.suffix == ".asc" else None)
 
@@ -475,15 +475,15 @@ def _gzipped(data: bytes, index: int) -> bool:
 
 
 def _path_cache(data: bytes, _index: int) -> bool:
-    from aerpaw_cmp.propagation.engines import PathCache
+    from aerpaw_cmp.propagation.engine.engines import PathCache
 
     with _file(data, "key.npz") as path:
         return PathCache(path.parent).load(path.stem) is not None
 
 
 def _cache_entry() -> bytes:
-    from aerpaw_cmp.propagation.engines import PathCache
-    from aerpaw_cmp.propagation.paths import PathSet
+    from aerpaw_cmp.propagation.engine.engines import PathCache
+    from aerpaw_cmp.propagation.geometry.paths import PathSet
 
     with tempfile.TemporaryDirectory() as folder:
         paths = PathSet(

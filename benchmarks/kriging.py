@@ -23,7 +23,7 @@ import numpy as np
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.kriging import OrdinaryKriging
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL as PAPER
-from aerpaw_cmp.propagation import compiled
+from aerpaw_cmp.propagation.native import compiled
 
 M, RADIUS_M, SEED = 20, 150.0, 20250210
 FIELDS = 27  # 9 altitudes x 3 K

@@ -118,8 +118,8 @@ def planted(fault: Fault) -> Iterator[None]:
 
 def _forget() -> None:
     """What the package keeps of the functions as they were."""
-    from aerpaw_cmp.propagation import faces
     from aerpaw_cmp.propagation.field import foliage
+    from aerpaw_cmp.propagation.geometry import faces
 
     faces._faces.cache_clear()
     foliage._last_index.clear()

@@ -83,7 +83,7 @@ def faces(count: int) -> dict[str, float]:
     from shapely.geometry import box
 
     from aerpaw_cmp.jobs.bench import random_scene
-    from aerpaw_cmp.propagation.arrays import Poses
+    from aerpaw_cmp.propagation.geometry.arrays import Poses
     from aerpaw_cmp.propagation.replay import replay
     from aerpaw_cmp.site.site import Building
 

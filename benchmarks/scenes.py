@@ -31,8 +31,8 @@ from typing import Any
 import numpy as np
 from shapely.geometry import box
 
+from aerpaw_cmp.propagation.geometry.paths import Links
 from aerpaw_cmp.propagation.options import Run
-from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.search.beams import grow_paths
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene, read_scene
@@ -144,7 +144,7 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
 def prism_row(task: dict[str, Any]) -> dict[str, Any]:
     """A town of prisms through the replay's own search."""
     from aerpaw_cmp.common.geodesy import SiteFrame
-    from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+    from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
     from aerpaw_cmp.propagation.scene import Scene
     from aerpaw_cmp.propagation.search import prisms
     from aerpaw_cmp.site.site import Building, Site, Tower

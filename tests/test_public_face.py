@@ -150,7 +150,7 @@ def test_a_replayed_flight_has_levels_matrices_and_paths_that_agree(flight: ac.F
 
 
 def test_trace_takes_plain_positions_and_equals_free_space_where_nothing_reflects() -> None:
-    from aerpaw_cmp.propagation.arrays import single_element
+    from aerpaw_cmp.propagation.geometry.arrays import single_element
 
     link = ac.Link(3.4e9, {"LW1": single_element()}, single_element(), transmit_power_dbm=40.0)
     site = ac.load_site("lake_wheeler")

@@ -18,15 +18,15 @@ from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..logs.ingest import Held, IngestedFile, ingest, read_log
 from ..logs.records import Stream
-from ..propagation.arrays import Link
+from ..propagation.geometry.arrays import Link
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
-from .lock import lock_of
 from .pose.cross_checks import doubts
 from .pose.heights import at_height, lacks_height, raised
 from .pose.hour_shift import clock_trap
 from .pose.track import Track, TrackPoses, good_positions
-from .scored import scored_rows, unscored
+from .rows.lock import lock_of
+from .rows.scored import scored_rows, unscored
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, SiteChoice
 
 Times = NDArray[np.datetime64]

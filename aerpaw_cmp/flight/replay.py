@@ -13,21 +13,21 @@ from ..common.jsonable import named
 from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
-from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.drivers.moving import loss_along, replay_moving
 from ..propagation.drivers.parts import replay_in_parts
 from ..propagation.edges import diffracted
 from ..propagation.field.sum import Fields, channel_matrices
+from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
+from ..propagation.geometry.paths import Faces, PathSet, RowsT
 from ..propagation.options import Engine, Estimate, Field, Loss, Run, Search
-from ..propagation.paths import Faces, PathSet, RowsT
 from ..propagation.replay import PER_LINK, Replay, replay
 from ..site.site import Site
 from .data import FlightData, RssSeries, Times, rank_positions
-from .learned_gain import LearnedGain, learned_gain
-from .lock import LOCK_FLOOR_DB
-from .losses import path_loss
+from .gains.learned_gain import LearnedGain, learned_gain
+from .gains.losses import path_loss
 from .pose.clock import Along, ClockChannel, ClockEstimate, judge_clock
 from .pose.track import TrackPoses, nanoseconds
+from .rows.lock import LOCK_FLOOR_DB
 from .settings import RtSettings
 from .training import learned_here
 

@@ -26,7 +26,7 @@ from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wave
 from ..common.yamlfile import StrictModel, load_yaml
 from ..logs.readers import ReadOptions
 from ..logs.records import Kind
-from ..propagation.arrays import (
+from ..propagation.geometry.arrays import (
     Array,
     Link,
     Pattern,

@@ -26,7 +26,7 @@ from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
 from ..common.yamlfile import dump_yaml
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
-from ..propagation.arrays import Poses, rotation_from_aircraft
+from ..propagation.geometry.arrays import Poses, rotation_from_aircraft
 from ..site.site import Site
 from .data import site_place
 from .pose.track import interpolated

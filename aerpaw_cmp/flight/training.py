@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.provenance import union
-from ..propagation.arrays import Link
+from ..propagation.geometry.arrays import Link
 from ..site.antenna.antennas import MeasuredPattern
 from ..site.antenna.learned import folder_of
 from ..site.antenna.sphere_pattern import LEARNED, SpherePattern, read_sphere_csv

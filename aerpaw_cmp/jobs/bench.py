@@ -19,9 +19,15 @@ from ..common.jsonable import named
 from ..common.stages import Progress, begin_peak, peak_mib, silent
 from ..common.units import ComplexArray, FloatArray, IntArray, spread_out, wavelength_m
 from ..compare.rank import channel_rank
-from ..propagation.arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from ..propagation.check.audit import RANK_K, Difference, compare
 from ..propagation.field.sum import mean_pair_power, rss_dbm
+from ..propagation.geometry.arrays import (
+    Link,
+    Poses,
+    rotation_from_aircraft,
+    tower_comparison_array,
+    uav_comparison_array,
+)
 from ..propagation.options import Run, Search
 from ..propagation.replay import Replay, replay
 from ..propagation.scene import Scene

@@ -23,7 +23,7 @@ from ..flight.replay import FlightReplay, Replayed, replay_flight
 from ..flight.settings import FlightFile, load_flight, with_learned
 from ..logs.flight_file import is_flight_file
 from ..logs.ingest import ingest
-from ..propagation.paths import PathSet
+from ..propagation.geometry.paths import PathSet
 from ..propagation.replay import require_xarray
 from ..site.site import Site
 from .options import RunOptions

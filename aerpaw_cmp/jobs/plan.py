@@ -18,8 +18,8 @@ from ..common.stages import Stages
 from ..common.units import spread_out
 from ..flight.data import FlightData
 from ..flight.settings import FlightFile, RtSettings
-from ..propagation.arrays import Link, Poses
-from ..propagation.engines import estimate_search
+from ..propagation.engine.engines import estimate_search
+from ..propagation.geometry.arrays import Link, Poses
 from ..propagation.options import Search
 from ..site.site import Site
 from ..site.siteyaml import load_site

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from ..logs.checksums import Record
+from ..logs.files.checksums import Record
 from .serial.modem import RI_QUERY
 from .session import TapStatus
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from ..common.errors import InputError, UsageError
-from ..logs.checksums import Record
+from ..logs.files.checksums import Record
 from .feed import Feed
 from .record.log import BadLine, read_log
 from .stop import Stop

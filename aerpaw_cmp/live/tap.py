@@ -19,7 +19,7 @@ from typing import Any
 
 from .. import __version__
 from ..common.errors import InputError
-from ..logs.checksums import SCHEMA, Record
+from ..logs.files.checksums import SCHEMA, Record
 from .predict import Asked, Predict, PredictionWorker
 from .record.log import Clock, SegmentLog, boot_id, clock_synchronised
 from .record.writer import LogWriter

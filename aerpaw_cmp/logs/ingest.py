@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.errors import InputError, UsageError, one_line, parsing
-from . import archives, chunks, packed
+from .files import archives, chunks, packed
+from .files.pieces import join
 from .flight_file import IngestedFile, read_flight
-from .pieces import join
 from .readers import DEEP_BYTES, HEAD_BYTES, Reader, ReadOptions, by_name, claims, identify
 from .records import ReadResult, has_wall_clock
 

@@ -95,7 +95,7 @@ class Reader:
         Is a file of a few records a piece of the log that its folder holds?
     read_pieces : callable, optional
         ``read_pieces(pieces, options) -> ReadResult``: the same from pieces of whole lines, for logs larger than
-        memory; see :mod:`aerpaw_cmp.logs.chunks`.
+        memory; see :mod:`aerpaw_cmp.logs.files.chunks`.
     clock_from, height_from : str
         ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.origins`. A stream's own
         attribute of that name wins.

@@ -38,7 +38,7 @@ from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
-from ..propagation.compiled import triangles_for
+from ..propagation.native.compiled import triangles_for
 from . import neighbours as choose
 
 # Correlation as a function of distance [m]; vectorised.

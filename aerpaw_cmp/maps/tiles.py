@@ -21,7 +21,7 @@ import numpy as np
 import shapely
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, wavelength_m
-from ..propagation.faces import corners, site_faces
+from ..propagation.geometry.faces import corners, site_faces
 from ..propagation.scene import REACH_M
 from ..propagation.search.mirror import Mirrors
 from ..site.site import Site, Tower

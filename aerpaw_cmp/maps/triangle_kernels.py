@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray
-from ..propagation.numba_options import kernel
+from ..propagation.native.numba_options import kernel
 from .kriging import SOUND_CONDITION
 
 

@@ -22,14 +22,14 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, wavelength_m
-from .arrays import Array, Link, Poses
-from .faces import inside
 from .field import dyads
 from .field.fresnel import FaceMaterials, coefficients
 from .field.geometry import parts_of, pattern_fields, plain, rows_of
 from .field.sum import Fields, Further, parts_between_poses
 from .field.wedge import wedge
-from .paths import Faces, PathSet, legs
+from .geometry.arrays import Array, Link, Poses
+from .geometry.faces import inside
+from .geometry.paths import Faces, PathSet, legs
 from .scene import Scene
 from .search.mirror import scene_tolerance_m
 from .search.occlusion import Occlusion

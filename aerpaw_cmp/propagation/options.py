@@ -11,7 +11,7 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
-from .paths import PathSet
+from .geometry.paths import PathSet
 
 Engine = Literal["image", "sionna"]
 Samples = int | Literal["auto"]

@@ -12,11 +12,11 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.units import BoolArray, ComplexArray, FloatArray, wavelength_m
 from ..site.site import Site
-from .arrays import Link, Poses
-from .engines import chosen_samples, path_cache, search_or_read
+from .engine.engines import chosen_samples, path_cache, search_or_read
 from .field.sum import Fields, Further, channel_matrices, mean_pair_power, rss_dbm
+from .geometry.arrays import Link, Poses
+from .geometry.paths import Faces, PathSet, Surfaces, legs
 from .options import Field, Run, Search
-from .paths import Faces, PathSet, Surfaces, legs
 from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.terrain import on_terrain

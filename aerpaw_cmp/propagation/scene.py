@@ -14,10 +14,10 @@ from ..site.mesh_scenes.mitsuba import TriangleScene
 from ..site.meshes import building_mesh
 from ..site.scenes import added
 from ..site.site import Site
-from . import compiled
-from .arrays import Link, Poses
-from .faces import inside_solids, site_faces
-from .paths import Faces, Links, Surfaces
+from .geometry.arrays import Link, Poses
+from .geometry.faces import inside_solids, site_faces
+from .geometry.paths import Faces, Links, Surfaces
+from .native import compiled
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,8 @@ from ..common.errors import UsageError
 from ..common.units import unmasked
 from ..site.site import Site
 from ..site.siteyaml import load_site
-from .arrays import Link, Poses
 from .edges import diffracted
+from .geometry.arrays import Link, Poses
 from .options import Engine, Field, Loss, Samples, Search
 from .replay import Replay, replay
 

@@ -15,9 +15,9 @@ from shapely.geometry import Polygon
 from ..common.geodesy import SiteFrame
 from ..common.htmltable import html_table
 from ..common.units import FloatArray
-from .dem import Dem
-from .heights import VerticalDatum
 from .mesh_scenes.mitsuba import TriangleScene
+from .relief.dem import Dem
+from .relief.heights import VerticalDatum
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,13 +24,13 @@ from ..common.geodesy import SiteFrame
 from ..common.jsonable import named
 from ..common.units import FloatArray
 from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines, nearest
-from .dem import Dem, read_dem
-from .heights import Height, HeightReference, VerticalDatum
 from .materials import material
 from .mesh_scenes.mitsuba import TriangleScene
+from .relief.dem import Dem, read_dem
+from .relief.heights import Height, HeightReference, VerticalDatum
+from .relief.surface import Surface, surface_through
 from .scenes import placed_scene, without_traps
 from .site import Building, Forest, Geofence, Site, Tower, Trees
-from .surface import Surface, surface_through
 from .trees import Distribution, TreeSizes, join_trees, place_trees, trees_at, wanted_trees
 
 # Sites that come with the package, by name.

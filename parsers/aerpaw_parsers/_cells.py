@@ -9,9 +9,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Attribute, Stream
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 # Radio accesses; the first where a log does not say.

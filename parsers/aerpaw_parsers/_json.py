@@ -11,9 +11,9 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray, IntArray
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
 
 # What Android and modems write for 'unavailable'.
 _SENTINELS = (2147483647, -2147483648, 9223372036854775807, 268435455, 65535)

@@ -7,8 +7,8 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.text import rows as _rows
 
 _NAMES = b"index rel_time_ms lat lon alt_m pdsch_rank nr_rsrp_dbm nr_sinr_db wb_cqi".split()
 HEADER = re.compile(rb"(?:\xef\xbb\xbf)?" + b", ?".join(_NAMES) + rb"[ \t]*\r?")

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Attribute, Stream
+from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _sheet

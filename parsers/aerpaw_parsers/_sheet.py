@@ -18,9 +18,9 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import ReadOptions, dictionary
 
 from . import _stamps

@@ -16,9 +16,9 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import lines as _lines
 
 _NAMED_ZONE = r"Z|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
 _ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
@@ -306,7 +306,7 @@ def read(
     Returns
     -------
     clock : str
-        As :func:`aerpaw_cmp.logs.rows.times` takes it.
+        As :func:`aerpaw_cmp.logs.text.rows.times` takes it.
     cells : array, shape (n,)
         Bytes or floats for it.
     warnings : list of str

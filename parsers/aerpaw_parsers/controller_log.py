@@ -12,11 +12,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray, IntArray
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
+from aerpaw_cmp.logs.text import textlog as _text
 
 _STAMP = rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] "
 _VALUE = re.compile(_STAMP + rb"(?P<tower>\d{1,2}):(?P<snr>" + _lines.NUMBER + rb"|nan|-?inf)[ \t]*\r?$", re.MULTILINE)

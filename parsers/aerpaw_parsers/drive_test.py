@@ -15,9 +15,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _cells, _nemo, _pose, _sheet, aadm_snr, own_csv, pose_csv, quectel_ri

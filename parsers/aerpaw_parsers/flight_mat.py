@@ -22,13 +22,13 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.matfile import MAGIC as _MAGIC
 from aerpaw_cmp.logs.matfile import MAGIC_73, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
 
 _TELEMETRY = {
     "mX": "longitude_deg",

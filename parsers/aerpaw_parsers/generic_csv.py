@@ -14,10 +14,10 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, Stream
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _pose, _sheet

@@ -11,9 +11,9 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common import kml
-from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.text import lines as _lines
 
 from . import _sheet, drive_test
 

@@ -11,10 +11,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
+from aerpaw_cmp.logs.text import textlog as _text
 
 from . import _cells, _nemo
 

@@ -12,11 +12,11 @@ import numpy as np
 
 from aerpaw_cmp.common import kml
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.jumps import FASTEST_MPS
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _cells, _pose

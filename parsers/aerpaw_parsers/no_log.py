@@ -10,10 +10,10 @@ from collections.abc import Callable
 
 from aerpaw_cmp.common import kml
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.matfile import MAGIC
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.text import lines as _lines
 
 from . import (
     cell_search,

@@ -17,11 +17,11 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, IntArray
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
 
 _CSI = re.compile(rb"\bUE (?P<rnti>[0-9a-f]{4}):? [^\n]{0,120}?\bCQI (?P<cqi>\d{1,2}),? RI (?P<ri>\d{1,2}),? PMI")
 _LEVEL = re.compile(

@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _sheet

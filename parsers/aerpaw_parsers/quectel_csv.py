@@ -30,11 +30,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, ReadResult, Stream
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
 
 _C = rb"[^,\n]{0,80}"
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'

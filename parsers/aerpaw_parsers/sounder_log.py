@@ -16,12 +16,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import make_frames as _frames
-from aerpaw_cmp.logs.chunks import Column
+from aerpaw_cmp.logs.files.chunks import Column
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import KEPT_REJECTED, ReadResult, Stream
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import make_frames as _frames
 
 _STAMP = 28  # "[" + 26 characters of time + "]"
 _VALUE = 16  # od -f: right-aligned in sixteen columns

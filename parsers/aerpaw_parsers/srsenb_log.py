@@ -17,10 +17,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import rows as _rows
+from aerpaw_cmp.logs.text import textlog as _text
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(

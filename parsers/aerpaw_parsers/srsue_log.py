@@ -14,10 +14,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import rows as _rows
+from aerpaw_cmp.logs.text import textlog as _text
 
 from . import _cells
 

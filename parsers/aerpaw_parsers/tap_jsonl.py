@@ -27,10 +27,10 @@ import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray
-from aerpaw_cmp.logs import make_frames
-from aerpaw_cmp.logs.checksums import SCHEMA, decode_record
+from aerpaw_cmp.logs.files.checksums import SCHEMA, decode_record
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, Kind, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.text import make_frames
 
 from . import _json
 

@@ -11,11 +11,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
-from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
+from aerpaw_cmp.logs.text import textlog as _text
 
 _N = _lines.NUMBER
 _PLACE = rb'\{"lat": ?(?P<lat>%s), ?"lon": ?(?P<lon>%s), ?"alt": ?(?P<alt>%s)\}' % (_N, _N, _N)

@@ -21,11 +21,11 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.logs import clocks as _time
-from aerpaw_cmp.logs import lines as _lines
-from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.text import clocks as _time
+from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs.text import rows as _rows
 
 _NUMBERS = (
     "index", "longitude", "latitude", "altitude", "pitch", "yaw", "roll", "north", "east", "down", "fix", "satellites"

@@ -87,7 +87,7 @@ def _mesh(path):
 
 def _elevation(path):
     from aerpaw_cmp.common.geodesy import SiteFrame
-    from aerpaw_cmp.site.dem import read_dem
+    from aerpaw_cmp.site.relief.dem import read_dem
 
     return read_dem(path, SiteFrame(35.7, -78.7), crs="EPSG:4326")
 

@@ -16,7 +16,7 @@ from aerpaw_cmp.compare.level import rss
 from aerpaw_cmp.compare.statistics import intervals as statistics
 from aerpaw_cmp.maps import grid, variogram
 from aerpaw_cmp.maps.biexponential import fit_biexponential
-from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
 
 ROOM = Path(ac.__file__).parent
 CHANCE = np.random.default_rng(5)

@@ -20,7 +20,7 @@ from aerpaw_cmp.compare.learning.calibration import (
 )
 from aerpaw_cmp.compare.level.detection import floored_fit
 from aerpaw_cmp.compare.level.rss import local_mean_db
-from aerpaw_cmp.propagation.arrays import rotation_from_yaw_pitch_roll
+from aerpaw_cmp.propagation.geometry.arrays import rotation_from_yaw_pitch_roll
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
 RECIPE = Recipe(model=MODEL, rotation=lambda *_: np.eye(3), mount=False)

@@ -197,7 +197,7 @@ def test_unknown_positions_belong_to_the_stretch_before():
 
 
 def test_link_geometry_in_the_antenna_frames():
-    from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
+    from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
 
     tower = np.array([10.0, -5.0, 10.0])
     rng = np.random.default_rng(9)

@@ -5,7 +5,7 @@ import pytest
 
 from aerpaw_cmp.compare.learning.locate import locate
 from aerpaw_cmp.flight.drafting.node import ListedPlace, Placer, listed_places
-from aerpaw_cmp.flight.lock import LOCK_FLOOR_DB
+from aerpaw_cmp.flight.rows.lock import LOCK_FLOOR_DB
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.site.siteyaml import load_site

@@ -6,7 +6,7 @@ import pytest
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare.level.detection import BASE_S
-from aerpaw_cmp.flight.lock import lock_of, may_lose_lock
+from aerpaw_cmp.flight.rows.lock import lock_of, may_lose_lock
 from aerpaw_cmp.logs.records import Stream
 
 

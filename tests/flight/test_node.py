@@ -14,7 +14,7 @@ from aerpaw_cmp.compare.learning.locate import LevelModel, NodeEstimate, level_t
 from aerpaw_cmp.flight.drafting import node
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
 from aerpaw_cmp.flight.drafting.node import listed_places
-from aerpaw_cmp.flight.learned_gain import sphere_angles
+from aerpaw_cmp.flight.gains.learned_gain import sphere_angles
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.logs.ingest import IngestedFile, ingest
 from aerpaw_cmp.logs.readers import ReadOptions

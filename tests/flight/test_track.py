@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.flight.pose import track as tracks
 from aerpaw_cmp.flight.pose.track import Track, good_positions
-from aerpaw_cmp.propagation.arrays import rotation_from_aircraft
+from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
 from tests.real_logs import dataset12
 
 FRAME = SiteFrame(35.7275, -78.6960)

@@ -13,7 +13,7 @@ from aerpaw_cmp.flight import replay as replays
 from aerpaw_cmp.flight.pose import track as tracks
 from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, RtSettings
 from aerpaw_cmp.jobs.reporting import audit_flight
-from aerpaw_cmp.propagation.arrays import Poses
+from aerpaw_cmp.propagation.geometry.arrays import Poses
 
 FRAME = SiteFrame(35.7275, -78.696)
 

@@ -10,7 +10,7 @@ from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term
 from aerpaw_cmp.compare.learning.calibration import Observed, Recipe
 from aerpaw_cmp.flight.data import RssSeries
 from aerpaw_cmp.flight.drafting.remembered import lock_elsewhere
-from aerpaw_cmp.flight.lock import LOCK_FLOOR_DB
+from aerpaw_cmp.flight.rows.lock import LOCK_FLOOR_DB
 from aerpaw_cmp.flight.settings import LinkSettings
 from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks, lock_words
 from aerpaw_cmp.site.antenna.learned import Entry, LearnedLock, LearnedSeries, read_learned, remember

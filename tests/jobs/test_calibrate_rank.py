@@ -17,7 +17,7 @@ from aerpaw_cmp.jobs.learning.calibrate_rank import (
     features_of,
     read_receiver,
 )
-from aerpaw_cmp.propagation.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
 
 SETTINGS = RankFitSettings(
     yaw_step_deg=45, uav_slant_deg=[[45, -45, -45, 45], [0, 90, 0, 90]], ground=[0.2], thin=2, members=3

@@ -19,7 +19,7 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series, compare_rss_series, pairs_of
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.foliage_notes import foliage_notes
-from aerpaw_cmp.propagation.arrays import rotation_from_aircraft
+from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
 from aerpaw_cmp.report.content.flight_parts import rank_warnings, rss_warnings, track_of
 from aerpaw_cmp.report.words.flight import instants
 from tests.simulated import write_yaml

@@ -20,11 +20,11 @@ from aerpaw_cmp.jobs.mapping.paper_table import paper_rows
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import RATIO_LIMIT_DB, rank_of_singular_values
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL
-from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.field.foliage import CrownIndex, Opaque, foliage_loss_db
+from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.site.dem import Dem
+from aerpaw_cmp.site.relief.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 from tests.jobs.sent_by_pickle import SentByPickle
 from tests.json_page import unlisted

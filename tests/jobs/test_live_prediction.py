@@ -19,7 +19,7 @@ from aerpaw_cmp.jobs.live.live_twin import LiveTwin
 from aerpaw_cmp.live.follow import TelemetrySample
 from aerpaw_cmp.live.serial.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.logs.writers import format_vehicle_out
-from aerpaw_cmp.propagation.arrays import Poses
+from aerpaw_cmp.propagation.geometry.arrays import Poses
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 

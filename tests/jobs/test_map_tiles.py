@@ -11,7 +11,7 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.mapping import coverage_map as mapping
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.tiles import PLANES, Budget, Reach, Tiling
-from aerpaw_cmp.propagation.arrays import Link, single_element
+from aerpaw_cmp.propagation.geometry.arrays import Link, single_element
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search.occlusion import Occlusion
 from aerpaw_cmp.propagation.trace import trace

@@ -25,7 +25,7 @@ from aerpaw_cmp.jobs.prediction.against import score_against
 from aerpaw_cmp.jobs.prediction.predict import write_maps
 from aerpaw_cmp.jobs.prediction.sources import named_flights
 from aerpaw_cmp.jobs.prediction.where import TargetOptions, Targets, find_targets
-from aerpaw_cmp.propagation.arrays import Link, single_element
+from aerpaw_cmp.propagation.geometry.arrays import Link, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.figures.flight_against import against_specs
 from aerpaw_cmp.report.kit.page import coded

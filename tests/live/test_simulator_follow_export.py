@@ -14,7 +14,7 @@ from aerpaw_cmp.live.record.export import COLUMNS, export_csv
 from aerpaw_cmp.live.serial import simulator
 from aerpaw_cmp.live.serial.modem import decode
 from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator, load_recorded, load_source
-from aerpaw_cmp.logs.checksums import encode_record
+from aerpaw_cmp.logs.files.checksums import encode_record
 from aerpaw_cmp.logs.readers import Reader
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.logs.records import ReadResult, Stream

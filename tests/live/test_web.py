@@ -23,7 +23,7 @@ from aerpaw_cmp.live.predict import RunningInterval
 from aerpaw_cmp.live.session import TapStatus
 from aerpaw_cmp.live.stop import Stop
 from aerpaw_cmp.live.web import Address, Limits, WebServer
-from aerpaw_cmp.logs.checksums import encode_record
+from aerpaw_cmp.logs.files.checksums import encode_record
 from benchmarks.tap_common import damaged
 from tests.live.terminals import until
 

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.logs import chunks
+from aerpaw_cmp.logs.files import chunks
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import by_name
 from aerpaw_cmp.logs.records import KEPT_REJECTED

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError
-from aerpaw_cmp.logs import packed
+from aerpaw_cmp.logs.files import packed
 from aerpaw_cmp.logs.ingest import ingest, sniffers_of
 from aerpaw_cmp.logs.readers import ReadOptions
 from tests.frames import assert_same_result

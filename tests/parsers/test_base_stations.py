@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_parsers import _json
 from tests.parsers import samples
 

@@ -5,7 +5,7 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs.text import lines as _lines
 
 
 @pytest.mark.parametrize("space", [b" ", b"\t", b"\x0b", b"\x0c", b"\r \r", b" \t \x0b"])

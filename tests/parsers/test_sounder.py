@@ -4,8 +4,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_parsers import sounder_log
 from tests.parsers.samples import OPTIONS
 

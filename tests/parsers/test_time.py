@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.text import clocks as _time
 
 NEW_YORK = "America/New_York"
 

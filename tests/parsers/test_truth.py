@@ -14,7 +14,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.logs.chunks import whole_lines
+from aerpaw_cmp.logs.files.chunks import whole_lines
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 from tests.frames import assert_same_result

@@ -12,7 +12,7 @@ import pytest
 
 from aerpaw_cmp.flight.pose.track import Track
 from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings
-from aerpaw_cmp.propagation.arrays import (
+from aerpaw_cmp.propagation.geometry.arrays import (
     Array,
     Link,
     Poses,

@@ -7,14 +7,6 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.level.field_difference import FieldAudit
-from aerpaw_cmp.propagation.arrays import (
-    Isotropic,
-    Link,
-    Poses,
-    linear_array,
-    rotation_from_yaw_pitch_roll,
-    single_element,
-)
 from aerpaw_cmp.propagation.check import audit as audit_module
 from aerpaw_cmp.propagation.check import explain, reference
 from aerpaw_cmp.propagation.check.audit import Second, _spread, compare, extra_rows
@@ -34,8 +26,16 @@ from aerpaw_cmp.propagation.check.field_audit import (
 )
 from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
 from aerpaw_cmp.propagation.field.sum import channel_matrices
+from aerpaw_cmp.propagation.geometry.arrays import (
+    Isotropic,
+    Link,
+    Poses,
+    linear_array,
+    rotation_from_yaw_pitch_roll,
+    single_element,
+)
+from aerpaw_cmp.propagation.geometry.paths import path_lengths
 from aerpaw_cmp.propagation.options import Search
-from aerpaw_cmp.propagation.paths import path_lengths
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search.merging import _labels

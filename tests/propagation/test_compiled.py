@@ -21,13 +21,14 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.bench import random_scene
-from aerpaw_cmp.propagation import compiled, engines
 from aerpaw_cmp.propagation import replay as replay_module
-from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
-from aerpaw_cmp.propagation.faces import site_faces
+from aerpaw_cmp.propagation.engine import engines
 from aerpaw_cmp.propagation.field import sum as field_sum
+from aerpaw_cmp.propagation.geometry.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.geometry.faces import site_faces
+from aerpaw_cmp.propagation.geometry.paths import Links
+from aerpaw_cmp.propagation.native import compiled
 from aerpaw_cmp.propagation.options import Run
-from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import mirror as image
@@ -383,7 +384,7 @@ def test_a_fault_planted_in_a_file_that_a_kernel_takes_in_reaches_compiled_code(
 
 @needs_numba
 def test_every_file_that_kernels_take_in_names_the_folder_of_compiled_code():
-    from aerpaw_cmp.propagation.compiled import ROOM, SOURCES
+    from aerpaw_cmp.propagation.native.compiled import ROOM, SOURCES
 
     known = {(ROOM / name).resolve() for name in SOURCES}
     holders = {path for path in ROOM.rglob("*.py") if "\n@kernel\n" in path.read_text(encoding="utf-8")}
@@ -515,7 +516,7 @@ class _Ends:
 
 @pytest.mark.parametrize("kind", DAMAGED)
 def test_a_damaged_entry_of_compiled_code_is_compiled_again(kind, tmp_path, monkeypatch):
-    numba_options = pytest.importorskip("aerpaw_cmp.propagation.numba_options")
+    numba_options = pytest.importorskip("aerpaw_cmp.propagation.native.numba_options")
     monkeypatch.setattr(numba_options, "FOLDER", tmp_path)
 
     def run():

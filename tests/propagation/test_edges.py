@@ -12,11 +12,11 @@ from shapely.geometry import Point, Polygon, box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
-from aerpaw_cmp.propagation.arrays import Array, Isotropic, Link, Poses, single_element
 from aerpaw_cmp.propagation.check.explain import further_path_lines
 from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
 from aerpaw_cmp.propagation.edges import EdgePaths, Edges, diffracted, over_edges, wedge_axes
-from aerpaw_cmp.propagation.faces import site_faces
+from aerpaw_cmp.propagation.geometry.arrays import Array, Isotropic, Link, Poses, single_element
+from aerpaw_cmp.propagation.geometry.faces import site_faces
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import Replay, replay
 from aerpaw_cmp.propagation.scene import Scene

@@ -10,9 +10,9 @@ pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.check.obstacles import why_not_there
-from aerpaw_cmp.propagation.engines import estimate_search
+from aerpaw_cmp.propagation.engine.engines import estimate_search
+from aerpaw_cmp.propagation.geometry.paths import Links
 from aerpaw_cmp.propagation.options import Run, Search
-from aerpaw_cmp.propagation.paths import Links
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import beams, prisms

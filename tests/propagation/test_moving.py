@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.drivers import moving
 from aerpaw_cmp.propagation.drivers.moving import replay_moving, site_with_tower_at
 from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
 from aerpaw_cmp.propagation.field.sum import channel_matrices
+from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site

@@ -7,7 +7,10 @@ import pytest
 import shapely
 
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation.arrays import (
+from aerpaw_cmp.propagation.check import field_audit, reference
+from aerpaw_cmp.propagation.field import dyads, sum
+from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
+from aerpaw_cmp.propagation.geometry.arrays import (
     Array,
     linear_array,
     rotation_from_aircraft,
@@ -15,9 +18,6 @@ from aerpaw_cmp.propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.check import field_audit, reference
-from aerpaw_cmp.propagation.field import dyads, sum
-from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
 from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import occlusion as solids

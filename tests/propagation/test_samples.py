@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.propagation.paths import Faces, PathSet
+from aerpaw_cmp.propagation.geometry.paths import Faces, PathSet
 from aerpaw_cmp.propagation.search.samples import FIRST, MOST, enough_samples, spread
 
 FACES = Faces(np.eye(3), np.zeros(3), ("concrete",) * 3, ("a", "b", "c"))

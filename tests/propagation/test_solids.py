@@ -3,8 +3,8 @@ import pytest
 import shapely
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.propagation.faces import inside_solids, site_faces
-from aerpaw_cmp.propagation.paths import Links
+from aerpaw_cmp.propagation.geometry.faces import inside_solids, site_faces
+from aerpaw_cmp.propagation.geometry.paths import Links
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search.mirror import find_paths
 from aerpaw_cmp.propagation.search.occlusion import Occlusion, convex_pieces

@@ -10,11 +10,11 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.bench import random_scene
-from aerpaw_cmp.propagation.arrays import Array, linear_array, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.check import field_audit
 from aerpaw_cmp.propagation.check.field_audit import per_pair
 from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
 from aerpaw_cmp.propagation.edges import over_edges
+from aerpaw_cmp.propagation.geometry.arrays import Array, linear_array, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import sionna

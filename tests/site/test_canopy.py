@@ -9,8 +9,8 @@ from shapely.geometry import Point, box
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.imports.canopy import building_heights, canopy_of
+from aerpaw_cmp.site.relief.dem import Dem
 from aerpaw_cmp.site.siteyaml import load_site
 
 FRAME = SiteFrame(35.7, -78.7)

@@ -7,7 +7,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.site.dem import EARTH_RADIUS_M, Dem, read_dem
+from aerpaw_cmp.site.relief.dem import EARTH_RADIUS_M, Dem, read_dem
 from aerpaw_cmp.site.siteyaml import load_site
 
 FRAME = SiteFrame(35.7275, -78.696)
@@ -86,7 +86,7 @@ def test_batches_agree_with_single_links(monkeypatch: pytest.MonkeyPatch) -> Non
     target = np.column_stack([random.uniform(-900, 900, (200, 2)) * [1, 0.5], random.uniform(-11, 5, 200)])
     together = dem.clear(source, target)
     assert 20 < together.sum() < 180
-    monkeypatch.setattr("aerpaw_cmp.site.dem._SAMPLES_AT_ONCE", 1)
+    monkeypatch.setattr("aerpaw_cmp.site.relief.dem._SAMPLES_AT_ONCE", 1)
     np.testing.assert_array_equal(dem.clear(source, target), together)
 
 

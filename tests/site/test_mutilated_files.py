@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.antenna.antennas import read_gain_grid, read_pattern_text
-from aerpaw_cmp.site.dem import read_dem
 from aerpaw_cmp.site.imports.footprints import import_footprints
+from aerpaw_cmp.site.relief.dem import read_dem
 from aerpaw_cmp.site.siteyaml import load_site
 
 FRAME = SiteFrame(35.7275, -78.696)

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.flight.learned_gain import learned_gain, pair_db
-from aerpaw_cmp.propagation.arrays import Array, Link, Poses, rotation_from_aircraft, single_element
+from aerpaw_cmp.flight.gains.learned_gain import learned_gain, pair_db
+from aerpaw_cmp.propagation.geometry.arrays import Array, Link, Poses, rotation_from_aircraft, single_element
 from aerpaw_cmp.site.antenna.pair_gain import PairGain
 from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, read_sphere_csv, sphere_csv
 

@@ -11,7 +11,7 @@ from shapely.geometry import Point
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.site.heights import Height, HeightReference, VerticalDatum
+from aerpaw_cmp.site.relief.heights import Height, HeightReference, VerticalDatum
 from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, SceneModel, SiteModel, build_site, load_site
 
 MINIMAL = """\

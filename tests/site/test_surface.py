@@ -7,8 +7,8 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.site.relief.surface import surface_through
 from aerpaw_cmp.site.siteyaml import known_grounds, load_site
-from aerpaw_cmp.site.surface import surface_through
 
 FRAME = SiteFrame(35.7275, -78.696)
 REACH = (-500.0, 500.0, -500.0, 500.0)

@@ -17,9 +17,9 @@ from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
 from ...site.antenna.antennas import MeasuredPattern
 from ...site.site import Site
-from ..learned_gain import sphere_angles
+from ..gains.learned_gain import sphere_angles
 from ..pose.track import Track
-from ..scored import unscored
+from ..rows.scored import unscored
 
 # Log odds from which on a tower of the site is taken; the surveyed flights give 2.8 to 4.7, others at most 1.0.
 _TOWER_ODDS = 2.0

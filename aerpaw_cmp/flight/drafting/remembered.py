@@ -17,7 +17,7 @@ from ...compare.learning.locate import LevelModel
 from ...site.antenna import learned
 from ...site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
 from ..data import FlightData, RssSeries, site_place
-from ..learned_gain import pair_and_sd_db, sphere_angles
+from ..gains.learned_gain import pair_and_sd_db, sphere_angles
 from ..marks import among
 from ..settings import FlightFile, check_logs, with_learned
 from .node import Taught

@@ -12,7 +12,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 
 from ...common.units import AnyArray
-from ...logs import archives
+from ...logs.files import archives
 from ...logs.ingest import IngestedFile, read_bytes
 from ...logs.jumps import jumps_of
 from ...logs.records import Stream, has_wall_clock

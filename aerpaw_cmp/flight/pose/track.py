@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ...common.geodesy import SiteFrame
 from ...common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
-from ...propagation.arrays import rotation_from_aircraft
+from ...propagation.geometry.arrays import rotation_from_aircraft
 from .heights import Ground, raised
 
 if TYPE_CHECKING:

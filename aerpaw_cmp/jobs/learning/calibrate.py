@@ -24,12 +24,12 @@ from ...compare.learning.calibration import Learned, Observed, Recipe, Score
 from ...compare.learning.correction import BIN_S
 from ...compare.learning.learning_curve import CurvePoint, learning_curve
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
-from ...flight.learned_gain import sphere_angles
-from ...flight.lock import LOCK_FLOOR_DB
+from ...flight.gains.learned_gain import sphere_angles
+from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...flight.settings import AntennaSettings, load_flight, load_pattern
 from ...flight.training import counted_once, flight_logs, marks_of
-from ...propagation.arrays import rotation_from_yaw_pitch_roll
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
+from ...propagation.geometry.arrays import rotation_from_yaw_pitch_roll
 from ...report.words.calibration import sentences
 from ...site.antenna.learned import LearnedLock, Source
 from .calibrate_lock import learned_locks, lock_words

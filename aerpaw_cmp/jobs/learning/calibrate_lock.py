@@ -8,7 +8,7 @@ import numpy as np
 
 from ...compare.learning.calibration import Learned, Observed, Recipe, flight_left_out
 from ...compare.level.detection import DetectionScore, learn_detection, score_detection
-from ...flight.lock import LOCK_FLOOR_DB
+from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...site.antenna.learned import LearnedLock
 
 

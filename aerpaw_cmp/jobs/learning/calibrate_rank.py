@@ -29,8 +29,8 @@ from ...flight.data import FlightData, RankSeries, rank_positions
 from ...flight.marks import among
 from ...flight.replay import attitude_rotation
 from ...flight.training import logs_of, series_mark
-from ...propagation.arrays import Link, Poses
 from ...propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
+from ...propagation.geometry.arrays import Link, Poses
 from ...site.antenna.learned import read_table
 
 # First key of a receiver file.

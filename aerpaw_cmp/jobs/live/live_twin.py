@@ -26,8 +26,8 @@ from ...live.serial.simulator import ranks_of
 from ...logs.readers import by_name
 from ...logs.writers import format_vehicle_out
 from ...maps.grid import Grid
-from ...propagation.arrays import Link, Poses, rotation_from_aircraft
 from ...propagation.field.baselines import free_space_dbm
+from ...propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
 from ...report.pages.live import LiveMap
 from ...site.site import Site
 

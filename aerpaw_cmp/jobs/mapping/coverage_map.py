@@ -41,12 +41,12 @@ from ...maps.store import TileStore
 from ...maps.study import HeldOutStudy, Study, held_out_study, interpolation_study, rank_fields
 from ...maps.tiles import Budget, Reach, Tiling
 from ...maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
-from ...propagation.arrays import Link, Poses, linear_array, single_element
 from ...propagation.field.foliage import crown_index, foliage_loss_db, foliage_model
 from ...propagation.field.stands import stand_loss_db
 from ...propagation.field.sum import channel_matrices, rss_dbm
+from ...propagation.geometry.arrays import Link, Poses, linear_array, single_element
+from ...propagation.geometry.paths import PathSet
 from ...propagation.options import Engine, Job, Run, Search
-from ...propagation.paths import PathSet
 from ...propagation.replay import Replay, replay
 from ...report.content import maps as page
 from ...report.pages.prediction import outside_share

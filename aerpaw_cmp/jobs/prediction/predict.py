@@ -27,7 +27,7 @@ from ...flight.settings import FlightFile, LinkSettings, LinksSettings
 from ...flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
 from ...maps import export
 from ...maps.grid import Grid, Layer
-from ...propagation.arrays import Poses, rotation_from_aircraft
+from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
 from ...report.pages.prediction import PredictionPage, outside_share, prediction_metrics, write_prediction
 from ...report.words.prediction import FLAGS, TITLES, first_words, memory_words
 from ...site.antenna.antennas import MeasuredPattern

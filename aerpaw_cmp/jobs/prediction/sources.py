@@ -18,11 +18,11 @@ from ...compare.learning.calibration import Observed
 from ...compare.learning.correction import BIN_S, Correction, Predictor, between_blocks_db, by_degree
 from ...flight.data import FlightData, RssSeries, load_data
 from ...flight.drafting.remembered import Remembered, remembered
-from ...flight.learned_gain import pair_db
+from ...flight.gains.learned_gain import pair_db
 from ...flight.replay import replay_poses
 from ...flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings, load_flight
-from ...propagation.arrays import Poses, rotation_from_aircraft
 from ...propagation.field.baselines import free_space_dbm
+from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
 from ...site.site import Site
 from ..learning.calibrate import load_calibration
 from ..tasks.manifest import inputs_of_flight

@@ -19,7 +19,7 @@ from ...flight.settings import FlightFile, load_flight
 from ...flight.simulate import planned_poses
 from ...logs.route import read_route
 from ...maps.grid import Grid
-from ...propagation.arrays import rotation_from_aircraft
+from ...propagation.geometry.arrays import rotation_from_aircraft
 from ...site.site import Site
 from ..tasks.manifest import inputs_of_flight, inputs_of_site
 

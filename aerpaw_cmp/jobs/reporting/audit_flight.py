@@ -20,15 +20,15 @@ from ...common.units import AnyArray, FloatArray, spread_out
 from ...compare.level.field_difference import FieldAudit
 from ...compare.result import AuditResult, EngineResult
 from ...flight.data import FlightData
-from ...flight.losses import path_loss
+from ...flight.gains.losses import path_loss
 from ...flight.replay import Replayed, attitude_rotation, part_of
 from ...flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ...logs.ingest import IngestedFile
-from ...propagation.arrays import Poses
 from ...propagation.check import reference
 from ...propagation.check.audit import Audit, Second, audit
 from ...propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
 from ...propagation.drivers.moving import site_with_tower_at
+from ...propagation.geometry.arrays import Poses
 from ...propagation.options import Field, Run, Search
 from ...propagation.search.sionna import free_memory
 from ...site.site import Site

@@ -45,9 +45,9 @@ from ...compare.statistics.memory import memory_share
 from ...compare.statistics.passes import Visit, repeatability
 from ...flight.data import FlightData, RankSeries, RssSeries
 from ...flight.drafting.remembered import errors_elsewhere, lock_elsewhere
-from ...flight.lock import LOCK_FLOOR_DB
-from ...flight.losses import direct_foliage_m
+from ...flight.gains.losses import direct_foliage_m
 from ...flight.replay import FlightReplay, Replayed
+from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...flight.settings import RssSettings, RtSettings
 from ...flight.training import learned_here
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm

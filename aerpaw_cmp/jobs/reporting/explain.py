@@ -17,10 +17,9 @@ from ...common.jsonable import fields_of, json_object
 from ...common.stages import Progress, silent
 from ...common.units import FloatArray
 from ...flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
-from ...flight.losses import path_loss, roughness_loss
+from ...flight.gains.losses import path_loss, roughness_loss
 from ...flight.replay import attitude_rotation, estimate_clocks, replay_poses, telemetry_time, valid_poses
 from ...flight.settings import RtSettings, load_flight
-from ...propagation.arrays import Link, Poses
 from ...propagation.check.explain import (
     ExplainedPath,
     explain_paths,
@@ -30,6 +29,7 @@ from ...propagation.check.explain import (
     why_not,
 )
 from ...propagation.drivers.moving import site_with_tower_at
+from ...propagation.geometry.arrays import Link, Poses
 from ...propagation.options import Engine
 from ...propagation.replay import Replay
 from ...site.site import Site

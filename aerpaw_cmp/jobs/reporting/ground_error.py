@@ -11,8 +11,8 @@ from ...common.units import FloatArray, IntArray, spread_out
 from ...compare.rank import channel_rank
 from ...flight.data import FlightData, site_place
 from ...flight.replay import Replayed, replay_poses
-from ...propagation.arrays import Poses
-from ...site.dem import Dem
+from ...propagation.geometry.arrays import Poses
+from ...site.relief.dem import Dem
 from ...site.site import Site
 from ...site.siteyaml import ground_surface, site_model
 

@@ -23,15 +23,15 @@ from ...compare.judge.ladder import Ladder, Rung, climb
 from ...compare.result import BASELINE_TITLE
 from ...flight.data import FlightData, RssSeries, choose_site, site_place
 from ...flight.drafting.remembered import errors_elsewhere, offered
-from ...flight.learned_gain import pair_db
-from ...flight.losses import path_loss
+from ...flight.gains.learned_gain import pair_db
+from ...flight.gains.losses import path_loss
 from ...flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
 from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import learned_here
-from ...propagation.arrays import Link, Poses
 from ...propagation.drivers.moving import replay_moving
 from ...propagation.edges import diffracted
 from ...propagation.field.sum import mean_pair_power, rss_dbm
+from ...propagation.geometry.arrays import Link, Poses
 from ...propagation.options import Field, Run, Search
 from ...propagation.replay import Replay, replay
 from ...site.antenna.antennas import Isotropic

@@ -14,7 +14,7 @@ from typing import Any
 from ...common.cells import guarded_text
 from ...common.errors import InputError
 from ...common.outputs import OutputFile
-from ...logs.checksums import Record
+from ...logs.files.checksums import Record
 from .log import BadLine, read_log, segments
 
 COLUMNS = (

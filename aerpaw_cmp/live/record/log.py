@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ...common.errors import InputError
-from ...logs.checksums import Record, decode_record, encode_record
+from ...logs.files.checksums import Record, decode_record, encode_record
 
 
 @dataclass(frozen=True, slots=True)

@@ -11,7 +11,7 @@ import threading
 from collections import deque
 from pathlib import Path
 
-from ...logs.checksums import Record
+from ...logs.files.checksums import Record
 from .log import SegmentLog
 
 

@@ -10,9 +10,9 @@ import numpy as np
 from ...common.units import IntArray
 from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
-from ..arrays import Link, Poses
+from ..geometry.arrays import Link, Poses
+from ..geometry.paths import joined
 from ..options import Engine, Field, Run, Search
-from ..paths import joined
 from ..replay import Replay
 from ..replay import replay as run_replay
 from ..search.mirror import plane_keys, planes_of

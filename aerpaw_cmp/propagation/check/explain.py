@@ -23,11 +23,11 @@ from ...common.units import (
     power_from_db,
     wavelength_m,
 )
-from ..arrays import Link, Poses
 from ..field.fresnel import FaceMaterials, reflection_coefficients
 from ..field.geometry import Elements, geometry
 from ..field.sum import amplitudes, pattern_ends
-from ..paths import Faces, PathSet, Surfaces
+from ..geometry.arrays import Link, Poses
+from ..geometry.paths import Faces, PathSet, Surfaces
 from ..replay import Replay
 from ..search.mirror import images_of, scene_tolerance_m, trace_back
 from ..search.occlusion import Occlusion

@@ -20,13 +20,13 @@ import numpy as np
 from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray
 from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
-from ..arrays import Array, Isotropic, Link, Poses
 from ..drivers.pairs import replay_pairs
 from ..edges import EdgePaths
 from ..field.stands import over_stands
 from ..field.sum import Further, channel_matrices
+from ..geometry.arrays import Array, Isotropic, Link, Poses
+from ..geometry.paths import Faces, PathSet, legs
 from ..options import Field, Search
-from ..paths import Faces, PathSet, legs
 from ..replay import Replay
 from ..scene import Scene
 from ..search.mirror import plane_keys, planes_of
@@ -559,7 +559,7 @@ def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
 
 def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Faces) -> tuple[IntArray, IntArray]:
     """Indices of the paths that both have."""
-    from ..paths import joined
+    from ..geometry.paths import joined
 
     plane = planes_of(joined(our_faces, their_faces))
     known = {key: index for index, key in enumerate(plane_keys(theirs, plane[len(our_faces) :]))}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from ...common.units import FloatArray, IntArray
-from ..paths import Surfaces
+from ..geometry.paths import Surfaces
 
 # A surface closer to an antenna than this hides nothing.
 _NEAR_END_M = 1e-3

@@ -22,9 +22,9 @@ from typing import Literal
 import numpy as np
 
 from ...common.units import ComplexArray, FloatArray
-from ..arrays import Array, Link, Poses, rotation_from_yaw_pitch_roll
 from ..field.sum import channel_matrices
-from ..paths import Faces, PathSet
+from ..geometry.arrays import Array, Link, Poses, rotation_from_yaw_pitch_roll
+from ..geometry.paths import Faces, PathSet
 
 # How the ground ray is added to the direct one.
 Ground = Literal["coherent", "power_sum"]

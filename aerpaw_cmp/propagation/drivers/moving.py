@@ -16,9 +16,9 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Site, Tower
-from ..arrays import Link, Poses
+from ..geometry.arrays import Link, Poses
+from ..geometry.paths import PathSet
 from ..options import Field, Job, Loss, Run, Search
-from ..paths import PathSet
 from ..replay import PER_LINK, Replay, replay
 from .parts import in_turn
 

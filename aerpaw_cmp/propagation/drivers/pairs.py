@@ -9,9 +9,9 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.units import ComplexArray, FloatArray
 from ...site.site import Site
-from ..arrays import Array, Link, Poses
-from ..engines import search_paths
+from ..engine.engines import search_paths
 from ..field.sum import channel_matrices, mean_pair_power, rss_dbm
+from ..geometry.arrays import Array, Link, Poses
 from ..options import Field, Run, Search
 from ..replay import further_paths, passed
 from ..scene import Scene, within_reach

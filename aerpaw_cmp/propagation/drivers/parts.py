@@ -10,9 +10,9 @@ import numpy as np
 
 from ...common.units import IntArray
 from ...site.site import Site
-from ..arrays import Link, Poses
+from ..geometry.arrays import Link, Poses
+from ..geometry.paths import Faces, PathSet, RowsT, joined
 from ..options import Field, Job, Progress, Run, Search
-from ..paths import Faces, PathSet, RowsT, joined
 from ..replay import PER_LINK, Replay, replay
 from ..scene import Omission
 

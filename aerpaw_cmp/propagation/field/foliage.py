@@ -19,7 +19,7 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Trees
-from ..paths import legs
+from ..geometry.paths import legs
 
 # Form of a crown between its base and the tree's top; the paper's is the cone.
 Shape = Literal["cone", "ellipsoid", "cylinder"]

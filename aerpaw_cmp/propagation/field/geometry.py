@@ -8,8 +8,8 @@ import numpy as np
 
 from ...common.units import AnyArray, FloatArray, IntArray
 from ...site.antenna.antennas import Isotropic
-from ..arrays import Array, Link, Pattern, Poses
-from ..paths import Faces, PathSet
+from ..geometry.arrays import Array, Link, Pattern, Poses
+from ..geometry.paths import Faces, PathSet
 from . import dyads
 
 

@@ -17,7 +17,7 @@ import shapely
 
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...site.site import Forest, Site
-from ..paths import legs
+from ..geometry.paths import legs
 from .foliage import FoliageModel, NoFoliage, Opaque
 from .knife_edges import Profile, deygout_db
 

@@ -22,9 +22,9 @@ import numpy as np
 
 from ...common.errors import UsageError
 from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
-from .. import compiled
-from ..arrays import Array, Link, Poses
-from ..paths import Faces, PathSet, Rows
+from ..geometry.arrays import Array, Link, Poses
+from ..geometry.paths import Faces, PathSet, Rows
+from ..native import compiled
 from . import dyads
 from .fresnel import FaceMaterials, coefficients
 from .geometry import Elements, Ends, Geometry, directions, geometry, parts_of, pattern_fields, plain, rows_of
@@ -120,7 +120,7 @@ def channel_matrices(
         Of compiled code (default: the cores this process may use); results do not depend on it.
     work : int, optional
         Element pairs of all links of the replay that this call is a part of; decides whether compiled code is worth
-        loading (:mod:`aerpaw_cmp.propagation.compiled`).
+        loading (:mod:`aerpaw_cmp.propagation.native.compiled`).
 
     Returns
     -------

@@ -19,10 +19,10 @@ import numpy as np
 
 from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
-from ..compiled import in_threads, thread_count
-from ..numba_options import kernel, part
+from ..geometry.paths import BoxTree, Links, PathSet, Surfaces
+from ..native.compiled import in_threads, thread_count
+from ..native.numba_options import kernel, part
 from ..options import Estimate, Progress, Run
-from ..paths import BoxTree, Links, PathSet, Surfaces
 from .boxtree import DEEPEST, box_missed, box_outside, box_tree, next_leaf, within_planes
 from .merging import WINDOW
 from .mirror import merge, searched_links

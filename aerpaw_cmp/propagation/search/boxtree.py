@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ...common.units import FloatArray, IntArray
-from ..numba_options import kernel, law, part
-from ..paths import BoxTree
+from ..geometry.paths import BoxTree
+from ..native.numba_options import kernel, law, part
 
 # Nodes that wait while a tree is walked: twice its depth for 4e9 items.
 DEEPEST = 64

@@ -11,8 +11,8 @@ import numpy as np
 from ...common.errors import InputError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...site.mesh_scenes.mitsuba import TriangleScene
-from ..numba_options import kernel
-from ..paths import Faces, Surfaces
+from ..geometry.paths import Faces, Surfaces
+from ..native.numba_options import kernel
 from .boxtree import box_tree, overlapping
 
 # Triangles whose corners lie within this of one plane [m] are one face. The files hold float32: 0.1 mm at 1 km.

@@ -21,9 +21,9 @@ import numpy as np
 
 from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
-from ..faces import corners, inside
+from ..geometry.faces import corners, inside
+from ..geometry.paths import Faces, Links, PathSet
 from ..options import Progress
-from ..paths import Faces, Links, PathSet
 from .occlusion import Occlusion
 
 # Of the largest coordinate: some thousand times the rounding error of a plane equation.

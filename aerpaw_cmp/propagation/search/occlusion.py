@@ -15,8 +15,8 @@ import shapely
 from shapely.geometry import Polygon
 
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
-from ..faces import corners
-from ..paths import Faces, legs
+from ..geometry.faces import corners
+from ..geometry.paths import Faces, legs
 
 # Segment-solid pairs looked at at once.
 CELLS_PER_CHUNK = 1_000_000

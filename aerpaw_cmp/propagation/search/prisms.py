@@ -10,9 +10,9 @@ from __future__ import annotations
 import numpy as np
 
 from ...common.units import FloatArray
-from ..faces import corners, triangles
+from ..geometry.faces import corners, triangles
+from ..geometry.paths import Faces, Links, PathSet, Surfaces
 from ..options import Run
-from ..paths import Faces, Links, PathSet, Surfaces
 from .beams import grow_paths
 from .boxtree import box_tree
 from .merging import WINDOW

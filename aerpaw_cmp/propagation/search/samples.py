@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.units import IntArray, spread_out
-from ..paths import Faces, PathSet
+from ..geometry.paths import Faces, PathSet
 from .mirror import plane_keys, planes_of
 
 # Rays per tower of the first pilot.

@@ -35,10 +35,10 @@ from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntAr
 from ...common.versions import version
 from ...machine.llvm import INSTALL_AGAIN, let_sionna_load, prepare_llvm
 from ...site.materials import material
-from ..arrays import Array, Link
-from ..faces import inside, triangles
+from ..geometry.arrays import Array, Link
+from ..geometry.faces import inside, triangles
+from ..geometry.paths import Faces, Links, PathSet, Surfaces, path_lengths
 from ..options import Progress
-from ..paths import Faces, Links, PathSet, Surfaces, path_lengths
 from .mirror import (
     MINIMUM_LENGTH_M,
     images_of,

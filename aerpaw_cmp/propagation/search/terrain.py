@@ -16,8 +16,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.units import BoolArray, FloatArray, IntArray
-from ...site.dem import Dem
-from ..paths import Faces, Links, PathSet, joined, legs
+from ...site.relief.dem import Dem
+from ..geometry.paths import Faces, Links, PathSet, joined, legs
 from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, images_of, trace_back
 from .occlusion import Occlusion
 

@@ -14,7 +14,7 @@ from shapely.geometry import Polygon
 from ...common.errors import InputError, about_file
 from ...common.geodesy import SiteFrame
 from ...common.units import FloatArray
-from ..dem import Dem, read_dem
+from ..relief.dem import Dem, read_dem
 from ..site import Forest
 from ..siteyaml import SiteModel
 from .footprints import SingleTree, only_trees, outline_dict

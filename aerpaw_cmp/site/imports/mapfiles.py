@@ -19,7 +19,7 @@ from ...common import kml
 from ...common.errors import InputError, parsed
 from ...common.files import read_input
 from ...common.xmlfiles import named, outermost, plain, xml_root
-from ...logs import archives
+from ...logs.files import archives
 from .osmfiles import read_elements
 from .outlines import BROKEN_ELEMENT, OSM_CREDIT, MapFile, Outline, Position, TreeLine, left_out, lonlat
 

@@ -13,8 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
-from ..common.units import AnyArray, BoolArray, IntArray
-from .records import KEPT_REJECTED, RejectedLine, RejectedReason
+from ...common.units import AnyArray, BoolArray, IntArray
+from ..records import KEPT_REJECTED, RejectedLine, RejectedReason
 
 # Characters of a rejected line that are kept.
 TEXT_LIMIT = 500

@@ -13,10 +13,10 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.units import AnyArray, BoolArray, IntArray
+from ...common.errors import UsageError
+from ...common.units import AnyArray, BoolArray, IntArray
+from ..readers import ReadOptions
 from .lines import add_flag
-from .readers import ReadOptions
 
 _AMBIGUOUS = "ambiguous_local_time"
 _NONEXISTENT = "nonexistent_local_time"

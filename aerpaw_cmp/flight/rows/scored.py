@@ -7,10 +7,10 @@ from collections import Counter
 import numpy as np
 import pandas as pd
 
-from ..common.errors import InputError
-from ..common.units import BoolArray
-from ..logs.limits import UNSCORED
-from ..logs.records import Stream
+from ...common.errors import InputError
+from ...common.units import BoolArray
+from ...logs.limits import UNSCORED
+from ...logs.records import Stream
 
 
 def unscored(frame: pd.DataFrame) -> BoolArray:

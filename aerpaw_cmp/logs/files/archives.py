@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from ..common.errors import InputError
+from ...common.errors import InputError
 
 # A flight of half an hour with a burst every 0.1 s has 18 000.
 MOST_MEMBERS = 20_000

@@ -8,11 +8,11 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 
-from ..common.units import BoolArray, IntArray
+from ...common.units import BoolArray, IntArray
+from ..readers import Reader, ReadOptions
+from ..records import Kind, ReadResult, Stream
 from . import lines as _lines
 from . import rows as _rows
-from .readers import Reader, ReadOptions
-from .records import Kind, ReadResult, Stream
 
 Pattern = re.Pattern[bytes]
 BOM = rb"(?:\xef\xbb\xbf)?"
@@ -42,7 +42,8 @@ def reader(
     name, title, kinds, sample
         As of :class:`aerpaw_cmp.logs.readers.Reader`.
     row : re.Pattern or callable
-        See :func:`aerpaw_cmp.logs.rows.matched`; a callable makes it of the beginning of the file (of its header, say).
+        See :func:`aerpaw_cmp.logs.text.rows.matched`; a callable makes it of the beginning of the file (of its
+        header, say).
     streams : callable
         ``streams(rows)``: the streams of the rows; its docstring is the reader's.
     sniff : callable, optional
@@ -60,7 +61,7 @@ def reader(
     fields : int
         Number of fields of a table: lines with others are rejected with their number.
     clock : str
-        See :func:`aerpaw_cmp.logs.rows.times`.
+        See :func:`aerpaw_cmp.logs.text.rows.times`.
     skip : callable, optional
         ``skip(data, lines)``: which of the matching lines (0-based) are comments after all.
 

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from shapely.geometry import Polygon
 
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)

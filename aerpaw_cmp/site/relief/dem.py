@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.errors import InputError, UsageError, parsing
-from ..common.files import read_input
-from ..common.geodesy import SiteFrame, in_shape
-from ..common.units import BoolArray, FloatArray, IntArray, unmasked
+from ...common.errors import InputError, UsageError, parsing
+from ...common.files import read_input
+from ...common.geodesy import SiteFrame, in_shape
+from ...common.units import BoolArray, FloatArray, IntArray, unmasked
 
 EARTH_RADIUS_M = 6_371_000.0
 # Ground on Earth lies between; other values are gaps that the file does not declare, or other units.
@@ -310,7 +310,7 @@ def _plausible(height_m: FloatArray, path: Path | None = None, line: int | None 
 
 
 def _read_geotiff(data: bytes, frame: SiteFrame, anchored: bool) -> Dem:
-    from ..common.native import read
+    from ...common.native import read
 
     if importlib.util.find_spec("rasterio") is None:
         raise UsageError("a GeoTIFF needs rasterio", expected="pip install 'aerpaw-cmp[geo]', or an ASCII grid (.asc)")

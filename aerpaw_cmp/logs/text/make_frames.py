@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..common.jsonable import named
-from ..common.units import AnyArray
-from .readers import ReadOptions
-from .records import COLUMNS, Attribute, Kind
+from ...common.jsonable import named
+from ...common.units import AnyArray
+from ..readers import ReadOptions
+from ..records import COLUMNS, Attribute, Kind
 
 _INTEGERS = ("fix", "satellites")
 

@@ -8,9 +8,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from .flight_file import IngestedFile
-from .readers import catalogue
-from .records import ReadResult, RejectedLine, RejectedReason, Stream
+from ..flight_file import IngestedFile
+from ..readers import catalogue
+from ..records import ReadResult, RejectedLine, RejectedReason, Stream
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -17,7 +17,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from enum import Enum
 
-from ..common.errors import UsageError
+from ...common.errors import UsageError
 
 
 class HeightReference(str, Enum):

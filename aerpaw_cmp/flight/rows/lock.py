@@ -6,10 +6,10 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from ..common.units import FloatArray
-from ..compare.level.detection import aligned_quality
-from ..compare.level.serving import at_times
-from ..logs.records import Stream
+from ...common.units import FloatArray
+from ...compare.level.detection import aligned_quality
+from ...compare.level.serving import at_times
+from ...logs.records import Stream
 
 # Quality [dB] at perfect lock (the peak of 4095 chips), and below which the receiver has lost it.
 _LOCK_QUALITY_DB, _LOST_QUALITY_DB = 20.0 * float(np.log10(4095.0)), 60.0

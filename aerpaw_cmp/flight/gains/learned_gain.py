@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..common.units import FloatArray
-from ..propagation.arrays import Array, Link, Poses
-from ..site.antenna.sphere_pattern import SpherePattern
+from ...common.units import FloatArray
+from ...propagation.geometry.arrays import Array, Link, Poses
+from ...site.antenna.sphere_pattern import SpherePattern
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

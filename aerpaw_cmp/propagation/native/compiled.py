@@ -29,10 +29,10 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.units import AnyArray
+from ...common.errors import UsageError
+from ...common.units import AnyArray
 
-ROOM = Path(__file__).parents[1]
+ROOM = Path(__file__).parents[2]
 SWITCH = "AERPAW_CMP_COMPILED"
 FIELD, BEAMS = "propagation.field.kernels", "propagation.search.beams"
 TRIANGLES = "maps.triangle_kernels"
@@ -40,7 +40,7 @@ TRIANGLES = "maps.triangle_kernels"
 SOURCES = (
     *(f"propagation/{name}.py" for name in (
         "field/dyads", "field/fresnel", "field/kernels", "search/beams", "search/merging", "search/boxtree",
-        "search/mirror", "compiled", "numba_options",
+        "search/mirror", "native/compiled", "native/numba_options",
     )),
     "maps/triangle_kernels.py",
 )  # fmt: skip

@@ -14,12 +14,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..readers import ReadOptions
+from ..records import Attribute, Kind, ReadResult, RejectedLine, Stream
 from . import clocks as _time
 from . import lines as _lines
 from . import make_frames as _frames
-from .readers import ReadOptions
-from .records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
 _NO_DATE = "the time stamp is no date of the calendar"
 _UNREAD = "the time is empty or of a form that is not read"

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.units import FloatArray, wavelength_m
-from ..propagation.arrays import Link, Poses, single_element
-from ..propagation.field.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
-from ..propagation.field.stands import stand_depth_m, stand_loss_db
-from ..propagation.options import Loss, Run, Search
-from ..propagation.paths import PathSet
-from ..propagation.replay import replay
-from ..site.site import Site
-from .settings import RtSettings
+from ...common.errors import UsageError
+from ...common.units import FloatArray, wavelength_m
+from ...propagation.field.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
+from ...propagation.field.stands import stand_depth_m, stand_loss_db
+from ...propagation.geometry.arrays import Link, Poses, single_element
+from ...propagation.geometry.paths import PathSet
+from ...propagation.options import Loss, Run, Search
+from ...propagation.replay import replay
+from ...site.site import Site
+from ..settings import RtSettings
 
 
 def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:

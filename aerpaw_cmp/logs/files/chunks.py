@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import AnyArray
+from ...common.units import AnyArray
 from . import packed
 
 PIECE_BYTES = 4 << 20

@@ -18,18 +18,18 @@ from typing import Any
 
 import numpy as np
 
-from .. import __version__
-from ..common.files import read_sealed, write_sealed
-from ..common.units import AnyArray, FloatArray
-from ..common.versions import version
-from ..site.site import Site
-from .arrays import Link, Poses
-from .compiled import beams, beams_for, switch, warn_once
-from .options import Estimate, Run, Search
-from .paths import PathSet
-from .scene import Scene, within_reach
-from .search import mirror
-from .search.samples import Choice, enough_samples, spread
+from ... import __version__
+from ...common.files import read_sealed, write_sealed
+from ...common.units import AnyArray, FloatArray
+from ...common.versions import version
+from ...site.site import Site
+from ..geometry.arrays import Link, Poses
+from ..geometry.paths import PathSet
+from ..native.compiled import beams, beams_for, switch, warn_once
+from ..options import Estimate, Run, Search
+from ..scene import Scene, within_reach
+from ..search import mirror
+from ..search.samples import Choice, enough_samples, spread
 
 # A search that will take longer is a warning where nobody asked to be told.
 _LONG_SEARCH_S = 60.0
@@ -123,8 +123,8 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
     links = scene.links_to(poses)
     extent = None if run.job is None else run.job.extent_m
     if by_beams(scene, search, _links(scene, run)):
-        from .search import beams as search_beams
-        from .search import prisms  # compiled: loaded where there are many faces
+        from ..search import beams as search_beams
+        from ..search import prisms  # compiled: loaded where there are many faces
 
         run = replace(run, on_estimate=run.on_estimate or _long_search)
         if scene.surfaces is not None:
@@ -132,7 +132,7 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
         return prisms.find_paths(scene.faces, links, run, max_depth=depth, extent_m=extent)
     if search.engine == "image":
         return mirror.find_paths(scene.faces, links, max_depth=depth, extent_m=extent, progress=run.progress)
-    from .search import sionna
+    from ..search import sionna
 
     return sionna.find_paths(
         scene.faces, links, sionna.Rays(**search.rays),
@@ -188,8 +188,8 @@ def estimate_search(
     scene, search = Scene.of(site, link, poses), replace(search or Search(), engine="image")
     if not by_beams(scene, search):
         return None
-    from .search import beams as search_beams
-    from .search import prisms  # compiled: loaded where there are many faces
+    from ..search import beams as search_beams
+    from ..search import prisms  # compiled: loaded where there are many faces
 
     return search_beams.estimate(
         scene.surfaces or prisms.solid_surfaces(scene.faces, scene.sources_m, poses.position_m),

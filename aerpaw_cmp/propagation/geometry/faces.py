@@ -16,8 +16,8 @@ import shapely
 from shapely.geometry import Polygon
 from shapely.geometry.polygon import orient
 
-from ..common.units import BoolArray, FloatArray, IntArray
-from ..site.site import Building, Site
+from ...common.units import BoolArray, FloatArray, IntArray
+from ...site.site import Building, Site
 from .paths import Faces
 
 # Walls start this far below the lower of their base and the site ground.
@@ -30,7 +30,7 @@ _UP = np.array([0.0, 0.0, 1.0])
 
 
 class _Face(NamedTuple):
-    """One row of :class:`~aerpaw_cmp.propagation.paths.Faces`."""
+    """One row of :class:`~aerpaw_cmp.propagation.geometry.paths.Faces`."""
 
     normal: FloatArray
     along: FloatArray

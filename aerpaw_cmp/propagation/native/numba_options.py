@@ -13,7 +13,7 @@ from numba.core import config
 from numba.core.serialize import dumps
 from numba.extending import register_jitable
 
-from ..common.files import read_sealed, write_sealed
+from ...common.files import read_sealed, write_sealed
 from .compiled import cache_folder
 
 FOLDER = cache_folder()
@@ -41,7 +41,7 @@ class _Sealed:
     """Compiled code of one kernel on disk, in place of numba's files, whose damage ends in any exception or a crash.
 
     An entry has its SHA-256 behind it: a damaged one is none, and is compiled anew. The folder is this user's alone
-    (:func:`aerpaw_cmp.propagation.compiled.cache_folder`), since an entry holds machine code.
+    (:func:`aerpaw_cmp.propagation.native.compiled.cache_folder`), since an entry holds machine code.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

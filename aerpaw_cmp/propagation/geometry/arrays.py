@@ -13,8 +13,8 @@ from typing import Protocol
 
 import numpy as np
 
-from ..common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, unmasked
-from ..site.antenna.antennas import Isotropic as Isotropic
+from ...common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, unmasked
+from ...site.antenna.antennas import Isotropic as Isotropic
 
 
 class Pattern(Protocol):

@@ -14,9 +14,9 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
-from ..common.errors import UsageError
-from ..common.geodesy import SiteFrame
-from ..common.units import FloatArray
+from ...common.errors import UsageError
+from ...common.geodesy import SiteFrame
+from ...common.units import FloatArray
 from .dem import Dem
 
 # Cells of the surface as an elevation model, and how many at most.

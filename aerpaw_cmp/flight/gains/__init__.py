@@ -1,0 +1,1 @@
+"""Gains and losses that a flight file names or a site remembers."""

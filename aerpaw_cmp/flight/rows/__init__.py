@@ -1,0 +1,1 @@
+"""Rows that count: positions that are scored, a sounder in lock."""

@@ -1,0 +1,1 @@
+"""Files of logs: archives, pieces, limits, kinds."""

@@ -1,0 +1,1 @@
+"""Arrays, faces and paths, shared by search and field."""

@@ -1,0 +1,1 @@
+"""Compiled kernels: when to use them, where to keep them."""

@@ -1,0 +1,1 @@
+"""Ground heights: elevation models, surfaces through points, datums."""

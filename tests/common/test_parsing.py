@@ -101,7 +101,7 @@ OWN = {
     "jobs/bench.py": "made by the benchmark",
     "logs/archives.py": "inside ingest and map files; its own list of what archives raise",
     "logs/checksums.py": "inside ingest",
-    "logs/lines.py": "inside ingest",
+    "logs/text/lines.py": "inside ingest",
     "logs/matfile.py": "inside ingest",
     "machine/llvm.py": "the answer of a child",
     "propagation/engines.py": "sealed by this user",

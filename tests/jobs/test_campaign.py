@@ -271,7 +271,7 @@ def row(flight: str, channel: str, measured: Any, simulated: Any, **keys: Any) -
         "unit": "dBm", "offset_db": float(np.nanmean(simulated - measured)), "rmse_db": nan, "correlation": nan, "n": n,
         "n_out_of_coverage": 0, "at_search_edge": False, "rmse_ci95_db": None, "offset_ci95_db": None,
         "correlation_ci95": None, "n_effective": nan, "lag_s": nan, "lag_verdict": "", "fitted": (), "baselines": {},
-        "step_db": 0.1, "span_db": (-50.0, 50.0), "time_s": np.arange(n) * 1.0,
+        "span_db": (-50.0, 50.0), "time_s": np.arange(n) * 1.0,
         "distance_m": np.arange(n) * 3.0,
         "position_m": np.stack([np.arange(n) * 3.0, np.zeros(n), np.full(n, 40.0)], axis=-1),
     }  # fmt: skip

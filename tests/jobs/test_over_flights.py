@@ -27,7 +27,7 @@ def rows(flights: int = 6, links: int = 2, samples: int = 120) -> list[RssRow]:
                     flight=f"f{flight}", setting="s", tower="LW1", channel=f"USRP{link}", unit="dBm", offset_db=0.0,
                     rmse_db=2.0, correlation=1.0, n=samples, n_out_of_coverage=0, at_search_edge=False,
                     rmse_ci95_db=None, offset_ci95_db=None, correlation_ci95=None, n_effective=1.0, lag_s=0.0,
-                    lag_verdict="", fitted=(), baselines={}, step_db=0.1, span_db=(-50.0, 50.0), time_s=share,
+                    lag_verdict="", fitted=(), baselines={}, span_db=(-50.0, 50.0), time_s=share,
                     distance_m=np.zeros(samples), position_m=place, simulated_dbm=simulated,
                     measured_db=np.where(rng.random(samples) < 0.1, np.nan, simulated + rng.normal(0, 2, samples)),
                     heading_deg=None if flight == 2 else rng.normal(90.0, 5.0, samples),

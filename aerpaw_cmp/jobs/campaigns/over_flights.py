@@ -38,7 +38,6 @@ def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], li
         fits = pooled_moments(
             {row.key: row.moments for row in members},
             per,
-            step_db=min(r.step_db for r in members),
             span_db=span,
         )
         pooled = [

@@ -84,7 +84,6 @@ def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
         offset = season.left_out_offsets(
             [row.n if np.isfinite(m) else 0 for row, m in zip(mine, mean, strict=True)],
             mean,
-            step_db=min(row.step_db for row in mine),
             span_db=(min(row.span_db[0] for row in mine), max(row.span_db[1] for row in mine)),
         )
         error = season.error_at_offset(offset, [row.rmse_db for row in mine], [row.offset_db for row in mine], mean)

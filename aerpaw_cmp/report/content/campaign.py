@@ -23,7 +23,7 @@ class RssRow:
     ``offset_db`` and ``rmse_db`` come from this row's own samples; ``pooled_offset_db`` is shared as the campaign's
     ``calibration`` says, ``pooled_rmse_db`` what it leaves on this row; ``held_out_offset_db`` comes from the other
     flights of the same setting, tower and channel, ``held_out_rmse_db`` is what that leaves here (NaN without another).
-    ``baselines`` are RMSE [dB] by name, each with an offset of its own; ``span_db`` and ``step_db`` are those of the
+    ``baselines`` are RMSE [dB] by name, each with an offset of its own; ``span_db`` is that of the
     offset search; ``within`` is the repeatability of the flight's two halves. Arrays (n,) are at the samples, NaN where
     a side is missing; they are kept for the first setting only, elsewhere they are empty and ``difference`` stands for
     them.
@@ -48,7 +48,6 @@ class RssRow:
     lag_verdict: str
     fitted: tuple[str, ...]
     baselines: Mapping[str, float]
-    step_db: float
     span_db: tuple[float, float]
     time_s: FloatArray = field(repr=False)
     measured_db: FloatArray = field(repr=False)

@@ -27,7 +27,7 @@ FLIGHTS = Path(__file__).parents[1] / "tests" / "field"
 NAMES = ("dataset12_40m", "dataset12_70m", "nr_rank_flight1", "nr_rank_flight3", "aadm")
 
 _BARE = {"site.without_buildings": True, "rt.foliage": "none", "rt.max_depth": 1, "rss.field": "power"}
-PARTS = {
+PARTS: dict[str, dict[str, object]] = {
     "buildings": {"site.without_buildings": False},
     "woods as trees": {"rt.foliage": "opaque"},
     "woods as media": {"rt.foliage": "attenuating"},
@@ -70,12 +70,12 @@ def rows_of(name: str) -> Iterator[list[str]]:
             lost = int(np.isnan(errors[0]).sum() - np.isnan(errors[1]).sum())
             change = f"{level.difference_db:+.2f} [{low:+.2f}, {high:+.2f}]"
             yield [name, f"{a.tower} {a.channel}", part, f"{level.other_rmse_db:.2f}", change, str(lost), "", ""]
-        for a, b in zip(bare.rank, added.rank, strict=True):
-            known = np.isfinite(a.measured)
+        for before, after in zip(bare.rank, added.rank, strict=True):
+            known = np.isfinite(before.measured)
             for k in (10.0, 100.0):
-                first, second = ((x.rank[k] == a.measured)[known].astype(float) for x in (a, b))
-                shift = variation(a.measured, b.rank[k]) - variation(a.measured, a.rank[k])
-                what = f"{a.tower} rank, K = {k:g}"
+                first, second = ((x.rank[k] == before.measured)[known].astype(float) for x in (before, after))
+                shift = variation(before.measured, after.rank[k]) - variation(before.measured, before.rank[k])
+                what = f"{before.tower} rank, K = {k:g}"
                 yield [name, what, part, f"{first.mean():.3f}", "", "", by_eighths(second - first), f"{shift:+.3f}"]
 
 

@@ -104,7 +104,7 @@ OWN = {
     "logs/text/lines.py": "inside ingest",
     "logs/matfile.py": "inside ingest",
     "machine/llvm.py": "the answer of a child",
-    "propagation/engines.py": "sealed by this user",
+    "propagation/engine/engines.py": "sealed by this user",
     "propagation/check/reference.py": "tables that the run has read",
     "jobs/reporting/audit_flight.py": "tables that the run has read",
 }

@@ -263,7 +263,8 @@ def _bound(series: RssSeries, score: rss.RssComparison) -> str | None:
         return None
     known = np.isfinite(score.residual_db)
     order = np.argsort(series.time[known], kind="stable")
-    length_s = np.ptp(series.time[known]) / np.timedelta64(1, "s")
+    time = series.time[known]
+    length_s = (time.max() - time.min()) / np.timedelta64(1, "s")
     return f"the flight is too short for its memory of {memory_share(score.residual_db[known][order]) * length_s:.0f} s"
 
 

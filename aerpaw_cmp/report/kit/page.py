@@ -45,7 +45,7 @@ def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
     return f"{text}\u202f{unit}" if unit else text
 
 
-def interval(value: tuple[float, float] | None, decimals: int = 1) -> str:
+def interval(value: tuple[float | None, float | None] | None, decimals: int = 1) -> str:
     """An interval as ``[low, high]``, a bound as ``≥ low``, or nothing; "n/a" where there is neither."""
     if value is None:
         return ""

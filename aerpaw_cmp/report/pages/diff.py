@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,7 +100,7 @@ def _site_alone(diff: ReportDiff) -> bool:
 
 def _cause(diff: ReportDiff) -> str:
     """Sentence on what else differs, which may be the reason."""
-    kinds = {"setting": diff.settings, "input": diff.inputs, "version": diff.versions}
+    kinds: dict[str, Sequence[object]] = {"setting": diff.settings, "input": diff.inputs, "version": diff.versions}
     if _site_alone(diff):
         kinds = {"site": [i for i in diff.inputs if i.role != _FLIGHT_FILE] or diff.settings, "version": diff.versions}
     changed = {name: len(items) for name, items in kinds.items()}

@@ -6,6 +6,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import yaml
 
@@ -32,8 +33,6 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
     def run(name: str, variant: str = "") -> Metrics:
         folder = tmp_path_factory.mktemp(name + variant)
         settings = yaml.safe_load(FLIGHTS[name].read_text(encoding="utf-8"))
-        settings.setdefault("rss", {})["bootstrap"] = 100
-        settings.setdefault("rank", {})["bootstrap"] = 100
         if variant == "vertical":
             settings["link"]["rank"]["tower"]["slant_deg"] = 0
             settings["link"]["rank"]["uav"]["slant_deg"] = 0
@@ -60,16 +59,16 @@ def test_report_completes_with_baselines_and_audit(report: Report, name: str) ->
     metrics = report(name)
     for tower in metrics["rss"].values():
         for channel in tower.values():
-            assert channel["n"] > (300 if name == "aadm" else 3000)
-            assert (
-                channel["rmse_ci95_db"] == [None, None]
-                or channel["rmse_ci95_db"][0] < channel["rmse_db"] < channel["rmse_ci95_db"][1]
-            )
+            # a Nemo table gives its own positions to its 1990 levels, a position a second
+            assert channel["n"] > (300 if name == "aadm" else 1500 if name.startswith("nr_rank") else 3000)
+            low, high = channel["rmse_ci95_db"]
+            assert low is None or low < channel["rmse_db"] < (high or np.inf)
             assert set(channel["baselines"]) == set(BASELINE_TITLE)
             assert not channel["at_search_edge"]
     for tower in metrics["rank"].values():
         assert set(tower["simulated"]) == {"10", "100", "1000"}
-    assert bool(metrics["rss"]) != bool(metrics["rank"])
+    assert metrics["rss"]
+    assert bool(metrics["rank"]) == name.startswith("nr_rank")
     audit = metrics["rt"]["audit"]
     assert audit["links"] >= 20
     assert audit["missing_paths"] == 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import gzip
+import zlib
 from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from functools import lru_cache
@@ -101,7 +102,7 @@ def _original(pattern: MeasuredPattern, folder: Path, memory: Path) -> SpherePat
 @lru_cache(maxsize=64)
 def _learned_table(place: Path) -> SpherePattern | None:
     """The table of a calibration; None of any other file."""
-    with suppress(InputError, OSError, EOFError):
+    with suppress(InputError, OSError, EOFError, zlib.error):
         with gzip.open(place) if place.suffix == ".gz" else place.open("rb") as book:
             learned = book.read(len(LEARNED)) == LEARNED.encode()
         return read_sphere_csv(place) if learned else None

@@ -172,15 +172,15 @@ def test_places_are_near_a_tower_up_to_thirty_kilometres(away: float, near: bool
     of: Any = SimpleNamespace(site=SimpleNamespace(frame=frame, towers=towers, name="s"),
                               settings=SimpleNamespace(logs=[]), files=[])  # fmt: skip
     places = np.array([[0.7 + 3.0, 0.5 + away], [0.7, 0.5 + away], [91.0, 0.5], [np.nan, 0.5], [0.7, -181.0]])
-    assert data._nearest_m(of.site, places[:, 0], places[:, 1]) == pytest.approx(1000.0 * abs(away))
+    assert data.nearest_m(of.site, places[:, 0], places[:, 1]) == pytest.approx(1000.0 * abs(away))
     flown = [("a", _stream("telemetry", "x", pd.DataFrame(places, columns=["latitude_deg", "longitude_deg"])))]
     if near:
         data._check_place(of, flown)
     else:
         with pytest.raises(InputError):
             data._check_place(of, flown)
-    assert np.isnan(data._nearest_m(of.site, np.array([91.0, np.nan]), np.array([0.0, 1.0])))
-    assert np.isfinite(data._nearest_m(of.site, np.array([90.0]), np.array([-180.0])))
+    assert np.isnan(data.nearest_m(of.site, np.array([91.0, np.nan]), np.array([0.0, 1.0])))
+    assert np.isfinite(data.nearest_m(of.site, np.array([90.0]), np.array([-180.0])))
 
 
 @pytest.mark.parametrize(

@@ -256,7 +256,11 @@ class Runs:
 
     def litter(self) -> list[str]:
         """Everything below the root that is neither target nor in it, and hidden places in it."""
-        names = [p for p in self.root.rglob("*") if p not in (self.folder, self.target)]
+        from aerpaw_cmp.site.antenna.learned import folder_of
+
+        memory = folder_of(self.target)  # of a site, copied from that of its base
+        own = (self.folder, self.target, *([memory, *memory.iterdir()] if (memory / "learned.yaml").exists() else []))
+        names = [p for p in self.root.rglob("*") if p not in own]
         return sorted(
             str(p.relative_to(self.root)) for p in names if self.target not in p.parents or ".aerpaw-" in p.name
         )

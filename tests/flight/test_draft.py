@@ -251,7 +251,9 @@ def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) 
     text, remarks = draft(files, logs, DraftOptions(timezone=ZONE))
     assert [log.path for log in parse_yaml(text, FlightFile).logs] == ["UAV/modem_ri.csv"]
     assert any(remark.endswith("samples can be compared") and not remark.startswith("0") for remark in remarks)
-    assert any("USRP1_power_log.txt: it has no positions, and no telemetry is here" in remark for remark in remarks), remarks
+    assert any("USRP1_power_log.txt: it has no positions, and no telemetry is here" in remark for remark in remarks), (
+        remarks
+    )
 
 
 def test_nothing_to_compare_is_said(logs: Path) -> None:

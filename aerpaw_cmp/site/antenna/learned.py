@@ -10,6 +10,7 @@ from __future__ import annotations
 import gzip
 import hashlib
 import shutil
+import tempfile
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -232,7 +233,10 @@ def carry_memory(base: str | Path, site: Path) -> list[str]:
     if not origin.is_dir() or folder.exists():
         return []
     names = ", ".join(read_learned(base).entries)
-    shutil.copytree(origin, folder, copy_function=shutil.copyfile)
+    with explained_os_errors(folder), tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
+        copy = Path(part) / "memory"  # takes its name when it is whole
+        shutil.copytree(origin, copy, copy_function=shutil.copyfile)
+        copy.rename(folder)
     return [f"learned antennas and receivers of the base were copied to {folder.name}: {names}"]
 
 

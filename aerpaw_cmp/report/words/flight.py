@@ -169,7 +169,8 @@ def flight_sentence(verdict: FlightVerdict | None, ray_db: float, baseline_db: f
     if word in _DECIDED:
         near, far = sorted(map(abs, verdict.ci95_db))
         size, ends = abs(verdict.difference_db), f"[{near:.2f}, {far:.2f}]"
-        return _DECIDED[word].format(ray=ray_db, size=size, name=name, range=ends, over=over)
+        one = f"a {name}" if verdict.against in ("constant", "log_distance") else name
+        return _DECIDED[word].format(ray=ray_db, size=size, name=one, range=ends, over=over)
     both = f"Ray tracing: RMSE {ray_db:.1f} dB; {name}: {baseline_db:.1f} dB."
     if word == "no interval":
         return f"{both} Too few samples for an interval of the difference."

@@ -13,14 +13,14 @@ __version__ = "0.3.0"
 
 # Where each public name lives.
 _HOME = {
-    "Array": "propagation.arrays",
+    "Array": "propagation.geometry.arrays",
     "BiExponential": "maps.biexponential",
     "Comparison": "jobs.notebook",
     "Flight": "jobs.notebook",
-    "Link": "propagation.arrays",
+    "Link": "propagation.geometry.arrays",
     "Logs": "logs.frames",
     "OrdinaryKriging": "maps.kriging",
-    "Poses": "propagation.arrays",
+    "Poses": "propagation.geometry.arrays",
     "Replay": "propagation.replay",
     "ReplayedFlight": "jobs.notebook",
     "Site": "site.site",

@@ -160,7 +160,7 @@ def test_reported_ranks_are_one_layer_off_or_without_csi_as_often_as_planned(tmp
         ({"path": "p.txt", "reader": "sounder_log", "channel": "USRP1"}, "does not say whose it is"),
         ({"path": "p.txt", "reader": "sounder_log", "node": "LW9", "channel": "USRP1"}, "the site has no tower 'LW9'"),
         ({"path": "p.txt", "reader": "aadm_snr"}, "no writer for log"),
-        (RANKS | {"path": "../p.csv"}, "lies outside the folder"),
+        (RANKS | {"path": "../p.csv"}, "no file of its folder"),
         (RANKS | {"path": "truth.json"}, "two files of this flight are named"),
     ],
 )

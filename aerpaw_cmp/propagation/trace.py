@@ -68,7 +68,7 @@ def trace(
 
     Examples
     --------
-    >>> from aerpaw_cmp.propagation.arrays import Link, single_element
+    >>> from aerpaw_cmp.propagation.geometry.arrays import Link, single_element
     >>> link = Link(3.4e9, {"LW1": single_element()}, single_element())
     >>> trace("lake_wheeler", link, [[100.0, 50.0, 40.0]]).rss_dbm.shape
     (1, 1)

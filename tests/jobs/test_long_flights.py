@@ -65,6 +65,6 @@ def test_a_replay_in_blocks_is_the_replay(one_tower: FlightData, monkeypatch: py
         np.testing.assert_array_equal(in_blocks.replay.rss_dbm, single.replay.rss_dbm)
         np.testing.assert_array_equal(in_blocks.replay.h, single.replay.h)
         assert len(in_blocks.replay.paths) == len(single.replay.paths)
-        for name in ("pose", "tower", "depth", "faces", "vertices_m", "tree"):
+        for name in ("pose", "tower", "depth", "faces", "vertices_m"):
             np.testing.assert_array_equal(getattr(in_blocks.replay.paths, name), getattr(single.replay.paths, name))
         assert in_blocks.replay.left_out == single.replay.left_out

@@ -109,7 +109,7 @@ def test_simulate_writes_nothing_outside_its_folder(logs: Path, capsys: pytest.C
     for name in (f"../{log}", str(logs / log)):
         (logs / "away.yaml").write_text(text.replace(log, name))
         said = refused(capsys, logs.parent, "simulate", logs / "away.yaml", "-o", logs.parent / "out", "--force")
-        assert "outside" in said
+        assert "no file of its folder" in said
 
 
 @pytest.fixture
@@ -139,7 +139,7 @@ def test_a_bad_folder_is_told_before_the_computation(
         "flight.data.gather",
         "jobs.campaigns.campaign.run",
         "jobs.mapping.coverage_map.make_maps",
-        "report.site_view.plan",
+        "report.pages.site.plan",
     ):
         monkeypatch.setattr(f"aerpaw_cmp.{name}", never)
     command = commands[job]

@@ -39,8 +39,8 @@ def test_a_planned_report_names_its_links_and_poses_and_writes_nothing(
     plan = planned(capsys, "report", file, "--logs-root", SAMPLE, "--audit", "none")
     assert sorted(tmp_path.rglob("*")) == there
     work = {stage["name"]: stage["work"] for stage in plan["stages"]}
-    assert work["replay RSS LW1 USRP1"].startswith("651 poses")
-    assert work["replay rank LW1"].startswith("652 poses")
+    assert work["replay RSS LW1 USRP1"].startswith("655 poses")
+    assert work["replay rank LW1"].startswith("655 poses")
     assert {"clocks", "compare", "ladder", "report"} <= set(work)
     assert "audit" not in work
     assert plan["output"] == "reports/sample1"
@@ -80,8 +80,8 @@ def test_the_time_of_a_replay_follows_its_poses(monkeypatch: pytest.MonkeyPatch,
 
     monkeypatch.setattr(planning, "_cpu_seconds", charged)
     rss, rank = planning._tried_replays(data)
-    assert [stage.seconds for stage in rss] == pytest.approx([0.010 + 0.651] * 2)
-    assert rank[0].seconds == pytest.approx(0.010 + 0.652)
+    assert [stage.seconds for stage in rss] == pytest.approx([0.010 + 0.655] * 2)
+    assert rank[0].seconds == pytest.approx(0.010 + 0.655)
     assert set(calls) == set(planning.TRIED_POSES)
 
 

@@ -5,6 +5,7 @@ import re
 
 import numpy as np
 import pytest
+from shapely import Point
 
 from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.propagation.check import audit as audit_module
@@ -44,6 +45,8 @@ from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")
+# buildings around LW1 hide its ground reflection from some of these poses
+SITE = dataclasses.replace(SITE, buildings=tuple(b for b in SITE.buildings if b.footprint.distance(Point(0, 0)) > 30.0))
 LINK = Link(3.3e9, {"LW1": single_element(Isotropic())}, single_element(Isotropic()))
 POSES = Poses(np.array([[120.0, 60.0, 40.0]]), np.eye(3)[None])
 
@@ -98,7 +101,7 @@ def test_coefficients_of_paths_are_compared_as_shares_of_the_strongest(planted: 
     east, north, _ = SITE.towers["LW1"].position_m
     spots = np.array([[120.0, 60.0, 40.0], [east + 1.5, north - 0.8, 0.6], [-700.0, 300.0, 60.0], [60.0, 10.0, 30.0]])
     few = Poses(spots, turns)
-    replayed = replay(SITE, LINK, few, Search("image", max_depth=1))
+    replayed = replay(dataclasses.replace(SITE, buildings=()), LINK, few, Search("image", max_depth=1))
     probe, left = _probe(LINK)
     assert left == ()
     scene, paths = Scene.of(SITE, probe, few), replayed.paths
@@ -110,7 +113,8 @@ def test_coefficients_of_paths_are_compared_as_shares_of_the_strongest(planted: 
 
     own = coefficients(replayed.faces)
     length = path_lengths(paths, scene.sources_m, spots)
-    k = int(np.flatnonzero((paths.pose == 1) & (paths.depth == 1))[0])  # below the tower, near the ground
+    ground = replayed.faces.solid[paths.faces[:, 0]] < 0
+    k = int(np.flatnonzero((paths.pose == 1) & (paths.depth == 1) & ground)[0])  # below the tower, near the ground
     gain, points = own.copy(), paths.vertices_m.copy()
     strong = np.unravel_index(np.abs(own[k]).argmax(), (2, 2))
     weak = np.unravel_index(np.abs(own[k]).argmin(), (2, 2))

@@ -418,7 +418,7 @@ from aerpaw_cmp.propagation.search import beams as growth
 from aerpaw_cmp.propagation.search import merging
 from aerpaw_cmp.propagation.search import prisms
 from aerpaw_cmp.propagation.field import kernels
-from aerpaw_cmp.propagation.numba_options import FOLDER
+from aerpaw_cmp.propagation.native.numba_options import FOLDER
 height = growth._height(np.array([[0.0, 0.0, 1.0]]), np.array([2.0]), 0, np.array([5.0, 5.0, 7.0]))
 print(json.dumps([FOLDER, height]))
 """

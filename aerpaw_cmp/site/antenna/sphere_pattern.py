@@ -253,6 +253,20 @@ def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float, notes:
 
     HORIZONTAL runs clockwise seen from above, as azimuths of planning tools do; VERTICAL starts at the horizon in front
     and goes down first.
+
+    Parameters
+    ----------
+    pattern : MeasuredPattern
+    name : str
+        Of the antenna.
+    carrier_hz : float
+    notes : sequence of str
+        A COMMENT line each.
+
+    Returns
+    -------
+    str
+        Text with a line end at its end.
     """
     degrees = np.radians(np.arange(360.0))
     level = pattern.gain_dbi(np.full(360, np.pi / 2), -degrees)

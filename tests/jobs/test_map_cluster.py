@@ -30,9 +30,9 @@ def environ() -> dict[str, str]:
 
 
 def computed(store: Path) -> int:
-    """Tiles that the ledger of a store names."""
+    """Tiles whose digest the ledger of a store holds."""
     try:
-        return int((np.asarray(zarr.open_group(str(store), mode="r")[LEDGER][:])[..., 0] >= 0).sum())
+        return int(np.asarray(zarr.open_group(str(store), mode="r")[LEDGER][:]).any(axis=-1).sum())
     except (OSError, KeyError, ValueError):
         return 0
 

@@ -364,7 +364,7 @@ print(w[kernels._TE])
 @needs_numba
 def test_a_fault_planted_in_a_file_that_a_kernel_takes_in_reaches_compiled_code(tmp_path):
     """numba alone would go on with what it compiled before: its cache knows the file of the kernel."""
-    package = Path(compiled.__file__).parents[1]
+    package = Path(compiled.__file__).parents[2]
     shutil.copytree(package, tmp_path / "aerpaw_cmp", ignore=shutil.ignore_patterns("__pycache__"))
 
     def coefficient():

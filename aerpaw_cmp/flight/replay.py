@@ -13,13 +13,12 @@ from ..common.jsonable import named
 from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
-from ..propagation.drivers.moving import loss_along, replay_moving
+from ..propagation.drivers.moving import replay_moving
 from ..propagation.drivers.parts import replay_in_parts
 from ..propagation.edges import diffracted
-from ..propagation.field.sum import Fields, channel_matrices
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
-from ..propagation.geometry.paths import Faces, PathSet, RowsT
-from ..propagation.options import Engine, Estimate, Field, Loss, Run, Search
+from ..propagation.geometry.paths import RowsT
+from ..propagation.options import Engine, Estimate, Field, Run, Search
 from ..propagation.replay import PER_LINK, Replay, replay
 from ..site.site import Site
 from .data import FlightData, RssSeries, Times, rank_positions
@@ -452,29 +451,3 @@ def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
     """Say what a search will take, where it is more than a moment."""
     if estimate.seconds > 1.0:
         progress(f"path search {name}: {estimate}")
-
-
-def fields_from(
-    sources_m: FloatArray, faces: Faces, paths: PathSet, link: Link, poses: Poses, loss: Loss | None
-) -> Fields:
-    """Fields over the paths of one tower.
-
-    Parameters
-    ----------
-    sources_m : (1 or poses, 3)
-        Where the tower is, or is at each pose: :meth:`Replayed.source_m` [m].
-    faces : Faces
-    paths : PathSet
-    link : Link
-    poses : Poses
-    loss : callable or None
-        Loss per path [dB].
-
-    Returns
-    -------
-    Fields
-        H (poses, 1, n_rx, n_tx) and powers.
-    """
-    loss_db = loss_along(loss, paths, sources_m, poses.position_m)
-    places_m = sources_m if len(sources_m) == 1 else sources_m[:, None]
-    return channel_matrices(paths, faces, places_m, poses, link, loss_db)

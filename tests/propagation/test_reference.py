@@ -1,5 +1,6 @@
 """The second implementation: against closed forms, against the replay, and faults that it must see."""
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -325,6 +326,18 @@ def test_dropped_and_invented_paths_are_seen(case):
     faces[row, 0] = np.flatnonzero(clean.faces.normal[:, 2] == 0)[0]  # over a wall that it does not meet
     moved = replace(clean, contributions=(replace(clean.paths, faces=faces),))
     assert audited(site, link, poses, moved).phantom_paths == 1
+
+
+def test_boxes_of_faces_lose_no_path_that_a_trial_of_all_sequences_has(case):
+    site, link, poses = case
+    second_way = reference.Reference(site, "LW1", field_audit.Expected.of(link).link)
+    tried = [(), *((m,) for m in second_way.mirrors), *itertools.permutations(second_way.mirrors, 2)]
+    for target in map(tuple, poses.position_m[:2].tolist()):
+        real = [tuple(map(id, s)) for s in tried if second_way.verdict(s, target) is not False]
+        likely = [tuple(map(id, s)) for s in second_way.sequences(target, 2)]
+        assert len(real) > 1
+        assert set(real) <= set(likely)
+        assert len(likely) < len(tried) / 20
 
 
 def test_audit_of_several_replays_adds_up():

@@ -25,14 +25,15 @@ from ...flight.data import FlightData, RssSeries, choose_site, site_place
 from ...flight.drafting.remembered import errors_elsewhere, offered
 from ...flight.gains.learned_gain import pair_db
 from ...flight.gains.losses import path_loss
-from ...flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
+from ...flight.replay import FlightReplay, Replayed, attitude_rotation
 from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import learned_here
-from ...propagation.drivers.moving import replay_moving
+from ...propagation.drivers.moving import loss_along, replay_moving
 from ...propagation.edges import diffracted
-from ...propagation.field.sum import mean_pair_power, rss_dbm
-from ...propagation.geometry.arrays import Link, Poses
-from ...propagation.options import Field, Run, Search
+from ...propagation.field.sum import channel_matrices, mean_pair_power, rss_dbm
+from ...propagation.geometry.arrays import Link, Poses, single_element
+from ...propagation.geometry.paths import PathSet
+from ...propagation.options import Run, Search
 from ...propagation.replay import Replay, replay
 from ...site.antenna.antennas import Isotropic
 from ...site.antenna.sphere_pattern import SpherePattern
@@ -174,11 +175,17 @@ class _Climber:
     def __init__(self, data: FlightData, series: Sequence[_Series]) -> None:
         self._data, self._series = data, series
         self._measured = [s.levels.measured_db[s.rows] for s in series]
-        self._traced: dict[tuple[int, bool, Relief, bool], tuple[Replay, float]] = {}
+        self._traced: dict[tuple[Any, ...], tuple[Replay, float]] = {}
+        self._lost: dict[tuple[int, Model], tuple[Replay, PathSet, list[FloatArray | None], float]] = {}
         patterns = [p for s in series for a in _arrays(s.replayed.link) for p in a.patterns]
         self._offer = offered(data) if all(p.name == "iso" for p in patterns) else None
         links = [s.replayed.link for s in series]
         self._links = links if self._offer is None else [_link_of(self._offer, data, s) for s in data.rss]
+        ways = [
+            (link.carrier_hz, self._sources(s, data.site).tobytes(), self._poses(s, "ignored").position_m.tobytes())
+            for link, s in zip(self._links, series, strict=True)
+        ]
+        self._like = [ways.index(way) for way in ways]  # by series, the first one with the same paths
 
     def climb(self) -> FlightLadder:
         """All stages."""
@@ -337,42 +344,60 @@ class _Climber:
 
     def _level(self, index: int, model: Model) -> tuple[FloatArray, float]:
         """Level (m,) [dBm] at the thinned samples of a series, and the seconds that the whole series would take."""
-        series, rt, site = self._series[index], self._data.settings.rt, self._site(model.relief)
-        traced, search_s = self._paths(index, model)
-        begin = time.perf_counter()
-        poses, link = self._poses(series, model.attitude), self._links[index]
+        series, link, site = self._series[index], self._links[index], self._site(model.relief)
         if model.antennas == "isotropic":
             link = _isotropic_link(link)
-        paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
-        changed = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
-        loss = path_loss(site, changed, link.carrier_hz)
-        sources = self._sources(series, site)
-        pair = pair_db(link, poses, sources)
-        if model.diffraction:
-            search = Search(max_depth=changed.max_depth, further=diffracted("edges"))
-            bent = replay(site, link, poses, search, Field(loss), Run(cache_dir=""))
-            level = bent.rss_power_dbm if model.ground == "power sum" else bent.rss_dbm
-            return level[:, 0] + pair, series.step * bent.seconds
-        fields = fields_from(sources, traced.faces, paths, link, poses, loss)
-        power = fields.power if model.ground == "power sum" else mean_pair_power(fields.h)
-        level = rss_dbm(power, link.transmit_power_dbm)[:, 0] + pair
+        traced, paths, losses_db, search_s = self._paths(index, model)
+        begin = time.perf_counter()
+        poses, sources = self._poses(series, model.attitude), self._sources(series, site)
+        places = sources if len(sources) == 1 else sources[:, None]
+        reflected = channel_matrices(paths, traced.faces, places, poses, link, losses_db[0])
+        fields = [reflected, *(
+            some.fields(traced.faces, sources, poses, link, loss_db)
+            for some, loss_db in zip(traced.further, losses_db[1:], strict=True)
+        )]  # fmt: skip
+        if model.ground == "power sum":
+            power = sum(item.power for item in fields)
+        else:
+            power = mean_pair_power(np.asarray(sum(item.h for item in fields)))
+        level = rss_dbm(np.asarray(power), link.transmit_power_dbm)[:, 0] + pair_db(link, poses, sources)
         return level, series.step * (search_s + time.perf_counter() - begin)
 
-    def _paths(self, index: int, model: Model) -> tuple[Replay, float]:
+    def _paths(self, index: int, model: Model) -> tuple[Replay, PathSet, list[FloatArray | None], float]:
+        """Replay with the paths of a model, those without an edge that it takes, losses [dB] of both, and seconds."""
+        # antennas and attitude change no path and no loss
+        key = self._like[index], dataclasses.replace(model, antennas="isotropic", attitude="ignored")
+        if key not in self._lost:
+            traced, search_s = self._traced_for(index, model)
+            begin = time.perf_counter()
+            rt, series, site = self._data.settings.rt, self._series[index], self._site(model.relief)
+            paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
+            changed = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
+            loss, sources = path_loss(site, changed, self._links[index].carrier_hz), self._sources(series, site)
+            targets = series.replayed.poses.position_m[series.picked]
+            lines = [paths, *(some.lines() for some in traced.further)]
+            losses = [loss_along(loss, some, sources, targets) for some in lines]
+            self._lost[key] = traced, paths, losses, search_s + time.perf_counter() - begin
+        return self._lost[key]
+
+    def _traced_for(self, index: int, model: Model) -> tuple[Replay, float]:
+        """Replay between single elements, and its seconds."""
         direct = model.relief != "flat" and model.ground == "none"  # reflections off shaped ground are costly to find
-        key = index, model.buildings, model.relief, direct
+        key = self._like[index], model.buildings, model.diffraction, model.relief, direct
         if key not in self._traced:
             begin = time.perf_counter()
-            site = self._site(model.relief)
+            series, tower, site = self._series[index], self._data.rss[index].tower, self._site(model.relief)
             site = site if model.buildings else dataclasses.replace(site, buildings=())
             depth = max(self._data.settings.rt.max_depth, 1) if model.buildings else 1
-            depth = 0 if direct else depth
-            series = self._series[index]
-            link, poses, sources = series.replayed.link, self._poses(series, "ignored"), self._sources(series, site)
+            search = Search(
+                max_depth=0 if direct else depth, further=diffracted("edges" if model.diffraction else "none")
+            )
+            link = Link(self._links[index].carrier_hz, {tower: single_element()}, single_element())
+            poses, sources = self._poses(series, "ignored"), self._sources(series, site)
             if series.replayed.tower_m is not None:
-                replayed = replay_moving(site, link, poses, sources, Search(max_depth=depth))
+                replayed = replay_moving(site, link, poses, sources, search)
             else:
-                replayed = replay(site, link, poses, Search(max_depth=depth), run=Run(cache_dir=""))
+                replayed = replay(site, link, poses, search, run=Run(cache_dir=""))
             self._traced[key] = replayed, time.perf_counter() - begin
         return self._traced[key]
 

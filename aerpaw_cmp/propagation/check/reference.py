@@ -15,12 +15,13 @@ import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import shapely
 from shapely.geometry import LineString, Point, Polygon
 
-from ...common.units import ComplexArray, FloatArray
+from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray
 from ...site.site import Site, Tower, Trees
 
 Vector = tuple[float, float, float]
@@ -320,6 +321,18 @@ class Mirror:
         """The image of a point."""
         return _plus(p, self.normal, -2.0 * self.height(p))
 
+    def box(self) -> tuple[Vector, Vector]:
+        """Least and greatest coordinates of the face; without end where it is the ground."""
+        if self.roof is not None:
+            west, south, east, north = self.roof.bounds
+            return (west, south, self.offset_m), (east, north, self.offset_m)
+        if self.solid < 0:
+            return (-math.inf,) * 3, (math.inf,) * 3
+        (west, east), (south, north) = (
+            sorted((x, x + self.length_m * way)) for x, way in zip(self.start, self.along, strict=True)
+        )
+        return (west, south, self.low_m), (east, north, self.high_m)
+
     def margin(self, p: Vector) -> float:
         """Distance of a point of the plane from the edges of the face [m]; positive inside, negative outside."""
         if self.roof is not None:
@@ -425,6 +438,28 @@ class Blocks:
 
 # ---------------------------------------------------------------- one link
 
+# Mirrors (sequences, depth) by number, and images (sequences, depth + 1, 3) of the source.
+_Chains = tuple[IntArray, FloatArray]
+
+# Rounding moves the point of a reflection by less, where its image and its other end are MARGIN_M or more apart along
+# the normal of its plane.
+_SLACK_M = 0.1
+
+
+class _Planes(NamedTuple):
+    """Mirrors as arrays: normals and boxes (mirrors, 3), offsets (mirrors,)."""
+
+    normal: FloatArray
+    offset_m: FloatArray
+    low_m: FloatArray
+    high_m: FloatArray
+
+    @classmethod
+    def of(cls, mirrors: Sequence[Mirror]) -> _Planes:
+        boxes = np.array([m.box() for m in mirrors])
+        planes = np.array([(*m.normal, m.offset_m) for m in mirrors])
+        return cls(planes[:, :3], planes[:, 3], boxes[:, 0], boxes[:, 1])
+
 
 @dataclass(frozen=True, slots=True)
 class Reference:
@@ -444,10 +479,12 @@ class Reference:
     loss: ExpectedLoss = field(default_factory=ExpectedLoss)
     mirrors: tuple[Mirror, ...] = field(init=False)
     blocks: Blocks = field(init=False)
-    _chains: dict[tuple[int, int], list[tuple[Mirror, ...]] | None] = field(init=False, default_factory=dict)
+    _planes: _Planes = field(init=False)
+    _chains: dict[tuple[int, int], list[_Chains] | None] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mirrors", _mirrors_of(self.site, self.site.towers[self.tower]))
+        object.__setattr__(self, "_planes", _Planes.of(self.mirrors))
         object.__setattr__(self, "blocks", Blocks(self.site))
 
     @property
@@ -457,30 +494,47 @@ class Reference:
         return (tower.east_m, tower.north_m, tower.ground_m + tower.antenna_height_m)
 
     def sequences(self, target: Vector, max_depth: int, budget: int = 20_000) -> list[tuple[Mirror, ...]] | None:
-        """All sequences whose images lie on the right sides; None when there are more than the budget."""
+        """All sequences that may lead to a target; None when the tower can begin more than the budget.
+
+        Their images lie on the right sides, and their points of reflection within the boxes of the faces.
+        """
         if (max_depth, budget) not in self._chains:
             self._chains[max_depth, budget] = self._from_source(max_depth, budget)
-        chains = self._chains[max_depth, budget]
-        # by identity: mirrors are compared field by field else
-        facing = {id(m) for m in self.mirrors if m.height(target) >= -MARGIN_M}
-        return None if chains is None else [s for s in chains if not s or id(s[-1]) in facing]
+        levels = self._chains[max_depth, budget]
+        if levels is None:
+            return None
+        near = (rows[self._in_boxes(rows, images, target)] for rows, images in levels)
+        return [tuple(self.mirrors[k] for k in row) for rows in near for row in rows.tolist()]
 
-    def _from_source(self, max_depth: int, budget: int) -> list[tuple[Mirror, ...]] | None:
-        """The sequences that the tower can begin, wherever the other end is."""
-        chains: list[tuple[Mirror, ...]] = [()]
-        level: list[tuple[tuple[Mirror, ...], Vector]] = [((), self.source)]
-        for depth in range(1, max_depth + 1):
-            grown = [
-                ((*past, mirror), mirror.mirrored(image))
-                for past, image in level
-                for mirror in self.mirrors
-                if mirror.height(image) > (0.0 if past else -MARGIN_M) and (not past or mirror is not past[-1])
-            ]
-            if len(grown) > budget:
+    def _from_source(self, max_depth: int, budget: int) -> list[_Chains] | None:
+        """Mirrors and images, by depth, of the sequences that the tower can begin, wherever the other end is."""
+        rows, images = np.zeros((1, 0), dtype=np.int64), np.array(self.source)[None, None]
+        levels = [(rows, images)]
+        for depth in range(max_depth):
+            height = images[:, -1] @ self._planes.normal.T - self._planes.offset_m
+            facing = height > (0.0 if depth else -MARGIN_M)
+            if depth:
+                facing[np.arange(len(rows)), rows[:, -1]] = False
+            past, mirror = np.nonzero(facing)
+            if len(past) > budget:
                 return None
-            chains += [s for s, _ in grown]
-            level = grown if depth < max_depth else []
-        return chains
+            image = images[past, -1] - 2.0 * height[past, mirror, None] * self._planes.normal[mirror]
+            rows, images = np.column_stack([rows[past], mirror]), np.concatenate([images[past], image[:, None]], axis=1)
+            levels.append((rows, images))
+        return levels
+
+    def _in_boxes(self, rows: IntArray, images: FloatArray, target: Vector) -> BoolArray:
+        """Check whether points of reflection lie within the boxes of their faces, grown by ``_SLACK_M``."""
+        planes, at, good = self._planes, np.tile(target, (len(rows), 1)), np.ones(len(rows), dtype=np.bool_)
+        for step in reversed(range(rows.shape[1])):
+            face, image = rows[:, step], images[:, step + 1]
+            ahead, behind = ((p * planes.normal[face]).sum(axis=1) - planes.offset_m[face] for p in (at, image))
+            through = ahead - behind
+            with np.errstate(divide="ignore", invalid="ignore"):
+                at = image - (behind / through)[:, None] * (at - image)
+            inside = (at >= planes.low_m[face] - _SLACK_M) & (at <= planes.high_m[face] + _SLACK_M)
+            good &= (np.abs(through) < MARGIN_M) | (inside.all(axis=1) & (through > 0.0))
+        return good
 
     def verdict(self, sequence: Sequence[Mirror], target: Vector, margin_m: float = MARGIN_M) -> bool | None:
         """Check whether a path over the mirrors exists; None where a change of ``margin_m`` would decide."""

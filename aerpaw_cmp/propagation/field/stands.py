@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -157,10 +158,10 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
     flat[np.hypot(*(flat - start_m[moved, :2]).T) < _UPRIGHT_M, 0] += _UPRIGHT_M  # a line has a length
     near, stand = tree.query(shapely.linestrings(np.stack([start_m[moved, :2], flat], axis=1)))
     for number in np.unique(stand):
-        mine, edges = near[stand == number], _edges(stands[number])
+        mine, (edges, following) = near[stand == number], _edges(stands[number])
         step = max(1, _PAIRS_AT_ONCE // len(edges))
         for some in (mine[first : first + step] for first in range(0, len(mine), step)):
-            row, share = _pieces(start_m[moved[some], :2], flat[some], edges)
+            row, share = _pieces(start_m[moved[some], :2], flat[some], edges, following)
             crossing, piece = np.unique(row, return_inverse=True)
             if not len(crossing):
                 continue
@@ -175,26 +176,28 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
             )
 
 
-def _edges(stand: Forest) -> FloatArray:
-    """Ends (edges, 2, 2) of the sides of a stand, holes included."""
+def _edges(stand: Forest) -> tuple[FloatArray, IntArray]:
+    """Ends (edges, 2, 2) of the sides of a stand, holes included, and the side (edges,) that follows each."""
     rings = [shapely.get_coordinates(ring) for ring in (stand.area.exterior, *stand.area.interiors)]
-    return np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
+    edges = np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
+    first = np.cumsum([0, *(len(ring) - 1 for ring in rings)])
+    return edges, np.concatenate([np.roll(np.arange(*pair), -1) for pair in pairwise(first)])
 
 
-def _pieces(start: FloatArray, end: FloatArray, edges: FloatArray) -> tuple[IntArray, FloatArray]:
+def _pieces(start: FloatArray, end: FloatArray, edges: FloatArray, following: IntArray) -> tuple[IntArray, FloatArray]:
     """Pieces of lines (k, 2) inside an outline of edges: their lines (n,), and where they begin and end (n, 2)."""
-    way = end - start
-    off = edges - start[:, None, None]  # k, edges, ends, 2
-    left = way[:, None, None, 0] * off[..., 1] - way[:, None, None, 1] * off[..., 0]
-    side = edges[:, 1] - edges[:, 0]
-    with np.errstate(divide="ignore", invalid="ignore"):
-        share = (off[..., 0, 0] * side[:, 1] - off[..., 0, 1] * side[:, 0]) / (
-            way[:, :1] * side[:, 1] - way[:, 1:] * side[:, 0]
-        )
-    crosses = (left[..., 0] > 0) != (left[..., 1] > 0)  # a corner belongs to one of its sides alone
-    inside = (crosses & (share <= 0.0)).sum(axis=1) % 2 == 1
-    share = np.sort(np.where(crosses & (share > 0.0) & (share < 1.0), share, 1.0), axis=1)
-    bounds = np.pad(share[:, : int((share < 1.0).sum(axis=1).max(initial=0)) + 1], ((0, 0), (1, 0)))
+    way, corner = end - start, edges[:, 0]
+    side, off = edges[:, 1] - corner, corner - start[:, None]  # k, edges, 2
+    left = way[:, :1] * off[..., 1] - way[:, 1:] * off[..., 0] > 0
+    line, edge = np.nonzero(left != left[:, following])  # a corner belongs to one of its sides alone
+    (east, north), (side_east, side_north), (way_east, way_north) = off[line, edge].T, side[edge].T, way[line].T
+    share = (east * side_north - north * side_east) / (way_east * side_north - way_north * side_east)
+    inside = np.bincount(line[share <= 0.0], minlength=len(way)) % 2 == 1
+    line, share = line[between := (share > 0.0) & (share < 1.0)], share[between]
+    order, count = np.lexsort([share, line]), np.bincount(line, minlength=len(way))
+    bounds = np.ones((len(way), count.max(initial=0) + 2))
+    bounds[:, 0] = 0.0
+    bounds[line[order], 1 + np.arange(len(line)) - np.repeat(np.cumsum(count) - count, count)] = share[order]
     odd = np.arange(bounds.shape[1] - 1) % 2 == 1
     line, at = np.nonzero((inside[:, None] != odd) & (bounds[:, 1:] > bounds[:, :-1]))
     return line, np.stack([bounds[line, at], bounds[line, at + 1]], axis=1)

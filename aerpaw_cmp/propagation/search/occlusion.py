@@ -8,6 +8,7 @@ is one: a segment that runs in the seam between them, outside both, is cut too.
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -240,16 +241,17 @@ def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
     return np.asarray(shapely.set_coordinates(polygons, np.einsum("ni,nij->nj", point, axes[owner])))
 
 
-def _convex(footprints: AnyArray) -> list[list[Polygon]]:
+def _convex(footprints: AnyArray) -> list[tuple[Polygon, ...]]:
     """The convex pieces of each footprint."""
     convex = _is_convex(footprints).tolist()
-    return [[part] if fills else convex_pieces(part) for part, fills in zip(footprints, convex, strict=True)]
+    return [(part,) if fills else convex_pieces(part) for part, fills in zip(footprints, convex, strict=True)]
 
 
-def convex_pieces(footprint: Polygon) -> list[Polygon]:
+@lru_cache(maxsize=4096)
+def convex_pieces(footprint: Polygon) -> tuple[Polygon, ...]:
     """Convex polygons that together are a footprint that is not convex, with corners at its corners only.
 
-    Triangles are joined as long as what they make is convex (Hertel and Mehlhorn, 1983).
+    Triangles are joined as long as what they make is convex (Hertel and Mehlhorn, 1983); kept, for each replay asks.
     """
     pieces = list(shapely.get_parts(shapely.constrained_delaunay_triangles(footprint)))
     first = 0
@@ -262,7 +264,7 @@ def convex_pieces(footprint: Polygon) -> list[Polygon]:
                 break
         else:
             first += 1
-    return pieces
+    return tuple(pieces)
 
 
 def _is_convex(polygons: Polygon | AnyArray) -> BoolArray:

@@ -396,10 +396,7 @@ class OutputFolder:
         _sync_tree(place.part)
         self._refuse_content()  # what came there meanwhile
         if not self.target.is_dir():
-            (place.part / _UNFINISHED).unlink(missing_ok=True)
-            _sync_folder(place.part)
-            place.part.rename(self.target)
-            _sync_folder(self.target.parent)
+            place.take_name()
             return
         for folder in (place.part, *(entry for entry in place.part.rglob("*") if entry.is_dir())):
             before = self.target / folder.relative_to(place.part)
@@ -412,6 +409,23 @@ class OutputFolder:
         _sync_folder(self.target.parent)
         with contextlib.suppress(OSError):  # the results stand; the next run tries again
             _clear(place.part)
+
+
+@contextlib.contextmanager
+def new_folder(target: Path) -> Iterator[Path]:
+    """An empty folder that takes a free name when the block ends without an error; errors as :class:`OutputFolder`."""
+    with explained_os_errors(target):
+        place = _Place(target, target, folder=True)
+        try:
+            (place.part / _UNFINISHED).touch()
+            yield place.part
+            _sync_tree(place.part)
+            place.refuse_gone()
+            raise_interrupt()
+            with held():
+                place.take_name()
+        finally:
+            place.leave()
 
 
 def foreign_entries(folder: Path, own: Iterable[str]) -> Iterator[str]:
@@ -544,6 +558,13 @@ class _Place:
         return UsageError(
             "another run is writing here", expected="one run at a time, or another name after -o", path=self.named
         )
+
+    def take_name(self) -> None:
+        """Give the folder the name of its target, which nothing has."""
+        (self.part / _UNFINISHED).unlink(missing_ok=True)
+        _sync_folder(self.part)
+        self.part.rename(self.target)
+        _sync_folder(self.target.parent)
 
     def lock_too(self, folder: Path) -> None:
         """Lock what is about to come to this place."""

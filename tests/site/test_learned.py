@@ -1,7 +1,9 @@
 """What a site remembers: written, found by name, refused where it does not fit."""
 
+import errno
 import json
 import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +13,7 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.outputs import file_digest
 from aerpaw_cmp.flight.drafting.remembered import Nodes, propose, searching_airframe
 from aerpaw_cmp.flight.marks import mark_of
@@ -21,6 +23,7 @@ from aerpaw_cmp.site.antenna.learned import (
     Learned,
     LearnedReceiver,
     LearnedSeries,
+    carry_memory,
     files_of,
     find_named,
     folder_of,
@@ -225,6 +228,41 @@ def test_a_memory_that_names_a_file_of_others_touches_and_shows_none(
     assert "years of work" not in said.out + said.err
     assert thesis.read_text() == "years of work"
     assert load_flight(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
+
+
+def test_an_index_that_leads_elsewhere_is_not_read(folder: Path) -> None:
+    index = folder_of(folder / "mine.yaml") / "learned.yaml"
+    (folder / "notes.txt").write_text("years of work")
+    index.unlink()
+    index.symlink_to("../notes.txt")
+    with pytest.raises(InputError, match="a link that leaves its folder"):
+        read_learned(folder / "mine.yaml")
+
+
+def test_a_copied_memory_is_whole_or_not_there_and_holds_its_own_files_alone(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    own, copy = folder_of(folder / "mine.yaml"), folder / "new.yaml"
+    (own / "diary.txt").symlink_to("/etc/hostname")
+    (own / "thesis.tex").write_text("years of work")
+    plain = shutil.copyfile
+
+    def full(source: Path, target: Path) -> None:
+        if source.name != "A.t.csv.gz":
+            plain(source, target)
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "copyfile", full)
+        with pytest.raises(OutputError, match="the disk is full"):
+            carry_memory(folder / "mine.yaml", copy)
+    assert sorted(place.name for place in folder.iterdir()) == ["mine.learned"]
+    assert carry_memory(folder / "mine.yaml", copy)
+    names = {"learned.yaml", "A.t.csv.gz", "A.u.csv.gz"}
+    assert {place.name: place.read_bytes() for place in folder_of(copy).iterdir()} == {
+        name: (own / name).read_bytes() for name in names
+    }
+    assert carry_memory(folder / "mine.yaml", copy) == []
 
 
 @pytest.mark.parametrize("name", ["A.t.csv.gz", "B.t.csv.gz"])

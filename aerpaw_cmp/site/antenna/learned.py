@@ -10,7 +10,6 @@ from __future__ import annotations
 import gzip
 import hashlib
 import shutil
-import tempfile
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -20,7 +19,7 @@ from pydantic import Field
 
 from ...common.errors import InputError, UsageError, parsing
 from ...common.files import LARGEST_TABLE, inside, locked, read_bounded, write_whole
-from ...common.outputs import explained_os_errors, file_digest
+from ...common.outputs import explained_os_errors, file_digest, new_folder
 from ...common.yamlfile import StrictModel, dump_yaml, load_yaml
 
 _INDEX = "learned.yaml"
@@ -169,10 +168,11 @@ def read_learned(site: str | Path) -> Learned:
     InputError
         It names a file outside its folder.
     """
-    index = folder_of(site) / _INDEX
+    folder = folder_of(site)
+    index = inside(folder, _INDEX, folder / _INDEX)
     memory = load_yaml(index, Learned) if index.is_file() else Learned()
     for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
-        inside(index.parent, name, index, plain=True)
+        inside(folder, name, index, plain=True)
     return memory
 
 
@@ -232,12 +232,12 @@ def carry_memory(base: str | Path, site: Path) -> list[str]:
     origin, folder = folder_of(base), folder_of(site)
     if not origin.is_dir() or folder.exists():
         return []
-    names = ", ".join(read_learned(base).entries)
-    with explained_os_errors(folder), tempfile.TemporaryDirectory(dir=folder.parent, prefix=f".{folder.name}.") as part:
-        copy = Path(part) / "memory"  # takes its name when it is whole
-        shutil.copytree(origin, copy, copy_function=shutil.copyfile)
-        copy.rename(folder)
-    return [f"learned antennas and receivers of the base were copied to {folder.name}: {names}"]
+    entries = read_learned(base).entries
+    with new_folder(folder) as copy:
+        for name in sorted({_INDEX}.union(*map(files_of, entries.values()))):
+            if (place := inside(origin, name, origin / _INDEX, plain=True)).is_file():
+                shutil.copyfile(place, copy / name)
+    return [f"learned antennas and receivers of the base were copied to {folder.name}: {', '.join(entries)}"]
 
 
 def memory_lines(site: str | Path) -> list[str]:

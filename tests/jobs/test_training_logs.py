@@ -22,7 +22,15 @@ from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import counted_once, flight_logs, marks_of
 from aerpaw_cmp.jobs.diff_reports import run_diff
-from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankSamples, rank_samples, read_receiver
+from aerpaw_cmp.jobs.learning.calibrate import CalibrationFile
+from aerpaw_cmp.jobs.learning.calibrate_rank import (
+    FittedReceiver,
+    RankCalibration,
+    RankSamples,
+    rank_samples,
+    read_receiver,
+)
+from aerpaw_cmp.jobs.learning.calibration_files import Calibrated, write_files
 from aerpaw_cmp.site.antenna.learned import folder_of
 from tests.jobs.calibrated import calibrated, past_sector_antenna, settings
 from tests.real_logs import REAL
@@ -296,6 +304,21 @@ def test_a_receiver_knows_its_reports_by_content() -> None:
     assert by_content.knows(reports_of("b", "2" * 64, "1" * 64))
     assert not by_content.knows(reports_of("a", "2" * 64))
     assert receiver().knows(reports_of("a", "2" * 64))  # of 0.3: the name is all there is
+
+
+def test_what_was_learned_from_ranks_alone_names_its_logs_too(tmp_path: Path) -> None:
+    sample = Path(__file__).parents[2] / "sample_logs"
+    flights = (load_data(load_flight(sample / "flight.yaml"), sample),)
+    (tmp_path / "calibrated").mkdir()
+    ranked = RankCalibration(receivers={}, scores={}, warnings=())
+    learned = Calibrated(CalibrationFile(calibration="c", flights=["flight.yaml"]), flights, (), None, ranked)
+    _, text = write_files(learned, tmp_path / "calibrated", "calibrated", {})
+    (tmp_path / "calibrated.yaml").write_text(text)
+    assert set(trained_on(text)) == set(flight_logs(flights[0]))
+    assert set(provenance.marks(text)) == set(marks_of(flights))
+    joined = load_flight(sample / "flight.yaml", learned=tmp_path / "calibrated.yaml")
+    assert set(joined.trained_on) == set(flight_logs(flights[0]))
+    assert joined.rank.receiver == str(tmp_path / "calibrated" / "receiver.json")
 
 
 @pytest.mark.field

@@ -141,15 +141,19 @@ def _pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[st
     ).notes()
 
 
+def _listed(key: str, entries: Sequence[str]) -> list[str]:
+    """Lines of calibrated.yaml that name the training logs."""
+    comment = {KEY: "SHA-256 of the logs: nothing is scored on them", MARKS: "marks, by which copies are known"}[key]
+    return [f"# {comment}", f"{key}:", *(f"  - '{entry}'" for entry in entries)] if entries else []
+
+
 def settings_text(calibration: Calibration, folder_name: str) -> str:
     """calibrated.yaml: the part of a flight.yaml that names the learned antennas."""
     lines = [
         f"{_MARK}: {calibration.settings.calibration}. Learned from {', '.join(calibration.names)}.",
         *(f"# {text}" for text in calibration.words),
         "# Put this into a flight.yaml; files resolve against its folder, or --logs-root.",
-        "# SHA-256 of the logs: nothing is scored on them",
-        f"{KEY}:",
-        *(f"  - {digest}" for digest in calibration.trained_on),
+        *_listed(KEY, calibration.trained_on),
         "link:",
         "  channels:",
     ]
@@ -268,6 +272,7 @@ def write_files(
     """
     calibration, ranked = calibrated.calibration, calibrated.ranked
     rank, rank_warnings = (None, ()) if ranked is None else (ranked.metrics(), ranked.warnings)
+    logs, marks = union(*map(flight_logs, calibrated.flights)), marks_of(calibrated.flights)
     if calibration is not None:
         maps = _antenna_maps(calibration)
         carrier = next(s.link.carrier_hz for data in calibrated.flights for s in data.rss)
@@ -281,16 +286,15 @@ def write_files(
         )
         write_calibration(record, folder)
         metrics = calibration_metrics(record)
-        text += f"# marks of the training logs, by which their copies are known\n{MARKS}:\n"
-        text += "".join(f"  - '{mark}'\n" for mark in calibration.marks)
     else:
-        text = _MARK + "\n"
+        text = "\n".join([f"{_MARK}: {calibrated.settings.calibration}", *_listed(KEY, logs)]) + "\n"
         metrics = {
             "scores": {}, "controls": {}, "words": [], "antennas": [], "calibration": calibrated.settings.calibration,
             "rank": rank, "warnings": [*calibrated.remarks, *rank_warnings], "flights": calibrated.settings.flights,
-            KEY: list(union(*map(flight_logs, calibrated.flights))), MARKS: list(marks_of(calibrated.flights)),
+            KEY: list(logs), MARKS: list(marks),
         }  # fmt: skip
         (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+    text += "".join(f"{line}\n" for line in _listed(MARKS, marks))
     if ranked is not None:
         (folder / "receiver.json").write_text(ranked.text(), encoding="utf-8")
         text += f"rank:\n  receiver: {name}/receiver.json\n"

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ...common.errors import InputError, UsageError
-from ...common.gaussian import gaussian_kernel
+from ...common.gaussian import Factor, gaussian_kernel
 from ...common.units import BoolArray, FloatArray, IntArray
 
 Frame = Literal["body", "mast", "pair", "world", "place"]
@@ -227,29 +227,6 @@ def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> Floa
     return out
 
 
-def factor_of(matrix: FloatArray) -> FloatArray:
-    """Lower Cholesky factor of a symmetric matrix, in its place.
-
-    Raises
-    ------
-    InputError
-        It is not positive definite, or not finite.
-    """
-    from scipy.linalg import LinAlgError, cholesky
-
-    try:
-        if not np.isfinite(matrix.sum()):
-            raise ValueError("numbers that are not finite")
-        # the transpose is the same matrix in the order that LAPACK works on
-        return np.asarray(cholesky(matrix.T, lower=True, overwrite_a=True, check_finite=False))
-    except (LinAlgError, ValueError) as error:
-        raise InputError(
-            f"the equations of the fit cannot be solved ({error})",
-            expected="levels that are finite and vary",
-            cause="a channel that never changes, or values that are no levels",
-        ) from None
-
-
 @dataclass(frozen=True, slots=True)
 class GainFit:
     """Gain over direction with its uncertainty.
@@ -271,7 +248,7 @@ class GainFit:
     log_evidence: float
     common_scale: float
     _weights: FloatArray = field(repr=False)
-    _lower: FloatArray = field(repr=False)
+    _factor: Factor = field(repr=False)
     # mean gain over the rows, by terms and antenna: every flight that is predicted asks for it
     _zeros: dict[tuple[tuple[Term, ...], str], float] = field(
         default_factory=dict, init=False, repr=False, compare=False
@@ -292,7 +269,7 @@ class GainFit:
             log_evidence=self.log_evidence + 0.5 * misfit * (1.0 - s**-2) - count * math.log(s),
             common_scale=1.0,
             _weights=self._weights / s**2,
-            _lower=self._lower * s,
+            _factor=Factor(self._factor.lower * s),
         )
 
     def predict(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> tuple[FloatArray, FloatArray]:
@@ -382,13 +359,11 @@ class GainFit:
         self, terms: Sequence[Term], at: LinkSamples, about: Sequence[LinkSamples]
     ) -> tuple[FloatArray, FloatArray]:
         """Sum of some terms along samples about its mean over others: mean and standard deviation (n,)."""
-        from scipy.linalg import solve_triangular
-
         centre = _covariance(terms, about, [at, *self.rows]).mean(axis=0)
         across = _covariance(terms, [at], self.rows) - centre[len(at) :]
         # between samples of one antenna every term counts
         prior = sum(t.sd_db**2 for t in terms) - 2.0 * centre[: len(at)] + _covariance(terms, about, about).mean()
-        spread = solve_triangular(self._lower, across.T, lower=True, check_finite=False)
+        spread = self._factor.whiten(across.T)
         return across @ self._weights, np.sqrt(np.maximum(prior - (spread**2).sum(axis=0), 0.0))
 
 
@@ -434,23 +409,21 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     Notes
     -----
     ``y = offset + gains + own + noise``, all normal: with the covariance ``C`` of the rows the gain at directions of
-    covariance ``k`` with them is ``k' C^-1 y`` (Rasmussen and Williams, Gaussian Processes for Machine Learning, eq.
-    2.25). The solution is exact but for the average over ``bin_s``.
+    covariance ``k`` with them is ``k' C^-1 y`` (:class:`~aerpaw_cmp.common.gaussian.Factor`). The solution is exact
+    but for the average over ``bin_s``.
     """
-    from scipy.linalg import cho_solve
-
     model, rows = _binned_series(series, model or GainModel())
-    lower = factor_of(_covariance_of_levels(model, rows))
+    factor = Factor.of(_covariance_of_levels(model, rows))
     target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
-    weights = cho_solve((lower, True), target, check_finite=False)
+    weights = factor.solve(target)
     misfit = float(target @ weights)
     return GainFit(
         model=model,
         rows=tuple(rows),
-        log_evidence=-0.5 * misfit - float(np.log(np.diag(lower)).sum()),
+        log_evidence=factor.log_likelihood(target),
         common_scale=math.sqrt(max(misfit / max(len(target) - len(rows), 1), 1e-6)),
         _weights=weights,
-        _lower=lower,
+        _factor=factor,
     )
 
 
@@ -503,9 +476,7 @@ def column_forms(
     (width, width)
         Symmetric, positive semidefinite [squared unit of the columns per dB^2].
     """
-    from scipy.linalg import solve_triangular
-
     model, rows = _binned_series(series, model)
     values = np.concatenate([columns(s, model.bin_s) for s in series if len(s.binned(model.bin_s))])
-    inside = solve_triangular(factor_of(_covariance_of_levels(model, rows)), values, lower=True)
+    inside = Factor.of(_covariance_of_levels(model, rows)).whiten(values)
     return np.asarray(inside.T @ inside)

@@ -21,8 +21,9 @@ from typing import Any, Literal
 import numpy as np
 
 from ...common.errors import InputError
+from ...common.gaussian import Factor
 from ...common.units import FloatArray, IntArray, spread_out
-from ..gains.direction_gain import LinkSamples, factor_of
+from ..gains.direction_gain import LinkSamples
 
 Part = Literal["mean", "place", "offset", "drift"]
 PARTS: tuple[Part, ...] = ("mean", "place", "offset", "drift")
@@ -266,26 +267,20 @@ class FieldFit:
         return len(self.rows) <= _EXACT_ROWS and len(self.rows) ** 2 * float(targets) <= _EXACT_WORK
 
     @cached_property
-    def _whitened(self) -> tuple[FloatArray, FloatArray]:
+    def _whitened(self) -> tuple[Factor, FloatArray]:
         """Factor of the covariance of the rows, and their values by it."""
-        from scipy.linalg import solve_triangular
-
-        lower = factor_of(_noisy(self.model, covariance(self.model, self.rows, self.rows)))
-        value = np.zeros(len(self.rows)) if self.value_db is None else self.value_db
-        return lower, np.asarray(solve_triangular(lower, value, lower=True, check_finite=False))
+        factor = Factor.of(_noisy(self.model, covariance(self.model, self.rows, self.rows)))
+        return factor, factor.whiten(np.zeros(len(self.rows)) if self.value_db is None else self.value_db)
 
     def _exact(
         self, targets: Rows, step: int, parts: Collection[Part]
     ) -> Iterator[tuple[slice | IntArray, FloatArray, FloatArray]]:
-        from scipy.linalg import solve_triangular
-
-        lower, white = self._whitened
+        factor, white = self._whitened
         prior = prior_sd_db(self.model, parts) ** 2
         for start in range(0, len(targets), step):
             block = slice(start, start + step)
-            across = covariance(self.model, targets.part(block), self.rows, parts)
-            half = solve_triangular(lower, across.T, lower=True, overwrite_b=True, check_finite=False)
-            yield block, half.T @ white, np.sqrt(np.maximum(prior - np.einsum("nm,nm->m", half, half), 0.0))
+            mean, explained = factor.condition(covariance(self.model, targets.part(block), self.rows, parts), white)
+            yield block, mean, np.sqrt(np.maximum(prior - explained, 0.0))
 
     def _nearest(
         self, targets: Rows, step: int, parts: Collection[Part]
@@ -359,14 +354,6 @@ def _cells(places: FloatArray, step: int) -> Iterator[tuple[IntArray, bool]]:
         yield alone[start : start + step], False
 
 
-def _inverse(lower: FloatArray) -> FloatArray:
-    """Inverse of a matrix of its Cholesky factor, at a third of what solving for the unit matrix takes."""
-    from scipy.linalg.lapack import dpotri
-
-    triangle = np.tril(dpotri(lower, lower=True)[0])
-    return np.asarray(triangle + np.tril(triangle, -1).T)
-
-
 def _noisy(model: FieldModel, matrix: FloatArray) -> FloatArray:
     """A covariance (..., n, n) with the noise on its diagonal, in place."""
     count = matrix.shape[-1]
@@ -394,21 +381,11 @@ def left_out(
         Of ``value_db``, noise included.
     own_sd_db : (n,)
         Of a row about the mean of its block, where a block's own mean is taken off.
-
-    Notes
-    -----
-    One inverse P of the covariance serves all blocks: the block b given the rest has the covariance ``inv(P_bb)`` and
-    the error ``inv(P_bb) (P y)_b`` (Rasmussen and Williams, eq. 5.10-5.12, for blocks).
     """
-    lower = factor_of(_noisy(model, covariance(model, rows, rows)))
-    inverse = _inverse(lower)
-    right = inverse @ value_db
+    factor = Factor.of(_noisy(model, covariance(model, rows, rows)))
     mean, sd, own_sd = np.empty((3, len(rows)))
-    for code in np.unique(block):
-        mine = np.flatnonzero(block == code)
-        spread = np.linalg.inv(inverse[np.ix_(mine, mine)])
-        mean[mine] = value_db[mine] - spread @ right[mine]
-        sd[mine] = np.sqrt(np.diag(spread))
+    for mine, mean_of_block, spread in factor.left_out(value_db, block):
+        mean[mine], sd[mine] = mean_of_block, np.sqrt(np.diag(spread))
         about = spread - spread.mean(axis=0) - spread.mean(axis=1)[:, None] + spread.mean()
         own_sd[mine] = np.sqrt(np.maximum(np.diag(about), 0.0))
     return mean, sd, own_sd
@@ -494,8 +471,8 @@ def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: flo
 def _likelihood(model: FieldModel, apart: _Apart, value: FloatArray, names: Sequence[str]) -> tuple[float, FloatArray]:
     """Log marginal likelihood but for a constant, and its slope along the logarithm of each named parameter."""
     place, drift = _place(model, apart), _drift(model, apart)
-    lower = factor_of(_noisy(model, MEAN_SD_DB**2 + place + model.offset_sd_db**2 * apart.same + drift))
-    inverse = _inverse(lower)
+    factor = Factor.of(_noisy(model, MEAN_SD_DB**2 + place + model.offset_sd_db**2 * apart.same + drift))
+    inverse = factor.inverse()
     weight = inverse @ value
     outer = np.outer(weight, weight) - inverse
     along = {
@@ -512,4 +489,4 @@ def _likelihood(model: FieldModel, apart: _Apart, value: FloatArray, names: Sequ
         else 0.5 * float(np.einsum("ij,ij->", outer, along[name]()))
         for name in names
     ]
-    return -0.5 * float(value @ weight) - float(np.log(np.diag(lower)).sum()), np.array(slope)
+    return factor.log_likelihood(value), np.array(slope)

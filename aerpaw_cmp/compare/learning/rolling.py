@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...common.gaussian import Factor
 from ...common.units import FloatArray, IntArray
 from ..judge.entries import crps_normal
 from .field_gp import FieldModel, Rows, covariance
@@ -156,23 +157,20 @@ class RouteAhead:
 
         One factor serves all trends. The strengths are scaled to the data: ``s^2 = y' inv(K) y / n``.
         """
-        from scipy.linalg import cho_factor, cho_solve
-
         rows = _rows(np.array(self._bins.place[:known]), np.array(self._bins.time_s[:known]))
         level = np.array(self._bins.level[:known])
         value = np.stack([level - np.array(self._bins.trends[name][:known]) for name in names], axis=1)
         matrix = covariance(model, rows, rows)
         matrix[np.diag_indices(known)] += model.noise_sd_db**2
-        factor = cho_factor(matrix, lower=True, overwrite_a=True, check_finite=False)
+        factor = Factor.of(matrix)
         middle = value.mean(axis=0)
-        solved = cho_solve(factor, value - middle, check_finite=False)
-        scale = np.maximum(((value - middle) * solved).sum(axis=0) / known, 1e-2)
+        white = factor.whiten(value - middle)
+        scale = np.maximum((white**2).sum(axis=0) / known, 1e-2)
         targets = _rows(place, time_s)
-        across = covariance(model, targets, rows)
+        mean, explained = factor.condition(covariance(model, targets, rows), white)
         prior = float(covariance(model, targets.part([0]), targets.part([0]))[0, 0])
-        explained = np.einsum("mn,nm->m", across, cho_solve(factor, across.T, check_finite=False))
         variance = np.maximum(prior - explained, 0.0) + model.noise_sd_db**2
-        return [(middle[k] + across @ solved[:, k], np.sqrt(scale[k] * variance)) for k in range(len(names))]
+        return [(middle[k] + mean[:, k], np.sqrt(scale[k] * variance)) for k in range(len(names))]
 
     def _predict(self, place: FloatArray) -> Ahead | None:
         """The rest of the route from where the UAV is."""

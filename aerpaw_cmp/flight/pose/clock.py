@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...common.gaussian import determining, gaussian_kernel
+from ...common.gaussian import Factor, determining, gaussian_kernel
 from ...common.jsonable import fields_of
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
@@ -485,8 +485,6 @@ def _averaged(table: FloatArray, width: float) -> FloatArray:
 
 def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray:
     """Features (g, q) whose products are the covariance of a gain of unit variance over directions (g, 3)."""
-    from scipy.linalg import solve_triangular
-
     finite = np.isfinite(direction).all(axis=1)
     unit = direction[finite] / np.linalg.norm(direction[finite], axis=1, keepdims=True)
 
@@ -495,9 +493,9 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
 
     some = unit[:: max(1, len(unit) // 1500)]
     base = some[determining(some, covariance, _LEFT, _FEATURES)]
-    lower = np.linalg.cholesky(covariance(base, base) + 1e-9 * np.eye(len(base)))
     out = np.full((len(direction), len(base)), np.nan)
-    out[finite] = solve_triangular(lower, covariance(unit, base).T, lower=True).T
+    known = Factor.of(covariance(base, base) + 1e-9 * np.eye(len(base)))
+    out[finite] = known.whiten(covariance(unit, base).T).T
     return out
 
 

@@ -9,7 +9,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ...common.gaussian import gaussian_kernel
+from ...common.gaussian import Factor, gaussian_kernel
 from ...common.units import FloatArray
 
 # Share of the variance by which rounded values may miss the function.
@@ -44,12 +44,10 @@ class PairGain:
     prior_sd_db: float
 
     @cached_property
-    def _factor(self) -> FloatArray:
-        from scipy.linalg import cholesky
-
+    def _factor(self) -> Factor:
         matrix = gaussian_kernel(self.directions, self.directions, self.length)
         matrix[np.diag_indices(len(matrix))] += _NUGGET
-        return np.asarray(cholesky(matrix, lower=True))
+        return Factor.of(matrix)
 
     def at(self, directions: FloatArray, apart_sd_db: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gain and standard deviation of the level (n,) towards directions (n, 6) [dB].
@@ -70,16 +68,13 @@ class PairGain:
         The variance is that of the record by the share of the process that its directions determine, and the sum of
         the antennas' and of the prior's by the rest.
         """
-        from scipy.linalg import solve_triangular
-
         gain, sd = np.empty(len(directions)), np.empty(len(directions))
-        weights = solve_triangular(self._factor, self.gain_db, lower=True)
+        white = self._factor.whiten(self.gain_db)
         for start in range(0, len(directions), 4096):
             part = slice(start, start + 4096)
             across = gaussian_kernel(directions[part], self.directions, self.length)
-            half = solve_triangular(self._factor, across.T, lower=True)
-            gain[part] = half.T @ weights
-            known = np.minimum((half**2).sum(axis=0), 1.0)
+            gain[part], known = self._factor.condition(across, white)
+            known = np.minimum(known, 1.0)
             near = across @ self.sd_db**2 / np.maximum(across.sum(axis=1), 1e-12)
             away = apart_sd_db[part] ** 2 + self.prior_sd_db**2
             sd[part] = np.sqrt(known * near + (1.0 - known) * away)

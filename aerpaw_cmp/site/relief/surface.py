@@ -10,11 +10,11 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
 from ...common.errors import UsageError
+from ...common.gaussian import Factor
 from ...common.geodesy import SiteFrame
 from ...common.units import FloatArray
 from .dem import Dem
@@ -75,7 +75,7 @@ class Surface:
             waves = self._waves(drawn)
             prior = waves(place)
             off = off + drawn.normal(0.0, self.error_m) - waves(self.place_m)
-        height = self.level_m + prior + self._between(place) @ cho_solve(self._factor(), off)
+        height = self.level_m + prior + self._between(place) @ self._factor().solve(off)
         return Dem(
             height_m=height.reshape(rows, columns), west=west, south=south, step_x=cell, step_y=cell, crs="local",
             frame=self.frame,
@@ -84,15 +84,14 @@ class Surface:
     def sd_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
         """Standard deviation (places,) of the surface [m]."""
         near = self._between(np.column_stack([east_m, north_m]))
-        known = (near * cho_solve(self._factor(), near.T).T).sum(axis=1)
+        known = (self._factor().whiten(near.T) ** 2).sum(axis=0)
         return np.asarray(np.sqrt(np.maximum(self.deviation_m**2 - known, 0.0)))
 
     def _between(self, place_m: FloatArray) -> FloatArray:
         return self.deviation_m**2 * _matern(cdist(place_m, self.place_m), self.length_m)
 
-    def _factor(self) -> tuple[FloatArray, bool]:
-        factor: tuple[FloatArray, bool] = cho_factor(self._between(self.place_m) + np.diag(self.error_m**2))
-        return factor
+    def _factor(self) -> Factor:
+        return Factor.of(self._between(self.place_m) + np.diag(self.error_m**2))
 
     def _waves(self, random: np.random.Generator) -> _Waves:
         """A draw before any point is known: waves whose vectors have the process' spectrum, Student's t of 3."""
@@ -163,8 +162,6 @@ def _likelihood(
 ) -> tuple[float, float]:
     """Log likelihood of the points under a process, and its most likely mean [m]."""
     covariance = deviation_m**2 * _matern(apart_m, length_m) + np.diag(error_m**2)
-    factor = cho_factor(covariance)
-    ones = np.ones(len(height_m))
-    level = float(ones @ cho_solve(factor, height_m) / (ones @ cho_solve(factor, ones)))
-    off = height_m - level
-    return float(-0.5 * off @ cho_solve(factor, off) - np.log(np.diag(factor[0])).sum()), level
+    factor = Factor.of(covariance)
+    level = float(np.average(height_m, weights=factor.solve(np.ones(len(height_m)))))
+    return factor.log_likelihood(height_m - level), level

@@ -324,7 +324,10 @@ class AuditResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EngineResult:
-    """Engine that replayed the flight, its price, the things that it left out, and its audit."""
+    """Engine that replayed the flight, its price, the things that it left out, and its audit.
+
+    ``not_audited`` is the reason why Sionna RT could not audit it, empty where it did or was not asked to.
+    """
 
     engine: str
     links: int
@@ -333,6 +336,7 @@ class EngineResult:
     settings: Mapping[str, object] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()
     audit: AuditResult | None = None
+    not_audited: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -320,6 +320,8 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
         elif m["at_search_edge"]:
             failed.append(f"{link}: the best offset lies at the edge of the searched span")
     audit = (metrics.get("rt") or {}).get("audit") or {}
+    if why := (metrics.get("rt") or {}).get("not_audited"):
+        failed.append(f"audit: {why}")
     if audit.get("missing_paths"):
         failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")
     failed += [f"audit of the field: {text}" for text in (audit.get("field") or {}).get("failures", ())]

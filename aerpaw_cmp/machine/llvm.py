@@ -354,6 +354,10 @@ def _llvm_library() -> Path | None:
     return None
 
 
+class SionnaMissing(CheckError):
+    """Sionna RT cannot be loaded on this machine: nothing but the audit and ``rt.engine: sionna`` needs it."""
+
+
 def prepare_llvm() -> Path:
     """Point Dr.Jit to an LLVM that works; call it before importing drjit, mitsuba or sionna.
 
@@ -364,13 +368,13 @@ def prepare_llvm() -> Path:
 
     Raises
     ------
-    CheckError
+    SionnaMissing
         If no usable LLVM is found; the message holds the line that installs one.
     """
     path = _llvm_library()
     if path is None:
         line = INSTALL_AGAIN if sionna_fails(_trials()) else install_line()
-        raise CheckError(f"{explain(_trials())}. Mend it with: {line}")
+        raise SionnaMissing(f"{explain(_trials())}. Mend it with: {line}")
     os.environ[LIBRARY_VARIABLE] = str(path)
     return path
 

@@ -33,7 +33,7 @@ import numpy as np
 from ...common.errors import CheckError, UsageError
 from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ...common.versions import version
-from ...machine.llvm import INSTALL_AGAIN, let_sionna_load, prepare_llvm
+from ...machine.llvm import INSTALL_AGAIN, SionnaMissing, let_sionna_load, prepare_llvm
 from ...site.materials import material
 from ..geometry.arrays import Array, Link
 from ..geometry.faces import inside, triangles
@@ -86,17 +86,28 @@ def load_variant(prefer: str | None = None) -> str:
     ------
     UsageError
         If Dr.Jit finds no device of that kind.
-    CheckError
-        If no LLVM serves.
+    SionnaMissing
+        If Sionna RT or a package that it needs is not installed, or no LLVM serves.
     """
+    try:
+        return _variant(("cuda", "llvm") if prefer is None else (prefer,))
+    except ImportError as error:
+        raise _missing(error) from error
+
+
+def _missing(error: ImportError) -> SionnaMissing:
+    return SionnaMissing(f"Sionna RT cannot be loaded ({error}). Mend it with: {INSTALL_AGAIN}")
+
+
+def _variant(kinds: Sequence[str]) -> str:
+    """The first of the kinds that serves, now in use."""
     let_sionna_load()
     _leave_for_later()
-    kinds = (prefer,) if prefer else ("cuda", "llvm")
-    without_llvm: CheckError | None = None
+    without_llvm: SionnaMissing | None = None
     if "llvm" in kinds:
         try:
             prepare_llvm()  # before Dr.Jit looks for one by itself
-        except CheckError as error:
+        except SionnaMissing as error:
             without_llvm = error  # a GPU may do without
     import mitsuba as mi
 
@@ -189,7 +200,7 @@ class _Builder:
         try:
             import sionna.rt as rt
         except ImportError as error:
-            raise CheckError(f"Sionna RT cannot be loaded ({error})", cause=f"mend it with: {INSTALL_AGAIN}") from error
+            raise _missing(error) from error
         if _ALIVE:
             gc.collect()  # an exception may have kept one
         scene, faces = rt.load_scene(), self.faces

@@ -142,7 +142,7 @@ def further_numbers(series: RssResult | RankResult) -> dict[str, Any]:
 def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
     audit = engine.audit
     return {
-        **named(engine, "engine links seconds paths left_out"),
+        **named(engine, "engine links seconds paths left_out not_audited"),
         "audit": None
         if audit is None
         else {

@@ -553,7 +553,10 @@ def warnings(data: ReportData) -> list[str]:
         texts += _rss_warnings(panel)
     audit = None if data.engine is None else data.engine.audit
     if data.engine is not None and audit is None:
-        texts.append("The replay engine was not audited against the other engine in this report.")
+        why = data.engine.not_audited
+        texts.append(
+            f"Not audited against Sionna RT: {why}" if why else "The replay was not audited against the other engine."
+        )
     if audit is not None and audit.missing_paths:
         texts.append(audit_summary(audit))
     if audit is not None and audit.fields is not None and audit.fields.failed:

@@ -6,6 +6,7 @@ import contextlib
 import glob
 import hashlib
 import os
+import re
 import tempfile
 import time
 from collections.abc import Iterator
@@ -54,6 +55,34 @@ def inside(
             path=source,
         )
     return place
+
+
+def cache_folder(*parts: str) -> Path:
+    """Place in the folder of all that this program can make again: ``AERPAW_CMP_CACHE``, else below the user's cache.
+
+    The user's cache is where ``XDG_CACHE_HOME`` says, ``~/.cache`` without it.
+    """
+    chosen = os.environ.get("AERPAW_CMP_CACHE")
+    folder = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "aerpaw-cmp")
+    return folder.expanduser().joinpath(*parts)
+
+
+# Entries of the cache: named by a digest of what they were made of, or compiled code below such a name.
+_ENTRY = re.compile(r"(kernels-)?[0-9a-f]{16,64}(\.\w+)?")
+
+
+def clear_cache() -> tuple[int, int]:
+    """Remove what the cache holds, and nothing that only stands in its folder; number of files and their bytes."""
+    folder, files, size = cache_folder(), 0, 0
+    for path in sorted(folder.rglob("*"), reverse=True):
+        names = path.relative_to(folder).parts
+        if path.is_symlink() or not path.is_file() or not any(_ENTRY.fullmatch(name) for name in names):
+            continue
+        size, files = size + path.stat().st_size, files + 1
+        path.unlink()
+        with contextlib.suppress(OSError):  # the last one takes its folder along
+            path.parent.rmdir()
+    return files, size
 
 
 @contextlib.contextmanager

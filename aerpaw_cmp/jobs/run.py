@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.errors import InputError, UsageError, noting_interrupts
+from ..common.files import cache_folder
 from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import Stages
@@ -559,11 +560,6 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
     return line[np.isfinite(line).all(axis=1)], settings.flight.name
 
 
-def _outcomes_folder() -> Path:
-    """Folder where outcomes are kept by default: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
-    return Path(os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp") / "outcomes"
-
-
 def run_campaign(
     path: Path,
     options: RunOptions = DEFAULT,
@@ -627,7 +623,7 @@ def run_campaign(
 def _campaign_keep(campaign: Any, path: Path, keep: Path | None = None) -> Path:
     """Folder of outcomes: as asked, else as campaign.yaml says, else in the user's cache."""
     if keep is None:
-        keep = _outcomes_folder() if campaign.keep is None else path.parent / Path(campaign.keep).expanduser()
+        keep = cache_folder("outcomes") if campaign.keep is None else path.parent / Path(campaign.keep).expanduser()
     if ":/" in str(keep):  # a path has one slash there
         raise UsageError(f"outcomes in {keep}", expected="a folder", cause="object stores are not written any more")
     return keep

@@ -17,6 +17,7 @@ from typing import Any, Literal
 
 from ..common import versions
 from ..common.errors import AerpawCmpError
+from ..common.files import cache_folder
 from . import llvm
 
 Status = Literal["ok", "warn", "fail"]
@@ -64,7 +65,7 @@ def checks() -> list[Check]:
         _cores_check(),
         memory_check(),
         _disk_check(Path.cwd()),
-        cache_check(llvm.cache_folder()),
+        cache_check(cache_folder()),
         readers_check(),
         *serial_checks(),
     ]

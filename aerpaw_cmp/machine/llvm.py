@@ -24,6 +24,7 @@ from hashlib import sha256
 from pathlib import Path
 
 from ..common.errors import CheckError
+from ..common.files import cache_folder
 from ..common.versions import version
 
 # 14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine.
@@ -301,14 +302,6 @@ def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], 
     return trials
 
 
-def cache_folder(environ: Mapping[str, str] = os.environ) -> Path:
-    """Folder where this program keeps what it can make again: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
-    if chosen := environ.get("AERPAW_CMP_CACHE"):
-        return Path(chosen)
-    base = environ.get("XDG_CACHE_HOME") or "~/.cache"
-    return Path(base).expanduser() / "aerpaw-cmp"
-
-
 def _verdict_file(library: Library) -> Path:
     """File where a good trial is remembered: it holds for this library file, these versions and this processor."""
     try:
@@ -322,7 +315,7 @@ def _verdict_file(library: Library) -> Path:
     versions = [version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
     # the nodes of a cluster share home folders: hence the processor in the key
     key = repr((str(library.path), stat.st_size, stat.st_mtime_ns, versions, processor, sys.prefix))
-    return cache_folder() / "llvm" / sha256(key.encode()).hexdigest()[:24]
+    return cache_folder("llvm", sha256(key.encode()).hexdigest()[:24])
 
 
 def _remembered_trial(library: Library) -> Trial:
@@ -354,7 +347,7 @@ def _llvm_library() -> Path | None:
     return None
 
 
-class SionnaMissing(CheckError):
+class SionnaMissingError(CheckError):
     """Sionna RT cannot be loaded on this machine: nothing but the audit and ``rt.engine: sionna`` needs it."""
 
 
@@ -368,13 +361,13 @@ def prepare_llvm() -> Path:
 
     Raises
     ------
-    SionnaMissing
+    SionnaMissingError
         If no usable LLVM is found; the message holds the line that installs one.
     """
     path = _llvm_library()
     if path is None:
         line = INSTALL_AGAIN if sionna_fails(_trials()) else install_line()
-        raise SionnaMissing(f"{explain(_trials())}. Mend it with: {line}")
+        raise SionnaMissingError(f"{explain(_trials())}. Mend it with: {line}")
     os.environ[LIBRARY_VARIABLE] = str(path)
     return path
 

@@ -1,5 +1,6 @@
 """What the audit is told of a flight's settings, and its check of the attitude."""
 
+import sys
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -10,10 +11,13 @@ import pytest
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight import replay as replays
+from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.pose import track as tracks
-from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, RtSettings
+from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, RtSettings, load_flight
 from aerpaw_cmp.jobs.reporting import audit_flight
+from aerpaw_cmp.machine.llvm import INSTALL_AGAIN
 from aerpaw_cmp.propagation.geometry.arrays import Poses
+from tests.jobs.test_audit_raw import write_flight
 
 FRAME = SiteFrame(35.7275, -78.696)
 
@@ -59,6 +63,16 @@ def test_wrong_sign_of_an_angle_is_seen(monkeypatch, mode, where, name, sign):
 def test_array_that_turns_although_the_attitude_is_ignored_is_seen():
     turned = SimpleNamespace(poses=Poses(np.zeros((1, 3)), tracks.rotation_from_aircraft([1.0], [0.0], [90.0])))
     assert audit_flight.attitude_checked(flight("ignored"), [turned]).failures
+
+
+def test_flight_is_replayed_where_sionna_rt_cannot_be_loaded(tmp_path, monkeypatch):
+    data = load_data(load_flight(write_flight(tmp_path)), tmp_path)
+    replayed = replays.replay_flight(data).all
+    monkeypatch.setitem(sys.modules, "mitsuba", None)
+    engine = audit_flight.audit_replays(data, replayed)
+    assert engine.audit is None
+    assert engine.not_audited.endswith(f"Mend it with: {INSTALL_AGAIN}")
+    assert "mitsuba" in engine.not_audited
 
 
 ARRAYS = {

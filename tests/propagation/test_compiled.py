@@ -463,7 +463,7 @@ def test_many_faces_without_compiled_code(monkeypatch, fresh, case, way):
 def test_compiled_code_has_to_be_quicker_than_numpy_its_compilation_included(monkeypatch, tmp_path):
     monkeypatch.delenv(compiled.SWITCH, raising=False)
     monkeypatch.setattr(compiled, "load", lambda _: compiled.State(types.ModuleType("kernels"), ""))
-    monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(compiled, "code_folder", lambda: tmp_path)
     monkeypatch.setattr(compiled, "find_spec", lambda _: True)
     monkeypatch.delitem(sys.modules, f"aerpaw_cmp.{compiled.FIELD}", raising=False)
 
@@ -489,7 +489,7 @@ def test_compiled_code_has_to_be_quicker_than_numpy_its_compilation_included(mon
 def test_many_jobs_of_one_process_pay_for_a_compiler(monkeypatch, tmp_path):
     monkeypatch.delenv(compiled.SWITCH, raising=False)
     monkeypatch.setattr(compiled, "load", lambda _: compiled.State(types.ModuleType("kernels"), ""))
-    monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(compiled, "code_folder", lambda: tmp_path)
     monkeypatch.setitem(compiled._in_numpy_s, compiled.FIELD, 0.0)
     monkeypatch.delitem(sys.modules, f"aerpaw_cmp.{compiled.FIELD}", raising=False)
     pairs = int(1.0 / compiled.FIELD_S)  # a second of NumPy
@@ -537,15 +537,15 @@ def test_a_damaged_entry_of_compiled_code_is_compiled_again(kind, tmp_path, monk
 
 def test_compiled_code_is_kept_where_nobody_else_can_write(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
-    compiled.cache_folder.cache_clear()
+    compiled.code_folder.cache_clear()
     try:
-        folder = compiled.cache_folder()
+        folder = compiled.code_folder()
         assert folder is not None
         folder.chmod(0o777)
-        compiled.cache_folder.cache_clear()
-        assert compiled.cache_folder() is None
+        compiled.code_folder.cache_clear()
+        assert compiled.code_folder() is None
     finally:
-        compiled.cache_folder.cache_clear()
+        compiled.code_folder.cache_clear()
 
 
 def test_wrong_settings_are_named(monkeypatch):

@@ -109,7 +109,8 @@ def test_anything_that_decides_paths_changes_the_key(case, tmp_path, scenes):
 )  # fmt: skip
 def test_the_cache_is_where_it_was_asked_for(monkeypatch, tmp_path, engine, given, environment, expected):
     monkeypatch.setenv("AERPAW_CMP_CACHE", environment)
-    monkeypatch.setattr(engines.Path, "home", lambda: tmp_path)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
     cache = engines.path_cache(Search(engine), Run(cache_dir=given))
     assert (None if cache is None else cache.folder) == (
         None if expected is None else tmp_path / expected if expected.startswith(".") else Path(expected)

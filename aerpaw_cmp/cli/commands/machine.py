@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from typer import Option
 
+from ...common import files as cached
 from ..app import Json, command
 from ..shown import print_json, records, say, show
 
@@ -58,10 +59,17 @@ def _conditions(at: Mapping[str, Any]) -> str:
     examples=[
         "aerpaw-cmp doctor",
         "aerpaw-cmp doctor --json",
+        "aerpaw-cmp doctor --clear-cache",
     ],
 )
-def doctor(as_json: Json = False) -> int:
+def doctor(
+    clear_cache: Annotated[bool, Option("--clear-cache", help="First empty the cache of this program.")] = False,
+    as_json: Json = False,
+) -> int:
     """Check this machine."""
+    if clear_cache:
+        files, size = cached.clear_cache()
+        say(f"cache: {files} files removed, {size / 1e6:.1f} MB")
     from ...machine import doctor as doctor_room
 
     checks = doctor_room.checks()

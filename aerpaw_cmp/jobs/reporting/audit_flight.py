@@ -24,7 +24,7 @@ from ...flight.gains.losses import path_loss
 from ...flight.replay import Replayed, attitude_rotation, part_of
 from ...flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ...logs.ingest import IngestedFile
-from ...machine.llvm import SionnaMissing
+from ...machine.llvm import SionnaMissingError
 from ...propagation.check import reference
 from ...propagation.check.audit import Audit, Second, audit
 from ...propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
@@ -71,7 +71,7 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
     if rt.audit_links:
         try:
             checked = _audit(data, replays, progress)
-        except SionnaMissing as error:  # all else has the same numbers without it
+        except SionnaMissingError as error:  # all else has the same numbers without it
             if rt.engine == "sionna":
                 raise
             not_audited = str(error)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import hashlib
 import io
-import os
 import time
 import warnings
 from dataclasses import replace
@@ -19,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from ... import __version__
-from ...common.files import read_sealed, write_sealed
+from ...common.files import cache_folder, read_sealed, write_sealed
 from ...common.units import AnyArray, FloatArray
 from ...common.versions import version
 from ...site.site import Site
@@ -44,7 +43,7 @@ def path_cache(search: Search, run: Run) -> PathCache | None:
     if folder is None:
         if search.engine != "sionna":
             return None
-        folder = os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp"
+        folder = cache_folder()
     return PathCache(Path(folder)) if str(folder) else None
 
 

@@ -30,6 +30,7 @@ from typing import Any
 import numpy as np
 
 from ...common.errors import UsageError
+from ...common.files import cache_folder
 from ...common.units import AnyArray
 
 ROOM = Path(__file__).parents[2]
@@ -95,11 +96,10 @@ def _source_hash() -> str:
 
 
 @lru_cache(maxsize=1)
-def cache_folder() -> Path | None:
+def code_folder() -> Path | None:
     """Folder of compiled code, this user's alone: in ``NUMBA_CACHE_DIR``, the package or the user's cache; or None."""
     named = os.environ.get("NUMBA_CACHE_DIR")
-    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-    for base in (Path(named),) if named else (ROOM / "__pycache__", home / "aerpaw-cmp" / "compiled"):
+    for base in (Path(named),) if named else (ROOM / "__pycache__", cache_folder("compiled")):
         folder = base / f"kernels-{_source_hash()}"
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -155,7 +155,7 @@ def _cost_s(name: str) -> float:
     """CPU seconds until compiled code runs: it is loaded, kept on disk, or has to be compiled."""
     if f"aerpaw_cmp.{name}" in sys.modules:
         return LEAST_S
-    folder = cache_folder() if find_spec("numba") else None
+    folder = code_folder() if find_spec("numba") else None
     return READ_S if folder is not None and (folder / f"{name}.compiled").exists() else COMPILE_S[name]
 
 
@@ -173,7 +173,7 @@ def load(name: str) -> State:
             warnings.simplefilter("ignore")  # numba's own, about its cache
             kernels = import_module(f"aerpaw_cmp.{name}")
             kernels.try_out()
-            if (folder := cache_folder()) is not None:
+            if (folder := code_folder()) is not None:
                 (folder / f"{name}.compiled").touch()
     except Exception as error:
         line = (str(error).splitlines() or [""])[0]

@@ -14,9 +14,9 @@ from numba.core.serialize import dumps
 from numba.extending import register_jitable
 
 from ...common.files import read_sealed, write_sealed
-from .compiled import cache_folder
+from .compiled import code_folder
 
-FOLDER = cache_folder()
+FOLDER = code_folder()
 _MARK = b"aerpaw-cmp kernel 1\n"
 _MATHS: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 _PART: dict[str, Any] = {"forceinline": True, "_nrt": False}
@@ -41,7 +41,7 @@ class _Sealed:
     """Compiled code of one kernel on disk, in place of numba's files, whose damage ends in any exception or a crash.
 
     An entry has its SHA-256 behind it: a damaged one is none, and is compiled anew. The folder is this user's alone
-    (:func:`aerpaw_cmp.propagation.native.compiled.cache_folder`), since an entry holds machine code.
+    (:func:`aerpaw_cmp.propagation.native.compiled.code_folder`), since an entry holds machine code.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:

@@ -20,7 +20,7 @@ import gc
 import inspect
 import re
 import sys
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -33,7 +33,7 @@ import numpy as np
 from ...common.errors import CheckError, UsageError
 from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ...common.versions import version
-from ...machine.llvm import INSTALL_AGAIN, SionnaMissing, let_sionna_load, prepare_llvm
+from ...machine.llvm import INSTALL_AGAIN, SionnaMissingError, let_sionna_load, prepare_llvm
 from ...site.materials import material
 from ..geometry.arrays import Array, Link
 from ..geometry.faces import inside, triangles
@@ -86,7 +86,7 @@ def load_variant(prefer: str | None = None) -> str:
     ------
     UsageError
         If Dr.Jit finds no device of that kind.
-    SionnaMissing
+    SionnaMissingError
         If Sionna RT or a package that it needs is not installed, or no LLVM serves.
     """
     try:
@@ -95,19 +95,19 @@ def load_variant(prefer: str | None = None) -> str:
         raise _missing(error) from error
 
 
-def _missing(error: ImportError) -> SionnaMissing:
-    return SionnaMissing(f"Sionna RT cannot be loaded ({error}). Mend it with: {INSTALL_AGAIN}")
+def _missing(error: ImportError) -> SionnaMissingError:
+    return SionnaMissingError(f"Sionna RT cannot be loaded ({error}). Mend it with: {INSTALL_AGAIN}")
 
 
 def _variant(kinds: Sequence[str]) -> str:
     """The first of the kinds that serves, now in use."""
     let_sionna_load()
     _leave_for_later()
-    without_llvm: SionnaMissing | None = None
+    without_llvm: SionnaMissingError | None = None
     if "llvm" in kinds:
         try:
             prepare_llvm()  # before Dr.Jit looks for one by itself
-        except SionnaMissing as error:
+        except SionnaMissingError as error:
             without_llvm = error  # a GPU may do without
     import mitsuba as mi
 

@@ -15,7 +15,7 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.outputs import file_digest
-from aerpaw_cmp.flight.drafting.remembered import Nodes, propose, searching_airframe
+from aerpaw_cmp.flight.drafting.remembered import Nodes, propose, searching_airframe, taught
 from aerpaw_cmp.flight.marks import mark_of
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.site.antenna.learned import (
@@ -81,10 +81,12 @@ def flight(folder: Path, antennas: dict[str, str], carrier_hz: float = CARRIER_H
         ("mine.yaml", [], ("A", "flight_mat"), "copy", False),  # learned from these readings in another log
     ],
 )
-def test_a_search_takes_the_airframe_of_other_flights_alone(folder, site, towers, series, log, fits) -> None:
-    airframe = searching_airframe(folder / site, towers, series, (log, MARK if log == "copy" else ""))
+def test_a_search_takes_the_antennas_of_other_flights_alone(folder, site, towers, series, log, fits) -> None:
+    log = log, MARK if log == "copy" else ""
+    airframe = searching_airframe(folder / site, towers, series, log)
     assert (airframe is not None) == fits
     assert airframe is None or airframe.gain_dbi(0.3, 0.4) == pytest.approx(0.0, abs=1e-6)
+    assert set(taught(folder / site, series, log)) == ({"LW1"} if fits or towers else set())  # whatever the towers
 
 
 def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:

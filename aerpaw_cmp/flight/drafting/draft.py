@@ -607,9 +607,10 @@ class _Entries:
             if level is not None:
                 series = _key(level, entry)[1], file.result.reader
                 mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
-                airframe = searching_airframe(memory, placer.site.towers, series, (file.sha256, mark))
+                log = file.sha256, mark
+                airframe = searching_airframe(memory, placer.site.towers, series, log)
                 levels_on_track = placer.levels(level, self._floor_db(level), airframe)
-                places[pci] = placer.propose(levels_on_track, taught(memory, series))
+                places[pci] = placer.propose(levels_on_track, taught(memory, series, log))
         for pci, place in places.items():
             if place is None:
                 continue

@@ -180,16 +180,24 @@ def searching_airframe(
     return None
 
 
-def taught(site: str | Path, series: tuple[str, str]) -> dict[str, Taught]:
+def taught(site: str | Path, series: tuple[str, str], log: tuple[str, str]) -> dict[str, Taught]:
     """Antennas at both ends that flights taught for a channel and reader, by tower; a damaged memory has none.
 
     Parameters
     ----------
     site : str or Path
     series : (channel, reader)
+    log : (SHA-256, mark)
+        Of the log, which must not have been learned from.
     """
     with suppress(InputError, UsageError):
-        fit = [known for known in remembered(site).values() if (known.series.channel, known.series.reader) == series]
+        fit = [
+            known
+            for known in remembered(site).values()
+            if (known.series.channel, known.series.reader) == series
+            and log[0] not in known.entry.trained_on
+            and not among(log[1], known.uav.marks)
+        ]
         return {
             known.series.tower: Taught(
                 tower=known.tower,

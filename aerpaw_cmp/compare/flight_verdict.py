@@ -8,6 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
+from ..common.units import FloatArray
+from .level.detection import DetectionScore, floored_fit
 from .result import FlightVerdict, RssResult
 from .statistics.intervals import corrected, pooled_difference
 from .statistics.memory import FEWEST
@@ -47,14 +49,50 @@ def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
     return float(np.sqrt((weight * np.asarray(rmse_db) ** 2).sum() / weight.sum()))
 
 
+def lock_lost(panel: RssResult) -> DetectionScore | None:
+    """The score of a receiver whose log says when it was in lock; None of others, and of one that never lost it."""
+    score = panel.further.detection
+    return score if score is not None and score.locks else None
+
+
 def flight_verdict(panels: Sequence[RssResult]) -> FlightVerdict | None:
-    """Ray tracing against the baseline with the smallest error, over all scored channels at once."""
+    """Ray tracing against the baseline with the smallest error, over all scored channels at once.
+
+    A receiver that lost its lock is judged on all its samples, lower levels counted as its floor.
+    """
     panels = scored(panels)
-    errors = baseline_errors(panels)
-    if not errors:
+    residuals = [_residuals(panel) for panel in panels]
+    errors = {name: _rms([of[name] for of in residuals]) for name in set.intersection(*map(set, residuals or [{}]))}
+    best = min((name for name in errors if name != _RAY), key=lambda name: errors[name], default="")
+    if not best:
         return None
-    best = min(errors, key=lambda name: errors[name])
-    pair = pooled_difference([(p.time, p.residual_db, p.calibrated_db - p.baselines[best].level_dbm) for p in panels])
+    channels = [(panel.time, of[_RAY], of[best]) for panel, of in zip(panels, residuals, strict=True)]
+    pair = pooled_difference(channels, free_offset=not any(map(lock_lost, panels)))
     return FlightVerdict(
-        against=best, difference_db=pair.difference_db, ci95_db=pair.difference_ci95_db, channels=len(panels)
-    )
+        against=best, rmse_db=errors[_RAY], baseline_rmse_db=errors[best], difference_db=pair.difference_db,
+        ci95_db=pair.difference_ci95_db, channels=len(panels),
+    )  # fmt: skip
+
+
+_RAY = "ray tracing"
+
+
+def _residuals(panel: RssResult) -> dict[str, FloatArray]:
+    """Residuals (n,) of ray tracing and of each baseline after its own offset, where a path is simulated [dB]."""
+    models = {_RAY: (panel.simulated_dbm, panel.score.offset_db)}
+    models |= {name: (model.level_dbm, model.offset_db) for name, model in panel.baselines.items()}
+    known, score = panel.posed & np.isfinite(panel.simulated_dbm), lock_lost(panel)
+    if score is None:
+        every = {name: panel.measured_db + offset - level for name, (level, offset) in models.items()}
+    else:
+        floor = score.floor_db
+        measured = np.where(known, np.fmax(panel.measured_db, floor), np.nan)
+        every = {
+            name: measured - np.maximum(level - floored_fit(measured, level, floor).offset_db, floor)
+            for name, (level, _) in models.items()
+        }
+    return {name: np.where(known, of, np.nan) for name, of in every.items() if np.isfinite(of).any()}
+
+
+def _rms(values: Sequence[FloatArray]) -> float:
+    return float(np.sqrt(np.nanmean(np.concatenate(values) ** 2)))

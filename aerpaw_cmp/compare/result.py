@@ -344,10 +344,12 @@ class FlightVerdict:
     """Ray tracing against the best baseline ``against``, over all channels of a flight at once.
 
     ``difference_db`` is its RMSE minus that of the baseline, each channel after its own offset: negative where ray
-    tracing is better.
+    tracing is better. Levels of a receiver that lost its lock count with its floor.
     """
 
     against: str
+    rmse_db: float
+    baseline_rmse_db: float
     difference_db: float
     ci95_db: Interval
     channels: int

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from ..common.counting import counted
 from ..common.errors import UsageError
 from .record.log import LogSettings
 from .serial.modem import OTHER_QUERIES, RI_QUERY, query_of
@@ -189,7 +190,7 @@ def format_status(status: TapStatus) -> str:
         "RSRP " + ("-" if status.rsrp_dbm is None else f"{status.rsrp_dbm} dBm"),
         "SINR " + ("-" if status.sinr_db is None else f"{status.sinr_db} dB"),
         f"{status.ri_rate_hz:.1f} Hz",
-        f"{status.gaps} gap{'' if status.gaps == 1 else 's'}",
+        counted(status.gaps, "gap"),
         f"{status.bytes_written / 2**20:.1f} MiB",
         "disk ?" if status.disk_free_bytes is None else f"disk {status.disk_free_bytes / 2**30:.1f} GiB",
     ]

@@ -13,6 +13,7 @@ from zoneinfo import ZoneInfo
 
 import pandas as pd
 
+from ..common.counting import counted
 from ..common.errors import InputError
 from ..common.htmltable import html_table
 from .flight_file import IngestedFile, write_flight
@@ -91,7 +92,9 @@ class Logs(dict[str, pd.DataFrame]):
 
     def __repr__(self) -> str:
         """One line per stream."""
-        return "\n".join([f"Logs of {_count(len(self.files), 'file')}", *("  " + _line(k, v) for k, v in self.items())])
+        return "\n".join(
+            [f"Logs of {counted(len(self.files), 'file')}", *("  " + _line(k, v) for k, v in self.items())]
+        )
 
     def _repr_html_(self) -> str:
         """A table of streams for notebooks."""
@@ -102,12 +105,8 @@ class Logs(dict[str, pd.DataFrame]):
         return html_table(("stream", "kind", "reader", "records", "file"), rows)
 
 
-def _count(number: int, noun: str) -> str:
-    return f"{number} {noun}" + ("" if number == 1 else "s")
-
-
 def _line(name: str, frame: pd.DataFrame) -> str:
-    return f"{name}: {frame.attrs['kind']}, {_count(len(frame), 'record')} ({frame.attrs['reader']})"
+    return f"{name}: {frame.attrs['kind']}, {counted(len(frame), 'record')} ({frame.attrs['reader']})"
 
 
 def _in_utc(frame: pd.DataFrame) -> pd.DataFrame:

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..common import versions
+from ..common.counting import counted
 from ..common.errors import AerpawCmpError
 from ..common.files import cache_folder
 from . import llvm
@@ -144,7 +145,7 @@ def _gpu_check() -> Check:
 def _cores_check() -> Check:
     """Processor cores that this process may use."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return Check("CPU", "ok", f"{cores} core{'s' if cores > 1 else ''}, {platform.machine()}")
+    return Check("CPU", "ok", f"{counted(cores, 'core')}, {platform.machine()}")
 
 
 def available_memory_bytes(root: Path = Path("/")) -> int | None:

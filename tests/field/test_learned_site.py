@@ -79,7 +79,7 @@ def test_an_unseen_flight_of_the_sounder_is_told_its_lock_by_other_flights(tmp_p
         REAL / "afar/results_useful_ori_exp_300_loc_2.mat", site, tmp_path
     )  # fmt: skip
     (numbers,) = (scores for _, scores in left_out["rows"](metrics))
-    assert "P(locked), learned on other flights" in sentence
+    assert "floor \N{MINUS SIGN}15" in sentence
     assert "Expect " in sentence
     assert numbers["P(detected) brier"] < 0.75 * numbers["P(detected) constant_brier"]
     assert numbers["P(detected) log_score"] < 0.75 * numbers["P(detected) constant_log_score"]

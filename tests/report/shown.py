@@ -20,7 +20,7 @@ from aerpaw_cmp.report.pages import flight as html
 from aerpaw_cmp.report.pages import maps as maps_html
 from aerpaw_cmp.report.pages import prediction as prediction_html
 from aerpaw_cmp.report.words.calibration import sentences
-from aerpaw_cmp.report.words.prediction import first_words
+from aerpaw_cmp.report.words.prediction import cautions, first_words
 from benchmarks import fabricated
 
 Fixture = Callable[[str], Any]
@@ -74,7 +74,7 @@ def calibration(_: Fixture) -> str:
         name="lake_wheeler_july", generated="2026-11-21T00:00:00+00:00", flights=["F0", "F1", "F2", "F3"],
         trained_on=["ab" * 32], marks=[], words=sentences(left, controls, (0.02, np.inf), ()), warnings=[], scores=as_dicts[0],
         controls=as_dicts[1], mounts={}, strengths={}, ground=None, curve=[], one_more_rmse_db=np.nan, antennas=[],
-        settings_text="link: {}",
+        settings_text="link: {" + ", ".join(f"setting_{i}: {i}" for i in range(200)) + "}",
     )  # fmt: skip
     return _written(calibration_html.write_calibration, data, "calibration")
 
@@ -114,9 +114,9 @@ def prediction(fixture: Fixture) -> str:
     )  # fmt: skip
     data = prediction_html.PredictionPage(
         name="route", kind="route", site=fixture("maps_data").site, table=table, units={"LW1 USRP1": "dBm"}, shape=None,
-        heights_m=(40.0,), verdict=first_words(chosen, 0.34, 2.0), candidates=[], model={"noise_sd_db": 1.0},
+        heights_m=(40.0,), verdict=first_words(chosen, 0.34, 2.0, 5.0), candidates=[], model={"noise_sd_db": 1.0},
         chosen={"title": "antennas learned from the named flights, no correction", "sd_factor": 1.0, "left_out": "flights"},
-        flown={}, flights=("F0", "F1"), trained_on=(), marks=(), threshold_db=None, warnings=(),
+        flown={}, flights=("F0", "F1"), trained_on=(), marks=(), threshold_db=None, warnings=cautions(chosen, 0.34),
         generated="2026-11-21T00:00:00+00:00", versions={}, stages_s={},
     )  # fmt: skip
     return _written(prediction_html.write_prediction, data, "prediction")

@@ -25,7 +25,7 @@ def test_the_first_words_need_no_scrolling(
 ) -> None:
     path = tmp_path / f"{page}.html"
     path.write_text(PAGES[page](request.getfixturevalue), encoding="utf-8")
-    for width, height in ((1440, 900), (390, 844)):
+    for width, height in ((1440, 900), (1024, 800), (390, 844)):
         size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": width < 500}
         driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
         driver.get(path.as_uri())

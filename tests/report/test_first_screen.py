@@ -1,21 +1,32 @@
 """The verdict of the first screen, and its numbers, against records whose answer is known."""
 
 import dataclasses
+import itertools
 
 import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.flight_verdict import baseline_errors, flight_verdict, pooled_db
 from aerpaw_cmp.compare.judge.causes import Cause
-from aerpaw_cmp.compare.level.detection import DetectionScore
+from aerpaw_cmp.compare.judge.ladder import LadderRow
+from aerpaw_cmp.compare.level.detection import DetectionScore, floored_fit
 from aerpaw_cmp.compare.level.field_difference import FieldAudit
-from aerpaw_cmp.compare.level.rss import ErrorSpan
 from aerpaw_cmp.compare.ranks.forecast import score_forecast
-from aerpaw_cmp.compare.result import ESTIMATED, ClockResult, FlightVerdict
+from aerpaw_cmp.compare.result import FlightVerdict
 from aerpaw_cmp.report.exports.tables import metrics
 from aerpaw_cmp.report.pages.diff import DIFFERENCE
-from aerpaw_cmp.report.words.flight import CAUSES, Judged, first_sentence, pretty, ranking_sentence, rss_verdict
-from aerpaw_cmp.report.words.flight_verdict import headlines, verdict
+from aerpaw_cmp.report.words.flight import (
+    CAUSES,
+    OFFSETS,
+    Judged,
+    cautions,
+    first_sentence,
+    offset_sentences,
+    pretty,
+    ranking_sentence,
+    rss_verdict,
+)
+from aerpaw_cmp.report.words.flight_verdict import MOST_WORDS, headlines, paragraph
 from benchmarks.fabricated import with_numbers
 
 
@@ -48,7 +59,8 @@ def with_errors(data, rmse_db, baseline_db):
 def judged_as(data, difference_db, low, high, rmse_db=8.4, baseline_db=7.9):
     """The report whose interval over all channels is this one."""
     best, n = next(iter(data.rss[0].baselines)), len(data.rss)
-    pooled = FlightVerdict(against=best, difference_db=difference_db, ci95_db=(low, high), channels=n)
+    pooled = FlightVerdict(against=best, rmse_db=rmse_db, baseline_rmse_db=baseline_db, difference_db=difference_db,
+                           ci95_db=(low, high), channels=n)  # fmt: skip
     return dataclasses.replace(with_errors(data, rmse_db, baseline_db), verdict=pooled)
 
 
@@ -56,21 +68,21 @@ def test_the_first_sentence_follows_from_the_interval_over_all_channels(report_d
     best, n = pretty(next(iter(report_data.rss[0].baselines))), len(report_data.rss)
     assert n > 2
     lost = judged_as(report_data, 0.5, 0.2, 0.8)
-    assert verdict(lost)[0] == (
-        f"Ray tracing (RMSE 8.4 dB) is 0.50 dB worse than {best} [0.20, 0.80] over {n} channels (95 %)."
+    assert paragraph(lost).startswith(
+        f"Ray tracing (RMSE 8.4 dB) is 0.50 dB worse than {best} [0.20, 0.80] over {n} channels (95 %). "
     )
     card = next(card for card in headlines(lost) if card.label == f"Against {best}, same samples")
     assert (card.value, card.interval) == ("+0.50 dB", "95 %: +0.20 to +0.80 dB")
-    same = verdict(judged_as(report_data, 0.5, -0.2, 1.2))[0]
-    assert f"The difference of +0.50 dB [−0.20, +1.20] over {n} channels is not significant (95 %)." in same
+    same = paragraph(judged_as(report_data, 0.5, -0.2, 1.2))
+    assert f"The difference [−0.20, +1.20] over {n} channels is not significant (95 %)." in same
     assert "better" not in same
     assert "worse" not in same
-    won = verdict(judged_as(report_data, -4.9, -6.0, -3.9, 3.0))[0]
+    won = paragraph(judged_as(report_data, -4.9, -6.0, -3.9, 3.0))
     assert won.startswith(f"Ray tracing (RMSE 3.0 dB) is 4.90 dB better than {best} [3.90, 6.00] over")
-    few = verdict(judged_as(report_data, 0.5, np.nan, np.nan))[0]
-    assert few.endswith(f"{best}: 7.9 dB. Too few samples for an interval of the difference.")
-    none = verdict(dataclasses.replace(lost, verdict=None))[0]
-    assert none == "Ray tracing: RMSE 8.4 dB. No baseline could be scored."
+    few = paragraph(judged_as(report_data, 0.5, np.nan, np.nan))
+    assert f"{best}: 7.9 dB. Too few samples for an interval of the difference." in few
+    none = paragraph(dataclasses.replace(lost, verdict=None))
+    assert none.startswith("Ray tracing: RMSE 8.4 dB. No baseline could be scored.")
 
 
 def test_a_bound_is_given_with_its_reason(report_data):
@@ -114,64 +126,126 @@ def test_no_sentence_contradicts_its_numbers(better, worse, channels):
     assert said.count("(95 %)") == 1
 
 
-def test_a_local_error_is_a_stretch_and_names_the_clock(report_data):
-    clock = ClockResult(
-        receiver="LW1", radio_minus_telemetry_s=0.1, ci95_s=(-9, 9), verdict="cannot tell", reason="", applied=ESTIMATED
-    )
-    panel = with_numbers(report_data.rss[0], clock=clock)
-    time = panel.time - panel.time[0] + np.datetime64("2025-06-01T14:00:00", "ns")
-    spans = [
-        ErrorSpan(start_s=0, end_s=s, n=9, mean_db=e, worst_db=e, position_m=(0, 0, 0), cause="a null")
-        for s, e in ((1, 20.0), (8, -6.5))
-    ]
-    data = dataclasses.replace(report_data, rss=(dataclasses.replace(panel, time=time, spans=tuple(spans)),))
-    said = verdict(data)[1]
-    assert "measured 6.5 dB below predicted" in said
-    assert "14:00:00-14:00:08 UTC" in said
-    assert "the radio clock could not be confirmed" in said
-    assert "Likely cause" not in said  # none was tested and found
-    assert "20.0" not in said
+CAUSE_CASES = {
+    "clock": (-3.0, (-3.5, -2.5), "", "3.0 s behind the telemetry clock [−3.5, −2.5]", "lag: apply"),
+    "heading": (40.0, (30.0, 50.0), "", "turned clockwise by 40 degrees [30, 50]", "mount"),
+    "tower": (np.nan, (np.nan, np.nan), "LW3", "the log is that of LW3", "node:"),
+    "pattern": (np.nan, (np.nan, np.nan), "", "antenna pattern", "calibrate"),
+    "blocked": (12.2, (10.0, 14.4), "30 to 75", "a loss of 12 dB [10, 14] towards 30 to 75 degrees", "site"),
+    "floor": (-88.4, (-89.0, -88.0), "", "no level below −88", "floor_db: -88"),
+    "gain step": (-6.0, (-7.0, -5.0), "90", "steps by −6.0 dB [−7.0, −5.0] at 14:01:30 UTC", "gain"),
+}
 
 
-@pytest.mark.parametrize(
-    ("name", "estimate", "ci95", "where", "said", "action"),
-    [
-        ("clock", -3.0, (-3.5, -2.5), "", "3.0 s behind the telemetry clock (95 %: −3.5 to −2.5 s)", "lag: apply"),
-        ("heading", 40.0, (30.0, 50.0), "", "turned clockwise by 40 (95 %: 30 to 50) degrees", "mount"),
-        ("tower", np.nan, (np.nan, np.nan), "LW3", "the log is that of LW3", "node:"),
-        ("pattern", np.nan, (np.nan, np.nan), "", "antenna pattern", "calibrate"),
-        ("blocked", 12.2, (10.0, 14.4), "30 to 75", "a loss of 12 dB (95 %: 10 to 14 dB) at 30 to 75 degrees", "site"),
-        ("floor", -88.4, (-89.0, -88.0), "", "no level below −88", "floor_db: -88"),
-        ("gain step", -6.0, (-7.0, -5.0), "90", "steps by −6.0 dB (95 %: −7.0 to −5.0 dB) at 14:01:30 UTC", "gain"),
-    ],
-)
-def test_a_cause_is_said_with_effect_interval_and_action(report_data, name, estimate, ci95, where, said, action):
+def with_cause(panel, name):
+    estimate, ci95, where, *_ = CAUSE_CASES[name]
+    cause = Cause(name=name, estimate=estimate, ci95=ci95, where=where, rmse_db=6.0, rmse_with_db=2.5, gain=40.0)
+    time = np.datetime64("2025-06-01T14:00:00") + np.arange(len(panel.time)) * np.timedelta64(1, "s")
+    return with_numbers(panel, time=time.astype("datetime64[ns]"), likely_cause=cause)
+
+
+@pytest.mark.parametrize("name", CAUSE_CASES)
+def test_a_cause_is_said_with_interval_and_action(report_data, name):
     first, *others = report_data.rss
-    cause = Cause(
-        name=name, estimate=estimate, ci95=ci95, where=where, rmse_db=6.0, rmse_with_db=2.5, gain=40.0
-    )  # fmt: skip
-    time = np.datetime64("2025-06-01T14:00:00") + np.arange(len(first.time)) * np.timedelta64(1, "s")
-    panel = with_numbers(first, time=time.astype("datetime64[ns]"), likely_cause=cause)
-    text = verdict(dataclasses.replace(report_data, rss=(panel, *others)))[1]
-    assert f"Likely cause at {panel.name}: " in text
+    said, action = CAUSE_CASES[name][3:]
+    before, _, text = paragraph(dataclasses.replace(report_data, rss=(with_cause(first, name), *others))).partition(
+        f" Likely cause at {first.name}: "
+    )
+    assert before.endswith(" (95 %).")
     assert said in text
-    assert "With it the RMSE is 2.5 instead of 6.0 dB" in text
+    assert "RMSE 2.5 dB with it." in text
     assert action in text.partition("Next: ")[2]
+    assert text.count("Next: ") == 1
     assert not any(word in text for word in ("significant", "better", "worse"))
-    assert set(CAUSES) == {"clock", "heading", "tower", "pattern", "blocked", "floor", "gain step"}
+    assert set(CAUSES) == set(CAUSE_CASES)
+
+
+LOCK = DetectionScore(
+    brier=0.137, constant_brier=0.197, log_score=0.42, constant_log_score=0.59, n=1000, n_detected=700,
+    floor_db=-15.0, offset_db=40.0, rmse_db=8.04, free_space_rmse_db=10.3, detected_rmse_db=7.0, reliability=(),
+    learned_on="other flights", locks=True,
+)  # fmt: skip
+DIGEST = ("ab" * 32,)
+
+
+def every_outcome(data):
+    """Reports of many kinds: verdict, expectation, cause, lock, training flight, recommended model, rank alone."""
+    verdicts = [(0.5, 0.2, 0.8), (-12.5, -13.25, -11.75), (0.5, -10.25, 11.25), (0.5, np.nan, np.nan), None]
+    rows = [None, LadderRow(model="free space", tower="LW1", channel="USRP1", rmse_heldout_db=3.0, n=100,
+                            difference_to_best_db=0.0, difference_to_best_ci95_db=(0.0, 0.0), seconds=1.0,
+                            recommended=True)]  # fmt: skip
+    for difference, known, cause, lock, learned, row in itertools.product(
+        verdicts, (False, True), (None, *CAUSE_CASES), (None, LOCK), (0, 1, 3), rows
+    ):
+        judged = judged_as(data, *difference, 18.4, 17.9) if difference else dataclasses.replace(data, verdict=None)
+        if difference:
+            judged = dataclasses.replace(judged, verdict=dataclasses.replace(judged.verdict, against="log_distance"))
+        panels = []
+        for number, panel in enumerate(judged.rss):
+            elsewhere = {"rmse_db": 13.5, "floor_rmse_db": 18.2} if known else None
+            numbers = {"elsewhere": elsewhere, "detection": lock, "unit": "dB re full scale"}
+            changed = with_numbers(panel if cause is None else with_cause(panel, cause), **numbers)
+            if number < learned:
+                changed = with_numbers(changed, trained_on=DIGEST, rmse_db=np.nan)
+            panels.append(changed)
+        yield dataclasses.replace(judged, rss=tuple(panels), ladder=() if row is None else (row,))
+
+
+def test_no_first_paragraph_has_more_than_sixty_words_and_all_have_one_order(report_data):
+    order = ("Training flight: ", "Ray tracing", "Expect ", "Likely cause at ", "Next: ")
+    paragraphs = {paragraph(data) for data in every_outcome(report_data)}
+    assert len(paragraphs) > 100
+    for text in paragraphs:
+        assert len(text.split()) <= MOST_WORDS == 60, text
+        places = [text.find(part) for part in order if part in text]
+        assert places == sorted(places), text
+        assert places[0] == 0
+        assert all(text.count(part) <= 1 for part in order[2:]), text
+        assert "Caution" not in text
+        assert "nan" not in text
+    for part in order:
+        assert any(part in text for text in paragraphs), part
+
+
+def test_a_training_flight_explains_its_dashes(report_data):
+    panels = tuple(with_numbers(p, trained_on=DIGEST, rmse_db=np.nan) for p in report_data.rss)
+    text = paragraph(dataclasses.replace(report_data, rss=panels))
+    assert text.startswith("Training flight: the antennas of 3 channels were learned from this flight's own log")
+    assert "the tables show “–” instead of an error. For comparison, " in text
+    assert DIGEST[0][:12] in rss_verdict(panels[0])
+
+
+@pytest.mark.parametrize(("offset_db", "unit", "said"), [
+    (-57.2, "dB re full scale", "Offset −57.2 dB: the log is relative to full scale"),
+    (3.1, "dB re full scale", None), (-88.0, "dB", "Offset −88.0 dB: the log is a ratio to the noise"),
+    (31.0, "dBm", "Offset +31.0 dB: the transmit power"), (np.nan, "dBm", None),
+])  # fmt: skip
+def test_a_negative_or_large_offset_is_explained(report_data, offset_db, unit, said):
+    panels = [with_numbers(panel, offset_db=offset_db, unit=unit) for panel in report_data.rss]
+    sentences = offset_sentences(panels)
+    assert len(sentences) == (said is not None)
+    assert all(text.startswith(said) for text in sentences)
+    assert unit in OFFSETS
+
+
+def test_page_terminal_and_metrics_have_the_same_words(report_data):
+    numbers = metrics(report_data)
+    assert numbers["sentence"] == paragraph(report_data)
+    assert numbers["warnings"] == cautions(report_data)
+    assert len(set(numbers["warnings"])) == len(numbers["warnings"])
 
 
 def test_one_wild_sample_that_moves_the_error_is_said(report_data):
     panel = with_numbers(report_data.rss[0], rmse_db=12.5, n_outliers=1, rmse_without_outliers_db=1.8)
-    said = verdict(dataclasses.replace(report_data, rss=(panel,)))[1]
-    assert f"1 outlying sample raises at {panel.name} its RMSE from 1.8 to 12.5 dB" in said
+    said = cautions(dataclasses.replace(report_data, rss=(panel,)))
+    assert f"{panel.name}: RMSE 1.8 dB without 1 outlier." in said
     calm = with_numbers(panel, rmse_db=1.9)
-    assert "outlying" not in verdict(dataclasses.replace(report_data, rss=(calm,)))[1]
+    assert "outlier" not in " ".join(cautions(dataclasses.replace(report_data, rss=(calm,))))
 
 
 def test_a_single_sample_is_no_result(report_data):
     panels = tuple(with_numbers(panel, n=1, rmse_db=0.01) for panel in report_data.rss)
-    first, _ = verdict(dataclasses.replace(report_data, rss=panels, rank=()))
+    first = paragraph(dataclasses.replace(report_data, rss=panels, rank=()))
     assert first.startswith("Nothing could be compared")
     assert "at most 1" in first
     assert "0.01" not in first
@@ -187,15 +261,15 @@ def test_doubts_are_said(report_data):
     engine = report_data.engine
     broken = dataclasses.replace(engine.audit, fields=FieldAudit(failures=("power of a path",)))
     data = dataclasses.replace(report_data, synthetic=False, engine=dataclasses.replace(engine, audit=broken))
-    assert "the audit of the field failed 1 times" in verdict(data)[1]
+    assert cautions(data)[0].startswith("The audit of the field failed")
     assert any(card.value == "1 failed" for card in headlines(data))
     none = dataclasses.replace(report_data, engine=dataclasses.replace(engine, audit=None))
-    assert "no audit" in verdict(none)[1]
+    assert any("was not audited" in text for text in cautions(none))
 
 
 def test_nothing_to_score(report_data):
     panels = tuple(with_numbers(panel, n=0, rmse_db=np.nan) for panel in report_data.rss)
-    first, _ = verdict(dataclasses.replace(report_data, rss=panels, rank=()))
+    first = paragraph(dataclasses.replace(report_data, rss=panels, rank=()))
     assert first.startswith("Nothing could be compared")
 
 
@@ -208,19 +282,21 @@ def test_a_rank_forecast_is_the_headline_where_there_is_one(report_data):
     )  # fmt: skip
     panel = with_numbers(report_data.rank[0], receiver=score)
     data = dataclasses.replace(report_data, rss=(), rank=(panel,))
-    first = verdict(data)[0]
-    assert first.startswith(f"Rank forecast at {panel.tower} by the receiver learned on other flights: kappa 0.37")
+    first = paragraph(data)
+    assert first.startswith(f"Rank at {panel.tower} by the receiver learned on other flights: kappa 0.37")
     assert "log score 19 % below the constant forecast" in first
     assert "agrees in 71 % of samples; always guessing the commonest agrees in 66 %" in first
+    assert len(first.split()) <= MOST_WORDS
     (card,) = [line for line in headlines(data) if line.label.startswith("Rank")]
     assert (card.value, card.interval) == ("kappa 0.37", "95 %: 0.17 to 0.61")
     unscored = with_numbers(panel, receiver=dataclasses.replace(score, kappa=np.nan))
-    assert "Rank forecast" not in verdict(dataclasses.replace(data, rank=(unscored,)))[0]
+    assert "receiver" not in paragraph(dataclasses.replace(data, rank=(unscored,)))
 
 
 def test_sentence_and_card_of_a_rank_show_the_same_digits(report_data):
     data = dataclasses.replace(report_data, rss=())
-    sentence, *_ = verdict(data)
+    sentence = paragraph(data)
+    assert len(sentence.split()) <= MOST_WORDS
     card = next(headline for headline in headlines(data) if headline.label.startswith("Rank"))
     best = min(data.rank[0].score.simulated.values(), key=lambda at: at.total_variation)
     shown = f"{100 * best.total_variation:.0f} percentage points"
@@ -247,23 +323,33 @@ def test_a_difference_of_reports_says_what_its_interval_does(word):
     assert "+0.31 dB" in said
 
 
-def test_a_receiver_that_lost_its_lock_is_scored_in_two_parts_first(report_data):
-    score = DetectionScore(
-        brier=0.137, constant_brier=0.197, log_score=0.42, constant_log_score=0.59, n=1000, n_detected=700,
-        floor_db=-15.0, offset_db=40.0, rmse_db=8.04, free_space_rmse_db=10.3, detected_rmse_db=7.0, reliability=(),
-        learned_on="other flights", locks=True,
+def test_a_receiver_that_lost_its_lock_has_one_error_that_with_the_floor(report_data):
+    """Levels: ray tracing 3 dB, the line 5 dB off where detected; both sides at the floor elsewhere."""
+    panel, rng = report_data.rss[0], np.random.default_rng(7)
+    level = np.where(np.isfinite(panel.simulated_dbm), panel.simulated_dbm, -80.0)
+    measured = level + rng.normal(0.0, 3.0, len(level))
+    floor = float(np.quantile(measured, 0.3))
+    line = dataclasses.replace(next(iter(panel.baselines.values())), level_dbm=level + rng.normal(0.0, 5.0, len(level)))
+    lost = measured < floor
+    panel = with_numbers(
+        panel, simulated_dbm=level, measured_db=np.where(lost, np.nan, measured), baselines={"free_space": line},
+        detection=dataclasses.replace(LOCK, floor_db=floor), elsewhere={"floor_rmse_db": 8.2, "rmse_db": 7.0},
+        posed=np.ones(len(level), dtype=bool), n=int((~lost).sum()),
     )  # fmt: skip
-    elsewhere = {"floor_rmse_db": 8.2, "free_space_floor_rmse_db": 10.4}
-
-    def said(score, elsewhere):
-        first = with_numbers(report_data.rss[0], detection=score, elsewhere=elsewhere)
-        return verdict(dataclasses.replace(report_data, rss=(first,)))[0]
-
-    text = said(score, elsewhere)
-    assert text.startswith(f"{report_data.rss[0].name} lost its lock in 30 % of the samples.")
-    assert "RMSE 8.0 dB; free space: 10.3 dB. Expect 8.2 dB on another flight (free space 10.4 dB)." in text
-    assert "P(locked), learned on other flights: Brier score 0.14; a constant: 0.20." in text
-    here = said(dataclasses.replace(score, learned_on="held-out segments"), None)
-    assert "P(locked), learned in other segments of this flight" in here
-    assert "Expect" not in here
-    assert "lock" not in said(dataclasses.replace(score, locks=False), None)  # a floor is no lock
+    floored = np.maximum(measured, floor)
+    expected = [np.sqrt(np.mean((floored - np.maximum(model - fit.offset_db, floor)) ** 2))
+                for model in (level, line.level_dbm) for fit in [floored_fit(floored, model, floor)]]  # fmt: skip
+    pooled = flight_verdict([panel])
+    assert (pooled.rmse_db, pooled.baseline_rmse_db) == pytest.approx(tuple(expected))
+    assert pooled.difference_db == pytest.approx(expected[0] - expected[1])
+    data = dataclasses.replace(report_data, rss=(panel,), verdict=pooled)
+    text, cards = paragraph(data), headlines(data)
+    assert text.startswith(f"Ray tracing (RMSE {expected[0]:.1f} dB, floor −{abs(floor):.0f}) is ")
+    assert text.count("RMSE") == 1
+    assert "Expect 8.2 dB on another flight." in text
+    assert "Brier" not in text
+    assert cards[0].value == f"{expected[0]:.1f} dB"
+    assert any(f"{panel.name} lost its lock in 30 % of the samples" in said for said in cautions(data))
+    assert "Brier score is 0.14 by the predicted level (learned on other flights), 0.20 by that share" in rss_verdict(
+        panel
+    )

@@ -1,5 +1,6 @@
 """Sentences of a prediction: each follows from an interval on what was left out, or on the flight that followed."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -8,7 +9,8 @@ import pytest
 from aerpaw_cmp.compare.judge.verdicts import Verdict
 from aerpaw_cmp.compare.learning.correction import OFF, Correction
 from aerpaw_cmp.compare.learning.field_gp import FieldModel
-from aerpaw_cmp.report.words.prediction import FIELD, FLOWN, after_flight, first_words
+from aerpaw_cmp.report.words.flight_verdict import MOST_WORDS
+from aerpaw_cmp.report.words.prediction import FIELD, FLOWN, after_flight, cautions, first_words
 
 FREE, LEARNED, WITH_FIELD = ("free space", OFF), ("learned", OFF), ("learned", "field of 2 dB, 30 m")
 
@@ -27,23 +29,24 @@ def correction(key: tuple[str, str], errors: dict[tuple[str, str], float], sd: f
 
 def test_a_model_that_beats_free_space_is_called_better_with_its_interval() -> None:
     errors = {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.1}
-    words = first_words(correction(LEARNED, errors, 3.0), outside=0.1, expected_db=4.2)
-    assert words.startswith(
-        "Expect an RMSE of 4.2 dB over 4 s means at these points on a new flight. "  # its offset and places count
-        "On flights left out, each about its own mean: 3.0 dB; free space 6.0 dB."
-    )
-    assert "The model is significantly better than free space (\N{MINUS SIGN}" in words
-    assert "90 % intervals hold " in words
-    assert "too narrow" not in words
-    assert "too wide" not in words
-    assert "The residual field is off" in words
-    assert "outside the flown places" not in words
+    chosen = correction(LEARNED, errors, 3.0)
+    words, listed = first_words(chosen, 0.1, 4.2, 7.5), " ".join(cautions(chosen, 0.1))
+    said = re.fullmatch(
+        r"Expect an RMSE of 4\.2 dB over 4 s means at these points on a new flight; 90 % of the samples lie within "
+        r"±7\.5 dB\. On flights left out it is (\d\.\d) dB better than free space \[(\d\.\d), (\d\.\d)\] \(95 %\)\.",
+        words,
+    )  # its offset and places count
+    assert said is not None
+    assert float(said[2]) < float(said[1]) < float(said[3])
+    assert "90 % intervals hold " in listed
+    assert "too narrow" not in listed
+    assert "too wide" not in listed
+    assert "The residual field is off" in listed
+    assert "outside the flown places" not in listed
 
 
 def test_equal_models_are_called_neither_better_nor_worse() -> None:
-    words = first_words(
-        correction(LEARNED, {FREE: 3.0, LEARNED: 3.0, WITH_FIELD: 3.0}, 3.0), outside=0.0, expected_db=4.2
-    )
+    words = first_words(correction(LEARNED, {FREE: 3.0, LEARNED: 3.0, WITH_FIELD: 3.0}, 3.0), 0.0, 4.2, 7.5)
     assert "is not significant (95 %)" in words
     assert "better" not in words
     assert "worse" not in words
@@ -51,27 +54,37 @@ def test_equal_models_are_called_neither_better_nor_worse() -> None:
 
 @pytest.mark.parametrize(("sd", "said"), [(1.5, "too narrow: errors are 2.0 times"), (6.0, "too wide: errors are 0.5")])
 def test_intervals_that_do_not_hold_are_named_with_the_ratio(sd: float, said: str) -> None:
-    words = first_words(
-        correction(LEARNED, {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.0}, sd), outside=0.0, expected_db=4.2
-    )
-    assert said in words
+    chosen = correction(LEARNED, {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.0}, sd)
+    assert said in " ".join(cautions(chosen, 0.0))
+    assert ("Next: add a flight of this area." in first_words(chosen, 0.0, 4.2, 7.5)) == (sd < 3.0)
 
 
 def test_a_field_that_helps_is_on_for_a_stated_gain() -> None:
-    words = first_words(
-        correction(WITH_FIELD, {FREE: 6.0, LEARNED: 4.0, WITH_FIELD: 2.0}, 3.0), outside=0.5, expected_db=4.2
-    )
-    assert "The residual field is on: it lowers the CRPS by " in words
-    assert "50 % of the points lie outside the flown places. Next: `aerpaw-cmp plan`" in words
+    chosen = correction(WITH_FIELD, {FREE: 6.0, LEARNED: 4.0, WITH_FIELD: 2.0}, 3.0)
+    listed = cautions(chosen, 0.5)
+    assert listed[0] == "50 % of the points lie outside the flown places."
+    assert "The residual field is on: it lowers the CRPS by " in " ".join(listed)
+    assert first_words(chosen, 0.5, 4.2, 7.5).endswith("Next: `aerpaw-cmp plan` names the flight that helps most.")
     assert set(FIELD) == {"better", "worse", "off"}
 
 
 def test_free_space_is_not_compared_with_itself() -> None:
-    words = first_words(
-        correction(FREE, {FREE: 3.0, ("free space", "field of 2 dB, 30 m"): 3.2, LEARNED: 4.0}, 3.0), 0.0, 4.2
-    )
-    assert "than free space" not in words
-    assert "Model: free space." in words
+    chosen = correction(FREE, {FREE: 3.0, ("free space", "field of 2 dB, 30 m"): 3.2, LEARNED: 4.0}, 3.0)
+    assert "than free space" not in first_words(chosen, 0.0, 4.2, 7.5)
+    assert "Model: free space." in cautions(chosen, 0.0)
+
+
+@pytest.mark.parametrize("outside", [0.0, 0.9])
+@pytest.mark.parametrize("sd", [1.5, 3.0, 6.0])
+@pytest.mark.parametrize("free_db", [2.0, 3.0, 12.0])
+def test_a_first_paragraph_has_one_error_one_step_and_sixty_words_at_most(
+    outside: float, sd: float, free_db: float
+) -> None:
+    chosen = correction(LEARNED, {FREE: free_db, LEARNED: 3.0, WITH_FIELD: 3.1}, sd)
+    for words in (first_words(source, outside, 14.2, 17.5) for source in (chosen, None)):
+        assert len(words.split()) <= MOST_WORDS
+        assert words.count("RMSE") == 1
+        assert words.count("Next: ") <= 1
 
 
 @pytest.mark.parametrize("cause", FLOWN)
@@ -79,6 +92,6 @@ def test_the_flight_that_followed_is_said_by_the_gravest_cause(cause: str) -> No
     scores = {"rmse_db": 4.0, "rmse_4s_db": 3.0, "own_offset_rmse_db": 3.5, "coverage_90": 0.7}
     stated = [Verdict(), Verdict(cause=cause, effect=2.0, interval=(1.5, 2.5), where="LW1 USRP1")]
     words = after_flight({"LW1 USRP1": scores}, stated)
-    assert "hold 70 % of the samples" in words
+    assert "the 90 % band holds 70 % of the samples" in words
     assert FLOWN[cause][0].split("{")[0] in words
     assert ("LW1 USRP1" in words) == (cause in ("narrow", "wide", "biased"))

@@ -7,6 +7,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from ...common.counting import counted
 from ...common.stages import duration
 from ...jobs.options import RunOptions
 from ..app import Export, Force, Json, LogsRoot, Scheduler, Workers, command, output
@@ -69,8 +70,8 @@ def _print_status(status: Any) -> None:
     if not status.to_do:
         time = "nothing to compute"
     show(
-        f"{status.name}: {len(status.states)} tasks, {status.kept} kept in {status.keep}, {status.failed} failed the "
-        f"last time, {status.to_do} to do, {time} with {status.workers} worker{'s' if status.workers > 1 else ''}"
+        f"{status.name}: {counted(len(status.states), 'task')}, {status.kept} kept in {status.keep}, "
+        f"{status.failed} failed the last time, {status.to_do} to do, {time} with {counted(status.workers, 'worker')}"
     )
     rows = [[s.task.flight, s.task.setting, (s.failure or s.trouble)[:100]] for s in status.states if not s.stored]
     if rows:

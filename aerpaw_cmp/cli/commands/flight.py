@@ -155,6 +155,7 @@ def _print_report_summary(outcome: Any) -> None:
     columns = {"tower": "tower", "K": "k", "agreement": "agreement:.3f", "total variation": "total_variation:.3f"}
     records(thresholds, {**columns, "n": "n"}, "Rank, measured against replayed")
     _print_forecasts(outcome.metrics["rank"])
+    show(" ".join([outcome.metrics["sentence"], *outcome.metrics["offsets"]]))
     if "against" in outcome.metrics:
         show(outcome.metrics["against"]["sentence"])
     warn_all(outcome.metrics["warnings"])

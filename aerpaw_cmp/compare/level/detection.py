@@ -9,7 +9,7 @@ import numpy as np
 
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..offset import STEP_DB, OffsetFit, offset_grid
-from ..ranks.forecast import brier_losses, constant_forecast, log_losses
+from ..ranks.forecast import brier_losses, log_losses
 from ..ranks.receiver import out_of_group
 
 # Held-out segments of a flight, equally long.
@@ -96,8 +96,8 @@ class DetectionScore:
         Lower levels count as this one [unit of the measurement].
     n, n_detected : int
     brier, constant_brier, log_score, constant_log_score : float
-        Of P(detected) from the predicted level; constant: the share in what P(detected) was learned from. Brier counts
-        one of the two outcomes: 0 to 1. Log score in nat.
+        Of P(detected) from the predicted level; constant: this flight's own share, the best that knows no level. Brier
+        counts one of the two outcomes: 0 to 1. Log score in nat.
     learned_on : str
         ``other flights``, or ``held-out segments``: each segment of this flight from the others.
     offset_db, rmse_db : float
@@ -163,12 +163,10 @@ def score_detection(
         return None
     outcome = detected.astype(np.int64) + 1
     if forecast is None:
-        stated, constant = _held_out(time, simulated, outcome)
+        stated = _held_out(time, simulated, outcome)
     else:
-        stated, constant = (
-            np.stack([1.0 - p, p], axis=1)
-            for p in (forecast.probability(simulated), np.full(len(simulated), forecast.share))
-        )
+        stated = np.stack([1.0 - (p := forecast.probability(simulated)), p], axis=1)
+    constant = np.tile([1.0 - detected.mean(), detected.mean()], (len(time), 1))
     fit = floored_fit(measured, simulated, floor_db)
     free = simulated if free_space_db is None else free_space_db[finite]
     residual = measured - np.maximum(simulated - fit.offset_db, floor_db)
@@ -189,17 +187,14 @@ def score_detection(
     )
 
 
-def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> tuple[FloatArray, FloatArray]:
-    """Probabilities (n, 2) of each segment from the others: by the level, and of a constant."""
+def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> FloatArray:
+    """Probabilities (n, 2) of each segment by the level, learned in the others."""
     segment = np.minimum((time_s - time_s.min()) / max(np.ptp(time_s), 1e-9) * _SEGMENTS, _SEGMENTS - 1).astype(
         np.int64
     )
     stated = out_of_group(level_db[:, None], outcome, segment, _PENALTY)[:, :2]
-    stated = stated / stated.sum(axis=1, keepdims=True)  # two outcomes of the four that a receiver of ranks knows
-    constant = np.zeros_like(stated)
-    for left_out in np.unique(segment):
-        constant[segment == left_out] = constant_forecast(outcome[segment != left_out], 2)
-    return stated, constant
+    # two outcomes of the four that a receiver of ranks knows
+    return np.asarray(stated / stated.sum(axis=1, keepdims=True))
 
 
 def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> OffsetFit:

@@ -542,14 +542,17 @@ def undecided(first: FloatArray, second: FloatArray) -> FloatArray:
     return np.asarray(2.0 * (first - share[stretch] * apart) * apart)
 
 
-def pooled_difference(channels: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> PairedDifference:
+def pooled_difference(
+    channels: Sequence[tuple[FloatArray, FloatArray, FloatArray]], *, free_offset: bool = True
+) -> PairedDifference:
     """Two models over all channels of a flight at once.
 
     Parameters
     ----------
     channels : sequence of ((n,), (n,), (n,))
-        Per channel: instants, and the errors of the two models at them [dB]; each channel and model has an own offset.
-        NaN takes no part.
+        Per channel: instants, and the errors of the two models at them [dB]. NaN takes no part.
+    free_offset : bool
+        Each channel and model has an own offset.
 
     Returns
     -------
@@ -561,7 +564,7 @@ def pooled_difference(channels: Sequence[tuple[FloatArray, FloatArray, FloatArra
     for time, error, other in channels:
         finite = np.isfinite(error) & np.isfinite(other)
         if finite.any():
-            columns = (values[finite] - values[finite].mean() for values in (error, other))
+            columns = (values[finite] - free_offset * values[finite].mean() for values in (error, other))
             parts.append((np.asarray(time)[finite], *columns))
     if not parts:
         return paired_difference([], [])

@@ -13,6 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ...common.counting import counted
 from ...live.feed import Feed
 from ...live.session import TapSettings, TapStatus, TapSummary
 from ...live.stop import Stop
@@ -182,7 +183,7 @@ def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str
     records, gaps = sum(s.records for s in summaries), sum(s.gaps for s in summaries)
     lost = sum(s.lost_records for s in summaries)
     at = time.strftime("%H:%M:%S", time.gmtime())
-    counts = f"{records} records, {gaps} gap{'' if gaps == 1 else 's'}" + (f", {lost} records lost" if lost else "")
+    counts = f"{records} records, {counted(gaps, 'gap')}" + (f", {lost} records lost" if lost else "")
     text = f"The tap ended at {at} UTC ({summaries[0].reason}): {counts}. The log is in {folder}."
     return {"text": text, "commands": _commands(folder, twin), "replay": False}
 

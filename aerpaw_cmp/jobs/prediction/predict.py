@@ -29,7 +29,7 @@ from ...maps import export
 from ...maps.grid import Grid, Layer
 from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
 from ...report.pages.prediction import PredictionPage, outside_share, prediction_metrics, write_prediction
-from ...report.words.prediction import FLAGS, TITLES, first_words, memory_words
+from ...report.words.prediction import FLAGS, TITLES, cautions, first_words, memory_cautions
 from ...site.antenna.antennas import MeasuredPattern
 from ...site.antenna.learned import BAND as CARRIER_BAND
 from ...site.antenna.learned import folder_of, read_learned
@@ -145,6 +145,7 @@ def predict(
     with stages("predict"):
         receivers = _receivers(known, place, site)
         table = _table(targets, site, (sources, model, receivers), threshold_db, stages.progress)
+    about = _model_fields(model, known, [receiver for receiver, _, _ in receivers.values()], table)
     page = PredictionPage(
         **named(targets, "name kind heights_m"),
         site=site,
@@ -153,9 +154,8 @@ def predict(
         shape=None if targets.grid is None else targets.grid.shape,
         flown={f"{s.flight} {s.antenna}": track_m(s).T for source in sources.values() for s in source.samples},
         threshold_db=threshold_db,
-        warnings=(*remarks, *targets.remarks),
         stages_s=stages.seconds,
-        **_model_fields(model, known, [receiver for receiver, _, _ in receivers.values()], table),
+        **about | {"warnings": (*about["warnings"], *remarks, *targets.remarks)},
     )
     return Prediction(page=page, targets=targets, model=model, sources=sources)
 
@@ -165,11 +165,13 @@ def _model_fields(
 ) -> dict[str, Any]:
     """Fields of the page that tell of the model and what it learned from."""
     guess = outside_share(table)
+    expected = float(np.sqrt((table["slow_sd_db"] ** 2).mean())), float((table["q95_db"] - table["q05_db"]).mean()) / 2
     logs, marks = ([getattr(receiver, key) for receiver in receivers] for key in (KEY, MARKS))
     if isinstance(model, Memory):
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
         return {
-            "verdict": memory_words([(m.entry, m.series, m.level.sd_db) for m in model.known.values()], guess),
+            "verdict": first_words(None, guess, *expected),
+            "warnings": memory_cautions([(m.entry, m.series) for m in model.known.values()], guess),
             "flights": [name for entry in entries for name in entry.flights],
             KEY: union(*(entry.trained_on for entry in entries), *logs),
             MARKS: union(*(end.marks for m in model.known.values() for end in (m.tower, m.uav)), *marks),
@@ -180,7 +182,8 @@ def _model_fields(
     correction = model.correction
     key = correction.base, correction.title
     return {
-        "verdict": first_words(correction, guess, float(np.sqrt((table["slow_sd_db"] ** 2).mean()))),
+        "verdict": first_words(correction, guess, *expected),
+        "warnings": cautions(correction, guess),
         "flights": [data.settings.flight.name for data in known],
         KEY: union(*map(flight_logs, known), *logs, *model.trained_on),
         MARKS: union(marks_of(known), *marks, *model.marks),

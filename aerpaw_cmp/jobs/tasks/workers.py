@@ -27,6 +27,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Protocol
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError
 from ...common.stages import Progress, silent
 from .outcomes import code_digest
@@ -335,7 +336,7 @@ def _scheduler(address: str, paths: Sequence[Path], progress: Progress) -> Itera
         check_workers(client, paths)
         dashboard = client.scheduler_info().get("services", {}).get("dashboard")
         page = f"; dashboard {client.dashboard_link}" if dashboard else ""
-        progress(f"{len(client.nthreads())} workers, {cluster.count} tasks at a time{page}")
+        progress(f"{counted(len(client.nthreads()), 'worker')}, {counted(cluster.count, 'task')} at a time{page}")
         yield cluster
     finally:
         with contextlib.suppress(Exception):

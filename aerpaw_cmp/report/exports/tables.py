@@ -18,7 +18,8 @@ from ..content.flight import RANKS, ReportData
 from ..content.made import about
 from ..kit.files import merge
 from ..names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
-from ..words.flight import audit_summary
+from ..words.flight import audit_summary, cautions, offset_sentences
+from ..words.flight_verdict import paragraph
 
 # 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable.
 DECIMALS = 4
@@ -36,7 +37,9 @@ def metrics(data: ReportData) -> dict[str, Any]:
     for pair in data.pairs:
         pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score
     result: dict[str, Any] = {
-        **named(data, "flight title synthetic settings warnings"),
+        **named(data, "flight title synthetic settings"),
+        "sentence": paragraph(data),
+        "warnings": cautions(data),
         "site": named(data.site, "name credit assumed"),
         "inputs": [
             named(f, "path sha256 reader lines accepted rejected blank role warnings")
@@ -46,6 +49,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         KEY: list(union(*(f.learned_on for f in data.inputs))),
         "rss": rss,
         "verdict": data.verdict,
+        "offsets": offset_sentences(data.rss),
         "rank": {item.tower: _rank_metrics(item) for item in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),
         **about(data),

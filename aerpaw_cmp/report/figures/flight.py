@@ -8,6 +8,7 @@ from functools import partial
 
 import numpy as np
 
+from ...compare.level.rss import PART_DB
 from ...compare.result import RankResult, RssResult
 from ..content.flight import ReportData, Track
 from ..kit.canvas import POINTS_PER_CLOUD, FigureSpec
@@ -43,6 +44,17 @@ def _figures(data: ReportData) -> Iterator[FigureSpec]:
     for panel in data.rss:
         if len(panel.time):
             yield from _rss_specs(data, panel)
+    for pair in data.pairs:
+        panels = [panel for name in (pair.first, pair.second) for panel in data.rss
+                  if (panel.tower, panel.channel) == (pair.tower, name)]  # fmt: skip
+        if len(panels) == 2 and all(panel.score.n for panel in panels):
+            yield FigureSpec(
+                f"rss_channels_{safe_name(pair.tower)}_{safe_name(pair.first)}_{safe_name(pair.second)}",
+                f"rss/{pair.tower}/{pair.first}", f"{pair.tower}: {pair.first} and {pair.second}",
+                f"Both channels, the second moved by its offset less that of the first. Shaded: they part by more than "
+                f"{PART_DB:.0f} dB. Ray tracing is that of {pair.first}.",
+                partial(rss_figures.channels_over_time, data, pair, panels),
+            )  # fmt: skip
     if any(np.isfinite(row.rmse_heldout_db) for row in data.ladder):
         yield FigureSpec(
             "ladder", "ladder", "Models from the simplest to the richest",
@@ -102,8 +114,8 @@ def _rss_specs(data: ReportData, panel: RssResult) -> Iterator[FigureSpec]:
     drawn = f" Of {count(len(panel.time))} samples {count(POINTS_PER_CLOUD)} are drawn, and every extreme."
     yield FigureSpec(
         f"rss_{stem}", section, f"{panel.name}: RSS over time",
-        "Top: the measurement after its offset, the ray tracing, and the baselines, each baseline moved to its own "
-        "best fit. " + _HATCHED * bool(panel.simulated_out_of_coverage.any())
+        "Top: the measurement as logged, the ray tracing and the baselines, each less its own offset. "
+        + _HATCHED * bool(panel.simulated_out_of_coverage.any())
         + "Bottom: residual; dashed lines are plus and minus one RMSE." + _band_words(panel)
         + drawn * (len(panel.time) > POINTS_PER_CLOUD),
         partial(rss_figures.rss_over_time, data, panel),

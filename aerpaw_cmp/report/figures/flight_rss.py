@@ -7,14 +7,16 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ...common.units import FloatArray
 from ...compare.judge.ladder import LadderRow
 from ...compare.level.detection import DetectionScore
-from ...compare.result import RankResult, RssResult
+from ...compare.result import PairResult, RankResult, RssResult
 from ..content.flight import ReportData, Track, start_of, used_towers
 from ..kit.canvas import (
     BASELINE,
     MEASURED,
     POINTS_PER_LINE,
+    SECOND,
     SIMULATED,
     TOWER,
     WAYPOINT,
@@ -35,7 +37,7 @@ from ..kit.canvas import (
     thinned_plan,
     time_axis,
 )
-from ..words.flight import count, pretty, signed
+from ..words.flight import count, instants, pretty, signed
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -60,12 +62,12 @@ def overview(data: ReportData, panel: RssResult) -> Figure:
     colour_bar(fig, points, plan, "Residual [dB]", "both")
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
-    calibrated = panel.calibrated_db
-    dots(right, seconds, calibrated, 2.5, color=MEASURED, label="measured, calibrated")
-    right.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing")
+    simulated = _moved(panel.simulated_dbm, panel.score.offset_db)
+    dots(right, seconds, panel.measured_db, 2.5, color=MEASURED, label="measured, as logged")
+    right.plot(*thinned(seconds, simulated), color=SIMULATED, linewidth=1.0, label="ray tracing, less its offset")
     time_axis(right, start)
-    right.set_ylabel("RSS [dBm]")
-    robust_limits(right, [calibrated, panel.simulated_dbm])
+    right.set_ylabel(f"RSS [{panel.unit}]")
+    robust_limits(right, [panel.measured_db, simulated])
     fig.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=2)
     return fig
 
@@ -138,7 +140,7 @@ def altitude(data: ReportData, track: Track) -> Figure:
 
 
 def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
-    """Calibrated measurement, simulation and baselines over time, and the residual under them."""
+    """Measurement as logged, simulation and baselines less their offsets over time, and the residual under them."""
     start, score = start_of(data), panel.score
     seconds = seconds_since(panel.time, start)
     fig, (ax, below) = subplots((9.2, 5.6), 2, 1, sharex=True, height_ratios=(2.6, 1.0))
@@ -146,29 +148,29 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     draw_out_of_coverage(
         ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", height=0.05, hatch="xxxxx"
     )
-    calibrated, residual = panel.calibrated_db, panel.residual_db
-    label = f"measured, {_offset(score.offset_db)} ({count(score.n)} scored)"
-    dots(ax, seconds, calibrated, 2.5, color=MEASURED, label=label, zorder=3.5)
+    measured, residual = panel.measured_db, panel.residual_db
+    simulated = _moved(panel.simulated_dbm, score.offset_db)
+    label = f"measured, as logged ({count(score.n)} scored)"
+    dots(ax, seconds, measured, 2.5, color=MEASURED, label=label, zorder=3.5)
     for name, baseline in panel.baselines.items():
         colour, dashes = BASELINE[name]
-        # each model is drawn where its own best offset puts it against the same calibrated points
-        level = baseline.level_dbm + (score.offset_db - baseline.offset_db)
         ax.plot(
-            *thinned(seconds, level), color=colour, linestyle=dashes, linewidth=1.2,
-            zorder=2.5 if name == "two_ray" else 3.7,  # its dense fringes would hide the rest
+            *thinned(seconds, _moved(baseline.level_dbm, baseline.offset_db)), color=colour, linestyle=dashes,
+            linewidth=1.2, zorder=2.5 if name == "two_ray" else 3.7,  # its dense fringes would hide the rest
             label=f"{pretty(name)} (own offset)",
         )  # fmt: skip
-    ax.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing", zorder=3)
+    label = f"ray tracing, {_offset(score.offset_db)}"
+    ax.plot(*thinned(seconds, simulated), color=SIMULATED, linewidth=1.0, label=label, zorder=3)
     if panel.stated is not None:
         some = slice(None, None, max(1, len(seconds) // POINTS_PER_LINE))
-        band = panel.stated.columns(panel.simulated_dbm)
+        band = panel.stated.columns(simulated)
         low, high = (band[f"simulated_{end}_dbm"][some] for end in ("low", "high"))
         ax.fill_between(seconds[some], low, high, color=SIMULATED, alpha=0.15, linewidth=0, label="90 % band", zorder=1)
-    alone = lonely(panel.simulated_dbm)  # a line shows no single point between two gaps
-    ax.plot(seconds[alone], panel.simulated_dbm[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
+    alone = lonely(simulated)  # a line shows no single point between two gaps
+    ax.plot(seconds[alone], simulated[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
     draw_waypoints(ax, data.moments, start)
-    robust_limits(ax, [calibrated, panel.simulated_dbm])
-    ax.set_ylabel("RSS [dBm]")
+    robust_limits(ax, [measured, simulated])
+    ax.set_ylabel(f"RSS [{panel.unit}]")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), ncols=3, markerscale=3)
     dots(below, seconds, residual, color="#0072B2", label="measured − simulated")
     below.axhline(0.0, color=SIMULATED, linewidth=0.8)
@@ -190,7 +192,34 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
 
 
 def _offset(offset_db: float) -> str:
-    return f"offset {signed(offset_db)} dB" if np.isfinite(offset_db) else "no offset"
+    return f"less its offset of {signed(offset_db)} dB" if np.isfinite(offset_db) else "no offset"
+
+
+def _moved(level_dbm: FloatArray, offset_db: float) -> FloatArray:
+    """A simulated level among the levels of the log."""
+    return level_dbm - offset_db if np.isfinite(offset_db) else level_dbm
+
+
+def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssResult]) -> Figure:
+    """Both channels of a tower and the ray tracing over time, spans in which they part shaded (the paper's Fig. 15)."""
+    start, (first, second) = start_of(data), panels
+    fig, ax = subplots((9.2, 3.6))
+    for span in pair.score.spans:
+        ax.axvspan(*seconds_since(np.array(instants(pair.time, span)), start), color="0.88", linewidth=0, zorder=0)
+    moved = second.score.offset_db - first.score.offset_db
+    shown = ((first, 0.0, MEASURED, ""), (second, moved, SECOND, f", moved by {signed(moved)} dB"))
+    for panel, by, colour, words in shown:
+        seconds = seconds_since(panel.time, start)
+        dots(ax, seconds, panel.measured_db + by, 2.5, color=colour, label=f"{panel.channel}, as logged{words}")
+    seconds, simulated = seconds_since(first.time, start), _moved(first.simulated_dbm, first.score.offset_db)
+    draw_out_of_coverage(ax, seconds, first.simulated_out_of_coverage, "Z: no path in the simulation")
+    ax.plot(*thinned(seconds, simulated), color=SIMULATED, linewidth=1.0, label="ray tracing")
+    draw_waypoints(ax, data.moments, start)
+    time_axis(ax, start)
+    ax.set_ylabel(f"RSS [{first.unit}]")
+    robust_limits(ax, [first.measured_db, second.measured_db + moved, simulated])
+    legend_below(ax, 3)
+    return fig
 
 
 def detection_reliability(score: DetectionScore) -> Figure:

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 
 # Okabe & Ito's palette (jfly.uni-koeln.de/color), chosen here for distinct lightness too
 MEASURED = "#56B4E9"
+SECOND = "#7A3FA0"
 SIMULATED = "#111111"
 BASELINE = {
     "free_space": ("#D55E00", (0, (5, 2))),
@@ -152,6 +153,7 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
     Beside them :data:`INLINE`, the same picture of 256 colours at most: a third of the bytes, and the same to the eye.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.ticker import AutoLocator
     from PIL import Image
 
     if kind == "paper":
@@ -159,6 +161,9 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
         fig.set_size_inches(_IEEE_WIDTH_IN, height * _IEEE_WIDTH_IN / width)
     dots_per_inch = 300.0 if kind == "paper" else _RASTER_DPI
     fig.set_dpi(dots_per_inch)
+    for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
+        if isinstance(axis.get_major_locator(), AutoLocator):
+            axis.get_major_locator().set_params(min_n_ticks=3)
     images = {name: io.BytesIO() for name in formats}
     # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
     agg = FigureCanvasAgg(fig)
@@ -235,10 +240,10 @@ def seconds_since(time: AnyArray, start: np.datetime64) -> FloatArray:
     return np.asarray((np.asarray(time) - start) / np.timedelta64(1, "s"), dtype=np.float64)
 
 
-_CLOCK_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 86400)
+_CLOCK_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
 
 
-def _clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 7) -> tuple[FloatArray, list[str]]:
+def _clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 9) -> tuple[FloatArray, list[str]]:
     """Ticks at round times of day.
 
     Parameters

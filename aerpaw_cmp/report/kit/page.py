@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup, escape
 
+from ...common.counting import counted
 from ...logs.records import has_wall_clock
 from ..names import iso_time, k_key
 from .canvas import FigureSpec, Picture, write_figures
@@ -89,12 +90,12 @@ def duration(seconds: float | None) -> str:
 
 
 def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Nested settings as dotted names and plain text."""
+    """Nested settings as dotted names and plain text, without those that are not set."""
     for key, value in settings.items():
         name = f"{above}.{key}" if above else str(key)
         if isinstance(value, Mapping):
             yield from flat(value, name)
-        else:
+        elif value is not None:
             yield name, ", ".join(map(short, value)) if isinstance(value, (list, tuple)) else short(value)
 
 
@@ -174,7 +175,7 @@ def environment() -> Any:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        num=number, coded=coded,
+        num=number, coded=coded, counted=counted,
         interval=interval, percent=percent, duration=duration, minute=minute, k=k_key,
         flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri, more=more,
     )  # fmt: skip

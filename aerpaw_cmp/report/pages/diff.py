@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ...common.counting import counted
 from ...common.jsonable import fields_of, json_object
 from ...compare.judge.report_difference import Changed
 from ...compare.judge.verdicts import changed_verdict
@@ -106,7 +107,7 @@ def _cause(diff: ReportDiff) -> str:
     changed = {name: len(items) for name, items in kinds.items()}
     moved = max((level.measured_max_db for level in diff.levels if math.isfinite(level.measured_max_db)), default=0.0)
     cause = changed_verdict(diff.pooled, bool(diff.differences), moved > TOLERANCE_DB, changed)
-    listed = " and ".join(f"{n} {name}{'' if n == 1 else 's'}" for name, n in changed.items() if n)
+    listed = " and ".join(counted(n, name) for name, n in changed.items() if n)
     verb = "differs" if sum(changed.values()) == 1 else "differ"
     if cause.cause == "none" and not listed:
         return ""

@@ -12,7 +12,7 @@ import numpy as np
 
 from ...common.jsonable import named
 from ...common.units import BoolArray, IntArray, spread_out
-from ...compare.level.rss import RssComparison
+from ...compare.level.rss import PART_DB, RssComparison
 from ...compare.offset import STEP_DB
 from ...compare.result import ModelLevel, RankResult, RssResult
 from ...logs.records import has_wall_clock
@@ -23,7 +23,7 @@ from ..kit.canvas import keep_extremes, seconds_since
 from ..kit.packed import PackedArrays
 from ..kit.shapes import listed, outline, walls
 from ..names import k_key
-from ..words.flight import nearest_k, pretty
+from ..words.flight import instants, nearest_k, pretty
 
 # Samples of all series together that the page holds; beyond them each series is thinned, extremes kept.
 POINTS = 50_000
@@ -52,7 +52,10 @@ def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
         "start": str(start.astype("datetime64[ms]")) if has_wall_clock(start) else "",
         "step_db": STEP_DB,
         "span_db": list(rss_settings.get("span_db", (-50.0, 50.0))),
-        "rss": [_rss(p, data.sources.get(p.name), start, arrays, share(len(p.time))) for p in data.rss],
+        "rss": [
+            _rss(p, data.sources.get(p.name), start, arrays, share(len(p.time))) | _beside(data, p, start)
+            for p in data.rss
+        ],
         "rank": [_rank(p, start, arrays, share(len(p.time))) for p in data.rank],
         "track": _track(data, start, arrays),
         "site": scene(data.site),
@@ -96,6 +99,9 @@ def _rss(
         "models": models,
         "geometry": geometry,
     }
+    if panel.stated is not None:
+        band = panel.stated.columns(panel.simulated_dbm)
+        channel["band"] = [arrays.add(band[f"simulated_{end}_dbm"][pick]) for end in ("low", "high")]
     if source is not None:
         channel |= {
             "files": list(source.files),
@@ -103,6 +109,16 @@ def _rss(
             "line": arrays.add(source.line[pick], "f8"),
         }
     return channel
+
+
+def _beside(data: ReportData, panel: RssResult, start: np.datetime64) -> dict[str, Any]:
+    """The second channel of a tower and the spans in which the two part, as in the paper's Fig. 15."""
+    for pair in data.pairs:
+        if pair.tower == panel.tower and panel.channel in (pair.first, pair.second):
+            ends = [seconds_since(np.array(instants(pair.time, span)), start).tolist() for span in pair.score.spans]
+            beside = pair.second if panel.channel == pair.first else pair.first
+            return {"beside": f"{pair.tower} {beside}", "parted": ends, "parted_db": PART_DB}
+    return {}
 
 
 def _fit(model: RssComparison | ModelLevel) -> dict[str, float | None]:

@@ -13,7 +13,7 @@ from ..kit.canvas import Picture
 from ..kit.page import by_section, embedded, environment, rendered
 from ..names import RANK_COLUMNS, RSS_COLUMNS
 from ..words import flight as words
-from ..words.flight_verdict import headlines, verdict
+from ..words.flight_verdict import headlines, paragraph
 from .explorer import payload
 
 # Rejected lines shown per file; the flight file holds all.
@@ -55,7 +55,7 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         sections=sections,
         overview=next(iter(sections.get("overview", [])), None),
         explorer=embedded(linked),
-        first_words=verdict(data),
+        first_words=paragraph(data),
         numbers=headlines(data),
         start=start_of(data),
         clock_unit="UTC" if has_wall_clock(start_of(data)) else "s",
@@ -67,7 +67,8 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         verdicts=words.verdicts(data.rss, data.rank),
         ladder_verdict=words.ladder_verdict(data.ladder),
         ladder=_ladder_table(data.ladder),
-        warnings=words.warnings(data),
+        cautions=words.cautions(data),
+        offsets=words.offset_sentences(data.rss),
         baselines=list(dict.fromkeys(name for item in data.rss for name in item.baselines)),
         rss_columns=RSS_COLUMNS,
         rank_columns=RANK_COLUMNS,

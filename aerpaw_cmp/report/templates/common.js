@@ -71,18 +71,19 @@ const common = (() => {
     return placed;
   }
 
-  function ticks(low, high, most = 5) {
+  function ticks(low, high, most = 5) { // three at least
     if (!(high > low)) return [low];
     const raw = (high - low) / most, mag = 10 ** Math.floor(Math.log10(raw)), step = [1, 2, 5, 10].map(k => k * mag).find(k => k >= raw * (1 - 1e-9)), out = [];
     for (let v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) out.push(Math.abs(v) < 1e-9 * step ? 0 : v);
-    return out;
+    return out.length < 3 && most < 20 ? ticks(low, high, most + 1) : out;
   }
   // instants at round times of day between two, all in seconds; "begun" is the time of day of zero
   function clockTicks(low, high, most, begun) {
     const day = 86400, steps = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, day, 2 * day, 7 * day, 30 * day, 90 * day, 365 * day];
     const step = steps.find(s => (high - low) / s <= most) ?? 3650 * day, out = [];
     for (let v = Math.ceil((low + begun) / step - 1e-9) * step; v <= high + begun; v += step) out.push(v - begun);
-    return high - low < 1.5 ? ticks(low, high, most) : out;
+    if (high - low < 4) return ticks(low, high, most);
+    return out.length < 3 && most < 20 ? clockTicks(low, high, most + 1, begun) : out;
   }
   const clockText = seconds => new Date(Math.round(seconds * 1000)).toISOString().slice(11, seconds % 1 ? 21 : 19);
   const digits = marks => { const step = marks.length > 1 ? Math.abs(marks[1] - marks[0]) : 1; return Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9))); };

@@ -92,8 +92,8 @@
       const i = nearest(get(s.time), t), model = s.models[state.model], measured = get(s.measured)[i], level = get(model.level)[i];
       const east = get(s.east), north = get(s.north), up = get(s.up);
       if (east) rows.push(["East, north, up", `${number(east[i], 0)}, ${number(north[i], 0)}, ${number(up[i], 1)} m`]);
-      rows.push(["Measured", number(measured, 1, s.unit)], ["Calibrated", number(measured + model.offset, 1, "dBm")]);
-      rows.push([model.name[0].toUpperCase() + model.name.slice(1), number(level, 1, "dBm")], ["Residual", number(measured + model.offset - level, 1, "dB")]);
+      rows.push(["Measured", number(measured, 1, s.unit)], [`${model.name[0].toUpperCase() + model.name.slice(1)}, less its offset`, number(level - model.offset, 1, s.unit)]);
+      rows.push(["Residual", number(measured + model.offset - level, 1, "dB")]);
       for (const g of s.geometry.slice(0, 2)) rows.push([g.name.replace(/ \[.*\]/, ""), number(get(g.values)[i], 1, (g.name.match(/\[(\w+)/) || [])[1])]);
       if (s.line !== undefined) rows.push(["Log", `${s.files[get(s.file)[i]] ?? "?"}, line ${get(s.line)[i]}`]);
     }
@@ -127,11 +127,13 @@
   let charts = [], range = null, linking = false;
 
   function axis(label, size = 52) {
-    return { label, labelSize: 18, size, stroke: css("--ink"), font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif",
+    const splits = (u, which, low, high) => common.ticks(low, high, Math.max(3, Math.floor(u.bbox.height / devicePixelRatio / 34)));
+    const values = (u, marks) => marks.map(v => number(v, common.digits(marks)));
+    return { label, splits, values, labelSize: 18, size, stroke: css("--ink"), font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif",
       grid: { stroke: css("--line"), width: 1 }, ticks: { stroke: css("--line"), width: 1 } };
   }
   function timeAxis() {
-    const a = axis("", 30), begun = Date.parse(data.start + "Z") / 1000;
+    const { splits, values, ...a } = axis("", 30), begun = Date.parse(data.start + "Z") / 1000;
     if (!data.start) return { ...a, space: 80, values: (u, splits) => splits.map((v, i) => number(v, v % 1 ? 1 : 0) + (i ? "" : " s")) };
     a.splits = (u, which, low, high) => common.clockTicks(low, high, u.width / 110, begun);
     a.values = (u, splits) => splits.map((v, i) => common.clockText(v + begun) + (i ? "" : " UTC"));
@@ -141,10 +143,10 @@
   function bands(u) {
     const { ctx, bbox } = u;
     ctx.save();
-    if (state.span) {
-      const a = u.valToPos(state.span[0], "x", true), b = u.valToPos(state.span[1], "x", true);
-      ctx.fillStyle = css("--chosen");
-      ctx.fillRect(Math.max(a, bbox.left), bbox.top, Math.min(b, bbox.left + bbox.width) - Math.max(a, bbox.left), bbox.height);
+    const spans = [...(u.parted || []).map(ends => [ends, "--parted"]), ...(state.span ? [[state.span, "--chosen"]] : [])];
+    for (const [ends, fill] of spans) {
+      const [a, b] = ends.map(t => Math.min(bbox.left + bbox.width, Math.max(bbox.left, u.valToPos(t, "x", true))));
+      ctx.fillStyle = css(fill); ctx.fillRect(a, bbox.top, b - a, bbox.height);
     }
     if (state.pose !== null) {
       const x = u.valToPos(state.pose, "x", true);
@@ -164,6 +166,7 @@
       width: Math.max(host.clientWidth, 200), height, legend: { show: false }, padding: [6, 12, 0, 0],
       scales: { x: { time: false, range: () => range }, ...(extra.scales || {}) },
       axes: [timeAxis(), { ...axis(label), ...(extra.axis || {}) }],
+      bands: extra.bands,
       cursor: { drag: { x: true, y: false, setScale: false }, y: false, points: { show: false } },
       series: [{}, ...series],
       hooks: {
@@ -177,6 +180,7 @@
       },
     };
     const made = new uPlot(options, columns, host);
+    made.parted = extra.parted;
     made.over.addEventListener("dblclick", () => { span(null); zoomTo(null); });
     charts.push({ chart: made, host, height });
   }
@@ -201,10 +205,25 @@
     const s = rss(), r = rank(), tall = innerWidth < 600 ? 150 : 175;
     if (s) {
       const time = get(s.time), model = s.models[state.model], measured = get(s.measured);
-      const calibrated = Array.from(measured, v => Number.isFinite(v) ? v + (model.offset ?? 0) : null);
-      const columns = [Array.from(time), calibrated, column(get(model.level))], series = [dots("measured, calibrated", css("--measured"), 4), line(model.name, css("--ink"))];
-      if (state.model === 0 && s.models[1]) { columns.push(column(get(s.models[1].level))); series.push(line(s.models[1].name, css("--baseline"), [6, 4], 1)); }
-      chart(target, "Level [dBm]", columns, series, tall + 30);
+      // levels as logged; each model is moved to them by its own offset
+      const moved = (index, by) => Array.from(get(index), v => Number.isFinite(v) ? v - (by ?? 0) : null), ray = s.models[0];
+      const columns = [Array.from(time), column(measured), moved(model.level, model.offset)], series = [dots("measured", css("--measured"), 4), line(model.name, css("--ink"))];
+      const words = [`dots: measured, as logged; line: ${model.name}${model.learned_here ? " with antennas learned from this flight" : ""}, less its offset of ${number(model.offset, 1, "dB")}`], extra = {};
+      if (state.model === 0 && s.models[1]) { columns.push(moved(s.models[1].level, s.models[1].offset)); series.push(line(s.models[1].name, css("--baseline"), [6, 4], 1)); words.push("dashed: " + s.models[1].name); }
+      const second = data.rss.find(o => o.name === s.beside), first = second ? 1 : 0; // under the dots and the line of the chosen channel
+      if (state.model === 0 && s.band) {
+        for (const end of s.band) { columns.push(moved(end, ray.offset)); series.push(line("", "transparent")); }
+        extra.bands = [{ series: [columns.length - 1 + first, columns.length - 2 + first], fill: css("--band-90") }];
+        words.push("band: 90 % of the samples are expected in it");
+      }
+      const tables = [columns];
+      if (second) {
+        tables.unshift([Array.from(get(second.time)), moved(second.measured, ray.offset - second.models[0].offset)]);
+        series.unshift(dots(second.name, css("--second"), 3)); extra.parted = s.parted;
+        words.push(`violet dots: ${second.name}, moved by ${number(second.models[0].offset - ray.offset, 1, "dB")}`, ...(s.parted.length ? [`shaded: the two part by more than ${s.parted_db} dB`] : []));
+      }
+      chart(target, `Level [${s.unit}]`, second ? uPlot.join(tables) : columns, series, tall + 30, extra);
+      at("legend").textContent = words.join("; ");
       const rest = residuals();
       chart(target, "Residual [dB]", [Array.from(time), column(rest), rest.length ? Array(rest.length).fill(0) : []], [dots("residual", css("--measured"), 3), line("zero", css("--soft"), undefined, 1)], tall - 20);
     }
@@ -216,7 +235,7 @@
     }
     const place = data.track || s || r;
     if (place && get(place.up)) chart(target, "Height [m]", [Array.from(get(place.time)), column(get(place.up))], [line("height", css("--ink"))], tall - 50);
-    at("legend").textContent = s ? `dots: measured plus offset; line: ${s.models[state.model].name}${s.models[state.model].learned_here ? " with antennas learned from this flight" : ""}${state.model === 0 && s.models[1] ? "; dashed: " + s.models[1].name : ""}` : "";
+    if (!s) at("legend").textContent = "";
   }
 
   // --- the map, plan or in three dimensions ---------------------------------------------------------------------------

@@ -8,15 +8,16 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.units import AnyArray
-from ...compare.flight_verdict import pooled_db
+from ...compare.flight_verdict import lock_lost, pooled_db
 from ...compare.judge.ladder import LadderRow
 from ...compare.level.detection import DetectionScore
 from ...compare.level.rss import ErrorSpan
 from ...compare.result import BASELINE_TITLE, AuditResult, FlightVerdict, RankResult, RssResult
 from ...compare.statistics.intervals import Interval, paired_verdict
 from ..content.flight import ReportData
-from .phrases import filled
+from .phrases import MINUS, filled
 
 # Name of the ladder's rung with the settings of the flight file.
 AS_SET = "as set in flight.yaml"
@@ -147,78 +148,75 @@ def first_sentence(facts: Judged) -> str:
     return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{baseline}. {significance}"
 
 
+# What the interval over all channels says: error, best baseline, interval. ``no interval`` has none.
 _DECIDED = {
-    "better": "Ray tracing (RMSE {ray:.1f} dB) is {size:.2f} dB better than {name} {range}{over} (95 %).",
-    "worse": "Ray tracing (RMSE {ray:.1f} dB) is {size:.2f} dB worse than {name} {range}{over} (95 %).",
+    "better": "Ray tracing (RMSE {ray}) is {size:.2f} dB better than {name} {ends}{over} (95 %).",
+    "worse": "Ray tracing (RMSE {ray}) is {size:.2f} dB worse than {name} {ends}{over} (95 %).",
+    "not significant": (
+        "Ray tracing: RMSE {ray}; {name}: {other}. The difference {ends}{over} is not significant (95 %)."
+    ),
+    "no interval": "Ray tracing: RMSE {ray}; {name}: {other}. Too few samples for an interval of the difference.",
 }
 
 
-def flight_sentence(verdict: FlightVerdict | None, ray_db: float, baseline_db: float) -> str:
+def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> str:
     """The error of ray tracing, and what the interval over all channels says of the best baseline.
 
     Examples
     --------
-    >>> pooled = FlightVerdict(against="two_ray", difference_db=-0.23, ci95_db=(-0.33, -0.14), channels=10)
-    >>> flight_sentence(pooled, 2.0, 2.2)
+    >>> pooled = FlightVerdict(against="two_ray", rmse_db=2.0, baseline_rmse_db=2.2, difference_db=-0.23,
+    ...     ci95_db=(-0.33, -0.14), channels=10)
+    >>> flight_sentence(pooled)
     'Ray tracing (RMSE 2.0 dB) is 0.23 dB better than two-ray ground [0.14, 0.33] over 10 channels (95 %).'
     """
-    if verdict is None:
-        return f"Ray tracing: RMSE {ray_db:.1f} dB. No baseline could be scored."
+    word, ends = paired_verdict(*verdict.ci95_db), verdict.ci95_db
+    if word in ("better", "worse"):
+        ends = sorted(map(abs, ends))
     name, over = pretty(verdict.against), f" over {verdict.channels} channels" if verdict.channels > 1 else ""
-    word = paired_verdict(*verdict.ci95_db)
-    if word in _DECIDED:
-        near, far = sorted(map(abs, verdict.ci95_db))
-        size, ends = abs(verdict.difference_db), f"[{near:.2f}, {far:.2f}]"
-        one = f"a {name}" if verdict.against in ("constant", "log_distance") else name
-        return _DECIDED[word].format(ray=ray_db, size=size, name=one, range=ends, over=over)
-    both = f"Ray tracing: RMSE {ray_db:.1f} dB; {name}: {baseline_db:.1f} dB."
-    if word == "no interval":
-        return f"{both} Too few samples for an interval of the difference."
-    change, low, high = (f"{v:+.2f}".replace("-", "−") for v in (verdict.difference_db, *verdict.ci95_db))
-    return f"{both} The difference of {change} dB [{low}, {high}]{over} is not significant (95 %)."
+    floor = "" if floor_db is None else f", floor {floor_db:.0f}".replace("-", MINUS)
+    signs = "+" if word == "not significant" else ""
+    return _DECIDED[word].format(
+        ray=f"{verdict.rmse_db:.1f} dB{floor}", other=f"{verdict.baseline_rmse_db:.1f} dB", over=over,
+        name=f"a {name}" if verdict.against in ("constant", "log_distance") else name,
+        size=abs(verdict.difference_db),
+        ends=f"[{', '.join(format(end, f'{signs}.2f').replace('-', MINUS) for end in ends)}]",
+    )  # fmt: skip
 
 
 def expected_sentence(panels: Sequence[RssResult]) -> str:
     """The error to expect on another flight; nothing unless every scored channel has it from flights left out."""
-    known = [panel.further.elsewhere for panel in panels]
-    if not known or not all(item and "rmse_db" in item for item in known):
-        return ""
-    learned, free = (
-        math.sqrt(sum(item[name] ** 2 for item in known if item) / len(known))
-        for name in ("rmse_db", "free_space_rmse_db")
-    )
-    return f"Expect {learned:.1f} dB on another flight (free space {free:.1f} dB)."
+    names = ["floor_rmse_db" if lock_lost(panel) else "rmse_db" for panel in panels]
+    known = [(panel.further.elsewhere or {}).get(name, math.nan) for panel, name in zip(panels, names, strict=True)]
+    error = math.sqrt(sum(value**2 for value in known) / len(known)) if known else math.nan
+    return f"Expect {error:.1f} dB on another flight." if math.isfinite(error) else ""
 
 
 # Causes of :mod:`aerpaw_cmp.compare.judge.causes` in words, and what to do next.
 CAUSES: dict[str, tuple[str, str]] = {
     "clock": (
-        "the radio clock is {size:.1f} s {side} the telemetry clock (95 %: {low:+.1f} to {high:+.1f} s)",
+        "the radio clock is {size:.1f} s {side} the telemetry clock [{low:+.1f}, {high:+.1f}]",
         "`rss: {{lag: apply}}`",
     ),
     "heading": (
-        "the UAV antenna is turned clockwise by {value:.0f} (95 %: {low:.0f} to {high:.0f}) degrees",
-        "check the mount of the antenna and the logged yaw",
+        "the UAV antenna is turned clockwise by {value:.0f} degrees [{low:.0f}, {high:.0f}]",
+        "check the antenna's mount and the logged yaw",
     ),
     "tower": ("the log is that of {where}", "check `node:` of this log"),
-    "pattern": (
-        "the antenna pattern of the UAV: the error follows the direction of the tower",
-        "`aerpaw-cmp calibrate`",
-    ),
+    "pattern": ("the antenna pattern of the UAV", "`aerpaw-cmp calibrate`"),
     "blocked": (
-        "a loss of {value:.0f} dB (95 %: {low:.0f} to {high:.0f} dB) at {where} degrees from the tower",
+        "a loss of {value:.0f} dB [{low:.0f}, {high:.0f}] towards {where} degrees",
         "add to the site what stands there",
     ),
     "floor": ("the receiver shows no level below {value:.0f} {unit}", "`floor_db: {typed}` for this log"),
     "gain step": (
-        "the level steps by {value:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) at {at} UTC",
-        "check the gain of the receiver; compare the two parts apart",
+        "the level steps by {value:+.1f} dB [{low:+.1f}, {high:+.1f}] at {at} UTC",
+        "check the receiver's gain",
     ),
 }
 
 
 def cause_sentence(panel: RssResult) -> str:
-    """Effect, cause with its interval, and action; nothing where no likely cause was identified."""
+    """Likely cause with its interval and the error with it, and the next step; nothing where none was identified."""
     cause = panel.further.likely_cause
     if cause is None:
         return ""
@@ -231,11 +229,7 @@ def cause_sentence(panel: RssResult) -> str:
         CAUSES[cause.name], value=value, low=low, high=high, size=abs(value), unit=panel.unit, at=at,
         side="ahead of" if value > 0 else "behind", where=cause.where, typed=f"{value:.0f}",
     )  # fmt: skip
-    return (
-        f"Likely cause at {panel.name}: {text}. "
-        f"With it the RMSE is {cause.rmse_with_db:.1f} instead of {cause.rmse_db:.1f} dB (means over 1 s). "
-        f"Next: {action}."
-    )
+    return f"Likely cause at {panel.name}: {text}; RMSE {cause.rmse_with_db:.1f} dB with it. Next: {action}."
 
 
 def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetime64]:
@@ -243,26 +237,6 @@ def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetim
     first = time.min()
     begin, end = (first + np.timedelta64(round(seconds * 1e9), "ns") for seconds in (span.start_s, span.end_s))
     return begin, end
-
-
-def local_error(panel: RssResult, span: ErrorSpan) -> str:
-    """Sentences on where a channel is missed most, and what is known of the measurement that may explain it."""
-    known = []
-    if panel.clock_verdict == "cannot tell":
-        known.append("the radio clock could not be confirmed")
-    if lock_lost(panel) is not None:
-        known.append("the receiver lost its lock on this flight")
-    side = "above" if span.mean_db > 0 else "below"
-    start, end = (str(t.astype("datetime64[s]"))[-8:] for t in instants(panel.time, span))
-    return (
-        f"Largest local error: measured {abs(span.mean_db):.1f} dB {side} predicted, {panel.name}, "
-        f"{start}-{end} UTC. No likely cause was identified{'; ' + ' and '.join(known) if known else ''}."
-    )
-
-
-def _field_failures(data: ReportData) -> int:
-    audit = None if data.engine is None else data.engine.audit
-    return 0 if audit is None or audit.fields is None else len(audit.fields.failures)
 
 
 def audit_summary(audit: AuditResult) -> str:
@@ -301,37 +275,6 @@ def audit_paths(audit: AuditResult) -> str:
     return ", ".join(parts)
 
 
-def _missing_paths(data: ReportData) -> int:
-    audit = None if data.engine is None else data.engine.audit
-    return 0 if audit is None else audit.missing_paths
-
-
-# What may be said against the numbers, and when.
-DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
-    (lambda d: bool(d.doubts), "{doubts}"),
-    (lambda d: any(p.score.at_edge for p in d.rss), "an offset lies at the edge of its search"),
-    (lambda d: any(not p.score.n and not p.training for p in d.rss), "a channel could not be scored"),
-    (lambda d: any(_moved_by_outliers(p) for p in d.rss), "{outliers}"),
-    (lambda d: d.engine is not None and d.engine.audit is None, "no audit"),
-    (lambda d: _missing_paths(d) > 0, "the audit misses {missing} paths"),
-    (lambda d: _field_failures(d) > 0, "the audit of the field failed {failed} times"),
-    (lambda d: any(p.clock_verdict == "cannot tell" for p in d.rss), "the radio clock could not be confirmed"),
-    (lambda d: d.synthetic, "synthetic data"),
-)
-
-
-def trust(data: ReportData) -> str:
-    """Check whether the numbers can be believed, by the checks that were made."""
-    facts = {
-        "missing": count(_missing_paths(data)),
-        "failed": count(_field_failures(data)),
-        "outliers": _outliers_in_words(data),
-        "doubts": "; ".join(data.doubts),
-    }
-    doubts = [text.format_map(facts) for holds, text in DOUBTS if holds(data)]
-    return f"Caution: {'; '.join(doubts)}." if doubts else "Every check of this report passed."
-
-
 def _recommended(data: ReportData) -> str:
     """Model that the ladder recommends; nothing without a ladder."""
     return next((row.model for row in data.ladder if row.recommended), "")
@@ -349,23 +292,8 @@ def next_step(data: ReportData) -> str:
     return next((text for holds, text in NEXT if holds(data)), "")
 
 
-# Outlying samples that move an RMSE by more than this [dB] are named in the first words.
+# Outlying samples that move an RMSE by more than this [dB] are named.
 _MOVED_DB = 0.3
-
-
-def _moved_by_outliers(panel: RssResult) -> float:
-    """By how much outlying samples raise the RMSE of a channel [dB]; 0 below :data:`_MOVED_DB`."""
-    moved = panel.score.rmse_db - panel.further.rmse_without_outliers_db
-    return float(moved) if moved > _MOVED_DB else 0.0  # NaN moves nothing
-
-
-def _outliers_in_words(data: ReportData) -> str:
-    panel = max(data.rss, key=_moved_by_outliers, default=None)
-    if panel is None or not _moved_by_outliers(panel):
-        return ""
-    n, without = panel.further.n_outliers, panel.further.rmse_without_outliers_db
-    change = f"its RMSE from {without:.1f} to {panel.score.rmse_db:.1f} dB"
-    return f"{count(n)} outlying sample{'s raise' if n > 1 else ' raises'} at {panel.name} {change}"
 
 
 def _listed(names: list[str]) -> str:
@@ -402,20 +330,25 @@ def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     )
 
 
-def training_sentence(names: Sequence[str], what: str, digests: Sequence[str]) -> str:
+def training_sentence(names: Sequence[str], what: str) -> str:
     """First words of a report on a log that something was learned from: no error of it is a prediction's."""
-    shown = ", ".join(f"{digest[:12]}..." for digest in digests[:3]) + (" and others" if len(digests) > 3 else "")
+    of = _listed(list(names)) if len(names) < 3 else f"{len(names)} channels"
+    were = "was" if what == "the receiver" else "were"
     return (
-        f"Training flight: {what} of {_listed(list(names))} {'was' if what == 'the receiver' else 'were'} learned from "
-        f"this flight's own log (SHA-256 {shown}). No error of the learned model is given here: it would be the error "
-        "of the fit."
+        f"Training flight: {what} of {of} {were} learned from this flight's own log, so the tables show "
+        "\u201c\u2013\u201d instead of an error."
     )
+
+
+def _learned_from(digests: Sequence[str]) -> str:
+    shown = ", ".join(f"{digest[:12]}..." for digest in digests[:3]) + (" and others" if len(digests) > 3 else "")
+    return f" Learned from the logs with SHA-256 {shown}."
 
 
 def rss_verdict(panel: RssResult) -> str:
     """Sentences on how well one channel is predicted, and whether the baselines do better."""
     if panel.training:
-        return training_sentence([panel.name], "the antennas", panel.further.trained_on or ())
+        return training_sentence([panel.name], "the antennas") + _learned_from(panel.further.trained_on or ())
     score = panel.score
     if score.n == 0 or not math.isfinite(score.rmse_db):
         return f"{panel.name}: nothing to score; all {count(len(panel.time))} samples are out of coverage on one side."
@@ -429,12 +362,9 @@ def rss_verdict(panel: RssResult) -> str:
         return text + "."
     best = min(errors, key=lambda name: errors[name])
     paired = panel.further.compared_with.get(best)
-    if paired is None:
-        return f"{text}; {pretty(best)}: {errors[best]:.1f} dB."
-    words = paired.in_words(pretty(best))
-    words = words.replace("(-", "(\u2212").replace("[-", "[\u2212")
-    further = _detection_words(panel) + _snr_words(panel)
-    return f"{text}: {words}; {pretty(best)}: {errors[best]:.1f} dB.{further}"
+    if paired is not None:
+        text += ": " + paired.in_words(pretty(best)).replace("(-", f"({MINUS}").replace("[-", f"[{MINUS}")
+    return f"{text}; {pretty(best)}: {errors[best]:.1f} dB.{_detection_words(panel)}{_snr_words(panel)}"
 
 
 def _detection_words(panel: RssResult) -> str:
@@ -442,12 +372,12 @@ def _detection_words(panel: RssResult) -> str:
     score = panel.further.detection
     if score is None:
         return ""
+    floor = f"{score.floor_db:.0f}".replace("-", MINUS)
     return (
-        f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of {score.n} samples. "
-        f"The predicted level gives P(detected) with a Brier score of {score.brier:.2f} ({learned_on(score)}; a "
-        f"constant: {score.constant_brier:.2f}). With a floor at {score.floor_db:.0f}, all samples: RMSE "
-        f"{score.rmse_db:.1f} dB (free space: {score.free_space_rmse_db:.1f} dB); detected samples, which are "
-        f"selected by their level: {score.detected_rmse_db:.1f} dB."
+        f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of {score.n} samples: the "
+        f"Brier score is {score.brier:.2f} by the predicted level ({learned_on(score)}), {score.constant_brier:.2f} by "
+        f"that share alone. With lower levels counted as {floor}: RMSE {score.rmse_db:.1f} dB (free space: "
+        f"{score.free_space_rmse_db:.1f} dB)."
     )
 
 
@@ -457,34 +387,6 @@ def learned_on(score: DetectionScore) -> str:
         "other flights": "learned on other flights",
         "held-out segments": "learned in other segments of this flight",
     }[score.learned_on]
-
-
-def lock_lost(panel: RssResult) -> DetectionScore | None:
-    """The score of a receiver whose log says when it was in lock; None of others, and of one that never lost it."""
-    score = panel.further.detection
-    return score if score is not None and score.locks else None
-
-
-def lock_sentence(panels: Sequence[RssResult]) -> str:
-    """Both parts of the score of a receiver that lost its lock; nothing where none did."""
-    sentences = []
-    for panel in panels:
-        score, known = lock_lost(panel), panel.further.elsewhere or {}
-        if score is None:
-            continue
-        floor, expected = f"{score.floor_db:.0f}".replace("-", "\N{MINUS SIGN}"), ""
-        if "floor_rmse_db" in known:
-            expected = (
-                f" Expect {known['floor_rmse_db']:.1f} dB on another flight (free space "
-                f"{known['free_space_floor_rmse_db']:.1f} dB)."
-            )
-        sentences.append(
-            f"{panel.name} lost its lock in {100 - 100 * score.n_detected / score.n:.0f} % of the samples. With lower "
-            f"levels counted as {floor} {panel.unit}: RMSE {score.rmse_db:.1f} dB; free space: "
-            f"{score.free_space_rmse_db:.1f} dB.{expected} P(locked), {learned_on(score)}: Brier score "
-            f"{score.brier:.2f}; a constant: {score.constant_brier:.2f}."
-        )
-    return " ".join(sentences)
 
 
 def _snr_words(panel: RssResult) -> str:
@@ -504,7 +406,7 @@ def rank_verdict(panel: RankResult) -> str:
     if k is None:
         return f"{panel.tower} rank: nothing to score; no sample has both a reported rank and a simulated one."
     best, logs = panel.score.simulated[k], panel.further.trained_on
-    learned = f" {training_sentence([panel.tower], 'the receiver', logs)}" if logs else ""
+    learned = f" {training_sentence([panel.tower], 'the receiver')}{_learned_from(logs)}" if logs else ""
     agree = f" and agrees pose by pose in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
     kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_kappa_references(panel)})" if math.isfinite(best.kappa) else ""
     return (
@@ -544,21 +446,10 @@ def _kappa_references(panel: RankResult) -> str:
     return words
 
 
-def warnings(data: ReportData) -> list[str]:
-    """Warnings that must be known before a number is believed; those of the data first."""
-    texts = list(data.warnings)
-    if data.synthetic:
-        texts.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")
-    for panel in data.rss:
-        texts += _rss_warnings(panel)
+def cautions(data: ReportData) -> list[str]:
+    """Sentences to be known before a number is believed: the list under the first paragraph, gravest first."""
+    texts = []
     audit = None if data.engine is None else data.engine.audit
-    if data.engine is not None and audit is None:
-        why = data.engine.not_audited
-        texts.append(
-            f"Not audited against Sionna RT: {why}" if why else "The replay was not audited against the other engine."
-        )
-    if audit is not None and audit.missing_paths:
-        texts.append(audit_summary(audit))
     if audit is not None and audit.fields is not None and audit.fields.failed:
         texts.append(
             "The audit of the field failed, so no level or rank below can be relied on: "
@@ -566,17 +457,69 @@ def warnings(data: ReportData) -> list[str]:
             + (f"; and {audit.fields.failed - 3} more" if audit.fields.failed > 3 else "")
             + "."
         )
+    if data.synthetic:
+        texts.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")
+    texts += [f"{text}." for text in data.doubts]
+    for panel in data.rss:
+        texts += _rss_cautions(panel)
+    if data.engine is not None and audit is None:
+        why = data.engine.not_audited
+        texts.append(
+            f"Not audited against Sionna RT: {why}" if why else "The replay was not audited against the other engine."
+        )
+    if audit is not None and audit.missing_paths:
+        texts.append(audit_summary(audit))
+    texts += data.warnings
     rejected = sum(f.rejected for f in data.inputs)
     if rejected:
         texts.append(f"{count(rejected)} log lines were rejected; see the account of the inputs.")
-    return texts
+    return list(dict.fromkeys(texts))
 
 
-def _rss_warnings(panel: RssResult) -> list[str]:
-    texts, score = [], panel.score
+def _rss_cautions(panel: RssResult) -> list[str]:
+    texts, score, lock, further = [], panel.score, lock_lost(panel), panel.further
+    if lock is not None:
+        share, floor = 100 - 100 * lock.n_detected / lock.n, f"{lock.floor_db:.0f}".replace("-", MINUS)
+        texts.append(
+            f"{panel.name} lost its lock in {share:.0f} % of the samples; levels below {floor} {panel.unit} count as "
+            f"{floor} in the first sentence."
+        )
     if 0 < score.n < FEW_SAMPLES:
         texts.append(f"{panel.name}: only {score.n} samples were scored, too few for a verdict.")
     if score.n_out_of_coverage > 0.2 * len(panel.time):
         share = 100 * score.n_out_of_coverage / len(panel.time)
         texts.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not part of the RMSE.")
+    if score.rmse_db - further.rmse_without_outliers_db > _MOVED_DB:  # NaN moves nothing
+        without = counted(further.n_outliers, "outlier")
+        texts.append(f"{panel.name}: RMSE {further.rmse_without_outliers_db:.1f} dB without {without}.")
     return texts
+
+
+# Offsets of at least this size, or below zero, are explained [dB].
+_LARGE_OFFSET_DB = 20.0
+
+# Reason of such an offset, by the unit of the log.
+OFFSETS = {
+    "dB re full scale": "the log is relative to full scale, and the offset turns it into dBm",
+    "dB": "the log is a ratio to the noise, and the offset is the level of that noise in dBm",
+    "dBm": "the transmit power, gains or losses of the settings are not those of the flight; RSRP is the level of one "
+    "subcarrier alone",
+}
+
+
+def offset_sentences(panels: Sequence[RssResult]) -> list[str]:
+    """Reason of negative and of large offsets, a sentence for each unit of the logs.
+
+    Examples
+    --------
+    >>> offset_sentences([])
+    []
+    """
+    known: dict[str, list[float]] = {}
+    for panel in panels:
+        if panel.score.offset_db < 0.0 or panel.score.offset_db >= _LARGE_OFFSET_DB:
+            known.setdefault(panel.unit, []).append(panel.score.offset_db)
+    return [
+        f"Offset {' to '.join(dict.fromkeys(signed(end) for end in (min(of), max(of))))} dB: {OFFSETS[unit]}."
+        for unit, of in known.items() if unit in OFFSETS
+    ]  # fmt: skip

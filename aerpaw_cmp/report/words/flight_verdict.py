@@ -1,4 +1,4 @@
-"""First screen of a report: a verdict in two sentences, and up to four numbers beside their baselines."""
+"""First screen of a report: a paragraph, and up to four numbers beside their baselines."""
 
 from __future__ import annotations
 
@@ -6,18 +6,16 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from ...common.provenance import union
-from ...compare.flight_verdict import baseline_errors, pooled_db, scored
+from ...common.counting import counted
+from ...compare.flight_verdict import baseline_errors, lock_lost, pooled_db, scored
 from ...compare.ranks.forecast import ForecastScore
 from ...compare.result import AuditResult, FlightVerdict, RankResult, RssResult
 from ...compare.statistics.intervals import Interval
 from ..content.flight import ReportData
 from . import flight as words
+from .prediction import before_flight
 
 NO_INTERVAL = "no interval can be given"
-
-# A channel whose RMSE is this much [dB] above the pooled one is named as where the prediction fails.
-LARGE_DB = 1.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -30,25 +28,34 @@ class Headline:
     reference: str
 
 
-def verdict(data: ReportData) -> tuple[str, ...]:
-    """Two sentences: how good against which baseline; where it fails, and whether to trust it."""
+# Words of a first paragraph at most.
+MOST_WORDS = 60
+
+
+def paragraph(data: ReportData) -> str:
+    """First words: error and best baseline, the error on another flight, one cause, one next step.
+
+    Page, terminal and metrics.json have them alike; cautions (:func:`.flight.cautions`) are a list of their own.
+    """
     panels = scored(data.rss)
-    first = _level_sentence(data.verdict, panels) if panels else _rank_sentence(data.rank)
+    error = _level_sentence(data.verdict, panels) if panels else _rank_sentence(data.rank)
     if learned := _training(data):
-        learned = " ".join(part for part in (learned, words.expected_sentence(data.rss)) if part)
-        return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, words.trust(data)) if part)
-    if not first:
+        other = error if panels or not data.rss else _baseline_sentence(data.rss)
+        parts = [learned, other, words.expected_sentence(data.rss)]
+    elif error and data.against is not None and data.against.scores:
+        parts = [error, before_flight(data.against.scores), words.next_step(data)]
+    elif error:
+        parts = [error, words.expected_sentence(panels), _cause(panels) or words.next_step(data)]
+    else:
         most = max([panel.score.n for panel in data.rss], default=0)
-        return (words.NOTHING_COMPARED if not most else words.TOO_FEW_COMPARED.format(n=most), words.trust(data))
-    first = " ".join(part for part in (words.lock_sentence(panels), first, words.expected_sentence(panels)) if part)
-    cause = _causes(panels)
-    where = (cause,) if cause else (_fails(panels), words.next_step(data))
-    return first, " ".join(part for part in (*where, words.trust(data)) if part)
+        parts = [words.TOO_FEW_COMPARED.format(n=most) if most else words.NOTHING_COMPARED]
+    return " ".join(part for part in parts if part)
 
 
 def _level_sentence(pooled: FlightVerdict | None, panels: Sequence[RssResult]) -> str:
-    baseline_db = math.nan if pooled is None else baseline_errors(panels)[pooled.against]
-    return words.flight_sentence(pooled, _pooled(panels), baseline_db)
+    if pooled is None:
+        return f"Ray tracing: RMSE {_pooled(panels):.1f} dB. No baseline could be scored."
+    return words.flight_sentence(pooled, next((lock.floor_db for p in panels if (lock := lock_lost(p))), None))
 
 
 def _training(data: ReportData) -> str:
@@ -57,7 +64,7 @@ def _training(data: ReportData) -> str:
         learned = [panel for panel in panels if panel.further.trained_on]
         if learned:
             names = [panel.name if isinstance(panel, RssResult) else panel.tower for panel in learned]
-            return words.training_sentence(names, what, union(*(panel.further.trained_on or () for panel in learned)))
+            return words.training_sentence(names, what)
     return ""
 
 
@@ -124,10 +131,9 @@ def _forecast_of(panel: RankResult) -> ForecastScore | None:
 
 def _forecast_sentence(panel: RankResult, score: ForecastScore) -> str:
     return (
-        f"Rank forecast at {panel.tower} by the receiver learned on other flights: kappa {score.kappa:.2f} (0 is "
-        f"chance), {_log_score(score)}."
-        f" The forecast rank agrees in {100 * score.agreement:.0f} % of samples; always "
-        f"guessing the commonest agrees in {100 * score.majority_agreement:.0f} %."
+        f"Rank at {panel.tower} by the receiver learned on other flights: kappa {score.kappa:.2f} (0 is chance), "
+        f"{_log_score(score)}. It agrees in {100 * score.agreement:.0f} % of samples; always guessing the commonest "
+        f"agrees in {100 * score.majority_agreement:.0f} %."
     )
 
 
@@ -165,28 +171,10 @@ def _rank_sentence(panels: Sequence[RankResult]) -> str:
     return ""
 
 
-# A shorter stretch of error is a fade, not a fault of the model.
-LONG_S = 5.0
-
-
-def _causes(panels: Sequence[RssResult]) -> str:
+def _cause(panels: Sequence[RssResult]) -> str:
     """The cause that explains most of a channel's error; nothing where no channel shows one."""
     gains = [(cause.gain, i) for i, panel in enumerate(panels) if (cause := panel.further.likely_cause) is not None]
     return words.cause_sentence(panels[max(gains)[1]]) if gains else ""
-
-
-def _fails(panels: Sequence[RssResult]) -> str:
-    """Sentence on where the error is largest."""
-    if not panels:
-        return ""
-    worst = max(panels, key=lambda p: p.score.rmse_db)
-    if len(panels) > 1 and worst.score.rmse_db > _pooled(panels) + LARGE_DB:
-        return f"Largest error of a channel: {worst.name}, {worst.score.rmse_db:.1f} dB."
-    spans = [(panel, span) for panel in panels for span in panel.spans if span.end_s - span.start_s >= LONG_S]
-    if not spans:
-        return f"Largest error of a channel: {worst.name}, {worst.score.rmse_db:.1f} dB." if len(panels) > 1 else ""
-    panel, span = max(spans, key=lambda item: abs(item[1].mean_db))
-    return words.local_error(panel, span)
 
 
 def headlines(data: ReportData) -> list[Headline]:
@@ -194,7 +182,7 @@ def headlines(data: ReportData) -> list[Headline]:
     lines = []
     panels = scored(data.rss)
     if panels:
-        lines += [_error(panels), *_difference(data.verdict)]
+        lines += [_error(panels, data.verdict), *_difference(data.verdict)]
     for panel in data.rank:
         score, k = _forecast_of(panel), words.nearest_k(panel)
         if score is not None:
@@ -220,14 +208,16 @@ def _audit(audit: AuditResult) -> Headline:
     return Headline(label="Audit", value=value, interval=words.audit_paths(audit), reference=extent)
 
 
-def _error(panels: Sequence[RssResult]) -> Headline:
-    total, best = _pooled(panels), _best_baseline(panels)
+def _error(panels: Sequence[RssResult], pooled: FlightVerdict | None) -> Headline:
+    total = _pooled(panels) if pooled is None else pooled.rmse_db
+    best = "no baseline" if pooled is None else f"{words.pretty(pooled.against)}: {pooled.baseline_rmse_db:.1f} dB"
+    floor = ", lower levels as the floor" if any(map(lock_lost, panels)) else ""
     return Headline(
-        label="RMSE of the level" if len(panels) == 1 else f"RMSE of the level, {len(panels)} channels",
+        label=f"RMSE of the level{f', {len(panels)} channels' if len(panels) > 1 else ''}{floor}",
         value=f"{total:.1f} dB",
-        interval=_ends(panels),
-        reference="no baseline" if best is None else f"{words.pretty(best[0])}: {best[1]:.1f} dB",
-    )
+        interval="" if floor else _ends(panels),
+        reference=best,
+    )  # fmt: skip
 
 
 def _interval(ends: Interval, form: str, unit: str = "") -> str:
@@ -282,5 +272,4 @@ def points(share: float) -> str:
     >>> points(0.012), points(0.18)
     ('1 percentage point', '18 percentage points')
     """
-    number = f"{100 * share:.0f}"
-    return f"{number} percentage point{'' if number == '1' else 's'}"
+    return counted(round(100 * share), "percentage point")

@@ -34,16 +34,13 @@ MANY = 0.2
 
 # The chosen model on what was left out, by the paired interval.
 AGAINST_FREE_SPACE = {
-    "better": (
-        "The model is significantly better than free space ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
+    "better": ("On {over} left out it is {size:.1f} dB better than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
+    "worse": ("On {over} left out it is {size:.1f} dB worse than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
+    "not significant": (
+        "On {over} left out the difference from free space [{low:+.1f}, {high:+.1f}] is not significant (95 %).",
         "",
     ),
-    "worse": (
-        "The model is significantly worse than free space ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
-        "",
-    ),
-    "not significant": ("The difference from free space of {effect:+.1f} dB is not significant (95 %).", ""),
-    "no interval": ("Too few samples for an interval of the difference.", ""),
+    "no interval": ("Too few samples for an interval of the difference from free space.", ""),
 }
 
 # The residual field, by the interval of the difference of the CRPS; ``off`` where it holds zero.
@@ -79,7 +76,7 @@ STATED: dict[str, tuple[str, str]] = {
 
 # The same on the flight that followed.
 FLOWN: dict[str, tuple[str, str]] = {
-    "none": ("Intervals are as stated.", "`aerpaw-cmp predict` with this flight for the next route"),
+    "none": ("", "`aerpaw-cmp predict` with this flight for the next route"),
     "no interval": ("Too few samples to judge the intervals.", ""),
     "narrow": (
         "Intervals of {where} are too narrow: errors are {effect:.1f} times as large as stated "
@@ -99,76 +96,71 @@ FLOWN: dict[str, tuple[str, str]] = {
 }
 
 
-def first_words(correction: Correction, outside: float, expected_db: float) -> str:
-    """Expected error, intervals, where the prediction is a guess, model, next step: first line of terminal and page.
+EXPECTED = (
+    "Expect an RMSE of {error:.1f} dB over 4 s means at these points on a new flight; 90 % of the samples lie within "
+    "\u00b1{band:.1f} dB."
+)
+REMEMBERED = "No flight is named: antennas and levels are those that the site remembers."
+OUTSIDE = {
+    "flown": "{percent:.0f} % of the points lie outside the flown places.",
+    "remembered": "{percent:.0f} % of the points lie in directions that the remembered flights hardly saw.",
+}
+PLAN = "Next: `aerpaw-cmp plan` names the flight that helps most."
+
+
+def first_words(correction: Correction | None, outside: float, expected_db: float, band_db: float) -> str:
+    """First paragraph of terminal, page and metrics.json: one error with its band, best baseline, one next step.
 
     Parameters
     ----------
-    correction : Correction
+    correction : Correction, optional
+        None: the memory of the site is the source.
     outside : float
-        Share of points outside the flown places.
+        Share of points outside the flown places, or in directions that flights hardly saw.
     expected_db : float
         Stated standard deviation of a mean over 4 s on a new flight, root mean square over the points [dB].
+    band_db : float
+        Half of the 90 % interval of a sample, mean over the points [dB].
 
     Returns
     -------
     str
     """
-    key, free = (correction.base, correction.title), ("free space", OFF)
-    over = "flights left out, each about its own mean" if len(correction.flights) > 1 else "300 m blocks left out"
-    baseline = f"; free space {correction.rmse_db[free]:.1f} dB" if free in correction.rmse_db else ""
-    texts = [
-        f"Expect an RMSE of {expected_db:.1f} dB over 4 s means at these points on a new flight.",
-        f"On {over}: {correction.rmse_db[key]:.1f} dB{baseline}.",
-    ]
-    if free in correction.rmse_db and key != free:
-        texts.append(said_of(_against_free_space(correction), AGAINST_FREE_SPACE))
-    error, sd = correction.held_out[key]
-    inside = 100.0 * _inside_share(error, sd)
-    texts.append(said_of(stated_errors(error, sd), STATED, inside=inside))
-    texts.append(f"Model: {TITLES[correction.base]}.")
-    texts.append(said_of(field(correction), FIELD))
-    if outside > MANY:
-        texts.append(
-            f"{100 * outside:.0f} % of the points lie outside the flown places. Next: `aerpaw-cmp plan` names the "
-            "flight that helps most."
-        )
+    texts = filled([EXPECTED], error=expected_db, band=band_db)
+    step = ""
+    if correction is None:
+        texts.append(REMEMBERED)
+    else:
+        if ("free space", OFF) in correction.rmse_db and (correction.base, correction.title) != ("free space", OFF):
+            verdict = _against_free_space(correction)
+            near, far = sorted(map(abs, verdict.interval))
+            over = "flights" if len(correction.flights) > 1 else "300 m blocks"
+            texts.append(said_of(verdict, AGAINST_FREE_SPACE, over=over, near=near, far=far))
+        step = _stated(correction).partition("Next: ")[2]
+    texts.append(PLAN if outside > MANY else f"Next: {step}" if step else "")
     return " ".join(text for text in texts if text)
 
 
-# A prediction from the memory of the site; ``learned`` by entry.
-NO_FLIGHT = (
-    "No flight is named: antennas and levels are those that the site remembers. {learned}. The offset of a new flight "
-    "has a standard deviation of up to {sd:.1f} dB."
-)
-
-UNSEEN = (
-    "{percent:.0f} % of the points lie in directions that the remembered flights hardly saw. Next: `aerpaw-cmp plan` "
-    "names the flight that helps most."
-)
+def cautions(correction: Correction, outside: float) -> list[str]:
+    """Sentences under the first paragraph: places never flown, intervals on what was left out, model and field."""
+    texts = filled([OUTSIDE["flown"]], percent=100.0 * outside) if outside > MANY else []
+    texts += [_stated(correction).partition(" Next: ")[0], f"Model: {TITLES[correction.base]}."]
+    return [text for text in (*texts, said_of(field(correction), FIELD)) if text]
 
 
-def memory_words(known: Sequence[tuple[Entry, LearnedSeries, float]], outside: float) -> str:
-    """First line of terminal and page without flights: what the site remembers, and the error to expect.
-
-    Parameters
-    ----------
-    known : sequence of (Entry, LearnedSeries, float)
-        With the standard deviation of the level [dB].
-    outside : float
-        Share of points in directions that flights hardly saw.
-
-    Returns
-    -------
-    str
-    """
+def memory_cautions(known: Sequence[tuple[Entry, LearnedSeries]], outside: float) -> list[str]:
+    """The same of a prediction without flights: what the site remembers, by entry."""
     each: dict[str, list[str]] = {}
-    for entry, series, _ in known:
+    for entry, series in known:
         each.setdefault(entry.about(), []).append(f"{series.tower} {series.channel}")
-    learned = ". ".join(f"{', '.join(names)}: {about}" for about, names in each.items())
-    sd = max(sd_db for *_, sd_db in known)
-    texts = [NO_FLIGHT, *([UNSEEN] if outside > MANY else [])]
-    return " ".join(filled(texts, learned=learned, sd=sd, percent=100.0 * outside))
+    texts = filled([OUTSIDE["remembered"]], percent=100.0 * outside) if outside > MANY else []
+    return [*texts, *(f"{', '.join(names)}: {about}." for about, names in each.items())]
+
+
+def _stated(correction: Correction) -> str:
+    """Sentence and step on the stated standard deviations on what was left out."""
+    error, sd = correction.held_out[correction.base, correction.title]
+    return said_of(stated_errors(error, sd), STATED, inside=100.0 * _inside_share(error, sd))
 
 
 def _inside_share(error: FloatArray, sd: FloatArray) -> float:
@@ -220,9 +212,18 @@ def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Ver
     mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
     worst = max(stated, key=lambda verdict: list(FLOWN).index(verdict.cause))
     return (
-        f"Predicted before this flight: RMSE {mean['rmse_db']:.1f} dB as predicted ({mean['rmse_4s_db']:.1f} dB over "
-        f"4 s), {mean['own_offset_rmse_db']:.1f} dB after the flight's own offset. The 90 % intervals hold "
-        f"{100 * mean['coverage_90']:.0f} % of the samples. {said_of(worst, FLOWN)}"
+        f"{before_flight(scores)} Over 4 s {mean['rmse_4s_db']:.1f} dB, after the flight's own offset "
+        f"{mean['own_offset_rmse_db']:.1f} dB. {said_of(worst, FLOWN).strip()}"
+    )
+
+
+def before_flight(scores: Mapping[str, Mapping[str, float]]) -> str:
+    """Sentence of a report's first paragraph on the prediction made before the flight; nothing without levels."""
+    if not scores:
+        return ""
+    error, inside = (float(np.mean([row[key] for row in scores.values()])) for key in ("rmse_db", "coverage_90"))
+    return (
+        f"Predicted before this flight: RMSE {error:.1f} dB; the 90 % band holds {100 * inside:.0f} % of the samples."
     )
 
 

@@ -17,6 +17,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError, parsing
 from ...common.files import LARGEST_TABLE, inside, locked, read_bounded, write_whole
 from ...common.outputs import explained_os_errors, file_digest, new_folder
@@ -127,7 +128,7 @@ class Entry(StrictModel):
     def about(self) -> str:
         """One sentence: learned from what, and what error to expect."""
         days = f" of {', '.join(self.flown)}" if self.flown else ""  # none where the logs have relative times
-        text = f"learned on {len(self.flights)} flight{'s' if len(self.flights) > 1 else ''}{days}"
+        text = f"learned on {counted(len(self.flights), 'flight')}{days}"
         if self.errors is not None:
             text += (
                 f"; expect an RMSE of {self.errors.rmse_db:.1f} dB on another flight, free space "

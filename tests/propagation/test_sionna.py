@@ -232,7 +232,7 @@ def test_sionnas_viewer_is_loaded_when_it_is_asked_for(sionna):
     code = (
         "import sys; from aerpaw_cmp.propagation.search import sionna; sionna.load_variant(); import sionna.rt as rt\n"
         "scene = rt.load_scene(rt.scene.simple_reflector)\n"
-        "assert 'sionna.rt.rcs' in sys.modules\n"
+        "assert hasattr(rt, 'rcs') == ('sionna.rt.rcs' in sys.modules)\n"
         "assert 'pythreejs' not in sys.modules and 'IPython' not in sys.modules\n"
         "scene.preview()\n"
         "scene.preview()\n"

@@ -218,7 +218,7 @@ class _Builder:
             mesh = self._mesh(plain, vertices, triangle[rows])
             objects.append(rt.SceneObject(mi_mesh=mesh, name=plain, radio_material=material))
             owners.append(owner[rows])
-        scene.add(objects)
+        scene.edit(add=objects)
         # read when a kernel runs: literals would be compiled anew for each carrier
         materials = scene.radio_materials.values()
         dr.make_opaque(scene.frequency, *((m.relative_permittivity, m.conductivity) for m in materials))
@@ -422,8 +422,9 @@ class _Finder:
         """Undo what makes scene and finder refer to each other, so that both are freed with their last user."""
         scene = self.built.scene
         del scene.sources, scene.targets
-        for name in (*scene.transmitters, *scene.receivers, *scene.objects):
+        for name in (*scene.transmitters, *scene.receivers):
             scene.remove(name)
+        scene.edit(remove=list(scene.objects))  # before 2.2 the only way to take an object out
         self.built, self.solver = None, None  # type: ignore[assignment]
 
     def trace(self, targets: _Ends, max_depth: int, samples: int) -> Any:

@@ -93,9 +93,9 @@ def _quick_answer(arguments: list[str]) -> int | None:
         print(help_text())
         return 0 if first else 2
     if first == "--version":
-        from . import __version__
+        from .common.versions import tool_version
 
-        print(f"aerpaw-cmp {__version__}")
+        print(f"aerpaw-cmp {tool_version()}")
         return 0
     if not first.startswith("-") and first not in COMMANDS:
         from .common.errors import printable

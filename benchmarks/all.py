@@ -115,15 +115,10 @@ def machine() -> dict[str, Any]:
 
 
 def version() -> str:
-    """Of this tree: the package's, and the commit where there is one."""
-    from aerpaw_cmp import __version__
+    """Of this tree."""
+    from aerpaw_cmp.common.versions import tool_version
 
-    command = ["git", "describe", "--always", "--dirty"]
-    try:
-        done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False)
-    except OSError:
-        return __version__
-    return f"{__version__} ({done.stdout.strip()})" if done.returncode == 0 else __version__
+    return tool_version()
 
 
 def _run(command: list[str], limit_s: float = LIMIT_S) -> tuple[str, str | None]:

@@ -12,6 +12,7 @@ import aerpaw_cmp
 from aerpaw_cmp import __main__ as program
 from aerpaw_cmp.common.commands import COMMANDS
 from aerpaw_cmp.common.errors import CheckError, InputError, UsageError
+from aerpaw_cmp.common.versions import tool_version
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -55,7 +56,7 @@ def test_help_names_every_command(flag: str) -> None:
 
 
 def test_version() -> None:
-    assert python("-m", "aerpaw_cmp", "--version").stdout == f"aerpaw-cmp {aerpaw_cmp.__version__}\n"
+    assert python("-m", "aerpaw_cmp", "--version").stdout == f"aerpaw-cmp {tool_version()}\n"
 
 
 def test_no_arguments_is_help_and_wrong_usage() -> None:

@@ -20,10 +20,10 @@ def lowest(dependencies: list[str]) -> list[str]:
 
     Examples
     --------
-    >>> lowest(["numpy>=2.0", "sionna-rt==2.2.0"])
-    ['numpy==2.0', 'sionna-rt==2.2.0']
+    >>> lowest(["numpy>=2.0", "sionna-rt>=2.0,<2.3"])
+    ['numpy==2.0', 'sionna-rt==2.0']
     """
-    return [re.sub(r"^([\w.-]+)>=([\w.]+)$", r"\1==\2", line) for line in dependencies]
+    return [re.sub(r"^([\w.-]+)>=([\w.]+)(,<[\w.]+)?$", r"\1==\2", line) for line in dependencies]
 
 
 if __name__ == "__main__":

@@ -17,8 +17,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from .. import __version__
 from ..common.errors import InputError
+from ..common.versions import tool_version
 from ..logs.files.checksums import SCHEMA, Record
 from .predict import Asked, Predict, PredictionWorker
 from .record.log import Clock, SegmentLog, boot_id, clock_synchronised
@@ -694,7 +694,7 @@ class Tap:
             "kind": "header",
             "schema": SCHEMA,
             "session": self._session,
-            "tool": f"aerpaw-cmp {__version__}",
+            "tool": f"aerpaw-cmp {tool_version()}",
             "boot_id": boot_id(),
             "clock_synchronised": clock_synchronised(),
             "ri_base": "one",

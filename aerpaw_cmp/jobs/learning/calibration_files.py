@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from ... import __version__
 from ...common.cf import file_attributes
 from ...common.gaussian import determining, gaussian_kernel
 from ...common.jsonable import named
 from ...common.provenance import KEY, MARKS, union
 from ...common.units import FloatArray, spread_out
-from ...common.versions import utc_now
+from ...common.versions import tool_version, utc_now
 from ...compare.gains.direction_gain import Frame, directed
 from ...compare.learning.calibration import Learned, mean_rmse
 from ...compare.learning.learning_curve import with_one_more
@@ -104,7 +103,7 @@ def _antenna_files(
         out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz, _provenance_notes(calibration))
         source = f"learned from the flights {names}, calibration {calibration.settings.calibration}"
         attributes = file_attributes(
-            f"{antenna}, antenna at the {end}", source, utc_now(), __version__, "; ".join(notes[1:])
+            f"{antenna}, antenna at the {end}", source, utc_now(), tool_version(), "; ".join(notes[1:])
         )  # fmt: skip
         attributes |= {KEY: " ".join(calibration.trained_on), MARKS: " ".join(calibration.marks)}
         sphere = sphere_netcdf(gains.gain_dbi, gains.sd_db, attributes, carrier_hz)

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from ...common.versions import utc_now, versions
+from ...common.versions import commit, utc_now, versions
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,6 +22,7 @@ def about(page: Any) -> dict[str, Any]:
     """The entries of metrics.json on when and how a page was made; ``page`` has the fields of :class:`Made`."""
     return {
         "generated": page.generated,
+        "commit": commit(),
         "versions": dict(sorted(page.versions.items())),
         "stages": {f"{name}_s": seconds for name, seconds in page.stages_s.items()},
     }

@@ -12,7 +12,6 @@ import typer
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.cli.app import app
 from aerpaw_cmp.common.commands import COMMANDS
-from aerpaw_cmp.live.record.export import ExportSummary
 from aerpaw_cmp.live.session import TapSummary
 from tests import json_page
 from tests.json_page import listed
@@ -41,7 +40,7 @@ WITHOUT_INPUT = {"bench", "doctor", "formats", "sample", "site", "tap", "modem-s
 MISSING = [
     "ingest nope", "report nope.yaml", "report nope.yaml --dry-run", "calibrate nope.yaml", "campaign nope.yaml",
     "explain nope.yaml --time 1 --tower LW1", "diff nope other",
-    "tap --play nope", "tap nope --flight nope.yaml", "map nope.yaml", "map lake_wheeler --flight nope.yaml --dry-run",
+    "tap nope --flight nope.yaml", "map nope.yaml", "map lake_wheeler --flight nope.yaml --dry-run",
     "predict nope.kml --with nope.yaml", "plan nope.kml --site lake_wheeler", "plan sphere --with nope.yaml",
     "plan sphere --site lake_wheeler --geofence nope.kml", "simulate nope.yaml", "site show nope.yaml",
     "site export nope.yaml -o scene", "site import nope.osm -o site.yaml",
@@ -101,7 +100,6 @@ def test_the_page_lists_what_json_prints(
 def test_the_page_lists_what_a_tap_prints() -> None:
     """Its records become the object as they are."""
     assert listed("tap") == [*(field.name for field in dataclasses.fields(TapSummary)), "modems"]
-    assert listed("tap --export") == [field.name for field in dataclasses.fields(ExportSummary)]
 
 
 def test_the_page_has_every_command() -> None:

@@ -47,7 +47,7 @@ COMMANDS = {
         "ingest . --timezone New_York; map lake_wheeler --spacing 0; map lake_wheeler --rss-altitude -3; "
         "map lake_wheeler --foliage autumn; map lake_wheeler --tile-m 1; explain flight.yaml --tower LW9 --time 5; "
         "explain flight.yaml --tower LW1 --time noon; predict lake_wheeler --with flight.yaml --height high; "
-        "plan sphere; tap log --ri-hz 0 --duration 1 --wait 0; tap --export cvs; "
+        "plan sphere; tap log --ri-hz 0 --duration 1 --wait 0; "
         "campaign campaign.yaml --workers 0; bench --poses none; site show nowhere; "
         "site export lake_weeler -o scene"
     ),
@@ -55,13 +55,13 @@ COMMANDS = {
         "ingest gone.txt; report gone.yaml; report no_log.yaml; explain gone.yaml --tower LW1 --time 5; "
         "simulate gone.yaml; calibrate gone.yaml; calibrate calibration.yaml; campaign gone.yaml; "
         "report flihgt.yaml; diff gone other; "
-        "predict gone.kml --with flight.yaml; plan gone.kml --site lake_wheeler; map gone.yaml; tap --play gone; "
+        "predict gone.kml --with flight.yaml; plan gone.kml --site lake_wheeler; map gone.yaml; "
         "report flight.yaml --with gone.yaml; report flight.yaml --against gone; site import gone.osm -o site.yaml"
     ),
     "wrong type of file": (
         "report .; report damaged.txt; simulate vehicleOut.txt; calibrate flight.yaml; campaign flight.yaml; "
         "diff . .; predict vehicleOut.txt --with calibration.yaml; map damaged.txt; "
-        "tap --play .; site import notes.txt -o site.yaml; plan route.kml --site lake_wheeler; "
+        "site import notes.txt -o site.yaml; plan route.kml --site lake_wheeler; "
         "report flight.yaml --against .; report flight.yaml --with flight.yaml"
     ),
     "bad YAML": (

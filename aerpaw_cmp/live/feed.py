@@ -41,7 +41,7 @@ _POINTS_AHEAD = 40
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
 PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
-# Faults that a crafted record of a played log can raise: the record is left out.
+# Faults that a record of unforeseen content can raise: it is left out of the page, and no poll waits for it.
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
@@ -142,15 +142,18 @@ class Feed:
     ----------
     names : sequence of str
         One per modem.
-    steady_ns : callable, optional
-        Steady time of now, in UTC at the start [ns]; None: by this machine's clocks, which then also time the records.
-        The player of a log gives its own, and records are timed by the headers of their log.
+    mono_ns, utc_ns : callable
+        The clocks that time the records [ns].
     """
 
-    def __init__(self, names: Sequence[str], steady_ns: Callable[[], int] | None = None) -> None:
-        shift = time.time_ns() - time.monotonic_ns()
-        self._live = steady_ns is None
-        self._steady_ns = steady_ns or (lambda: time.monotonic_ns() + shift)
+    def __init__(
+        self,
+        names: Sequence[str],
+        mono_ns: Callable[[], int] = time.monotonic_ns,
+        utc_ns: Callable[[], int] = time.time_ns,
+    ) -> None:
+        shift = utc_ns() - mono_ns()
+        self._utc_ns, self._steady_ns = utc_ns, lambda: mono_ns() + shift
         self.epoch = secrets.token_hex(4)
         self.start_ns = self._steady_ns()
         self._modems = [_Modem(name, shift_ns=shift, predicted=Rows(len(PREDICTED))) for name in names]
@@ -212,7 +215,7 @@ class Feed:
                 "continues": epoch == self.epoch,
                 "start_ms": self.start_ns // 1_000_000,
                 "now_s": round(now, 3),
-                "clock_ms": time.time_ns() // 1_000_000 if self._live else None,
+                "clock_ms": self._utc_ns() // 1_000_000,
                 "modems": modems,
                 "alarms": [asdict(alarm) for alarm in self._alarms if alarm.version > version],
                 "ended": self._ended,
@@ -255,8 +258,6 @@ class Feed:
             self._record(modem, item)
 
     def _record(self, modem: _Modem, record: Record) -> None:
-        if not self._live:
-            modem.records += 1
         takers = {
             "header": self._take_header,
             "exchange": self._take_exchange,
@@ -269,8 +270,6 @@ class Feed:
             take(modem, record)
 
     def _take_header(self, modem: _Modem, record: Record) -> None:
-        if not self._live:
-            modem.shift_ns = record["utc_ns"] - record["mono_ns"]
         modem.port = str(record.get("port", {}).get("device", ""))
         modem.period_s = 1.0 / record.get("settings", {}).get("ri_hz", 2.0)
         modem.connected, modem.ended = True, False
@@ -322,8 +321,6 @@ class Feed:
         modem.gap_text = "" if modem.connected else f"no modem: {record['reason']}"
         if modem.connected:
             modem.rank_s = self._seconds(modem, record["mono_ns"])
-        elif not self._live:
-            modem.gaps += 1
         if not modem.connected:
             modem.rank = modem.rsrp_dbm = modem.sinr_db = None  # what was last measured is not what is now
 
@@ -331,10 +328,8 @@ class Feed:
         modem.step_s = self._seconds(modem, record["mono_ns"])
         modem.step_text = f"the wall clock stepped by {record['step_ns'] / 1e9:+.3f} s"
 
-    def _take_end(self, modem: _Modem, record: Record) -> None:
+    def _take_end(self, modem: _Modem, _record: Record) -> None:
         modem.connected, modem.ended, modem.gap_text = False, True, ""
-        if not self._live:
-            self._note(modem, "message", f"end of the session: {record.get('reason', '')}")
 
     # alarms -----------------------------------------------------------------------------------------------
 

@@ -1,4 +1,4 @@
-"""The tap's page without a browser: what the server answers and refuses, what the feed keeps, how a log is played."""
+"""The tap's page without a browser: what the server answers and refuses, what the feed keeps."""
 
 import base64
 import contextlib
@@ -16,14 +16,11 @@ import time
 import numpy as np
 import pytest
 
-from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.feed import CHUNK, MEASURED, STALE_S, Feed, Rows
-from aerpaw_cmp.live.play import Player
 from aerpaw_cmp.live.predict import RunningInterval
 from aerpaw_cmp.live.session import TapStatus
-from aerpaw_cmp.live.stop import Stop
 from aerpaw_cmp.live.web import Address, Limits, WebServer
-from aerpaw_cmp.logs.files.checksums import encode_record
 from benchmarks.tap_common import damaged
 from tests.live.terminals import until
 
@@ -35,15 +32,15 @@ class Hand:
     """A feed whose clock is turned by hand, and records for it."""
 
     def __init__(self, names=("modem",), rate_ns=SECOND // 2):
-        self.now_ns, self.step = 1_000 * SECOND, rate_ns
-        self.feed = Feed(list(names), lambda: self.now_ns)
+        self.now_ns = self.start_ns = 1_000 * SECOND
+        self.step = rate_ns
+        self.feed = Feed(list(names), lambda: self.mono_ns, lambda: self.now_ns)
         for modem in range(len(names)):
             self.put({"kind": "header", "utc_ns": self.now_ns, "mono_ns": 0, "port": {}}, modem)
-        self.start_ns = self.now_ns
 
     @property
     def mono_ns(self):
-        return self.now_ns - self.start_ns if hasattr(self, "start_ns") else 0
+        return self.now_ns - self.start_ns
 
     def put(self, record, modem=0):
         self.feed.put(modem, record)
@@ -534,7 +531,7 @@ def test_the_end_is_said_to_all():
     hand = Hand()
     hand.answer()
     _, cursor = hand.feed.after("")
-    hand.feed.end({"text": "over", "commands": ["a"], "replay": False})
+    hand.feed.end({"text": "over", "commands": ["a"]})
     assert hand.feed.after(cursor)[0]["ended"]["text"] == "over"
 
 
@@ -563,45 +560,6 @@ def test_no_interval_before_there_is_anything_to_judge_by():
         assert interval.bounds() is None
         interval.add(float(number))
     assert interval.bounds() is not None
-
-
-# a log that is played ------------------------------------------------------------------------------------------
-
-
-def write_log(folder, ranks, start_ns, period_ns=SECOND):
-    folder.mkdir()
-    lines = [{"kind": "header", "utc_ns": start_ns, "mono_ns": 77, "port": {"device": "/dev/x"}}]
-    for number, rank in enumerate(ranks):
-        at = number * period_ns
-        lines.append({"kind": "exchange", "query": "nr5g_csi", "status": "ok", "decoded": {"rank": rank}, "lines": [],
-                      "sent_mono_ns": 77 + at, "last_mono_ns": 77 + at, "sent_utc_ns": start_ns + at, "last_utc_ns": start_ns + at})  # fmt: skip
-    (folder / "tap_a_0001.jsonl").write_bytes(b"".join(map(encode_record, lines)) + b"torn")
-
-
-def test_two_logs_are_played_side_by_side_at_their_pace(tmp_path):
-    write_log(tmp_path / "a", [1, 2, 3, 4], 100 * SECOND)
-    write_log(tmp_path / "b", [4, 4], 101 * SECOND + SECOND // 2)
-    player, stop = Player([tmp_path / "a", tmp_path / "b"], speed=10.0), Stop()
-    feed = Feed(["a", "b"], player.steady_ns)
-    start = time.monotonic()
-    bad = player.play(feed, stop)
-    assert time.monotonic() - start > 0.25  # three seconds of the log
-    assert bad == 2
-    feed.digest()
-    message, _ = feed.after("")
-    assert rows_of(message, 0).round(3)[:, :2].tolist() == [[0, 1], [1, 2], [2, 3], [3, 4]]
-    assert rows_of(message, 1).round(3)[:, :2].tolist() == [[1.5, 4], [2.5, 4]]
-    assert message["clock_ms"] is None
-    assert message["start_ms"] == 100_000
-    stop.close()
-
-
-def test_nothing_to_play(tmp_path):
-    (tmp_path / "tap_x.jsonl").write_bytes(b"torn")
-    with pytest.raises(InputError, match="no record with a time"):
-        Player([tmp_path])
-    with pytest.raises(UsageError, match="--speed"):
-        Player([tmp_path], speed=0.0)
 
 
 # the tap with a page -------------------------------------------------------------------------------------------

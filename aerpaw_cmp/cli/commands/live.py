@@ -10,7 +10,7 @@ from typer import Argument, Option
 from typer.core import TyperCommand
 
 from ...common.errors import UsageError, one_line
-from ..app import Force, Json, command, output
+from ..app import Json, command, output
 from ..shown import print_files, print_json, say, show
 
 WEB = "127.0.0.1:8765"
@@ -36,8 +36,6 @@ class WebCommand(TyperCommand):
         "aerpaw-cmp tap",
         "aerpaw-cmp tap /dev/ttyUSB2 -o taplog --no-csi-alarm 5 --duration 600",
         "aerpaw-cmp tap /tmp/modem -o taplog --web --flight sample_logs/flight.yaml",
-        "aerpaw-cmp tap --play taplog --speed 20",
-        "aerpaw-cmp tap -o taplog --export csv",
     ],
     kind=WebCommand,
 )
@@ -62,37 +60,18 @@ def tap(
         str | None,
         Option(help=f"Also show the flight as a page, at HOST:PORT [default: {WEB}]; 0.0.0.0 asks for a token."),
     ] = None,
-    play: Annotated[
-        list[Path] | None, Option(help="Earlier log to show on the page; nothing is tapped; repeatable.")
-    ] = None,
-    speed: Annotated[float, Option(help="Seconds of the log per second, with --play.")] = 1.0,
-    export: Annotated[Literal["csv"] | None, Option(help="Write the log below OUT as a table and stop.")] = None,
     flight: Annotated[Path | None, Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
     telemetry: Annotated[Path | None, Option(help="The growing vehicleOut file that --flight follows.")] = None,
-    force: Force = False,
     as_json: Json = False,
 ) -> int:
     """Log the modem's rank indicator until interrupted."""
-    from ...common.jsonable import json_safe
-
-    if export is not None:
-        from ...live.record.export import export_csv
-
-        exported = export_csv(out, out / "tap.csv", force=force)
-        if as_json:
-            print_json(json_safe(exported))
-        else:
-            show(exported)
-        return 0
     _needs_posix("tap")
-    from ...jobs.live.live_tap import Shown, play_logs, tap_modems
+    from ...common.jsonable import json_safe
+    from ...jobs.live.live_tap import Shown, tap_modems
     from ...live.record.log import LogSettings
     from ...live.session import TapSettings
 
-    shown = Shown(web=web or (WEB if play else None), flight=flight, telemetry=telemetry, say=say)
-    if play:
-        play_logs(play, speed, shown)
-        return 0
+    shown = Shown(web=web, flight=flight, telemetry=telemetry, say=say)
     settings = TapSettings(
         folder=out,
         ri_hz=ri_hz,
@@ -156,7 +135,7 @@ def _needs_posix(command: str) -> None:
             raise UsageError(
                 f"'{command}' needs Python's {name}, which this system does not have",
                 expected="Linux (another POSIX system may do)",
-                cause="Windows; logs of a tap can be read, reported and exported on every system",
+                cause="Windows; logs of a tap can be read, reported on every system",
             ) from None
 
 

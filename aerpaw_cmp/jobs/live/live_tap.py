@@ -1,4 +1,4 @@
-"""``tap`` as a job: one modem or several, with a page where it is wanted; an earlier log played to the page."""
+"""``tap`` as a job: one modem or several, with a page where it is wanted."""
 
 from __future__ import annotations
 
@@ -98,38 +98,6 @@ def tap_modems(
     return summaries
 
 
-def play_logs(folders: Sequence[Path], speed: float, shown: Shown) -> None:
-    """Show earlier logs as a page, until a signal ends it.
-
-    Parameters
-    ----------
-    folders : sequence of Path
-        Log folders or segments, one per modem.
-    speed : float
-        Seconds of the log per second.
-    shown : Shown
-        ``flight`` gives the map behind the flight; predictions are those in the log.
-    """
-    from ...live.play import Player
-
-    player, names, stop = Player(folders, speed), _names([str(folder) for folder in folders]), Stop()
-    with contextlib.ExitStack() as stack:
-        stack.callback(stop.close)
-        stack.enter_context(stop.on_signals())
-        feed = Feed(names, player.steady_ns)
-        twin = _twin(shown)
-        _serve(stack, feed, twin, shown, f"replay of {', '.join(names)} at {speed:g}x")
-        bad = player.play(feed, stop)
-        if bad:
-            shown.say(f"{bad} lines of the log are torn or damaged and are not shown")
-        if not stop.count:
-            text = f"The log ended: {', '.join(names)}."
-            feed.end({"text": text, "commands": _commands(folders[0], twin), "replay": True})
-            shown.say("the log is at its end; Ctrl-C ends the page")
-        while not stop.wait(1.0):
-            pass
-
-
 def _twin(shown: Shown) -> Any:
     if shown.flight is None:
         return None
@@ -180,15 +148,11 @@ def _names(paths: Sequence[str]) -> list[str]:
 
 
 def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str, Any]:
+    from .live_twin import report_commands
+
     records, gaps = sum(s.records for s in summaries), sum(s.gaps for s in summaries)
     lost = sum(s.lost_records for s in summaries)
     at = time.strftime("%H:%M:%S", time.gmtime())
     counts = f"{records} records, {counted(gaps, 'gap')}" + (f", {lost} records lost" if lost else "")
     text = f"The tap ended at {at} UTC ({summaries[0].reason}): {counts}. The log is in {folder}."
-    return {"text": text, "commands": _commands(folder, twin), "replay": False}
-
-
-def _commands(folder: Path, twin: Any) -> list[str]:
-    from .live_twin import report_commands
-
-    return report_commands(folder, twin)
+    return {"text": text, "commands": report_commands(folder, twin)}

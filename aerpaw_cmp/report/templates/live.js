@@ -40,7 +40,7 @@
       for (const alarm of state.alarms.values()) alarm.end ??= state.now;
       Object.assign(state, { epoch: message.epoch, ended: null });
     }
-    Object.assign(state, { page: message.page, start: message.start_ms, now: message.start_ms + message.now_s * 1000, clock: message.clock_ms, ended: message.ended, received: Date.now(), cursor: id });
+    Object.assign(state, { page: message.page, start: message.start_ms, now: message.start_ms + message.now_s * 1000, ended: message.ended, received: Date.now(), cursor: id });
     message.modems.forEach((sent, i) => {
       const modem = state.modems[i] ??= { rows: table(MEASURED), predictions: table(PREDICTED) };
       take(modem.rows, sent.rows); take(modem.predictions, sent.predictions);
@@ -140,7 +140,7 @@
 
   function drawState() {
     const open = state.modems.filter(m => m.now.connected).length, online = connected();
-    const [text, kind] = state.ended ? [state.ended.replay ? "log at its end" : "ended", ""] : !online ? ["no connection to the tap", "bad"] : open < state.modems.length ? [state.modems.length > 1 ? `${open} of ${state.modems.length} modems` : "no modem", "bad"] : [state.clock === null ? "replay" : "live", "live"];
+    const [text, kind] = state.ended ? ["ended", ""] : !online ? ["no connection to the tap", "bad"] : open < state.modems.length ? [state.modems.length > 1 ? `${open} of ${state.modems.length} modems` : "no modem", "bad"] : ["live", "live"];
     at("state").textContent = text; at("state").className = `pill ${kind}`;
     at("clock").textContent = `${clock(state.now)} UTC`;
     at("ended").hidden = !state.ended;
@@ -448,7 +448,7 @@
     drawState(); drawCards(); drawAlarms(); drawCharts(); drawPose(); drawMap();
     state.drawn++;
     const newest = last(state.modems[state.chosen]?.rows.columns.t ?? []);
-    state.delay = state.clock === null ? NaN : Date.now() - newest; // from the answer's time to the screen, on one computer's clock
+    state.delay = Date.now() - newest; // from the answer's time to the screen, on one computer's clock
   }
   at("window").addEventListener("change", () => later(draw));
   common.whenResized(document.body, draw);

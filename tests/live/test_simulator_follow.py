@@ -1,6 +1,5 @@
 """The simulated modem, the followed telemetry and the CSV export."""
 
-import csv
 import threading
 
 import numpy as np
@@ -10,11 +9,9 @@ import pytest
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.live.follow import TelemetryFollower, predict_along
 from aerpaw_cmp.live.predict import Prediction
-from aerpaw_cmp.live.record.export import COLUMNS, export_csv
 from aerpaw_cmp.live.serial import simulator
 from aerpaw_cmp.live.serial.modem import decode
-from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator, load_recorded, load_source
-from aerpaw_cmp.logs.files.checksums import encode_record
+from aerpaw_cmp.live.serial.simulator import ModemSimSettings, ModemSimulator, load_recorded, load_source
 from aerpaw_cmp.logs.readers import Reader
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.logs.records import ReadResult, Stream
@@ -204,56 +201,3 @@ def test_long_telemetry_is_read_from_its_end(tmp_path):
     follower = TelemetryFollower(path, reader=LINES, keep_s=1e6)
     assert 2000 < follower.poll() < 3000
     assert follower.latest().altitude_m == 5999.0
-
-
-# export ------------------------------------------------------------------------------------------------------
-
-
-def test_export(modem, tap, tmp_path):
-    sim = modem(faults=Faults(latency_s=0.0))
-    session = tap(sim.port)
-    session.wait(lambda: len(sim.journal) > 25)
-    session.end()
-    summary = export_csv(tmp_path / "log", tmp_path / "out.csv")
-    with (tmp_path / "out.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert len(rows) == summary.rows
-    assert tuple(rows[0]) == COLUMNS
-    ranks = [row["rank"] for row in rows if row["query"] == "nr5g_csi"]
-    assert ranks
-    assert set(ranks) <= {"1", "2", "3", "4"}
-    assert next(row["rsrp_dbm"] for row in rows if row["query"] == "servingcell").startswith("-")
-    assert all(row["rsrp_rx3_dbm"] for row in rows if row["query"] == "qrsrp")
-    assert all(row["sinr_rx0_db"] for row in rows if row["query"] == "qsinr")
-
-
-def test_export_holds_no_formula(tmp_path):
-    evil = '=cmd|"/C calc"!A0'
-    record = {
-        "kind": "exchange", "query": "servingcell", "sent_utc_ns": 1, "last_utc_ns": 2, "status": "ok",
-        "lines": [evil], "n": 1,
-    }  # fmt: skip
-    record |= {"decoded": {"state": evil, "rat": "@SUM(1)"}, "flags": ["-1+1", evil]}
-    (tmp_path / "tap_x.jsonl").write_bytes(encode_record(record) + b"torn")
-    summary = export_csv(tmp_path, tmp_path / "out.csv")
-    assert (summary.rows, len(summary.bad_lines)) == (1, 1)
-    with (tmp_path / "out.csv").open() as file:
-        (row,) = csv.DictReader(file)
-    assert not [v for v in row.values() if v[:1] in ("=", "+", "@", "-", "\t")]
-
-
-def test_export_of_nothing(tmp_path):
-    with pytest.raises(InputError, match="no tap log"):
-        export_csv(tmp_path, tmp_path / "out.csv")
-    with pytest.raises(InputError, match="no such file"):
-        export_csv(tmp_path / "x", tmp_path / "out.csv")
-    assert not (tmp_path / "out.csv").exists()
-    (tmp_path / "tap_x.jsonl").write_bytes(encode_record({"kind": "exchange", "n": 0}))
-    with pytest.raises(InputError, match="lacks what its kind"):
-        export_csv(tmp_path, tmp_path / "out.csv")
-    with pytest.raises(UsageError, match="no such folder"):
-        export_csv(tmp_path, tmp_path / "no/out.csv")
-    (tmp_path / "mine.csv").write_text("mine")
-    for target, said in ((tmp_path / "mine.csv", "--force"), (tmp_path / "tap_x.jsonl", "replace an input")):
-        with pytest.raises(UsageError, match=said):
-            export_csv(tmp_path, target)

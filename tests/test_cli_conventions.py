@@ -40,7 +40,7 @@ WITHOUT_INPUT = {"bench", "doctor", "formats", "sample", "site", "tap", "modem-s
 MISSING = [
     "ingest nope", "report nope.yaml", "report nope.yaml --dry-run", "calibrate nope.yaml", "campaign nope.yaml",
     "explain nope.yaml --time 1 --tower LW1", "diff nope other",
-    "tap nope --flight nope.yaml", "map nope.yaml", "map lake_wheeler --flight nope.yaml --dry-run",
+    "tap nope --flight nope.yaml", "map nope.yaml",
     "predict nope.kml --with nope.yaml", "plan nope.kml --site lake_wheeler", "plan sphere --with nope.yaml",
     "plan sphere --site lake_wheeler --geofence nope.kml", "simulate nope.yaml", "site show nope.yaml",
     "site export nope.yaml -o scene", "site import nope.osm -o site.yaml",

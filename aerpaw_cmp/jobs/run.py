@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..common.errors import InputError, UsageError, noting_interrupts
+from ..common.errors import UsageError, noting_interrupts
 from ..common.files import cache_folder
 from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
@@ -440,9 +440,7 @@ def run_map(
     settings: Any,
     options: RunOptions = DEFAULT,
     *,
-    flight: Path | None = None,
     flights: Sequence[Path] = (),
-    remembered: bool = False,
 ) -> JobOutcome:
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -452,12 +450,8 @@ def run_map(
         site.yaml, or the name of a packaged site.
     settings : MapSettings
     options : RunOptions
-    flight : Path, optional
-        flight.yaml whose track trains the test "along a flight".
     flights : sequence of Path
         Flight files that correct the levels and ranks (:mod:`.predict`).
-    remembered : bool
-        Correct by what the site remembers, where no flight is named.
 
     Returns
     -------
@@ -473,9 +467,9 @@ def run_map(
 
     known = named_flights(flights)
     place, progress, stages = load_site(site), options.progress, Stages(options.progress)
-    if (flights or remembered) and settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m)):
+    if flights and settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m)):
         raise UsageError("flights and a map in tiles", expected="fewer receivers, or a map without --with")
-    inputs, folder = _map_inputs(site, flight, options)
+    inputs, folder = _map_inputs(site, options)
     inputs += files_of(known, options.logs_root)
     with OutputFolder(folder, job="map", inputs=inputs, force=options.force) as output:
         file = [Path(site).absolute()] if Path(site).is_file() else []
@@ -484,14 +478,12 @@ def run_map(
                 place, settings, stages, workers=crew, name=str(file[0] if file else site),
                 store=folder.with_name(f"{folder.name}.zarr"), force=options.force,
             )  # fmt: skip
-        if flights or remembered:
+        if flights:
             from .prediction.corrected_map import corrected_maps
 
             heights = settings.rss_altitudes_m, settings.rank_altitudes_m
             outcome.corrected = corrected_maps(site, settings.spacing_m, heights, known, options.logs_root, stages)
         if outcome.settings.study:
-            if flight is not None:
-                outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, options.logs_root)
             mapping.study_maps(outcome, stages)
         with output.filling() as part:
             with stages("export"):
@@ -507,15 +499,14 @@ def run_map(
         return JobOutcome(folder=folder, metrics=maps_metrics(record), files=output.placed([*written, *files]))
 
 
-def _map_inputs(site: str, flight: Path | None, options: RunOptions) -> tuple[list[Path], Path]:
+def _map_inputs(site: str, options: RunOptions) -> tuple[list[Path], Path]:
     """Files that a map is made from, and the folder of its results."""
-    from .tasks.manifest import inputs_of_flights, inputs_of_site
+    from .tasks.manifest import inputs_of_site
 
-    flown = inputs_of_flights([] if flight is None else [flight], options.logs_root)
-    return [*inputs_of_site(site), *flown], options.out or Path("reports") / f"map-{Path(site).stem}"
+    return inputs_of_site(site), options.out or Path("reports") / f"map-{Path(site).stem}"
 
 
-def plan_map(site: str, settings: Any, options: RunOptions = DEFAULT, *, flight: Path | None = None) -> Any:
+def plan_map(site: str, settings: Any, options: RunOptions = DEFAULT) -> Any:
     """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a map: what :func:`run_map` would do; writes nothing.
 
     Parameters
@@ -523,8 +514,6 @@ def plan_map(site: str, settings: Any, options: RunOptions = DEFAULT, *, flight:
     site : str
     settings : MapSettings
     options : RunOptions
-    flight : Path, optional
-        As for :func:`run_map`.
 
     Returns
     -------
@@ -533,31 +522,13 @@ def plan_map(site: str, settings: Any, options: RunOptions = DEFAULT, *, flight:
     Raises
     ------
     UsageError, InputError
-        What the map itself would raise of its settings and output; no such flight.
+        What the map itself would raise of its settings and output.
     """
     from .plan import map_plan
 
-    inputs, folder = _map_inputs(site, flight, options)
-    if flight is not None and not flight.is_file():
-        raise InputError("no such file", cause="a misspelt path", path=flight)
+    inputs, folder = _map_inputs(site, options)
     OutputFolder(folder, job="map", inputs=inputs, force=options.force).refuse()
     return map_plan(site, settings, inputs=inputs, out=folder)
-
-
-def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
-    """East and north (n, 2) [m] of a flight, and its name."""
-    import numpy as np
-
-    from ..flight.data import load_data
-    from ..flight.settings import load_flight
-    from ..report.content.flight_parts import track_of
-
-    settings = load_flight(flight)
-    track = track_of(load_data(settings, flight.parent, logs_root))
-    if track is None:
-        raise UsageError(f"{flight} has no track", expected="telemetry, or rank logs with positions")
-    line = np.column_stack([track.east_m, track.north_m])
-    return line[np.isfinite(line).all(axis=1)], settings.flight.name
 
 
 def run_campaign(

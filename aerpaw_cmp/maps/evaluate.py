@@ -16,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
-from .grid import Grid
 
 
 class Predictor(Protocol):
@@ -149,99 +148,12 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     points = unmasked(points_m)
     cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / block_m + 1e-9).astype(np.int64)
     _, block = np.unique(cell, axis=0, return_inverse=True)
-    return grouped(model, points, values, block.ravel())
-
-
-def grouped(model: Predictor, points_m: ArrayLike, values: ArrayLike, group: IntArray) -> Score:
-    """Leave out one group of positions (n,) at a time: blocks, flights, days.
-
-    Parameters
-    ----------
-    model : Predictor
-    points_m : array_like, (n, 2) or (n, 3)
-    values : array_like, (n, ...)
-    group : (n,) int
-        Positions of one number are left out together.
-
-    Returns
-    -------
-    Score
-    """
     data = unmasked(values)
-    return score(data, _group_estimate(model, points_m, data, group))
-
-
-def _group_estimate(model: Predictor, points_m: ArrayLike, values: FloatArray, group: IntArray) -> FloatArray:
-    """Estimate of each value from the groups that it is not in."""
-    estimate = np.full_like(values, np.nan)
-    for number in np.unique(group):
-        test = group == number
-        estimate[test] = _held_out_estimate(model, points_m, values, test)[0][test]
-    return estimate
-
-
-def altitude_held_out(model: Predictor, points_m: ArrayLike, altitudes_m: ArrayLike, values: ArrayLike) -> Score:
-    """Leave out one whole altitude at a time and predict it from the others, in 3-D.
-
-    Parameters
-    ----------
-    model : Predictor
-        Such as ``OrdinaryKriging(..., vertical_scale=5.0)``; its radius and scale decide which altitudes count.
-    points_m : (n, 2)
-        East, north [m].
-    altitudes_m : (altitudes,)
-        Heights [m].
-    values : (n, altitudes, K)
-        Rank or RSS.
-
-    Returns
-    -------
-    Score
-        Arrays of shape (altitudes, K).
-    """
-    points, heights = unmasked(points_m), unmasked(altitudes_m)
-    data = unmasked(values)
-    if data.ndim != 3 or data.shape[:2] != (len(points), len(heights)):
-        raise UsageError(f"values of shape {data.shape}", expected=f"({len(points)}, {len(heights)}, K)")
-    space = np.column_stack([np.tile(points[:, :2], (len(heights), 1)), np.repeat(heights, len(points))])
-    stacked = data.transpose(1, 0, 2).reshape(len(space), -1)
-    level = np.repeat(np.arange(len(heights)), len(points))
-    estimate = _group_estimate(model, space, stacked, level)
-    return score(data, estimate.reshape(len(heights), len(points), -1).transpose(1, 0, 2))
-
-
-def along_trajectory(model: Predictor, grid: Grid, values: ArrayLike, trajectory_m: ArrayLike) -> Score:
-    """Train on the cells that a flight crosses, predict all others.
-
-    Parameters
-    ----------
-    model : Predictor
-        Its radius should reach beyond the flight, or cells far from it stay unpredicted (and are counted).
-    grid : Grid
-        The map.
-    values : (n, ...)
-        The map's values.
-    trajectory_m : (samples, 2+)
-        East, north [m] of the flight; samples outside the map do not count.
-
-    Returns
-    -------
-    Score
-        On the cells that were not crossed.
-
-    Raises
-    ------
-    UsageError
-        If the flight never crosses the map.
-    """
-    visited = np.unique(grid.index_of(trajectory_m))
-    visited = visited[visited >= 0]
-    if not len(visited):
-        raise UsageError("the flight does not cross the map", expected="a trajectory in the site frame [m]")
-    test = np.ones(len(grid), dtype=bool)
-    test[visited] = False
-    data = unmasked(values)
-    return score(data[test], _held_out_estimate(model, grid.points_m, data, test)[0][test])
+    estimate = np.full_like(data, np.nan)
+    for number in np.unique(block):
+        test = block.ravel() == number
+        estimate[test] = _held_out_estimate(model, points, data, test)[0][test]
+    return score(data, estimate)
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,56 +213,3 @@ def interval_coverage(
     z = np.abs(guess[good] - truth[good]) / np.sqrt(spread[good])
     inside = (z[:, None] <= norm.ppf((1 + level) / 2)).mean(axis=0)
     return IntervalCoverage(level, np.asarray(inside), float((z**2).mean()), int(good.sum()))
-
-
-# Random orders of a learning curve.
-_REPEATS = 3
-
-
-def learning_curve(
-    model: Predictor,
-    points_m: ArrayLike,
-    values: ArrayLike,
-    sizes: Sequence[int],
-    *,
-    seed: int = 0,
-) -> FloatArray:
-    """MAE (sizes, ...) on the positions not sampled, against the number of random samples, mean over repeats.
-
-    The samples of a smaller size are part of those of a larger one, so that the curve is not blurred by luck.
-
-    Parameters
-    ----------
-    model : Predictor
-    points_m : array_like, (n, 2) or (n, 3)
-    values : array_like, (n, ...)
-    sizes : sequence of int
-        Numbers of samples, each below n.
-    seed : int
-        Of the random orders of the positions.
-
-    Returns
-    -------
-    (sizes, ...)
-        MAE in the unit of the values; NaN where nothing could be predicted.
-
-    Raises
-    ------
-    UsageError
-        If a size leaves nothing to predict.
-    """
-    points, data = unmasked(points_m), unmasked(values)
-    wrong = [size for size in sizes if not 0 < size < len(points)]
-    if wrong:
-        raise UsageError(f"sample sizes {wrong} for {len(points)} positions", expected="at least one left to predict")
-    generator = np.random.default_rng(seed)
-    error = np.empty((_REPEATS, len(sizes), *data.shape[1:]))
-    for repeat in range(_REPEATS):
-        order = generator.permutation(len(points))
-        for row, size in enumerate(sizes):
-            test = np.ones(len(points), dtype=bool)
-            test[order[:size]] = False
-            error[repeat, row] = score(data[test], _held_out_estimate(model, points, data, test)[0][test]).mae
-    known = np.isfinite(error)
-    total = np.where(known, error, 0.0).sum(axis=0)
-    return np.asarray(np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan))

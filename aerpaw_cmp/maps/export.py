@@ -1,8 +1,8 @@
 """Maps as files that other programs open: one function per format, ``write_X(path, maps)`` (NetCDF: ``netcdf.py``).
 
 A :class:`MapLayers` holds what is written: a grid, the site's frame and any layers (a level, its standard deviation, a
-corrected level, classes). Out of coverage is an empty cell (CSV), ``null`` (JSON), NaN (GeoTIFF), and in layers of
-classes the class 0, "Z". Samples along a flight are written by :mod:`aerpaw_cmp.report.exports`.
+corrected level, classes). Out of coverage is an empty cell (CSV), NaN (GeoTIFF), and in layers of classes the class 0,
+"Z". Samples along a flight are written by :mod:`aerpaw_cmp.report.exports`.
 
     maps = MapLayers(grid=grid, frame=site.frame, layers=(Layer("level_db", level, "dBm", "Level"),))
     write_geotiff(folder / "level.tif", maps)
@@ -13,7 +13,6 @@ GeoTIFF needs rasterio: ``pip install aerpaw-cmp[geo]``. A file that exists is r
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -26,7 +25,6 @@ from ..common.cells import guarded
 from ..common.cf import site_crs
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
-from ..common.jsonable import json_safe
 from ..common.kml import CLASS_COLOURS
 from ..common.units import AnyArray, FloatArray
 from .grid import Border, Grid, Layer
@@ -95,56 +93,6 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
     target = Path(path)
     guarded(pd.DataFrame(table)).to_csv(target, index=False, lineterminator="\n")
     return target
-
-
-def write_json(path: str | Path, maps: MapLayers, summary: Mapping[str, Any] | None = None) -> Path:
-    """Axes, layers (in index order, ``null`` out of coverage) and a free summary as one JSON object."""
-    grid = maps.grid
-    content = {
-        "origin": {"latitude_deg": maps.frame.latitude_deg, "longitude_deg": maps.frame.longitude_deg},
-        "east_m": grid.east_m.tolist(),
-        "north_m": grid.north_m.tolist(),
-        "spacing_m": grid.spacing_m,
-        "order": "from the south-west corner, east first, then north",
-        "summary": json_safe(dict(summary or {})),
-        "layers": {
-            layer.name: {
-                "title": layer.title,
-                "unit": layer.unit,
-                "classes": list(layer.classes) or None,
-                "values": json_safe(layer.values),
-            }
-            for layer in maps.layers
-        },
-    }
-    target = Path(path)
-    target.write_text(json.dumps(content, allow_nan=False) + "\n", encoding="utf-8")
-    return target
-
-
-def write_geojson(path: str | Path, maps: MapLayers) -> Path:
-    """Cells as polygons with the layers as properties, towers as points, serving borders as lines (RFC 7946)."""
-    half = maps.grid.spacing_m / 2
-    ring = half * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1], [-1, -1]])  # closed, counter-clockwise
-    corners = maps.lonlat((maps.grid.points_m[:, None, :] + ring).reshape(-1, 2)).reshape(-1, 5, 2)
-    columns = {layer.name: json_safe(layer.values) for layer in maps.layers}
-    features = []
-    for i, corner in enumerate(corners):
-        properties = {"kind": "cell", "index": i + 1, **{name: values[i] for name, values in columns.items()}}
-        features.append(_feature("Polygon", [corner.tolist()], properties))
-    for name, place in maps.towers_m.items():
-        features.append(_feature("Point", maps.lonlat([place])[0].tolist(), {"kind": "tower", "name": name}))
-    for border in maps.borders:
-        between = {"kind": "border", "towers": maps.towers_of(border)}
-        features.append(_feature("LineString", maps.lonlat(border.line_m).tolist(), between))
-    target = Path(path)
-    content = {"type": "FeatureCollection", "features": features}
-    target.write_text(json.dumps(content, allow_nan=False, separators=(",", ":")) + "\n", encoding="utf-8")
-    return target
-
-
-def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[str, Any]:
-    return {"type": "Feature", "geometry": {"type": kind, "coordinates": coordinates}, "properties": properties}
 
 
 def write_geotiff(path: str | Path, maps: MapLayers) -> Path:

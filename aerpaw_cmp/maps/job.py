@@ -125,12 +125,9 @@ class MapResult:
         shares = [[class_shares(rank[a, k], HIGHEST_RANK) for k in range(rank.shape[1])] for a in range(rank.shape[0])]
         return np.array(shares).reshape(*rank.shape[:2], HIGHEST_RANK + 1)
 
-    def coverage(
-        self, antennas: Antennas = "mimo", tower: str | None = None, threshold_dbm: float = -np.inf
-    ) -> FloatArray:
-        """Probability of coverage per RSS altitude: share of positions with a path and at least the threshold."""
-        rss = self.rss(antennas, tower)
-        return np.asarray((np.isfinite(rss) & (np.nan_to_num(rss, nan=-np.inf) >= threshold_dbm)).mean(axis=1))
+    def coverage(self, antennas: Antennas = "mimo", tower: str | None = None) -> FloatArray:
+        """Probability of coverage per RSS altitude: share of positions with a path."""
+        return np.asarray(np.isfinite(self.rss(antennas, tower)).mean(axis=1))
 
     def _of(self, values: NDArray[np.generic], tower: str | None) -> FloatArray:
         if tower is not None:

@@ -99,11 +99,6 @@ class OrdinaryKriging:
         Of the random selection.
     sill : float or (fields,), optional
         v^2 of the variance; by default the sample variance of each field.
-    vertical_scale : float
-        In 3-D one metre of height counts as this many horizontal metres (geometric anisotropy).
-    vertical_correlation : callable, optional
-        In 3-D, Phi = correlation(horizontal) * vertical_correlation(vertical), as in Maeng et al. 2023; the scale
-        then only serves to choose neighbours.
     outside : {"nan", "nearest"}
         What happens where no sample lies within the radius.
 
@@ -135,8 +130,6 @@ class OrdinaryKriging:
         selection: Literal["nearest", "random"] = "nearest",
         seed: int = 0,
         sill: ArrayLike | None = None,
-        vertical_scale: float = 1.0,
-        vertical_correlation: Correlation | None = None,
         outside: Literal["nan", "nearest"] = "nan",
     ) -> None:
         self.correlation = correlation
@@ -145,8 +138,6 @@ class OrdinaryKriging:
         self.selection = selection
         self.seed = seed
         self.sill = sill
-        self.vertical_scale = vertical_scale
-        self.vertical_correlation = vertical_correlation
         self.outside = outside
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> OrdinaryKriging:
@@ -204,8 +195,6 @@ class OrdinaryKriging:
             wrong.append(f"neighbours = {self.neighbours}: expected a whole number of at least 1")
         if not self.radius_m > 0:
             wrong.append(f"radius_m = {self.radius_m}: expected a positive length")
-        if not self.vertical_scale > 0:
-            wrong.append(f"vertical_scale = {self.vertical_scale}: expected a positive ratio")
         if self.selection not in ("nearest", "random"):
             wrong.append(f"selection = {self.selection!r}: expected 'nearest' or 'random'")
         if self.outside not in ("nan", "nearest"):
@@ -272,9 +261,6 @@ class OrdinaryKriging:
         return Weights(chosen.index, weight, variance, regularised)
 
     def _neighbours(self, samples: FloatArray, targets: FloatArray, skip: IntArray | None) -> choose.Neighbours:
-        scale = np.ones(samples.shape[1])
-        scale[2:] = self.vertical_scale
-        samples, targets = samples * scale, targets * scale
         chosen = choose.by_rule(self, samples, targets, skip)
         if self.outside == "nearest":
             empty = np.flatnonzero(chosen.count == 0)
@@ -287,13 +273,9 @@ class OrdinaryKriging:
     def _semivariance(self, offset_m: FloatArray) -> FloatArray:
         """1 - Phi of offsets (dims, ...) between different places."""
         square = offset_m[0] ** 2 + offset_m[1] ** 2
-        if len(offset_m) == 2:
-            phi = self.correlation(np.sqrt(square))
-        elif self.vertical_correlation is not None:
-            phi = self.correlation(np.sqrt(square)) * self.vertical_correlation(np.abs(offset_m[2]))
-        else:
-            phi = self.correlation(np.sqrt(square + (self.vertical_scale * offset_m[2]) ** 2))
-        gamma = 1.0 - np.asarray(phi, dtype=np.float64)
+        for more in offset_m[2:]:
+            square += more**2
+        gamma = 1.0 - np.asarray(self.correlation(np.sqrt(square)), dtype=np.float64)
         if not np.isfinite(gamma).all():
             raise UsageError("the correlation is not finite at some distance", expected="a number at every distance")
         return np.asarray(np.maximum(gamma, 0.0))

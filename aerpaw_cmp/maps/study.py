@@ -1,13 +1,12 @@
-"""Correlation and interpolation of maps: the paper's comparison (section VII-C), and the one with gaps."""
+"""Correlation and interpolation of maps: the paper's comparison (section VII-C)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from ..common.units import FloatArray
 from . import evaluate, variogram
@@ -127,87 +126,3 @@ def _curve(correlation: variogram.BinnedCorrelation) -> variogram.BiExponential:
         return variogram.fit_biexponential(correlation.distance_m, correlation.correlation)
     reason = "no two positions have varying rank vectors: the paper's curve stands in"
     return replace(variogram.PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)
-
-
-@dataclass(frozen=True, slots=True)
-class HeldOutStudy:
-    """Kriging where no near neighbour gives the answer away. Scores have the shape (altitudes, K).
-
-    Parameters
-    ----------
-    blocked : Score
-        One square block of the area left out at a time.
-    altitude_held_out : Score
-        One altitude left out at a time, predicted in 3-D.
-    vertical_scale : float
-        Anisotropy used for it, fitted to the correlation of the altitudes' maps.
-    trajectory : Score or None
-        Trained on the cells of a flight only.
-    learning_sizes : tuple of int
-        Numbers of random samples.
-    learning_mae : (sizes, altitudes, K)
-        MAE at the other positions.
-    """
-
-    blocked: evaluate.Score
-    altitude_held_out: evaluate.Score
-    vertical_scale: float
-    trajectory: evaluate.Score | None
-    learning_sizes: tuple[int, ...]
-    learning_mae: FloatArray
-
-
-_LEARNING_SIZES = (25, 50, 100, 200, 400, 800, 1600)
-
-
-def held_out_study(
-    grid: Grid,
-    altitudes_m: Sequence[float],
-    values: FloatArray,
-    fit: variogram.BiExponential,
-    *,
-    trajectory_m: ArrayLike | None = None,
-    block_m: float = 300.0,
-    neighbours: int = 20,
-    seed: int = 0,
-) -> HeldOutStudy:
-    """Evaluate Kriging with gaps: every sample may be far, so the radius does not bind (``outside="nearest"``).
-
-    What is held out is the values; the correlation curve is the one given, of the whole map.
-
-    Parameters
-    ----------
-    grid, altitudes_m, values
-        Maps (n, altitudes, K), as in :func:`interpolation_study`.
-    fit : BiExponential
-        Of :class:`Study`.
-    trajectory_m : (samples, 2+), optional
-        A flight [m].
-    block_m : float
-        Side of the blocks.
-    neighbours, seed
-        M; seed of the learning curve.
-
-    Returns
-    -------
-    HeldOutStudy
-        Scores by block, by altitude and along the flight, and the learning curve at those of
-        :data:`_LEARNING_SIZES` below the number of positions.
-    """
-    points = grid.points_m
-    wide = OrdinaryKriging(fit, neighbours, outside="nearest")
-    horizontal = variogram.field_correlation(points, values, width_m=grid.spacing_m)
-    across = variogram.vertical_correlation(altitudes_m, np.moveaxis(values, 0, -1))
-    in_space = _curve(horizontal)
-    varies = np.isfinite(across.correlation[1:]).any()
-    scale = variogram.fit_vertical_scale(in_space, across) if varies else 1.0
-    space = OrdinaryKriging(in_space, neighbours, np.inf, vertical_scale=scale)
-    sizes = tuple(size for size in _LEARNING_SIZES if size < len(grid))
-    return HeldOutStudy(
-        blocked=evaluate.blocked(wide, points, values, block_m),
-        altitude_held_out=evaluate.altitude_held_out(space, points, altitudes_m, values),
-        vertical_scale=scale,
-        trajectory=None if trajectory_m is None else evaluate.along_trajectory(wide, grid, values, trajectory_m),
-        learning_sizes=sizes,
-        learning_mae=evaluate.learning_curve(wide, points, values, sizes, seed=seed),
-    )

@@ -28,7 +28,7 @@ from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
-from .biexponential import PAPER_BIEXPONENTIAL, BiExponential, fit_biexponential, least_on_axis
+from .biexponential import PAPER_BIEXPONENTIAL, BiExponential, fit_biexponential
 
 __all__ = [
     "PAPER_BIEXPONENTIAL",
@@ -37,7 +37,6 @@ __all__ = [
     "Variogram",
     "field_correlation",
     "fit_biexponential",
-    "fit_vertical_scale",
     "vector_correlation",
     "vertical_correlation",
 ]
@@ -201,38 +200,6 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
     sums = _Sums(n, _HEIGHT_BIN_M)
     sums.add(np.repeat(gap, fields), value.ravel())
     return BinnedCorrelation(*sums.means(), levels, excluded, 0)
-
-
-def fit_vertical_scale(
-    correlation: Callable[[FloatArray], FloatArray],
-    vertical: BinnedCorrelation,
-    bounds: tuple[float, float] = (0.1, 1000.0),
-) -> float:
-    """Horizontal metres that one metre of height is worth: least squares of ``Phi(scale * height)``.
-
-    Parameters
-    ----------
-    correlation : callable
-        Horizontal Phi(distance [m]).
-    vertical : BinnedCorrelation
-        Of :func:`vertical_correlation`.
-    bounds : (low, high)
-        Of the scale.
-
-    Returns
-    -------
-    float
-        For ``OrdinaryKriging(vertical_scale=...)``.
-    """
-    usable = np.isfinite(vertical.correlation) & (vertical.mean_distance_m > 0)
-    if not usable.any():
-        raise UsageError("no two altitudes to compare", expected="maps of at least two altitudes that vary")
-    height, phi = vertical.mean_distance_m[usable], vertical.correlation[usable]
-
-    def cost(log_scale: float) -> float:
-        return float(((np.asarray(correlation(np.exp(log_scale) * height)) - phi) ** 2).sum())
-
-    return float(np.exp(least_on_axis(cost, (np.log(bounds[0]), np.log(bounds[1])), 1e-9)))
 
 
 # --- pairs ----------------------------------------------------------------------------------------------------------

@@ -75,30 +75,22 @@ def prediction(trouble: str, draw: Generator) -> Verdict:
 
 
 def coverage(trouble: str, draw: Generator) -> Verdict:
-    """A square of 900 positions about a tower; trees and a hill take levels, a threshold takes weak ones."""
+    """A square of 900 positions about a tower; trees and a hill take levels."""
     east, north = np.meshgrid(np.linspace(-600, 600, 30), np.linspace(-600, 600, 30))
-    distance = np.hypot(east, north).ravel() + 20.0
-    level = -20.0 * np.log10(distance) + draw.normal(0.0, 2.0, distance.size)
-    threshold, trees, hill = -np.inf, np.zeros(distance.size, bool), np.zeros(distance.size, bool)
+    trees, hill = np.zeros(east.size, bool), np.zeros(east.size, bool)
     edge = draw.uniform(-300.0, 200.0)
     if trouble == "trees":
         trees = east.ravel() > edge
     elif trouble == "blocked":
         hill = north.ravel() > edge
-    elif trouble == "level":
-        threshold = float(np.quantile(level, draw.uniform(0.2, 0.8)))
-    elif trouble == "threshold":
-        threshold = level.max() + draw.uniform(1.0, 30.0)
     elif trouble == "no path":
-        hill = np.ones(distance.size, bool)
-    path = ~trees & ~hill
+        hill = np.ones(east.size, bool)
     return coverage_verdict(
         [
             Coverage(
                 height_m=height,
-                covered=float(np.mean(path & (level > threshold))),
-                clear=float(np.mean(~hill & (level > threshold))),
-                reached=float(np.mean(path)),
+                covered=float(np.mean(~trees & ~hill)),
+                clear=float(np.mean(~hill)),
                 outside=draw.uniform(0.6, 1.0) if trouble == "extrapolated" else draw.uniform(0.0, 0.4),
             )
             for height in (30.0, 110.0)
@@ -133,7 +125,7 @@ KINDS: dict[Callable[[str, Generator], Verdict], tuple[str, ...]] = {
     calibration: ("not significant", "better", "worse"),
     frames: ("not separable", "antenna", "place"),
     prediction: ("none", "narrow", "wide", "biased"),
-    coverage: ("none", "trees", "blocked", "level", "threshold", "no path", "extrapolated"),
+    coverage: ("none", "trees", "blocked", "no path", "extrapolated"),
     difference: ("none", "setting", "input", "version", "measured", "unexplained"),
 }
 
@@ -264,15 +256,14 @@ def test_stated_errors_by_their_limits(
 
 
 @pytest.mark.parametrize(
-    ("covered", "clear", "reached", "outside", "cause"),
-    [(0.95, 1.0, 1.0, 0.0, "none"), (0.94, 1.0, 0.95, 0.0, "trees"), (0.5, 0.6, 0.9, 0.0, "level"),
-     (0.5, 0.6, 0.55, 0.0, "blocked"), (0.0, 0.0, 0.4, 0.0, "threshold"), (0.0, 0.0, 0.0, 0.0, "no path"),
-     (0.9, 1.0, 1.0, 0.51, "extrapolated"), (0.99, 1.0, 1.0, 0.5, "none"), (0.5, np.nan, np.nan, 0.0, "blocked")],
+    ("covered", "clear", "outside", "cause"),
+    [(0.95, 1.0, 0.0, "none"), (0.94, 1.0, 0.0, "trees"), (0.5, 0.6, 0.0, "blocked"), (0.0, 0.0, 0.0, "no path"),
+     (0.9, 1.0, 0.51, "extrapolated"), (0.99, 1.0, 0.5, "none"), (0.5, np.nan, 0.0, "blocked")],
 )  # fmt: skip
 def test_the_worst_height_says_what_takes_its_coverage(
-    covered: float, clear: float, reached: float, outside: float, cause: str
+    covered: float, clear: float, outside: float, cause: str
 ) -> None:
-    here = Coverage(height_m=70.0, covered=covered, clear=clear, reached=reached, outside=outside)
+    here = Coverage(height_m=70.0, covered=covered, clear=clear, outside=outside)
     said = coverage_verdict([Coverage(height_m=30.0, covered=1.0, outside=1.0), here])
     assert (said.cause, said.effect, said.where) == (cause, covered, "70 m")
 

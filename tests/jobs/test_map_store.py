@@ -395,4 +395,4 @@ def test_flights_and_tiles_are_refused_before_anything_runs():
     from aerpaw_cmp.jobs import run
 
     with pytest.raises(UsageError, match="flights and a map in tiles"):
-        run.run_map(SITE, SETTINGS, remembered=True)
+        run.run_map(SITE, SETTINGS, flights=[Path("sample_logs/flight.yaml")])

@@ -149,19 +149,20 @@ def test_a_shortened_reach_is_seen(fault, monkeypatch):
         assert_equal(maps, one_piece)
 
 
-def test_a_tower_out_of_range_is_left_out_and_nothing_changes():
+def test_a_tower_that_is_left_out_of_a_tile_reaches_no_position_of_it():
     site = town(20, side_m=4000.0)
     free = in_one_piece(site, settings(spacing_m=200.0))[0]["none"]
     floor = float(np.nanmax(free.rss_siso_dbm)) - 3.0
-    chosen = settings(spacing_m=200.0, threshold_dbm=floor)
-    maps, _, _ = in_tiles(site, chosen, 5)
-    assert_equal(maps, in_one_piece(site, chosen)[0])
-    reach = mapping.SiteChannels(site, chosen).reach
+    budget = Budget(carrier_hz=3.4e9, transmit_power_dbm=40.0, gain_db=10 * np.log10(4), floor_dbm=floor)
     corner = np.array([[-2000.0, -2000.0, 2.0], [-1800.0, -1800.0, 2.0]])
-    range_m = Budget(carrier_hz=3.4e9, transmit_power_dbm=40.0, gain_db=10 * np.log10(4), floor_dbm=floor).range_m
-    far = [name for name, tower in site.towers.items() if np.hypot(tower.east_m + 1800, tower.north_m + 1800) > range_m]
+    near = set(Reach(site, budget, max_depth=2).of(corner).towers)
+    far = [name for name, t in site.towers.items() if np.hypot(t.east_m + 1800, t.north_m + 1800) > budget.range_m]
     assert far
-    assert not set(far) & set(reach.of(corner).towers)
+    assert not set(far) & near
+    there = (np.abs(free.grid.points_m + 1900.0) <= 100.0).all(axis=1)
+    assert there.any()
+    left_out = [number for number, name in enumerate(free.tower_names) if name not in near]
+    assert not (np.nan_to_num(free.rss_siso_dbm[:, left_out][:, :, there], nan=-np.inf) >= floor).any()
 
 
 def test_a_tile_without_towers_is_out_of_coverage_at_once(monkeypatch):

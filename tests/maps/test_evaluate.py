@@ -80,31 +80,6 @@ def test_blocks_never_train_on_themselves():
     assert set.union(*missing) == blocks
 
 
-def test_held_out_altitude_is_not_seen_and_a_linear_profile_is_found():
-    spy = Spy()
-    heights = [30.0, 40.0, 50.0]
-    evaluate.altitude_held_out(spy, GRID.points_m, heights, np.zeros((len(GRID), 3, 2)))
-    assert [sorted(set(seen[:, 2])) for seen in spy.seen] == [[40.0, 50.0], [30.0, 50.0], [30.0, 40.0]]
-    values = np.broadcast_to(np.array(heights)[None, :, None], (len(GRID), 3, 2))
-    # all within 40 m, so that as many are taken above as below
-    model = OrdinaryKriging(exponential, 100, 40.0, vertical_scale=2.0)
-    result = evaluate.altitude_held_out(model, GRID.points_m, heights, values)
-    assert result.mae.shape == (3, 2)
-    assert result.mae[1].max() < 1e-9, "half-way by symmetry"
-    assert result.mae[0].min() > 5.0, "below all samples nothing can be known"
-
-
-def test_trajectory_trains_on_its_cells_only():
-    spy = Spy()
-    flight = np.column_stack([np.linspace(-100, 700, 500), np.full(500, 200.0)])
-    result = evaluate.along_trajectory(spy, GRID, np.zeros((len(GRID), 1)), flight)
-    assert len(spy.seen[0]) == 20, "one row of cells"
-    assert set(spy.seen[0][:, 1]) == {195.0}
-    assert result.n.tolist() == [len(GRID) - 20]
-    with pytest.raises(UsageError, match="does not cross"):
-        evaluate.along_trajectory(spy, GRID, np.zeros(len(GRID)), [[5e3, 0.0]])
-
-
 def test_kriging_wins_where_its_model_holds_and_its_variance_is_honest():
     """A Gaussian field with the model's correlation: best linear predictor, calibrated intervals."""
     values = simulated_field(GRID.points_m, 2, fields=40, noise=0.1)
@@ -140,14 +115,3 @@ def test_blocked_is_harder_than_leave_one_out():
     near = evaluate.leave_one_out(model, GRID.points_m, values).mae.mean()
     blocked = evaluate.blocked(model, GRID.points_m, values, 200.0).mae.mean()
     assert blocked > 1.3 * near
-
-
-def test_learning_curve_falls_and_is_repeatable():
-    values = simulated_field(GRID.points_m, 6, fields=10)
-    model = OrdinaryKriging(exponential, outside="nearest")
-    curve = evaluate.learning_curve(model, GRID.points_m, values, (10, 40, 160), seed=1).mean(axis=1)
-    assert curve[0] > curve[1] > curve[2]
-    again = evaluate.learning_curve(model, GRID.points_m, values, (10, 40, 160), seed=1).mean(axis=1)
-    np.testing.assert_array_equal(curve, again)
-    with pytest.raises(UsageError, match="sample sizes"):
-        evaluate.learning_curve(model, GRID.points_m, values, (len(GRID),))

@@ -1,7 +1,6 @@
 """Files are read back with the programs that others use."""
 
 import io
-import json
 import sys
 import zipfile
 from xml.etree import ElementTree
@@ -11,7 +10,6 @@ import pandas as pd
 import pytest
 from matplotlib import colormaps
 from matplotlib.image import imread
-from shapely.geometry import shape
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
@@ -51,41 +49,6 @@ def test_csv_keeps_order_and_gaps(tmp_path):
     np.testing.assert_array_equal(table["rank_k10_h030m_joint"], RANK)
     east, north = FRAME.to_local(table["latitude_deg"], table["longitude_deg"])
     np.testing.assert_allclose(np.column_stack([east, north]), GRID.points_m, atol=2e-4)
-
-
-def test_json_is_strict(tmp_path):
-    path = export.write_json(
-        tmp_path / "m.json", BARE, {"mae": np.array([1.0, np.nan]), "n": np.int64(3), "r": float("inf")}
-    )
-
-    def refuse(name):
-        raise AssertionError(name)
-
-    content = json.loads(path.read_text(), parse_constant=refuse)
-    assert content["summary"] == {"mae": [1.0, None], "n": 3, "r": None}
-    values = content["layers"]["rss_h030m_joint"]["values"]
-    assert values[3] is None
-    assert values[4] == RSS[4]
-    assert content["layers"]["rank_k10_h030m_joint"]["classes"][0] == "Z"
-
-
-def test_geojson_cells_are_where_the_positions_are(tmp_path):
-    path = export.write_geojson(tmp_path / "m.geojson", MAPS)
-    features = json.loads(path.read_text())["features"]
-    cells = [f for f in features if f["properties"]["kind"] == "cell"]
-    assert len(cells) == len(GRID)
-    for i in (0, 5, 6, len(GRID) - 1):
-        polygon = shape(cells[i]["geometry"])
-        assert polygon.exterior.is_ccw
-        east, north = FRAME.to_local(polygon.centroid.y, polygon.centroid.x)
-        assert [float(east), float(north)] == pytest.approx(GRID.points_m[i].tolist(), abs=0.02)
-        assert polygon.area * 111_320**2 * np.cos(np.radians(35.7275)) == pytest.approx(900.0, rel=0.01)
-    assert cells[3]["properties"]["rss_h030m_joint"] is None
-    assert cells[4]["properties"]["rank_k10_h030m_joint"] == 4
-    towers = [f["properties"]["name"] for f in features if f["properties"]["kind"] == "tower"]
-    assert towers == list(TOWERS)
-    border = next(f for f in features if f["properties"]["kind"] == "border")
-    assert border["properties"]["towers"] == ["LW1", "LW<2>"]
 
 
 def test_kmz_has_a_map_and_a_legend_per_layer(tmp_path):

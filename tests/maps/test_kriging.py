@@ -60,10 +60,10 @@ def test_equals_pykrige_in_space():
     values = np.random.default_rng(9).normal(size=120)
     peer = ok3d.OrdinaryKriging3D(
         *points.T, values, variogram_model="custom", variogram_parameters=[0.0],
-        variogram_function=lambda _, d: 1 - exponential(d), anisotropy_scaling_z=4.0,
+        variogram_function=lambda _, d: 1 - exponential(d),
     )  # fmt: skip
     expected, expected_variance = peer.execute("points", *targets.T, backend="loop", n_closest_points=15)
-    model = OrdinaryKriging(exponential, 15, np.inf, sill=1.0, vertical_scale=4.0).fit(points, values)
+    model = OrdinaryKriging(exponential, 15, np.inf, sill=1.0).fit(points, values)
     estimate, variance = model.predict(targets)
     np.testing.assert_allclose(estimate, np.asarray(expected), atol=1e-9, rtol=0)
     np.testing.assert_allclose(variance, np.asarray(expected_variance), atol=1e-9, rtol=0)
@@ -394,7 +394,6 @@ def test_random_leave_one_out_does_not_see_the_target():
         ({"radius_m": -1.0}, "radius_m"),
         ({"selection": "all"}, "selection"),
         ({"sill": -1.0}, "sill"),
-        ({"vertical_scale": 0.0}, "vertical_scale"),
     ],
 )
 def test_wrong_settings_are_named(arguments, message):
@@ -415,10 +414,6 @@ def with_nugget(d):
     return 0.9 * np.exp(-np.asarray(d) / 70.0)  # a tenth is nugget
 
 
-def vertical(d):
-    return np.exp(-np.asarray(d) / 30.0)
-
-
 def by_hand(
     points,
     values,
@@ -428,8 +423,6 @@ def by_hand(
     radius,
     correlation,
     sill,
-    scale=1.0,
-    vertical=None,
     outside="nan",
 ):
     """Estimate and variance at one target."""
@@ -438,15 +431,10 @@ def by_hand(
     points, values = points[known], np.asarray(values)[known]
 
     def apart(a, b):
-        d = a - b
-        if len(d) == 3:
-            d = d * [1.0, 1.0, scale]
-        return float(np.sqrt(np.sum(d * d)))
+        return float(np.linalg.norm(a - b))
 
     def phi(a, b):
-        if vertical is None:
-            return float(correlation(apart(a, b)))
-        return float(correlation(np.hypot(*(a - b)[:2])) * vertical(abs(a[2] - b[2])))
+        return float(correlation(apart(a, b)))
 
     order = sorted(range(len(points)), key=lambda i: apart(points[i], target))
     chosen = [i for i in order if apart(points[i], target) <= radius][:neighbours]
@@ -471,16 +459,8 @@ CASES = [
     {"dims": 2, "neighbours": 20, "radius": 90.0},
     {"dims": 2, "neighbours": 4, "radius": 15.0, "outside": "nearest"},
     {"dims": 2, "neighbours": 1, "radius": 40.0},
-    {"dims": 3, "neighbours": 8, "radius": 80.0, "scale": 2.5},
-    {"dims": 3, "neighbours": 8, "radius": 60.0, "vertical": vertical},
-    {
-        "dims": 3,
-        "neighbours": 5,
-        "radius": 70.0,
-        "vertical": vertical,
-        "scale": 3.0,
-        "outside": "nearest",
-    },
+    {"dims": 3, "neighbours": 8, "radius": 80.0},
+    {"dims": 3, "neighbours": 5, "radius": 30.0, "outside": "nearest"},
 ]
 
 
@@ -495,17 +475,14 @@ def test_every_target_is_that_of_its_own_system(case, seed):
     values[:, 2] = np.nan
     values[3, 2] = 1.5
     targets = np.concatenate([rng.uniform(-20, 220, (25, case["dims"])) * ([1, 1, 0.3][: case["dims"]]), points[:3]])
-    options = {
-        "vertical_scale": case.get("scale", 1.0),
-        "vertical_correlation": case.get("vertical"), "outside": case.get("outside", "nan"),
-    }  # fmt: skip
-    model = OrdinaryKriging(with_nugget, case["neighbours"], case["radius"], **options).fit(points, values)
+    outside = case.get("outside", "nan")
+    model = OrdinaryKriging(with_nugget, case["neighbours"], case["radius"], outside=outside).fit(points, values)
     estimate, variance = model.predict(targets)
     sill = [
         np.var(column[np.isfinite(column)], ddof=1) if np.isfinite(column).sum() > 1 else 0.0 for column in values.T
     ]
     np.testing.assert_allclose(model.sill_, sill, rtol=1e-12)
-    rules = {key: case[key] for key in ("neighbours", "radius", "scale", "vertical", "outside") if key in case}
+    rules = {key: case[key] for key in ("neighbours", "radius", "outside") if key in case}
     for field in range(3):
         expected = [
             by_hand(points, values[:, field], t, correlation=with_nugget, sill=sill[field], **rules) for t in targets
@@ -528,10 +505,7 @@ def test_what_is_not_said_is_twenty_neighbours_within_150_m_the_nearest_and_exac
     rng = np.random.default_rng(3)
     points, values = rng.uniform(0, 300, (80, 2)), rng.normal(size=80)
     targets = np.concatenate([rng.uniform(0, 300, (10, 2)), points[:2], [[900.0, 0.0]]])
-    said = OrdinaryKriging(
-        with_nugget, 20, 150.0, selection="nearest", seed=0, sill=None, vertical_scale=1.0,
-        vertical_correlation=None, outside="nan",
-    )  # fmt: skip
+    said = OrdinaryKriging(with_nugget, 20, 150.0, selection="nearest", seed=0, sill=None, outside="nan")
     usual = OrdinaryKriging(with_nugget)
     for a, b in zip(usual.fit(points, values).predict(targets), said.fit(points, values).predict(targets), strict=True):
         np.testing.assert_array_equal(a, b)

@@ -157,18 +157,6 @@ def test_vertical_correlation_closed_form():
     assert bins.excluded_constant == 1
 
 
-@pytest.mark.parametrize("scale", [0.4, 7.0])
-def test_vertical_scale_comes_back(scale):
-    """A height profile that is the horizontal curve, flatter or steeper."""
-    heights = np.arange(0.0, 90.0, 10.0)
-    profile = variogram.BinnedCorrelation(
-        heights, heights, PAPER_BIEXPONENTIAL(scale * heights), heights.astype(int) + 1, 9, 0, 0
-    )
-    assert variogram.fit_vertical_scale(PAPER_BIEXPONENTIAL, profile) == pytest.approx(scale, rel=1e-5)
-    with pytest.raises(UsageError, match="two altitudes"):
-        variogram.fit_vertical_scale(PAPER_BIEXPONENTIAL, vertical_correlation([30.0], RNG.normal(size=(1, 50))))
-
-
 # --- the curve ------------------------------------------------------------------------------------------------------
 
 DISTANCE = np.arange(0.0, 501.0, 30.0)

@@ -15,7 +15,6 @@ from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report.content.flight import InputFile, ReportData, Track, Waypoint
 from aerpaw_cmp.report.content.maps import (
     Correlation,
-    LearningCurve,
     MapError,
     MapLayer,
     MapsData,
@@ -210,7 +209,7 @@ def make_maps() -> MapsData:
         borders_m=lines, rss=tuple(rss), rank=tuple(rank),
         layers=(*(MapLayer(quantity="Singular value spread", label="sigma 1 over sigma 2 [dB]", unit="dB", axes=at_height(h), values=20 + d / 30 + h / 10) for h in (30.0, 70.0)), MapLayer(quantity="Foliage loss", label="RSS with minus without trees [dB]", unit="dB", axes=at_height(30.0), values=np.where(wood, -12.0, 0.0), difference=True),),
         correlation=(Correlation(title="Rank, horizontal", distance_m=distance, correlation=model + 0.01 * np.cos(distance), fit_distance_m=distance, fit=model, fit_label="bi-exponential, RMSE 0.007", excluded=7),),
-        errors=tuple(errors), learning=(LearningCurve(method="Kriging", samples=np.array([50, 100, 400, 1600]), mae=np.array([0.3, 0.25, 0.16, 0.1])),),
+        errors=tuple(errors),
         paper=(PaperRow(where="Fig. 12", what="c1", paper="0.2932", ours="0.2931", figure="correlation"), PaperRow(where="Fig. 13", what="lowest MAE", paper="K = 10", ours="K = 10", figure="mae_leave_one_out")),
         warnings=("Towers of another source differ by up to 9 m.",), versions={"numpy": np.__version__}, settings={"rt": {"max_depth": 2}}, stages_s={"replay": 3.0}, metrics={"fit": {"rmse": 0.0153}},
     )  # fmt: skip

@@ -148,7 +148,7 @@ def site_show(
         "aerpaw-cmp map --quick",
         "aerpaw-cmp map site.yaml --spacing 15 --dry-run",
         "aerpaw-cmp map site.yaml -o reports/map --spacing 20 --rank-altitude 30 --rank-altitude 70",
-        "aerpaw-cmp map lake_wheeler --flight flight.yaml --foliage none --no-study --json",
+        "aerpaw-cmp map lake_wheeler --foliage none --no-study --json",
         "aerpaw-cmp map lake_wheeler --with flight1.yaml --with flight2.yaml",
     ],
 )
@@ -173,18 +173,8 @@ def map_(
     carrier_ghz: Annotated[float | None, Option(help="Carrier frequency [GHz]  [default: 3.4]")] = None,
     engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: image]")] = None,
     max_depth: Annotated[int | None, Option(min=0, max=3, help="Largest number of reflections  [default: 2]")] = None,
-    samples: Annotated[int | None, Option(min=1, help="Rays per tower (sionna only)  [default: 1e6]")] = None,
-    flight: Annotated[
-        Path | None, Option(help="flight.yaml whose track is the training set of the test 'along a flight'.")
-    ] = None,
     flights: Flights = None,
-    remembered: Annotated[
-        bool, Option("--remembered", help="Correct by what the site remembers, without --with.")
-    ] = False,
     logs_root: LogsRoot = None,
-    threshold_dbm: Annotated[
-        float | None, Option(help="Lowest level in coverage [dBm]  [default: any path is coverage]")
-    ] = None,
     study: Annotated[bool, Option("--study/--no-study", help="Also spatial correlation and interpolation.")] = True,
     tile_m: Annotated[
         float | None,
@@ -210,17 +200,15 @@ def map_(
         "carrier_hz": None if carrier_ghz is None else carrier_ghz * 1e9,
         "engine": engine,
         "max_depth": max_depth,
-        "samples": samples,
-        "threshold_dbm": threshold_dbm,
         "study": study,
         "tile_m": tile_m,
     }
     settings = map_settings(fields, quick=quick)
     options = RunOptions(out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say)
     if dry_run:
-        print_plan(run.plan_map(site, settings, options, flight=flight), as_json)
+        print_plan(run.plan_map(site, settings, options), as_json)
         return
-    outcome = run.run_map(site, settings, options, flight=flight, flights=flights or (), remembered=remembered)
+    outcome = run.run_map(site, settings, options, flights=flights or ())
     if as_json:
         print_json(outcome.metrics)
         return

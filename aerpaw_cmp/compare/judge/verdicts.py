@@ -267,14 +267,13 @@ _COVERED = 0.95
 class Coverage:
     """One height of a map: shares of its positions.
 
-    ``covered`` with the trees as mapped, ``clear`` without trees (NaN where not mapped), ``reached`` by any path
-    whatever its level (NaN where not known); ``outside`` lie further from every flight than a correction reaches.
+    ``covered`` with the trees as mapped, ``clear`` without trees (NaN where not mapped); ``outside`` lie further from
+    every flight than a correction reaches.
     """
 
     height_m: float
     covered: float
     clear: float = math.nan
-    reached: float = math.nan
     outside: float = 0.0
 
 
@@ -289,25 +288,21 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     -------
     Verdict
         Effect: share covered at the height with the least. Causes: ``extrapolated`` (most positions lie beyond the
-        flights), ``threshold`` or ``no path`` (nothing is covered), ``level``, ``trees``, ``blocked`` (what takes most
-        of the gaps), ``none`` (at least :data:`_COVERED`). A computed share has no interval.
+        flights), ``no path`` (nothing is covered), ``trees``, ``blocked`` (what takes most of the gaps), ``none`` (at
+        least :data:`_COVERED`). A computed share has no interval.
     """
     if not heights:
         return Verdict()
     worst = min(heights, key=lambda height: height.covered)
-    gap = {
-        "level": _fraction(worst.reached - worst.covered),
-        "trees": _fraction(worst.clear - worst.covered),
-    }
-    gap["blocked"] = 1.0 - worst.covered - max(gap.values())
+    by_trees = _fraction(worst.clear - worst.covered)
     if worst.outside > 0.5:
         cause = "extrapolated"
     elif worst.covered == 0.0:
-        cause = "threshold" if gap["level"] > 0.0 else "no path"
+        cause = "no path"
     elif worst.covered >= _COVERED:
         cause = NONE
     else:
-        cause = max(gap, key=lambda name: gap[name])
+        cause = "trees" if by_trees >= 1.0 - worst.covered - by_trees else "blocked"
     return Verdict(cause=cause, effect=worst.covered, where=f"{worst.height_m:g} m")
 
 

@@ -29,16 +29,14 @@ from ...maps import grid as cells
 from ...maps.evaluate import (
     Predictor,
     Score,
-    along_trajectory,
-    altitude_held_out,
     blocked,
-    learning_curve,
 )
 from ...maps.grid import Grid
 from ...maps.interpolate import InverseDistance, Nearest, ServingTowerMean
+from ...maps.kriging import OrdinaryKriging
 from ...maps.netcdf import write_netcdf
 from ...maps.store import TileStore
-from ...maps.study import HeldOutStudy, Study, held_out_study, interpolation_study, rank_fields
+from ...maps.study import Study, interpolation_study, rank_fields
 from ...maps.tiles import Budget, Reach, Tiling
 from ...maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ...propagation.field.foliage import crown_index, foliage_loss_db, foliage_model
@@ -97,8 +95,6 @@ class MapSettings:
         Side of the blocks that are left out whole.
     study : bool
         Correlation, interpolation and their errors, too.
-    threshold_dbm : float
-        A level below it is out of coverage in the RSS maps.
     seed : int
         Of random samples.
     tile_m : float, optional
@@ -122,7 +118,6 @@ class MapSettings:
     radius_m: float = 150.0
     block_m: float = 300.0
     study: bool = True
-    threshold_dbm: float = -np.inf
     seed: int = 0
     tile_m: float | None = None
 
@@ -184,7 +179,7 @@ class SiteChannels:
             carrier_hz=settings.carrier_hz,
             transmit_power_dbm=settings.transmit_power_dbm,
             gain_db=float(db_from_power(settings.elements)),
-            floor_dbm=max(settings.threshold_dbm, THERMAL_NOISE_DBM_HZ),
+            floor_dbm=THERMAL_NOISE_DBM_HZ,
         )
         cast = settings.engine != "image"
         self.reach = Reach(site, budget, max_depth=settings.max_depth, every=cast)
@@ -284,9 +279,7 @@ class SiteChannels:
         return job.Evaluation(siso, mimo, spread, placed(some.singular_values))
 
     def _rss_dbm(self, h: ComplexArray) -> FloatArray:
-        level = rss_dbm(_beam_power(h), self.settings.transmit_power_dbm)
-        with np.errstate(invalid="ignore"):
-            return np.asarray(np.where(level >= self.settings.threshold_dbm, level, np.nan))
+        return rss_dbm(_beam_power(h), self.settings.transmit_power_dbm)
 
     def _above_ground(self, position_m: FloatArray) -> FloatArray:
         if self.site.dem is None:
@@ -369,20 +362,16 @@ class MapOutcome:
 
     ``maps`` by foliage mode; of a map in tiles some positions, as ``tiles`` says. ``studies``: positions out of
     coverage as no sample ("missing"), as rank 0 ("zero"), and as rank 0 with M random samples within the radius in
-    place of the M nearest ("random").
+    place of the M nearest ("random"). ``blocks``: errors of each interpolator with square blocks left out whole.
     """
 
     site: Site
     settings: MapSettings
     maps: dict[str, job.MapResult] = field(default_factory=dict)
     studies: dict[str, Study] = field(default_factory=dict)
-    held_out: HeldOutStudy | None = None
-    peers: dict[str, dict[str, Score]] = field(default_factory=dict)
-    learning: dict[str, FloatArray] = field(default_factory=dict)
+    blocks: dict[str, Score] = field(default_factory=dict)
     correlations: dict[str, BinnedCorrelation] = field(default_factory=dict)
     paths: int = 0
-    trajectory_m: FloatArray | None = None
-    trajectory_name: str = ""
     tiles: dict[str, Any] = field(default_factory=dict)
     corrected: CorrectedMaps | None = None
 
@@ -532,38 +521,20 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
             "vertical": vertical_correlation(heights, np.moveaxis(rank, 0, -1)),
             "RSS": field_correlation(points, result.rss().T, width_m=width),
         }
-    if outcome.trajectory_m is None:
-        outcome.trajectory_m, outcome.trajectory_name = _tower_round(outcome.site)
     with stages("held-out tests"):
-        fit, line = outcome.studies["missing"].fit, outcome.trajectory_m
-        outcome.held_out = held_out_study(
-            result.grid, heights, rank, fit, trajectory_m=line, block_m=s.block_m, neighbours=s.neighbours, seed=s.seed
-        )
-        sizes = outcome.held_out.learning_sizes
-        for name, peer in _wide_peers(result, s.neighbours).items():
-            outcome.peers.setdefault("blocks", {})[name] = blocked(peer, result.grid.points_m, rank, s.block_m)
-            outcome.peers.setdefault("flight", {})[name] = along_trajectory(peer, result.grid, rank, line)
-            if not isinstance(peer, ServingTowerMean):  # knows no height
-                score = altitude_held_out(peer, result.grid.points_m, heights, rank)
-                outcome.peers.setdefault("altitude", {})[f"{name}, 3-D"] = score
-            outcome.learning[name] = learning_curve(peer, result.grid.points_m, rank, sizes, seed=s.seed)
+        for name, model in _far_reaching(outcome).items():
+            outcome.blocks[name] = blocked(model, result.grid.points_m, rank, s.block_m)
 
 
-def _wide_peers(result: job.MapResult, neighbours: int) -> dict[str, Predictor]:
-    """Interpolators that reach as far as they must, to stand beside Kriging where samples are far."""
+def _far_reaching(outcome: MapOutcome) -> dict[str, Predictor]:
+    """Interpolators that reach as far as they must where every sample is far."""
+    neighbours = outcome.settings.neighbours
     return {
+        "Kriging": OrdinaryKriging(outcome.studies["missing"].fit, neighbours, outside="nearest"),
         "nearest": Nearest(np.inf),
         "inverse distance": InverseDistance(neighbours, np.inf),
-        "serving-tower mean": ServingTowerMean(result.towers_m),
+        "serving-tower mean": ServingTowerMean(outcome.shown.towers_m),
     }
-
-
-def _tower_round(site: Site) -> tuple[FloatArray, str]:
-    """A round over the first three towers and back, every 5 m: the shape of the paper's RSS flight."""
-    corners = np.array([tower.position_m[:2] for tower in list(site.towers.values())[:3]])
-    corners = np.vstack([corners, corners[:1]])
-    legs = [np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / 5.0))) for a, b in itertools.pairwise(corners)]
-    return np.concatenate(legs), "a round " + "-".join([*list(site.towers)[:3], next(iter(site.towers))])
 
 
 # --- the page ------------------------------------------------------------------------------------------------------
@@ -619,7 +590,6 @@ def maps_record(
         ),
         correlation=tuple(_correlation_panels(outcome)),
         errors=tuple(_errors(outcome)),
-        learning=tuple(_learning(outcome)),
         paper=tuple(paper),
         warnings=() if flown is None else tuple(flown.prediction.warnings),
         notes=_notes(outcome),
@@ -755,20 +725,16 @@ def _correlation(title: str, binned: BinnedCorrelation, **modelled: Any) -> page
 
 
 def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
-    if not outcome.studies or outcome.held_out is None:
+    if not outcome.studies:
         return
     heights, _ = rank_fields(outcome.shown)
-    held_out, chosen = outcome.held_out, outcome.studies["random"].scores
+    chosen = outcome.studies["random"].scores
     tables: dict[str, dict[str, Score]] = {
         "leave one out": dict(outcome.studies["missing"].scores),
         "leave one out, Z as rank 0": dict(outcome.studies["zero"].scores),
         "leave one out, Z as rank 0, random samples": {name: chosen[name] for name in INTERPOLATORS if name in chosen},
-        f"blocks of {outcome.settings.block_m:g} m left out": {"Kriging": held_out.blocked, **outcome.peers["blocks"]},
-        "altitude left out": {"Kriging, 3-D": held_out.altitude_held_out, **outcome.peers["altitude"]},
+        f"blocks of {outcome.settings.block_m:g} m left out": outcome.blocks,
     }
-    if held_out.trajectory is not None:
-        name = f"trained along {outcome.trajectory_name}"
-        tables[name] = {"Kriging": held_out.trajectory, **outcome.peers["flight"]}
     fields = list(itertools.product(enumerate(heights), enumerate(outcome.shown.ks)))
     for evaluation, scores in tables.items():
         for method, score in scores.items():
@@ -777,15 +743,6 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
                     evaluation=evaluation, method=method, k=k, altitude_m=height,
                     mae=float(score.mae[row, column]), n=int(score.n[row, column]),
                 )  # fmt: skip
-
-
-def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
-    if outcome.held_out is None or not outcome.held_out.learning_sizes:
-        return
-    sizes = np.array(outcome.held_out.learning_sizes)
-    for name, mae in {"Kriging": outcome.held_out.learning_mae, **outcome.learning}.items():
-        mean = np.array([finite_mean(row) for row in mae.reshape(len(sizes), -1)])
-        yield page.LearningCurve(method=f"{name}, mean over heights and K", samples=sizes, mae=mean)
 
 
 def _notes(outcome: MapOutcome) -> tuple[str, ...]:
@@ -817,9 +774,6 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
             "intervals": study.intervals,
             "intervals_paper_v2": study.intervals_paper,
         }
-    if outcome.held_out is not None:
-        result["vertical_scale"] = outcome.held_out.vertical_scale
-        result["trajectory"] = outcome.trajectory_name
     for mode, maps, change in _foliage_changes(outcome):
         result.setdefault("foliage", {})[mode] = [
             {"altitude_m": height, "mean_rss_loss_db": finite_mean(loss_db), "lost": float(lost.mean())}
@@ -832,7 +786,7 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
 
 
 def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[Path]:
-    """layers.csv, layers.geojson, maps.json and maps.kmz; maps.nc and maps.tif where the libraries are installed.
+    """layers.csv and maps.kmz; maps.nc and maps.tif where the libraries are installed.
 
     ``progress`` is told of files that are left out, and why.
     """
@@ -849,8 +803,6 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
     all_joint, levels_and_ranks = replace(every_layer, layers=joint), replace(every_layer, layers=shown)
     written = [
         export.write_csv(folder / "layers.csv", every_layer),
-        export.write_geojson(folder / "layers.geojson", levels_and_ranks),
-        export.write_json(folder / "maps.json", all_joint, {"site": site.name, **_provenance()}),
         export.write_kmz(folder / "maps.kmz", levels_and_ranks, title=site.name),
     ]
     maps = dict(outcome.ordered())
@@ -876,7 +828,7 @@ def _about_maps(title: str) -> dict[str, str]:
         title=title,
         source="ray tracing",
         **_provenance(),
-        comment="A missing level has no path or lies below the threshold. A rank of 0 is a code: no path.",
+        comment="A missing level has no path. A rank of 0 is a code: no path.",
     )
 
 

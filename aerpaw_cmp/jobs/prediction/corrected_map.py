@@ -106,7 +106,7 @@ def corrected_maps(
     logs_root: Path | None = None,
     stages: Stages | None = None,
 ) -> CorrectedMaps:
-    """Predict a map's grid from flights, or from what the site remembers, beside the raw replay of the same links.
+    """Predict a map's grid from flights, beside the raw replay of the same links.
 
     Parameters
     ----------
@@ -116,7 +116,7 @@ def corrected_maps(
     heights_m : (sequence of float, sequence of float)
         Of levels, and of ranks.
     flights : sequence of NamedFlight
-        To learn from; without any the memory of the site is the source.
+        To learn from.
     logs_root : Path, optional
     stages : Stages, optional
 

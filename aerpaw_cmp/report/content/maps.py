@@ -119,15 +119,6 @@ class MapError:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class LearningCurve:
-    """MAE of a method against the number of samples it was given, each (m,)."""
-
-    method: str
-    samples: IntArray
-    mae: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PaperRow:
     """A number that the paper states, beside ours, and where to see it."""
 
@@ -186,7 +177,6 @@ class MapsData(Made):
     layers: tuple[MapLayer, ...] = ()
     correlation: tuple[Correlation, ...] = ()
     errors: tuple[MapError, ...] = ()
-    learning: tuple[LearningCurve, ...] = ()
     paper: tuple[PaperRow, ...] = ()
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()

@@ -12,7 +12,7 @@ from ...common.units import FloatArray, spread_out
 from ...site.scenes import drawn_buildings
 from ...site.site import Site
 from ..content.flight import RANKS
-from ..content.maps import JOINT, Correlation, LearningCurve, MapError, MapLayer, MapsData, RankMap, RssMap
+from ..content.maps import JOINT, Correlation, MapError, MapLayer, MapsData, RankMap, RssMap
 from ..kit.canvas import (
     RANK_HATCH,
     TOWER,
@@ -20,7 +20,6 @@ from ..kit.canvas import (
     beyond,
     colour_bar,
     draw_credit,
-    plain_ticks,
     rank_colour,
     subplots,
 )
@@ -303,20 +302,6 @@ def error_curves(errors: Sequence[MapError]) -> Figure:
     return fig
 
 
-def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
-    """MAE against the number of samples."""
-    fig, ax = subplots((9.2, 3.0))
-    for number, curve in enumerate(curves):
-        ax.semilogx(
-            curve.samples, curve.mae, **curve_style(number, marked=True), label=curve.method,
-        )  # fmt: skip
-    ax.set_ylim(bottom=0)
-    plain_ticks(ax.xaxis)
-    ax.set(xlabel="Number of samples", ylabel="Mean absolute error of the rank")
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
-    return fig
-
-
 # --- all figures ---------------------------------------------------------------------------------
 
 
@@ -401,10 +386,4 @@ def _kriging_specs(data: MapsData) -> Iterator[FigureSpec]:
             f"mae_{safe_name(evaluation)}", "kriging", f"Error of interpolated rank, {evaluation}",
             "Mean absolute error against height; lower is better.",
             partial(error_curves, errors),
-        )  # fmt: skip
-    if data.learning:
-        yield FigureSpec(
-            "learning_curve", "kriging", "How many samples are needed",
-            "Mean absolute error against the number of samples given.",
-            partial(learning_curves, data.learning),
         )  # fmt: skip

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...compare.judge.verdicts import Coverage, coverage_verdict
 from ...maps.grid import PAPER_SPACING_M
-from ..content.maps import JOINT, MapsData, RssMap
+from ..content.maps import JOINT, MapsData
 from .phrases import said_of
 
 LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
@@ -17,15 +17,7 @@ LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
 CAUSES: dict[str, tuple[str, str]] = {
     "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
     "trees": (LEAST + "; trees take most of the rest.", "fly higher, or map `--foliage attenuating` beside it"),
-    "level": (
-        LEAST + "; levels below {threshold:g} dBm take most of the rest.",
-        "raise the transmit power, or lower `--threshold-dbm`",
-    ),
     "blocked": (LEAST + "; buildings and terrain take most of the rest.", "fly higher, or add a tower"),
-    "threshold": (
-        "No position reaches {threshold:g} dBm at {where}, though paths arrive at {reached:.1f} % of them.",
-        "raise the transmit power, or lower `--threshold-dbm`",
-    ),
     "no path": ("No path arrives at any position at {where}.", "check the towers and the area of the site"),
     "extrapolated": (
         LEAST + ". {outside:.0f} % of the positions lie outside the flown places: there the correction is a guess.",
@@ -44,9 +36,7 @@ def first_words(data: MapsData) -> str:
         coverage_verdict(heights),
         CAUSES,
         percent=100.0 * worst.covered,
-        reached=100.0 * worst.reached,
         outside=100.0 * worst.outside,
-        threshold=float(data.settings.get("threshold_dbm", -np.inf)),
     )
     best = max(heights, key=lambda height: height.covered)
     more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
@@ -67,18 +57,11 @@ def coverage(data: MapsData) -> list[Coverage]:
             height_m=item.altitude_m,
             covered=item.coverage,
             clear=clear.get(item.altitude_m, np.nan),
-            reached=_reached(data, item),
             outside=data.outside_flown,
         )
         for item in same_link
         if item.foliage == first.foliage
     ]
-
-
-def _reached(data: MapsData, levels: RssMap) -> float:
-    """Share of positions that any path reaches: those with a rank."""
-    share = [1.0 - m.share[0] for m in data.rank if (m.altitude_m, m.foliage) == (levels.altitude_m, levels.foliage)]
-    return float(share[0]) if share else np.nan
 
 
 def warnings(data: MapsData) -> list[str]:
@@ -111,9 +94,8 @@ def _made(data: MapsData) -> Iterator[str]:
         "takes ITU-R P.833 over the path's length in crowns; none leaves the trees out."
     )
     yield "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element."
-    threshold = f", in maps of RSS above {s['threshold_dbm']:g} dBm" if np.isfinite(s["threshold_dbm"]) else ""
     yield (
         "No receiver bandwidth is assumed: a link is in coverage where a path arrives above the thermal noise of 1 Hz "
-        f"(-174 dBm){threshold}."
+        "(-174 dBm)."
     )
     yield f"Spread, condition number, correlation and interpolation are those of foliage {data.rss[0].foliage}."

@@ -17,10 +17,12 @@ import ipaddress
 import json
 import re
 import secrets
+import selectors
 import socket
 import threading
 import time
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -36,6 +38,8 @@ DEFAULT = "127.0.0.1:8765"
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
 # Bytes handed to a browser's socket at once: each piece has its own time limit, so a slow link is no dead one.
 _PIECE = 16_384
+# Connections that wait for their request, of all addresses.
+_MOST_WAITING = 256
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,9 +62,10 @@ class Limits:
     Parameters
     ----------
     connections : int
-        Open at once, of browsers with the token and of others each. The oldest of the others gives way to a new one.
+        Open at once, of browsers with the token and of others each. Of the others, the oldest of the address that has
+        most gives way to a new one.
     per_second, burst : float
-        New connections, on average and at once; more wait their turn, so that none keeps others out.
+        Answers to an address without the token, on average and at once; beyond, its connections are closed.
     request_s : float
         Longest time between a connection and the end of its request [s].
     send_s : float
@@ -146,7 +151,7 @@ class WebServer:
             raise _refused(address, error) from None
         self.address = Address(address.host, self._server.server_address[1])
         self._threads = [
-            threading.Thread(target=self._server.serve_forever, args=(0.5,), name="tap-web", daemon=True),
+            threading.Thread(target=self._server.serve, name="tap-web", daemon=True),
             threading.Thread(target=self._digest, name="tap-web-feed", daemon=True),
         ]
 
@@ -174,7 +179,8 @@ class WebServer:
         until = time.monotonic() + wait_s
         while self._server.streams and time.monotonic() < until:
             time.sleep(0.02)
-        self._server.shutdown()
+        self._server.ended = True
+        self._threads[0].join()
         self._server.server_close()
         self._server.close_all()
 
@@ -185,19 +191,42 @@ class WebServer:
             time.sleep(self.limits.tick_s)
 
 
+@dataclass(slots=True)
+class _Guest:
+    """A connection: its address, since when it is there (for ever once let in), whether it seems to have the token."""
+
+    address: Any
+    since: float
+    known: bool = False
+
+
+def _crowding(guests: Mapping[socket.socket, _Guest]) -> socket.socket:
+    """The oldest connection of the address that has most."""
+    most = Counter(guest.address[0] for guest in guests.values()).most_common(1)[0][0]
+    return next(request for request, guest in guests.items() if guest.address[0] == most)
+
+
 class _Server(ThreadingHTTPServer):
-    """Threads for connections, their number and their rate bounded."""
+    """Threads for connections, their number and their rate bounded for each address.
+
+    A connection waits in one loop, without a thread, until its request is there. One with the token is answered; the
+    others of an address have an allowance, and what is beyond it is closed without an answer. So a flood, of another
+    computer or of pictures in another page of the same browser, keeps itself out and nobody else.
+    """
 
     daemon_threads = True
     block_on_close = False
-    request_queue_size = 32
+    request_queue_size = 128
 
     def __init__(self, web: WebServer) -> None:
         self.web = web
         self.streams = 0
+        self.ended = False
         self._lock = threading.Lock()
-        self._open: dict[socket.socket, float] = {}
-        self._allowance, self._counted = web.limits.burst, time.monotonic()
+        self._secrets = quote(web.token).encode(), web.pass_word.encode()
+        self._waiting: dict[socket.socket, _Guest] = {}
+        self._open: dict[socket.socket, _Guest] = {}
+        self._allowances: dict[str, tuple[float, float]] = {}
         self.address_family = socket.AF_INET6 if ":" in web.address.host else socket.AF_INET
         super().__init__((web.address.host, web.address.port), _Handler)
 
@@ -207,21 +236,76 @@ class _Server(ThreadingHTTPServer):
         self.socket.bind(self.server_address)
         self.server_address = self.socket.getsockname()
 
-    def verify_request(self, request: Any, client_address: Any) -> bool:  # noqa: ARG002
-        """Let a connection wait its turn, then make room for it: the oldest that showed no token gives way."""
-        limits = self.web.limits
-        now = time.monotonic()
-        self._allowance = min(limits.burst, self._allowance + (now - self._counted) * limits.per_second) - 1.0
-        self._counted = now
-        time.sleep(max(0.0, -self._allowance / limits.per_second))
+    def serve(self) -> None:
+        """Accept connections and hand them on when their request is there, until ``ended``."""
+        self.socket.setblocking(False)
+        with selectors.DefaultSelector() as ready:
+            ready.register(self.socket, selectors.EVENT_READ)
+            while not self.ended:
+                for key, _ in ready.select(self.web.limits.tick_s):
+                    if key.fileobj is self.socket:
+                        self._accept(ready)
+                    elif (guest := self._leave(key.fileobj, ready)) is not None:
+                        self._answer(key.fileobj, guest)
+                oldest, limit = next(iter(self._waiting.items()), None), time.monotonic() - self.web.limits.request_s
+                if oldest is not None and oldest[1].since < limit and self._leave(oldest[0], ready):
+                    oldest[0].close()
+        for request in self._waiting:
+            request.close()
+
+    def _accept(self, ready: selectors.BaseSelector) -> None:
+        """Let a connection wait for its request; of too many the oldest of the most frequent address goes."""
+        try:
+            request, address = self.socket.accept()
+        except OSError:  # gone again, or too many files are open
+            time.sleep(0.01)
+            return
+        request.setblocking(False)
+        self._waiting[request] = _Guest(address, time.monotonic())
+        ready.register(request, selectors.EVENT_READ)
+        if len(self._waiting) > _MOST_WAITING:
+            crowding = _crowding(self._waiting)
+            self._leave(crowding, ready)
+            crowding.close()
+
+    def _leave(self, request: Any, ready: selectors.BaseSelector) -> _Guest | None:
+        """End the wait of a connection."""
+        guest = self._waiting.pop(request, None)
+        if guest is not None:
+            ready.unregister(request)
+        return guest
+
+    def _answer(self, request: socket.socket, guest: _Guest) -> None:
+        """Start the thread of a request, if it shows the token or its address has allowance left."""
+        head = b""
+        with contextlib.suppress(OSError):
+            head = request.recv(_PIECE, socket.MSG_PEEK)
+        guest.known = any(secret in head for secret in self._secrets)  # the handler looks closely
+        if not head or not (guest.known or self._allowed(guest.address[0])):
+            request.close()
+            return
+        request.setblocking(True)
         with self._lock:
-            unknown = [other for other, since in self._open.items() if since < float("inf")]
-            gives_way = unknown[: len(unknown) + 1 - limits.connections]
+            self._open[request] = guest
+            others = {other: known for other, known in self._open.items() if not known.known}
+            gives_way = [_crowding(others)] if len(others) > self.web.limits.connections else []
             for other in gives_way:
                 del self._open[other]
-            self._open[request] = time.monotonic()
         self._end(gives_way)
-        return True
+        try:
+            self.process_request(request, guest.address)
+        except RuntimeError:  # no further thread can be had
+            self.shutdown_request(request)
+
+    def _allowed(self, host: str) -> bool:
+        """Check whether an address may have one more answer without the token."""
+        limits, now = self.web.limits, time.monotonic()
+        if len(self._allowances) > _MOST_WAITING:
+            self._allowances.clear()
+        left, counted = self._allowances.get(host, (limits.burst, now))
+        left = min(limits.burst, left + (now - counted) * limits.per_second)
+        self._allowances[host] = left - float(left >= 1.0), now
+        return left >= 1.0
 
     def shutdown_request(self, request: Any) -> None:
         """Forget the connection, then close it."""
@@ -243,22 +327,22 @@ class _Server(ThreadingHTTPServer):
     def let_in(self, request: Any) -> bool:
         """Lift the time limit of a connection that showed the token; False where too many of these are open."""
         with self._lock:
-            known = sum(since == float("inf") for since in self._open.values())
-            if known >= self.web.limits.connections:
+            known = sum(guest.since == float("inf") for guest in self._open.values())
+            if known >= self.web.limits.connections or request not in self._open:
                 return False
-            self._open[request] = float("inf")
+            self._open[request] = _Guest(self._open[request].address, float("inf"), known=True)
             return True
 
     def end_late_requests(self) -> None:
         """End connections whose request does not come to an end, a byte at a time or not at all."""
         limit = time.monotonic() - self.web.limits.request_s
-        self._end([request for request, since in list(self._open.items()) if since < limit])
+        self._end([request for request, guest in list(self._open.items()) if guest.since < limit])
 
     def close_all(self) -> None:
         """End every connection."""
         self._end(list(self._open))
 
-    def _end(self, requests: list[socket.socket]) -> None:
+    def _end(self, requests: Iterable[socket.socket]) -> None:
         for request in requests:
             with contextlib.suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)

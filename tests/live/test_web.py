@@ -228,6 +228,31 @@ def test_pictures_of_another_page_do_not_keep_the_pilot_out(tools):
         assert browser.connections == 1
 
 
+def test_a_flood_of_an_address_keeps_neither_others_out_nor_who_has_the_token(tools):
+    """An allowance that never comes back, used up by one address, which also fills all places that wait."""
+    limits = Limits(connections=4, per_second=1e-9, burst=6)
+    with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", 0), limits=limits) as web:
+
+        def answer(source, text):
+            with socket.create_connection(("127.0.0.1", web.address.port), 10, (source, 0)) as link:
+                link.sendall(f"GET {text} HTTP/1.0\r\nHost: 127.0.0.1\r\n\r\n".encode())
+                with contextlib.suppress(ConnectionResetError):
+                    return link.makefile("rb").readline()[9:12].decode()
+                return ""
+
+        hostile = [answer("127.0.0.2", "/?x") for _ in range(40)]
+        assert hostile == ["403"] * 6 + [""] * 34
+        places = ("127.0.0.1", web.address.port)
+        silent = [socket.create_connection(places, 10, ("127.0.0.2", 0)) for _ in range(300)]
+        until(lambda: len(web._server._waiting) == 256, 10.0)
+        assert answer("127.0.0.2", "/?x") == ""
+        for source in ("127.0.0.3", "127.0.0.2"):
+            assert answer(source, f"/?token={web.token}") == "200"
+        assert answer("127.0.0.3", "/?x") == "403"  # its own allowance is untouched
+        for link in silent:
+            link.close()
+
+
 def test_browsers_with_the_token_are_bounded(tools):
     with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", 0), limits=Limits(connections=2)) as web:
         browsers = [tools.Browser.of(web) for _ in range(2)]

@@ -22,10 +22,9 @@ import signal
 import sys
 
 from .common import interrupts, terminal
+from .common.interrupts import SIGNALLED
 
 INTERNAL_ERROR = 70
-# Plus the number of the signal.
-SIGNALLED = 128
 OUTPUT_FAULT = 3
 BROKEN_PIPE = 141
 # Set by a shell that asks what may follow on the line.
@@ -206,11 +205,10 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _interrupted(interrupt: KeyboardInterrupt) -> int:
     """Tell what is kept; 128 and the number of the signal."""
-    by = interrupts.last()
-    word = "interrupted" if by == signal.SIGINT else f"ended by {by.name}"
     from .common.errors import one_line
 
-    print(one_line("; ".join([f"aerpaw-cmp: {word}", *_notes(interrupt)])), file=sys.stderr)
+    by = interrupts.last()
+    print(one_line("; ".join([f"aerpaw-cmp: {interrupts.said(by)}", *_notes(interrupt)])), file=sys.stderr)
     return SIGNALLED + by
 
 

@@ -5,11 +5,15 @@ a finaliser, in the callback of a weak reference ("Exception ignored in ..."); b
 body becomes a RuntimeError. A command notes that it came, looks again before each stage and before an output takes its
 name, and holds it back for the moments in which a half-done step would be told wrongly.
 
+A call of compiled code (LLVM, linear algebra, Sionna) may last for minutes, and Python hears nothing before it returns:
+then a second thread ends the process in its place.
+
 SIGTERM is what scancel, systemd and docker send, SIGHUP what a closed terminal does: both end a command as Ctrl-C does.
 """
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -24,8 +28,14 @@ if TYPE_CHECKING:
 # What ends a command in order.
 SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
 
+# Plus the number of the signal: the exit code.
+SIGNALLED = 128
+
 # Undone when :func:`noted` ends: hidden places whose owner an interrupt did not let finish its first step.
 AT_END: list[Callable[[], None]] = []
+
+# How long compiled code may go on after a signal: half of the second within which a command should end.
+PATIENCE_S = 0.5
 
 _signalled = False
 _last: int = signal.SIGINT
@@ -72,15 +82,15 @@ def noted() -> Iterator[None]:
     # Python shows a traceback of what it swallows: this one is not lost
     sys.unraisablehook = lambda what: None if what.exc_type is KeyboardInterrupt else previous(what)
     try:
-        yield
+        with _watched():
+            yield
     except Exception as error:
         if not _signalled:
             raise
         raise KeyboardInterrupt from error
     finally:
         _set(SIGNALS, signal.SIG_IGN, _note)
-        while AT_END:
-            AT_END.pop()()
+        _clear()
         _signalled = False
         sys.unraisablehook = previous
         for number, before in ours:
@@ -102,6 +112,42 @@ def _note(number: int, _frame: FrameType | None) -> None:
     global _signalled, _last
     _signalled, _last = True, number
     raise KeyboardInterrupt
+
+
+def _clear() -> None:
+    while AT_END:
+        AT_END.pop()()
+
+
+@contextmanager
+def _watched() -> Iterator[None]:
+    """Let a second thread look after signals that the first one does not hear."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    before = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
+    ended = threading.Event()
+    threading.Thread(target=_watch, args=(read, ended), daemon=True).start()
+    try:
+        yield
+    finally:
+        ended.set()
+        signal.set_wakeup_fd(before)
+        os.close(write)
+
+
+def _watch(signals: int, ended: threading.Event) -> None:
+    """End the process where a signal came, nobody holds it back, and Python could not run its handler for a while."""
+    while number := os.read(signals, 1):
+        if not ended.wait(PATIENCE_S) and not _signalled and signal.getsignal(number[0]) is _note:
+            _clear()
+            os.write(2, f"aerpaw-cmp: {said(number[0])} in a long calculation; its output was not written\n".encode())
+            os._exit(SIGNALLED + number[0])
+    os.close(signals)
+
+
+def said(number: int) -> str:
+    """How a message calls the end by a signal."""
+    return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
 
 
 @contextmanager

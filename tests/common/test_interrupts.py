@@ -143,6 +143,35 @@ def test_each_signal_is_told_and_ends_with_its_code(name, code, monkeypatch, cap
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
 
 
+# A signal comes during a call of compiled code that lasts ten minutes; ``held`` lets the one of a second go on.
+LONG_CALL = """
+import contextlib, hashlib, os, signal, sys, threading
+from pathlib import Path
+from aerpaw_cmp.common import interrupts
+from aerpaw_cmp.common.outputs import OutputFile
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+rounds, hold = int(sys.argv[1]), interrupts.held if sys.argv[2] == "held" else contextlib.nullcontext
+threading.Timer(0.1, os.kill, [os.getpid(), signal.SIGTERM]).start()
+with interrupts.noted(), OutputFile(Path("out"), own=lambda _: True), hold():
+    hashlib.pbkdf2_hmac("sha256", b"", b"", rounds)
+    print("not interrupted", flush=True)
+"""
+
+
+@pytest.mark.parametrize(("rounds", "how"), [(10**9, "plain"), (2 * 10**6, "held")])
+def test_a_signal_is_heard_in_the_middle_of_compiled_code(rounds, how, tmp_path):
+    words = [sys.executable, "-c", LONG_CALL, str(rounds), how]
+    run = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, timeout=300, check=False)
+    if how == "plain":
+        assert (run.returncode, run.stdout) == (128 + signal.SIGTERM, "")
+        assert run.stderr == "aerpaw-cmp: ended by SIGTERM in a long calculation; its output was not written\n"
+    else:
+        assert run.stdout == "not interrupted\n"
+        assert "KeyboardInterrupt" in run.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.parametrize("kind", ["file", "folder"])
 def test_an_interrupt_while_the_hidden_place_is_made_leaves_none(tmp_path, kind, monkeypatch, capsys):
     plain = outputs._lock

@@ -60,6 +60,33 @@ class SiteFrame:
         return latitude, longitude
 
 
+def bearing_deg(vectors: FloatArray) -> FloatArray:
+    """Compass bearing (...) of vectors (..., 2 or more) of east and north: clockwise from north, (-180, 180] deg.
+
+    Examples
+    --------
+    >>> bearing_deg(np.array([[1.0, 0.0], [-1.0, 1.0]])).round(9).tolist()
+    [90.0, -45.0]
+    """
+    return np.asarray(np.degrees(np.arctan2(vectors[..., 0], vectors[..., 1])))
+
+
+def azimuth_rad(vectors: FloatArray) -> FloatArray:
+    """Mathematical azimuth (...) of vectors (..., 2 or more): from the first axis towards the second, (-pi, pi] rad.
+
+    Examples
+    --------
+    >>> np.degrees(azimuth_rad(np.array([[1.0, 0.0], [-1.0, 1.0]]))).round(9).tolist()
+    [0.0, 135.0]
+    """
+    return np.asarray(np.arctan2(vectors[..., 1], vectors[..., 0]))
+
+
+def elevation_rad(vectors: FloatArray) -> FloatArray:
+    """Elevation (...) of vectors (..., 3) above the plane of their first two axes [rad]."""
+    return np.asarray(np.arctan2(vectors[..., 2], np.hypot(vectors[..., 0], vectors[..., 1])))
+
+
 def in_shape(transform: Callable[[Any, Any], Any], x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Coordinates transformed by pyproj, in their common shape; up to 3.7.1 it takes an array of one for a number.
 

@@ -19,7 +19,7 @@ import pandas as pd
 
 from ..common.errors import UsageError
 from ..common.files import inside
-from ..common.geodesy import SiteFrame
+from ..common.geodesy import SiteFrame, bearing_deg
 from ..common.outputs import SUMS, OutputFolder
 from ..common.stages import Progress, silent
 from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
@@ -115,7 +115,7 @@ def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArra
     """
     velocity = trajectory.velocity_at(time_s)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
-    yaw = pd.Series(np.where(speed > 0.1, np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1])), np.nan))
+    yaw = pd.Series(np.where(speed > 0.1, bearing_deg(velocity), np.nan))
     return np.zeros(len(time_s)), -0.6 * speed, yaw.ffill().bfill().fillna(0.0).to_numpy()
 
 

@@ -28,6 +28,7 @@ import numpy as np
 
 from ..common import kml
 from ..common.errors import InputError, parsing
+from ..common.geodesy import bearing_deg
 from ..common.xmlfiles import named, outermost, plain, xml_root
 from . import dictionary
 from .ingest import as_utf8, read_bytes, read_file
@@ -132,11 +133,9 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
 
 def _courses(table: pd.DataFrame) -> pd.Series[float]:
     """Course [deg] from each point to the next that lies elsewhere; the last keeps the one before."""
-    import numpy as np
-
     north = table["latitude_deg"].diff().shift(-1)
     east = table["longitude_deg"].diff().shift(-1) * np.cos(np.radians(table["latitude_deg"]))
-    course = np.degrees(np.arctan2(east, north))
+    course = pd.Series(bearing_deg(np.column_stack([east, north])), index=table.index)
     courses: pd.Series[float] = course.where((north != 0) | (east != 0)).bfill().ffill()
     return courses
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
-from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.common.geodesy import SiteFrame, azimuth_rad, bearing_deg, elevation_rad
 
 ORIGIN = (35.72750947, -78.69595819)
 FRAME = SiteFrame(*ORIGIN)
@@ -49,6 +49,18 @@ def test_one_longitude_for_many_latitudes() -> None:
     east, north = FRAME.to_local([[35.727], [35.728]], [-78.696, -78.697, -78.698])
     assert east.shape == north.shape == (2, 3)
     assert np.diff(north, axis=0) == pytest.approx(np.full((1, 3), 110.95), abs=0.1)
+
+
+def test_bearings_turn_with_the_clock_and_azimuths_against_it() -> None:
+    """A vector made of its bearing has that bearing, and its azimuth is what the bearing lacks to a right angle."""
+    bearing = np.linspace(-179.0, 180.0, 360)
+    turned, up = np.radians(bearing), np.radians(np.linspace(-90.0, 90.0, 360))
+    vectors = 7.0 * np.column_stack([np.cos(up) * np.sin(turned), np.cos(up) * np.cos(turned), np.sin(up)])
+    flat = slice(1, -1)  # straight up and down have no bearing
+    assert bearing_deg(vectors)[flat] == pytest.approx(bearing[flat], abs=1e-9)
+    assert np.exp(1j * azimuth_rad(vectors)[flat]) == pytest.approx(np.exp(1j * (np.pi / 2 - turned[flat])), abs=1e-12)
+    assert elevation_rad(vectors) == pytest.approx(up, abs=1e-12)
+    assert bearing_deg(vectors[7]) == bearing_deg(vectors[:8, :2])[7]
 
 
 def test_what_is_no_place_stays_none() -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...common.errors import InputError
+from ...common.geodesy import azimuth_rad
 from ...common.units import BoolArray, FloatArray, IntArray, spread_out
 from ..gains.direction_gain import GainFit, GainModel, LinkSamples, Term, chosen_fit, fit_gain
 from ..gains.mount import GainOf, MountFit, fit_mounts
@@ -457,7 +458,7 @@ def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, Bo
     """Sectors of azimuth at the tower, with a guard."""
 
     def azimuth(o: Observed) -> FloatArray:
-        return np.degrees(np.arctan2(o.samples.at_tower[:, 1], o.samples.at_tower[:, 0]))
+        return np.degrees(azimuth_rad(o.samples.at_tower))
 
     return _angular(azimuth(scored), azimuth(source), SECTORS, _GUARD_DEG)
 
@@ -503,8 +504,8 @@ def wrong_way(observed: Sequence[Observed]) -> list[Observed]:
     """Control: headings taken with the wrong sign."""
     out = []
     for o in observed:
-        world, body = -o.samples.at_tower, o.samples.at_uav
-        turned = 2.0 * np.arctan2(world[:, 1], world[:, 0]) - np.arctan2(body[:, 1], body[:, 0])
+        body = o.samples.at_uav
+        turned = 2.0 * azimuth_rad(-o.samples.at_tower) - azimuth_rad(body)
         across = np.hypot(body[:, 0], body[:, 1])
         out.append(_with_uav(o, np.stack([across * np.cos(turned), across * np.sin(turned), body[:, 2]], axis=1)))
     return out

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ...common.errors import InputError
+from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.units import FloatArray, IntArray
 from ..gains.direction_gain import LinkSamples
 from ..judge.entries import crps_normal
@@ -380,7 +381,7 @@ def by_degree(predictor: Predictor) -> Predictor:
             return predictor(samples)
         cells = np.zeros(len(samples), dtype=np.int64)
         for ray in (samples.at_tower, samples.at_uav):
-            for angle in (np.arctan2(ray[:, 1], ray[:, 0]), np.arcsin(np.clip(ray[:, 2], -1.0, 1.0))):
+            for angle in (azimuth_rad(ray), elevation_rad(ray)):
                 cells = 361 * cells + np.round(np.degrees(angle)).astype(np.int64) + 180
         degrees, first, member = np.unique(cells, return_index=True, return_inverse=True)
         keys, values = known.get(samples.antenna, (np.zeros(0, dtype=np.int64), np.zeros((2, 0))))

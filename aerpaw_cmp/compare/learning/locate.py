@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...common.geodesy import elevation_rad
 from ...common.units import BoolArray, FloatArray, unmasked
 
 
@@ -195,7 +196,7 @@ def _features(track: LevelTrack, places: FloatArray, model: LevelModel) -> tuple
     ray = track.position_m[None] - places[:, None]
     across = np.hypot(ray[..., 0], ray[..., 1])
     decades = np.log10(np.maximum(np.hypot(across, ray[..., 2]), 1.0) / 100.0)
-    elevation = np.arctan2(ray[..., 2], across)
+    elevation = elevation_rad(ray)
     columns = [
         np.full(across.shape, _FREE_DB),
         -10.0 * model.slope_sd * decades,

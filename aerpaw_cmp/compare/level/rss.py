@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
 from ..offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, trimmed_offset
@@ -388,8 +389,8 @@ def link_geometry(
     ray = place - unmasked(tower_m)
     columns = {
         "distance_m": np.linalg.norm(ray, axis=1),
-        "elevation_deg": np.degrees(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))),
-        "azimuth_deg": np.degrees(np.arctan2(ray[:, 0], ray[:, 1])) % 360.0,
+        "elevation_deg": np.degrees(elevation_rad(ray)),
+        "azimuth_deg": bearing_deg(ray) % 360.0,
         "height_m": place[:, 2],
     }
     in_array_frame = ray @ (np.eye(3) if tower_mount is None else tower_mount)
@@ -399,14 +400,13 @@ def link_geometry(
         columns["uav_azimuth_deg"], columns["uav_elevation_deg"] = _direction_deg(
             body @ (np.eye(3) if uav_mount is None else uav_mount)
         )
-        columns["heading_deg"] = np.degrees(np.arctan2(rotation[:, 0, 0], rotation[:, 1, 0])) % 360.0
+        columns["heading_deg"] = bearing_deg(rotation[:, :, 0]) % 360.0
     return columns
 
 
 def _direction_deg(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Azimuth from x towards y and elevation above the x-y plane [deg]."""
-    flat = np.hypot(vector[:, 0], vector[:, 1])
-    return np.degrees(np.arctan2(vector[:, 1], vector[:, 0])), np.degrees(np.arctan2(vector[:, 2], flat))
+    return np.degrees(azimuth_rad(vector)), np.degrees(elevation_rad(vector))
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...common.errors import InputError
+from ...common.geodesy import azimuth_rad
 from ...common.units import FloatArray, IntArray, unmasked
 from ..rank import MAX_RANK, cohen_kappa, one_hot
 from ..statistics.intervals import REPLICATES, autocorrelation, bootstrap_means, interval
@@ -118,9 +119,8 @@ def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8)
 
     Sectors left out are directions that the fit never saw; neighbouring samples in time mostly share one.
     """
-    ray = position_m[:, :2] - np.asarray(tower_m)[:2]
     # cut where the tower has seen nothing, so that the seam splits no sector
-    azimuth = np.arctan2(ray[:, 1], ray[:, 0])
+    azimuth = azimuth_rad(position_m[:, :2] - np.asarray(tower_m)[:2])
     order = np.sort(azimuth)
     gap = np.diff(np.append(order, order[0] + 2.0 * np.pi))
     turned = (azimuth - order[(np.argmax(gap) + 1) % len(order)]) % (2.0 * np.pi)

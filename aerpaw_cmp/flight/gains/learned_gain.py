@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.units import FloatArray
 from ...propagation.geometry.arrays import Array, Link, Poses
 from ...site.antenna.sphere_pattern import SpherePattern
@@ -77,8 +78,7 @@ def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tupl
 
 def sphere_angles(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Zenith angle and azimuth (...,) [rad] of directions (..., 3)."""
-    x, y, z = np.moveaxis(direction, -1, 0)
-    return np.asarray(np.arctan2(np.hypot(x, y), z)), np.asarray(np.arctan2(y, x))
+    return 0.5 * np.pi - elevation_rad(direction), azimuth_rad(direction)
 
 
 def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | float:

@@ -14,6 +14,7 @@ import shapely.affinity
 from shapely.ops import substring
 
 from ...common.errors import UsageError
+from ...common.geodesy import bearing_deg
 from ...common.units import FloatArray, spread_out
 from .track import interpolated
 
@@ -226,7 +227,7 @@ def waypoints_of(legs: Sequence[FloatArray], area: Any, height_m: float, nose: N
     out: list[Waypoint] = []
     for (place, number), (following, _) in pairwise([*corners, corners[-1]]):
         step = following - place
-        course = math.degrees(math.atan2(step[0], step[1])) if step.any() else (out[-1].yaw_deg if out else 0.0)
+        course = float(bearing_deg(step)) if step.any() else (out[-1].yaw_deg if out else 0.0)
         yaw = {"along": course, "fixed": 0.0, "four headings": course + 90.0 * (number % 4)}[nose]
         if not step.any() and out:
             yaw = out[-1].yaw_deg

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...common.geodesy import SiteFrame
+from ...common.geodesy import SiteFrame, bearing_deg
 from ...common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ...propagation.geometry.arrays import rotation_from_aircraft
 from .heights import Ground, raised
@@ -174,7 +174,7 @@ class TrackPoses:
     @property
     def heading_deg(self) -> FloatArray:
         """Heading of the nose, clockwise from north, [0, 360) deg."""
-        return np.asarray(np.degrees(np.arctan2(self.rotation[:, 0, 0], self.rotation[:, 1, 0])) % 360.0)
+        return np.asarray(bearing_deg(self.rotation[:, :, 0]) % 360.0)
 
 
 def nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
@@ -463,8 +463,7 @@ class Track:
     def _course_at(self, t: FloatArray) -> FloatArray:
         """Course over ground [deg], interpolated as a direction."""
         angle = np.radians(self._course_deg)
-        mixed = interpolated(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)]))
-        return np.asarray(np.degrees(np.arctan2(mixed[:, 0], mixed[:, 1])))
+        return bearing_deg(interpolated(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)])))
 
 
 def interpolated(t: FloatArray, at: FloatArray, values: FloatArray) -> FloatArray:
@@ -512,7 +511,7 @@ def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> Floa
 
 def _courses(velocity: FloatArray) -> FloatArray:
     """Course over ground [deg clockwise from north]; at rest the last one holds (before the first: the first)."""
-    course = np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1]))
+    course = bearing_deg(velocity)
     moving = np.flatnonzero(np.hypot(velocity[:, 0], velocity[:, 1]) >= _COURSE_SPEED_MPS)
     if not len(moving):
         return np.zeros(len(velocity))

@@ -11,6 +11,7 @@ import pandas as pd
 
 from ...common.errors import UsageError, parsing
 from ...common.files import LARGEST_TABLE, read_bounded
+from ...common.geodesy import bearing_deg
 from ...common.provenance import KEY, MARKS
 from ...common.units import FloatArray, IntArray
 from ...compare.learning.calibration import Observed
@@ -105,8 +106,7 @@ def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
 
 def _rank_score(samples: RankSamples, part: pd.DataFrame) -> ForecastScore | None:
     """Score of predicted probabilities; the constant forecast beside it is their mean over the predicted points."""
-    nose = samples.poses.rotation[:, :, 0]
-    heading_deg = np.degrees(np.arctan2(nose[:, 0], nose[:, 1]))
+    heading_deg = bearing_deg(samples.poses.rotation[:, :, 0])
     index, near = _nearest(samples.poses.position_m, heading_deg, part)
     if near.sum() < FEWEST:
         return None

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ...common.errors import InputError, UsageError
+from ...common.geodesy import azimuth_rad
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples
@@ -125,8 +126,7 @@ class Source:
     def replayed_db(self, samples: LinkSamples) -> FloatArray:
         """Replayed level above free space (n,) of a level aircraft [dB]; NaN without a path."""
         link = self.link.build([self.tower], self.folder)
-        body, world = samples.at_uav, -samples.at_tower
-        turn = np.arctan2(world[:, 1], world[:, 0]) - np.arctan2(body[:, 1], body[:, 0])
+        turn = azimuth_rad(-samples.at_tower) - azimuth_rad(samples.at_uav)
         flat = np.zeros(len(turn))
         known = self.rt.attitude != "ignored"
         rotation = rotation_from_aircraft(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)

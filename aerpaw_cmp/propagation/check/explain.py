@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from ...common.geodesy import bearing_deg, elevation_rad
 from ...common.jsonable import fields_of, json_safe
 from ...common.units import (
     SPEED_OF_LIGHT_MPS,
@@ -191,10 +192,10 @@ def _explained(
         segments_m=tuple(lengths.tolist()),
         length_m=float(lengths.sum()),
         delay_ns=1e9 * float(lengths.sum()) / SPEED_OF_LIGHT_MPS,
-        departure_azimuth_deg=_azimuth_deg(departure),
-        departure_elevation_deg=_elevation_deg(departure),
-        arrival_azimuth_deg=_azimuth_deg(arrival),
-        arrival_elevation_deg=_elevation_deg(arrival),
+        departure_azimuth_deg=float(bearing_deg(departure) % 360.0),
+        departure_elevation_deg=float(np.degrees(elevation_rad(departure))),
+        arrival_azimuth_deg=float(bearing_deg(arrival) % 360.0),
+        arrival_elevation_deg=float(np.degrees(elevation_rad(arrival))),
         terms_db=terms,
         level_dbm=link.transmit_power_dbm + sum(terms.values()),
         phase_deg=float(np.degrees(np.arctan2(field[0, 1], field[0, 0]))),
@@ -219,14 +220,6 @@ def _bounce(faces: Faces, face: int, point: FloatArray, leg: FloatArray, link: L
         tm_db=float(db_from_amplitude(abs(tm))),
         loss_db=-loss_db,
     )
-
-
-def _azimuth_deg(leg: FloatArray) -> float:
-    return float(np.degrees(np.arctan2(leg[0], leg[1])) % 360.0)
-
-
-def _elevation_deg(leg: FloatArray) -> float:
-    return float(np.degrees(np.arctan2(leg[2], np.hypot(leg[0], leg[1]))))
 
 
 def power_sum_dbm(paths: tuple[ExplainedPath, ...]) -> float:

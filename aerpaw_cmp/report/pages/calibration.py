@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.jsonable import json_object, named
 from ...compare.learning.calibration import BASELINES
 from ..content.calibration import AntennaMap, CalibrationData
@@ -74,8 +75,7 @@ def draw_antenna(antenna: AntennaMap) -> Figure:
         fig.colorbar(mesh, ax=ax, label=label, pad=0.01)
         ax.set_ylabel("elevation [deg]")
         ax.set_yticks([-90, -45, 0, 45, 90])
-    at = np.degrees(np.arctan2(antenna.flown[:, 1], antenna.flown[:, 0])) % 360.0
-    up = np.degrees(np.arcsin(np.clip(antenna.flown[:, 2], -1, 1)))
+    at, up = np.degrees(azimuth_rad(antenna.flown)) % 360.0, np.degrees(elevation_rad(antenna.flown))
     for ax, colour in zip(axes, ("black", "white"), strict=True):
         ax.plot(at, up, ".", markersize=1.5, color=colour, alpha=0.6, label="flown")
     axes[1].set_xlabel("azimuth, counter-clockwise from forward or east [deg]")

@@ -10,6 +10,7 @@ from functools import cached_property
 import numpy as np
 
 from ...common.gaussian import Factor, gaussian_kernel
+from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.units import FloatArray
 
 # Share of the variance by which rounded values may miss the function.
@@ -110,8 +111,7 @@ class PairGain:
 
 
 def _angles(vectors: FloatArray) -> FloatArray:
-    azimuth = np.degrees(np.arctan2(vectors[:, 1], vectors[:, 0])) % 360.0
-    return np.column_stack([azimuth, np.degrees(np.arcsin(np.clip(vectors[:, 2], -1.0, 1.0)))])
+    return np.column_stack([np.degrees(azimuth_rad(vectors)) % 360.0, np.degrees(elevation_rad(vectors))])
 
 
 def _vectors(angles_deg: FloatArray) -> FloatArray:

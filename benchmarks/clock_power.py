@@ -19,9 +19,9 @@ from pathlib import Path
 from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, drafts
+from aerpaw_cmp.flight.memory import load_with_learned
 from aerpaw_cmp.flight.pose.clock import CANNOT_TELL, SHIFTED, ClockEstimate, judge_clock
 from aerpaw_cmp.flight.replay import clock_channels, same_computer
-from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 
@@ -37,7 +37,7 @@ def drafted(path: Path, timezone: str) -> FlightData | None:
             (made,) = drafts(files, Path(folder), DraftOptions(timezone=timezone))
             flight = Path(folder) / "flight.yaml"
             flight.write_text(made.text)
-            settings = load_flight(flight)
+            settings = load_with_learned(flight)
             data = gather(settings, Path(folder), read_logs(settings, Path(folder)))
     except (AerpawCmpError, ValueError):
         return None

@@ -412,10 +412,10 @@ repeatability: {radius_m: 3, heading_within_deg: null}
 
 
 def _flight(path: Path) -> bool:
-    from aerpaw_cmp.flight.settings import load_flight
+    from aerpaw_cmp.flight.memory import load_with_learned
     from aerpaw_cmp.flight.simulate import plan_trajectory
 
-    settings = load_flight(path)
+    settings = load_with_learned(path)
     for link in (settings.link.rss, settings.link.rank, *settings.link.channels.values()):
         link.build(["LW1"], path.parent)
     for log in settings.logs:

@@ -18,9 +18,10 @@ from ..common.yamlfile import parse_yaml
 from ..compare.result import FlightResult
 from ..flight.data import FlightData, gather, load_data, rank_positions
 from ..flight.drafting.draft import draft, flights_by_name
+from ..flight.memory import load_with_learned, with_learned
 from ..flight.overrides import overridden
 from ..flight.replay import FlightReplay, Replayed, replay_flight
-from ..flight.settings import FlightFile, load_flight, with_learned
+from ..flight.settings import FlightFile
 from ..logs.flight_file import is_flight_file
 from ..logs.ingest import ingest
 from ..propagation.geometry.paths import PathSet
@@ -75,7 +76,7 @@ def open_flight(
     drafted = file.is_file() and is_flight_file(file)
     if flight is not None and not drafted:
         raise UsageError("flight=NAME beside a flight.yaml", expected="a flight file of several flights", path=file)
-    settings = _drafted(file, flight) if drafted else load_flight(file)
+    settings = _drafted(file, flight) if drafted else load_with_learned(file)
     data = load_data(overridden(settings, overrides or {}), file.parent, root)
     changed = ("the draft of its flight file",) if drafted else ()
     return Flight(file, data, root, changed=(*changed, *(overrides or ())))

@@ -146,11 +146,11 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
         As :meth:`aerpaw_cmp.flight.simulate.FlightSimulator.run`.
     """
     from ..flight.data import choose_site
-    from ..flight.settings import load_flight
+    from ..flight.memory import load_with_learned
     from ..flight.simulate import FlightSimulator
     from .tasks.manifest import inputs_of_flight
 
-    settings = load_flight(flight)
+    settings = load_with_learned(flight)
     site = choose_site(settings.site, flight.parent)
     simulator = FlightSimulator(settings, site, flight.parent)
     inputs = inputs_of_flight(settings.model_copy(update={"logs": []}), flight)  # the logs are its outputs
@@ -208,8 +208,8 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
     JobOutcome
     """
     from ..flight.data import load_data
+    from ..flight.memory import load_with_learned
     from ..flight.replay import replay_flight
-    from ..flight.settings import load_flight
     from ..report.content.flight_parts import report_data
     from ..report.exports.formats import chosen_formats
     from ..report.exports.tables import metrics as metrics_of
@@ -255,7 +255,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
             extra = {**record.extra_metrics, "against": before.metrics()}
             record = replace(record, against=before, extra_metrics=extra)
         if target is not None:
-            target.write(sealed(recommended_text(load_flight(flight, learned), flight_run.ladder, flight.name)))
+            target.write(sealed(recommended_text(load_with_learned(flight, learned), flight_run.ladder, flight.name)))
         with output.filling() as place:
             written = write_report(
                 record, place, drawn=chosen.figures, style=chosen.style, exports=formats, stages=stages
@@ -266,11 +266,11 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
 
 def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
     """Settings with what the command line says instead, files that they name, folder of the results."""
-    from ..flight.settings import load_flight
+    from ..flight.memory import load_with_learned
     from .tasks.manifest import inputs_of_flight
 
     learned = None if chosen.learned is None else Path(chosen.learned)
-    settings = _overridden(load_flight(flight, learned), chosen.engine, chosen.audit)
+    settings = _overridden(load_with_learned(flight, learned), chosen.engine, chosen.audit)
     inputs = [*inputs_of_flight(settings, flight, options.logs_root), *([] if learned is None else [learned])]
     return settings, inputs, options.out or Path("reports") / settings.flight.name
 
@@ -408,9 +408,9 @@ def run_site_show(
 
     settings, inputs, logs_root = None, inputs_of_site(site or "lake_wheeler"), options.logs_root
     if flight is not None:
-        from ..flight.settings import load_flight
+        from ..flight.memory import load_with_learned
 
-        settings = load_flight(flight)
+        settings = load_with_learned(flight)
         if site is not None:
             file = str(Path(site).resolve()) if Path(site).is_file() else site
             settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})

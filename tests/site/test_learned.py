@@ -17,6 +17,7 @@ from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.outputs import file_digest
 from aerpaw_cmp.flight.drafting.remembered import Nodes, propose, searching_airframe, taught
 from aerpaw_cmp.flight.marks import mark_of
+from aerpaw_cmp.flight.memory import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.site.antenna.learned import (
     Entry,
@@ -90,7 +91,7 @@ def test_a_search_takes_the_antennas_of_other_flights_alone(folder, site, towers
 
 
 def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:
-    settings = load_flight(flight(folder, {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}))
+    settings = load_with_learned(flight(folder, {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}))
     link = settings.link.channels["A"].build(["LW1", "LW2"], Path("/nowhere"))
     ends = [link.tower_arrays["LW1"].patterns[0], link.uav_array.patterns[0]]
     assert all(isinstance(pattern, SpherePattern) for pattern in ends)
@@ -110,10 +111,18 @@ def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:
     ],
 )
 def test_what_does_not_fit_is_left_out_and_said(folder: Path, name: str, carrier_hz: float, said: str) -> None:
-    settings = load_flight(flight(folder, {"uav": name}, carrier_hz))
+    settings = load_with_learned(flight(folder, {"uav": name}, carrier_hz))
     (note,) = settings.flight.notes
     assert said in note
     assert settings.link.channels == {}
+
+
+def test_reading_a_flight_opens_no_table(folder: Path) -> None:
+    """A name that leads nowhere is noticed by the stage that looks for it, not by the settings."""
+    path = flight(folder, {"uav": "nowhere/d12_uav"})
+    assert load_flight(path).flight.notes == []
+    assert load_flight(path).antennas == {"uav": "nowhere/d12_uav"}
+    assert len(load_with_learned(path).flight.notes) == 1
 
 
 OTHER_LOGS = sphere_csv(np.zeros((7, 8)), np.ones((7, 8)), (f"trained_on: {'b' * 64}",)).encode()
@@ -138,7 +147,7 @@ def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: b
         table.unlink()
     else:
         table.write_bytes(content)
-    settings = load_flight(flight(folder, {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}))
+    settings = load_with_learned(flight(folder, {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}))
     (note,) = settings.flight.notes
     assert note.startswith(f"antennas.{end}: ")
     assert said in note
@@ -170,7 +179,7 @@ def test_a_damaged_receiver_is_left_out_and_said(folder: Path, content: bytes | 
     if content is not None:
         (folder_of(folder / "mine.yaml") / "r.json.gz").write_bytes(content)
     path.write_text(path.read_text() + f"rank: {{receiver: {name}}}\n", encoding="utf-8")
-    settings = load_flight(path)
+    settings = load_with_learned(path)
     (note,) = settings.flight.notes
     assert note.startswith("rank.receiver: ")
     assert said in note
@@ -184,7 +193,7 @@ def test_a_damaged_memory_is_one_message(folder: Path, text: str) -> None:
     (folder_of(folder / "mine.yaml") / "learned.yaml").write_text(text)
     with pytest.raises(UsageError):
         read_learned(folder / "mine.yaml")
-    assert load_flight(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
+    assert load_with_learned(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
 
 
 def test_a_memory_of_the_first_format_reads_and_is_written_in_the_second(folder: Path) -> None:
@@ -229,7 +238,7 @@ def test_a_memory_that_names_a_file_of_others_touches_and_shows_none(
     said = capsys.readouterr()
     assert "years of work" not in said.out + said.err
     assert thesis.read_text() == "years of work"
-    assert load_flight(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
+    assert load_with_learned(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
 
 
 def test_an_index_that_leads_elsewhere_is_not_read(folder: Path) -> None:
@@ -317,7 +326,7 @@ def test_learned_antennas_are_found_from_any_working_folder(
     path.write_text(path.read_text() + "rank: {receiver: mine/nr}\n", encoding="utf-8")
     monkeypatch.chdir(folder / where)
     relative = Path(os.path.relpath(path))
-    settings = load_flight(relative)
+    settings = load_with_learned(relative)
     assert settings.flight.notes == []
     link = settings.link.channels["A"].build(["LW1"], relative.parent)
     assert isinstance(link.uav_array.patterns[0], SpherePattern)

@@ -23,6 +23,7 @@ from ...site.siteyaml import load_site
 from ..data import is_ratio, rank_quantity, site_place
 from ..gains.losses import sight_shares
 from ..marks import mark_of
+from ..memory import with_learned
 from ..pose.cross_checks import questions
 from ..pose.grouping import Flight, Span, flights, stream_span
 from ..pose.heights import height_in_name, lacks_height
@@ -30,7 +31,7 @@ from ..pose.hour_shift import clock_trap
 from ..pose.time_origin import Origin, origin_of
 from ..pose.track import interpolated, positions_over_time
 from ..rows.lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
-from ..settings import FlightFile, LogSettings, RssSettings, with_learned
+from ..settings import FlightFile, LogSettings, RssSettings
 from .dry_run import DryRun, dry_run
 from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
 from .remembered import Nodes, Proposal, propose, searching_airframe, taught

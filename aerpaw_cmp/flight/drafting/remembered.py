@@ -19,7 +19,8 @@ from ...site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
 from ..data import FlightData, RssSeries, site_place
 from ..gains.learned_gain import pair_and_sd_db, sphere_angles
 from ..marks import among
-from ..settings import FlightFile, check_logs, with_learned
+from ..memory import check_logs, with_learned
+from ..settings import FlightFile
 from .node import Taught
 
 

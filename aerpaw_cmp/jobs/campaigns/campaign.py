@@ -16,8 +16,9 @@ from ...common.errors import InputError, UsageError
 from ...common.jsonable import named
 from ...common.stages import Stages
 from ...common.yamlfile import StrictModel, load_yaml
+from ...flight.memory import load_with_learned
 from ...flight.overrides import Overrides, overridden
-from ...flight.settings import FlightFile, load_flight
+from ...flight.settings import FlightFile
 from ...report.content.campaign import CampaignData, Failure
 from ..options import DEFAULT, RunOptions
 from ..tasks.workers import open_workers
@@ -172,7 +173,7 @@ def _flight_files(
     for entry in campaign.flights:
         path = folder / entry
         try:
-            flight = load_flight(path)
+            flight = load_with_learned(path)
         except (InputError, UsageError) as error:
             failures.append(Failure(flight=Path(entry).stem, setting="every setting", message=str(error)))
             continue

@@ -23,8 +23,9 @@ from ...compare import offset
 from ...compare.result import FlightResult, RankResult, RssResult
 from ...flight.data import FlightData, RankSeries, RssSeries, gather, read_logs
 from ...flight.marks import among
+from ...flight.memory import load_with_learned
 from ...flight.overrides import Overrides, overridden
-from ...flight.settings import FlightFile, RssSettings, load_flight
+from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import logs_of, series_mark
 from ...report.content.campaign import Failure, FlownRank, FlownTrack, RankRow, RssRow
 from ..reporting.flight_run import run_flight
@@ -93,7 +94,7 @@ def _stamp(path: Path) -> tuple[int, int]:
 
 @lru_cache(maxsize=512)
 def _flight_file(path: Path, _size: int, _mtime_ns: int) -> FlightFile:
-    return load_flight(path)
+    return load_with_learned(path)
 
 
 @lru_cache(maxsize=2)

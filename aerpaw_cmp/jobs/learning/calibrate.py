@@ -25,8 +25,9 @@ from ...compare.learning.correction import BIN_S
 from ...compare.learning.learning_curve import CurvePoint, learning_curve
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ...flight.gains.learned_gain import sphere_angles
+from ...flight.memory import load_with_learned
 from ...flight.rows.lock import LOCK_FLOOR_DB
-from ...flight.settings import AntennaSettings, load_flight, load_pattern
+from ...flight.settings import AntennaSettings, load_pattern
 from ...flight.training import counted_once, flight_logs, marks_of
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ...propagation.geometry.arrays import rotation_from_yaw_pitch_roll
@@ -239,7 +240,7 @@ def _score_further(
     observed: Sequence[Observed],
 ) -> tuple[tuple[Score, ...], list[str]]:
     """Scores of further flights with what was learned, and which of them were learned from."""
-    further = [load_data(load_flight(path), path.parent, logs_root) for path in paths]
+    further = [load_data(load_with_learned(path), path.parent, logs_root) for path in paths]
     distinct, remarks = counted_once([*flights, *further])
     fresh = [data for data in distinct if not any(data is item for item in flights)]
     if not fresh:
@@ -262,7 +263,7 @@ def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None
     out = []
     for name in settings.flights:
         path = folder / name
-        flight = load_flight(path)
+        flight = load_with_learned(path)
         out.append(load_data(flight, path.parent, logs_root))
     names = [data.settings.flight.name for data in out]
     for name in names:

@@ -17,8 +17,9 @@ from ...common.units import MINIMUM_HEIGHT_M, FloatArray, spread_out
 from ...compare.learning.rolling import RouteAhead
 from ...compare.rank import channel_rank
 from ...flight.data import choose_site
+from ...flight.memory import load_with_learned
 from ...flight.replay import replay_poses
-from ...flight.settings import FlightFile, LogSettings, load_flight
+from ...flight.settings import FlightFile, LogSettings
 from ...flight.simulate import planned_poses
 from ...live.follow import TelemetryFollower, TelemetrySample, predict_along
 from ...live.predict import Predict, Prediction
@@ -62,7 +63,7 @@ class LiveTwin:
         telemetry : Path, optional
             The growing log; without it, the first telemetry log of the flight file.
         """
-        settings = load_flight(flight)
+        settings = load_with_learned(flight)
         site = choose_site(settings.site, flight.parent)
         link = settings.link.rank.build([settings.rank.tower], flight.parent)
         k = sorted(settings.rank.k)[len(settings.rank.k) // 2]

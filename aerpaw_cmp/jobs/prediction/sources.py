@@ -20,8 +20,9 @@ from ...compare.learning.correction import BIN_S, Correction, Predictor, between
 from ...flight.data import FlightData, RssSeries, load_data
 from ...flight.drafting.remembered import Remembered, remembered
 from ...flight.gains.learned_gain import pair_db
+from ...flight.memory import load_with_learned
 from ...flight.replay import replay_poses
-from ...flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings, load_flight
+from ...flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings
 from ...propagation.field.baselines import free_space_dbm
 from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
 from ...site.site import Site
@@ -57,7 +58,7 @@ def named_flights(paths: Sequence[Path]) -> list[NamedFlight]:
         text = path.read_text(encoding="utf-8", errors="replace") if is_settings(path) and path.is_file() else ""
         listed = text.startswith("calibration:") or "\ncalibration:" in text
         each = [path.parent / name for name in load_calibration(path).flights] if listed else [path]
-        out += [NamedFlight(file, load_flight(file)) for file in each]
+        out += [NamedFlight(file, load_with_learned(file)) for file in each]
     return out
 
 

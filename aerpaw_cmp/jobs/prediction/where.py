@@ -13,9 +13,10 @@ from ...common.errors import InputError, UsageError, parsing
 from ...common.units import BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples
 from ...flight.data import FAR_M, FlightData, load_data, nearest_m
+from ...flight.memory import load_with_learned
 from ...flight.pose.heights import raised
 from ...flight.pose.track import interpolated
-from ...flight.settings import FlightFile, load_flight
+from ...flight.settings import FlightFile
 from ...flight.simulate import planned_poses
 from ...logs.route import read_route
 from ...maps.grid import Grid
@@ -137,7 +138,7 @@ def flight_of(where: Path) -> FlightFile | None:
     if not is_settings(where) or not where.is_file():
         return None
     text = where.read_text(encoding="utf-8", errors="replace")
-    return load_flight(where) if re.search(r"^flight\s*:", text, re.MULTILINE) else None
+    return load_with_learned(where) if re.search(r"^flight\s*:", text, re.MULTILINE) else None
 
 
 def target_files(where: Path, site: str | None, logs_root: Path | None) -> list[Path]:

@@ -18,8 +18,9 @@ from ...common.stages import Progress, silent
 from ...common.units import FloatArray
 from ...flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
 from ...flight.gains.losses import path_loss, roughness_loss
+from ...flight.memory import load_with_learned
 from ...flight.replay import attitude_rotation, estimate_clocks, replay_poses, telemetry_time, valid_poses
-from ...flight.settings import RtSettings, load_flight
+from ...flight.settings import RtSettings
 from ...propagation.check.explain import (
     ExplainedPath,
     explain_paths,
@@ -107,7 +108,7 @@ def run_explain(
     UsageError
         Unknown tower or channel, a time that is none or lies outside the logs, no pose there.
     """
-    settings = load_flight(flight)
+    settings = load_with_learned(flight)
     data = load_data(settings, flight.parent, logs_root)
     series = _series(data, tower, channel)
     at, seconds = _sample(series, time, settings.timezone)

@@ -18,7 +18,8 @@ from ...common.files import LARGEST_TABLE
 from ...common.inputs import input_files, named_files
 from ...common.outputs import file_digest
 from ...common.provenance import trained_on
-from ...flight.settings import FlightFile, load_flight
+from ...flight.memory import load_with_learned
+from ...flight.settings import FlightFile
 from ...report.content.flight import InputFile
 from ...site.antenna.learned import read_table
 
@@ -76,7 +77,7 @@ def inputs_of_flights(flights: Iterable[Path], logs_root: Path | None = None) ->
     for flight in flights:
         files.append(flight)
         with suppress(AerpawCmpError, OSError):
-            files += inputs_of_flight(load_flight(flight), flight, logs_root)
+            files += inputs_of_flight(load_with_learned(flight), flight, logs_root)
     return files
 
 

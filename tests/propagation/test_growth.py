@@ -9,7 +9,7 @@ from shapely.geometry import box
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.propagation.check.obstacles import why_not_there
+from aerpaw_cmp.propagation.check.explain import why_not
 from aerpaw_cmp.propagation.engine.engines import estimate_search
 from aerpaw_cmp.propagation.geometry.paths import Links
 from aerpaw_cmp.propagation.options import Run, Search
@@ -276,8 +276,21 @@ def test_a_thousand_buildings_are_searched_not_refused(scenes):
     assert (result.paths.depth == 2).sum() > 10
 
 
-def test_what_hides_a_path_is_named_by_other_code(scenes):
-    """Lines of sight and paths of the canyon, asked of every triangle in NumPy."""
+def first_met(surfaces, source, spot):
+    """Label of the first surface on a straight way, by the planes of all triangles; None where there is none."""
+    corner = surfaces.corners_m
+    normal = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    before, after = (((end - corner[:, 0]) * normal).sum(axis=1) for end in (source, spot))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = before / (before - after)
+    rows = np.flatnonzero((share > 0) & (share < 1))
+    rows = rows[enumerate_._inside(corner[rows], normal[rows], source + share[rows, None] * (spot - source))]
+    return surfaces.faces.label[surfaces.face[rows[share[rows].argmin()]]] if len(rows) else None
+
+
+def test_what_hides_a_path_is_named(scenes):
+    """Lines of sight and paths of the canyon."""
     site = scenes.site((), ((-20.0, 0.0, 20.0),), scene=placed_scene(enumerate_.shipped("simple_street_canyon")))
     rng = np.random.default_rng(14)
     spots = np.column_stack([rng.uniform(-60, 60, 40), rng.uniform(-40, 40, 40), rng.uniform(1, 30, 40)])
@@ -285,15 +298,16 @@ def test_what_hides_a_path_is_named_by_other_code(scenes):
     source, none = np.array([-20.0, 0.0, 20.0]), np.zeros(0, dtype=np.int64)
     direct = set(replayed.paths.pose[replayed.paths.depth == 0].tolist())
     for pose, spot in enumerate(spots):
-        reason = why_not_there(replayed.surfaces, source, spot, none)
-        assert (reason == "") == (pose in direct)
-        assert reason == "" or reason.startswith("occluded by mesh-building_")
-    for row in np.flatnonzero(replayed.paths.depth)[:40]:
-        assert (
-            why_not_there(replayed.surfaces, source, spots[replayed.paths.pose[row]], replayed.paths.faces[row]) == ""
+        label = first_met(replayed.surfaces, source, spot)
+        assert (label is None) == (pose in direct)
+        assert why_not(replayed.faces, source, spot, none, replayed.surfaces) == (
+            "" if label is None else f"occluded by {label}"
         )
+    for row in np.flatnonzero(replayed.paths.depth)[:40]:
+        spot, faces = spots[replayed.paths.pose[row]], replayed.paths.faces[row]
+        assert why_not(replayed.faces, source, spot, faces, replayed.surfaces) == ""
     other = np.array([int(replayed.paths.faces[replayed.paths.depth == 1][0, 0])])
-    reasons = {why_not_there(replayed.surfaces, source, spot, other) for spot in spots}
+    reasons = {why_not(replayed.faces, source, spot, other, replayed.surfaces) for spot in spots}
     assert len(reasons) >= 3
 
 

@@ -32,7 +32,6 @@ from ..geometry.paths import Faces, PathSet, Surfaces
 from ..replay import Replay
 from ..search.mirror import images_of, scene_tolerance_m, trace_back
 from ..search.occlusion import Occlusion
-from .obstacles import why_not_there
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -251,7 +250,7 @@ def why_not(
         The first reason that was met.
     """
     if surfaces is not None:
-        return why_not_there(surfaces, source_m, target_m, sequence)
+        return _why_not_there(surfaces, source_m, target_m, sequence)
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
     images = images_of(faces, sequence[None], source_m[None])
@@ -273,6 +272,25 @@ def why_not(
     if Occlusion(faces, tolerance).segments(corners[:-1], corners[1:]).any():
         return "occluded by buildings that touch"
     return ""
+
+
+def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:
+    """As :func:`why_not` of a scene of triangles, by the rules of its search."""
+    from ..search.beams import EDGE_M, obstacle, reflection_points  # compiled: loaded where there is a scene
+
+    sequence = sequence[sequence >= 0]
+    points = np.zeros((0, 3))
+    if len(sequence):
+        ends = source_m[None], target_m[None]
+        _, _, ahead = reflection_points(surfaces, sequence[None], *ends, edge_m=1e9)
+        if not ahead[0]:
+            return "the ends of a reflection lie on two sides of its face"
+        _, vertices, good = reflection_points(surfaces, sequence[None], *ends, edge_m=EDGE_M)
+        if not good[0]:
+            return f"a reflection point lies outside {surfaces.faces.label[int(sequence[0])]} or a later face"
+        points = vertices[0]
+    face = obstacle(surfaces, np.concatenate([source_m[None], points, target_m[None]]), sequence)
+    return "" if face is None else f"occluded by {surfaces.faces.label[face]}"
 
 
 def _prisms_only(faces: Faces) -> bool:

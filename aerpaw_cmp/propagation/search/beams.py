@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -440,14 +441,35 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
     node, waiting = next_leaf(lower, upper, child, todo, 1, box_missed, (a, inverse))
     while node >= 0:
         for k in range(start[node], start[node] + many[node]):
-            t = _share_to(corners[items[k]], a, way, length, rules.margin)
-            if t <= 0.0 or t >= 1.0:
-                continue
-            hit = a[0] + t * way[0], a[1] + t * way[1], a[2] + t * way[2]
-            if not (_at_end(before, hit, t * length, rules) or _at_end(after, hit, (1.0 - t) * length, rules)):
+            if _cut_at(corners[items[k]], a, way, length, before, after, rules) > 0.0:
                 return True
         node, waiting = next_leaf(lower, upper, child, todo, waiting, box_missed, (a, inverse))
     return False
+
+
+@kernel
+def _first_cut(corners, a, b, before, after, rules):  # type: ignore[no-untyped-def]
+    """Triangle that cuts a segment first, by the rules of :func:`segment_cut`; -1 where none does."""
+    way = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    length = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
+    first, share = -1, 1.0
+    for k in range(len(corners)):
+        t = _cut_at(corners[k], a, way, length, before, after, rules)
+        if 0.0 < t < share:
+            first, share = k, t
+    return first
+
+
+@part
+def _cut_at(corners, a, way, length, before, after, rules):  # type: ignore[no-untyped-def]
+    """Share of the way at which a triangle cuts a segment; -1 where it cuts nothing."""
+    t = _share_to(corners, a, way, length, rules.margin)
+    if t <= 0.0 or t >= 1.0:
+        return -1.0
+    hit = a[0] + t * way[0], a[1] + t * way[1], a[2] + t * way[2]
+    if _at_end(before, hit, t * length, rules) or _at_end(after, hit, (1.0 - t) * length, rules):
+        return -1.0
+    return t
 
 
 @part
@@ -838,6 +860,18 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
     return pose[:total].copy(), faces[:total].copy(), points[:total].copy(), followed
 
 
+def obstacle(surfaces: Surfaces, points_m: FloatArray, sequence: IntArray) -> int | None:
+    """Face that cuts a path (depth + 2, 3) over the faces ``sequence`` first, from the source; None where none does."""
+    rules, antenna = _rules(surfaces, len(sequence), solids=False), (np.zeros(3), 0.0)
+    normal, offset = np.ascontiguousarray(surfaces.faces.normal), surfaces.faces.offset_m
+    ends = [antenna, *((normal[face], float(offset[face])) for face in sequence), antenna]
+    for (a, b), (before, after) in zip(pairwise(points_m), pairwise(ends), strict=True):
+        triangle = _first_cut(surfaces.corners_m, a, b, before, after, rules)
+        if triangle >= 0:
+            return int(surfaces.face[triangle])
+    return None
+
+
 def try_out() -> None:
     """Compile, or read what was compiled before, and ask whether a triangle hides one of two points.
 
@@ -859,6 +893,7 @@ __all__ = [
     "estimate",
     "grow_paths",
     "in_face",
+    "obstacle",
     "reflection_points",
     "segment_cut",
     "try_out",

@@ -412,7 +412,7 @@ repeatability: {radius_m: 3, heading_within_deg: null}
 
 
 def _flight(path: Path) -> bool:
-    from aerpaw_cmp.flight.memory import load_with_learned
+    from aerpaw_cmp.flight.gains.memory import load_with_learned
     from aerpaw_cmp.flight.simulate import plan_trajectory
 
     settings = load_with_learned(path)

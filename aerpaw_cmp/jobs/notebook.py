@@ -18,7 +18,7 @@ from ..common.yamlfile import parse_yaml
 from ..compare.result import FlightResult
 from ..flight.data import FlightData, gather, load_data, rank_positions
 from ..flight.drafting.draft import draft, flights_by_name
-from ..flight.memory import load_with_learned, with_learned
+from ..flight.gains.memory import load_with_learned, with_learned
 from ..flight.overrides import overridden
 from ..flight.replay import FlightReplay, Replayed, replay_flight
 from ..flight.settings import FlightFile

@@ -146,7 +146,7 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
         As :meth:`aerpaw_cmp.flight.simulate.FlightSimulator.run`.
     """
     from ..flight.data import choose_site
-    from ..flight.memory import load_with_learned
+    from ..flight.gains.memory import load_with_learned
     from ..flight.simulate import FlightSimulator
     from .tasks.manifest import inputs_of_flight
 
@@ -208,7 +208,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
     JobOutcome
     """
     from ..flight.data import load_data
-    from ..flight.memory import load_with_learned
+    from ..flight.gains.memory import load_with_learned
     from ..flight.replay import replay_flight
     from ..report.content.flight_parts import report_data
     from ..report.exports.formats import chosen_formats
@@ -266,7 +266,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
 
 def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
     """Settings with what the command line says instead, files that they name, folder of the results."""
-    from ..flight.memory import load_with_learned
+    from ..flight.gains.memory import load_with_learned
     from .tasks.manifest import inputs_of_flight
 
     learned = None if chosen.learned is None else Path(chosen.learned)
@@ -408,7 +408,7 @@ def run_site_show(
 
     settings, inputs, logs_root = None, inputs_of_site(site or "lake_wheeler"), options.logs_root
     if flight is not None:
-        from ..flight.memory import load_with_learned
+        from ..flight.gains.memory import load_with_learned
 
         settings = load_with_learned(flight)
         if site is not None:

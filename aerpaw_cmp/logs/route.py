@@ -106,7 +106,6 @@ _EXPECTED = "a QGroundControl .plan, QGC WPL waypoints, a KML with a line, a CSV
 
 
 def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
-    import numpy as np
     import pandas as pd
 
     if not route.points:
@@ -135,9 +134,9 @@ def _courses(table: pd.DataFrame) -> pd.Series[float]:
     """Course [deg] from each point to the next that lies elsewhere; the last keeps the one before."""
     north = table["latitude_deg"].diff().shift(-1)
     east = table["longitude_deg"].diff().shift(-1) * np.cos(np.radians(table["latitude_deg"]))
-    course = pd.Series(bearing_deg(np.column_stack([east, north])), index=table.index)
-    courses: pd.Series[float] = course.where((north != 0) | (east != 0)).bfill().ffill()
-    return courses
+    moves = ((north != 0) | (east != 0)).to_numpy()
+    courses: pd.Series[float] = table["yaw_deg"].mask(moves, bearing_deg(np.column_stack([east, north])))
+    return courses.where(moves).bfill().ffill()
 
 
 def _log(path: str | Path) -> _Route:

@@ -16,8 +16,8 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.outputs import file_digest
 from aerpaw_cmp.flight.drafting.remembered import Nodes, propose, searching_airframe, taught
+from aerpaw_cmp.flight.gains.memory import load_with_learned
 from aerpaw_cmp.flight.marks import mark_of
-from aerpaw_cmp.flight.memory import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.site.antenna.learned import (
     Entry,

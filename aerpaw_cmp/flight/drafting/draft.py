@@ -22,8 +22,8 @@ from ...site.site import Site
 from ...site.siteyaml import load_site
 from ..data import is_ratio, rank_quantity, site_place
 from ..gains.losses import sight_shares
+from ..gains.memory import with_learned
 from ..marks import mark_of
-from ..memory import with_learned
 from ..pose.cross_checks import questions
 from ..pose.grouping import Flight, Span, flights, stream_span
 from ..pose.heights import height_in_name, lacks_height

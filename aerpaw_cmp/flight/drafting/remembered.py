@@ -18,8 +18,8 @@ from ...site.antenna import learned
 from ...site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
 from ..data import FlightData, RssSeries, site_place
 from ..gains.learned_gain import pair_and_sd_db, sphere_angles
+from ..gains.memory import check_logs, with_learned
 from ..marks import among
-from ..memory import check_logs, with_learned
 from ..settings import FlightFile
 from .node import Taught
 

@@ -16,7 +16,7 @@ from ...common.errors import InputError, UsageError
 from ...common.jsonable import named
 from ...common.stages import Stages
 from ...common.yamlfile import StrictModel, load_yaml
-from ...flight.memory import load_with_learned
+from ...flight.gains.memory import load_with_learned
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile
 from ...report.content.campaign import CampaignData, Failure

@@ -22,8 +22,8 @@ from ...common.versions import utc_now, versions
 from ...compare import offset
 from ...compare.result import FlightResult, RankResult, RssResult
 from ...flight.data import FlightData, RankSeries, RssSeries, gather, read_logs
+from ...flight.gains.memory import load_with_learned
 from ...flight.marks import among
-from ...flight.memory import load_with_learned
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import logs_of, series_mark

@@ -25,7 +25,7 @@ from ...compare.learning.correction import BIN_S
 from ...compare.learning.learning_curve import CurvePoint, learning_curve
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ...flight.gains.learned_gain import sphere_angles
-from ...flight.memory import load_with_learned
+from ...flight.gains.memory import load_with_learned
 from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...flight.settings import AntennaSettings, load_pattern
 from ...flight.training import counted_once, flight_logs, marks_of

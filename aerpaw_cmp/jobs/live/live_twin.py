@@ -17,7 +17,7 @@ from ...common.units import MINIMUM_HEIGHT_M, FloatArray, spread_out
 from ...compare.learning.rolling import RouteAhead
 from ...compare.rank import channel_rank
 from ...flight.data import choose_site
-from ...flight.memory import load_with_learned
+from ...flight.gains.memory import load_with_learned
 from ...flight.replay import replay_poses
 from ...flight.settings import FlightFile, LogSettings
 from ...flight.simulate import planned_poses

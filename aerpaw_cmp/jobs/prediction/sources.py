@@ -20,7 +20,7 @@ from ...compare.learning.correction import BIN_S, Correction, Predictor, between
 from ...flight.data import FlightData, RssSeries, load_data
 from ...flight.drafting.remembered import Remembered, remembered
 from ...flight.gains.learned_gain import pair_db
-from ...flight.memory import load_with_learned
+from ...flight.gains.memory import load_with_learned
 from ...flight.replay import replay_poses
 from ...flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings
 from ...propagation.field.baselines import free_space_dbm

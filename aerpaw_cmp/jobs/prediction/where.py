@@ -13,7 +13,7 @@ from ...common.errors import InputError, UsageError, parsing
 from ...common.units import BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples
 from ...flight.data import FAR_M, FlightData, load_data, nearest_m
-from ...flight.memory import load_with_learned
+from ...flight.gains.memory import load_with_learned
 from ...flight.pose.heights import raised
 from ...flight.pose.track import interpolated
 from ...flight.settings import FlightFile

@@ -18,7 +18,7 @@ from ...common.stages import Progress, silent
 from ...common.units import FloatArray
 from ...flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
 from ...flight.gains.losses import path_loss, roughness_loss
-from ...flight.memory import load_with_learned
+from ...flight.gains.memory import load_with_learned
 from ...flight.replay import attitude_rotation, estimate_clocks, replay_poses, telemetry_time, valid_poses
 from ...flight.settings import RtSettings
 from ...propagation.check.explain import (

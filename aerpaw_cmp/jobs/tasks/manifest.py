@@ -18,7 +18,7 @@ from ...common.files import LARGEST_TABLE
 from ...common.inputs import input_files, named_files
 from ...common.outputs import file_digest
 from ...common.provenance import trained_on
-from ...flight.memory import load_with_learned
+from ...flight.gains.memory import load_with_learned
 from ...flight.settings import FlightFile
 from ...report.content.flight import InputFile
 from ...site.antenna.learned import read_table

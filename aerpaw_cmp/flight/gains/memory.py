@@ -10,10 +10,10 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ..common.errors import InputError, UsageError, parsing
-from ..site.antenna.learned import BAND, Named, find_named, read_table
-from ..site.antenna.sphere_pattern import read_sphere_csv
-from .settings import AntennaSettings, ArraySettings, FlightFile, LinkSettings, load_flight
+from ...common.errors import InputError, UsageError, parsing
+from ...site.antenna.learned import BAND, Named, find_named, read_table
+from ...site.antenna.sphere_pattern import read_sphere_csv
+from ..settings import AntennaSettings, ArraySettings, FlightFile, LinkSettings, load_flight
 
 
 def load_with_learned(path: str | Path, learned: Path | None = None) -> FlightFile:

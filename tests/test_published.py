@@ -16,11 +16,11 @@ import pytest
 
 import aerpaw_cmp
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.compare.judge.entries import LevelSeries
 from aerpaw_cmp.compare.statistics.intervals import bootstrap_means
 from benchmarks.published import __main__ as published
 from benchmarks.published import entrants, tasks
 from benchmarks.published.score import block_of, intervals, rmse_replicates
+from tests.compare.test_entries import LONG, SHORT
 from tests.real_logs import REAL
 
 FOLDER = Path(entrants.__file__).parent
@@ -314,15 +314,6 @@ def test_ranks_by_replay_say_more_than_a_constant(tmp_path: Path) -> None:
 
 
 # --- intervals -----------------------------------------------------------------------------------------------------
-
-RNG = np.random.default_rng(2)
-LONG = LevelSeries(
-    name="long", time_s=np.arange(60) * 2.0, measured_db=RNG.normal(-70, 6, 60), level_db=RNG.normal(-72, 3, 60),
-    sd_db=RNG.uniform(2.0, 9.0, 60),
-)  # fmt: skip
-SHORT = LevelSeries(
-    name="short", time_s=np.arange(25) * 1.5, measured_db=RNG.normal(-60, 4, 25), level_db=np.full(25, -61.0)
-)
 
 
 def test_intervals_are_those_of_blocks_of_twenty_seconds() -> None:

@@ -40,16 +40,7 @@ class DryRun:
 
 
 def dry_run(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) -> DryRun:
-    """Gather a flight as a report does, and count what could be scored.
-
-    Parameters
-    ----------
-    settings : FlightFile
-    folder : Path
-        Of the flight file.
-    files : sequence of IngestedFile
-        In the order of ``settings.logs``.
-    """
+    """Gather a flight as a report does, by :func:`~aerpaw_cmp.flight.data.gather`, and count what could be scored."""
     try:
         data = gather(settings, folder, files)
     except (InputError, UsageError) as error:

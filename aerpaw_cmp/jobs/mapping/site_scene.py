@@ -71,7 +71,7 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
         The site.yaml to write.
     facts : SceneOptions
     force : bool
-        Replace a file that this tool did not write.
+        Replace a site.yaml that this tool did not write.
 
     Returns
     -------

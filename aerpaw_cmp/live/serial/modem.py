@@ -308,12 +308,8 @@ def _decode_rows(lines: Sequence[str], flags: list[str], command: str, names: Se
 
     Parameters
     ----------
-    lines : sequence of str
-        Of the answer.
-    flags : list of str
-        Receives what was odd.
-    command : str
-        Such as ``+QCAINFO``.
+    lines, flags, command
+        As for :func:`_decode_antennas`.
     names : sequence of str
         Of the fields, in order.
 

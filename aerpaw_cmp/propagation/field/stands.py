@@ -77,11 +77,8 @@ def over_stands(site: Site, source_m: FloatArray, vertices_m: FloatArray, target
 
     Parameters
     ----------
-    site : Site
-    source_m, target_m : (paths, 3)
-        Ends [m].
-    vertices_m : (paths, depth, 3)
-        Points of reflection [m]; NaN where unused.
+    site, source_m, vertices_m, target_m
+        As for :func:`stand_loss_db`.
 
     Returns
     -------

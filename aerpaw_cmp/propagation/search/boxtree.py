@@ -235,10 +235,8 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
 
     Parameters
     ----------
-    lower, upper : (nodes, 3)
-        Corners of the boxes of a tree [m].
-    node : int
-        Which box.
+    lower, upper, node
+        As for :func:`box_outside`.
     segment : ((3,), (3,))
         Start [m], and one over each component of its vector [1/m]; 1e300 where that is 0.
 

@@ -247,6 +247,7 @@ def read_pattern_text(path: str | Path, *, polarised: bool = True) -> MeasuredPa
     Returns
     -------
     MeasuredPattern
+        With E_phi and E_theta where ``polarised``.
 
     Raises
     ------

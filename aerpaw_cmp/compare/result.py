@@ -320,6 +320,8 @@ class AuditResult:
     note: str = ""
     fields: FieldAudit | None = None
     """Fields, paths and attitude against Sionna's own coefficients and a second implementation."""
+    read_from_cache_of: str = ""
+    """Day on which this machine made it, where its inputs are those of that day."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -242,7 +242,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
 
                 before = score_against(data, Path(chosen.against))
         replays = replay_flight(data, stages)
-        flight_run = run_flight(data, stages, replays=replays, ladder=True)
+        flight_run = run_flight(data, stages, replays=replays, anew=chosen.audit is not None, ladder=True)
         carriers = {replayed.link.carrier_hz for replayed in replays.all}
         record = report_data(
             data,

@@ -195,6 +195,15 @@ def test_paths_of_the_asked_poses_are_matched_and_those_that_are_lacking_counted
         assert (audit.paths, audit.missing_paths) == (asked - lacking, lacking if complete else 0)
         assert audit.power_max_db < 1e-9
         assert bool(audit.failures) == bool(lacking and complete)
+    calls, known, where = [], {}, "aerpaw_cmp.propagation.search.sionna.own_coefficients"
+    monkeypatch.setattr(where, lambda *a, **k: calls.append(1) or own(*a, **k))
+    for slant in (0.0, 0.35):  # another channel, elsewhere slanted: the answer is the same
+        uav = dataclasses.replace(link.uav_array, slant_rad=link.uav_array.slant_rad + slant)
+        slanted = dataclasses.replace(link, uav_array=uav)
+        replayed, expected = replay(SITE, slanted, poses, search), Expected.of(slanted)
+        audit = against_sionna(SITE, slanted, poses, replayed, chosen, expected, search, complete=complete, known=known)
+        assert (audit.paths, audit.failures) == (asked, ())
+    assert len(calls) == 1
 
 
 def test_a_link_s_error_is_that_of_its_sum_where_all_paths_are_near_and_none_fades() -> None:

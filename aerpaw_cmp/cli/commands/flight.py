@@ -32,7 +32,7 @@ def report(
     logs_root: LogsRoot = None,
     engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: rt.engine]")] = None,
     audit: Annotated[
-        str | None, Option(help="Number of audited links, 'full' or 'none'  [default: rt.audit_links]")
+        str | None, Option(help="Number of audited links, 'full' or 'none'; audits anew  [default: rt.audit_links]")
     ] = None,
     recommend: Annotated[
         Path | None, Option("--recommend", help="Write a flight.yaml with the recommended model.")

@@ -11,6 +11,7 @@ import gzip
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -33,6 +34,7 @@ from ...propagation.geometry.arrays import Poses
 from ...propagation.options import Field, Run, Search
 from ...propagation.search.sionna import free_memory
 from ...site.site import Site
+from .audit_cache import entry_of, read_audit, write_audit
 
 # Logged attitudes that are turned into rotations a second time.
 _ATTITUDE_ROWS = 200
@@ -53,7 +55,9 @@ _NOT_COVERED = (
 )
 
 
-def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progress = silent) -> EngineResult:
+def audit_replays(
+    data: FlightData, replays: Sequence[Replayed], progress: Progress = silent, *, anew: bool = True
+) -> EngineResult:
     """The engine record, with the audit where ``rt.audit_links`` asks for one.
 
     Parameters
@@ -62,6 +66,8 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
     replays : sequence of Replayed
         Of its RSS series, then of its ranks.
     progress : Progress
+    anew : bool
+        Audit even what this machine audited before.
 
     Returns
     -------
@@ -70,7 +76,7 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
     rt, checked, not_audited = data.settings.rt, None, ""
     if rt.audit_links:
         try:
-            checked = _audit(data, replays, progress)
+            checked = _audit_or_read(data, replays, progress, anew=anew)
         except SionnaMissingError as error:  # all else has the same numbers without it
             if rt.engine == "sionna":
                 raise
@@ -90,18 +96,33 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
     )
 
 
+def _audit_or_read(
+    data: FlightData, replays: Sequence[Replayed], progress: Progress, *, anew: bool
+) -> AuditResult | None:
+    """The audit, kept by its inputs; read, unless it is to be made anew, where this machine has it."""
+    if not data.settings.rt.advanced.cache:
+        return _audit(data, replays, progress)
+    entry = entry_of(data, replays)
+    known = None if anew else read_audit(entry)
+    if known is None and (made := _audit(data, replays, progress)) is not None:
+        write_audit(entry, made)
+        return made
+    return known
+
+
 def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:
     """One audit over all series: links are shared out in proportion to their poses."""
     ks = data.settings.rank.k
     total = sum(len(r.poses) for r in replays)
     few = int(np.clip(_REFERENCE_LINKS_AT_MOST // max(len(replays), 1), 3, REFERENCE_LINKS))
     parts: list[Audit] = []
+    known: dict[str, Any] = {}
     for site, replayed, expected in standing(data, replays):
         count = len(replayed.poses)
         links = min(count, max(math.ceil(data.settings.rt.audit_links * count / max(total, 1)), 1))
         if links:
             progress(f"audit {replayed.replay.towers[0]}: {links} links")
-            second = Second(links=links, expected=expected, ks=ks, reference_links=few)
+            second = Second(links=links, expected=expected, ks=ks, reference_links=few, known=known)
             parts.append(_of_series(data.settings.rt, site, replayed, second))
     if not parts:
         return None

@@ -47,6 +47,7 @@ def run_flight(
     *,
     replays: FlightReplay | None = None,
     audit: bool = True,
+    anew: bool = False,
     ladder: bool = False,
 ) -> FlightRun:
     """Clocks, replay, comparison, audit and ladder.
@@ -60,6 +61,8 @@ def run_flight(
         Of this flight, where they were made before (:func:`~aerpaw_cmp.flight.replay.replay_flight`).
     audit : bool
         Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
+    anew : bool
+        Audit even what this machine audited before.
     ladder : bool
         Also score simpler and richer models of the RSS on stretches left out.
 
@@ -74,7 +77,7 @@ def run_flight(
         result = compare_flight(data, replays)
     if audit:
         with stages("audit"):
-            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
+            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress, anew=anew))
     climbed: FlightLadder | None = None
     if ladder:
         with stages("ladder"):

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -108,6 +109,8 @@ class Second:
         Poses that the second implementation computes.
     complete : bool
         Whether the replay claims to have every path.
+    known : dict
+        Sionna's own coefficients by what they depend on: channels with one tower and track share them.
     """
 
     reference: Engine | None = None
@@ -116,6 +119,7 @@ class Second:
     ks: Sequence[float] = RANK_K
     reference_links: int = REFERENCE_LINKS
     complete: bool = True
+    known: dict[str, Any] = field(default_factory=dict)
 
 
 def audit(
@@ -158,7 +162,9 @@ def audit(
         if site.scene is None:
             fields += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
         rayed = replace(search, samples=min(rays, _FIELD_SAMPLES))
-        fields += against_sionna(site, link, poses, replay, chosen, expected, rayed, complete=complete)
+        fields += against_sionna(
+            site, link, poses, replay, chosen, expected, rayed, complete=complete, known=second.known
+        )
     return Audit(
         field=fields,
         engine=replay.engine,

@@ -13,10 +13,11 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
+from ...common.content import content_digest
 from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray
 from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
@@ -25,7 +26,7 @@ from ..edges import EdgePaths
 from ..field.stands import over_stands
 from ..field.sum import Further, channel_matrices
 from ..geometry.arrays import Array, Isotropic, Link, Poses
-from ..geometry.paths import Faces, PathSet, legs
+from ..geometry.paths import Faces, Links, PathSet, legs
 from ..options import Field, Search
 from ..replay import Replay
 from ..scene import Scene
@@ -33,6 +34,9 @@ from ..search.mirror import plane_keys, planes_of
 from ..search.terrain import TERRAIN
 from .bent import bent_matrix
 from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
+
+if TYPE_CHECKING:
+    from ..search.sionna import Coefficients
 
 # Of the strongest of a path's four entries: float32 leaves some 5e-4 of rotations, patterns and Fresnel coefficients.
 _ENTRY_TOLERANCE = 3e-3
@@ -407,6 +411,7 @@ def against_sionna(
     search: Search,
     *,
     complete: bool = True,
+    known: dict[str, Any] | None = None,
 ) -> FieldAudit:
     """Each path's power, phase and polarisation against what Sionna itself computes.
 
@@ -424,14 +429,14 @@ def against_sionna(
         Depth, rays and batch of Sionna's search.
     complete : bool
         Ask for the explicit arrays at short range, too.
+    known : dict, optional
+        What Sionna answered before, by what it was asked.
 
     Returns
     -------
     FieldAudit
         Counts and largest errors over the paths that both have.
     """
-    from ..search.sionna import Rays, own_coefficients
-
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     scene = Scene.of(site, link, few)
     probe, covered = _probe(link)
@@ -439,9 +444,7 @@ def against_sionna(
         np.array([expected.link.towers[name].mount for name in link.tower_arrays]),
         few.rotation @ np.array(expected.link.uav.mount),
     )
-    theirs = own_coefficients(
-        scene.faces, scene.links_to(few), probe, turns, Rays(**search.rays), surfaces=scene.surfaces
-    )
+    theirs = _own(scene, scene.links_to(few), probe, turns, search, {} if known is None else known)
     place = np.full(int(max(len(poses), 1)), -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
     rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~_over_terrain(replay))
@@ -453,6 +456,28 @@ def against_sionna(
         lacking = np.setdiff1d(np.arange(len(theirs.paths)), matches)
         total += _lacking(site, replay, theirs.paths, scene.faces, lacking, few, expected)
     return replace(total, not_covered=covered)
+
+
+def _own(
+    scene: Scene, links: Links, probe: Link, turns: tuple[FloatArray, FloatArray], search: Search, known: dict[str, Any]
+) -> Coefficients:
+    """Sionna's own coefficients in the slants of a probe; it is asked once for upright and level elements."""
+    from ..search.sionna import Rays, own_coefficients
+
+    arrays, cross = list(probe.tower_arrays.items()), np.array([0.0, np.pi / 2])
+    upright = replace(
+        probe,
+        tower_arrays={name: replace(array, slant_rad=cross) for name, array in arrays},
+        uav_array=replace(probe.uav_array, slant_rad=cross),
+    )
+    patterns = [array.patterns[0].name for array in (*probe.tower_arrays.values(), probe.uav_array)]
+    key = content_digest(scene.faces, scene.surfaces, links, patterns, probe.carrier_hz, turns, search.rays)
+    if key not in known:
+        rays = Rays(**search.rays)
+        known[key] = own_coefficients(scene.faces, links, upright, turns, rays, surfaces=scene.surfaces)
+    slants = np.stack([array.slant_parts for _, array in arrays])[known[key].paths.tower]
+    gain = np.einsum("pab,au,pbv->puv", known[key].gain, probe.uav_array.slant_parts, slants)
+    return replace(known[key], gain=gain)  # type: ignore[no-any-return]
 
 
 def per_pair(

@@ -258,6 +258,9 @@ def audit_summary(audit: AuditResult) -> str:
             f"{fields.power_max_db:.2g} dB and {fields.phase_max_rad:.2g} rad."
         )
         texts.append(f"Checks failed: {count(len(fields.failures))}.")
+    if audit.read_from_cache_of:
+        day = audit.read_from_cache_of
+        texts.append(f"Read from the cache of {day}, made of the same inputs; --audit makes it anew.")
     return " ".join(texts)
 
 

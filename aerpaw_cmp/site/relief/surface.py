@@ -7,6 +7,7 @@ curvature is not); its variance and length are those under which the points are 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import product
 
 import numpy as np
@@ -148,13 +149,23 @@ def surface_through(points_m: FloatArray, frame: SiteFrame, reach_m: tuple[float
                 expected=f"heights at one place within {_CONTRADICTION:g} standard deviations",
                 cause="another vertical datum, or an error that is too small",
             )
-    apart = cdist(place, place)
-    best = max(product(_LENGTHS_M, _DEVIATIONS_M), key=lambda sizes: _likelihood(apart, height, error, *sizes)[0])
-    level = _likelihood(apart, height, error, *best)[1]
+    length, deviation, level = _likeliest(np.ascontiguousarray(points_m).tobytes())
     return Surface(
-        place_m=place, height_m=height, error_m=error, deviation_m=float(best[1]), length_m=float(best[0]),
-        level_m=level, frame=frame, reach_m=reach_m,
+        place_m=place, height_m=height, error_m=error, deviation_m=deviation, length_m=length, level_m=level,
+        frame=frame, reach_m=reach_m,
     )  # fmt: skip
+
+
+@lru_cache(maxsize=8)
+def _likeliest(points: bytes) -> tuple[float, float, float]:
+    """Length, deviation and mean [m] of the process of points; kept, for each stage of a report asks."""
+    rows = np.frombuffer(points).reshape(-1, 4)
+    place, height, error = rows[:, :2], rows[:, 2], rows[:, 3]
+    apart = cdist(place, place)
+    length, deviation = max(
+        product(_LENGTHS_M, _DEVIATIONS_M), key=lambda sizes: _likelihood(apart, height, error, *sizes)[0]
+    )
+    return float(length), float(deviation), _likelihood(apart, height, error, length, deviation)[1]
 
 
 def _likelihood(

@@ -45,7 +45,7 @@ $(LLVM): $(READY) tools/setup_llvm.py aerpaw_cmp/machine/llvm.py
 	@touch $@
 
 report: $(READY) $(LLVM)
-	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT) --force
+	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT) --figures png --force
 	@echo "The report: $(CURDIR)/$(REPORT)/report.html"
 
 # the order of files is that of tests/conftest.py: the dearest first

@@ -83,7 +83,7 @@ def _cpu_seconds(work: Any) -> float:
 
 
 def report_plan(
-    settings: FlightFile, folder: Path, logs_root: Path | None, *, inputs: list[Path], out: Path, figures: str = "page"
+    settings: FlightFile, folder: Path, logs_root: Path | None, *, inputs: list[Path], out: Path, figures: str = "none"
 ) -> Plan:
     """Stages, links, poses and time of a report; reads the logs and writes nothing.
 

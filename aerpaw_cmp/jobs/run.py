@@ -173,8 +173,8 @@ class ReportOptions:
         calibrated.yaml whose antennas, ground and receiver take the place of those of the flight file.
     against : path, optional
         Output folder of ``predict``: what it said of this flight is scored.
-    figures : {"page", "none", "svg", "png", "pdf", "all"}
-        What is drawn: what the page shows, nothing, or every figure in one format or in all.
+    figures : {"none", "svg", "png", "pdf", "all"}
+        Figures drawn as files: none, or every one in one format or in all.
     style : {"screen", "paper"}
     export : sequence of str
         Formats of the samples besides those of ``report.export``.
@@ -185,7 +185,7 @@ class ReportOptions:
     recommend: Path | None = None
     learned: Path | str | None = None
     against: Path | str | None = None
-    figures: str = "page"
+    figures: str = "none"
     style: str = "screen"
     export: Sequence[str] = ()
 
@@ -485,6 +485,7 @@ def run_map(
             outcome.corrected = corrected_maps(site, settings.spacing_m, heights, known, options.logs_root, stages)
         if outcome.settings.study:
             mapping.study_maps(outcome, stages)
+        outcome.flights = tuple(_compared(flight, options, stages) for flight in known)
         with output.filling() as part:
             with stages("export"):
                 files = mapping.export_maps(outcome, part, progress)
@@ -529,6 +530,15 @@ def plan_map(site: str, settings: Any, options: RunOptions = DEFAULT) -> Any:
     inputs, folder = _map_inputs(site, options)
     OutputFolder(folder, job="map", inputs=inputs, force=options.force).refuse()
     return map_plan(site, settings, inputs=inputs, out=folder)
+
+
+def _compared(flight: Any, options: RunOptions, stages: Stages) -> Any:
+    """A flight replayed and compared, for the figures of a map."""
+    from ..report.content.flight_parts import report_data
+    from .reporting.flight_run import run_flight
+
+    data = flight.load(options.logs_root)
+    return report_data(data, run_flight(data, stages, audit=False).result)
 
 
 def run_campaign(

@@ -18,8 +18,8 @@ from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.report.content.flight_parts import report_data
 from aerpaw_cmp.report.exports.tables import metrics
-from aerpaw_cmp.report.figures import flight as figures
-from aerpaw_cmp.report.figures.flight_serving import shown_confusion
+from aerpaw_cmp.report.figures.charts import shown_confusion
+from aerpaw_cmp.report.pages import flight as html
 from aerpaw_cmp.site.siteyaml import load_site
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
@@ -97,9 +97,7 @@ def test_the_report_of_a_phone_shows_the_matrix_of_metrics_json(phone: Path) -> 
     record = report_data(outcome.data, outcome.result)
     assert record.serving is not None
     entry = metrics(record)["serving"]
-    (spec,) = (p for p in figures.figure_specs(record) if p.section == "serving")
-    assert spec.page
     names, table = shown_confusion(record.serving)
     assert names == entry["cells"]
     assert [list(entry["confusion"][name].values()) for name in names] == table.tolist()
-    assert f"{100 * entry['hit_share']:.0f} % of all" in spec.caption
+    assert f"<b>{100 * entry['hit_share']:.1f}\N{NARROW NO-BREAK SPACE}%</b> of" in html.page(record, [])

@@ -40,7 +40,7 @@ def _written(write: Callable[[Any, Path], Any], data: Any, name: str) -> str:
 
 
 def report(fixture: Fixture) -> str:
-    return html.page(fixture("report_data"), [], ["metrics.json"])
+    return html.page(fixture("report_data"), ["metrics.json"])
 
 
 def site_map(fixture: Fixture) -> str:

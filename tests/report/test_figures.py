@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 
-from aerpaw_cmp.compare.level.detection import DetectionScore
 from aerpaw_cmp.compare.result import RankResult, RssResult
 from aerpaw_cmp.report.content.flight import ReportData, Track, start_of, used_towers
 from aerpaw_cmp.report.figures import flight as figures
 from aerpaw_cmp.report.figures import flight_rss as rss_figures
+from aerpaw_cmp.report.figures import maps as map_figures
 from aerpaw_cmp.report.kit import canvas
 from aerpaw_cmp.report.pages import flight as html
 from benchmarks.fabricated import rank_result, rss_result, with_numbers
@@ -235,7 +235,7 @@ def test_relative_times_count_from_the_first_sample(small_report):
     assert labels
     assert set(labels) == {"Time after the first sample [s]"}
     assert any(panel.spans for panel in data.rss)
-    page = html.page(data, [], [])
+    page = html.page(data, [])
     assert "From (s)" in page
     assert "23:57" not in page
 
@@ -316,35 +316,18 @@ def test_very_many_outages_are_joined_where_no_eye_parts_them():
     assert canvas._apart(few, seconds) is few
 
 
-def test_the_forecast_of_a_receiver_is_the_first_figure_of_the_rank(report_data):
-    """Shares along the flight add up to 100 %, and a certain forecast fills its own band alone."""
-    panel = report_data.rank[0]
-    assert not any("rank_forecast" in spec.name for spec in figures.figure_specs(report_data))
-    n = len(panel.time)
-    certain = np.arange(n) < n // 2
-    said = np.where(certain[:, None], [0.0, 1.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4])
-    data = dataclasses.replace(report_data, rank=(dataclasses.replace(panel, probability=said), *report_data.rank[1:]))
-    (first,) = [spec for spec in figures.figure_specs(data) if spec.section == "forecast"]
-    assert first.name.startswith("rank_forecast")
-    upper = first.draw().axes[0]
-    bands = [band.get_paths()[0].vertices for band in upper.collections[:4]]
-    assert max(v[:, 1].max() for v in bands) == pytest.approx(100.0)
-    begin = [v[np.abs(v[:, 0] - v[:, 0].min()) < 1e-9, 1] for v in bands]
-    assert [np.ptp(y) for y in begin] == pytest.approx([0.0, 100.0, 0.0, 0.0])
-
-
-def test_the_reliability_of_a_detection_is_drawn_where_it_was_scored(report_data):
-    panel = report_data.rss[0]
-    score = DetectionScore(
-        reliability=((0.1, 0.12, 50), (0.5, 0.45, 80), (0.9, 0.93, 200)), brier=0.11, constant_brier=0.2,
-        log_score=0.3, constant_log_score=0.6, n=330, n_detected=230, floor_db=-15.0, rmse_db=9.0, offset_db=1.0,
-        detected_rmse_db=7.0, free_space_rmse_db=9.9, learned_on="other flights",
-    )  # fmt: skip
-    assert not any("rss_detection" in spec.name for spec in figures.figure_specs(report_data))
-    scored = with_numbers(panel, detection=score)
-    data = dataclasses.replace(report_data, rss=(scored, *report_data.rss[1:]))
-    (spec,) = [candidate for candidate in figures.figure_specs(data) if "rss_detection" in candidate.name]
-    assert "Brier score 0.110, constant forecast 0.200" in spec.caption
-    assert "(learned on other flights)" in spec.caption
-    points = spec.draw().axes[0].collections[0].get_offsets()
-    np.testing.assert_allclose(points, [[10, 12], [50, 45], [90, 93]])
+def test_both_channels_of_a_tower_stand_in_one_panel_of_report_and_map(report_data, maps_data):
+    """The second is moved by its offset less that of the first; spans in which they part are shaded."""
+    (spec,) = [spec for spec in figures.figure_specs(report_data) if spec.name.startswith("rss_channels")]
+    assert spec.name == "rss_channels_LW1_USRP1_USRP2"
+    (ax,) = spec.draw().axes
+    first, second, _ = report_data.rss
+    lines = {line.get_label().split(",")[0]: line.get_ydata() for line in ax.lines}
+    moved = second.score.offset_db - first.score.offset_db
+    np.testing.assert_allclose(np.sort(lines["USRP1"]), np.sort(first.measured_db))
+    np.testing.assert_allclose(np.sort(lines["USRP2"]), np.sort(second.measured_db + moved))
+    assert np.nanmax(lines["ray tracing"]) == pytest.approx(np.nanmax(first.simulated_dbm) - first.score.offset_db)
+    assert len(ax.patches) == len(report_data.pairs[0].score.spans) > 0
+    assert ax.get_ylabel() == f"RSS [{first.unit}]"
+    with_flight = map_figures.figure_specs(dataclasses.replace(maps_data, flights=(report_data,)))
+    assert [spec.name for spec in with_flight if spec.section == "flights"] == [f"{spec.name}_sample"]

@@ -17,7 +17,6 @@ from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report.content import flight_parts as build
 from aerpaw_cmp.report.content.flight import InputFile, ReportData
-from aerpaw_cmp.report.kit.canvas import Picture
 from aerpaw_cmp.report.pages import flight as html
 from aerpaw_cmp.report.words import flight as words
 from benchmarks.fabricated import with_numbers
@@ -74,22 +73,15 @@ def parse(text: str) -> Page:
     return page
 
 
-def fake_pictures(data: ReportData) -> list[Picture]:
-    from aerpaw_cmp.report.figures.flight import figure_specs
-
-    return [Picture(p, {"svg": b"<svg/>"}) for p in figure_specs(data)]
-
-
 def render(data: ReportData) -> Page:
-    return parse(html.page(data, fake_pictures(data), ["metrics.json"]))
+    return parse(html.page(data, ["metrics.json"]))
 
 
 def test_well_formed_and_loads_nothing_from_elsewhere(report_data):
-    text = html.page(report_data, fake_pictures(report_data), ["metrics.json"])
+    text = html.page(report_data, ["metrics.json"])
     page = parse(text)
     assert text.lstrip().startswith("<!DOCTYPE html>")
-    assert page.loads
-    assert all(load.startswith("data:image/svg+xml;base64,") for load in page.loads)
+    assert page.loads == []
     assert not {"iframe", "object", "embed", "form"} & set(page.tags)
     assert not re.search(r"@import|url\(", text)
     # the data block, which no browser runs, and the one script that the policy names by its digest
@@ -104,16 +96,9 @@ def test_well_formed_and_loads_nothing_from_elsewhere(report_data):
     assert page.tags.count("table") == page.tags.count("caption")
 
 
-def test_every_figure_has_a_place(report_data):
-    from aerpaw_cmp.report.figures.flight import figure_specs
-
-    page = render(report_data)
-    assert [p.name for p in figure_specs(report_data) if f"figure-{p.name}" not in page.ids] == []
-
-
 def test_first_screen_says_what_and_how_well(report_data):
     text = render(report_data).text
-    head = text[: text.index("The flight")]
+    head = text[: text.index("Received signal strength")]
     panel = report_data.rss[0]
     errors = (panel.score.rmse_db, *(panel.baselines[name].rmse_db for name in ("free_space", "two_ray")))
     for piece in (f"{panel.score.offset_db:.1f}", *(f"{error:.2f}" for error in errors), "synthetic"):
@@ -177,7 +162,7 @@ def test_all_parts_missing(report_data):
 
 
 def test_panels_are_said_in_their_own_section(report_data):
-    text = html.page(report_data, fake_pictures(report_data), [])
+    text = html.page(report_data, [])
     for panel in report_data.rss:
         section = text[text.index(f"<h3>{panel.name}</h3>") :]
         assert words.rss_verdict(panel) in section[: section.index("</p>")]
@@ -234,7 +219,7 @@ class TestWords:
 def test_a_note_of_site_and_flight_is_said_once(report_data):
     note = "this flight is replayed without the buildings of the site"
     site = dataclasses.replace(report_data.site, notes=(note,))
-    text = html.page(dataclasses.replace(report_data, site=site, notes=(note, "of the flight alone")), [], [])
+    text = html.page(dataclasses.replace(report_data, site=site, notes=(note, "of the flight alone")), [])
     assert text.count(note) == 1
     assert text.count("of the flight alone") == 1
 

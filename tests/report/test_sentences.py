@@ -21,8 +21,8 @@ ROOT = Path(__file__).parents[2] / "aerpaw_cmp" / "report"
 TABLE = Path(__file__).with_name("sentences.md")
 GAP = "…"
 SOURCES = {
-    "report": ("words/flight.py", "words/flight_verdict.py", "figures/flight.py", "figures/flight_serving.py",
-               "figures/flight_against.py", "figures/flight_rss.py", "figures/flight_rank.py",
+    "report": ("words/flight.py", "words/flight_verdict.py", "figures/flight.py", "figures/charts.py",
+               "figures/flight_rss.py", "figures/flight_rank.py",
                "templates/report.html.jinja", "templates/explorer.html.jinja",
                "templates/method.html.jinja", "templates/plates.html.jinja", "templates/spans.html.jinja",
                "templates/site_view.html.jinja"),

@@ -47,9 +47,9 @@ def report(
     ] = None,
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
-        Literal["page", "none", "svg", "png", "pdf", "all"],
-        Option(help="Figures to draw: those of the page, none, or all in one format or in every format."),
-    ] = "page",
+        Literal["none", "svg", "png", "pdf", "all"],
+        Option(help="Figures as files beside the page: none, or all in one format or in every format."),
+    ] = "none",
     style: Annotated[
         Literal["screen", "paper"], Option(help="Figure style: screen, or paper (IEEE width, fonts embedded).")
     ] = "screen",

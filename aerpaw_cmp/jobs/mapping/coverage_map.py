@@ -47,6 +47,7 @@ from ...propagation.geometry.paths import PathSet
 from ...propagation.options import Engine, Job, Run, Search
 from ...propagation.replay import Replay, replay
 from ...report.content import maps as page
+from ...report.content.flight import ReportData
 from ...report.pages.prediction import outside_share
 from ...site.site import Site
 from ...site.siteyaml import load_site
@@ -374,6 +375,7 @@ class MapOutcome:
     paths: int = 0
     tiles: dict[str, Any] = field(default_factory=dict)
     corrected: CorrectedMaps | None = None
+    flights: tuple[ReportData, ...] = ()
 
     @property
     def shown(self) -> job.MapResult:
@@ -578,6 +580,7 @@ def maps_record(
         rss=rss,
         corrected=() if flown is None else tuple(flown.rss_maps(result.grid)),
         corrected_rank=tuple(_rank_versions(outcome)),
+        flights=outcome.flights,
         flown_m=() if flown is None else tuple(line.T for line in flown.prediction.flown.values()),
         outside_flown=0.0 if flown is None else outside_share(flown.prediction.table),
         corrected_words="" if flown is None else flown.prediction.verdict,

@@ -14,6 +14,7 @@ from ...common.units import FloatArray, IntArray
 from ...compare.statistics.intervals import Interval
 from ...site.site import Site
 from ..names import k_key
+from .flight import ReportData
 from .made import Made
 
 # Name of the map in which the nearest tower serves.
@@ -154,6 +155,8 @@ class MapsData(Made):
         Share of positions further from those flights than a correction reaches.
     corrected_words : str
         First words of the prediction that corrected the levels.
+    flights : tuple of ReportData
+        Those that ``--with`` names, replayed and compared.
     layers : tuple of MapLayer
         Besides RSS and rank.
     metrics : mapping
@@ -172,6 +175,7 @@ class MapsData(Made):
     flown_m: tuple[FloatArray, ...] = ()
     outside_flown: float = 0.0
     corrected_words: str = ""
+    flights: tuple[ReportData, ...] = ()
     rank: tuple[RankMap, ...] = ()
     rank_by_tower: tuple[RankMap, ...] = ()
     layers: tuple[MapLayer, ...] = ()

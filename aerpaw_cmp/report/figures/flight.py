@@ -13,11 +13,9 @@ from ...compare.result import RankResult, RssResult
 from ..content.flight import ReportData, Track
 from ..kit.canvas import POINTS_PER_CLOUD, FigureSpec
 from ..names import safe_name
-from ..words.flight import count, learned_on
+from ..words.flight import count
 from . import flight_rank as rank_figures
 from . import flight_rss as rss_figures
-from .flight_against import against_specs
-from .flight_serving import serving_spec
 
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:
@@ -31,44 +29,30 @@ def figure_specs(data: ReportData) -> list[FigureSpec]:
 
 
 def _figures(data: ReportData) -> Iterator[FigureSpec]:
-    scored = [panel for panel in data.rss if len(panel.time) and panel.score.n]
-    if scored:
-        yield FigureSpec(
-            "overview", "overview", "Where and when the prediction fails",
-            f"{scored[0].name}. Left: the flight coloured by the residual, measured minus ray tracing after the "
-            "offset. Right: level over time.",
-            partial(rss_figures.overview, data, scored[0]),
-        )  # fmt: skip
     if data.track is not None and len(data.track.time):
         yield from _track_specs(data, data.track)
     for panel in data.rss:
         if len(panel.time):
             yield from _rss_specs(data, panel)
-    for pair in data.pairs:
-        panels = [panel for name in (pair.first, pair.second) for panel in data.rss
-                  if (panel.tower, panel.channel) == (pair.tower, name)]  # fmt: skip
-        if len(panels) == 2 and all(panel.score.n for panel in panels):
-            yield FigureSpec(
-                f"rss_channels_{safe_name(pair.tower)}_{safe_name(pair.first)}_{safe_name(pair.second)}",
-                f"rss/{pair.tower}/{pair.first}", f"{pair.tower}: {pair.first} and {pair.second}",
-                f"Both channels, the second moved by its offset less that of the first. Shaded: they part by more than "
-                f"{PART_DB:.0f} dB. Ray tracing is that of {pair.first}.",
-                partial(rss_figures.channels_over_time, data, pair, panels),
-            )  # fmt: skip
-    if any(np.isfinite(row.rmse_heldout_db) for row in data.ladder):
-        yield FigureSpec(
-            "ladder", "ladder", "Models from the simplest to the richest",
-            "RMSE on held-out segments, a line per tower and channel. Whiskers: 95 % interval of the difference to the "
-            "best model on the same samples. Filled: the recommended model.",
-            partial(rss_figures.ladder, data.ladder),
-        )  # fmt: skip
-    if data.serving is not None and data.serving.n:
-        yield serving_spec(data.serving)
+    yield from channel_specs(data)
     for rank in data.rank:
         if len(rank.time):
             yield from _rank_specs(data, rank)
-    if data.against is not None:
-        yield from against_specs(data.against)
+
+
+def channel_specs(data: ReportData, section: str | None = None) -> Iterator[FigureSpec]:
+    """Both channels of each tower in one panel (the paper's Fig. 15)."""
+    panels = {(panel.tower, panel.channel): panel for panel in data.rss if panel.score.n}
+    for pair in data.pairs:
+        both = [panels[pair.tower, name] for name in (pair.first, pair.second) if (pair.tower, name) in panels]
+        if len(both) == 2:
+            yield FigureSpec(
+                f"rss_channels_{safe_name(pair.tower)}_{safe_name(pair.first)}_{safe_name(pair.second)}",
+                section or f"rss/{pair.tower}/{pair.first}", f"{pair.tower}: {pair.first} and {pair.second}",
+                f"Both channels, the second moved by its offset less that of the first. Shaded: they part by more than "
+                f"{PART_DB:.0f} dB. Ray tracing is that of {pair.first}.",
+                partial(rss_figures.channels_over_time, data, pair, both),
+            )  # fmt: skip
 
 
 def _track_specs(data: ReportData, track: Track) -> Iterator[FigureSpec]:
@@ -120,26 +104,10 @@ def _rss_specs(data: ReportData, panel: RssResult) -> Iterator[FigureSpec]:
         + drawn * (len(panel.time) > POINTS_PER_CLOUD),
         partial(rss_figures.rss_over_time, data, panel),
     )  # fmt: skip
-    score = panel.further.detection
-    if score is not None and score.reliability:
-        yield FigureSpec(
-            f"rss_detection_{stem}", section, f"{panel.name}: is the probability of detection calibrated?",
-            "Fifths of the predicted probability against the share that the receiver detected; on the diagonal the "
-            f"forecast is calibrated. Brier score {score.brier:.3f}, constant forecast {score.constant_brier:.3f}; log "
-            f"score {score.log_score:.3f}, constant {score.constant_log_score:.3f} ({learned_on(score)}).",
-            partial(rss_figures.detection_reliability, score),
-        )  # fmt: skip
 
 
 def _rank_specs(data: ReportData, panel: RankResult) -> Iterator[FigureSpec]:
     stem, section = safe_name(panel.tower), f"rank/{panel.tower}"
-    if panel.probability is not None:
-        # it stands under the table of the result
-        yield FigureSpec(
-            f"rank_forecast_{stem}", "forecast", f"{panel.tower}: rank forecast along the flight",
-            "Probability of each rank by the fitted receiver (means), above the reported ranks.",
-            partial(rank_figures.rank_forecast, data, panel),
-        )  # fmt: skip
     yield FigureSpec(
         f"rank_histogram_{stem}", section, f"{panel.tower}: how often each rank",
         "Shares of rank 1 to 4 among samples in coverage, measured beside every K. Whiskers: 95 % intervals.",
@@ -149,7 +117,6 @@ def _rank_specs(data: ReportData, panel: RankResult) -> Iterator[FigureSpec]:
         f"rank_map_{stem}", section, f"{panel.tower}: rank along the flight",
         "Rank at every sample. Colour and marker give the rank; crosses marked Z had no path in the simulation.",
         partial(rank_figures.rank_maps, data, panel),
-        page=False,
     )  # fmt: skip
     yield FigureSpec(
         f"rank_time_{stem}", section, f"{panel.tower}: rank over time",
@@ -162,7 +129,6 @@ def _rank_specs(data: ReportData, panel: RankResult) -> Iterator[FigureSpec]:
             "Counts; colour is the share of each measured rank (rows). Frames: equal ranks. Z: no path in the "
             "simulation.",
             partial(rank_figures.confusion, panel),
-            page=False,
         )  # fmt: skip
     if np.isfinite(panel.score.curve.agreement).any():
         yield FigureSpec(
@@ -170,5 +136,4 @@ def _rank_specs(data: ReportData, panel: RankResult) -> Iterator[FigureSpec]:
             "Agreement by pose and distance between the histograms as the threshold K varies. The best K is the one of "
             "the highest agreement.",
             partial(rank_figures.agreement_curve, panel),
-            page=False,
         )  # fmt: skip

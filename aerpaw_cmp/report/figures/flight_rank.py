@@ -159,37 +159,6 @@ def rank_over_time(data: ReportData, panel: RankResult) -> Figure:
     return fig
 
 
-# Means of the forecast along the flight: as many as a page can show.
-_FORECAST_COLUMNS = 600
-
-
-def rank_forecast(data: ReportData, panel: RankResult) -> Figure:
-    """Probability of each rank along the flight, the reported ranks under it."""
-    probability = panel.probability
-    assert probability is not None
-    start = start_of(data)
-    seconds = seconds_since(panel.time, start)
-    known = np.isfinite(probability).all(axis=1)
-    order = np.flatnonzero(known)[np.argsort(seconds[known], kind="stable")]
-    parts = np.array_split(order, min(_FORECAST_COLUMNS, max(len(order), 1)))
-    at = np.array([seconds[part].mean() for part in parts if len(part)])
-    mean = np.array([probability[part].mean(axis=0) for part in parts if len(part)])
-    fig, (upper, lower) = subplots((9.2, 4.2), 2, 1, sharex=True, height_ratios=[2.4, 1.0])
-    if len(at):
-        labels = [f"rank {rank}" for rank in RANKS]
-        upper.stackplot(at, *(100 * mean.T), colors=[rank_colour(rank) for rank in RANKS], labels=labels, linewidth=0.4,
-                        edgecolor="#222222")  # fmt: skip
-    upper.set(ylim=(0, 100), ylabel="Probability [%]")
-    upper.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), reverse=True)
-    draw_measured_rank(lower, seconds, panel)
-    draw_waypoints(upper, data.moments, start, names=True)
-    lower.set_yticks(RANKS)
-    lower.set(ylim=(0.5, 4.5), ylabel="Rank")
-    lower.legend(*legend_of(lower, lambda label: label != "waypoint"), loc="center left", bbox_to_anchor=(1.0, 0.5))
-    time_axis(lower, start)
-    return fig
-
-
 def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankResult) -> None:
     """Reported ranks as ticks; those held over from an earlier report are smaller and grey."""
     held_over = ~panel.score.staleness.fresh

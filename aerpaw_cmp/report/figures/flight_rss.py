@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ...common.units import FloatArray
-from ...compare.judge.ladder import LadderRow
-from ...compare.level.detection import DetectionScore
 from ...compare.result import PairResult, RankResult, RssResult
 from ..content.flight import ReportData, Track, start_of, used_towers
 from ..kit.canvas import (
@@ -20,7 +18,6 @@ from ..kit.canvas import (
     SIMULATED,
     TOWER,
     WAYPOINT,
-    cloud,
     colour_bar,
     dots,
     draw_out_of_coverage,
@@ -42,34 +39,6 @@ from ..words.flight import count, instants, pretty, signed
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
-
-
-def overview(data: ReportData, panel: RssResult) -> Figure:
-    """The flight coloured by residual beside level and residual over time, of one channel."""
-    fig, (plan, right) = subplots((9.2, 4.0), 1, 2, width_ratios=(1.0, 1.5))
-    residual = panel.residual_db
-    draw_site(plan, data.site, towers=[panel.tower])
-    few = cloud(residual)
-    points = plan.scatter(
-        *panel.position_m[few, :2].T, c=residual[few], cmap="RdBu_r", vmin=-12, vmax=12, s=6, linewidths=0,
-        rasterized=True, zorder=5,
-    )  # fmt: skip
-    _draw_node(plan, panel)
-    tower = data.site.towers.get(panel.tower)
-    ends = [] if tower is None else [tower.position_m[None]]
-    ends += [] if panel.tower_m is None else [panel.tower_m]
-    frame_around(plan, *np.concatenate([panel.position_m, *ends])[:, :2].T)
-    colour_bar(fig, points, plan, "Residual [dB]", "both")
-    start = start_of(data)
-    seconds = seconds_since(panel.time, start)
-    simulated = _moved(panel.simulated_dbm, panel.score.offset_db)
-    dots(right, seconds, panel.measured_db, 2.5, color=MEASURED, label="measured, as logged")
-    right.plot(*thinned(seconds, simulated), color=SIMULATED, linewidth=1.0, label="ray tracing, less its offset")
-    time_axis(right, start)
-    right.set_ylabel(f"RSS [{panel.unit}]")
-    robust_limits(right, [panel.measured_db, simulated])
-    fig.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=2)
-    return fig
 
 
 def _draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
@@ -207,10 +176,10 @@ def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssR
     for span in pair.score.spans:
         ax.axvspan(*seconds_since(np.array(instants(pair.time, span)), start), color="0.88", linewidth=0, zorder=0)
     moved = second.score.offset_db - first.score.offset_db
-    shown = ((first, 0.0, MEASURED, ""), (second, moved, SECOND, f", moved by {signed(moved)} dB"))
+    shown = ((first, 0.0, MEASURED, "as logged"), (second, moved, SECOND, f"moved by {signed(moved)} dB"))
     for panel, by, colour, words in shown:
         seconds = seconds_since(panel.time, start)
-        dots(ax, seconds, panel.measured_db + by, 2.5, color=colour, label=f"{panel.channel}, as logged{words}")
+        dots(ax, seconds, panel.measured_db + by, 2.5, color=colour, label=f"{panel.channel}, {words}")
     seconds, simulated = seconds_since(first.time, start), _moved(first.simulated_dbm, first.score.offset_db)
     draw_out_of_coverage(ax, seconds, first.simulated_out_of_coverage, "Z: no path in the simulation")
     ax.plot(*thinned(seconds, simulated), color=SIMULATED, linewidth=1.0, label="ray tracing")
@@ -219,52 +188,4 @@ def channels_over_time(data: ReportData, pair: PairResult, panels: Sequence[RssR
     ax.set_ylabel(f"RSS [{first.unit}]")
     robust_limits(ax, [first.measured_db, second.measured_db + moved, simulated])
     legend_below(ax, 3)
-    return fig
-
-
-def detection_reliability(score: DetectionScore) -> Figure:
-    """Share of detected samples over the probability that the predicted level gave them; area: samples."""
-    predicted, detected, n = np.array(score.reliability, dtype=np.float64).T
-    fig, ax = subplots((4.8, 3.6))
-    ax.plot([0, 100], [0, 100], color="0.6", linewidth=1, label="calibrated")
-    ax.plot(100 * predicted, 100 * detected, color=SIMULATED, linewidth=1)
-    ax.scatter(
-        100 * predicted,
-        100 * detected,
-        s=12 + 120 * n / n.max(),
-        color=SIMULATED,
-        zorder=3,
-        label="fifths of the samples",
-    )
-    ax.set(xlabel="Predicted probability of detection [%]", ylabel="Detected samples [%]", xlim=(0, 100), ylim=(0, 100))
-    ax.legend(loc="upper left")
-    return fig
-
-
-def ladder(rows: Sequence[LadderRow]) -> Figure:
-    """RMSE of each model on held-out segments, a marker per tower and channel."""
-    models = list(dict.fromkeys(row.model for row in rows))
-    channels = list(dict.fromkeys((row.tower, row.channel) for row in rows))
-    fig, ax = subplots((9.2, 0.36 * len(models) + 1.5))
-    for number, (tower, channel) in enumerate(channels):
-        scored = [
-            row for row in rows if (row.tower, row.channel) == (tower, channel) and np.isfinite(row.rmse_heldout_db)
-        ]
-        at = np.array([models.index(row.model) for row in scored]) + 0.5 * ((number + 0.5) / len(channels) - 0.5)
-        rmse = np.array([row.rmse_heldout_db for row in scored])
-        bounds = np.array([row.difference_to_best_ci95_db for row in scored]) - np.array(
-            [[row.difference_to_best_db] for row in scored]
-        )
-        colour = f"C{number % 10}"
-        spread = np.nan_to_num(np.abs(bounds.T))
-        ax.errorbar(rmse, at, xerr=spread, fmt="none", ecolor=colour, elinewidth=1.0, capsize=2.0)
-        ax.scatter(
-            rmse, at, s=26, facecolor=[colour if row.recommended else "white" for row in scored], edgecolor=colour,
-            marker="os^Dvp"[number % 6], zorder=3, label=f"{tower} {channel}".strip(),
-        )  # fmt: skip
-    ax.set_yticks(range(len(models)), models)
-    ax.invert_yaxis()
-    ax.set_xlabel("RMSE on held-out segments [dB]")
-    ax.grid(axis="y", visible=False)
-    legend_below(ax)
     return fig

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -24,6 +25,7 @@ from ..kit.canvas import (
     subplots,
 )
 from ..names import k_key, safe_name
+from .flight import channel_specs
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -317,7 +319,11 @@ def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
 
 def figure_specs(data: MapsData) -> list[FigureSpec]:
     """Every figure that the data allow, in reading order."""
-    return [*_rss_specs(data), *_rank_specs(data), *_kriging_specs(data)]
+    flown = [
+        replace(spec, name=f"{spec.name}_{safe_name(flight.flight)}", title=f"{flight.flight}, {spec.title}")
+        for flight in data.flights for spec in channel_specs(flight, "flights")
+    ]  # fmt: skip
+    return [*_rss_specs(data), *flown, *_rank_specs(data), *_kriging_specs(data)]
 
 
 def _under(foliage: str) -> str:

@@ -56,17 +56,13 @@ _WIDE = (9.2, 4.2)
 
 @dataclass(frozen=True, slots=True)
 class FigureSpec:
-    """A figure that can be drawn: file name, section of the page, its words, and the function that draws it.
-
-    ``page``: the page itself shows it, not only ``--figures all``.
-    """
+    """A figure that can be drawn: file name, section of the page, its words, and the function that draws it."""
 
     name: str
     section: str
     title: str
     caption: str
     draw: Callable[[], Figure]
-    page: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -90,13 +90,28 @@ def duration(seconds: float | None) -> str:
 
 
 def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
-    """Nested settings as dotted names and plain text, without those that are not set."""
+    """Nested settings as dotted names and plain text, without those that are not set; a bound as ``≥ low``.
+
+    Examples
+    --------
+    >>> list(flat({"a": {"b_ci95_db": (5.5, None), "c": None}, "d": [1, 2], "e_ci95": (None, None)}))
+    [('a.b_ci95_db', '≥ 5.5'), ('d', '1, 2')]
+    """
     for key, value in settings.items():
         name = f"{above}.{key}" if above else str(key)
         if isinstance(value, Mapping):
             yield from flat(value, name)
-        elif value is not None:
-            yield name, ", ".join(map(short, value)) if isinstance(value, (list, tuple)) else short(value)
+        elif (text := _plain(name, value)) is not None:
+            yield name, text
+
+
+def _plain(name: str, value: Any) -> str | None:
+    """Text of one setting or number; None where it is not set."""
+    if "ci95" in name and isinstance(value, (list, tuple)) and None in value:
+        return None if value[0] is None else f"≥ {short(value[0])}"
+    if isinstance(value, (list, tuple)):
+        return ", ".join(map(short, value))
+    return None if value is None else short(value)
 
 
 def clock(instant: Any, start: Any) -> str:

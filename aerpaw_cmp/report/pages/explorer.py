@@ -6,6 +6,7 @@ correlation and histograms of the chosen samples), by the same formulas as :mod:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,6 +20,7 @@ from ...logs.records import has_wall_clock
 from ...site.scenes import drawn_buildings
 from ...site.site import Site
 from ..content.flight import GEOMETRY, PosePaths, ReportData, Source, start_of
+from ..figures.charts import Chart
 from ..kit.canvas import keep_extremes, seconds_since
 from ..kit.packed import PackedArrays
 from ..kit.shapes import listed, outline, walls
@@ -32,12 +34,13 @@ _TREES = 1500
 TRACK_POINTS = 4000
 
 
-def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
+def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS) -> dict[str, Any]:
     """Everything the script needs, as plain values.
 
     Parameters
     ----------
     data : ReportData
+    charts : sequence of Chart
     limit : int
         Samples of all series together.
     """
@@ -60,6 +63,7 @@ def payload(data: ReportData, limit: int = POINTS) -> dict[str, Any]:
         "track": _track(data, start, arrays),
         "site": scene(data.site),
         "paths": [_paths(p, start) for p in data.paths],
+        "plots": [_packed(chart.content, arrays) for chart in charts],
         "packed": arrays.content(),
     }
 
@@ -72,6 +76,15 @@ def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) 
         for whose, position_m in ends
         for axis, places in zip(AXES, position_m.T, strict=True)
     }
+
+
+def _packed(value: Any, arrays: PackedArrays) -> Any:
+    """A chart with its arrays in the page's block."""
+    if isinstance(value, np.ndarray):
+        return arrays.add(value, "f8" if value.max(initial=0.0) > 1e5 else "f4")
+    if isinstance(value, dict):
+        return {key: _packed(each, arrays) for key, each in value.items()}
+    return [_packed(each, arrays) for each in value] if isinstance(value, list) else value
 
 
 AXES = ("east", "north", "up")

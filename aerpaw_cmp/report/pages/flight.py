@@ -9,8 +9,8 @@ from ...compare.level.rss import PART_DB
 from ...logs.records import has_wall_clock
 from ..content.flight import RANKS, ReportData, start_of
 from ..exports.tables import further_numbers
-from ..kit.canvas import Picture
-from ..kit.page import by_section, embedded, environment, rendered
+from ..figures.charts import charts_of, shown_confusion
+from ..kit.page import embedded, environment, rendered
 from ..names import RANK_COLUMNS, RSS_COLUMNS
 from ..words import flight as words
 from ..words.flight_verdict import headlines, paragraph
@@ -34,29 +34,27 @@ def _ladder_table(ladder: Sequence[LadderRow]) -> list[tuple[str, bool, float, d
     ]
 
 
-def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
+def page(data: ReportData, files: Sequence[str]) -> str:
     """The whole page.
 
     Parameters
     ----------
     data : ReportData
-    pictures : sequence of Picture
-        Drawn figures; each stands in its section.
     files : sequence of str
         Names of the files beside the page.
     """
-    linked = payload(data) if data.rss or data.rank else None
-    sections = by_section(pictures)
+    charts = charts_of(data)
+    linked = payload(data, charts) if data.rss or data.rank else None
     environment().filters.update(_FILTERS)
     return rendered(
         "report",
         ("uplot.min.js", "common.js", "explorer.js") if linked else (),
         data=data,
-        sections=sections,
-        overview=next(iter(sections.get("overview", [])), None),
+        charts=charts,
         explorer=embedded(linked),
         first_words=paragraph(data),
         numbers=headlines(data),
+        serving=shown_confusion(data.serving) if data.serving is not None and data.serving.n else None,
         start=start_of(data),
         clock_unit="UTC" if has_wall_clock(start_of(data)) else "s",
         files=files,

@@ -16,11 +16,10 @@ from ..kit.canvas import FORMATS, STYLES, write_figures
 from ..kit.files import json_text, write_file
 from . import flight as html
 
-PAGE = "page"
-# What is drawn: nothing, what the page shows, or every figure in one format or in all.
-FIGURES = ("none", PAGE, "svg", "png", "pdf", "all")
+# Figures that are drawn as files: none, or every one in a format or in all.
+FIGURES = ("none", "svg", "png", "pdf", "all")
 
-__all__ = ["FIGURES", "PAGE", "STYLES", "WrittenReport", "write_report"]
+__all__ = ["FIGURES", "STYLES", "WrittenReport", "write_report"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,7 +34,7 @@ def write_report(
     data: ReportData,
     folder: str | Path,
     *,
-    drawn: str = PAGE,
+    drawn: str = "none",
     style: str = "screen",
     exports: Sequence[str] = (),
     stages: Stages | None = None,
@@ -68,12 +67,12 @@ def write_report(
     folder, stages = Path(folder), stages or Stages(seconds=dict(data.stages_s))
     written: list[Path] = []
     with stages("report"):
-        specs = [] if drawn == "none" else [p for p in figures.figure_specs(data) if p.page or drawn != PAGE]
-        formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
+        specs = [] if drawn == "none" else figures.figure_specs(data)
+        formats = FORMATS if drawn == "all" else (drawn,)
         for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
             # written even without rows: a reader finds the same files in every report
             written.append(write_file(folder / name, text))
-        pictures, paths = write_figures(specs, folder / "figures", formats, style, stages.progress)
+        _, paths = write_figures(specs, folder / "figures", formats, style, stages.progress)
     written += paths
     if exports:
         from ..exports.formats import write_exports
@@ -85,8 +84,7 @@ def write_report(
     offered = (folder, folder / FOLDER)
     files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in offered)]
     with stages("report"):
-        shown = [picture for picture in pictures if {"png", "svg"} & set(picture.formats)]
-        page = write_file(folder / "report.html", html.page(data, shown, files))
+        page = write_file(folder / "report.html", html.page(data, files))
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
     numbers = write_file(folder / "metrics.json", json_text(metrics(data)))
     return WrittenReport(files=(page, *written, numbers), data=data)

@@ -174,11 +174,19 @@ const common = (() => {
     jobs.forEach(job => waiting.add(job));
   }
 
+  // a button that saves a canvas as a picture
+  function download(canvas) {
+    const button = document.createElement("button");
+    button.type = "button"; button.textContent = "PNG";
+    button.addEventListener("click", () => canvas.toBlob(blob => { const a = document.createElement("a"); a.href = URL.createObjectURL(blob); a.download = `${canvas.getAttribute("aria-label")}.png`; a.click(); URL.revokeObjectURL(a.href); }));
+    return button;
+  }
+
   function whenResized(element, job) {
     let width = 0;
     new ResizeObserver(() => { if (element.clientWidth !== width) { width = element.clientWidth; later(job); } }).observe(element);
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => later(job));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, credit, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar };
+  return { at, css, number, unpack, values, cells, fill, frame, credit, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, download, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar };
 })();

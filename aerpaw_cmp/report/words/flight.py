@@ -31,6 +31,11 @@ def pretty(name: str) -> str:
     return BASELINE_TITLE.get(name, name.replace("_", " "))
 
 
+def with_article(name: str) -> str:
+    """A baseline's name inside a sentence."""
+    return f"a {pretty(name)}" if name in ("constant", "log_distance") else pretty(name)
+
+
 def count(n: int) -> str:
     """A whole number, thousands set apart as in the tables.
 
@@ -169,15 +174,14 @@ def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> st
     >>> flight_sentence(pooled)
     'Ray tracing (RMSE 2.0 dB) is 0.23 dB better than two-ray ground [0.14, 0.33] over 10 channels (95 %).'
     """
-    word, ends = paired_verdict(*verdict.ci95_db), verdict.ci95_db
-    if word in ("better", "worse"):
-        ends = sorted(map(abs, ends))
-    name, over = pretty(verdict.against), f" over {verdict.channels} channels" if verdict.channels > 1 else ""
+    word = paired_verdict(*verdict.ci95_db)
+    ends = sorted(map(abs, verdict.ci95_db)) if word in ("better", "worse") else list(verdict.ci95_db)
+    name, over = with_article(verdict.against), f" over {verdict.channels} channels" if verdict.channels > 1 else ""
     floor = "" if floor_db is None else f", floor {floor_db:.0f}".replace("-", MINUS)
     signs = "+" if word == "not significant" else ""
     return _DECIDED[word].format(
         ray=f"{verdict.rmse_db:.1f} dB{floor}", other=f"{verdict.baseline_rmse_db:.1f} dB", over=over,
-        name=f"a {name}" if verdict.against in ("constant", "log_distance") else name,
+        name=name,
         size=abs(verdict.difference_db),
         ends=f"[{', '.join(format(end, f'{signs}.2f').replace('-', MINUS) for end in ends)}]",
     )  # fmt: skip
@@ -185,8 +189,9 @@ def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> st
 
 def expected_sentence(panels: Sequence[RssResult]) -> str:
     """The error to expect on another flight; nothing unless every scored channel has it from flights left out."""
-    names = ["floor_rmse_db" if lock_lost(panel) else "rmse_db" for panel in panels]
-    known = [(panel.further.elsewhere or {}).get(name, math.nan) for panel, name in zip(panels, names, strict=True)]
+    # a receiver that can lose its lock has the error with its floor, too, and that is its error
+    given = [panel.further.elsewhere or {} for panel in panels]
+    known = [entry.get("floor_rmse_db", entry.get("rmse_db", math.nan)) for entry in given]
     error = math.sqrt(sum(value**2 for value in known) / len(known)) if known else math.nan
     return f"Expect {error:.1f} dB on another flight." if math.isfinite(error) else ""
 
@@ -213,6 +218,9 @@ CAUSES: dict[str, tuple[str, str]] = {
         "check the receiver's gain",
     ),
 }
+
+
+NO_CAUSE = "No likely cause was identified."
 
 
 def cause_sentence(panel: RssResult) -> str:

@@ -45,7 +45,9 @@ def paragraph(data: ReportData) -> str:
     elif error and data.against is not None and data.against.scores:
         parts = [error, before_flight(data.against.scores), words.next_step(data)]
     elif error:
-        parts = [error, words.expected_sentence(panels), _cause(panels) or words.next_step(data)]
+        cause = _cause(panels)
+        without = (words.NO_CAUSE if panels else "", words.next_step(data))
+        parts = [error, words.expected_sentence(panels), *([cause] if cause else without)]
     else:
         most = max([panel.score.n for panel in data.rss], default=0)
         parts = [words.TOO_FEW_COMPARED.format(n=most) if most else words.NOTHING_COMPARED]
@@ -71,7 +73,7 @@ def _training(data: ReportData) -> str:
 def _baseline_sentence(panels: Sequence[RssResult]) -> str:
     """Sentence on what a model without anything learned leaves on the panels of a training flight."""
     best = _best_baseline([panel for panel in panels if panel.training])
-    return "" if best is None else f"For comparison, {words.pretty(best[0])}: RMSE {best[1]:.1f} dB."
+    return "" if best is None else f"For comparison, {words.with_article(best[0])}: RMSE {best[1]:.1f} dB."
 
 
 def _best_baseline(panels: Sequence[RssResult]) -> tuple[str, float] | None:

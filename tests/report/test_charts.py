@@ -1,0 +1,108 @@
+"""Charts that the page's script draws: what they show is what the numbers say; the table of serving cells."""
+
+import dataclasses
+import re
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.judge.ladder import LadderRow
+from aerpaw_cmp.compare.level.detection import DetectionScore
+from aerpaw_cmp.compare.level.serving import compare_serving
+from aerpaw_cmp.report.content.against import Against, AgainstSeries
+from aerpaw_cmp.report.figures.charts import charts_of, shown_confusion
+from aerpaw_cmp.report.pages import flight as html
+from benchmarks.fabricated import with_numbers
+
+
+@pytest.fixture
+def serving():
+    """Three cells of which the third never serves; the prediction takes it for the second at times."""
+    level = [[-70, -80, -99], [-70, -80, -99], [-90, -75, -99], [-90, -85, -80], [np.nan] * 3]
+    return compare_serving([0, 1, 1, 1, 0], level, ["LW1 PCI 1", "LW2 PCI 2", "LW3 PCI 3"])
+
+
+def test_counts_stand_in_the_row_that_served_and_the_column_predicted(report_data, serving):
+    names, table = shown_confusion(serving)
+    assert names == ["LW1 PCI 1", "LW2 PCI 2", "LW3 PCI 3"]
+    assert table.tolist() == [[1, 0, 0, 1], [1, 1, 1, 0], [0, 0, 0, 0]]  # the last column: nothing predicted
+    page = html.page(dataclasses.replace(report_data, serving=serving), [])
+    first = page[page.index(f'<tr><th scope="row">{names[1]}</th>', page.index('id="serving"')) :]
+    cells = re.findall(r'<td class="n">(\d+)</td>', first[: first.index("</tr>")])
+    assert list(map(int, cells)) == table[1].tolist()
+    assert "The prediction is no better than that." in page
+    assert 'id="serving"' not in html.page(report_data, [])
+
+
+def test_many_cells_are_gathered_without_losing_a_sample():
+    rng = np.random.default_rng(0)
+    n, cells = 4000, 60
+    served = np.minimum(rng.geometric(0.1, n) - 1, cells - 1)
+    comparison = compare_serving(served, rng.normal(-80, 5, (n, cells)), [f"c{i}" for i in range(cells)])
+    names, table = shown_confusion(comparison)
+    assert len(names) == 17
+    assert names[-1] == "others"
+    assert table.shape == (17, 18)
+    assert table.sum() == n
+    named = [int(name[1:]) for name in names[:-1]]
+    assert np.trace(table[:16, :16]) == sum(comparison.confusion[i, i] for i in named)
+
+
+def test_a_ladder_has_a_dot_for_each_score_and_whiskers_of_the_difference(report_data):
+    rows = [
+        LadderRow(model=model, tower="LW1", channel=channel, rmse_heldout_db=rmse, n=100, seconds=1.0,
+                  difference_to_best_db=rmse - 3.0, difference_to_best_ci95_db=(rmse - 3.5, rmse - 2.75),
+                  recommended=model == "rich")
+        for model, channel, rmse in (("free space", "A", 5.0), ("free space", "B", 6.0), ("rich", "A", 3.0),
+                                     ("rich", "B", np.nan))
+    ]  # fmt: skip
+    (chart,) = charts_of(dataclasses.replace(report_data, ladder=tuple(rows)))
+    first, second = chart.content["marks"]
+    assert (chart.content["rows"], chart.content["chosen"]) == (["free space", "rich"], 1)
+    np.testing.assert_allclose(first["x"], [5.0, 3.0])
+    np.testing.assert_allclose(first["low"] - first["x"], -0.5)
+    np.testing.assert_allclose(first["high"] - first["x"], 0.25)
+    np.testing.assert_array_equal(np.rint(first["y"]), [0, 1])
+    np.testing.assert_allclose(second["x"], [6.0])  # what was not scored has no dot
+
+
+def test_the_bands_of_a_forecast_are_its_probabilities_one_upon_the_other(report_data):
+    panel = report_data.rank[0]
+    certain = np.arange(len(panel.time)) < len(panel.time) // 2
+    said = np.where(certain[:, None], [0.0, 1.0, 0.0, 0.0], [0.1, 0.2, 0.3, 0.4])
+    data = dataclasses.replace(report_data, rank=(dataclasses.replace(panel, probability=said),))
+    (chart,) = charts_of(data)
+    heights = [(mark["high"] - mark["low"])[[0, -1]] for mark in chart.content["marks"]]
+    np.testing.assert_allclose(heights, [[0, 10], [100, 20], [0, 30], [0, 40]], atol=1e-9)
+    assert chart.content["marks"][-1]["high"].max() == pytest.approx(100.0)
+
+
+def test_the_reliability_of_a_detection_is_drawn_where_it_was_scored(report_data):
+    score = DetectionScore(
+        reliability=((0.1, 0.12, 50), (0.5, 0.45, 80), (0.9, 0.93, 200)), brier=0.11, constant_brier=0.2,
+        log_score=0.3, constant_log_score=0.6, n=330, n_detected=230, floor_db=-15.0, rmse_db=9.0, offset_db=1.0,
+        detected_rmse_db=7.0, free_space_rmse_db=9.9, learned_on="other flights",
+    )  # fmt: skip
+    assert charts_of(report_data) == []
+    scored = with_numbers(report_data.rss[0], detection=score)
+    (chart,) = charts_of(dataclasses.replace(report_data, rss=(scored, *report_data.rss[1:])))
+    assert "Brier score 0.110, this flight's own share 0.200" in chart.caption
+    assert "(learned on other flights)" in chart.caption
+    dots = chart.content["marks"][0]
+    np.testing.assert_allclose([dots["x"], dots["y"]], [[10, 50, 90], [12, 45, 93]])
+
+
+def test_a_prediction_is_drawn_with_the_band_that_was_given(report_data):
+    time_s = np.arange(5.0)
+    series = AgainstSeries(
+        name="LW1 A", time_s=time_s, measured_db=-60 - time_s, level_db=-61 - time_s, sd_db=np.ones(5),
+        low_db=-65 - time_s, high_db=-58 - time_s, share_near=1.0, start=np.datetime64("2025-06-01T14:00:00"),
+    )  # fmt: skip
+    against = Against(folder="p", sentence="", generated="", flights=(), series=(series,), words="")
+    (chart,) = charts_of(dataclasses.replace(report_data, against=against))
+    band, dots, line = chart.content["marks"]
+    assert band["low"] is series.low_db
+    assert band["high"] is series.high_db
+    assert dots["y"] is series.measured_db
+    assert line["y"] is series.level_db
+    assert chart.content["x"]["start"].startswith("2025-06-01T14:00:00")

@@ -68,10 +68,12 @@ _DBM, _DB = (-200.0, 30.0), (-60.0, 100.0)
 QUANTITIES: tuple[Quantity, ...] = (
     # when; the surest first
     Quantity("time", "time", (
-        r"^time utc usec$", r"^(measured|recorded|logged|sampled|seen) at$",
+        r"^time utc usec$", r"^time (edt|est|cdt|cst|mdt|mst|pdt|pst|cest|cet|bst|utc|gmt)$",
+        r"^(measured|recorded|logged|sampled|seen) at$",
         r"^(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| us| iso| unix)?$",
         r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s| us)?$",
-        r"^(custom )?(update ?)?(local |utc )?time( utc| ms| s| us| usec| local| epoch)?$", r"^time ?millisecond$",
+        r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| local| epoch)?$",
+        r"^time ?millisecond$",
         r"^(rel|relative|elapsed) ?time( ms| s)?$", r"^time boot ms$", r"^(epoch|unix)( ms| s)?$", r"^utc$", r"^t$",
     )),
     Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$",)),
@@ -90,33 +92,36 @@ QUANTITIES: tuple[Quantity, ...] = (
     # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
     Quantity("home", "other", (
         r"\b(home|take ?off|launch|terrain|ground|geoid|undulation|delta|target|max|min)\b.*" + _UP + r"(?!.*\babove)",
-        _UP + r" (of )?(home|terrain|geoid|target)$", r"^geoid", r"accuracy|variance|\bvdop\b|precision",
+        _UP + r" (of )?(home|terrain|target)$", r"^geoid", r"accuracy|variance|\bvdop\b|precision",
     )),
     Quantity("altitude_m", "height", (
         _UP + r" ?(above |over )?(the )?(take ?off|home|launch)", r"\b(rel|relative)[ ]?(home ?)?(alt|altitude|height)",
         _UP + r" ?(rel|relative|ato)\b", r"^rel ?home ?alt$", r"^osd height", r"^ascent",
     ), "m", can_be=(-1000.0, 20_000.0), datum="take-off"),
     Quantity("altitude_m", "height", (
-        r"\bagl\b|altitude ?agl|^agl ?alt", _UP + r" ?(above |over )(the )?(ground|terrain)", r"\babove ground\b",
+        r"\bagl\b|altitude ?agl|^agl ?alt",
+        r"^(lidar|radar|laser|range ?finder) " + _UP[2:], _UP + r" ?(above |over )(the )?(ground|terrain)",
+        r"\babove ground\b",
     ), "m", can_be=(-1000.0, 20_000.0), datum="ground"),
     Quantity("altitude_m", "height", (
-        r"(\b|altitude|alt|height)(amsl|msl|asl)\b", r"sea ?level", r"\borthometric\b", r"^osd alt", r"^gps " + _UP[2:],
+        r"(\b|altitude|alt|height|h)(amsl|msl|asl)\b", r"sea ?level", r"\borthometric\b|^alt(itude)? (gps|geoid)$",
+        r"^osd alt", r"^gps " + _UP[2:],
         r"^(ele|elevation)( m| ft| feet| meters)?$",
     ), "m", can_be=(-1000.0, 20_000.0), datum="sea level"),
     Quantity("altitude_m", "height", (
-        r"^(alt|altitude)( m| meters| metres| ft| feet)?$", r"^(height|hgt)( m| meters| metres| ft| feet)?$",
-    ), "m", can_be=(-1000.0, 20_000.0), datum="unknown"),
-    Quantity("altitude_m", "height", (
         r"ellips", r"\b(hae|wgs ?84)\b",
     ), "m", can_be=(-1000.0, 20_000.0), datum="ellipsoid"),
+    Quantity("altitude_m", "height", (
+        r"^(alt|altitude)( m| meters| metres| ft| feet)?$", r"^(height|hgt)( m| meters| metres| ft| feet)?$",
+        r"^(baro(metric)?|pressure) " + _UP[2:], _UP + r" baro$",
+    ), "m", can_be=(-1000.0, 20_000.0), datum="unknown"),
     # how it lies; a gimbal's or camera's angles are not the aircraft's
     Quantity("gimbal", "other", (r"\b(gimbal|camera|mount|payload|des|desired|target|setpoint|sp)\b",)),
     Quantity("roll_deg", "angle", (r"^(osd )?roll( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
     Quantity("pitch_deg", "angle", (r"^(osd )?pitch( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
     Quantity("yaw_deg", "angle", (
-        r"^(osd )?yaw( deg| degrees| rad)?$", r"^compass heading( degrees)?$", r"^(heading|hdg)( deg| degrees)?$",
-        r"^bearing( deg)?$",
-    ), "deg", none=(1000.0,), can_be=_ANGLE),
+        r"^(osd )?yaw( deg| degrees| rad)?$", r"^compass heading( degrees)?$", r"^(heading|hdg)( deg| degrees| cdeg)?$",
+    ), "deg", can_be=_ANGLE),
     Quantity("velocity_north_mps", "velocity", (
         r"^velocity ?(north|x)( mps)?$", r"^vn$", r"^vel n m s$", r"^(osd )?x ?speed", r"^speed ?x$", r"^vx$",
     ), "m/s", can_be=_SPEED),
@@ -132,12 +137,16 @@ QUANTITIES: tuple[Quantity, ...] = (
     )),
     # who
     Quantity("device", "identity", (
-        r"^(device|phone|modem|ue|vehicle|drone|uav|logger|serial)( ?(id|name|no|number|serial|index))?$",
-        r"^(imei|imsi|sys ?id|system ?id)$", r"^(receiver|rx)( ?(id|name|channel|port|antenna|serial number))?$",
+        r"^(device|phone|modem|ue|vehicle|drone|uav|logger|serial|node|station|client|user|robot|rover|aircraft|tail|host"
+        r"|antenna|interface|mac|sensor|gps|gps receiver)"
+        r"( ?(id|name|no|num|number|sn|serial|index|instance|port|model|address))?$",
+        r"^(imei|imsi|sys ?id|system ?id|comp ?id|component ?id)$",
+        r"^(receiver|rx)( ?(id|name|channel|port|antenna|serial number))?$",
         r"^(transmitter|tx)( ?(id|name|channel|port|antenna))?$",
     )),
     Quantity("network", "identity", (
-        r"^(network )?(operator|carrier|provider|plmn|sim)( ?(id|name|code|slot|no))?$", r"^network name$",
+        r"^(network )?(operator|carrier|provider|plmn|sim|slot|sub|subscription)( ?(id|name|code|slot|no|index))?$",
+        r"^network name$",
         r"^mcc$", r"^mnc$", r"^mcc ?mnc$", r"^(receiver|rx|cent(er|re)|carrier) freq(uency)?( hz| mhz| ghz)?$",
     )),
     Quantity("technology", "cell", (
@@ -155,7 +164,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("RSRP", "rss", (
         r"\brs ?rp\b|\bss ?rsrp\b|\b(nrx)?rsrp\d{0,2}\b|\b(n|nb|nbr)\d{0,2}rsrp\b",
     ), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0,), can_be=_DB),
+    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0, 255.0), can_be=_DB),
     Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", can_be=_DB),
     Quantity("RSSI", "rss", (r"\brssi\d{0,2}\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RSCP", "rss", (r"\brscp\b",), "dBm", none=(0.0,), can_be=_DBM),
@@ -168,7 +177,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("ARFCN", "cell", (
         r"\b(nr ?|e ?|u ?)?arfcn\d{0,2}\b|\bchannel number\b|\bfreq(uency)? channel\b",
     ), can_be=(0.0, 3_279_165.0)),
-    Quantity("CQI", "kpi", (r"\bcqi\b",), can_be=(0.0, 100.0)),
+    Quantity("CQI", "kpi", (r"\bcqi\b",), none=(255.0,), can_be=(0.0, 100.0)),
     Quantity("path loss", "kpi", (r"\bpath ?loss\b",), "dB"),
     Quantity("throughput", "kpi", (r"\b(throughput|tput|bit ?rate|thr?put)\b",), "bit/s"),
     Quantity("MCS", "kpi", (r"\bmcs\b",), can_be=(0.0, 100.0)),
@@ -178,8 +187,8 @@ QUANTITIES: tuple[Quantity, ...] = (
 _COMPILED = tuple((re.compile("|".join(f"(?:{pattern})" for pattern in row.names)), row) for row in QUANTITIES)
 
 _NEIGHBOUR = re.compile(
-    r"\b(detected|neigh(bou?rs?)?\d{0,2}|nbr?\d{0,2}|ncell ?\d{0,2}|n ?\d{1,2}|nrx|nlte\w*|adj(acent)?\d{0,2})\b"
-    r"|\btop \d{1,2}\b"
+    r"\b(detected|neigh(bou?rs?)?\d{0,2}|ngh?br?s?\d{0,2}|nbr?\d{0,2}|nc(ell)? ?\d{0,2}|n ?\d{1,2}|nrx|nlte\w*"
+    r"|adj(acent)?\d{0,2})\b|\btop \d{1,2}\b"
     r"|\bn\d?(rsrp|rxrsrp|rsrq|pci)\d{0,2}\b|^nrx|\bnbr?\d{0,2}(rsrp|rsrq|pci)\b"
 )
 _NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss|\bnrpci\b|\bnr ?arfcn\b|\bnci\b")
@@ -187,11 +196,20 @@ _LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
 # A secondary carrier: it serves beside the primary one.
 _SECONDARY = re.compile(r"\bsc(?:ell|c) ?(\d{0,2})\b")
 _NUMBER = re.compile(
-    r"(?:^| )(?:n|nb|nbr|neigh|neighbou?r|ncell|adj|top|rsrp|rsrq|pci|e?arfcn)? ?(\d{1,2})(?: |$)"
+    r"(?:^| )(?:n|nb|nbr|nc|ngbr|neigh|neighbou?r|ncell|adj|top|rsrp|rsrq|pci|e?arfcn)? ?(\d{1,2})(?: |$)"
     r"|\bn(?:br?)?(\d{1,2})[a-z]"
 )
-# What the base station hears is no level of the downlink.
-_UPLINK = re.compile(r"\b(ul|uplink|pusch|pucch|srs)\b")
+# Another cell of a table, or the cell of another device, by its number or its order.
+_OTHER = re.compile(
+    r"\b((?:sim|dev(?:ice)?|modem|ue|phone|slot) ?\d{1,2})\b|\b(second|third|inter|intra|pscell|secondary)\b"
+    r"|\b(?:cell|pci|rsrp|rsrq|rssi|sinr|e?arfcn) ?(\d{1,2})\b"
+)
+# What the base station hears, statistics, and what a model says are no level that the receiver measured.
+_INDIRECT = re.compile(
+    r"\b(ul|uplink|pusch|pucch|srs|at (the )?(gnb|enb|bs)|(gnb|enb|bs) (rx|rssi|received)|min|minimum|max|maximum|std"
+    r"|stdev|sigma|var|variance|thresh(old)?|predicted|prediction|simulated|expected|target|model(led)?|error|delta|diff"
+    r"|offset|count)\b"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,15 +224,16 @@ class Meaning:
     rat : str
         ``lte``, ``nr`` or empty.
     place : str
-        ``serving``, ``scell1``, ``n2`` (the second neighbour; ``n0`` where it has no number).
-    uplink : bool
+        ``serving``, ``scell1``, ``n2`` (the second neighbour; ``n0`` where it has no number), ``cell2``, ``sim2``.
+    indirect : bool
+        Of the uplink, a statistic or a model: no level that the receiver measured.
     """
 
     quantity: Quantity
     unit: str = ""
     rat: str = ""
     place: str = "serving"
-    uplink: bool = False
+    indirect: bool = False
 
     @property
     def neighbour(self) -> bool:
@@ -254,14 +273,14 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     >>> level.quantity.name, level.unit, level.place
     ('RSRP', 'dbm', 'n1')
     """
-    unit, _zone, rest = in_brackets(name)
-    text = plain(name) if words is None else words
-    bare = plain(rest) if words is None else text
-    if not unit and (end := re.fullmatch(r"(.+) (\S+)", text)) and end[2] in _SUFFIXES:
-        unit = end[2]
-    row = next(
-        (row for form, row in _COMPILED if form.search(text) or (bare != text and form.search(bare))), None
-    )  # fmt: skip
+    bare, unit = without_unit(name)
+    texts = [plain(name) if words is None else words]
+    if texts[0] == plain(name):
+        # 'Time (+02:00)'; 'heightAboveGround'
+        texts += [bare, plain(in_brackets(name)[2]), plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))]
+    row, text = next(
+        ((row, text) for text in dict.fromkeys(texts) for form, row in _COMPILED if form.search(text)), (None, "")
+    )
     if row is None or row.role == "other":
         return None
     rat = "nr" if _NR.search(text) else "lte" if _LTE.search(text) else ""
@@ -269,7 +288,26 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     number = next((group for group in digits.groups() if group), "0") if digits else "0"
     second = _SECONDARY.search(text)
     place = f"n{number}" if _NEIGHBOUR.search(text) else f"scell{second[1]}" if second else "serving"
-    return Meaning(row, unit, rat, place, uplink=_UPLINK.search(text) is not None)
+    if place == "serving" and (other := _OTHER.search(text)):
+        place = (other[1] or other[2] or f"cell{other[3]}").replace(" ", "")
+    return Meaning(row, unit, rat, place, indirect=_INDIRECT.search(text) is not None)
+
+
+def without_unit(name: str) -> tuple[str, str]:
+    """Plain name without the unit that it ends with, in brackets or not, and the unit in lower case or an empty text.
+
+    Examples
+    --------
+    >>> without_unit("Height [ft]"), without_unit("rsrp_dbm"), without_unit("latE7"), without_unit("Time (EDT)")
+    (('height', 'ft'), ('rsrp', 'dbm'), ('lat', 'e7'), ('time edt', 'edt'))
+    """
+    unit, _zone, rest = in_brackets(name)
+    if unit:
+        return plain(rest) if is_unit(unit) else plain(name), unit
+    end = re.fullmatch(r"(.+?)(?: (\S+)|(?: ?1?)(e ?[67]))", plain(name))
+    if end is not None and (end[3] or end[2] in _SUFFIXES):
+        return end[1], (end[3] or end[2]).replace(" ", "")
+    return plain(name), ""
 
 
 def in_brackets(name: str) -> tuple[str, str, str]:
@@ -289,7 +327,8 @@ def in_brackets(name: str) -> tuple[str, str, str]:
 def rank_of(quantity: Quantity, words: str) -> tuple[int, int]:
     """Place of a plain name in the order of preference: rows come so, and the patterns of a row."""
     fits = [i for i, pattern in enumerate(quantity.names) if re.search(pattern, words)]
-    return QUANTITIES.index(quantity), fits[0] if fits else len(quantity.names)
+    last = len(QUANTITIES) * (quantity.datum == "ellipsoid")
+    return QUANTITIES.index(quantity) + last, fits[0] if fits else len(quantity.names)
 
 
 def is_none(quantity: Quantity, values: FloatArray) -> BoolArray:
@@ -337,10 +376,11 @@ def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
 UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     **{word: ("m", _times(factor)) for word, factor in (
         ("ft", 0.3048), ("feet", 0.3048), ("foot", 0.3048), ("m", 1.0), ("meter", 1.0), ("meters", 1.0),
-        ("metres", 1.0), ("cm", 0.01), ("mm", 1e-3), ("km", 1e3), ("yd", 0.9144))},
+        ("metres", 1.0), ("cm", 0.01), ("mm", 1e-3), ("km", 1e3), ("yd", 0.9144), ("in", 0.0254),
+        ("inch", 0.0254), ("inches", 0.0254))},
     **{word: ("m/s", _times(factor)) for word, factor in (
         ("mph", 0.44704), ("m/s", 1.0), ("mps", 1.0), ("km/h", 1 / 3.6), ("kmh", 1 / 3.6), ("kph", 1 / 3.6),
-        ("kts", 0.514444), ("kt", 0.514444), ("knots", 0.514444), ("cm/s", 0.01), ("ft/s", 0.3048))},
+        ("kts", 0.514444), ("kt", 0.514444), ("kn", 0.514444), ("knots", 0.514444), ("cm/s", 0.01), ("ft/s", 0.3048))},
     **{word: ("deg", _times(factor)) for word, factor in (
         ("deg", 1.0), ("degree", 1.0), ("degrees", 1.0), ("\u00b0", 1.0), ("rad", 180 / np.pi),
         ("radians", 180 / np.pi), ("1e-7 deg", 1e-7), ("1e-7deg", 1e-7), ("dege7", 1e-7), ("deg e7", 1e-7),

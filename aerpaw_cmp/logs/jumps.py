@@ -26,6 +26,9 @@ _MOST_SHARE = 0.6
 
 _DEGREE_M = 111_200.0
 
+# A step back is shorter than this share of the steps there.
+_BACK_SHARE = 0.2
+
 
 def jumps_of(stream: Stream) -> tuple[BoolArray, str]:
     """Rows (n,) of a stream whose position is a jump, and a sentence on them or on the track; empty where all fits.
@@ -42,18 +45,17 @@ def jumps_of(stream: Stream) -> tuple[BoolArray, str]:
         return none, ""
     speed_mps = _speed_mps(time_s, place_m)
     what = f"{stream.kind} {stream.name!r}"
-    if speed_mps > FASTEST_MPS:
+    if speed_mps > FASTEST_MPS and not _comes_back(time_s, place_m):
         return none, (
             f"{what}: its positions imply {speed_mps:.0f} m/s throughout: are its times in another unit, "
             "such as milliseconds?"
         )
     astray, fast_mps, at = _astray(time_s, place_m)
-    if not astray.any():
+    if not astray.any() and speed_mps <= FASTEST_MPS:
         return none, ""
-    share = float(astray.mean())
-    if share > _FEW_SHARE:
+    if speed_mps > FASTEST_MPS or float(astray.mean()) > _FEW_SHARE:
         return none, (
-            f"{what}: {share:.0%} of its positions cannot be reached from the others in time: two vehicles, or two "
+            f"{what}: its positions change between places that cannot be reached in time: two vehicles, or two "
             "receivers, in one table?"
         )
     out = none.copy()
@@ -91,6 +93,24 @@ def _speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
     return float(np.median(step_m[moving] / step_s[moving])) if moving.sum() >= 3 else 0.0
 
 
+def _runs(time_s: FloatArray, place_m: FloatArray) -> tuple[IntArray, IntArray]:
+    """First rows, and the rows behind the last, of the runs that fast steps divide a track into."""
+    step_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
+    fast = step_m > FASTEST_MPS * np.abs(np.diff(time_s)) + _JITTER_M
+    begins = np.concatenate([[0], np.flatnonzero(fast) + 1])
+    return begins, np.append(begins[1:], len(time_s))
+
+
+def _comes_back(time_s: FloatArray, place_m: FloatArray) -> bool:
+    """Check whether fast steps lead back to where the track was a step or two before: it is of several vehicles."""
+    begins, ends = _runs(time_s, place_m)
+    apart_m = [
+        float(np.median(np.linalg.norm(place_m[begins[lag:]] - place_m[ends[:-lag] - 1], axis=1)))
+        for lag in (1, 2, 3) if len(begins) > lag + 1
+    ]  # fmt: skip
+    return len(apart_m) > 1 and min(apart_m[1:]) < _BACK_SHARE * apart_m[0]
+
+
 def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, float, int]:
     """Rows (n,) off the track, the greatest speed that the first of them implies, and its number.
 
@@ -98,13 +118,10 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, float, 
     cannot reach in time is off it; a long one goes on elsewhere, as after a time without fixes.
     """
     count = len(time_s)
-    step_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
-    fast = step_m > FASTEST_MPS * np.abs(np.diff(time_s)) + _JITTER_M
     astray = np.zeros(count, dtype=np.bool_)
-    if not fast.any():
+    begins, ends = _runs(time_s, place_m)
+    if len(begins) == 1:
         return astray, 0.0, 0
-    begins = np.concatenate([[0], np.flatnonzero(fast) + 1])
-    ends = np.append(begins[1:], count)
     main = int(np.argmax(ends - begins))
     few = max(3.0, 0.05 * count)
 
@@ -121,5 +138,6 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, float, 
     walk(range(main + 1, len(begins)), begins, ends - 1)
     walk(range(main - 1, -1, -1), ends - 1, begins)
     at = int(np.argmax(astray))
+    step_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
     step_s = np.maximum(np.abs(np.diff(time_s)), 1e-3)
     return astray, float((step_m / step_s)[max(at - 1, 0) : at + 1].max()), at

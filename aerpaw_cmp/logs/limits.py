@@ -208,7 +208,7 @@ def _two_levels(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> Non
     if step > _APART_DB and back < _BACK_SHARE * step:
         warnings.append(
             f"rss {stream.name!r}: its levels alternate, {step:.0f} dB apart from record to record: two devices, SIMs "
-            "or networks in one series, which no column tells apart"
+            "or networks in one series, which no column known as a name tells apart"
         )
 
 

@@ -168,7 +168,6 @@ def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:
 
 
 _PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
-_MOVED_M, _CLIMB_M = 0.5, 2.0
 
 
 def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> FloatArray:
@@ -181,16 +180,8 @@ def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[s
     if not home.any():
         rest = _pose.at_rest(rows.time[known], *(values[name][known] for name in _PLACE))
         return altitude - float(altitude[known[0]] if rest is None else rest)
-    home_s, home_m = flight.home.time_s[home], flight.home.columns["altitude_m"][home]
-    climbs = altitude[known] - np.minimum.accumulate(altitude[known]) > _CLIMB_M
-    takeoff_s = time_s[known[int(np.argmax(climbs))]] if climbs.any() else home_s[-1]
-    at = max(int(np.searchsorted(home_s, takeoff_s, side="right")) - 1, 0)
-    if np.ptp(home_m) > _MOVED_M:
-        rows.warnings.append(
-            f"home moved ({np.min(home_m):.1f} .. {np.max(home_m):.1f} m above sea level): heights count from the home "
-            f"at take-off, {home_m[at]:.1f} m"
-        )
-    return np.asarray(altitude - home_m[at])
+    home_m = flight.home.columns["altitude_m"][home]
+    return _pose.above_home(rows, time_s, altitude, flight.home.time_s[home], home_m)
 
 
 def of_both(position: Series, above_home: str) -> Series:
@@ -201,6 +192,6 @@ def of_both(position: Series, above_home: str) -> Series:
     altitude, height = position.columns["altitude_m"], position.columns.pop(above_home)
     home_m = altitude - height
     finite = home_m[np.isfinite(home_m)]
-    if not len(finite) or np.ptp(finite) <= _MOVED_M:
+    if not len(finite) or np.ptp(finite) <= _pose.MOVED_M:
         position.columns["altitude_m"], home_m = height, np.zeros(len(height))
     return Series(position.time_s, position.number, {"altitude_m": home_m})

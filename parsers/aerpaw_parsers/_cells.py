@@ -211,7 +211,7 @@ def named(
 ) -> Stream | None:  # fmt: skip
     """Level or KPI stream of a column by its name; of an unknown one, a KPI under its own name.
 
-    A level of a neighbour that nobody names, and one that the base station measured, is a KPI.
+    A level of a neighbour that nobody names, one that the base station measured, a statistic, a prediction are KPIs.
 
     Parameters
     ----------
@@ -229,7 +229,7 @@ def named(
     meaning = dictionary.meaning(name)
     quantity = dictionary.Quantity(name, "kpi", ()) if meaning is None else meaning.quantity
     short = re.sub(r"\W+", "_", dictionary.plain(name))
-    if quantity.kind == "rss" and meaning is not None and not meaning.uplink and not meaning.neighbour:
+    if quantity.kind == "rss" and meaning is not None and not meaning.indirect and not meaning.neighbour:
         level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))
         return rows.stream(
             "rss", short, {"rss_db": level}, where=where, flag=flag, channel=rows.options.channel or short,

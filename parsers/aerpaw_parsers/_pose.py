@@ -12,7 +12,7 @@ from aerpaw_cmp.readers import dictionary
 from . import _sheet
 
 _PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
-_ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
+ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 _VELOCITIES = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
 # Attributes of a stream that say how its heights are known.
 Height = dict[str, Attribute | None]
@@ -93,7 +93,7 @@ def _height(rows: _rows.Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     """Datum and values of the column of heights whose datum is of most use: the dictionary has them in that order."""
     column = sheet.find("altitude_m")
     if column is None:
-        rows.warnings.append("the log has no altitude: give the track another log, or heights are unknown")
+        rows.warnings.append("no column is known as a height: give the track another log, or heights are unknown")
         return "unknown", np.full(len(rows), np.nan)
     meaning = sheet.meanings[column]
     assert meaning is not None
@@ -101,7 +101,49 @@ def _height(rows: _rows.Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     if datum == "unknown":
         known = sheet.program.datum if sheet.program is not None else ""
         rows.height_from, datum = ("program", known) if known else ("assumed", datum)
-    return datum, sheet.numbers(column)
+    height = sheet.numbers(column)
+    return datum, _with_moved_home(rows, sheet, height) if datum == "take-off" else height
+
+
+# Home moved where it is further than this from where it was [m]; an aircraft that is so much higher has taken off [m].
+MOVED_M, _OFF_M = 0.5, 2.0
+
+
+def above_home(
+    rows: _rows.Rows, time_s: FloatArray, altitude: FloatArray, home_s: FloatArray, home_m: FloatArray
+) -> FloatArray:
+    """Heights above the home at take-off, of altitudes above sea level and the altitudes of home at their times."""
+    known = np.flatnonzero(np.isfinite(altitude))
+    climbs = altitude[known] - np.minimum.accumulate(altitude[known]) > _OFF_M
+    takeoff_s = time_s[known[int(np.argmax(climbs))]] if climbs.any() else home_s[-1]
+    at = max(int(np.searchsorted(home_s, takeoff_s, side="right")) - 1, 0)
+    if np.ptp(home_m) > MOVED_M:
+        rows.warnings.append(
+            f"home moved ({np.min(home_m):.1f} .. {np.max(home_m):.1f} m above sea level): heights count from the home "
+            f"at take-off, {home_m[at]:.1f} m"
+        )
+    return np.asarray(altitude - home_m[at])
+
+
+def _with_moved_home(rows: _rows.Rows, sheet: _sheet.Sheet, height: FloatArray) -> FloatArray:
+    """Heights above take-off, where a column above sea level beside them tells that home moved in one step."""
+    for i, meaning in enumerate(sheet.meanings):
+        datum = "" if meaning is None else meaning.quantity.datum
+        if datum == "sea level" or (
+            datum == "unknown" and sheet.program is not None and sheet.program.datum == "sea level"
+        ):
+            altitude = sheet.numbers(i)
+            known = np.flatnonzero(np.isfinite(altitude) & np.isfinite(height))
+            home_m = (altitude - height)[known]
+            steady = np.abs(np.diff(home_m)) < _JITTER_M
+            if len(known) > 1 and np.ptp(home_m) > MOVED_M and steady.mean() > _STEADY:
+                time_s = (rows.time - rows.time[0]) / np.timedelta64(1, "s")
+                return above_home(rows, time_s, altitude, time_s[known], home_m)
+    return height
+
+
+# Two columns of one estimate go together to this [m], in all rows but those in which home moves.
+_JITTER_M, _STEADY = 0.1, 0.9
 
 
 def above_takeoff(
@@ -193,10 +235,10 @@ def at_rest(time: AnyArray, latitude: FloatArray, longitude: FloatArray, altitud
 
 def _attitude(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
     """Angles in degrees: by the unit of the name, by the program, and only then by the values of all three."""
-    columns = {key: column for key in _ANGLES if (column := sheet.find(key)) is not None}
+    columns = {key: column for key in ANGLES if (column := sheet.find(key)) is not None}
     values = {key: sheet.numbers(column) for key, column in columns.items()}
     named = any(sheet.unit(column) for column in columns.values())
-    if not named and _are_radians(values):
+    if not named and are_radians(values):
         rows.warnings.append("nothing names the unit of the angles: by their values they were read as radians, a guess")
         values = {key: np.degrees(value) for key, value in values.items()}
     yaw = values.get("yaw_deg")
@@ -206,12 +248,12 @@ def _attitude(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
     return values
 
 
-def _are_radians(values: dict[str, FloatArray]) -> bool:
+def are_radians(values: dict[str, FloatArray]) -> bool:
     """Check whether roll, pitch and yaw all lie where radians of an aircraft do, and no degrees are likelier.
 
     In degrees a flight with such values never turned away from north by more than six degrees.
     """
-    if set(values) != set(_ANGLES) or not all(np.isfinite(value).any() for value in values.values()):
+    if set(values) != set(ANGLES) or not all(np.isfinite(value).any() for value in values.values()):
         return False
-    roll, pitch, yaw = (float(np.nanmax(np.abs(values[key]))) for key in _ANGLES)
+    roll, pitch, yaw = (float(np.nanmax(np.abs(values[key]))) for key in ANGLES)
     return roll <= np.pi / 2 and pitch <= np.pi / 2 and yaw <= 2 * np.pi and max(roll, pitch, yaw) > 0

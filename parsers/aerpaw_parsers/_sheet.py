@@ -87,6 +87,26 @@ def _number(text: str) -> tuple[float, str]:
         return np.nan, ""
 
 
+# 35.728 N; 35 43.68 N; degrees, minutes and seconds with their marks.
+_MARKS = "[\u00b0'\u2032\u2033\"dms ]"
+_ANGLE = re.compile(rf"[-+]?[\d.]+(?:{_MARKS}{{1,3}}[\d.]+){{0,2}}{_MARKS}{{0,3}}([NSEW]?)")
+
+
+def _angle(text: str) -> tuple[float, str]:
+    """Number and unit of a position: also as degrees, minutes and seconds, and with the letter of a hemisphere."""
+    value, unit = _number(text)
+    written = _ANGLE.fullmatch(text) if np.isnan(value) or unit == "w" else None
+    if written is None:
+        return value, unit
+    try:
+        parts = [float(part) for part in re.findall(r"[\d.]+", text)]
+    except ValueError:
+        return np.nan, ""
+    value = sum(part / 60**i for i, part in enumerate(parts))
+    return -value if written[1] in ("S", "W") or text.startswith("-") else value, ""
+
+
+_VALUE = re.compile(r"\s*[-+\[\"]?\d")
 # Units of cells that change nothing.
 _HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
 
@@ -229,7 +249,7 @@ class Sheet:
             meaning = self.meanings[column]
             if meaning is not None:
                 values = self._angles(column, meaning.quantity, values)
-                if meaning.quantity.role not in ("rss", "rank", "position", "time") or meaning.uplink:
+                if meaning.quantity.role not in ("rss", "rank", "position", "time") or meaning.indirect:
                     values = np.where(dictionary.is_none(meaning.quantity, values), np.nan, values)
             values.flags.writeable = False  # the next who asks gets the same
             self._numbers[column] = values
@@ -238,7 +258,9 @@ class Sheet:
     def _parsed(self, column: int, texts: list[str]) -> FloatArray:
         if self._has_points and _are_thousands(texts):
             texts = [text.replace(",", "") for text in texts]
-        parsed = {text: _number(text) for text in set(texts)}  # tables repeat themselves
+        meaning = self.meanings[column]
+        reads = _angle if meaning is not None and meaning.quantity.role == "position" else _number
+        parsed = {text: reads(text) for text in set(texts)}  # tables repeat themselves
         values = np.array([parsed[text][0] for text in texts], dtype=np.float64)
         words = [text for text in texts if np.isnan(parsed[text][0]) and text.lower() not in NO_VALUE]
         if 2 * len(words) > sum(text.lower() not in NO_VALUE for text in texts):
@@ -246,6 +268,10 @@ class Sheet:
                 f"column {self.names[column]!r}: {len(words)} cells are no number (the first: {words[0][:30]!r}) and "
                 "read as missing"
             )
+        unit = meaning.unit if meaning is not None and "[" in self.names[column] else ""
+        if unit and meaning is not None and meaning.quantity.unit and not dictionary.is_unit(unit):
+            text = f"column {self.names[column]!r}: no unit that is known: read as {meaning.quantity.unit}"
+            self.notes.setdefault(column, text)
         units = {unit for _, unit in parsed.values() if dictionary.is_unit(unit)}
         if not units:
             return dictionary.converted(values, self.unit(column))
@@ -335,7 +361,8 @@ class _Table:
     def __init__(self, names: list[str], comments: list[int]) -> None:
         self.names, self.comments = names, comments
         self._place = list(range(len(names)))  # column of each field under the present header
-        self._known, self._turned = {dictionary.plain(name) for name in names}, False
+        self._unit = [""] * len(names)  # of each field, where that of the first header was another
+        self._known, self._turned = {dictionary.without_unit(name)[0] for name in names}, False
         self._row: list[int] = []
         self._cells: list[list[str]] = []
         self._short: list[tuple[int, list[str]]] = []
@@ -344,9 +371,8 @@ class _Table:
     def add(self, i: int, fields: list[str]) -> None:
         """The next line that is not blank."""
         width = len(self._place)
-        begins = fields[0].strip()
-        may_be = not begins[:1].isdigit() and dictionary.plain(begins) in self._known
-        if may_be and self._is_header([text.strip() for text in fields]):
+        words = [text.strip() for text in fields]
+        if not any(_VALUE.match(text) for text in words) and self._is_header(words):
             self.comments.append(i)  # files joined by hand
         elif len(fields) == width:
             self._row.append(i)
@@ -359,29 +385,34 @@ class _Table:
 
     def _is_header(self, texts: list[str]) -> bool:
         """Check whether a line is a header, of the same columns or of others; what follows is read under it."""
-        known = sum(
-            dictionary.plain(text) in self._known or dictionary.meaning(text) is not None for text in texts if text
-        )
-        numbers = any(np.isfinite(_number(text)[0]) for text in texts)
-        if numbers or 2 * known <= sum(bool(text) for text in texts):
+        bare = [dictionary.without_unit(text) for text in texts]
+        known = [
+            name in self._known or dictionary.meaning(text) is not None
+            for (name, _), text in zip(bare, texts, strict=True)
+        ]
+        if len(texts) < 2 or 2 * sum(known) <= sum(bool(text) for text in texts):
             return False
-        plain = [dictionary.plain(name) for name in self.names]
-        spare = {name: [j for j, other in enumerate(plain) if other == dictionary.plain(name)] for name in texts}
-        self._place, self._turned = [], True
-        for name in texts:
-            if not spare[name]:
-                spare[name].append(len(self.names))
-                self.names.append(name)
-                self._known.add(dictionary.plain(name))
-            self._place.append(spare[name].pop(0))
+        spare: dict[str, list[int]] = {}
+        for j, name in enumerate(self.names):
+            spare.setdefault(dictionary.without_unit(name)[0], []).append(j)
+        self._place, self._unit, self._turned = [], [], True
+        for (name, unit), text in zip(bare, texts, strict=True):
+            if not spare.get(name):
+                spare[name] = [len(self.names)]
+                self.names.append(text)
+                self._known.add(name)
+            column = spare[name].pop(0)
+            self._place.append(column)
+            changed = dictionary.is_unit(unit) and unit != dictionary.without_unit(self.names[column])[1]
+            self._unit.append(unit if changed else "")
         return True
 
     def _placed(self, fields: list[str]) -> list[str]:
         if len(self.names) == len(self._place) and not self._turned:
             return fields
         cells = [""] * len(self.names)
-        for j, text in zip(self._place, fields, strict=True):
-            cells[j] = text
+        for j, text, unit in zip(self._place, fields, self._unit, strict=True):
+            cells[j] = f"{text.strip()} {unit}" if unit and text.strip() else text
         return cells
 
     def sheet(self, lines: _lines.Lines, last_line: int) -> Sheet:
@@ -395,8 +426,12 @@ class _Table:
             self._odd = [item for item in self._odd if item[0] not in read]
         last = self._row[-1] if self._row else self.comments[-1]
         torn = len(lines) - 1 if lines.unterminated else -1
-        # words below the table, as Nemo writes them, have no separator
-        foot = {i for i, count, _ in self._odd if i > last and count == 1 and i != torn}
+        # words below the table, as Nemo writes them, have no separator and begin with no number
+        foot = {
+            i
+            for i, count, _ in self._odd
+            if i > last and count == 1 and i != torn and not _VALUE.match(lines.raw(i).decode("utf-8", "replace"))
+        }
         return Sheet(
             lines=lines,
             names=self.names,
@@ -455,7 +490,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         [(sheet.names[i], m.quantity, sheet.numbers(i)) for i, m in enumerate(sheet.meanings)
          if m is not None and m.quantity.role in ("position", "cell") and m.quantity.can_be[1] < np.inf]
         + [(sheet.names[i], m.quantity, sheet.numbers(i)) for i, m in enumerate(sheet.meanings)
-           if m is not None and m.quantity.role == "rss" and not m.uplink]
+           if m is not None and m.quantity.role == "rss" and not m.indirect]
     )  # fmt: skip
     mapped = column is not None
     column = sheet.find("time") if column is None else column
@@ -497,7 +532,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if day is not None and not zone:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
     if (beside := None if mapped else sheet.find("zone")) is not None:
-        zones = [text if _stamps.is_zone(text) else "" for text in sheet.texts(beside)]
+        zones = [_stamps.beside(text) for text in sheet.texts(beside)]
         texts = [f"{time} {own}".strip() for time, own in zip(texts, zones, strict=True)]
     gps = re.search(r"\bgps", name) is not None
     return _stamps.read(texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps)
@@ -510,11 +545,19 @@ _COUNTS = {"us": re.compile(r"\b(us|usec|micros\w*)\b"), "ms": re.compile(r"\bms
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:
     """UTC of a column of GPS weeks and one of the seconds or milliseconds of the week; None where there are none."""
     week, second = sheet.find("gps_week"), sheet.find("gps_seconds")
+    if second is None and time is not None and "gps" in sheet.plain[time]:
+        second = time
     if week is None or second is None or (time is not None and time != second and not _counts(sheet, time)):
         return None
     weeks, seconds = sheet.numbers(week), sheet.numbers(second)
-    if not (np.nanmedian(weeks) > 1024 if np.isfinite(weeks).any() else False):
+    if not np.isfinite(weeks).any():
         return None
+    if np.nanmedian(weeks) < 1024:
+        raise InputError(
+            f"the GPS weeks are about {np.nanmedian(weeks):.0f}",
+            expected="weeks since 1980, such as 2370",
+            cause="the receiver counts them modulo 1024: add 1024 or 2048 to the column",
+        )
     scale = 1e-3 if np.nanmax(seconds) > 604_800 else 1.0
     return np.asarray(weeks * 604_800.0 + seconds * scale + _stamps.GPS_S - _stamps.LEAP_S)
 
@@ -593,7 +636,8 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
         The name is empty where the table has one part.
     """
     columns = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name == key]
-    values_of = {i: {text for text in sheet.texts(i) if _says(text, key)} for i in columns}
+    counted = {i: "device" if sheet.plain[i].startswith(("sim", "slot", "sub")) else key for i in columns}
+    values_of = {i: {text for text in sheet.texts(i) if _says(text, counted[i])} for i in columns}
     several = [i for i, values in values_of.items() if 1 < len(values) <= _MOST_PARTS]
     alone = {sheet.plain[i]: next(iter(values)) for i, values in values_of.items() if len(values) == 1}
     if not several:
@@ -603,7 +647,7 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
     for values in product(*[dict.fromkeys(column.tolist()) for column in texts]):
         where = np.all([column == value for column, value in zip(texts, values, strict=True)], axis=0)
         if where.any():
-            written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if _says(text, key)}
+            written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if _says(text, counted[i])}
             about = rows.about | _about(alone | written)
             label = "_".join(_label(name, text) for name, text in written.items())
             yield label, replace(rows.part(where), about=about), sheet.part(where)
@@ -625,7 +669,7 @@ _SI = re.compile(r"(\d{1,12}(?:\.\d{1,9})?) ?([kMG])?(?:Hz)?")
 
 
 def _says(text: str, key: str) -> bool:
-    """Check whether a cell names something; networks have no number 0."""
+    """Check whether a cell names something; networks have no number 0, devices and SIMs may."""
     return text.lower() not in NO_VALUE and text not in ("2147483647", "65535") and (key == "device" or text != "0")
 
 

@@ -26,7 +26,7 @@ _CLOCK = (
     r"(?P<hour>\d{1,2})[:.h-](?P<minute>\d\d)(?:[:.m-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,9}))?)?"
     r" ?(?P<half>[AaPp]\.?[Mm]\.?)?"
 )
-_GAP = r"[T _,:;]{1,3}(?:at )?"
+_GAP = r"[T _,:;-]{1,3}(?:at )?"
 _DAY = r"(?:(?:[Mm]on|[Tt]ue|[Ww]ed|[Tt]hu|[Ff]ri|[Ss]at|[Ss]un)[a-z]{0,6}[., ]{1,2})?"
 _WORD = r"(?P<word>[A-Za-z]{3,9})\.?"
 # The date in front of the clock; date(1) puts the year, and the zone, behind it.
@@ -166,7 +166,10 @@ def _year(digits: str) -> str:
 
 
 def _match(text: str) -> re.Match[str] | None:
-    return next((match for form in _FORMS if (match := form.fullmatch(text))), None)
+    matches = (form.fullmatch(text) for form in _FORMS)
+    return next(
+        (match for match in matches if match and (match.groupdict().get("word") is None or _month(match["word"]))), None
+    )
 
 
 def _written(text: str, order: _Order, zones: _Zones) -> bytes:
@@ -276,12 +279,24 @@ def header_zone(name: str, brackets: str) -> str:
     words = re.split(r"[^A-Za-z0-9+]+", name)
     if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu"}:
         return "UTC"
-    return next((word for word in words if word in _HOURS or word in _STANDARD or word in _WITH_SUMMER), "")
+    last = words[-1].upper() if len(words[-1]) > 2 else ""  # 'time_edt'
+    return next((word for word in (*words, last) if word in {*_HOURS, *_STANDARD, *_WITH_SUMMER}), "")
 
 
-def is_zone(text: str) -> bool:
-    """Check whether a cell is a time zone that can stand behind a time."""
-    return re.fullmatch(_NAMED_ZONE, text) is not None
+def beside(text: str) -> str:
+    """Time zone of a column of zones, as it stands behind a time; of numbers hours, minutes or seconds east of UTC.
+
+    Examples
+    --------
+    >>> beside("EDT"), beside("-240"), beside("-14400"), beside("-0400"), beside("5.5"), beside("here")
+    ('EDT', '-04:00', '-04:00', '-0400', '+05:30', '')
+    """
+    number = re.fullmatch(r"[+-]?\d{1,5}(?:\.\d{1,2})?", text)
+    if number is None or re.fullmatch(r"[+-]\d{4}", text):
+        return text if re.fullmatch(_NAMED_ZONE, text) else ""
+    hours = float(text)
+    hours /= 1 if abs(hours) <= 14 else 60 if abs(hours) <= 840 else 3600
+    return _shown(hours)
 
 
 def read(
@@ -311,7 +326,7 @@ def read(
         Bytes or floats for it.
     warnings : list of str
     """
-    shown = [text.strip().strip('"').strip() for text in texts]
+    shown = [text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else text.strip() for text in texts]
     filled = [text for text in shown if text]
     refuse_spreadsheets(filled)
     counts = sum(_NUMBER.fullmatch(text) is not None for text in filled)

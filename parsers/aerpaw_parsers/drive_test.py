@@ -41,14 +41,22 @@ def sniff(head: bytes) -> bool:
 
 @dataclass
 class _Cell:
-    """Columns of one place in the table: the serving cell, or the n-th of the others."""
+    """Columns of one place in the table: the serving cell, or the n-th of the others, of one device or SIM."""
 
     rat: str
-    serving: bool
+    place: str
     rsrp: int | None = None
     pci: int | None = None
     arfcn: int | None = None
     qualities: dict[str, int] = field(default_factory=dict)
+
+    @property
+    def serving(self) -> bool:
+        return self.place.startswith(("serving", "scell", *_OWNERS))
+
+
+# Places that are devices or SIMs: cells of each are series of their own.
+_OWNERS = ("sim", "slot", "dev", "modem", "phone", "ue")
 
 
 def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
@@ -59,14 +67,17 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
         if meaning is None or meaning.quantity.role not in ("rss", "rank", "kpi", "cell"):
             continue
         name = meaning.quantity.name
-        if meaning.uplink or (meaning.quantity.role in ("rss", "kpi") and name not in ("RSRP", *_QUALITIES)):
+        if meaning.indirect or (meaning.quantity.role in ("rss", "kpi") and name not in ("RSRP", *_QUALITIES)):
             others.append(i)
         elif meaning.quantity.role == "rank":
             ranks.append(i)
         elif meaning.quantity.role != "cell" or name in ("PCI", "ARFCN"):
             place = (meaning.rat, meaning.place)
-            _put(cells.setdefault(place, _Cell(meaning.rat, not meaning.neighbour)), i, name, others)
-    return _completed(cells, others), others, ranks
+            _put(cells.setdefault(place, _Cell(*place)), i, name, others)
+    placed = _completed(cells, others)
+    if len(placed) == 1:
+        placed[0].place = "serving"  # 'rsrp1' alone
+    return placed, others, ranks
 
 
 def _put(cell: _Cell, i: int, quantity: str, others: list[int]) -> None:
@@ -96,6 +107,8 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
             partner for (access, place), partner in cells.items() if place == role and (not rat or access in ("", rat))
         ]
         homes = [partner for partner in same if partner.rsrp is not None]
+        if role == "serving" and not homes and not rat:  # a PCI beside 'rsrp1' alone
+            homes = [cell for cell in cells.values() if cell.rsrp is not None and not cell.place.startswith("n")]
         if len(homes) == 1:
             home = homes[0]
             home.rat = home.rat or rat
@@ -108,7 +121,7 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
     for key, cell in list(cells.items()):
         if len(named) == 1 and not cell.serving:
             cell.rat = cell.rat or next(iter(named))
-        if cell.rsrp is None or (cell.pci is None and not cell.serving):
+        if cell.rsrp is None or (cell.pci is None and cell.place != "serving" and len(cells) > 1):
             others += [column for column in (cell.rsrp, *cell.qualities.values()) if column is not None]
             del cells[key]
     return list(cells.values())
@@ -192,7 +205,14 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
 
 def _radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     cells, others, ranks = _places(sheet)
-    levels = _cells.streams(rows, _readings(sheet, cells), source="drive test")
+    owned: dict[str, list[_Cell]] = {}
+    for cell in cells:
+        owned.setdefault(cell.place if cell.place.startswith(_OWNERS) else "", []).append(cell)
+    levels = [
+        _renamed(stream, owner if len(owned) > 1 else "")
+        for owner, part in owned.items()
+        for stream in _cells.streams(rows, _readings(sheet, part), source="drive test")
+    ]
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
     return [*levels, *((_rank if column in ranks else _other)(rows, sheet, column) for column in columns)]
 

@@ -31,6 +31,8 @@ _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": (
 _INK = re.compile(rb"\S")
 # Units of record columns, by the ends of their names.
 _UNITS = {"_deg": "deg", "_m": "m", "_mps": "m/s", "_dbm": "dBm", "_db": "dB"}
+# Quantities whose names alone contradict no mapping to a column of the telemetry.
+_NO_POSE = ("time", "fix", "satellites")
 # Keys that divide a mapped table, besides devices: each part is a series.
 _KEYS = ("network", "PCI", "ARFCN")
 
@@ -100,15 +102,29 @@ def _values(sheet: _sheet.Sheet, column: int, name: str, options: ReadOptions) -
         If the unit in the file is of another quantity than the mapping.
     """
     values, unit = sheet.numbers(column), sheet.unit_read(column)
+    meaning, written = sheet.meanings[column], sheet.names[column]
+    if meaning is not None and not _is_of(meaning.quantity, name, options.unit):
+        raise UsageError(
+            f"the name of column {written!r} says {meaning.quantity.name}, the mapping {name}",
+            expected="one quantity and unit: mend the mapping, --unit or the header",
+        )
     wanted = next(unit for end, unit in (*_UNITS.items(), ("", "")) if name.endswith(end))
     right = unit in ("dBm", "dB") if name == "rss_db" else unit == wanted
-    if unit and wanted and not right and unit in {known for known, _ in dictionary.UNITS.values()}:
+    bracketed = "[" in written or unit in {known for known, _ in dictionary.UNITS.values()}
+    if unit and wanted and not right and bracketed:
         raise UsageError(
             f"column {sheet.names[column]!r} is in {unit} and mapped to {name}", expected=f"a column in {wanted}"
         )
     if name == "rss_db" and unit == "dBm" and options.unit not in (None, "dBm"):
         raise UsageError(f"column {sheet.names[column]!r} says dBm and --unit says {options.unit}", expected="one unit")
     return values
+
+
+def _is_of(quantity: dictionary.Quantity, name: str, unit: str | None) -> bool:
+    """Check whether a column of a quantity can be mapped to a column of the record model."""
+    if name == "rss_db":
+        return quantity.role == "rss" or (quantity.unit == "dB" and unit != "dBm")
+    return name not in COLUMNS["telemetry"] or quantity.name in (name, *_NO_POSE)
 
 
 def _odd(sheet: _sheet.Sheet, column: int) -> BoolArray:
@@ -140,6 +156,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     if kind == "rss" and options.unit is None and not unit:
         rows.warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
     streams: list[Stream | None] = []
+    angles = {name: sheet.numbers(where[name]) for name in _pose.ANGLES if name in where}
+    if not any(sheet.unit(where[name]) for name in angles) and _pose.are_radians(angles):
+        rows.warnings.append(
+            "the angles are read as degrees, but their values look like radians: name them 'yaw [rad]'"
+        )
     for device, of_device, table in _sheet.parts(rows, sheet, "device"):
         for label, part, cells in _divided(of_device, table, kind):
             values = {name: _values(cells, column, name, options) for name, column in where.items()}

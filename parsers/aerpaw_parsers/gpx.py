@@ -8,11 +8,13 @@ the file name. Elevations are brought to heights above the first point.
 from __future__ import annotations
 
 import re
+from itertools import pairwise
 
 import numpy as np
 
+from aerpaw_cmp.common.units import IntArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 
@@ -58,11 +60,25 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         extra=_torn(lines, data, row), closed=True,
     )  # fmt: skip
     rows.warnings += warnings
+    begun = [track.start() for track in re.finditer(rb"<trk\b", data)]
+    track = np.searchsorted(begun, np.array([at for at, _ in points], dtype=np.int64))[rows.at]
+    if not _overlap(rows, track):
+        return rows.result([_stream(rows, "track")])
+    return rows.result([_stream(rows.part(track == i), f"track_{i}") for i in np.unique(track).tolist()])
+
+
+def _overlap(rows: _rows.Rows, track: IntArray) -> bool:
+    """Check whether tracks of one file run at the same time, as those of two devices do."""
+    spans = sorted((rows.time[track == i].min(), rows.time[track == i].max()) for i in np.unique(track))
+    return any(start < end for (_, end), (start, _) in pairwise(spans))
+
+
+def _stream(rows: _rows.Rows, name: str) -> Stream | None:
     values = {"latitude_deg": rows.decimal("lat"), "longitude_deg": rows.decimal("lon")}
     lost = _pose.clean(rows, values)
     values["altitude_m"], rows.height_from = rows.decimal("ele"), "program"
     values["altitude_m"], about = _pose.above_takeoff(rows, values, "sea level", lost)
-    return rows.result([rows.stream("telemetry", "track", values, where=~lost, source="GPX", about=about)])
+    return rows.stream("telemetry", name, values, where=~lost, source="GPX", about=about)
 
 
 def _torn(lines: _lines.Lines, data: bytes, row: object) -> list[RejectedLine]:

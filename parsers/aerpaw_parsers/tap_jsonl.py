@@ -11,10 +11,10 @@ integers [ns]: UTC since 1970 and the monotonic clock.
 ``clock disk alarm prediction``  what else happened
 ``rotate end``  last line of a segment, and of the last one
 
-An exchange is accepted: as a record of rank (``nr5g_csi``, ``lte_csi``), of RSS (RSRP of ``servingcell``, a series for
-each cell: PCI, ARFCN), or as a companion of these. Everything else that is sound counts as comment. The time of a
-record is the middle between command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR beside a rank
-are those of the last ``servingcell`` within 2 s.
+An exchange is accepted: as a record of rank (``nr5g_csi``, ``lte_csi``), of RSS (RSRP of ``servingcell``, NR and LTE,
+a series for each cell: PCI, ARFCN), or as a companion of these. Everything else that is sound counts as comment. The
+time of a record is the middle between command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR
+beside a rank are those of the last ``servingcell`` within 2 s.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     for name, value in (("node", options.node), ("frequency_hz", options.frequency_hz)):
         if value is not None:
             common[name] = value
-    rsrp = _joined("rss", log.rsrp)
+    levels = {leg: _joined("rss", pieces) for leg, pieces in log.levels.items()}
     streams = []
     for query, name in _RANKS:
         frame = _joined("rank", log.rank[query])
@@ -95,13 +95,14 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
             continue
         if name == "nr5g" or frame["rank"].notna().any():
             if name == "nr5g":
-                frame = _with_serving_cell(frame, rsrp)
+                frame = _with_serving_cell(frame, levels["nr"])
             ri_base = str(header.get("ri_base", "one"))
             streams.append(
                 Stream("rank", name, frame, {**common, "ri_base": ri_base, "channel": options.channel or name})
             )
-    if rsrp is not None:
-        streams += _cells(rsrp, {**common, "unit": "dBm", "rat": "nr"}, options)
+    for leg, frame in levels.items():
+        if frame is not None and (leg == "nr" or frame["rss_db"].notna().any()):
+            streams += _cells(frame, {**common, "unit": "dBm", "rat": leg}, options)
     return ReadResult(
         reader="tap_jsonl",
         streams=tuple(streams),
@@ -122,7 +123,7 @@ class _Log:
     def __init__(self) -> None:
         self.header: dict[str, Any] | None = None
         self.rank: dict[str, list[Columns]] = {query: [] for query, _ in _RANKS}
-        self.rsrp: list[Columns] = []
+        self.levels: dict[str, list[Columns]] = {leg: [] for leg in _LEVELS}
         self.lines = self.exchanges = self.blank = 0
         self.rejected: list[RejectedLine] = []
         self.events: list[str] = []
@@ -140,7 +141,8 @@ class _Log:
         self.blank += blank + len(records) - len(exchanges)
         for query, pieces in self.rank.items():
             pieces.append(_rank_columns(exchanges, query))
-        self.rsrp.append(_rsrp_columns(exchanges))
+        for leg, pieces in self.levels.items():
+            pieces.append(_rsrp_columns(exchanges, leg))
         for _, record in records:
             self._note(record)
 
@@ -253,14 +255,21 @@ def _rank_columns(exchanges: list[tuple[int, dict[str, Any]]], query: str) -> Co
     return _columns(answers, {name: name for name in ("rank", "ri_raw", "mcs", "cqi", "pmi")})
 
 
-def _rsrp_columns(exchanges: list[tuple[int, dict[str, Any]]]) -> Columns:
-    """RSRP and SINR of the NR serving cell."""
+# Columns of a leg of the serving cell; LTE's SINR is in steps that the manual leaves open.
+_LEVELS = {
+    "nr": {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"},
+    "lte": {"rss_db": "rsrp_dbm", "rsrq_db": "rsrq_db", "rssi_dbm": "rssi_dbm"},
+}
+
+
+def _rsrp_columns(exchanges: list[tuple[int, dict[str, Any]]], leg: str) -> Columns:
+    """Levels of the serving cell."""
     answers = []
     for number, record in exchanges:
-        values = _json.inside(_json.inside(record, "decoded"), "nr")
+        values = _json.inside(_json.inside(record, "decoded"), leg)
         if record.get("query") == "servingcell" and values:
             answers.append((number, record, values, _flags(record)))
-    return _columns(answers, {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"} | _IDENTITY)
+    return _columns(answers, _LEVELS[leg] | _IDENTITY)
 
 
 # Attributes of a cell, and the keys under which they were decoded.
@@ -275,7 +284,7 @@ def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOption
         mine = ((identity == values) | (identity.isna() & np.isnan(values))).all(axis=1)
         about = {key: int(value) for key, value in zip(_IDENTITY, values, strict=True) if np.isfinite(value)}
         words = [f"{key}{about[key]}" for key in ("pci", "arfcn") if key in about] if len(cells) > 1 else []
-        name = "_".join(["nr5g_rsrp", *words])
+        name = "_".join(["nr5g_rsrp" if common["rat"] == "nr" else "lte_rsrp", *words])
         frame = rsrp[mine].drop(columns=list(_IDENTITY)).reset_index(drop=True)
         yield Stream("rss", name, frame, {**common, **about, "channel": options.channel or name})
 

@@ -111,7 +111,7 @@ RIGHT = {
         {"lte_pci1": {"rss_db": down(-30.1, 4)}}, start=f"{START}.729", options=NEW_YORK, about={"arfcn": 7399, "quantity": "PSS power"}
     ),
     "53_gnettrack_one_line.kml": Right(
-        {"nr_pci1": {"rss_db": down(-72, 3)}, "phone": {"altitude_m": [0, -1, -2], "yaw_deg": [NAN] * 3}}, options=NEW_YORK,
+        {"nr_pci1": {"rss_db": down(-72, 3)}, "phone": {"altitude_m": [0, -1, -2]}}, options=NEW_YORK,
     ),
     "aerpaw_monitoring.csv": Right({
         "link_power_LW1_transmitter0_receiver0": {"rss_db": [-71.25, -71.3]},
@@ -246,6 +246,47 @@ COUSINS: dict[str, tuple[str, Right]] = {
               maps=("t=time", "lat=latitude_deg", "lon=longitude_deg", "alt_msl=altitude_m"))),
     "networks by their code": (alternating("mnc", 410, 260), Right({"pci11_mnc410": HIGH, "pci11_mnc260": LOW})),
     "SIMs": (alternating("SIM slot", 1, 2), Right({"pci11_sim1": HIGH, "pci11_sim2": LOW})),
+    "SIMs from 0": (alternating("Sim", 0, 1), Right({"pci11_sim0": HIGH, "pci11_sim1": LOW})),
+    "subscriptions of Android": (alternating("subId", 1, 2), Right({"pci11_subid1": HIGH, "pci11_subid2": LOW})),
+    "nodes": (alternating("node", "A", "B"), Right({"pci11_A": HIGH, "pci11_B": LOW})),
+    "SIMs in columns": (
+        table("time,sim1_pci,sim1_rsrp,sim2_pci,sim2_rsrp", f"{EPOCH},11,{{l}},11,-12{{i}}"),
+        Right({"pci11_sim1": {"rss_db": down(-90, 4)}, "pci11_sim2": {"rss_db": down(-120, 4)}})),
+    "a second header in another unit": (
+        table("time,lat,lon,alt_rel [m],pci,p_dbm", f"{EPOCH},{PLACE},3,11,{{l}}")
+        + table("time,lat,lon,alt_rel [ft],pci,p_dbw", f"174956401{{i}},{PLACE},10,11,{{l}}"),
+        Right({"telemetry": {"altitude_m": [3] * 4 + [3.048] * 4}},
+              maps=("time=time", "lat=latitude_deg", "lon=longitude_deg", "alt_rel [m]=altitude_m"))),
+    "statistics and predictions are no levels": radio(
+        "rsrp_max,predicted_rsrp,rsrp_threshold", "-60,-61,-110", {**LEVELS, "rsrp_max": {"value": [-60] * 4}}),
+    "names of Java": (
+        table("timestampMs,latitudeE7,longitudeE7,heightAboveGround,physCellId,rsrpDbm", EPOCH + "000,357280001,-786960001,3,11,{l}"),
+        Right({**LEVELS, "phone": {"latitude_deg": [35.7280001] * 4, "altitude_m": [3] * 4}}, about={})),
+    "millionths of a degree": (
+        table("time,latE6,lonE6,pci,rsrp", EPOCH + ",35728000,-78696000,11,{l}"), Right({"phone": {"latitude_deg": [35.728] * 4}, **LEVELS})),
+    "degrees, minutes, seconds": (
+        table("time,lat,lon,pci,rsrp", EPOCH + ",35\u00b043'40.80036\"\"N,78.6960001W,11,{l}"),
+        Right({"phone": {"latitude_deg": [35.7280001] * 4, "longitude_deg": [-78.6960001] * 4}})),
+    "above the ellipsoid in brackets": height("altitude (WGS84)", "{a}", [0, 1, 2, 3], said="ellipsoid"),
+    "offsets of a column in minutes": (
+        table("Time,utc_offset,pci,rsrp", f"{LOCAL},-240,11,{{l}}"), Right(LEVELS, options={"timezone": "Asia/Tokyo"})),
+    "zone of a header in small letters": phone("time_edt", LOCAL, timezone="Asia/Tokyo"),
+    "weeks beside GPS milliseconds": (
+        table("GPSWeek,GPSTime_ms,pci,rsrp", "2370,22401{i}000,11,{l}"), Right(LEVELS, start="2025-06-10T14:13:12", said="GPS weeks")),
+    "angles under --map that look like radians": (
+        table("t,lat,lon,h,a,b,c", f"{EPOCH},{PLACE},3,0.1,0.1,1.5"),
+        Right({"telemetry": {"yaw_deg": [1.5] * 4}}, said="look like radians",
+              maps=("t=time", "lat=latitude_deg", "lon=longitude_deg", "h=altitude_m", "a=roll_deg", "b=pitch_deg", "c=yaw_deg"))),
+    "two vehicles that nothing tells apart": (
+        "time,lat,lon,alt_rel\n" + "".join(f"{1749564000 + i},{35.7 + i % 2 / 50},-78.7,3\n" for i in range(8)),
+        Right({"vehicle": {"altitude_m": [3] * 8}}, said="two vehicles")),
+    "home moves in flight": (
+        "time,lat,lon,alt_msl,relative_alt\n" + "".join(
+            f"{1749564000 + i},35.7,-78.7,{110 + 3 * i},{3 * i - 8 * (i > 9)}\n" for i in range(20)),
+        Right({"vehicle": {"altitude_m": [3 * i for i in range(20)]}}, said="home moved")),
+    "neighbours by number alone": radio("PCI_2,RSRP_2", "20,-12{i}", N1),
+    "neighbours of an array": radio("NeighborRSRP[0],NeighborPCI[0]", "-12{i},20", N1),
+    "neighbours on other carriers": radio("inter_pci,inter_rsrp", "20,-12{i}", N1),
     "two networks that nothing tells apart": (alternating("note", "", ""), Right({"pci11": {"rss_db": [-70, -110] * 4}}, said="alternate")),
     "devices under --map": (alternating("imei", 111, 112), Right(
         {"rss_imei111": HIGH, "rss_imei112": LOW},
@@ -354,6 +395,8 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "shifted by a column": (table("time,pci,lat,lon,rsrp", EPOCH + ",35.728,-78.696,{l},11"), InputError, SHIFTED),
     "a PCI with a fraction": (table("time,lat,lon,pci,rsrp,rsrq", EPOCH + ",35.7,-78.7,1234.5,11,{l}"), InputError, SHIFTED),
     "a latitude of 999": (table("time,lat,lon,pci,rsrp", EPOCH + ",999,35.7,-78.7,{l}"), InputError, SHIFTED),
+    "weeks modulo 1024": (table("week,tow,pci,rsrp", "322,22401{i},11,{l}"), InputError, "modulo 1024"),
+    "a month of no language": (phone("Time", "10 foo 2025 10:00:0{i}")[0], InputError, "of a form that is not read"),
     "a web page": ("<!DOCTYPE html><html><body>Log in</body></html>\n", InputError, "a web page"),
     "a table of nobody": (
         table("index,when_utc,Breite,rx_power_dbm,temperature", "{i},2025-06-10 10:00:0{i},35,{l},20"), InputError,
@@ -374,6 +417,8 @@ def test_a_header_and_a_mapping_that_disagree_are_refused(tmp_path: Path) -> Non
     place = ("time=time", "p [dBm]=rss_db", "lat=latitude_deg", "lon=longitude_deg")
     with pytest.raises(UsageError, match="is in deg and mapped to altitude_m"):
         read(tmp_path / "x.csv", (*place, "h [deg]=altitude_m"), {})
+    with pytest.raises(UsageError, match="'lon' says longitude_deg, the mapping latitude_deg"):
+        read(tmp_path / "x.csv", (*place[:2], "lon=latitude_deg", "lat=longitude_deg"), {})
     with pytest.raises(UsageError, match="says dBm"):
         read(tmp_path / "x.csv", place, {"unit": "dB re full scale"})
 
@@ -403,3 +448,19 @@ def test_captures_of_several_frequencies_are_several_series(tmp_path: Path) -> N
     assert levels == {
         "USRP1_3400MHz": (3.4e9, pytest.approx(-20, abs=0.01)), "USRP1_3500MHz": (3.5e9, pytest.approx(-40, abs=0.05)),
     }  # fmt: skip
+
+
+def test_tracks_of_one_time_in_a_gpx_are_two(tmp_path: Path) -> None:
+    point = '<trkpt lat="35.7{t}" lon="-78.7"><ele>9{i}</ele><time>2025-06-10T14:00:0{i}Z</time></trkpt>'
+    tracks = ("".join(point.format(t=t, i=i) for i in range(4)) for t in range(2))
+    (tmp_path / "x.gpx").write_text("<gpx>" + "".join(f"<trk>{points}</trk>" for points in tracks) + "</gpx>")
+    shown = {item.name: item.frame["latitude_deg"].tolist() for item in read(tmp_path / "x.gpx", (), {}).streams}
+    assert shown == {"track_1": [35.70] * 4, "track_2": [35.71] * 4}
+
+
+def test_a_table_below_in_another_form_is_no_words(tmp_path: Path) -> None:
+    """Its rows are rejected, and counted, not taken for a comment."""
+    below = table("time;rsrp;pci", "174956401{i};{l};12")
+    (tmp_path / "x.csv").write_text(table("time,pci,rsrp", f"{EPOCH},11,{{l}}") + below)
+    result = read(tmp_path / "x.csv", (), {})
+    assert (result.accepted, len(result.rejected)) == (4, 4)

@@ -205,10 +205,11 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
             path=path,
         )
     binary = b"\0" in head
+    cause = "another kind of file, or a damaged one" if binary else _way_out(head)
     raise InputError(
         "binary content that no reader knows" if binary else f"no reader knows this content: {_excerpt(head)}",
-        expected="one of the formats of 'aerpaw-cmp formats'" + ("" if binary else nearest(head)),
-        cause="another kind of file, or a damaged one" if binary else _way_out(head),
+        expected="one of the formats of 'aerpaw-cmp formats'" + ("" if binary or "--map" in cause else nearest(head)),
+        cause=cause,
         path=path,
     )
 

@@ -35,7 +35,11 @@ _GAIN = re.compile(rb"\A(?:\d{1,3}\s*\n)?Frequency\tE ?Total\. ?dB")
 _LEVELS = re.compile(rb"(?i)g-?net ?track|\b(?:rsrp|rxlev|rscp|level)\b\W{0,20}-?\d{2,3}\b")
 _TIMED = re.compile(rb"(?i)\btime|<when>|\b\d\d:\d\d:\d\d\b")
 _WIFI = re.compile(rb'\A[\s\[]*\{[^\n]{0,400}"log_type"\s*:\s*"wifi"|\A[\s\[]*\{[^\n]{0,400}"connected_bssid"')
-_NMEA = re.compile(rb"\$[A-Z]{2}(?:GGA|RMC|GSA|GSV|GLL|VTG|ZDA),")
+_STAMP = rb"(?:\[?\d{4}-\d\d-\d\d[ T][0-9:.]{8,18}\]?[ ,]{1,2})"
+_NMEA = re.compile(_STAMP + rb"?\$[A-Z]{2}(?:GGA|RMC|GSA|GSV|GLL|VTG|ZDA),")
+_WIFI_OTHER = re.compile(rb"\A(?:WigleWifi-|BSSID ?,)|^\w{1,15} +Scan completed|^BSS [0-9a-f:]{17}", re.MULTILINE)
+_ANSWERS = re.compile(_STAMP + rb"[+#][A-Z0-9]{2,12}: ")
+_SUBTITLES = re.compile(rb"\A\s*1\s*\n\d\d:\d\d:\d\d,\d{3} --> ")
 _WEB = re.compile(rb"(?i)\A\s*(?:<!doctype html|<html\b)")
 _CELL_SEARCH = re.compile(rb"Found CELL \d{1,5}\.\d MHz, EARFCN=\d")
 _PLAN = re.compile(rb'"fileType"\s*:\s*"Plan"|\A\s*QGC WPL \d+')
@@ -48,7 +52,7 @@ _RADIO = re.compile(
     rb"|Built in Release mode using"
 )
 _PLACE = re.compile(rb"\s*-?\d{1,3}\.\d{2,12}, ?-?\d{1,3}\.\d{2,12}\s*")
-_AT = re.compile(rb"(?i)\s*(?:at[+&a-z][^\r\n]{0,200}|\+[A-Z0-9]{2,12}: ?[^\r\n]{0,300}|OK|ERROR|ATI)\s*")
+_AT = re.compile(rb"(?i)\s*(?:at[+&#a-z][^\r\n]{0,200}|[+#][A-Z0-9]{2,12}: ?[^\r\n]{0,300}|OK|ERROR|ATI)\s*")
 _NEMO_BINARY = re.compile(rb"(?i)nmfs|nemo file|anite")
 _SCRIPT_TALK = re.compile(rb"\[[-0-9/]{10} [0-9:.]{8,18}\] ")
 
@@ -102,7 +106,7 @@ def _transcript(head: bytes) -> bool:
     return (
         b"\0" not in head
         and 2 * known > len(lines)
-        and any(line.lstrip()[:3].upper() in (b"AT+", b"+QE", b"+QC", b"+QN", b"+CM") for line in lines)
+        and any(line.lstrip()[:3].upper() in (b"AT+", b"AT#", b"+QE", b"+QC", b"+QN", b"+CM") for line in lines)
     )
 
 
@@ -179,6 +183,11 @@ _KINDS: tuple[tuple[str, str, _Test], ...] = (
     ("kml_levels", "a KML with levels in a layout that is not read: give the program's text log or CSV",
      lambda head: _kml(head) and _LEVELS.search(head) is not None and _TIMED.search(head) is not None),
     ("wifi_scan", "a Wi-Fi scan of PawPrints (access points, no cells)", _WIFI),
+    ("wifi_other", "a Wi-Fi scan (access points, no cells)", _WIFI_OTHER),
+    ("subtitles", "subtitles of a drone's video: convert them to CSV or GPX", _SUBTITLES),
+    ("pdf", "a PDF", re.compile(rb"\A%PDF-")),
+    ("at_answers", "AT answers of a modem whose forms are not read (Quectel's +QENG and +QNWCFG are)",
+     lambda head: _lines.mostly(head, _ANSWERS)),
     ("nmea", "NMEA sentences of a receiver: convert them to GPX (gpsbabel does)", _nmea),
     ("web_page", "a web page (a login or an error page in place of the download?)", _WEB),
     ("kml_other", "a KML without measurements (a geofence, a map, a route for 'aerpaw-cmp predict')", _plain_kml),

@@ -397,6 +397,10 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "a latitude of 999": (table("time,lat,lon,pci,rsrp", EPOCH + ",999,35.7,-78.7,{l}"), InputError, SHIFTED),
     "weeks modulo 1024": (table("week,tow,pci,rsrp", "322,22401{i},11,{l}"), InputError, "modulo 1024"),
     "a month of no language": (phone("Time", "10 foo 2025 10:00:0{i}")[0], InputError, "of a form that is not read"),
+    "a scan of access points": ("WigleWifi-1.4,appRelease=2.53\nMAC,SSID,FirstSeen,RSSI\n", InputError, "a Wi-Fi scan"),
+    "answers of another modem": (
+        table("", '[2025-06-10 10:00:0{i}] #RFSTS: "310 26",1795,-101,-67,-15,2242'), InputError, "AT answers of a modem"),
+    "NMEA through ts": (table("", "[2025-06-10 10:00:0{i}] $GNGGA,140000.00,3543.68,N,07841.76,W,1"), InputError, "NMEA"),
     "a web page": ("<!DOCTYPE html><html><body>Log in</body></html>\n", InputError, "a web page"),
     "a table of nobody": (
         table("index,when_utc,Breite,rx_power_dbm,temperature", "{i},2025-06-10 10:00:0{i},35,{l},20"), InputError,

@@ -8,7 +8,7 @@ do not: units and datums that a program is known to write. A new name is a row h
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from types import MappingProxyType
@@ -395,6 +395,8 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     "mw": ("dBm", _milliwatts(1.0)), "w": ("dBm", _milliwatts(1e3)), "uw": ("dBm", _milliwatts(1e-3)),
     "\u00b5w": ("dBm", _milliwatts(1e-3)), "nw": ("dBm", _milliwatts(1e-6)), "pw": ("dBm", _milliwatts(1e-9)),
 }  # fmt: skip
+# Units of numbers that MAVLink writes as integers: of a table in decimals they are another program's.
+OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
 # Units that may end a name without brackets: 'alt_ft', 'rsrp_dbm'.
 _SUFFIXES = {"ft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps", "dbm",
@@ -466,13 +468,18 @@ def _program(
 
 PROGRAMS: tuple[Program, ...] = (
     _program("PX4, vehicle_gps_position", "time utc usec,timestamp", datum="sea level",
-             units={"timestamp": "us", "alt": "mm"}),
+             units={"timestamp": "us", "alt": "mm", "lat": "e7", "lon": "e7"}),
     _program("PX4", "timestamp,timestamp sample", "timestamp,delta alt", datum="sea level", units={"timestamp": "us"},
              angles="rad"),
     _program("MAVLink", "time boot ms", "rollspeed", datum="sea level", angles="rad", units={
         "relative alt": "mm", "alt": "mm", "vx": "cm/s", "vy": "cm/s", "vz": "cm/s", "hdg": "cdeg", "lat": "e7",
-        "lon": "e7"}),
-    _program("ArduPilot", "timeus", "gcrs,spd", "lat,lng,q1,q2", "desroll,roll", datum="sea level", angles="deg"),
+        "lon": "e7"}, words={r"satellites visible": "satellites"}),
+    _program("ArduPilot", "timeus", "gcrs,spd", "lat,lng,q1,q2", "desroll,roll", datum="sea level", angles="deg",
+             words={r"status": "fix"}),
+    _program("AERPAW .mat", "mx,my,mz", "lat s,lon s", "lat all,lon all", datum="take-off", angles="deg", words={
+        r"mx|lon s|lon all": "longitude", r"my|lat s|lat all": "latitude", r"mz|height s|h all": "altitude rel",
+        r"mroll|roll all": "roll", r"mpitch|pitch all": "pitch", r"myaw|ori s|ori all": "yaw", r"mspeedx": "vn",
+        r"mspeedy": "ve", r"mspeedz|mvz": "vd"}, units={"ori s": "rad"}),
     _program("aerpawlib", "gpsfix,numberofsatellites", "gpsfix,batteryvolts", "numberofsatellites,batteryvolts",
              "volt,number of satellite", "voltage,number of satellites", "volt,number of satellites", datum="take-off"),
     _program("G-NetTrack Pro", "level,qual,networktech", "level,qual,networkmode", datum="sea level", words={
@@ -505,8 +512,47 @@ def in_common_words(names: list[str]) -> list[str]:
     if "rank" in names and not words and any(_is_level(name) for name in names):
         words = {"rank": "rank indicator"}  # by itself the word may be that of any list
     for pattern, word in words.items():
-        names = [re.sub(f"^{pattern}$", word, name) for name in names]
+        names = [re.sub(f"^(?:{pattern})$", word, name) for name in names]
     return names
+
+
+def record_columns(
+    fields: Mapping[str, FloatArray], *, integers: Collection[str] = (), of: Collection[str] = ()
+) -> dict[str, FloatArray]:
+    """Columns of the record model, in its units, that the fields of a message or of a file hold.
+
+    Parameters
+    ----------
+    fields : mapping of str to float array, shape (n,)
+    integers : collection of str
+        Names of fields that are written as integers: only these have the units of integers (mm, 1e-7 deg).
+    of : collection of str
+        Further names that tell the program.
+
+    Returns
+    -------
+    dict of str to float array, shape (n,)
+        Of several fields of one column the preferred; heights above take-off as ``above_home_m``.
+    """
+    names = [plain(name) for name in fields]
+    known = program([*names, *map(plain, of)])
+    columns: dict[str, tuple[tuple[int, int], FloatArray]] = {}
+    for name, own in zip(fields, names, strict=True):
+        words = next((word for form, word in known.words.items() if re.fullmatch(form, own)), own) if known else own
+        what = meaning(name, None if words == own else words)
+        if what is None or what.quantity.role not in ("position", "height", "angle", "velocity", "count"):
+            continue
+        row = what.quantity
+        unit = what.unit or (known.units.get(own, known.angles if row.role == "angle" else "") if known else "")
+        unit = "" if unit in OF_INTEGERS and name not in integers else unit
+        # 65535 mm are a height: of these only the ends of the type are none
+        none = np.abs(fields[name]) >= UNAVAILABLE[0] if unit in ("mm", "e7") else is_none(row, fields[name])
+        values = np.where(none, np.nan, fields[name])
+        column = "above_home_m" if row.datum == "take-off" else row.name
+        place = rank_of(row, words)
+        if column not in columns or place < columns[column][0]:
+            columns[column] = place, converted(values, unit)
+    return {column: values for column, (_, values) in columns.items()}
 
 
 def _is_level(name: str) -> bool:

@@ -156,7 +156,7 @@ def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     for name in _PLACE:
         values[name] = np.where(lost, np.nan, values[name])
     values["altitude_m"] = _height(rows, flight, time_s, values)
-    heading = values.pop("heading_deg", np.full(len(rows), np.nan))
+    heading = values.pop("yaw_deg", np.full(len(rows), np.nan))
     for name in ("roll_deg", "pitch_deg", "yaw_deg"):
         values[name] = flight.attitude.near(name, time_s)
     values["yaw_deg"] = np.where(np.isnan(values["yaw_deg"]), heading, values["yaw_deg"])

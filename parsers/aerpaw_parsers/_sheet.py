@@ -192,7 +192,7 @@ class Sheet:
         unit = self.program.units.get(self._own[column], "")
         if meaning is not None and meaning.quantity.role == "angle":
             unit = unit or self.program.angles
-        return unit if unit not in _OF_INTEGERS or self._in_integers else ""
+        return unit if unit not in dictionary.OF_INTEGERS or self._in_integers else ""
 
     def unit_read(self, column: int) -> str:
         """Unit of :meth:`numbers`; empty where the brackets hold something else, such as ``(LTE scell0)``."""
@@ -306,8 +306,6 @@ class Sheet:
         return [self.notes[column] for column in sorted(self.notes)]
 
 
-# Units of numbers that MAVLink writes as integers: of a table in decimals they are another program's.
-_OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7")
 _DECIMAL_POINT = re.compile(r"-?\d{1,9}\.\d{1,15}")
 _DECIMAL_COMMA = re.compile(r"-?\d{1,4},\d{1,9}")
 _THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,12})?")

@@ -14,9 +14,9 @@ import struct
 
 import numpy as np
 
-from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from aerpaw_cmp.readers import dictionary
 
 from . import _autopilot
 
@@ -150,25 +150,20 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     series = {name: _series(by_name, name) for name in _WANTED}
     gps = series["GPS"]
     place = series["POS"] if len(series["POS"].time_s) else gps
-    column = place.columns
-    if "Lat" not in column or "Lng" not in column:
-        place, column = _autopilot.NONE, {"Lat": _autopilot.NONE.time_s, "Lng": _autopilot.NONE.time_s}
-    altitude = column.get("Alt", np.full(len(place.time_s), np.nan))
-    position = _autopilot.Series(
-        place.time_s,
-        place.number,
-        {"latitude_deg": column["Lat"], "longitude_deg": column["Lng"], "altitude_m": altitude},
-    )
+    if "Lat" not in place.columns or "Lng" not in place.columns:
+        place = _autopilot.Series(gps.time_s[:0], gps.number[:0], {"Lat": gps.time_s[:0], "Lng": gps.time_s[:0]})
+    names = ("Lat", "Lng", "Alt", "RelHomeAlt")  # the yaw of a receiver is none where it has one antenna
+    position = _named(place, *(name for name in names if name in place.columns))
+    position.columns.setdefault("altitude_m", np.full(len(place.time_s), np.nan))
     home = _autopilot.NONE
-    if "RelHomeAlt" in column:
-        position.columns["above_home_m"] = column["RelHomeAlt"]
+    if "above_home_m" in position.columns:
         home = _autopilot.of_both(position, "above_home_m")
     filters = next((series[name] for name in ("XKF1", "NKF1", "EKF1") if len(series[name].time_s)), _autopilot.NONE)
     flight = _autopilot.Flight(
         position=position,
-        attitude=_renamed(series["ATT"], {"Roll": "roll_deg", "Pitch": "pitch_deg", "Yaw": "yaw_deg"}),
-        velocity=_renamed(filters, {"VN": "velocity_north_mps", "VE": "velocity_east_mps", "VD": "velocity_down_mps"}),
-        fix=_renamed(gps, {"Status": "fix", "NSats": "satellites"}),
+        attitude=_named(series["ATT"]),
+        velocity=_named(filters),
+        fix=_named(gps),
         utc_minus_clock_s=_offset(gps),
         home=home,
         source="ArduPilot dataflash log",
@@ -176,9 +171,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return _autopilot.result("ardupilot_bin", options, [flight], count, damaged)
 
 
-def _renamed(series: _autopilot.Series, names: dict[str, str]) -> _autopilot.Series:
-    columns: dict[str, FloatArray] = {new: series.columns[old] for old, new in names.items() if old in series.columns}
-    return _autopilot.Series(series.time_s, series.number, columns)
+def _named(series: _autopilot.Series, *names: str) -> _autopilot.Series:
+    """Messages with the columns of the record model; of the named columns alone where there are some."""
+    fields = {name: series.columns[name] for name in names or series.columns}
+    return _autopilot.Series(series.time_s, series.number, dictionary.record_columns(fields, of=("TimeUS",)))
 
 
 def _offset(gps: _autopilot.Series) -> float | None:

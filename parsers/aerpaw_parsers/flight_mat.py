@@ -29,29 +29,13 @@ from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
+from aerpaw_cmp.readers import dictionary
 
-_TELEMETRY = {
-    "mX": "longitude_deg",
-    "mY": "latitude_deg",
-    "mZ": "altitude_m",
-    "mRoll": "roll_deg",
-    "mPitch": "pitch_deg",
-    "mYaw": "yaw_deg",
-    "mSpeedX": "velocity_north_mps",
-    "mSpeedY": "velocity_east_mps",
-    "mSpeedZ": "velocity_down_mps",
-    "mVz": "velocity_down_mps",
-    "lat_s": "latitude_deg",
-    "lon_s": "longitude_deg",
-    "height_s": "altitude_m",
-    "ori_s": "yaw_deg",
-    "lat_all": "latitude_deg",
-    "lon_all": "longitude_deg",
-    "h_all": "altitude_m",
-    "ori_all": "yaw_deg",
-    "roll_all": "roll_deg",
-    "pitch_all": "pitch_deg",
-}
+_TELEMETRY = (
+    *("mX", "mY", "mZ", "mRoll", "mPitch", "mYaw", "mSpeedX", "mSpeedY", "mSpeedZ", "mVz"),
+    *("lat_s", "lon_s", "height_s", "ori_s"),
+    *("lat_all", "lon_all", "h_all", "ori_all", "roll_all", "pitch_all"),
+)
 LEVELS = {
     "mpower1": "USRP1",
     "mpower2": "USRP2",
@@ -236,11 +220,12 @@ def _common_length(table: dict[str, AnyArray]) -> int:
 
 
 def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream | None:
-    values = {column: _numeric(table[name], name) for name, column in _TELEMETRY.items() if name in table}
-    if not values:
+    fields = {name: _numeric(table[name], name) for name in _TELEMETRY if name in table}
+    if not fields:
         return None
-    if "ori_s" in table:  # radians, reckoned from the track
-        values["yaw_deg"] = np.degrees(values["yaw_deg"])
+    values = dictionary.record_columns(fields)
+    if (height := values.pop("above_home_m", None)) is not None:
+        values["altitude_m"] = height
     if "height_s" not in table and "lat_s" in table:
         values["altitude_m"] = np.full(len(rows), np.nan)
     flag, lost = rows.flag.copy(), np.zeros(len(rows), dtype=bool)

@@ -17,6 +17,7 @@ from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
+from aerpaw_cmp.readers import dictionary
 
 from . import _pose, _stamps
 
@@ -74,9 +75,9 @@ def _overlap(rows: _rows.Rows, track: IntArray) -> bool:
 
 
 def _stream(rows: _rows.Rows, name: str) -> Stream | None:
-    values = {"latitude_deg": rows.decimal("lat"), "longitude_deg": rows.decimal("lon")}
+    values = dictionary.record_columns({key: rows.decimal(key) for key in ("lat", "lon", "ele")})
     lost = _pose.clean(rows, values)
-    values["altitude_m"], rows.height_from = rows.decimal("ele"), "program"
+    rows.height_from = "program"
     values["altitude_m"], about = _pose.above_takeoff(rows, values, "sea level", lost)
     return rows.stream("telemetry", name, values, where=~lost, source="GPX", about=about)
 

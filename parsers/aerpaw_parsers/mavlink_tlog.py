@@ -13,6 +13,7 @@ import numpy as np
 
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from aerpaw_cmp.readers import dictionary
 
 from . import _autopilot
 
@@ -24,7 +25,12 @@ _LAYOUT = {
     _ATTITUDE: struct.Struct("<Iffffff"),
     _GPS: struct.Struct("<QiiiHHHHBB"),
 }
-_FIELDS = {_POSITION: 9, _ATTITUDE: 7, _GPS: 10}
+# Names of the fields, as MAVLink's description of common messages has them.
+_FIELDS = {
+    _POSITION: ["time_boot_ms", "lat", "lon", "alt", "relative_alt", "vx", "vy", "vz", "hdg"],
+    _ATTITUDE: ["time_boot_ms", "roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed"],
+    _GPS: ["time_usec", "lat", "lon", "alt", "eph", "epv", "vel", "cog", "fix_type", "satellites_visible"],
+}
 _EARLIEST_US, _LATEST_US = 946_684_800_000_000, 9_200_000_000_000_000
 
 
@@ -128,8 +134,9 @@ def _flight(messages: dict[int, list[_Message]], system: int, name: str) -> _aut
     for kind in (_POSITION, _ATTITUDE, _GPS):
         rows = [item for item in messages[kind] if item[1] == autopilot]
         rows = rows or [item for item in messages[kind] if item[1][0] == system and item[1][1] not in _NO_AUTOPILOT]
-        table = np.array([row[3] for row in rows], dtype=np.float64).reshape(len(rows), _FIELDS[kind])
-        columns = _columns(kind, table) if len(rows) or kind == _POSITION else {}
+        table = np.array([row[3] for row in rows], dtype=np.float64).reshape(len(rows), len(_FIELDS[kind]))
+        fields = dict(zip(_FIELDS[kind], table.T, strict=True))
+        columns = dictionary.record_columns(fields, integers=fields, of=("time_boot_ms",))
         series[kind] = _autopilot.Series(
             np.array([row[2] for row in rows]), np.array([row[0] for row in rows], dtype=np.int64), columns
         )
@@ -143,25 +150,6 @@ def _flight(messages: dict[int, list[_Message]], system: int, name: str) -> _aut
 
 # MAV_COMPONENT: cameras, gimbals, and what else lies on its own axes.
 _NO_AUTOPILOT = {*range(100, 106), 154, *range(171, 176)}
-_NO_HEADING = 65535
-
-
-def _columns(kind: int, table: np.ndarray) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
-    if kind == _POSITION:
-        table = table if table.size else np.zeros((0, 9))
-        return {
-            "latitude_deg": table[:, 1] / 1e7,
-            "longitude_deg": table[:, 2] / 1e7,
-            "altitude_m": table[:, 3] / 1e3,
-            "above_home_m": table[:, 4] / 1e3,
-            "heading_deg": np.where(table[:, 8] == _NO_HEADING, np.nan, table[:, 8] / 100),
-            "velocity_north_mps": table[:, 5] / 100,
-            "velocity_east_mps": table[:, 6] / 100,
-            "velocity_down_mps": table[:, 7] / 100,
-        }
-    if kind == _ATTITUDE:
-        return {name: np.degrees(table[:, 1 + i]) for i, name in enumerate(("roll_deg", "pitch_deg", "yaw_deg"))}
-    return {"fix": table[:, 8], "satellites": table[:, 9]}
 
 
 READER = Reader(

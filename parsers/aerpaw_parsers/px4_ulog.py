@@ -19,6 +19,7 @@ import numpy as np
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from aerpaw_cmp.readers import dictionary
 
 from . import _autopilot
 
@@ -151,17 +152,13 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     if position is not None:
         track = _series(tables[place_name], numbers[place_name], position)
     local, attitude = tables["vehicle_local_position"], tables["vehicle_attitude"]
-    velocity = {
-        f"velocity_{way}_mps": _column(local, name) for way, name in (("north", "vx"), ("east", "vy"), ("down", "vz"))
-    }
-    fix = {"fix": _column(gps, "fix_type"), "satellites": _column(gps, "satellites_used")}
     utc = _column(gps, "time_utc_usec")
     offset = None if utc is None else _autopilot.offset_s(utc / 1e6, gps["timestamp"].astype(np.float64) / 1e6)
     flight = _autopilot.Flight(
         position=track,
         attitude=_series(attitude, numbers["vehicle_attitude"], _angles(attitude)),
-        velocity=_series(local, numbers["vehicle_local_position"], velocity),
-        fix=_series(gps, numbers[gps_name], fix),
+        velocity=_series(local, numbers["vehicle_local_position"], _columns(local)),
+        fix=_series(gps, numbers[gps_name], _columns(gps)),
         utc_minus_clock_s=offset,
         home=_home(tables["home_position"], numbers["home_position"]),
         source="PX4 ULog" if place_name == "vehicle_global_position" else f"PX4 ULog, {place_name}",
@@ -169,19 +166,20 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return _autopilot.result("px4_ulog", options, [flight], count, damaged)
 
 
-def _position(table: AnyArray) -> dict[str, FloatArray] | None:
-    """Latitude, longitude and altitude of the estimator's or the receiver's own messages, None where there are none.
+def _columns(table: AnyArray) -> dict[str, FloatArray]:
+    """Columns of the record model; receivers wrote integers until PX4 1.14, degrees and metres as doubles since."""
+    names = [name for name in table.dtype.names or () if table[name].ndim == 1 and table.dtype[name].kind in "iuf"]
+    fields = {name: table[name].astype(np.float64) for name in names}
+    return dictionary.record_columns(fields, integers=[name for name in names if table.dtype[name].kind != "f"])
 
-    Receivers wrote 1e-7 deg and mm as integers until PX4 1.14, degrees and metres as doubles since.
-    """
-    for names in (("lat", "lon", "alt"), ("latitude_deg", "longitude_deg", "altitude_msl_m")):
-        latitude, longitude, altitude = (_column(table, name) for name in names)
-        if latitude is None or longitude is None or not len(table):
-            continue
-        per_degree, per_metre = (1e7, 1e3) if table.dtype[names[0]].kind == "i" else (1.0, 1.0)
-        height = np.full(len(table), np.nan) if altitude is None else altitude / per_metre
-        return {"latitude_deg": latitude / per_degree, "longitude_deg": longitude / per_degree, "altitude_m": height}
-    return None
+
+def _position(table: AnyArray) -> dict[str, FloatArray] | None:
+    """Place and altitude of the estimator's or the receiver's own messages, None where there is none."""
+    columns = _columns(table)
+    if not len(table) or not {"latitude_deg", "longitude_deg"} <= set(columns):
+        return None
+    unknown = np.full(len(table), np.nan)
+    return {name: columns.get(name, unknown) for name in ("latitude_deg", "longitude_deg", "altitude_m")}
 
 
 def _home(table: AnyArray, numbers: list[int]) -> _autopilot.Series:

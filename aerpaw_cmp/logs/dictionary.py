@@ -548,6 +548,8 @@ def record_columns(
         # 65535 mm are a height: of these only the ends of the type are none
         none = np.abs(fields[name]) >= UNAVAILABLE[0] if unit in ("mm", "e7") else is_none(row, fields[name])
         values = np.where(none, np.nan, fields[name])
+        if row.role == "position" and not unit:
+            unit = angle_form(values, row)
         column = "above_home_m" if row.datum == "take-off" else row.name
         place = rank_of(row, words)
         if column not in columns or place < columns[column][0]:

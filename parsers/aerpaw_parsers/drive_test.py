@@ -107,8 +107,11 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
             partner for (access, place), partner in cells.items() if place == role and (not rat or access in ("", rat))
         ]
         homes = [partner for partner in same if partner.rsrp is not None]
-        if role == "serving" and not homes and not rat:  # a PCI beside 'rsrp1' alone
-            homes = [cell for cell in cells.values() if cell.rsrp is not None and not cell.place.startswith("n")]
+        if cell.pci is not None and role == "serving" and not homes:  # a PCI beside 'rsrp1' or 'RSRP[0]' alone
+            homes = [
+                home for home in cells.values()
+                if home.rsrp is not None and not home.place.startswith("n") and (not rat or home.rat in ("", rat))
+            ]  # fmt: skip
         if len(homes) == 1:
             home = homes[0]
             home.rat = home.rat or rat

@@ -286,6 +286,8 @@ COUSINS: dict[str, tuple[str, Right]] = {
         Right({"vehicle": {"altitude_m": [3 * i for i in range(20)]}}, said="home moved")),
     "neighbours by number alone": radio("PCI_2,RSRP_2", "20,-12{i}", N1),
     "neighbours of an array": radio("NeighborRSRP[0],NeighborPCI[0]", "-12{i},20", N1),
+    "an index at the level alone": (
+        table("time,NR5G PCI,NR5G SS-RSRP[0]", f"{EPOCH},11,{{l}}"), Right({"nr_pci11": {"rss_db": down(-90, 4)}})),
     "neighbours on other carriers": radio("inter_pci,inter_rsrp", "20,-12{i}", N1),
     "two networks that nothing tells apart": (alternating("note", "", ""), Right({"pci11": {"rss_db": [-70, -110] * 4}}, said="alternate")),
     "devices under --map": (alternating("imei", 111, 112), Right(

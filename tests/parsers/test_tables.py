@@ -209,13 +209,6 @@ def test_commas_of_thousands_are_no_decimal_commas() -> None:
     assert column_of(drive_test(six_rows(commas)), "telemetry", "altitude_m") == [30.0 + i / 10 for i in range(6)]
 
 
-def test_columns_of_hemispheres_give_the_sign() -> None:
-    head = "Time,Latitude,N/S,Longitude,E/W,Altitude (m),RSRP (dBm)\n"
-    result = drive_test(six_rows("2025-03-02 10:00:0{i},35.72{i},N,78.69,W,3{i},-8{i}", head=head))
-    assert column_of(result, "telemetry", "longitude_deg") == [-78.69] * 6
-    assert column_of(result, "telemetry", "latitude_deg") == [35.72 + i / 1000 for i in range(6)]
-
-
 def test_speeds_in_centimetres_per_second() -> None:
     head = "Time,Latitude,Longitude,Height (m),xSpeed(cm/s),ySpeed [cm/s]\n"
     result = read("pose_csv", six_rows("2025-03-02 10:00:0{i},35.72{i},-78.69,3{i},1{i},-250", head=head))

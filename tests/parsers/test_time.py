@@ -25,10 +25,6 @@ def utc_of(*texts: str, zone: str = NEW_YORK) -> list[str]:
     return [str(time)[:19] for time in made.time.astype("datetime64[s]")]
 
 
-def test_summer_and_winter() -> None:
-    assert utc_of("2024-07-02T11:00:00", "2023-12-13T12:00:00") == ["2024-07-02T15:00:00", "2023-12-13T17:00:00"]
-
-
 @given(
     st.datetimes(datetime(1971, 1, 1), datetime(2037, 1, 1)), st.sampled_from([NEW_YORK, "Australia/Lord_Howe", "UTC"])
 )

@@ -50,6 +50,20 @@ class Reading:
     qualities: tuple[float, ...] = (np.nan,) * len(QUALITIES)
 
 
+def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -> Reading:
+    """Levels of one cell from the fields of an object or of a table row, by their names; see :class:`Reading`."""
+    known: dict[str, float] = {}
+    for name, value in fields.items():
+        what = dictionary.meaning(name)
+        if what is not None and np.isfinite(value) and not name.startswith("csi"):  # SS-RSRP is the cell's level
+            known.setdefault(what.quantity.name, value)
+    pci, arfcn, level, *qualities = (known.get(name, np.nan) for name in _QUANTITIES)
+    return Reading(row, rat, pci, arfcn, level, serving, tuple(qualities))
+
+
+_QUANTITIES = ("PCI", "ARFCN", "RSRP", "RSRQ", "RSSI", "SINR", "path loss")
+
+
 @dataclass(frozen=True)
 class Table:
     """Readings as columns; meanings as of :class:`Reading`.

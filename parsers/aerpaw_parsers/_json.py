@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from bisect import bisect_right
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,10 +13,7 @@ from aerpaw_cmp.common.units import FloatArray, IntArray
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
-
-# What Android and modems write for 'unavailable'.
-_SENTINELS = (2147483647, -2147483648, 9223372036854775807, 268435455, 65535)
-
+from aerpaw_cmp.readers import dictionary
 
 _MOST_LINES = 5000
 # Bytes of objects over several lines that were looked at in vain [bytes]: a limit on time.
@@ -144,7 +140,7 @@ def number(value: Any) -> float:
         converted = float(value)
     except (TypeError, ValueError, OverflowError):
         return float("nan")
-    return float("nan") if converted in _SENTINELS or abs(converted) > 1e300 else converted
+    return float("nan") if converted in dictionary.UNAVAILABLE or abs(converted) > 1e300 else converted
 
 
 def column(entries: list[dict[str, Any]], *names: str) -> FloatArray:
@@ -164,14 +160,21 @@ def listed(entry: dict[str, Any], name: str) -> list[dict[str, Any]]:
     return [item for item in value if isinstance(item, dict)] if isinstance(value, list) else []
 
 
-def ue_ranks(
-    rows: _rows.Rows, ues: list[tuple[int, dict[str, Any]]], names: Mapping[str, tuple[str, ...]]
-) -> ReadResult:
-    """Rank streams of UEs, each with its row; ``names`` are the keys of each column, ``ri`` among them."""
+def ue_ranks(rows: _rows.Rows, ues: list[tuple[int, dict[str, Any]]]) -> ReadResult:
+    """Rank streams of UEs, each with its row; what a key holds of the downlink is said by the dictionary."""
     entries = [ue for _, ue in ues]
-    columns = {name: column(entries, *keys) for name, keys in names.items()}
+    none = np.full(len(entries), np.nan)
+    columns = {"rank": none, "cqi": none, "mcs": none, "rnti": column(entries, "rnti")}
+    for key in dict.fromkeys(key for entry in entries for key in entry):
+        what = dictionary.meaning(key)
+        if what is not None and not what.indirect and (name := what.quantity.name.lower()) in _OF_UE:
+            before = columns.get(name, none)
+            columns[name] = np.where(np.isnan(before), column(entries, key), before)
     pick = np.array([i for i, _ in ues], dtype=np.int64)
-    return rows.result(_rows.mean_rank(rows, columns.pop("ri"), columns, pick=pick))
+    return rows.result(_rows.mean_rank(rows, columns.pop("rank"), columns, pick=pick))
+
+
+_OF_UE = ("rank", "cqi", "mcs", "pci")
 
 
 def bracket(line: bytes) -> str | None:

@@ -110,7 +110,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
         for ue in _json.listed(replies[at], "ue_list")
         for cell in _json.listed(ue, "cells")
     ]
-    return _json.ue_ranks(rows, pairs, {"ri": ("ri",), "cqi": ("cqi",), "mcs": ("dl_mcs",), "rnti": ("rnti",)})
+    return _json.ue_ranks(rows, pairs)
 
 
 READER = Reader(

@@ -46,22 +46,9 @@ def sniff(head: bytes) -> bool:
 
 def _reading(row: int, cell: dict[str, Any], connected: float) -> _cells.Reading:
     rat = "nr" if "NR" in str(cell.get("technology")) or "5G" in str(cell.get("technology")) else "lte"
-    pci = _json.number(cell.get("pci"))
-    level, quality, ratio = (
-        next((v for key in keys if np.isfinite(v := _json.number(cell.get(key)))), np.nan)
-        for keys in (("rsrp", "ss_rsrp"), ("rsrq", "ss_rsrq"), ("rssnr", "ss_sinr", "sinr"))
-    )
-    serving = str(cell.get("is_connected")).lower() == "true" or (rat == "lte" and pci == connected)
-    arfcn = next((v for key in ("earfcn", "nrarfcn", "arfcn") if np.isfinite(v := _json.number(cell.get(key)))), np.nan)
-    return _cells.Reading(
-        row=row,
-        rat=rat,
-        pci=pci,
-        arfcn=arfcn,
-        rsrp_dbm=level,
-        serving=serving,
-        qualities=(quality, _json.number(cell.get("rssi")), ratio, np.nan),
-    )
+    fields = {name: _json.number(value) for name, value in cell.items()}
+    serving = str(cell.get("is_connected")).lower() == "true" or (rat == "lte" and fields.get("pci") == connected)
+    return _cells.reading(row, fields, rat=rat, serving=serving)
 
 
 def _readings(entries: list[dict[str, Any]]) -> Iterator[_cells.Reading]:

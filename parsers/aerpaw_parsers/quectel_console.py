@@ -75,12 +75,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     )
     timed = [entries[i] for i in rows.at.tolist()]
     readings = [
-        _cells.Reading(
-            row=i, rat="lte" if title == "LTE" else "nr", pci=value.get("PCID", np.nan),
-            arfcn=value.get("earfcn", value.get("ARFCN", np.nan)),
-            rsrp_dbm=value.get("RSRP", np.nan), serving=True,
-            qualities=(value.get("RSRQ", np.nan), value.get("RSSI", np.nan), value.get("SINR", np.nan), np.nan),
-        )
+        _cells.reading(i, value, rat="lte" if title == "LTE" else "nr", serving=True)
         for i, (_, _, title, value) in enumerate(timed) if "RSRP" in value
     ]  # fmt: skip
     ranks = [_rank(rows, name, [(item[2], item[3]) for item in timed]) for name in _CSI]

@@ -110,14 +110,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     )
     rows.warnings += warnings
     pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(entries[with_ue[at]])]
-    names = {
-        "ri": ("dl_ri", "ri"),
-        "cqi": ("cqi", "dl_cqi"),
-        "mcs": ("dl_mcs", "mcs"),
-        "rnti": ("rnti",),
-        "pci": ("pci",),
-    }
-    return _json.ue_ranks(rows, pairs, names)
+    return _json.ue_ranks(rows, pairs)
 
 
 READER = Reader(

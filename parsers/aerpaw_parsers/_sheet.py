@@ -641,11 +641,12 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
     if not several:
         yield "", replace(rows, about=rows.about | _about(alone)), sheet
         return
-    texts = [np.array(sheet.texts(i), dtype=object) for i in several]
+    # rows that name none are one part, whatever they write
+    texts = [np.array([text if text in values_of[i] else "" for text in sheet.texts(i)], dtype=object) for i in several]
     for values in product(*[dict.fromkeys(column.tolist()) for column in texts]):
         where = np.all([column == value for column, value in zip(texts, values, strict=True)], axis=0)
         if where.any():
-            written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if _says(text, counted[i])}
+            written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if text}
             about = rows.about | _about(alone | written)
             label = "_".join(_label(name, text) for name, text in written.items())
             yield label, replace(rows.part(where), about=about), sheet.part(where)

@@ -203,7 +203,7 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
             suffix = "_".join(word for word in (network, device) if word)
             streams += [_renamed(stream, suffix) for stream in _radio(part, cells)]
     rows.warnings += sheet.unread()
-    return rows.result(_distinct(streams))
+    return rows.result(streams)
 
 
 def _radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
@@ -275,15 +275,6 @@ def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     if tower := _TOWER_SNR.fullmatch(name):
         return _rows.snr(rows, tower[1].upper(), values)
     return _cells.named(rows, name, values, unit=sheet.unit_read(column), where=np.isfinite(values))
-
-
-def _distinct(streams: list[Stream | None]) -> list[Stream | None]:
-    """Streams by name: of two columns of one name the first is kept."""
-    by_name: dict[str, Stream] = {}
-    for stream in streams:
-        if stream is not None:
-            by_name.setdefault(stream.name, stream)
-    return list(by_name.values())
 
 
 READER = Reader(

@@ -470,3 +470,13 @@ def test_a_table_below_in_another_form_is_no_words(tmp_path: Path) -> None:
     (tmp_path / "x.csv").write_text(table("time,pci,rsrp", f"{EPOCH},11,{{l}}") + below)
     result = read(tmp_path / "x.csv", (), {})
     assert (result.accepted, len(result.rejected)) == (4, 4)
+
+
+def test_rows_whose_identity_says_nothing_are_one_part_and_none_is_lost(tmp_path: Path) -> None:
+    """Parts of one name took each other's place: ``B`` is a SIM here and a network there."""
+    cells = [("A", "B"), ("", "B"), ("B", ""), ("nan", "-"), ("n/a", ""), ("", "0")]
+    rows = "".join(f"{1749564000 + i},{a},{b},11,{-90 - i}\n" for i, (a, b) in enumerate(cells))
+    (tmp_path / "x.csv").write_text(f"time,operator,sim slot,pci,rsrp\n{rows}")
+    streams = read(tmp_path / "x.csv", (), {}).streams
+    assert len({item.name for item in streams}) == len(streams)
+    assert sorted(level for item in streams for level in item.frame["rss_db"]) == [-95.0, -94, -93, -92, -91, -90]

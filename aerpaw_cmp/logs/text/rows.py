@@ -183,8 +183,14 @@ class Rows:
         return {"rank": ranks(ri, self.flag, none=none), "ri_raw": ri}
 
     def result(self, streams: Iterable[Stream | None]) -> ReadResult:
-        """The streams that have rows, with the account."""
-        present = tuple(stream for stream in streams if stream is not None)
+        """The streams that have rows, each with a name of its own, with the account."""
+        names: dict[str, Stream] = {}
+        for stream in streams:
+            if stream is not None:
+                alike = sum(name == stream.name or name.startswith(f"{stream.name}_again") for name in names)
+                name = f"{stream.name}_again{alike}" if alike else stream.name
+                names[name] = replace(stream, name=name) if alike else stream
+        present = tuple(names.values())
         back = [text for stream in present[:1] for text in _frames.steps_back(stream.frame)]
         return ReadResult(
             reader=self.reader,

@@ -143,8 +143,14 @@ _IN_WORDS: dict[Any, str] = {
 }
 
 
+# Raised by a line of this package, these are its own faults and not those of a file.
+_FAULTS = (TypeError, AttributeError, NameError, AssertionError, NotImplementedError, ImportError)
+
+
 @contextmanager
-def parsing(path: str | Path, expected: str | None = None, cause: str = "a damaged file") -> Iterator[None]:
+def parsing(
+    path: str | Path, expected: str | None = None, cause: str = "a damaged file", *, any_shape: bool = False
+) -> Iterator[None]:
     """Whatever a file's content makes its parser raise is an :class:`InputError` about the file.
 
     The one place for it, since libraries raise two dozen kinds on damage (RecursionError of a nested JSON, csv.Error of
@@ -155,6 +161,12 @@ def parsing(path: str | Path, expected: str | None = None, cause: str = "a damag
     path : str or Path
     expected, cause : str, optional
         Of the message, for what the parser does not foresee itself.
+    any_shape : bool
+        Inside, JSON is walked through whose shape nobody has checked: there a TypeError is of the file, elsewhere ours.
+
+    Yields
+    ------
+    None
     """
     try:
         with about_file(path):
@@ -164,6 +176,8 @@ def parsing(path: str | Path, expected: str | None = None, cause: str = "a damag
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", expected=expected, path=path) from error
     except Exception as error:
+        if isinstance(error, _FAULTS) and not any_shape and _is_raised_here(error):
+            raise
         words = f"{type(error).__name__}: {one_line(str(error)[:200])}"
         words = next((text for kind, text in _IN_WORDS.items() if isinstance(error, kind)), words)
         raise InputError(
@@ -172,6 +186,15 @@ def parsing(path: str | Path, expected: str | None = None, cause: str = "a damag
             cause=cause,
             path=path,
         ) from error
+
+
+def _is_raised_here(error: BaseException) -> bool:
+    """Check whether a line of this package or of its readers raised an error, not a library that it called."""
+    trace = error.__traceback__
+    while trace is not None and trace.tb_next is not None:
+        trace = trace.tb_next
+    name = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
+    return name.partition(".")[0] in ("aerpaw_cmp", "aerpaw_parsers")
 
 
 def parsed(expected: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:

@@ -288,7 +288,7 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
         raise InputError(
             f"flight file of version {version}", expected=f"version {_VERSION}", cause="a newer tool", path=path
         )
-    with parsing(path, "a flight file of 'aerpaw-cmp ingest -o'", "a cut copy: ingest the logs again"):
+    with parsing(path, "a flight file of 'aerpaw-cmp ingest -o'", "a cut copy: ingest the logs again", any_shape=True):
         return [_read_file(items, name) for name in _numbered(items, "files/")]
 
 

@@ -167,7 +167,7 @@ class _Item:
 
 
 def _plan(data: bytes, path: str | Path) -> _Route:
-    with parsing(path, "a mission with items", "a damaged QGroundControl plan"):
+    with parsing(path, "a mission with items", "a damaged QGroundControl plan", any_shape=True):
         mission = json.loads(data)["mission"]
         home = _numbers(mission.get("plannedHomePosition") or ())
         items = list(_items(mission["items"]))

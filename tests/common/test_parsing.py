@@ -1,7 +1,9 @@
 """Whatever a file of others makes a parser raise is one message about that file."""
 
 import ast
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, cast
 
 import pytest
 
@@ -43,6 +45,32 @@ def test_messages_of_our_own_and_interrupts_pass_through() -> None:
         raise KeyboardInterrupt
     with pytest.raises(InputError, match=r"a\.log: cut"), parsing("a.log"):
         raise InputError("cut")
+
+
+def line_of(module: str) -> Callable[..., int]:
+    """A line of a module that adds a number to whatever it is given."""
+    scope: dict[str, Any] = {"__name__": module}
+    exec("def add(cell, *_, **__): return cell + 1", scope)
+    return cast("Callable[..., int]", scope["add"])
+
+
+def test_a_fault_of_our_own_is_not_blamed_on_the_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for module in ("aerpaw_cmp.logs.route", "aerpaw_parsers.nemo"):
+        with pytest.raises(TypeError), parsing("a.log"):
+            line_of(module)("text")
+        with pytest.raises(InputError, match="TypeError"), parsing("a.log", any_shape=True):
+            line_of(module)("text")
+    with pytest.raises(InputError, match="TypeError"), parsing("a.log"):
+        line_of("scipy.io")("text")
+    with pytest.raises(InputError, match="KeyError"), parsing("a.log"):
+        line_of("aerpaw_cmp.logs.route")({}["x"])
+    (tmp_path / "route.csv").write_bytes(SMALL_FILES["route:csv"][0])
+    monkeypatch.setattr("aerpaw_cmp.logs.route._table", line_of("aerpaw_cmp.logs.route"))
+    words = ["predict", str(tmp_path / "route.csv"), "--site", "lake_wheeler", "-o", str(tmp_path / "p"), "-q"]
+    assert main(words) == 70
+    assert "This is a fault of the program, not of your input" in capsys.readouterr().err
 
 
 def nested(text: str) -> bytes:

@@ -230,7 +230,7 @@ def find_reports(flights: Iterable[str], folder: Path, places: Sequence[Path]) -
 
 def _flight_of(path: Path) -> str | None:
     try:
-        with parsing(path):
+        with parsing(path, any_shape=True):
             name = json.loads(read_bounded(path, LARGEST_TABLE)).get("flight")
     except InputError:
         return None

@@ -191,7 +191,7 @@ def read_receiver(path: Path) -> dict[str, FittedReceiver]:
     InputError
         If it is no such file.
     """
-    with parsing(path, f"a file of format {FORMAT!r}", "a file of another kind"):
+    with parsing(path, f"a file of format {FORMAT!r}", "a file of another kind", any_shape=True):
         content = json.loads(read_table(path, "a receiver file"))
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")

@@ -41,7 +41,7 @@ def score_against(data: FlightData, folder: Path) -> Against:
     InputError
         The folder holds no prediction.
     """
-    with parsing(folder, "the output folder of 'aerpaw-cmp predict'"):
+    with parsing(folder, "the output folder of 'aerpaw-cmp predict'", any_shape=True):
         about = json.loads(read_bounded(folder / "metrics.json", LARGEST_TABLE))
         table = pd.read_csv(folder / "prediction.csv", low_memory=False)
         learned, marked, sentence = list(about[KEY]), tuple(map(str, about.get(MARKS, ()))), str(about["sentence"])

@@ -85,7 +85,7 @@ class OutcomeStore:
             self.warnings.append(f"a damaged outcome was not used, its task is computed anew: {file}")
             return None
         try:
-            with parsing(file), np.load(io.BytesIO(content), allow_pickle=False) as parts:
+            with parsing(file, any_shape=True), np.load(io.BytesIO(content), allow_pickle=False) as parts:
                 arrays = {name: parts[name] for name in parts.files}
                 return self._kind.validate_python([_with_arrays(json.loads(arrays["content"].tobytes()), arrays)])[0]
         except InputError:
@@ -112,7 +112,7 @@ class OutcomeStore:
     def manifest(self, key: str, *, failed: bool = False) -> dict[str, Any]:
         """Manifest beside an outcome (or a failure); empty where it cannot be read."""
         place = self.folder / f"{key}{'.failed' if failed else ''}.json"
-        with contextlib.suppress(InputError), parsing(place):
+        with contextlib.suppress(InputError), parsing(place, any_shape=True):
             return dict(json.loads(place.read_bytes()))
         return {}
 

@@ -47,6 +47,22 @@ def test_a_killed_worker_costs_its_task_one_more_try(seen: dict[str, Any], tmp_p
         assert killed[:5] + killed[6:] == [i * i for i in range(8) if i != 5]
 
 
+def test_workers_run_no_module_that_lies_in_the_working_folder(tmp_path: Path) -> None:
+    """A folder of logs that somebody handed on, with files named like modules that a new interpreter loads."""
+    script, logs = tmp_path / "script.py", tmp_path / "logs"
+    logs.mkdir()
+    for name in ("multiprocessing", "pickle", "numpy", "signal"):
+        (logs / f"{name}.py").write_text(f"open('ran_{name}', 'w').close()")
+    script.write_text(
+        "import os\nfrom aerpaw_cmp.jobs.tasks.workers import Processes\n"
+        "if __name__ == '__main__':\n"
+        "    Processes(2).run(os.path.abspath, ['a', 'b'], lambda number, place: print(number, place))\n"
+    )
+    done = subprocess.run([sys.executable, str(script)], cwd=logs, capture_output=True, text=True, check=True)
+    assert sorted(done.stdout.splitlines()) == [f"0 {logs / 'a'}", f"1 {logs / 'b'}"]
+    assert not list(logs.glob("ran_*"))
+
+
 def test_workers_that_see_no_file_or_run_other_code_are_named(seen: dict[str, Any]) -> None:
     cluster = seen["cluster"]
     assert cluster["good"] == "no error"

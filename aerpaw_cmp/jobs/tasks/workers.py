@@ -129,10 +129,15 @@ class _Worker:
 
     def _start(self) -> None:
         # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
-        context = get_context("spawn")
+        context, folder = get_context("spawn"), os.getcwd()  # noqa: PTH109
         self.pipe, child_end = context.Pipe()
-        self._process = context.Process(target=_serve, args=(child_end, self._function), daemon=True)  # type: ignore[attr-defined]
-        self._process.start()
+        self._process = context.Process(target=_serve, args=(child_end, self._function, folder), daemon=True)  # type: ignore[attr-defined]
+        # a new interpreter looks for modules in its folder first: a stranger's, it may be, with a multiprocessing.py
+        os.chdir(Path(os.__file__).parent)
+        try:
+            self._process.start()
+        finally:
+            os.chdir(folder)
         child_end.close()
 
     def send(self, item: Any) -> None:
@@ -159,8 +164,9 @@ class _Worker:
         self.pipe.close()
 
 
-def _serve(pipe: Connection, function: Task) -> None:
-    """Answer until the pipe says no more, or is closed: the process that holds its other end is gone."""
+def _serve(pipe: Connection, function: Task, folder: str) -> None:
+    """Answer in a folder until the pipe says no more, or is closed: the process that holds its other end is gone."""
+    os.chdir(folder)
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the first process
     for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
         signal.signal(number, signal.SIG_DFL)

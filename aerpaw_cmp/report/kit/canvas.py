@@ -94,6 +94,7 @@ def style(kind: str = "screen") -> Iterator[None]:
         "font.family": "sans-serif",
         "font.sans-serif": ["DejaVu Sans"],
         "font.size": 9.0,
+        "text.usetex": False,  # a matplotlibrc of the working folder, a stranger's perhaps, would run LaTeX
         "text.parse_math": False,  # names are drawn as they are: a waypoint may be called A_$
         "axes.titlesize": 10.0,
         "axes.titleweight": "bold",

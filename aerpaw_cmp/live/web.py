@@ -21,8 +21,7 @@ import selectors
 import socket
 import threading
 import time
-from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -40,6 +39,9 @@ _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
 _PIECE = 16_384
 # Connections that wait for their request, of all addresses.
 _MOST_WAITING = 256
+_LOW_WATER = socket.SOL_SOCKET, socket.SO_RCVLOWAT
+_TOKEN_WANTED = "the token is missing or wrong: use the address that the tap printed"
+_NO_TOKEN = f"HTTP/1.0 403 Forbidden\r\nContent-Type: text/plain\r\n\r\n{_TOKEN_WANTED}\n".encode()
 
 
 @dataclass(frozen=True, slots=True)
@@ -62,10 +64,9 @@ class Limits:
     Parameters
     ----------
     connections : int
-        Open at once, of browsers with the token and of others each. Of the others, the oldest of the address that has
-        most gives way to a new one.
+        Open at once, of browsers with the token.
     per_second, burst : float
-        Answers to an address without the token, on average and at once; beyond, its connections are closed.
+        Refusals to an address without the token, on average and at once; beyond, its connections are closed.
     request_s : float
         Longest time between a connection and the end of its request [s].
     send_s : float
@@ -187,31 +188,15 @@ class WebServer:
     def _digest(self) -> None:
         while not self.closing:
             self.feed.digest()
-            self._server.end_late_requests()
             time.sleep(self.limits.tick_s)
 
 
-@dataclass(slots=True)
-class _Guest:
-    """A connection: its address, since when it is there (for ever once let in), whether it seems to have the token."""
-
-    address: Any
-    since: float
-    known: bool = False
-
-
-def _crowding(guests: Mapping[socket.socket, _Guest]) -> socket.socket:
-    """The oldest connection of the address that has most."""
-    most = Counter(guest.address[0] for guest in guests.values()).most_common(1)[0][0]
-    return next(request for request, guest in guests.items() if guest.address[0] == most)
-
-
 class _Server(ThreadingHTTPServer):
-    """Threads for connections, their number and their rate bounded for each address.
+    """Threads for browsers that have the token; whoever has not is refused without.
 
-    A connection waits in one loop, without a thread, until its request is there. One with the token is answered; the
-    others of an address have an allowance, and what is beyond it is closed without an answer. So a flood, of another
-    computer or of pictures in another page of the same browser, keeps itself out and nobody else.
+    A connection waits in one loop until its request is there. An address that does not show the token gets so many
+    refusals, and is closed without a word beyond: a flood, of another computer or of pictures in another page of the
+    same browser, keeps itself out and nobody else.
     """
 
     daemon_threads = True
@@ -224,8 +209,8 @@ class _Server(ThreadingHTTPServer):
         self.ended = False
         self._lock = threading.Lock()
         self._secrets = quote(web.token).encode(), web.pass_word.encode()
-        self._waiting: dict[socket.socket, _Guest] = {}
-        self._open: dict[socket.socket, _Guest] = {}
+        self._waiting: dict[socket.socket, tuple[tuple[Any, ...], float]] = {}
+        self._open: set[socket.socket] = set()
         self._allowances: dict[str, tuple[float, float]] = {}
         self.address_family = socket.AF_INET6 if ":" in web.address.host else socket.AF_INET
         super().__init__((web.address.host, web.address.port), _Handler)
@@ -237,19 +222,16 @@ class _Server(ThreadingHTTPServer):
         self.server_address = self.socket.getsockname()
 
     def serve(self) -> None:
-        """Accept connections and hand them on when their request is there, until ``ended``."""
+        """Accept connections and answer them, until ``ended``."""
         self.socket.setblocking(False)
         with selectors.DefaultSelector() as ready:
             ready.register(self.socket, selectors.EVENT_READ)
             while not self.ended:
                 for key, _ in ready.select(self.web.limits.tick_s):
-                    if key.fileobj is self.socket:
-                        self._accept(ready)
-                    elif (guest := self._leave(key.fileobj, ready)) is not None:
-                        self._answer(key.fileobj, guest)
-                oldest, limit = next(iter(self._waiting.items()), None), time.monotonic() - self.web.limits.request_s
-                if oldest is not None and oldest[1].since < limit and self._leave(oldest[0], ready):
-                    oldest[0].close()
+                    self._accept(ready) if key.fileobj is self.socket else self._look_at(key.fileobj, ready)
+                limit = time.monotonic() - self.web.limits.request_s
+                for request in [request for request, (_, since) in self._waiting.items() if since < limit]:
+                    self._leave(request, ready).close()
         for request in self._waiting:
             request.close()
 
@@ -261,44 +243,43 @@ class _Server(ThreadingHTTPServer):
             time.sleep(0.01)
             return
         request.setblocking(False)
-        self._waiting[request] = _Guest(address, time.monotonic())
+        self._waiting[request] = address, time.monotonic()
         ready.register(request, selectors.EVENT_READ)
         if len(self._waiting) > _MOST_WAITING:
-            crowding = _crowding(self._waiting)
-            self._leave(crowding, ready)
-            crowding.close()
+            hosts = [host for (host, *_), _ in self._waiting.values()]
+            crowding = hosts.index(max(set(hosts), key=hosts.count))
+            self._leave(list(self._waiting)[crowding], ready).close()
 
-    def _leave(self, request: Any, ready: selectors.BaseSelector) -> _Guest | None:
-        """End the wait of a connection."""
-        guest = self._waiting.pop(request, None)
-        if guest is not None:
-            ready.unregister(request)
-        return guest
+    def _leave(self, request: socket.socket, ready: selectors.BaseSelector) -> socket.socket:
+        del self._waiting[request]
+        ready.unregister(request)
+        return request
 
-    def _answer(self, request: socket.socket, guest: _Guest) -> None:
-        """Start the thread of a request, if it shows the token or its address has allowance left."""
-        head = b""
+    def _look_at(self, request: Any, ready: selectors.BaseSelector) -> None:
+        """Answer a request in a thread of its own if it seems to have the token (the handler looks closely)."""
+        if request not in self._waiting:
+            return  # closed in this round
+        address, head = self._waiting[request][0], b""
         with contextlib.suppress(OSError):
             head = request.recv(_PIECE, socket.MSG_PEEK)
-        guest.known = any(secret in head for secret in self._secrets)  # the handler looks closely
-        if not head or not (guest.known or self._allowed(guest.address[0])):
-            request.close()
+        known = any(secret in head for secret in self._secrets)
+        more = len(head) + 1
+        if head and not known and b"\r\n\r\n" not in head and request.getsockopt(*_LOW_WATER) < more <= _PIECE:
+            request.setsockopt(*_LOW_WATER, more)  # readable again when more of it is there
             return
-        request.setblocking(True)
-        with self._lock:
-            self._open[request] = guest
-            others = {other: known for other, known in self._open.items() if not known.known}
-            gives_way = [_crowding(others)] if len(others) > self.web.limits.connections else []
-            for other in gives_way:
-                del self._open[other]
-        self._end(gives_way)
-        try:
-            self.process_request(request, guest.address)
-        except RuntimeError:  # no further thread can be had
-            self.shutdown_request(request)
+        self._leave(request, ready)
+        with contextlib.suppress(OSError, RuntimeError):  # gone, or no further thread can be had
+            if known:
+                request.setblocking(True)
+                self.process_request(request, address)
+                return
+            if head and self._allowed(address[0]):
+                request.recv(_PIECE)
+                request.send(_NO_TOKEN)
+        request.close()
 
     def _allowed(self, host: str) -> bool:
-        """Check whether an address may have one more answer without the token."""
+        """Check whether an address may have one more refusal."""
         limits, now = self.web.limits, time.monotonic()
         if len(self._allowances) > _MOST_WAITING:
             self._allowances.clear()
@@ -310,7 +291,7 @@ class _Server(ThreadingHTTPServer):
     def shutdown_request(self, request: Any) -> None:
         """Forget the connection, then close it."""
         with self._lock:
-            self._open.pop(request, None)
+            self._open.discard(request)
         super().shutdown_request(request)
 
     @contextlib.contextmanager
@@ -325,25 +306,16 @@ class _Server(ThreadingHTTPServer):
                 self.streams -= 1
 
     def let_in(self, request: Any) -> bool:
-        """Lift the time limit of a connection that showed the token; False where too many of these are open."""
+        """Note a connection that showed the token; False where too many of these are open."""
         with self._lock:
-            known = sum(guest.since == float("inf") for guest in self._open.values())
-            if known >= self.web.limits.connections or request not in self._open:
+            if len(self._open) >= self.web.limits.connections:
                 return False
-            self._open[request] = _Guest(self._open[request].address, float("inf"), known=True)
+            self._open.add(request)
             return True
-
-    def end_late_requests(self) -> None:
-        """End connections whose request does not come to an end, a byte at a time or not at all."""
-        limit = time.monotonic() - self.web.limits.request_s
-        self._end([request for request, guest in list(self._open.items()) if guest.since < limit])
 
     def close_all(self) -> None:
         """End every connection."""
-        self._end(list(self._open))
-
-    def _end(self, requests: Iterable[socket.socket]) -> None:
-        for request in requests:
+        for request in list(self._open):
             with contextlib.suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
 
@@ -397,7 +369,7 @@ class _Handler(BaseHTTPRequestHandler):
         if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin") and not opened:
             return HTTPStatus.FORBIDDEN, "the request comes from another site"
         if not self._has_token(query):
-            return HTTPStatus.FORBIDDEN, "the token is missing or wrong: use the address that the tap printed"
+            return HTTPStatus.FORBIDDEN, _TOKEN_WANTED
         if path not in ("/", "/events"):
             return HTTPStatus.NOT_FOUND, "there is one page here: /"
         return None

@@ -350,7 +350,10 @@ def main() -> int:
     for fault in (f for f in FAULTS if options.only in f.name):
         with planted(fault):
             faulty = replays_of(data)
-            named = failures(data, faulty, sionna=not options.no_sionna)
+            try:
+                named = failures(data, faulty, sionna=not options.no_sionna)
+            except Exception as error:  # Sionna refuses such a material, say: that is loud enough
+                named = [f"refused: {type(error).__name__}: {str(error).splitlines()[0][:100]}"]
             faulty_ranks = ranks_of(faulty)
         effect = change(clean, faulty, clean_ranks, faulty_ranks)
         rows.append({"fault": fault.name, **dataclasses.asdict(effect), "counts": effect.counts, "caught": bool(named),

@@ -44,6 +44,18 @@ def lone(case):
     return replace(site, towers={"LW1": site.towers["LW1"]}), poses
 
 
+def test_no_plugin_of_the_working_folder_is_loaded(sionna, tmp_path):
+    """Mitsuba puts the working folder first, where it may find native code under the name of a shape."""
+    import mitsuba as mi
+
+    (tmp_path / "plugins").mkdir()
+    (tmp_path / "plugins" / "cylinder.so").write_bytes(b"no library")
+    mi.file_resolver().prepend(str(tmp_path))  # as when the process began in this folder
+    sionna.load_variant()
+    assert str(tmp_path) not in str(mi.file_resolver())
+    assert "Cylinder" in str(mi.load_dict({"type": "cylinder"}))
+
+
 def test_both_engines_find_the_same_paths_and_fields(sionna, scenes, case):
     site, poses = case
     link = scenes.link(site, tower_comparison_array(), uav_comparison_array(wavelength_m(scenes.carrier_hz)))

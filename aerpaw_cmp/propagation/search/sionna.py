@@ -24,6 +24,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 from weakref import WeakSet
@@ -111,6 +112,9 @@ def _variant(kinds: Sequence[str]) -> str:
             without_llvm = error  # a GPU may do without
     import mitsuba as mi
 
+    # Mitsuba looks for its plugins, native code, in the working folder first: a stranger's, it may be
+    mi.file_resolver().clear()
+    mi.file_resolver().append(str(Path(mi.__file__).parent))
     current = mi.variant()
     if current in [f"{kind}_ad_mono_polarized" for kind in kinds]:
         return str(current)

@@ -113,6 +113,16 @@ def bound(case, link, scene, gain):
 
 
 @needs_numba
+def test_no_file_of_the_working_folder_tells_numba_what_to_write(tmp_path, monkeypatch):
+    """``chrome_trace: thesis.tex`` there made numba replace the thesis at the end of the command."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / ".numba_config.yaml").write_text("chrome_trace: thesis.tex\n")
+    state = compiled.load.__wrapped__("propagation.search.beams")
+    assert state.kernels is None
+    assert "the working folder holds a .numba_config.yaml" in state.reason
+
+
+@needs_numba
 @pytest.mark.parametrize("name", PATTERNS)
 @pytest.mark.parametrize("uav_transmits", [False, True])
 def test_compiled_equals_numpy(monkeypatch, case, name, uav_transmits):

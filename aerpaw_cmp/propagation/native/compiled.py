@@ -168,6 +168,8 @@ def load(name: str) -> State:
     """
     if find_spec("numba") is None:
         return State(None, "numba is not installed (pip install 'aerpaw-cmp[fast]')")
+    if os.path.lexists(".numba_config.yaml"):  # it names files that numba then writes: a stranger's, it may be
+        return State(None, "the working folder holds a .numba_config.yaml, which numba would obey")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba's own, about its cache

@@ -396,7 +396,7 @@ logs:
   - {path: b.txt, reader: sounder_log, node: LW1, channel: USRP1, clock: local, floor_db: -200, skip: [quality]}
 link: {rss: {carrier_hz: 3.3e9, tower: {layout: linear, elements: 2, slant_deg: [45, -45], antenna: {model: dipole}}}}
 rt: {engine: image, max_depth: 1, attitude: logged, foliage: attenuating}
-rss: {span_db: [-50, 50], lag: apply, window_s: 1, advanced: {step_db: 0.1}}
+rss: {span_db: [-50, 50], lag: apply, advanced: {step_db: 0.1}}
 rank: {tower: LW1, k: [10, 100], advanced: {bootstrap: 50}}
 report: {title: t, waypoints: [{label: W, east_m: 1, north_m: 2, height_m: 3}]}
 """

@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..common.jsonable import named
 from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
@@ -426,7 +425,7 @@ def replay_poses(
     search = Search(
         engine,
         max_depth=rt.max_depth,
-        **named(rt.advanced, "samples device"),
+        samples=rt.advanced.samples,
         further=diffracted(rt.diffraction),
     )
     # the image engine finds the paths of a pose whatever the others are; planes of terrain are numbered as they are met
@@ -434,7 +433,6 @@ def replay_poses(
     long = alone and len(poses) > BLOCK
     run = Run(
         cache_dir=None if rt.advanced.cache else "",
-        threads=rt.advanced.threads,
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" or long or towers_m is not None else None,
         on_estimate=lambda estimate: _tell(progress, name, estimate),

@@ -47,8 +47,6 @@ class AntennaSettings(StrictModel):
     file: str | None = None
     variable: str | None = None
     """Name of the grid inside a .mat file."""
-    polarised: bool = True
-    """Use both field components of a text pattern; false: its total gain on the element's slant."""
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
@@ -70,8 +68,6 @@ class ArraySettings(StrictModel):
     elements: Annotated[int, Field(ge=1, le=64)] = 4
     positions_m: Annotated[list[tuple[float, float, float]], Field(max_length=64)] | None = None
     antenna: AntennaSettings = AntennaSettings()
-    antennas: list[AntennaSettings] | None = None
-    """One per element, in place of ``antenna``."""
     slant_deg: float | list[float] = 0.0
     yaw_deg: float = 0.0
     pitch_deg: float = 0.0
@@ -97,18 +93,13 @@ class ArraySettings(StrictModel):
             raise UsageError(
                 f"{len(slant)} slants for {len(positions)} elements", expected="one slant, or one per element"
             )
-        antennas = self.antennas or [self.antenna]
-        if len(antennas) not in (1, len(positions)):
-            raise UsageError(
-                f"{len(antennas)} antennas for {len(positions)} elements", expected="one antenna, or one per element"
-            )
         mount = rotation_from_yaw_pitch_roll(
             np.radians(self.yaw_deg), np.radians(self.pitch_deg), np.radians(self.roll_deg)
         )
         return Array(
             positions,
             np.radians(np.broadcast_to(slant, (len(positions),)).copy()),
-            tuple(load_pattern(a, folder, SPEED_OF_LIGHT_MPS / wavelength) for a in antennas),
+            (load_pattern(self.antenna, folder, SPEED_OF_LIGHT_MPS / wavelength),),
             mount,
         )
 
@@ -125,7 +116,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
     if settings.model == "file":
         from ..site.antenna.pattern_files import read_pattern_file
 
-        return read_pattern_file(file, polarised=settings.polarised, carrier_hz=carrier_hz)
+        return read_pattern_file(file, carrier_hz=carrier_hz)
     if settings.model == "sphere":
         return read_sphere_csv(file)
     if settings.model == "gain_grid":
@@ -332,10 +323,7 @@ class AdvancedRt(StrictModel):
     maximum_gap_s: Positive = 3.0
     """Telemetry gaps longer than this are not bridged."""
     cache: bool = True
-    device: Literal["auto", "cpu", "cuda"] = "auto"
-    """Of Sionna's search; auto: a GPU where there is one."""
-    threads: Annotated[int, Field(ge=1, le=1024)] | None = None
-    """Of compiled code; by default the cores this process may use. Results do not depend on it."""
+    """Keep Sionna's paths and the audit for the next run."""
 
 
 class RtSettings(StrictModel):
@@ -344,7 +332,7 @@ class RtSettings(StrictModel):
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
     diffraction: Literal["none", "edges"] = "none"
-    """Paths over one edge of a building, in H, levels and ranks; ``all``: also with a wall or roof on one side."""
+    """Paths over one edge of a building, in H, levels and ranks."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
@@ -375,19 +363,11 @@ class RssSettings(StrictModel):
     span_db: tuple[float, float] = (-50.0, 50.0)
     lag: Literal["off", "estimate", "apply"] | float = "estimate"
     """Radio minus telemetry clock: estimated and shown, estimated and applied, or taken off as given [s]."""
-    field: Literal["coherent", "power", "local_mean"] = "coherent"
+    field: Literal["coherent", "power"] = "coherent"
     """Which simulated RSS is compared."""
-    window_s: Annotated[float, Field(ge=0)] = 0.0
-    """Measurement averaged (in power) over this window; 0 leaves samples as they are."""
     minimum_height_m: float | None = None
     """Samples below this height are left out of the comparison, and counted."""
     advanced: AdvancedRss = AdvancedRss()
-
-    @model_validator(mode="after")
-    def _window_of_local_mean(self) -> RssSettings:
-        if self.field == "local_mean" and self.window_s <= 0:
-            raise ValueError("field: local_mean averages over window_s, which must be above 0")
-        return self
 
     @field_validator("span_db")
     @classmethod
@@ -420,7 +400,6 @@ class RankSettings(StrictModel):
 class ReportSettings(StrictModel):
     """Contents of the report."""
 
-    title: str | None = None
     waypoints: list[Waypoint] = []
     export: list[Literal["geojson", "kmz", "netcdf", "all"]] = []
     """Formats of the samples besides rss.csv and rank.csv."""

@@ -15,7 +15,6 @@ from .geometry.paths import PathSet
 
 Engine = Literal["image", "sionna"]
 Samples = int | Literal["auto"]
-Device = Literal["auto", "cpu", "cuda"]
 # ``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target.
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 
@@ -38,8 +37,6 @@ class Search:
     further : tuple of callable
         Searches ``(scene, poses, link)`` of further kinds of paths, such as
         :func:`aerpaw_cmp.propagation.edges.over_edges`. In H, levels and ranks, whichever engine finds the reflections.
-    device : {"auto", "cpu", "cuda"}
-        Of Sionna's search; "auto" is a GPU where Dr.Jit finds one.
     links : (towers, poses) bool, optional
         Links that count; the others have no path and are not searched for.
     """
@@ -49,23 +46,17 @@ class Search:
     samples: Samples = "auto"
     batch: int = 50
     further: tuple[Callable[..., Any], ...] = ()
-    device: Device = "auto"
     links: BoolArray | None = None
-
-    @property
-    def variant(self) -> str | None:
-        """Mitsuba's name of the device."""
-        return {"cpu": "llvm", "cuda": "cuda"}.get(self.device)
 
     @property
     def rays(self) -> dict[str, Any]:
         """Options that Sionna's search takes."""
-        return {name: getattr(self, name) for name in ("max_depth", "samples", "batch", "variant")}
+        return {name: getattr(self, name) for name in ("max_depth", "samples", "batch")}
 
     @property
     def deciding(self) -> dict[str, object]:
         """Options that an entry of the path cache depends on."""
-        names = ("engine", "max_depth", "samples", "batch", "variant")
+        names = ("engine", "max_depth", "samples", "batch")
         return {name: getattr(self, name) for name in names}
 
     def check(self) -> None:

@@ -23,7 +23,7 @@ POSITIVE = {
 }
 LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
     **{f"{part}.{key}": ([TINY], [0.0]) for part, keys in POSITIVE.items() for key in keys.split()},
-    **dict.fromkeys(("flight.plan.fading_db", "rt.reflection_loss_db", "rss.window_s"), ([0.0], [-TINY])),
+    **dict.fromkeys(("flight.plan.fading_db", "rt.reflection_loss_db"), ([0.0], [-TINY])),
     "link.rss.uav.elements": ([1, 64], [0, 65]),
     "logs.height_m": ([-1000, 20_000], [-1000.1, 20_000.1]),
     "flight.plan.waypoints": ([[POINT, POINT]], [[POINT]]),
@@ -34,7 +34,6 @@ LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
     "towers.N.latitude_deg": ([-90, 90], [-90.1, 90.1]),
     "towers.N.longitude_deg": ([-180, 180], [-180.1, 180.1]),
     "rt.advanced.samples": (["auto", 1, 100_000_000], [0, 100_000_001]),
-    "rt.advanced.threads": ([1, 1024], [0, 1025]),
     "rt.max_depth": ([0, 3], [-1, 4]),
     "rt.ground_roughness_m": ([0, 10], [-TINY, 10.1]),
     "rt.audit_links": ([0], [-1]),
@@ -66,15 +65,6 @@ def test_a_key_takes_its_limits_and_nothing_beyond(key: str) -> None:
     for value in refused:
         with pytest.raises(ValidationError):
             FlightFile.model_validate(flight(key, value))
-
-
-def test_a_local_mean_wants_a_window() -> None:
-    content = flight("rss.window_s", 0.1)
-    content["rss"]["field"] = "local_mean"
-    FlightFile.model_validate(content)
-    content["rss"]["window_s"] = 0.0
-    with pytest.raises(ValidationError, match="window_s"):
-        FlightFile.model_validate(content)
 
 
 def test_what_a_flight_file_does_not_say() -> None:

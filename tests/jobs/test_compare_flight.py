@@ -281,24 +281,6 @@ def test_the_track_of_a_rank_log_with_positions_of_its_own_is_the_logs(tmp_path:
     assert track_of(dataclasses.replace(bare, rank=(own,))).east_m == pytest.approx(at)
 
 
-def test_a_local_mean_averages_both_sides_and_all_models(tmp_path: Path) -> None:
-    rng = np.random.default_rng(5)
-    at = np.arange(0, 60, 0.25)
-    rss = {"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}
-    (as_logged,) = compared_rss(flight(tmp_path, rss=rss))
-    (mean,) = compared_rss(flight(tmp_path, rss=rss, rss_keys={"field": "local_mean", "window_s": 4}))
-    footing = as_logged.further.averaged["coherent"]["4 s"]
-    assert mean.score.rmse_db == pytest.approx(footing.rmse_db, abs=1e-9)
-    two_ray = mean.baselines["two_ray"]
-    assert np.nanstd(np.diff(two_ray.level_dbm)) < np.nanstd(np.diff(as_logged.baselines["two_ray"].level_dbm))
-
-
-def test_a_local_mean_without_a_window_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = flight(tmp_path, rss={"USRP1": ([1.0], [-70.0])}, rss_keys={"field": "local_mean"})
-    assert main(["report", str(path)]) == 2
-    assert "window_s" in capsys.readouterr().err
-
-
 def test_reflection_loss_weakens_reflections_only_and_ends_as_free_space(tmp_path: Path) -> None:
     at = np.arange(0, 120, 0.5)
     path = flight(tmp_path, 120, rss={"USRP1": (at, free_space_db(at))})

@@ -77,14 +77,6 @@ def test_principal_cuts_equal_the_file(tmp_path: Path) -> None:
     np.testing.assert_allclose(pattern.gain_dbi(theta, phi), rows[:, 2], atol=0.05)
 
 
-def test_total_gain_without_polarisation(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.txt", rows_of(clockwise=True))
-    polarised, total = read_pattern_text(path), read_pattern_text(path, polarised=False)
-    theta, phi = directions()
-    np.testing.assert_allclose(total.gain_dbi(theta, phi), polarised.gain_dbi(theta, phi), atol=0.05)
-    assert not total.field(theta, phi)[1].any()
-
-
 @settings(max_examples=100, deadline=None)
 @given(st.floats(0, 2 * math.pi), st.floats(0, 2 * math.pi), st.sampled_from([0.0, math.pi]))
 def test_poles_and_wrap_have_no_seam(azimuth: float, second_azimuth: float, pole: float) -> None:

@@ -239,15 +239,11 @@ def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> 
     """An array of flight.yaml, laid out a second time."""
     positions = reference.layout_positions(settings.layout, wavelength, settings.elements, settings.positions_m)
     slants = settings.slant_deg if isinstance(settings.slant_deg, list) else [settings.slant_deg]
-    antennas = settings.antennas or [settings.antenna]
-
-    def per_element(values: Sequence[object]) -> list[object]:
-        return list(values) * len(positions) if len(values) == 1 else list(values)
-
+    pattern = _pattern(settings.antenna, folder, reference.C_MPS / wavelength)
     return reference.ExpectedArray(
         positions_m=positions,
-        slants_deg=tuple(float(x) for x in per_element(slants)),  # type: ignore[arg-type]
-        patterns=tuple(_pattern(a, folder, reference.C_MPS / wavelength) for a in per_element(antennas)),  # type: ignore[arg-type]
+        slants_deg=tuple(slants * len(positions) if len(slants) == 1 else slants),
+        patterns=(pattern,) * len(positions),
         mount=reference.turned(settings.yaw_deg, settings.pitch_deg, settings.roll_deg),
     )
 

@@ -53,7 +53,7 @@ from ...flight.training import learned_here
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ...site.site import Site
 from .ground_error import agreement_by_ground
-from .levels import Levels, at_samples, levels_of, stated_spread
+from .levels import Levels, levels_of, stated_spread
 from .likely_cause import cause_of
 
 # Both sides are averaged over these windows to see how much of the error is fading.
@@ -162,7 +162,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     spans = _worst(series.time, score.residual_db, case.position_m, case.geometry, direct)
     if case.trained:
         score, residual_by, spans = rss.without_errors(score), {}, []
-    stated = stated_spread(replayed, settings.window_s)
+    stated = stated_spread(replayed)
     return RssResult(
         **named(series, "tower channel unit time"),
         **named(case, "position_m geometry"),
@@ -185,8 +185,7 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
     levels = levels_of(series, replayed, settings)
     geometry = link_geometry(data.site, series.tower, replayed, data.settings.rt)
     simple = {
-        name: at_samples(series, replayed, level, settings)
-        for name, level in _baseline_levels(data.site, series.tower, replayed).items()
+        name: replayed.spread(level) for name, level in _baseline_levels(data.site, series.tower, replayed).items()
     }
     position = replayed.spread(replayed.poses.position_m)
     simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)

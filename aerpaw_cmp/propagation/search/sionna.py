@@ -530,13 +530,11 @@ class Rays:
         Rays per tower and batch.
     batch : int
         Poses per call, at most 100; bounds the memory.
-    variant : {"cuda", "llvm"}, optional
     """
 
     max_depth: int = 2
     samples: int = 1_000_000
     batch: int = 50
-    variant: str | None = None
 
 
 def find_paths(
@@ -583,7 +581,7 @@ def _refined(
     if not 1 <= batch <= _LARGEST_BATCH:
         raise UsageError(f"batch {batch}", expected=f"1 to {_LARGEST_BATCH} poses per call")
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
-    load_variant(rays.variant)
+    load_variant()
     builder = _Builder(faces=faces, links=links, carrier_hz=carrier_hz, surfaces=surfaces)
 
     def make(towers: IntArray, chosen: IntArray) -> _Finder:
@@ -648,7 +646,7 @@ def own_coefficients(
     -------
     Coefficients
     """
-    load_variant(rays.variant)
+    load_variant()
     sources_m, targets_m = links.sources_m, links.targets_m
     arrays = list(probe.tower_arrays.values())
     pattern = np.array([array.patterns[0].name for array in arrays])
@@ -729,7 +727,7 @@ def own_channels(
     -------
     (poses, towers, n_rx, n_tx) complex
     """
-    load_variant(rays.variant)
+    load_variant()
     sources_m, targets_m = links.sources_m, links.targets_m
     arrays, uav = list(link.tower_arrays.values()), link.uav_array
     for array in (*arrays, uav):

@@ -57,7 +57,7 @@ def report_data(
     }
     return record.ReportData(
         **{field.name: getattr(result, field.name) for field in dataclasses.fields(result)},
-        title=settings.report.title or settings.flight.title or settings.flight.name,
+        title=settings.flight.title or settings.flight.name,
         flight=settings.flight.name,
         site=data.site,
         generated=utc_now(),

@@ -233,7 +233,7 @@ class _Rows:
 
 
 @parsed("an antenna pattern file")
-def read_pattern_text(path: str | Path, *, polarised: bool = True) -> MeasuredPattern:
+def read_pattern_text(path: str | Path) -> MeasuredPattern:
     """An AERPAW antenna text file: complex E_phi and E_theta over phi x theta.
 
     Parameters
@@ -241,8 +241,6 @@ def read_pattern_text(path: str | Path, *, polarised: bool = True) -> MeasuredPa
     path : str or Path
         Header lines, then tab-separated phi, theta [rad], total, E_phi, E_theta [dBi], and the phases [rad].
         theta from -pi to pi at phi from 0 to below pi, or theta from 0 to pi at phi from 0 to below 2 pi.
-    polarised : bool
-        False keeps the total gain only, all of it in E_theta, as the gain grids have it.
 
     Returns
     -------
@@ -271,11 +269,7 @@ def read_pattern_text(path: str | Path, *, polarised: bool = True) -> MeasuredPa
     along = _points_along_phi(e_theta.T, e_phi.T)
     if not along:
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
-    if polarised:
-        pattern = MeasuredPattern(path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
-    else:
-        total = np.hypot(np.abs(e_theta), np.abs(e_phi)).astype(np.complex128)
-        pattern = MeasuredPattern(path.stem, total.T, None, rows.frequency_hz)
+    pattern = MeasuredPattern(path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
     check_power(pattern, path)
     return pattern
 

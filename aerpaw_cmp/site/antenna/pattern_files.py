@@ -35,14 +35,12 @@ _GAIN_TABLE = re.compile(r"(?im)^\s*Frequency\s+E ?Total\. ?dB\s*$")
 
 
 @parsed("an antenna pattern file")
-def read_pattern_file(path: str | Path, *, polarised: bool = True, carrier_hz: float | None = None) -> MeasuredPattern:
+def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> MeasuredPattern:
     """An antenna pattern: AERPAW's text over the sphere or along one great circle, MSI Planet (.msi, .pln) or NSMA.
 
     Parameters
     ----------
     path : str or Path
-    polarised : bool
-        False keeps the total gain only; cuts have no polarisation.
     carrier_hz : float, optional
         Which frequency of a file with several.
 
@@ -57,19 +55,18 @@ def read_pattern_file(path: str | Path, *, polarised: bool = True, carrier_hz: f
     """
     path = Path(path)
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
-    pattern = _of_any_kind(text, path, polarised, carrier_hz)
+    pattern = _of_any_kind(text, path, carrier_hz)
     pattern.trained_on, pattern.marks = trained_on(text), marks(text)
     return pattern
 
 
-def _of_any_kind(text: str, path: Path, polarised: bool, carrier_hz: float | None) -> MeasuredPattern:
+def _of_any_kind(text: str, path: Path, carrier_hz: float | None) -> MeasuredPattern:
     """The pattern of a file of any kind.
 
     Parameters
     ----------
     text : str
     path : Path
-    polarised : bool
     carrier_hz : float or None
         As :func:`read_pattern_file`.
 
@@ -91,7 +88,7 @@ def _of_any_kind(text: str, path: Path, polarised: bool, carrier_hz: float | Non
             expected="a pattern of the same antenna, such as SA-1400-5900_F3300.txt",
             path=path,
         )
-    return read_pattern_text(path, polarised=polarised)
+    return read_pattern_text(path)
 
 
 def _planet(text: str, path: Path) -> dict[str, FloatArray]:

@@ -398,7 +398,7 @@ link: {rss: {carrier_hz: 3.3e9, tower: {layout: linear, elements: 2, slant_deg: 
 rt: {engine: image, max_depth: 1, attitude: logged, foliage: attenuating}
 rss: {span_db: [-50, 50], lag: apply, advanced: {step_db: 0.1}}
 rank: {tower: LW1, k: [10, 100], advanced: {bootstrap: 50}}
-report: {title: t, waypoints: [{label: W, east_m: 1, north_m: 2, height_m: 3}]}
+report: {waypoints: [{label: W, east_m: 1, north_m: 2, height_m: 3}]}
 """
 CAMPAIGN = b"""campaign: c
 title: "A campaign"

@@ -79,9 +79,9 @@ def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert [wood.height_m for wood in loaded.forests] == [20.0]
     assert len(loaded.trees) == 0
     assert (site.with_suffix(".learned") / "learned.yaml").is_file()  # what its base learned goes with it
-    written = out_of(capsys, "site", "show", site, "-o", tmp_path / "show", "--export").split()
+    written = out_of(capsys, "site", "show", site, "-o", tmp_path / "show").split()
     assert all(Path(path).stat().st_size > 100 for path in written)
-    assert {Path(path).suffix for path in written} >= {".html", ".png", ".svg", ".xml"}
+    assert {Path(path).suffix for path in written} >= {".html", ".png", ".svg"}
 
 
 def test_site_show_takes_the_flights_own_site(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

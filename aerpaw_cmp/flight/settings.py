@@ -401,8 +401,6 @@ class ReportSettings(StrictModel):
     """Contents of the report."""
 
     waypoints: list[Waypoint] = []
-    export: list[Literal["geojson", "kmz", "netcdf", "all"]] = []
-    """Formats of the samples besides rss.csv and rank.csv."""
 
 
 class FlightFile(StrictModel):

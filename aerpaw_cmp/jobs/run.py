@@ -165,8 +165,8 @@ class ReportOptions:
 
     Parameters
     ----------
-    engine, audit : str, optional
-        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number).
+    audit : str, optional
+        In place of ``rt.audit_links`` ("full", "none" or a number).
     recommend : Path, optional
         Where the flight file with the settings of the recommended model is written.
     learned : path, optional
@@ -177,10 +177,9 @@ class ReportOptions:
         Figures drawn as files: none, or every one in one format or in all.
     style : {"screen", "paper"}
     export : sequence of str
-        Formats of the samples besides those of ``report.export``.
+        Formats of the samples.
     """
 
-    engine: str | None = None
     audit: str | None = None
     recommend: Path | None = None
     learned: Path | str | None = None
@@ -233,7 +232,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
         if chosen.recommend is not None:
             file = OutputFile(chosen.recommend, own=is_sealed, inputs=inputs, force=options.force)
             target = outputs.enter_context(file)
-        formats = chosen_formats(settings.report.export, chosen.export)
+        formats = chosen_formats(chosen.export)
         with stages("read"):
             data = load_data(settings, flight.parent, options.logs_root)
             before = None
@@ -270,7 +269,7 @@ def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> 
     from .tasks.manifest import inputs_of_flight
 
     learned = None if chosen.learned is None else Path(chosen.learned)
-    settings = _overridden(load_with_learned(flight, learned), chosen.engine, chosen.audit)
+    settings = _with_audit(load_with_learned(flight, learned), chosen.audit)
     inputs = [*inputs_of_flight(settings, flight, options.logs_root), *([] if learned is None else [learned])]
     return settings, inputs, options.out or Path("reports") / settings.flight.name
 
@@ -294,19 +293,15 @@ def _require_same_folder(recommend: Path, flight: Path, logs_root: Path | None) 
         )
 
 
-def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
-    """The settings with what the command line says instead."""
-    change: dict[str, Any] = {}
-    if engine is not None:
-        if engine not in ("image", "sionna"):
-            raise UsageError(f"--engine {engine!r}", expected="image or sionna")
-        change["engine"] = engine
-    if audit is not None:
-        numbers = {"full": 10**9, "none": 0}
-        if audit not in numbers and not audit.isdecimal():
-            raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
-        change["audit_links"] = numbers[audit] if audit in numbers else int(audit)
-    return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
+def _with_audit(settings: Any, audit: str | None) -> Any:
+    """The settings with as many audited links as the command line says."""
+    if audit is None:
+        return settings
+    numbers = {"full": 10**9, "none": 0}
+    if audit not in numbers and not audit.isdecimal():
+        raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
+    links = numbers[audit] if audit in numbers else int(audit)
+    return settings.model_copy(update={"rt": settings.rt.model_copy(update={"audit_links": links})})
 
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
@@ -380,9 +375,7 @@ def run_site_import(
     return [*actions, *carry_memory(base, out)]
 
 
-def run_site_show(
-    site: str | None, options: RunOptions = DEFAULT, *, flight: Path | None = None, export: bool = False
-) -> JobOutcome:
+def run_site_show(site: str | None, options: RunOptions = DEFAULT, *, flight: Path | None = None) -> JobOutcome:
     """Plan view and a page of the scene in 3-D; with a flight its track.
 
     Without a site the flight's own is shown; with neither, the packaged one.
@@ -395,8 +388,6 @@ def run_site_show(
         ``out`` is ``reports/site-SITE`` by default.
     flight : Path, optional
         flight.yaml whose track is drawn.
-    export : bool
-        Also the scene as PLY and Mitsuba XML.
 
     Returns
     -------
@@ -428,10 +419,6 @@ def run_site_show(
             place, track = data.site, track_of(data)
         with output.filling() as folder:
             written = write_site_view(place, folder, track=track)
-            if export:
-                from ..site.export import export_scene
-
-                written += export_scene(place, folder / "scene")
         return JobOutcome(folder=out, files=output.placed(written))
 
 
@@ -583,7 +570,7 @@ def run_campaign(
 
     stages = Stages(options.progress)
     campaign = load_campaign(path)
-    formats = chosen_formats(campaign.export, export)
+    formats = chosen_formats(export)
     inputs = [path, *inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)]
     folder = options.out or Path("reports") / campaign.campaign
     store = None if fresh else _campaign_keep(campaign, path, keep)

@@ -67,7 +67,6 @@ class TapSettings:
     silent_s: float = 10.0
     enable_csi: bool = False
     no_csi_alarm_s: float | None = None
-    no_csi_exit: bool = False
     status_s: float = 1.0
     duration_s: float | None = None
     wait_for_port_s: float = 0.0

@@ -231,7 +231,7 @@ class Tap:
             self._notifier.close()
         return TapSummary(
             **said,
-            exit_code=1 if self._stop.reason == "no_csi" or self._log.lost else 0,
+            exit_code=1 if self._log.lost else 0,
             segments=self._log.paths,
             records=self._log.records,
             lost_records=self._log.lost,
@@ -603,8 +603,6 @@ class Tap:
             self._alarms += 1
             self._record({"kind": "alarm", "reason": f"no CSI for {limit:g} s", **self._now()})
             self._say(f"no CSI for {limit:g} s: is data flowing, and CSI reporting on (--enable-csi)?")
-        if self._settings.no_csi_exit and not self._stop.count:
-            self._stop("no_csi")
 
     def _flush_noise(self) -> None:
         if self._noise["not_kept"]:

@@ -2,7 +2,6 @@
 
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -65,25 +64,6 @@ def test_the_planted_antenna_is_in_the_file(folder: Path, metrics: dict) -> None
     error -= error[looked].mean()
     assert np.mean(np.abs(error[looked]) < 2 * sd[looked]) >= 0.9
     assert (folder / "calibrated" / "LW1.USRP1.tower.msi").read_text().startswith("NAME LW1.USRP1.tower")
-
-
-def test_the_sphere_as_netcdf_is_that_of_the_csv(folder: Path, metrics: dict, cf_faults: Any) -> None:
-    del metrics
-    xarray = pytest.importorskip("xarray")
-    pytest.importorskip("netCDF4")
-    for end in ("tower", "uav"):
-        path = folder / "calibrated" / f"LW1.USRP1.{end}.nc"
-        table = pd.read_csv(path.with_suffix(".csv"), comment="#")
-        with xarray.open_dataset(path) as sphere:
-            assert sphere["gain"].dims == ("elevation", "azimuth")
-            assert sphere["gain"].attrs["ancillary_variables"] == "gain_sd"
-            assert float(sphere["frequency"]) == pytest.approx(3.3e9)
-            flat = sphere.to_dataframe(dim_order=["elevation", "azimuth"]).reset_index()
-        np.testing.assert_allclose(flat["azimuth"], table["azimuth_deg"], atol=1e-9)
-        np.testing.assert_allclose(flat["elevation"], table["elevation_deg"], atol=1e-9)
-        np.testing.assert_allclose(flat["gain"], table["gain_dbi"], atol=6e-4)
-        np.testing.assert_allclose(flat["gain_sd"], table["gain_sd_db"], atol=6e-4)
-        assert cf_faults(path) == []
 
 
 def test_a_flight_kept_aside_replays_with_the_learned_antennas(folder: Path, metrics: dict) -> None:

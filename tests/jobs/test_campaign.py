@@ -74,8 +74,8 @@ def summary(folder: Path) -> dict[str, Any]:
     broken["logs"][1]["path"] = "gone/<b>USRP1.txt"
     write_yaml(folder / "broken.yaml", broken)
     return result(
-        folder, "whole", flights=["first.yaml", "second.yaml", "broken.yaml", "missing.yaml"],
-        settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}}, calibration="channel", export=["geojson", "kmz"],
+        folder, "whole", "--export", "geojson,kmz", flights=["first.yaml", "second.yaml", "broken.yaml", "missing.yaml"],
+        settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}}, calibration="channel",
     )  # fmt: skip
 
 

@@ -92,7 +92,7 @@ def test_plan_writes_the_best_route_and_prefers_headings(place: Path) -> None:
         (["sphere", "--avoid", "round.kml"], 3, "an area of 10001 corners that cannot be used"),
         (["sphere", "--tower", "LW9"], 2, "no tower 'LW9'"),
         (["sphere", "--height=-inf"], 2, "--height -inf; expected a finite number"),
-        (["sphere", "--target-height", "nan"], 2, "--target-height nan; expected a finite number"),
+        (["sphere", "--height", "nan"], 2, "--height nan; expected a finite number"),
     ],
 )
 def test_bad_input_is_one_message(

@@ -244,7 +244,7 @@ def own_folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of this tool that later commands read: ``scene`` of ``site.yaml``, ``flown`` with logs of ``away.yaml``."""
     folder = tmp_path_factory.mktemp("own")
     scene, site = folder / "scene", folder / "site.yaml"
-    assert main(["site", "export", "lake_wheeler", "-o", str(scene), "--no-trees"]) == 0
+    assert main(["site", "export", "lake_wheeler", "-o", str(scene)]) == 0
     assert main(["site", "import", str(scene / "scene.xml"), "--base", "lake_wheeler", "-o", str(site)]) == 0
     assert main(["simulate", str(SAMPLE / "flight.yaml"), "-o", str(folder / "flown")]) == 0
     content = yaml.safe_load((SAMPLE / "flight.yaml").read_text())

@@ -49,7 +49,8 @@ def test_a_planned_report_names_its_links_and_poses_and_writes_nothing(
     audited = planned(capsys, "report", file, "--logs-root", SAMPLE, "--audit", "50", "--figures", "none")
     assert "audit" in {stage["name"] for stage in audited["stages"]}
     assert "figures of 0 channels" in audited["stages"][-1]["work"]
-    sionna = planned(capsys, "report", file, "--logs-root", SAMPLE, "--engine", "sionna")
+    file.write_text(file.read_text().replace("engine: image", "engine: sionna"))
+    sionna = planned(capsys, "report", file, "--logs-root", SAMPLE)
     assert "replay RSS LW1 USRP1" in sionna["not_estimated"]
     assert main(["report", str(file), "--logs-root", str(SAMPLE), "--audit", "none", "--dry-run"]) == 0
     assert "not run" in capsys.readouterr().out

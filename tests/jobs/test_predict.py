@@ -57,7 +57,7 @@ def small(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def prediction(small):
-    return job.predict(small / "points.csv", named_flights([small / "a.yaml", small / "b.yaml"]), threshold_db=-60.0)
+    return job.predict(small / "points.csv", named_flights([small / "a.yaml", small / "b.yaml"]))
 
 
 def rows(prediction, point):
@@ -105,13 +105,6 @@ def test_columns_are_those_of_the_contract(prediction):
     assert ((levels["q05_db"] < levels["level_db"]) & (levels["level_db"] < levels["q95_db"])).all()
     by_point = levels.groupby(["point", "channel"], observed=True)["p_serving"].sum()
     np.testing.assert_allclose(by_point, 1.0, atol=2e-3)
-
-
-def test_p_above_is_the_normal_probability(prediction):
-    from scipy.stats import norm
-
-    levels = prediction.table[prediction.table["level_db"].notna()]
-    np.testing.assert_allclose(levels["p_above"], norm.sf((-60.0 - levels["level_db"]) / levels["sd_db"]), atol=1e-9)
 
 
 def test_a_notebook_shows_first_words_and_points(prediction):

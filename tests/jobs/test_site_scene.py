@@ -52,7 +52,7 @@ def test_in_and_out_and_in_again(room: Path, tmp_path: Path, capsys: pytest.Capt
     assert {"marble with thickness=0.2", "constant with permittivity=4 conductivity=0.01 thickness=0.1"} == set(
         first.faces.material
     )
-    assert main(["site", "export", str(out), "--sionna", str(tmp_path / "out")]) == 0
+    assert main(["site", "export", str(out), "-o", str(tmp_path / "out")]) == 0
     assert capsys.readouterr().out.split()[-1] == str(tmp_path / "out" / "scene.xml")
     again = tmp_path / "again.yaml"
     run_scene_import(tmp_path / "out" / "scene.xml", again, SceneOptions(origin="35.7,-78.7", towers=["T=-5,3,10"]))
@@ -104,7 +104,7 @@ def test_maps_are_no_scenes(room: Path, tmp_path: Path) -> None:
 
 
 def test_a_site_of_prisms_can_be_written(tmp_path: Path) -> None:
-    files = run_site_export("lake_wheeler", tmp_path / "out", trees=False).files
+    files = run_site_export("lake_wheeler", tmp_path / "out").files
     assert files[0].name == "scene.xml"
     assert {f.stem for f in files[1:]} >= {"all_concrete", "all_medium_dry_ground"}
 

@@ -116,7 +116,7 @@ def prediction(fixture: Fixture) -> str:
         name="route", kind="route", site=fixture("maps_data").site, table=table, units={"LW1 USRP1": "dBm"}, shape=None,
         heights_m=(40.0,), verdict=first_words(chosen, 0.34, 2.0, 5.0), candidates=[], model={"noise_sd_db": 1.0},
         chosen={"title": "antennas learned from the named flights, no correction", "sd_factor": 1.0, "left_out": "flights"},
-        flown={}, flights=("F0", "F1"), trained_on=(), marks=(), threshold_db=None, warnings=cautions(chosen, 0.34),
+        flown={}, flights=("F0", "F1"), trained_on=(), marks=(), warnings=cautions(chosen, 0.34),
         generated="2026-11-21T00:00:00+00:00", versions={}, stages_s={},
     )  # fmt: skip
     return _written(prediction_html.write_prediction, data, "prediction")

@@ -30,7 +30,6 @@ def report(
     flight: Annotated[Path, Argument(help="flight.yaml")],
     out: Annotated[Path | None, output("Output folder  [default: reports/<flight>]")] = None,
     logs_root: LogsRoot = None,
-    engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: rt.engine]")] = None,
     audit: Annotated[
         str | None, Option(help="Number of audited links, 'full' or 'none'; audits anew  [default: rt.audit_links]")
     ] = None,
@@ -62,7 +61,6 @@ def report(
     from ...jobs import run
 
     chosen = run.ReportOptions(
-        engine=engine,
         audit=audit,
         recommend=recommend,
         learned=learned,

@@ -50,10 +50,7 @@ def tap(
     status: Annotated[bool, Option("--status/--no-status", help="A status line on standard error.")] = True,
     enable_csi: Annotated[bool, Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")] = False,
     ri_hz: Annotated[float, Option(help="Rate of the rank indicator.")] = 2.0,
-    other_hz: Annotated[float, Option(help="Rate of each other query.")] = 1.0,
     no_csi_alarm: Annotated[float | None, Option(help="Seconds without CSI until the bell rings.")] = None,
-    no_csi_exit: Annotated[bool, Option("--no-csi-exit", help="Exit with code 1 on that alarm.")] = False,
-    sync_s: Annotated[float, Option(help="Longest time between a record and its sync to disk [s].")] = 1.0,
     duration: Annotated[float | None, Option(help="Stop after this many seconds.")] = None,
     wait: Annotated[float, Option(help="Seconds to wait for the port.")] = 0.0,
     web: Annotated[
@@ -68,20 +65,16 @@ def tap(
     _needs_posix("tap")
     from ...common.jsonable import json_safe
     from ...jobs.live.live_tap import Shown, tap_modems
-    from ...live.record.log import LogSettings
     from ...live.session import TapSettings
 
     shown = Shown(web=web, flight=flight, telemetry=telemetry, say=say)
     settings = TapSettings(
         folder=out,
         ri_hz=ri_hz,
-        other_hz=other_hz,
         enable_csi=enable_csi,
         no_csi_alarm_s=no_csi_alarm,
-        no_csi_exit=no_csi_exit,
         duration_s=duration,
         wait_for_port_s=wait,
-        log=LogSettings(sync_interval_s=sync_s),
     )
     line = StatusLine(status and not say.quiet)
     summaries = tap_modems(settings, port or [None], shown, on_status=line)

@@ -41,10 +41,7 @@ def plan(
     speed: Annotated[float, Option(min=0.5, max=40.0, help="Speed [m/s].")] = 8.0,
     height: Annotated[
         list[float] | None,
-        Option(help="Height of the tool's own patterns above take-off [m]; repeatable  [default: 40]"),
-    ] = None,
-    target_height: Annotated[
-        list[float] | None, Option(help="Height of a target that is a site [m]; repeatable  [default: 40]")
+        Option(help="Height of the tool's own patterns, and of a target that is a site [m]; repeatable  [default: 40]"),
     ] = None,
     tower_distance: Annotated[float, Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
     out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,
@@ -65,7 +62,7 @@ def plan(
         avoid=tuple(avoid or ()),
         routes=tuple(routes or ()),
         towers=tuple(tower or ()),
-        target=TargetOptions(heights_m=tuple(target_height or (40.0,)), spacing_m=60.0, site=site),
+        target=TargetOptions(heights_m=tuple(height or (40.0,)), spacing_m=60.0, site=site),
     )
     outcome = run_plan(
         target, flights or (), options, RunOptions(out=out, logs_root=logs_root, force=force, progress=say)

@@ -17,7 +17,7 @@ from ..shown import print_json, records, say, show, warn_all
     examples=[
         "aerpaw-cmp predict plan.kml --with flight1.yaml --with flight2.yaml -o prediction",
         "aerpaw-cmp predict plan.kml --site lake_wheeler -o prediction",
-        "aerpaw-cmp predict next_flight.yaml --with flight1.yaml --threshold -95",
+        "aerpaw-cmp predict next_flight.yaml --with flight1.yaml",
         "aerpaw-cmp predict lake_wheeler --with flight1.yaml --height 40 --height 80 --spacing 30",
     ],
 )
@@ -42,9 +42,6 @@ def predict(
         float | None,
         Option(help="Heading of a grid, and of points without yaw [deg]; without it all headings count alike."),
     ] = None,
-    threshold: Annotated[
-        float | None, Option(help="Also the probability that the level exceeds this, in the unit of the logs.")
-    ] = None,
     logs_root: LogsRoot = None,
     force: Force = False,
     as_json: Json = False,
@@ -58,7 +55,6 @@ def predict(
         flights or (),
         TargetOptions(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading, site=site),
         RunOptions(out=out, logs_root=logs_root, force=force, progress=say),
-        threshold_db=threshold,
     )
     print_json(outcome.metrics) if as_json else _print_summary(outcome)
 
@@ -66,10 +62,10 @@ def predict(
 def _print_summary(outcome: Any) -> None:
     m = outcome.metrics
     show(m["sentence"])
-    series = [{"name": name, "mean_p_above": None, **numbers} for name, numbers in m["series"].items()]
+    series = [{"name": name, **numbers} for name, numbers in m["series"].items()]
     columns = {
         "series": "name", "unit": "unit", "mean level": "mean_level_db:.1f", "mean SD dB": "mean_sd_db:.1f",
-        "P(above)": "mean_p_above:.2f", "outside flown": "share_outside_flown:.0%", "points": "points",
+        "outside flown": "share_outside_flown:.0%", "points": "points",
     }  # fmt: skip
     records(series, columns, "Prediction")
     warn_all(m["warnings"])

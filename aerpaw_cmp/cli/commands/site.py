@@ -96,15 +96,14 @@ def site_import(
 )
 def site_export(
     site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")],
-    out: Annotated[Path, Option("-o", "--out", "--sionna", metavar="DIR", help="Output folder.")],
-    trees: Annotated[bool, Option("--trees/--no-trees", help="Also export crowns and trunks.")] = True,
+    out: Annotated[Path, output("Output folder.")],
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Write a site for Sionna."""
     from ...jobs.mapping.site_scene import run_site_export
 
-    files = run_site_export(site, out, trees=trees, force=force).files
+    files = run_site_export(site, out, force=force).files
     print_files(files if as_json else files[:1], as_json)
 
 
@@ -114,7 +113,7 @@ def site_export(
     text="Plan of a site, and a standalone page that shows it in 3-D.",
     examples=[
         "aerpaw-cmp site show",
-        "aerpaw-cmp site show site.yaml -o reports/site --export",
+        "aerpaw-cmp site show site.yaml -o reports/site",
         "aerpaw-cmp site show --flight sample_logs/flight.yaml",
     ],
 )
@@ -125,7 +124,6 @@ def site_show(
     out: Annotated[Path | None, output("Output folder  [default: reports/site-<site>]")] = None,
     flight: Annotated[Path | None, Option(help="Draw the track of this flight.yaml.")] = None,
     logs_root: LogsRoot = None,
-    export: Annotated[bool, Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -133,7 +131,7 @@ def site_show(
     from ...jobs import run
 
     options = RunOptions(out=out, logs_root=logs_root, force=force)
-    shown = run.run_site_show(site, options, flight=flight, export=export)
+    shown = run.run_site_show(site, options, flight=flight)
     if not as_json and flight is None:
         from ...site.antenna.learned import memory_lines
 

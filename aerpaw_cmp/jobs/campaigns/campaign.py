@@ -41,8 +41,6 @@ class CampaignFile(StrictModel):
     repeatability: RepeatSettings = RepeatSettings()
     keep: str | None = None
     """Folder of outcomes, against this file's."""
-    export: list[str] = Field(default_factory=list)
-    """Formats of the samples: those of ``report.export`` of a flight."""
 
 
 def load_campaign(path: Path) -> CampaignFile:

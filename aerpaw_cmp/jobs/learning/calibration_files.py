@@ -13,12 +13,10 @@ from typing import Any
 
 import numpy as np
 
-from ...common.cf import file_attributes
 from ...common.gaussian import determining, gaussian_kernel
 from ...common.jsonable import named
 from ...common.provenance import KEY, MARKS, union
 from ...common.units import FloatArray, spread_out
-from ...common.versions import tool_version, utc_now
 from ...compare.gains.direction_gain import Frame, directed
 from ...compare.learning.calibration import Learned, mean_rmse
 from ...compare.learning.learning_curve import with_one_more
@@ -36,7 +34,6 @@ from ...site.antenna.sphere_pattern import (
     planning_cuts,
     sphere_csv,
     sphere_grid,
-    sphere_netcdf,
     unit_mean_gain,
 )
 from .calibrate import Calibration, CalibrationFile
@@ -74,10 +71,8 @@ def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]
 
 def _antenna_files(
     calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float
-) -> dict[str, str | bytes]:
+) -> dict[str, str]:
     """Content of each file by its name: the full sphere with standard deviation, and cuts for planning tools.
-
-    The sphere is CSV and, where netCDF4 is installed, NetCDF too.
 
     Parameters
     ----------
@@ -87,7 +82,7 @@ def _antenna_files(
 
     Returns
     -------
-    dict of str to str or bytes
+    dict of str to str
     """
     names = ", ".join(calibration.names)
     notes = (
@@ -95,20 +90,12 @@ def _antenna_files(
         "gain of the antenna as mounted: UAV in the body frame (x forward, y left, z up), tower in east-north-up",
         "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
     )
-    out: dict[str, str | bytes] = {}
+    out: dict[str, str] = {}
     for (antenna, end), gains in maps.items():
         stem = safe_name(f"{antenna}.{end}")
         out[f"{stem}.csv"] = sphere_csv(gains.gain_dbi, gains.sd_db, (*notes, *_notes(calibration, antenna, end)))
         pattern = SpherePattern(stem, gains.gain_dbi, gains.sd_db)
         out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz, _provenance_notes(calibration))
-        source = f"learned from the flights {names}, calibration {calibration.settings.calibration}"
-        attributes = file_attributes(
-            f"{antenna}, antenna at the {end}", source, utc_now(), tool_version(), "; ".join(notes[1:])
-        )  # fmt: skip
-        attributes |= {KEY: " ".join(calibration.trained_on), MARKS: " ".join(calibration.marks)}
-        sphere = sphere_netcdf(gains.gain_dbi, gains.sd_db, attributes, carrier_hz)
-        if sphere is not None:
-            out[f"{stem}.nc"] = sphere
     return out
 
 

@@ -191,7 +191,7 @@ def _towers(towers: Sequence[str], frame: SiteFrame, low: Any, high: Any) -> dic
     return by_name
 
 
-def run_site_export(site: str, out: Path, *, trees: bool = True, force: bool = False) -> JobOutcome:
+def run_site_export(site: str, out: Path, *, force: bool = False) -> JobOutcome:
     """Write any site as ``scene.xml`` with PLY meshes, which ``sionna.rt.load_scene`` opens.
 
     Parameters
@@ -200,8 +200,6 @@ def run_site_export(site: str, out: Path, *, trees: bool = True, force: bool = F
         site.yaml, or the name of a packaged site.
     out : Path
         Folder.
-    trees : bool
-        Crowns and trunks too.
     force : bool
         Replace files that this tool did not write.
 
@@ -212,5 +210,5 @@ def run_site_export(site: str, out: Path, *, trees: bool = True, force: bool = F
     """
     with OutputFolder(out, job="site export", inputs=inputs_of_site(site), force=force) as output:
         with output.filling() as folder:
-            written = export_scene(load_site(site), folder, trees=trees)
+            written = export_scene(load_site(site), folder)
         return JobOutcome(folder=out, files=output.placed(written))

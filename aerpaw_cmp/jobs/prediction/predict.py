@@ -99,7 +99,6 @@ def predict(
     flights: Sequence[NamedFlight],
     options: TargetOptions | None = None,
     *,
-    threshold_db: float | None = None,
     logs_root: Path | None = None,
     stages: Stages | None = None,
 ) -> Prediction:
@@ -112,8 +111,6 @@ def predict(
     flights : sequence of NamedFlight
         To learn from; without any the memory of the site is the source.
     options : TargetOptions, optional
-    threshold_db : float, optional
-        P(level > threshold) is given for it, in the unit of the logs.
     logs_root : Path, optional
         Where logs resolve.
     stages : Stages, optional
@@ -144,7 +141,7 @@ def predict(
         model = memory or _best_model(targets, sources, known, place, remarks)
     with stages("predict"):
         receivers = _receivers(known, place, site)
-        table = _table(targets, site, (sources, model, receivers), threshold_db, stages.progress)
+        table = _table(targets, site, (sources, model, receivers), stages.progress)
     about = _model_fields(model, known, [receiver for receiver, _, _ in receivers.values()], table)
     page = PredictionPage(
         **named(targets, "name kind heights_m"),
@@ -153,7 +150,6 @@ def predict(
         units={f"{s.tower} {s.channel}": s.unit for s in sources.values()},
         shape=None if targets.grid is None else targets.grid.shape,
         flown={f"{s.flight} {s.antenna}": track_m(s).T for source in sources.values() for s in source.samples},
-        threshold_db=threshold_db,
         stages_s=stages.seconds,
         **about | {"warnings": (*about["warnings"], *remarks, *targets.remarks)},
     )
@@ -347,7 +343,6 @@ def _table(
     targets: Targets,
     site: Site,
     learned: tuple[Mapping[str, Source], Flown | Memory, Receivers],
-    threshold_db: float | None,
     progress: Progress,
 ) -> pd.DataFrame:
     """Rows of every tower and channel, then of every receiver; float32, or a million points take gigabytes.
@@ -358,15 +353,12 @@ def _table(
     site : Site
     learned : tuple
         Sources, model, receivers.
-    threshold_db : float or None
     progress : callable
 
     Returns
     -------
     DataFrame
     """
-    from scipy.special import ndtr
-
     sources, model, receivers = learned
     level, slow, guess = _levels(targets, sources, model, progress)
     serving = _serving(level, slow, [source.channel for source in sources.values()])
@@ -397,7 +389,6 @@ def _table(
         fading = model.fading(source.antenna)
         half, sd = fading.half_width_db(slow[k], BAND), fading.total_db(slow[k])
         values = {"level_db": level[k], "sd_db": sd, "q05_db": level[k] - half, "q95_db": level[k] + half}
-        values |= {} if threshold_db is None else {"p_above": ndtr((level[k] - threshold_db) / sd)}
         values |= {"p_serving": serving[k], "slow_sd_db": slow[k]} | (
             dict.fromkeys(RANKS, nothing) if receivers else {}
         )
@@ -535,8 +526,6 @@ def run_predict(
     flights: Sequence[Path],
     target: TargetOptions,
     options: RunOptions = DEFAULT,
-    *,
-    threshold_db: float | None = None,
 ) -> JobOutcome:
     """Predict and write ``prediction.csv``, ``.nc``, ``.html`` (of a grid ``.tif``, ``.kmz``) and figures.
 
@@ -549,7 +538,6 @@ def run_predict(
     target : TargetOptions
     options : RunOptions
         ``out`` is ``reports/prediction-NAME`` by default.
-    threshold_db : float, optional
 
     Returns
     -------
@@ -559,9 +547,7 @@ def run_predict(
     inputs = [*target_files(where, target.site, options.logs_root), *files_of(known, options.logs_root)]
     folder, stages = options.out or Path("reports") / f"prediction-{where.stem}", Stages(options.progress)
     with OutputFolder(folder, job="predict", inputs=inputs, force=options.force) as output:
-        prediction = predict(
-            where, known, target, threshold_db=threshold_db, logs_root=options.logs_root, stages=stages
-        )
+        prediction = predict(where, known, target, logs_root=options.logs_root, stages=stages)
         with output.filling() as place:
             options.progress("page")
             written, remarks = write_prediction(prediction.page, place)

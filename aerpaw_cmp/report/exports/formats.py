@@ -21,8 +21,8 @@ ALL = "all"
 FOLDER = "exports"
 
 
-def chosen_formats(*lists: str | Iterable[str]) -> tuple[str, ...]:
-    """The formats of lists as a user writes them: names, also joined by commas; ``all`` for every one.
+def chosen_formats(names: str | Iterable[str]) -> tuple[str, ...]:
+    """The formats that a user writes: names, also joined by commas; ``all`` for every one.
 
     Raises
     ------
@@ -31,11 +31,11 @@ def chosen_formats(*lists: str | Iterable[str]) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> chosen_formats(["netcdf,kmz", "kmz"], "geojson")
+    >>> chosen_formats(["netcdf,kmz", "geojson"])
     ('geojson', 'kmz', 'netcdf')
     """
-    names = [name for some in lists for name in ([some] if isinstance(some, str) else some)]
-    chosen = [part.strip().lower() for name in names for part in name.split(",") if part.strip()]
+    listed = [names] if isinstance(names, str) else names
+    chosen = [part.strip().lower() for name in listed for part in name.split(",") if part.strip()]
     unknown = [name for name in chosen if name not in (*FORMATS, ALL)]
     if unknown:
         raise UsageError(f"export {unknown[0]!r}", expected=", ".join((*FORMATS, ALL)))

@@ -45,7 +45,6 @@ class PredictionPage(Made):
     flights: Sequence[str]
     trained_on: Sequence[str]
     marks: Sequence[str]
-    threshold_db: float | None
     warnings: Sequence[str]
 
     @property
@@ -72,14 +71,13 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
             "mean_sd_db": part["sd_db"].mean(),
             "share_outside_flown": outside_share(part),
             **{f"share_{flag}": float((part["flag"] == flag).mean()) for flag in FLAGS if flag != "outside_flown"},
-            **({"mean_p_above": part["p_above"].mean()} if "p_above" in part else {}),
         }
         for name, part in data.series
     }
     ranks = data.table[data.table["channel"] == "rank"]
     return json_object(
         prediction=data.name,
-        **named(data, "kind flights trained_on marks threshold_db chosen candidates warnings"),
+        **named(data, "kind flights trained_on marks chosen candidates warnings"),
         sentence=data.verdict,
         field=data.model,
         series=series,
@@ -132,7 +130,7 @@ def _dataset(data: PredictionPage) -> Any:
     variables: dict[str, Any] = {"series": ("series", np.array(names), {"long_name": "tower and channel"})}
     for name, unit in (("time_s", "s"), ("east_m", "m"), ("north_m", "m"), ("height_m", "m"), ("yaw_deg", "degree")):
         variables[name] = ("point", first[name].to_numpy(np.float64), {"units": unit})
-    for name in ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db", "p_above", "p_serving"):
+    for name in ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db", "p_serving"):
         if name in first:
             values = np.stack([part[name].to_numpy(np.float32) for _, part in series])
             variables[name] = (("series", "point"), values, {"units": "dB" if name.endswith("_db") else "1"})
@@ -209,8 +207,6 @@ def _draw_profile(data: PredictionPage, name: str, part: pd.DataFrame) -> Figure
     ax.fill_between(time, part["q05_db"], part["q95_db"], color=canvas.SIMULATED, alpha=0.25, linewidth=0,
                     label="90 % interval of one sample")  # fmt: skip
     ax.plot(time, part["level_db"], color=canvas.SIMULATED, linewidth=1.2, label="median")
-    if data.threshold_db is not None:
-        ax.axhline(data.threshold_db, color="0.4", linestyle="--", linewidth=1, label="threshold")
     ax.set(xlabel="time along the route [s]", ylabel=f"level [{data.units.get(name, 'dB')}]")
-    canvas.legend_below(ax, 3)
+    canvas.legend_below(ax, 2)
     return fig

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
 
-from ...common.cf import CONVENTIONS, DB, dataset, netcdf_bytes
-from ...common.errors import InputError, UsageError, parsed
+from ...common.errors import InputError, parsed
 from ...common.provenance import marks, trained_on
 from ...common.units import BoolArray, FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
@@ -80,49 +79,6 @@ def unit_mean_gain(gain_db: FloatArray) -> FloatArray:
     theta = np.linspace(0.0, np.pi, gain_db.shape[0])
     weight = np.sin(theta)[:, None] * np.ones_like(gain_db)
     return np.asarray(gain_db - db_from_power((power_from_db(gain_db) * weight).sum() / weight.sum()))
-
-
-def sphere_netcdf(
-    gain_dbi: FloatArray, sd_db: FloatArray, attributes: Mapping[str, str], frequency_hz: float
-) -> bytes | None:
-    """An antenna file as NetCDF after CF-1.11; None where netCDF4 is not installed (``aerpaw-cmp[geo]``).
-
-    Parameters
-    ----------
-    gain_dbi, sd_db : (thetas, phis)
-        Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
-    attributes : mapping of str to str
-        Of the file: ``title``, ``source``, ``history`` and what else there is to say.
-    frequency_hz : float
-
-    Returns
-    -------
-    bytes or None
-        ``gain`` and its ancillary ``gain_sd`` over ``elevation`` (90 to -90 deg) and ``azimuth`` (0 to below 360 deg,
-        counter-clockwise from x), in dB as UDUNITS has it, and the scalar ``frequency``.
-    """
-    rows, columns = gain_dbi.shape
-    over = ("elevation", "azimuth")
-    carrier = {"long_name": "frequency of the gain", "standard_name": "radiation_frequency", "units": "Hz"}
-    gain = {"long_name": "gain of the antenna as mounted, its mean power over the sphere 0 dBi",
-            "ancillary_variables": "gain_sd"}  # fmt: skip
-    shared = {"units": DB, "coordinates": "frequency"}
-    try:
-        sphere = dataset(
-            {
-                "elevation": ("elevation", 90.0 - np.linspace(0.0, 180.0, rows),
-                              {"long_name": "angle above the x-y plane of the antenna's frame", "units": "degree"}),
-                "azimuth": ("azimuth", np.arange(columns) * (360.0 / columns),
-                            {"long_name": "angle in the x-y plane, counter-clockwise from x", "units": "degree"}),
-                "frequency": ((), frequency_hz, carrier),
-                "gain": (over, gain_dbi.astype(np.float32), gain | shared),
-                "gain_sd": (over, sd_db.astype(np.float32), {"long_name": "standard deviation of the gain"} | shared),
-            },
-            {"Conventions": CONVENTIONS, **attributes},
-        )  # fmt: skip
-        return bytes(netcdf_bytes(sphere))
-    except UsageError:
-        return None
 
 
 def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] = (), decimals: int = 3) -> str:

@@ -21,7 +21,7 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError, parsing
 from aerpaw_cmp.common.units import FloatArray, IntArray, spread_out
-from aerpaw_cmp.compare.result import APPLIED, GIVEN, RssResult
+from aerpaw_cmp.compare.result import APPLIED, GIVEN
 from aerpaw_cmp.flight.data import FlightData, RankSeries, RssSeries
 from aerpaw_cmp.flight.replay import Replayed, attitude_rotation
 from aerpaw_cmp.flight.settings import LogSettings
@@ -44,8 +44,7 @@ _FURTHEST_M = 5_000.0
 # Largest differences by kind, with the unit. Coherent levels have more in fades, as much as 0.01 rad does there.
 _TOLERANCES = {
     "time": (1e-3, "s"), "position": (0.005, "m"), "rotation": (1e-5, "rad"), "measured level": (1e-3, "dB"),
-    "simulated level": (0.01, "dB"), "compared level": (1e-6, "dB"), "offset": (1e-6, "dB"), "RMSE": (1e-6, "dB"),
-    "tower": (0.005, "m"), "rank": (0.5, ""), "clock": (1e-6, "s"),
+    "simulated level": (0.01, "dB"), "tower": (0.005, "m"), "rank": (0.5, ""),
 }  # fmt: skip
 
 
@@ -110,10 +109,8 @@ class _Account:
         )
 
 
-def raw_checked(
-    data: FlightData, replays: Sequence[Replayed], expected: Sequence[Expected], results: Sequence[RssResult] = ()
-) -> RawAudit:
-    """Positions, datum, attitude, readings, levels and scores of some samples, from the bytes of the logs.
+def raw_checked(data: FlightData, replays: Sequence[Replayed], expected: Sequence[Expected]) -> RawAudit:
+    """Positions, datum, attitude, readings and levels of some samples, from the bytes of the logs.
 
     Parameters
     ----------
@@ -122,8 +119,6 @@ def raw_checked(
         Of its RSS series, then of its ranks.
     expected : sequence of Expected
         The settings of each replay, read a second time.
-    results : sequence of RssResult
-        What was made of the RSS series, where it was compared.
 
     Returns
     -------
@@ -143,9 +138,6 @@ def raw_checked(
         check = _Series(data=data, series=series, replayed=replayed, path=path, reference=reference, account=account)
         check.readings(logs, rows)
         check.poses_and_levels(rows)
-        check.clock_sign()
-    for series, result in zip(data.rss, results, strict=False):
-        _scores_checked(data, series, result, account)
     for rank in data.rank:
         _rank_checked(data, rank, logs, path, account)
     return account.result()
@@ -433,42 +425,6 @@ class _Series:
             spare = 20 * math.log10(1 + 0.01 * math.sqrt(power / value)) if value < power else 0.0
             self.account.add("simulated level", abs(ours_dbm - expected), where, spare=spare)
 
-    def clock_sign(self) -> None:
-        """The measurement follows direct and ground path better at the clock taken off than at its opposite."""
-        clock, reference = self.replayed.clock, self.reference
-        if clock is None or self.path is None or reference is None or clock.result.applied != APPLIED:
-            return
-        ahead = clock.result.radio_minus_telemetry_s
-        if abs(ahead) < _LEAST_AHEAD_S:
-            return
-        known = np.flatnonzero(self.replayed.valid & np.isfinite(self.series.measured_db))
-        rows = known[spread_out(len(known), _CLOCK_SAMPLES)]
-        spreads = []
-        for sign in (-1.0, 1.0):
-            error = [self._residual_db(reference, row, sign * ahead) for row in rows.tolist()]
-            spreads.append(float(np.nanstd(error)) if np.isfinite(error).sum() > _CLOCK_SAMPLES // 2 else math.nan)
-        if spreads[1] < _WRONG_SIGN * spreads[0]:
-            self.account.broken.append(
-                f"from raw bytes: the radio clock of {self.name}, {ahead:+.2f} s, has the wrong sign: the level varies "
-                f"by {spreads[0]:.1f} dB about the prediction with it, by {spreads[1]:.1f} dB with its opposite"
-            )
-
-    def _residual_db(self, reference: Reference, row: int, added_s: float) -> float:
-        """Measured minus coherent sum of direct and ground path, at a pose so much later."""
-        assert self.path is not None
-        pose = self.path.pose(float(self.series.time[row].astype("datetime64[us]").astype(np.int64)) + added_s * 1e6)
-        turn = None if pose is None else _as_asked(pose, self.data.settings.rt.attitude)
-        if pose is None or turn is None:
-            return math.nan
-        ground = next(m for m in reference.mirrors if m.solid < 0)
-        h, _ = reference.matrix([((), 0.0), ((ground,), 0.0)], pose.place_m, turn)
-        value = float((np.abs(h) ** 2).mean())
-        return float(self.series.measured_db[row]) - 10 * math.log10(value) if value > 0 else math.nan
-
-
-# Clocks nearer to the telemetry's have no sign to see; samples; wrong is a sign whose opposite spreads a tenth less.
-_LEAST_AHEAD_S, _CLOCK_SAMPLES, _WRONG_SIGN = 0.2, 60, 0.9
-
 
 def _value(reading: Reading, series: RssSeries, log: LogSettings) -> float | None:
     """The value of a reading that is a series' level."""
@@ -490,24 +446,6 @@ def _as_asked(pose: Pose, mode: str) -> Matrix | None:
     if mode == "ignored":
         return ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     return level(pose.turn) if mode == "level" and pose.turn is not None else pose.turn
-
-
-def _scores_checked(data: FlightData, series: RssSeries, result: RssResult, account: _Account) -> None:
-    """Offset and RMSE in closed form from the levels that rss.csv lists."""
-    settings, where = data.settings.rss, f"{series.tower} {series.channel}"
-    error = np.asarray(result.measured_db - result.simulated_dbm)
-    error = error[np.isfinite(error)]
-    if result.further.trained_on or not len(error):
-        return
-    account.add("RMSE", abs(len(error) - result.score.n), f"the number of samples of {where}")
-    low, high = (round(end / 0.1) for end in settings.span_db)
-    mean = -float(error.mean()) / 0.1
-    steps = (math.floor(mean), math.floor(mean) + 1)
-    nearest = min(steps, key=lambda n: (round(abs(n - mean), 9), abs(n)))
-    offset = min(max(nearest, low), high) * 0.1
-    account.add("offset", abs(offset - result.score.offset_db), where, spare=1e-3 * 0.1)
-    rmse = math.sqrt(float(((error + result.score.offset_db) ** 2).mean()))
-    account.add("RMSE", abs(rmse - result.score.rmse_db), where)
 
 
 # ---------------------------------------------------------------- rank

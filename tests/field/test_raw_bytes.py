@@ -8,7 +8,6 @@ from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.replay import replay_flight
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.audit_flight import expectations
-from aerpaw_cmp.jobs.reporting.compare_flight import compare_flight
 from tests.raw_checks import raw_checked
 from tests.real_logs import REAL
 
@@ -17,10 +16,10 @@ FLIGHTS = sorted(Path(__file__).parent.glob("*.yaml"))
 
 
 @pytest.mark.parametrize("path", FLIGHTS, ids=lambda path: path.stem)
-def test_times_levels_positions_and_scores_are_those_of_the_bytes(path: Path) -> None:
+def test_times_levels_and_positions_are_those_of_the_bytes(path: Path) -> None:
     data = load_data(load_flight(path), REAL)
-    replays = replay_flight(data)
-    audit = raw_checked(data, replays.all, expectations(data, replays.all), compare_flight(data, replays).rss)
+    replays = replay_flight(data).all
+    audit = raw_checked(data, replays, expectations(data, replays))
     assert audit.failures == ()
     assert audit.samples + audit.poses > 40 or path.stem.startswith("nr_rank")
     assert audit.position_max_m < 0.005

@@ -260,8 +260,6 @@ def own_folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "words",
     [
-        "map lake_wheeler --flight away.yaml -o flown",
-        "map lake_wheeler --flight away.yaml --dry-run -o flown",
         "predict away.yaml -o flown",
         "calibrate calibration.yaml --score away.yaml -o flown.yaml",
         "calibrate calibration.yaml --score in_scene.yaml -o in_scene.yaml",

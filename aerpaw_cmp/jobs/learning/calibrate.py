@@ -52,13 +52,8 @@ class PatternsSettings(StrictModel):
 class FitSettings(StrictModel):
     """Selection of what is learned."""
 
-    gain: Literal["both", "uav", "tower"] = "both"
     mount: Literal["azimuth", "tilt", "none"] = "azimuth"
     """Of antennas with a pattern."""
-    place: bool = False
-    """Also a field over places, drawn and scored apart; never part of an antenna."""
-    ground: bool = True
-    """How rough the ground is, by the likelihood of a two-ray model beside the gains."""
     bin_s: Annotated[float, Field(gt=0, le=60)] = 4.0
 
 
@@ -108,10 +103,9 @@ class Calibration:
     flights: tuple[FlightData, ...]
     observed: tuple[Observed, ...]
     learned: Learned
-    place: Learned | None
     scores: Mapping[str, tuple[Score, ...]]
     controls: Mapping[str, tuple[Score, ...]]
-    ground: GroundFit | None
+    ground: GroundFit
     curve: tuple[CurvePoint, ...]
     locks: Mapping[str, LearnedLock]
     """By antenna, of receivers that lose their lock."""
@@ -194,12 +188,8 @@ def calibrate(
     series = [o.samples for o in observed]
     with stages("fit"):
         learned = calibration.learn(series, recipe)
-        place = None
-        if settings.fit.place:
-            with_place = calibration.only_terms(recipe, (*recipe.model.terms, direction_gain.PLACE_TERM))
-            place = calibration.learn(series, with_place)
     with stages("ground"):
-        ground = _fit_ground(flights, observed, learned) if settings.fit.ground else None
+        ground = _fit_ground(flights, observed, learned)
     fits: dict[str, Learned] = {}
     with stages("scores"):
         scores = _score_all(observed, recipe, stages, fits)
@@ -218,7 +208,6 @@ def calibrate(
         flights=tuple(flights),
         observed=tuple(observed),
         learned=learned,
-        place=place,
         scores=scores,
         controls=controls,
         ground=ground,
@@ -226,7 +215,7 @@ def calibrate(
         locks=locks,
         warnings=tuple(warnings),
         words=(
-            *sentences(scores, controls, None if ground is None else ground.likely_m, curve),
+            *sentences(scores, controls, ground.likely_m, curve),
             *map(lock_words, locks.values()),
         ),
     )
@@ -386,11 +375,6 @@ def learned_antennas(train: Sequence[direction_gain.LinkSamples]) -> Learned:
 
 def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
     """Terms and patterns as calibration.yaml asks."""
-    terms: dict[str, tuple[direction_gain.Term, ...]] = {
-        "both": direction_gain.ANTENNA_TERMS,
-        "uav": direction_gain.UAV_TERMS,
-        "tower": direction_gain.TOWER_TERMS,
-    }
     patterns: dict[str, GainOf] = {}
     if settings.patterns.uav is not None:
         patterns["uav"] = gain_of(settings.patterns.uav, folder)
@@ -399,7 +383,7 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
         if chosen is not None:
             patterns[antenna] = gain_of(chosen, folder)
     return Recipe(
-        model=direction_gain.GainModel(terms=terms[settings.fit.gain], bin_s=settings.fit.bin_s),
+        model=direction_gain.GainModel(bin_s=settings.fit.bin_s),
         rotation=rotation,
         patterns=patterns,
         mount=settings.fit.mount != "none",

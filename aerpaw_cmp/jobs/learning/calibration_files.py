@@ -16,9 +16,9 @@ import numpy as np
 from ...common.gaussian import determining, gaussian_kernel
 from ...common.jsonable import named
 from ...common.provenance import KEY, MARKS, union
-from ...common.units import FloatArray, spread_out
+from ...common.units import spread_out
 from ...compare.gains.direction_gain import Frame, directed
-from ...compare.learning.calibration import Learned, mean_rmse
+from ...compare.learning.calibration import mean_rmse
 from ...compare.learning.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries, rank_quantity
 from ...flight.training import flight_logs, marks_of
@@ -153,7 +153,7 @@ def settings_text(calibration: Calibration, folder_name: str) -> str:
             f"      tower: {{antenna: {{model: sphere, file: {ends['tower']}}}}}",
             f"      uav: {{antenna: {{model: sphere, file: {ends['uav']}}}}}",
         ]
-    rough = None if calibration.ground is None else calibration.ground.used_m
+    rough = calibration.ground.used_m
     lines += [
         "# the gains were learned beside line of sight alone",
         "rt: {engine: image, max_depth: 0, attitude: logged}",
@@ -188,13 +188,11 @@ def _record_of(
         | {"probability": dict(zip([f"{g:g}" for g in m.grid_deg], map(float, m.probability), strict=True))}
         for name, m in calibration.learned.mounts.items()
     }
-    ground = None
-    if calibration.ground is not None:
-        heights = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in calibration.ground.roughness_m]
-        ground = {
-            "rows": list(zip(heights, calibration.ground.log_likelihood, strict=True)),
-            "likely_m": calibration.ground.likely_m,
-        }
+    heights = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in calibration.ground.roughness_m]
+    ground = {
+        "rows": list(zip(heights, calibration.ground.log_likelihood, strict=True)),
+        "likely_m": calibration.ground.likely_m,
+    }
     return CalibrationData(
         name=calibration.settings.calibration,
         flights=calibration.names,
@@ -207,21 +205,9 @@ def _record_of(
         curve=[dataclasses.asdict(point) for point in calibration.curve],
         one_more_rmse_db=with_one_more(calibration.curve),
         antennas=tuple(maps.values()),
-        place=None if calibration.place is None else _place(calibration, calibration.place),
         settings_text=text,
         stages_s=stages_s,
     )
-
-
-def _place(calibration: Calibration, place: Learned) -> dict[str, FloatArray]:
-    """The place field of the first antenna along all flights, thinned."""
-    assert place.fit is not None
-    first = place.fit.antennas[0]
-    samples = [o.samples for o in calibration.observed if o.samples.antenna == first]
-    thinned = [s.part(np.arange(0, len(s), max(1, len(s) // 1500))) for s in samples]
-    gain = [place.fit.mean(s, ("place",)) for s in thinned]
-    position = np.concatenate([s.position_m for s in thinned])
-    return {"east_m": position[:, 0], "north_m": position[:, 1], "gain_db": np.concatenate(gain)}
 
 
 @dataclass(frozen=True, slots=True)
@@ -331,7 +317,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
             **_provenance(calibration.settings, calibration.flights, command),
             errors=_errors(calibration),
             series=series,
-            ground_roughness_m=None if calibration.ground is None else calibration.ground.used_m,
+            ground_roughness_m=calibration.ground.used_m,
         ),
         tables,
     )

@@ -73,11 +73,6 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
     force : bool
         Replace a site.yaml that this tool did not write.
 
-    Returns
-    -------
-    list of str
-        A line per thing that was done.
-
     Raises
     ------
     UsageError

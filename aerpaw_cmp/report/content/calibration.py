@@ -55,6 +55,5 @@ class CalibrationData(Made):
     one_more_rmse_db: float
     """To expect with one flight more, extrapolated [dB]; NaN without a curve."""
     antennas: Sequence[AntennaMap]
-    place: Mapping[str, FloatArray] | None = None
     rank: Mapping[str, Any] | None = None
     settings_text: str = ""

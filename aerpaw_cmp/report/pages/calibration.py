@@ -121,16 +121,6 @@ def draw_curve(data: CalibrationData) -> Figure:
     return fig
 
 
-def draw_place(place: Mapping[str, Any], name: str) -> Figure:
-    """The field over places that the fit with one has, along the flights."""
-    fig, ax = canvas.subplots((7.0, 6.0))
-    points = ax.scatter(place["east_m"], place["north_m"], c=place["gain_db"], s=4, cmap="coolwarm", rasterized=True)
-    fig.colorbar(points, ax=ax, label="field over places [dB]")
-    ax.set_aspect("equal")
-    ax.set(xlabel="east [m]", ylabel="north [m]", title=name)
-    return fig
-
-
 def _mean(rows: Sequence[Mapping[str, Any]], key: str = "rmse_db") -> float:
     return float(np.mean([r[key] for r in rows])) if rows else float("nan")
 
@@ -158,12 +148,6 @@ def figure_specs(data: CalibrationData) -> Iterator[FigureSpec]:
             "Elsewhere the gain is a guess, and its standard deviation says so. The level is normalised to a mean of "
             "0 dBi over the sphere: it is not identified beside the offsets.",
             partial(draw_antenna, a),
-        )  # fmt: skip
-    if data.place is not None:
-        yield FigureSpec(
-            "place", "place", "Field over places",
-            "What the fit with a place field puts into places instead of antennas. No antenna file has it.",
-            partial(draw_place, data.place, "field over places"),
         )  # fmt: skip
 
 

@@ -7,7 +7,6 @@ without an estimate is counted as ``unpredicted`` and not averaged in.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -15,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import BoolArray, FloatArray, IntArray, unmasked
+from ..common.units import FloatArray, IntArray, unmasked
 
 
 class Predictor(Protocol):
@@ -81,39 +80,9 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
 
 def leave_one_out(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> Score:
     """The paper's evaluation: each position from all others; values (n, altitudes, K) give MAE (altitudes, K)."""
-    return score(values, leave_one_out_estimate(model, points_m, values)[0])
-
-
-def leave_one_out_estimate(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Leave-one-out estimate and variance in the shape of ``values`` (n, ...)."""
     data = unmasked(values)
-    estimate, variance = model.fit(points_m, data.reshape(len(data), -1)).leave_one_out()
-    return estimate.reshape(data.shape), variance.reshape(data.shape)
-
-
-def _held_out_estimate(
-    model: Predictor, points_m: ArrayLike, values: ArrayLike, test: BoolArray
-) -> tuple[FloatArray, FloatArray]:
-    """Train on the positions outside ``test`` (n,), predict those inside; NaN elsewhere; shape of ``values``.
-
-    Parameters
-    ----------
-    model : Predictor
-    points_m : array_like, (n, 2) or (n, 3)
-    values : array_like, (n, ...)
-    test : (n,) bool
-        Positions that are predicted.
-
-    Returns
-    -------
-    (estimate, variance), each (n, ...)
-    """
-    points, data = unmasked(points_m), unmasked(values)
-    flat = data.reshape(len(data), -1)
-    estimate, variance = np.full_like(flat, np.nan), np.full_like(flat, np.nan)
-    if test.any() and not test.all():
-        estimate[test], variance[test] = model.fit(points[~test], flat[~test]).predict(points[test])
-    return estimate.reshape(data.shape), variance.reshape(data.shape)
+    estimate, _ = model.fit(points_m, data.reshape(len(data), -1)).leave_one_out()
+    return score(data, estimate.reshape(data.shape))
 
 
 def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: float = 300.0) -> Score:
@@ -149,67 +118,10 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / block_m + 1e-9).astype(np.int64)
     _, block = np.unique(cell, axis=0, return_inverse=True)
     data = unmasked(values)
-    estimate = np.full_like(data, np.nan)
+    flat = data.reshape(len(data), -1)
+    estimate = np.full_like(flat, np.nan)
     for number in np.unique(block):
         test = block.ravel() == number
-        estimate[test] = _held_out_estimate(model, points, data, test)[0][test]
-    return score(data, estimate)
-
-
-@dataclass(frozen=True, slots=True)
-class IntervalCoverage:
-    """Coverage of the Kriging intervals: shows whether the Kriging variance is calibrated.
-
-    Parameters
-    ----------
-    level : (levels,)
-        Nominal probability of the interval.
-    observed : (levels,)
-        Share of values inside; equal to ``level`` for a calibrated variance and normal errors.
-    standardised_variance : float
-        Mean of error^2 / variance: 1 for a calibrated variance, above 1 when it is too small.
-    n : int
-        Values with an estimate and a variance above 0.
-    """
-
-    level: FloatArray
-    observed: FloatArray
-    standardised_variance: float
-    n: int
-
-
-def interval_coverage(
-    values: ArrayLike,
-    estimate: ArrayLike,
-    variance: ArrayLike,
-    levels: Sequence[float] = (0.5, 0.8, 0.9, 0.95),
-) -> IntervalCoverage:
-    """Share of values within the central normal intervals of estimate and variance, all of the same shape.
-
-    Parameters
-    ----------
-    values, estimate, variance : array_like, (...)
-        True values, predictions, and the variances claimed for them; NaN takes no part.
-    levels : sequence of float
-        Probabilities of the intervals.
-
-    Returns
-    -------
-    IntervalCoverage
-        Share inside per level (to compare with the level), mean squared standardised error, number of values.
-
-    Notes
-    -----
-    A value is inside the interval of probability p where ``|z| <= Phi^-1((1 + p) / 2)`` with
-    ``z = (estimate - value) / sqrt(variance)``.
-    """
-    from scipy.stats import norm
-
-    truth, guess, spread = (np.asarray(a, dtype=np.float64) for a in (values, estimate, variance))
-    good = np.isfinite(truth) & np.isfinite(guess) & (spread > 0)
-    level = np.asarray(levels, dtype=np.float64)
-    if not good.any():
-        return IntervalCoverage(level, np.full(len(level), np.nan), float("nan"), 0)
-    z = np.abs(guess[good] - truth[good]) / np.sqrt(spread[good])
-    inside = (z[:, None] <= norm.ppf((1 + level) / 2)).mean(axis=0)
-    return IntervalCoverage(level, np.asarray(inside), float((z**2).mean()), int(good.sum()))
+        if not test.all():
+            estimate[test], _ = model.fit(points[~test], flat[~test]).predict(points[test])
+    return score(data, estimate.reshape(data.shape))

@@ -31,17 +31,11 @@ class Study:
     scores : mapping of str to Score
         "Kriging", "makima", "spline" (the paper's), "nearest", "inverse distance", "serving-tower mean"; arrays of
         shape (altitudes, K).
-    intervals : IntervalCoverage
-        Of the Kriging variance with one v^2 per map: its sample variance.
-    intervals_paper : IntervalCoverage
-        With the paper's v^2, the variance over the altitudes at each position; positions with v^2 = 0 do not count.
     """
 
     correlation: variogram.BinnedCorrelation
     fit: variogram.BiExponential
     scores: Mapping[str, evaluate.Score]
-    intervals: evaluate.IntervalCoverage
-    intervals_paper: evaluate.IntervalCoverage
 
 
 def rank_fields(
@@ -85,40 +79,21 @@ def interpolation_study(
     Returns
     -------
     Study
-        The correlation and its fit, scores of every interpolator, coverage of Kriging's intervals.
+        The correlation and its fit, scores of every interpolator.
     """
     points = grid.points_m
     correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m, missing="pairwise")
     fit = _curve(correlation)
-    kriging = OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed)
-    estimate, variance = evaluate.leave_one_out_estimate(kriging, points, values)
-    peers: dict[str, evaluate.Predictor] = {
+    models: dict[str, evaluate.Predictor] = {
+        "Kriging": OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed),
         "makima": IndexInterpolation("makima", grid, neighbours, radius_m, selection=selection, seed=seed),
         "spline": IndexInterpolation("spline", grid, neighbours, radius_m, selection=selection, seed=seed),
         "nearest": Nearest(radius_m),
         "inverse distance": InverseDistance(neighbours, radius_m),
         "serving-tower mean": ServingTowerMean(towers_m),
     }
-    scores = {"Kriging": evaluate.score(values, estimate)}
-    scores |= {name: evaluate.leave_one_out(peer, points, values) for name, peer in peers.items()}
-    sill = kriging.sill_.reshape(values.shape[1:])
-    relative = np.where(sill > 0, variance / np.where(sill > 0, sill, 1.0), np.nan)
-    return Study(
-        correlation,
-        fit,
-        scores,
-        evaluate.interval_coverage(values, estimate, variance),
-        evaluate.interval_coverage(values, estimate, relative * altitude_variance(values)[:, None, :]),
-    )
-
-
-def altitude_variance(values: FloatArray) -> FloatArray:
-    """The paper's v^2 (n, K): sample variance over the altitudes of (n, altitudes, K); NaN below two values."""
-    known = np.isfinite(values)
-    count = known.sum(axis=1)
-    mean = np.where(known, values, 0.0).sum(axis=1) / np.maximum(count, 1)
-    squares = np.where(known, values - mean[:, None], 0.0) ** 2
-    return np.asarray(np.where(count > 1, squares.sum(axis=1) / np.maximum(count - 1, 1), np.nan))
+    scores = {name: evaluate.leave_one_out(model, points, values) for name, model in models.items()}
+    return Study(correlation, fit, scores)
 
 
 def _curve(correlation: variogram.BinnedCorrelation) -> variogram.BiExponential:

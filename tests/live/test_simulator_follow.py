@@ -11,8 +11,8 @@ from aerpaw_cmp.live.follow import TelemetryFollower, predict_along
 from aerpaw_cmp.live.predict import Prediction
 from aerpaw_cmp.live.serial import simulator
 from aerpaw_cmp.live.serial.modem import decode
-from aerpaw_cmp.live.serial.simulator import ModemSimSettings, ModemSimulator, load_recorded, load_source
-from aerpaw_cmp.logs.readers import Reader
+from aerpaw_cmp.live.serial.simulator import ModemSimSettings, ModemSimulator, load_recorded, ranks_of
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from tests.live.terminals import held
@@ -63,7 +63,7 @@ def test_tap_of_a_transcript(modem, tap, tools, tmp_path):
     assert ranks[:4] == [3, 1, 3, 1]
 
 
-def test_ranks_of_another_log_as_a_modem(tmp_path, monkeypatch):
+def test_the_ranks_of_a_log_are_flown_again(tmp_path, monkeypatch):
     def read(data, options):
         rows = [line.split(",") for line in data.decode().split()]
         times = pd.Timestamp("2026-01-01") + pd.to_timedelta([float(row[0]) for row in rows], unit="s")
@@ -75,8 +75,8 @@ def test_ranks_of_another_log_as_a_modem(tmp_path, monkeypatch):
     monkeypatch.setattr(simulator, "identify", lambda _data: reader)
     path = tmp_path / "rank.csv"
     path.write_text("10,1\n12,4\n14,nan\n15,2\n")
-    modem = load_source(path)
-    ranks = [modem._rank(t) for t in (0.0, 1.9, 2.0, 3.9, 4.5, 5.0, 5.9, 6.1)]
+    rank = ranks_of(path, ReadOptions(timezone="UTC"))
+    ranks = [rank(t) for t in (0.0, 1.9, 2.0, 3.9, 4.5, 5.0, 5.9, 6.1)]
     assert ranks == [1, 1, 4, 4, 0, 2, 2, 1]  # and again from the start
 
 
@@ -85,9 +85,9 @@ def test_nothing_to_replay(tmp_path, content):
     path = tmp_path / "t.txt"
     path.write_bytes(content)
     with pytest.raises(InputError, match="no answer to any known command"):
-        load_source(path)
+        load_recorded(path)
     with pytest.raises(InputError):
-        load_source(tmp_path / "missing.txt")
+        load_recorded(tmp_path / "missing.txt")
 
 
 def test_what_two_threads_say_at_once_comes_one_behind_the_other():

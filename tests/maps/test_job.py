@@ -15,7 +15,7 @@ from aerpaw_cmp.maps.job import (
     map_job,
     rank_of_singular_values,
 )
-from aerpaw_cmp.maps.study import altitude_variance, interpolation_study, rank_fields
+from aerpaw_cmp.maps.study import interpolation_study, rank_fields
 
 GRID = Grid.over_area((-300.0, 300.0, -300.0, 300.0))
 TOWERS = {"A": np.array([-200.0, 0.0, 10.0]), "B": np.array([200.0, 50.0, 10.0])}
@@ -209,13 +209,6 @@ def test_wrong_engine_and_no_tower_are_named():
         map_job(GRID, {}, Engine())
     with pytest.raises(ValueError, match="shapes"):
         map_job(GRID, TOWERS, lambda *_: Evaluation(*3 * [np.zeros((1, 1))], np.zeros((1, 1, 4))))
-
-
-def test_papers_variance_over_altitudes():
-    values = np.array([[[1.0], [2.0], [3.0]], [[2.0], [2.0], [np.nan]], [[1.0], [np.nan], [np.nan]]])
-    variance = altitude_variance(values)[:, 0]
-    assert variance[:2].tolist() == [1.0, 0.0]
-    assert np.isnan(variance[2])
 
 
 def test_rss_is_studied_like_rank(result):

@@ -142,7 +142,7 @@ def _needs_posix(command: str) -> None:
 )
 def modem_sim(
     link: Annotated[Path | None, Option(help="Symbolic link to the port, updated when the port changes.")] = None,
-    source: Annotated[Path | None, Option(help="Log to play: a transcript, a tap log, or any log with ranks.")] = None,
+    source: Annotated[Path | None, Option(help="Log to play: a transcript or a tap log.")] = None,
     kind: Annotated[Literal["modem", "gps", "diag", "silent", "rubbish"], Option(help="Device to imitate.")] = "modem",
     flight: Annotated[
         Path | None, Option(help="flight.yaml: fly it again from now on, with its ranks; needs --telemetry.")

@@ -774,8 +774,6 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
         result.setdefault("correlation", {})[f"z_{key}"] = {
             **named(study.fit, "c1 c2 c3 c4 rmse degenerate message"),
             **named(study.correlation, "positions excluded_constant"),
-            "intervals": study.intervals,
-            "intervals_paper_v2": study.intervals_paper,
         }
     for mode, maps, change in _foliage_changes(outcome):
         result.setdefault("foliage", {})[mode] = [

@@ -1,7 +1,7 @@
 """A modem that is not there: a pseudo-terminal that answers like an RM502Q-AE, with faults on request.
 
 It speaks to whatever opens the port, so the tap, a terminal program and the tests all use the same thing. Answers
-come from a built-in flight, a captured transcript, an earlier tap log, or the ranks of any log that a reader knows.
+come from a built-in flight, a captured transcript or an earlier tap log.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class ModemSimSettings:
     link : Path, optional
         A symbolic link to the port, kept right when the port changes its number; None: no link.
     source : Path, optional
-        What to play: a transcript, a tap log, or a log with ranks that a reader knows; None: a built-in flight.
+        What to play: a transcript or a tap log; None: a built-in flight.
     kind : {"modem", "gps", "diag", "silent", "rubbish"}
         What hangs on the port.
     faults : Faults
@@ -303,28 +303,6 @@ def load_recorded(path: Path) -> RecordedModem:
     return modem
 
 
-def load_source(path: Path) -> FlightModem | RecordedModem:
-    """A modem that plays a file: a transcript, a tap log, or the ranks of any log that a reader knows.
-
-    So a flight made by ``aerpaw-cmp simulate`` can be flown again against the tap.
-
-    Raises
-    ------
-    InputError
-        If there is nothing to play in it.
-    """
-    try:
-        return load_recorded(path)
-    except InputError as error:
-        if not path.is_file():
-            raise
-        # only time differences matter here
-        ranks = ranks_of(path, ReadOptions(timezone="UTC", ri_base="one"))
-        if ranks is None:
-            raise error from None
-        return FlightModem(ranks)
-
-
 def ranks_of(path: Path, options: ReadOptions) -> Callable[[float], int] | None:
     """Rank over time since the start of a log, None if no reader finds ranks in it."""
     data = path.read_bytes()
@@ -371,7 +349,7 @@ class ModemSimulator:
         self.settings = settings or ModemSimSettings()
         self._modem: FlightModem | RecordedModem
         if self.settings.source is not None:
-            self._modem = load_source(self.settings.source)
+            self._modem = load_recorded(self.settings.source)
         else:
             rank, rsrp = self.settings.rank or _flight_rank, self.settings.rsrp or _flight_rsrp
             self._modem = FlightModem(rank, self.settings.csi_on, rsrp)

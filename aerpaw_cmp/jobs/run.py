@@ -330,8 +330,6 @@ def run_site_import(
     *,
     base: str = "lake_wheeler",
     untagged: str | None = None,
-    canopy: Path | None = None,
-    surface: Path | None = None,
     trees: bool = False,
     force: bool = False,
 ) -> list[str]:
@@ -347,8 +345,6 @@ def run_site_import(
         Site whose towers and settings are kept.
     untagged : str, optional
         What areas without a tag are: building, forest or geofence.
-    canopy, surface : Path, optional
-        Canopy-height model that gives stands and trees; surface model that gives buildings their heights.
     trees : bool
         Woods are single trees at random places, not media.
     force : bool
@@ -360,16 +356,10 @@ def run_site_import(
         A line per thing that was done.
     """
     from ..site.antenna.learned import carry_memory
-    from ..site.imports.canopy import with_canopy, with_heights
     from ..site.imports.footprints import import_site, site_yaml
 
-    rasters = [path for path in (canopy, surface) if path is not None]
-    with OutputFile(out, own=is_sealed, inputs=[*files, *rasters, Path(base)], force=force) as output:
-        model, actions = import_site(files, base=base, untagged=untagged, trees=trees, maps_needed=not rasters)
-        for path, with_raster in ((canopy, with_canopy), (surface, with_heights)):
-            if path is not None:
-                model, more = with_raster(model, path)
-                actions += more
+    with OutputFile(out, own=is_sealed, inputs=[*files, Path(base)], force=force) as output:
+        model, actions = import_site(files, base=base, untagged=untagged, trees=trees)
         text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
         output.write(sealed(text))
     return [*actions, *carry_memory(base, out)]

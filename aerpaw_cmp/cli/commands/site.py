@@ -21,15 +21,14 @@ from ..shown import print_files, print_json, print_plan, say, show, table
         "aerpaw-cmp site import farm.osm -o site.yaml",
         "aerpaw-cmp site import munich.xml --origin 48.1372,11.5755 --tower BS=8.5,21,27 -o munich.yaml",
         "aerpaw-cmp site import fields.kml barns.geojson --base my_towers.yaml --untagged building -o site.yaml",
-        "aerpaw-cmp site import farm.osm --canopy chm.tif --buildings dsm.tif -o site.yaml",
     ],
 )
 def site_import(
     out: Annotated[Path, output("The site.yaml to write.", "FILE")],
     files: Annotated[
-        list[Path] | None,
-        Argument(help="Map files, or one Mitsuba XML  [default: none; with --canopy or --buildings]"),
-    ] = None,
+        list[Path],
+        Argument(help="Map files, or one Mitsuba XML"),
+    ],
     base: Annotated[
         str | None, Option(help="Site that gives towers and settings  [default: lake_wheeler; none for a scene]")
     ] = None,
@@ -47,14 +46,6 @@ def site_import(
     untagged: Annotated[
         Literal["building", "forest", "geofence"] | None, Option(help="Kind of the areas without a tag.")
     ] = None,
-    canopy: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="Canopy heights (GeoTIFF): stands and trees in place of all others."),
-    ] = None,
-    buildings: Annotated[
-        Path | None,
-        Option(metavar="FILE", help="Surface model (GeoTIFF) that gives the buildings their heights."),
-    ] = None,
     trees: Annotated[bool, Option("--trees", help="Woods as single trees at random places, not as media.")] = False,
     force: Force = False,
     as_json: Json = False,
@@ -63,10 +54,9 @@ def site_import(
     from ...jobs import run
     from ...jobs.mapping import site_scene
 
-    files = files or []
     scene = len(files) == 1 and site_scene.is_scene(files[0])
     of_scenes = {"--origin": origin, "--tower": tower, "--material": material, "--turn": turn}
-    of_maps = {"--untagged": untagged, "--canopy": canopy, "--buildings": buildings, "--trees": trees}
+    of_maps = {"--untagged": untagged, "--trees": trees}
     for option in (name for name, value in (of_maps if scene else of_scenes).items() if value):
         kinds = ("a Mitsuba scene", "map files") if scene else ("map files", "one Mitsuba XML")
         raise UsageError(f"{option} with {kinds[0]}", expected=f"{kinds[1]}, or no {option}")
@@ -77,9 +67,7 @@ def site_import(
         actions = site_scene.run_scene_import(files[0], out, facts, force=force)
     else:
         base = base or "lake_wheeler"
-        actions = run.run_site_import(
-            files, out, base=base, untagged=untagged, canopy=canopy, surface=buildings, trees=trees, force=force
-        )
+        actions = run.run_site_import(files, out, base=base, untagged=untagged, trees=trees, force=force)
     if as_json:
         print_json({"file": str(out), "base": base, "actions": actions})
         return

@@ -618,7 +618,6 @@ def import_site(
     files: Sequence[str | Path],
     *,
     base: str | Path = "lake_wheeler",
-    maps_needed: bool = True,
     **options: Any,
 ) -> tuple[SiteModel, list[str]]:
     """A site with the towers and settings of ``base`` and everything else from map files.
@@ -629,8 +628,6 @@ def import_site(
         Map files.
     base : str or path
         Packaged site or site.yaml.
-    maps_needed : bool
-        Without files the base alone is an error.
     **options
         For :func:`import_footprints`.
 
@@ -639,18 +636,14 @@ def import_site(
     SiteModel, list of str
         The settings (see :func:`site_yaml`), and what was done.
     """
-    if not files and maps_needed:
-        raise UsageError(
-            "no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files, --canopy or --buildings"
-        )
+    if not files:
+        raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
     model = site_model(base)
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
     content = model.model_dump()
     if model.dem is not None:  # the new file may lie in another folder
         content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
-    actions: list[str] = []
-    if files:
-        actions = _from_maps(content, import_footprints(files, frame, area_m=extent_m(model, frame), **options))
+    actions = _from_maps(content, import_footprints(files, frame, area_m=extent_m(model, frame), **options))
     imported = SiteModel.model_validate(content)
     return imported, [_kept_of_base(imported, base), *actions]
 
@@ -659,24 +652,19 @@ def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
     """Outlines and trees of maps in place of those of the base."""
     content |= {
         "buildings": [
-            outline_dict(b.name, b.footprint) | named(b, "height_m material source") for b in imports.buildings
+            _outline_dict(b.name, b.footprint) | named(b, "height_m material source") for b in imports.buildings
         ],
         "forests": [
-            outline_dict(f.name, f.area)
+            _outline_dict(f.name, f.area)
             | named(f, "trees_per_hectare minimum_spacing_m source height_m evergreen_share")
             for f in imports.forests
         ],
-        "geofences": [outline_dict(g.name, g.area) for g in imports.geofences],
+        "geofences": [_outline_dict(g.name, g.area) for g in imports.geofences],
         "credit": "; ".join(imports.credits),
         "assumed": imports.assumed,
     }
-    content["trees"] |= only_trees(imports.trees)
+    content["trees"] |= {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in imports.trees]}
     return imports.actions
-
-
-def only_trees(trees: Sequence[SingleTree]) -> dict[str, Any]:
-    """Keys of ``trees`` in site.yaml with these single trees and no others."""
-    return {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in trees]}
 
 
 def _kept_of_base(model: SiteModel, base: str | Path) -> str:
@@ -696,7 +684,7 @@ def _tree_dict(tree: SingleTree) -> dict[str, Any]:
     return {"at_m": (round(tree.east_m, 2), round(tree.north_m, 2)), **known}
 
 
-def outline_dict(name: str, area: Polygon) -> dict[str, Any]:
+def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
     """Name and polygon as site.yaml writes them."""
 
     def ring(line: Any) -> list[tuple[float, float]]:

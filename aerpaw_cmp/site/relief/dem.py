@@ -43,8 +43,6 @@ class Dem:
         Any that pyproj knows, such as ``EPSG:4326`` (degrees), or ``local`` for metres of the site frame.
     frame : SiteFrame
         Of the site.
-    anchored : bool
-        Up counts from the ground at the origin, which the grid must cover; else heights are taken as they are.
     """
 
     height_m: FloatArray
@@ -54,7 +52,6 @@ class Dem:
     step_y: float
     crs: str
     frame: SiteFrame
-    anchored: bool = True
     _to_grid: Any = field(init=False, repr=False, compare=False, default=None)
 
     def __post_init__(self) -> None:
@@ -74,7 +71,7 @@ class Dem:
                     expected=f"coordinates of {self.crs}",
                     cause="they are metres or feet: another crs",
                 )
-        if self.anchored and np.isnan(self.absolute_m(0.0, 0.0)):
+        if np.isnan(self.absolute_m(0.0, 0.0)):
             gap = self._covers_origin()
             raise InputError(
                 "the elevation model has no height at the site's origin",
@@ -115,16 +112,7 @@ class Dem:
 
     def ground_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
         """Up of the ground [m]: 0 at the origin of the site; NaN outside the grid."""
-        return self.absolute_m(east_m, north_m) - (self.absolute_m(0.0, 0.0) if self.anchored else 0.0)
-
-    def place(self, column: ArrayLike, row: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """East and north [m] of places in the grid, counted in cells from the first."""
-        x = self.west + self.step_x * unmasked(column)
-        y = self.south + self.step_y * unmasked(row)
-        if self._to_grid is None:
-            return x, y
-        longitude, latitude = self._to_grid.transform(x, y, direction="INVERSE")
-        return self.frame.to_local(latitude, longitude)
+        return self.absolute_m(east_m, north_m) - self.absolute_m(0.0, 0.0)
 
     def slope(self, east_m: FloatArray, north_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rise of the ground per metre to the east and to the north, from points 1/64 of a cell apart."""
@@ -202,7 +190,7 @@ class Dem:
         return float(np.hypot(east, north).min())
 
 
-def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None, anchored: bool = True) -> Dem:
+def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> Dem:
     """An elevation model: ESRI ASCII grid (``.asc``), or GeoTIFF with the extra ``aerpaw-cmp[geo]``.
 
     Parameters
@@ -213,8 +201,6 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None, anch
         Of the site.
     crs : str, optional
         Needed for ASCII grids, which name none; ``local`` means metres of the site frame.
-    anchored : bool
-        As of :class:`Dem`.
 
     Returns
     -------
@@ -231,13 +217,13 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None, anch
     data = read_input(path, MAX_BYTES, "an elevation model")
     with parsing(path, "an elevation model"):
         if data[:2] in (b"II", b"MM"):
-            return _read_geotiff(data, frame, anchored)
+            return _read_geotiff(data, frame)
         if crs is None:
             raise UsageError("an ASCII grid names no coordinate system", expected="crs, such as EPSG:4326")
-        return _read_ascii(data, path, frame, crs, anchored)
+        return _read_ascii(data, path, frame, crs)
 
 
-def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str, anchored: bool) -> Dem:
+def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str) -> Dem:
     lines = data.decode("utf-8-sig").splitlines()
     header, begin = _ascii_header(lines, path)
     rows, columns, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
@@ -259,7 +245,7 @@ def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str, anchored: b
     south = header.get("yllcenter", header.get("yllcorner", 0.0) + step / 2)
     return Dem(
         height_m=flat.reshape(rows, columns)[::-1], west=west, south=south, step_x=step, step_y=step, crs=crs,
-        frame=frame, anchored=anchored,
+        frame=frame,
     )  # fmt: skip
 
 
@@ -309,7 +295,7 @@ def _plausible(height_m: FloatArray, path: Path | None = None, line: int | None 
     return height_m
 
 
-def _read_geotiff(data: bytes, frame: SiteFrame, anchored: bool) -> Dem:
+def _read_geotiff(data: bytes, frame: SiteFrame) -> Dem:
     from ...common.native import read
 
     if importlib.util.find_spec("rasterio") is None:
@@ -326,5 +312,5 @@ def _read_geotiff(data: bytes, frame: SiteFrame, anchored: bool) -> Dem:
     south = north + step_north * (band.shape[0] - 0.5)
     return Dem(
         height_m=band[::-1], west=west, south=south, step_x=step_east, step_y=-step_north, crs=notes["crs"],
-        frame=frame, anchored=anchored,
+        frame=frame,
     )  # fmt: skip

@@ -89,12 +89,7 @@ class FlightReplay:
         return (*self.rss, *self.rank)
 
 
-def replay_flight(
-    data: FlightData,
-    stages: Stages | None = None,
-    *,
-    clocks: Sequence[Clock | None] | None = None,
-) -> FlightReplay:
+def replay_flight(data: FlightData, stages: Stages | None = None) -> FlightReplay:
     """Clocks and replay alone.
 
     Parameters
@@ -102,8 +97,6 @@ def replay_flight(
     data : FlightData
     stages : Stages, optional
         Times "clocks" and "replay".
-    clocks : sequence of Clock or None, optional
-        One per RSS series, in place of what ``rss.lag`` asks for.
 
     Returns
     -------
@@ -112,7 +105,7 @@ def replay_flight(
     """
     stages = stages or Stages()
     with stages("clocks"):
-        known = estimate_clocks(data, stages.progress) if clocks is None else clocks
+        known = estimate_clocks(data, stages.progress)
     with stages("replay"):
         return FlightReplay(
             rss=tuple(replay_rss(data, stages.progress, known)), rank=tuple(replay_rank(data, stages.progress))

@@ -285,17 +285,13 @@ class Nearest(_Local):
 
 
 class InverseDistance(_Local):
-    """Mean weighted by ``distance ** -power`` (Shepard 1968, doi:10.1145/800186.810616); exact at samples."""
-
-    def __init__(self, neighbours: int = 20, radius_m: float = 150.0, power: float = 2.0) -> None:
-        super().__init__(neighbours, radius_m)
-        self.power = power
+    """Mean weighted by the inverse square of distance (Shepard 1968, doi:10.1145/800186.810616); exact at samples."""
 
     def _combine(self, near: _Near) -> FloatArray:
         at = near.distance_m < choose.TIE_M
-        # relative to the nearest, so that no power overflows
+        # relative to the nearest, so that nothing overflows
         ratio = near.distance_m[:, :1] / np.where(at, 1.0, near.distance_m)
-        weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**self.power)
+        weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**2)
         weight /= weight.sum(axis=1, keepdims=True)
         first = near.values[:, :1]
         return np.asarray(first[:, 0] + (weight[:, :, None] * (near.values - first)).sum(axis=1))

@@ -101,7 +101,7 @@ def test_nearest_follows_the_tie_rule():
 
 
 def test_inverse_distance_closed_form_and_exactness():
-    model = InverseDistance(power=2.0).fit([[10.0, 0.0], [-20.0, 0.0]], [1.0, 6.0])
+    model = InverseDistance().fit([[10.0, 0.0], [-20.0, 0.0]], [1.0, 6.0])
     estimate, _ = model.predict([[0.0, 0.0], [10.0, 0.0]])
     assert estimate[0] == pytest.approx((1 / 100 * 1 + 1 / 400 * 6) / (1 / 100 + 1 / 400), rel=1e-14)
     assert estimate[1] == 1.0

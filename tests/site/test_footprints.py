@@ -1,7 +1,6 @@
 """One village written in four formats gives one site; every kind of broken outline is repaired and reported."""
 
 import json
-import math
 from pathlib import Path
 
 import numpy as np
@@ -248,14 +247,6 @@ def test_hole_outside_and_multipolygon_keep_their_area(tmp_path: Path) -> None:
     assert len({b.name for b in outlines.buildings}) == 2
 
 
-@pytest.mark.parametrize(
-    ("written", "metres"), [("12", 12), ("12,5 m", 12.5), ("40 ft", 12.192), ("40'", 12.192), ("39'4\"", 11.9888)]
-)
-def test_heights_with_units(tmp_path: Path, written: str, metres: float) -> None:
-    outlines = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": written}))
-    assert outlines.buildings[0].height_m == pytest.approx(metres, abs=0.006)
-
-
 def test_heights_that_cannot_be_metres(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"2400 m high.*feet or centimetres"):
         imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "2400"}))
@@ -292,27 +283,6 @@ def test_site_on_the_antimeridian_is_whole(tmp_path: Path) -> None:
     outlines = import_footprints([path], frame)
     assert outlines.buildings[0].footprint.area == pytest.approx(400, rel=1e-4)
     assert said(outlines, "crosses the antimeridian")
-
-
-def test_osm_with_missing_nodes_is_reported(tmp_path: Path) -> None:
-    path = osm_xml(tmp_path / "a.osm")
-    path.write_text(path.read_text().replace('<node id="2" ', '<node id="999" '))
-    outlines = import_footprints([path], FRAME)
-    assert said(outlines, "1 of 5 nodes are not in the file")
-    assert any(b.name == "barn" and b.footprint.area == pytest.approx(200, rel=1e-3) for b in outlines.buildings)
-
-
-def test_single_trees_of_osm(tmp_path: Path) -> None:
-    longitude, latitude = lonlat(square(50, 60))[0]
-    path = tmp_path / "t.osm"
-    path.write_text(
-        f'<osm><node id="1" lat="{latitude!r}" lon="{longitude!r}"><tag k="natural" v="tree"/></node></osm>'
-    )
-    model, _ = import_site([path])
-    assert len(build_site(model).trees) == 1
-    [tree] = import_footprints([path], FRAME).trees
-    assert math.hypot(tree.east_m - 50, tree.north_m - 60) < 0.01
-    assert (tree.height_m, tree.crown_diameter_m) == (None, None)
 
 
 @pytest.mark.parametrize(

@@ -84,20 +84,6 @@ def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert {Path(path).suffix for path in written} >= {".html", ".png", ".svg"}
 
 
-def test_site_show_takes_the_flights_own_site(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    flight = ["--flight", SAMPLE / "flight.yaml"]
-    page = out_of(capsys, "site", "show", "-o", tmp_path / "own", *flight).split("\n")[0]
-    scene = json.loads(Path(page).read_text().split('id="scene">')[1].split("</script>")[0])
-    assert len(scene["flight"]) > 50
-    tower = [t["name"] for t in scene["towers"]]
-    other = tmp_path / "other.yaml"
-    towers = "".join(
-        f"  {n}: {{latitude_deg: {35.7275 + 0.001 * i}, longitude_deg: -78.696}}\n" for i, n in enumerate(tower)
-    )
-    other.write_text(f"name: Other\norigin: {{latitude_deg: 35.7275, longitude_deg: -78.696}}\ntowers:\n{towers}")
-    assert "Other_plan.png" in out_of(capsys, "site", "show", other, "-o", tmp_path / "other", *flight)
-
-
 @pytest.mark.parametrize("command", [["report", SAMPLE / "flight.yaml", "--audit", "none"], ["site", "show"]])
 def test_a_file_in_the_way_of_the_folder(
     command: list[object], tmp_path: Path, capsys: pytest.CaptureFixture[str]

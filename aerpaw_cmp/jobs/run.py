@@ -365,19 +365,15 @@ def run_site_import(
     return [*actions, *carry_memory(base, out)]
 
 
-def run_site_show(site: str | None, options: RunOptions = DEFAULT, *, flight: Path | None = None) -> JobOutcome:
-    """Plan view and a page of the scene in 3-D; with a flight its track.
-
-    Without a site the flight's own is shown; with neither, the packaged one.
+def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:
+    """Plan view and a page of the scene in 3-D.
 
     Parameters
     ----------
-    site : str, optional
+    site : str
         site.yaml, or the name of a packaged site.
     options : RunOptions
         ``out`` is ``reports/site-SITE`` by default.
-    flight : Path, optional
-        flight.yaml whose track is drawn.
 
     Returns
     -------
@@ -385,30 +381,13 @@ def run_site_show(site: str | None, options: RunOptions = DEFAULT, *, flight: Pa
     """
     from ..report.pages.site import write_site_view
     from ..site.siteyaml import load_site
-    from .tasks.manifest import inputs_of_flight, inputs_of_site
+    from .tasks.manifest import inputs_of_site
 
-    settings, inputs, logs_root = None, inputs_of_site(site or "lake_wheeler"), options.logs_root
-    if flight is not None:
-        from ..flight.gains.memory import load_with_learned
-
-        settings = load_with_learned(flight)
-        if site is not None:
-            file = str(Path(site).resolve()) if Path(site).is_file() else site
-            settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
-        inputs = inputs_of_flight(settings, flight, logs_root)
-    track, shown = None, site or (settings.site.file if settings else "lake_wheeler")
-    out = options.out or Path("reports") / f"site-{Path(shown).stem}"
-    with OutputFolder(out, job="site show", inputs=inputs, force=options.force) as output:
-        if flight is None or settings is None:
-            place = load_site(site or "lake_wheeler")
-        else:
-            from ..flight.data import load_data
-            from ..report.content.flight_parts import track_of
-
-            data = load_data(settings, flight.parent, logs_root)
-            place, track = data.site, track_of(data)
+    out = options.out or Path("reports") / f"site-{Path(site).stem}"
+    with OutputFolder(out, job="site show", inputs=inputs_of_site(site), force=options.force) as output:
+        place = load_site(site)
         with output.filling() as folder:
-            written = write_site_view(place, folder, track=track)
+            written = write_site_view(place, folder)
         return JobOutcome(folder=out, files=output.placed(written))
 
 

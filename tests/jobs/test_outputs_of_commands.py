@@ -265,7 +265,6 @@ def own_folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
         "calibrate calibration.yaml --score in_scene.yaml -o in_scene.yaml",
         "map site.yaml -o scene",
         "site show site.yaml -o scene",
-        "site show --flight in_scene.yaml -o scene",
         "site export site.yaml -o scene",
         "report in_scene.yaml -o scene",
         "simulate in_scene.yaml -o scene",

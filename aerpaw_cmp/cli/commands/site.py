@@ -102,28 +102,22 @@ def site_export(
     examples=[
         "aerpaw-cmp site show",
         "aerpaw-cmp site show site.yaml -o reports/site",
-        "aerpaw-cmp site show --flight sample_logs/flight.yaml",
     ],
 )
 def site_show(
-    site: Annotated[
-        str | None, Argument(help="site.yaml or packaged site  [default: that of --flight, else lake_wheeler]")
-    ] = None,
+    site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
     out: Annotated[Path | None, output("Output folder  [default: reports/site-<site>]")] = None,
-    flight: Annotated[Path | None, Option(help="Draw the track of this flight.yaml.")] = None,
-    logs_root: LogsRoot = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Look at a site."""
     from ...jobs import run
 
-    options = RunOptions(out=out, logs_root=logs_root, force=force)
-    shown = run.run_site_show(site, options, flight=flight)
-    if not as_json and flight is None:
+    shown = run.run_site_show(site, RunOptions(out=out, force=force))
+    if not as_json:
         from ...site.antenna.learned import memory_lines
 
-        for line in memory_lines(site or "lake_wheeler"):
+        for line in memory_lines(site):
             say(line)
     print_files(shown.files, as_json)
 

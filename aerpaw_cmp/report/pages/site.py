@@ -13,7 +13,6 @@ import numpy as np
 from ...common.units import FloatArray
 from ...site.scenes import drawn_buildings
 from ...site.site import Site
-from ..content.flight import Track
 from ..kit import canvas
 from ..kit.files import write_file
 from ..kit.page import embedded, rendered
@@ -25,11 +24,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TREES_IN_PAGE = 5000
-FLIGHT_POINTS = 2000
 
 
-def view_limits(site: Site, track: Track | None) -> FloatArray:
-    """(3, 2) lowest and highest east, north, up of everything that stands or flies, with a margin [m]."""
+def view_limits(site: Site) -> FloatArray:
+    """(3, 2) lowest and highest east, north, up of everything that stands there, with a margin [m]."""
     points = [tower.position_m for tower in site.towers.values()]
     for building in drawn_buildings(site):
         for corner in np.asarray(building.footprint.exterior.coords)[:, :2]:
@@ -38,8 +36,6 @@ def view_limits(site: Site, track: Track | None) -> FloatArray:
         points += list(at_height(np.asarray(area.exterior.coords)[:, :2], 0.0))
     if len(trees := site.trees):
         points += list(np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m]))
-    if track is not None and len(track.time):
-        points += list(np.stack([track.east_m, track.north_m, track.up_m], axis=1)[:: max(1, len(track.time) // 500)])
     if not points:
         return np.array([[-100.0, 100.0], [-100.0, 100.0], [0.0, 50.0]])
     cloud = np.array(points)
@@ -52,17 +48,13 @@ def view_limits(site: Site, track: Track | None) -> FloatArray:
     )
 
 
-def plan(site: Site, track: Track | None = None) -> Figure:
+def plan(site: Site) -> Figure:
     """Plan view with everything on it, to scale."""
-    limits = view_limits(site, track)
+    limits = view_limits(site)
     width, height = np.ptp(limits[:2], axis=1)
     shape = float(np.clip(width / height, 0.45, 2.2))
     fig, ax = canvas.subplots((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
     canvas.draw_site(ax, site)
-    if track is not None and len(track.time):
-        ax.plot(
-            *canvas.thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.3, label="flight", zorder=4
-        )
     ax.set_axisbelow(True)
     ax.set_xlim(*limits[0])
     ax.set_ylim(*limits[1])
@@ -72,36 +64,30 @@ def plan(site: Site, track: Track | None = None) -> Figure:
     return fig
 
 
-def _view_of(site: Site, track: Track | None = None) -> dict[str, Any]:
+def _view_of(site: Site) -> dict[str, Any]:
     """The site as plain lists for the page, rounded to 0.1 m."""
-    flight: list[Any] = []
-    if track is not None and len(track.time):
-        line = np.stack([track.east_m, track.north_m, track.up_m], axis=1)[:: max(1, len(track.time) // FLIGHT_POINTS)]
-        flight = listed(line[np.isfinite(line).all(axis=1)])
     shown = scene(site, TREES_IN_PAGE)
     walled = zip(drawn_buildings(site), shown["buildings"], strict=True)
     return {
         **shown,
         "buildings": [{"name": b.name, "height": b.height_m, "faces": faces} for b, faces in walled],
-        "limits": listed(view_limits(site, track)),
+        "limits": listed(view_limits(site)),
         "fences": [listed(g.area.exterior.coords) for g in site.geofences],
-        "flight": flight,
     }
 
 
-def viewer(site: Site, track: Track | None = None) -> str:
+def viewer(site: Site) -> str:
     """The page that shows the site in 3-D."""
-    content = _view_of(site, track)
+    content = _view_of(site)
     return rendered(
         "site_view",
         site=site,
         scene=embedded(content),
         trees_shown=len(content["trees"]),
-        has_flight=bool(content["flight"]),
     )
 
 
-def write_site_view(site: Site, folder: str | Path, *, track: Track | None = None) -> list[Path]:
+def write_site_view(site: Site, folder: str | Path) -> list[Path]:
     """Write ``<site>.html`` and ``<site>_plan.svg|png``.
 
     Parameters
@@ -109,8 +95,6 @@ def write_site_view(site: Site, folder: str | Path, *, track: Track | None = Non
     site : Site
     folder : path
         Made when missing.
-    track : Track, optional
-        A flight to draw.
 
     Returns
     -------
@@ -118,7 +102,7 @@ def write_site_view(site: Site, folder: str | Path, *, track: Track | None = Non
         The page first.
     """
     folder, stem = Path(folder), safe_name(site.name)
-    written = [write_file(folder / f"{stem}.html", viewer(site, track))]
+    written = [write_file(folder / f"{stem}.html", viewer(site))]
     with canvas.style():
-        drawn = canvas.save_as(plan(site, track), ("svg", "png"))
+        drawn = canvas.save_as(plan(site), ("svg", "png"))
     return [*written, *(write_file(folder / f"{stem}_plan.{form}", picture) for form, picture in drawn.items())]

@@ -95,10 +95,6 @@ function solids() {
     const foot = shape(t.at), top = shape([t.at[0], t.at[1], t.top]);
     parts.push([foot[2], () => { polyline([foot, top], "#C1121F", 4); pen.beginPath(); pen.arc(top[0], top[1], 5, 0, 7); pen.fillStyle = "#C1121F"; pen.fill(); }]);
   }
-  if (on("flight")) for (let i = 1; i < scene.flight.length; i++) {
-    const a = shape(scene.flight[i - 1]), b = shape(scene.flight[i]);
-    parts.push([(a[2] + b[2]) / 2, () => polyline([a, b], "#0072B2", 2)]);
-  }
   parts.sort((a, b) => b[0] - a[0]).forEach(part => part[1]());
 }
 

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import sys
-import typing
 import zipfile
 
 import numpy as np
@@ -13,7 +12,6 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.compare.gains.spread import NO_SPREAD, StatedSpread
-from aerpaw_cmp.flight.settings import ReportSettings
 from aerpaw_cmp.report.exports import formats, kmz, points
 from aerpaw_cmp.report.exports import tables as export
 
@@ -371,8 +369,6 @@ def test_formats_are_chosen_by_name():
     assert formats.chosen_formats([]) == ()
     with pytest.raises(UsageError, match=r"'shapefile'.*netcdf"):
         formats.chosen_formats(["shapefile"])
-    asked = typing.get_args(typing.get_args(ReportSettings.model_fields["export"].annotation)[0])
-    assert set(asked) == {*formats.FORMATS, formats.ALL}
 
 
 def test_a_missing_library_is_named_with_its_extra(data, tmp_path, monkeypatch):

@@ -118,9 +118,7 @@ def test_hostile_names_are_escaped(maps_data):
     assert page.count("<script") == 2
 
 
-@pytest.mark.parametrize(
-    "missing", ["rss", "rank", "layers", "correlation", "errors", "learning", "paper", "borders_m"]
-)
+@pytest.mark.parametrize("missing", ["rss", "rank", "layers", "correlation", "errors", "paper", "borders_m"])
 def test_a_part_may_be_missing(maps_data, missing):
     data = dataclasses.replace(maps_data, **{missing: ()})
     maps_html.maps_page(data, pictures(data), [])

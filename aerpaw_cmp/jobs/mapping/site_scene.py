@@ -73,6 +73,11 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
     force : bool
         Replace a site.yaml that this tool did not write.
 
+    Returns
+    -------
+    list of str
+        What was made of the scene, a line each.
+
     Raises
     ------
     UsageError

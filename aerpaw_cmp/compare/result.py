@@ -58,6 +58,18 @@ class ClockResult:
     applied: str
     checks: Mapping[str, object] = field(default_factory=dict)
 
+    @property
+    def shifted(self) -> bool:
+        """True of a clock that is wrong and was not corrected."""
+        return self.verdict == "shifted" and self.applied != APPLIED
+
+    @property
+    def in_words(self) -> str:
+        """Its lag with the interval, as every sentence has them."""
+        low, high = self.ci95_s
+        side = "ahead of" if self.radio_minus_telemetry_s > 0 else "behind"
+        return f"{abs(self.radio_minus_telemetry_s):.2f} s {side} the telemetry clock [{low:+.2f}, {high:+.2f}]"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
@@ -125,8 +137,6 @@ class RssFurther:
     """Of a ratio to the noise whose receiver's bandwidth is given."""
     repeatability: Mapping[str, Repeated]
     explained_by: Mapping[str, float]
-    likely_cause: Cause | None = None
-    """Of the error, where one is shown."""
     rmse_bound: str | None = None
     """Reason why the interval of the RMSE is a lower bound alone, where it is."""
     simulated_sd_db: float | None = None
@@ -372,6 +382,15 @@ class FlightResult:
     ladder: tuple[LadderRow, ...] = ()
     verdict: FlightVerdict | None = None
     """None where no channel and baseline could be scored."""
+    likely_cause: Cause | None = None
+    """The one trouble that explains most of the error of the flight; None where none is identified."""
+    next_step: str | None = None
+    """The one thing to do next, a clause; None where nothing that is known changes the result."""
+
+    @property
+    def cause(self) -> str | None:
+        """The likely cause in a sentence."""
+        return None if self.likely_cause is None else self.likely_cause.sentence
 
     @property
     def clocks(self) -> dict[str, ClockResult]:

@@ -80,6 +80,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     return FlightResult(
         rss=tuple(results),
         verdict=flight_verdict(results),
+        likely_cause=cause_of(data, replays, results),
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
         pairs=tuple(pairs_of(results)),
         serving=serving_of(data.rss, results),
@@ -252,7 +253,6 @@ def _further(
         censored=_censored(settings, levels),
         detection=_detection(case.data, series, levels, case.simple["free_space"]),
         snr=_snr(series, levels),
-        likely_cause=cause_of(case.data.site, series, replayed, levels, case.simple["free_space"]),
     )
 
 

@@ -1,107 +1,185 @@
-"""Evidence from which a likely cause is told, gathered from a replayed series."""
+"""Evidence from which the likely cause of a flight's error is told, gathered from its replayed series."""
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from ...common.units import FloatArray
-from ...compare.judge.causes import Cause, LevelEvidence, likely_cause
+from ...compare.judge.causes import Cause, LevelEvidence, flight_cause
 from ...compare.level import rss
-from ...flight.data import RssSeries
-from ...flight.replay import Replayed
+from ...compare.result import RssResult
+from ...flight.data import FlightData, RssSeries
+from ...flight.replay import FlightReplay, Replayed, attitude_rotation
+from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
 from ...site.antenna.antennas import Isotropic
+from ...site.antenna.sphere_pattern import SpherePattern
 from ...site.site import Site
-from .levels import Levels
 
 _ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
+_RISES_M = (-150.0, -100.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 100.0, 150.0)
 
 
-def cause_of(site: Site, series: RssSeries, replayed: Replayed, levels: Levels, free_space: FloatArray) -> Cause | None:
-    """Likely cause of the error of one tower and channel; None where no trouble shows, and for a tower that moves.
+def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResult]) -> Cause | None:
+    """The likely cause of the error of a flight over its scored channels; towers that move have none.
 
     Parameters
     ----------
-    site : Site
-    series : RssSeries
-    replayed : Replayed
-    levels : Levels
-        Measured and predicted at the samples.
-    free_space : (n,)
-        Level of free space at the samples [dBm].
+    data : FlightData
+    replays : FlightReplay
+    results : sequence of RssResult
+        The compared series.
 
     Returns
     -------
     Cause or None
     """
-    if replayed.tower_m is not None:
-        return None
-    time_s = rss.seconds(series.time)
-    directions = _link_geometry(replayed, replayed.source_m(site), replayed.poses.rotation)
-    order = np.argsort(time_s, kind="stable")
-    names = ("uav_azimuth_deg", "uav_elevation_deg", "azimuth_deg")
-    spread = {name: replayed.spread(directions[name])[order] for name in names}
-    evidence = LevelEvidence(
-        time_s=time_s[order],
-        measured_db=levels.measured_db[order],
-        predicted_db=levels.simulated_db[order],
-        uav_azimuth_deg=spread["uav_azimuth_deg"],
-        uav_elevation_deg=spread["uav_elevation_deg"],
-        tower_azimuth_deg=spread["azimuth_deg"],
-        turned_db={
-            angle: replayed.spread(change)[order] for angle, change in _turned(site, replayed, directions).items()
-        },
-        other_towers_db={
-            name: (levels.simulated_db - free_space + level)[order]
-            for name, level in _other_towers(site, series.tower, replayed, _gain_db(replayed, directions)).items()
-        },
-        clock_confirmed=replayed.clock is not None and replayed.clock.result.verdict == "ok",
+    if any(_simulated(stream) for file in data.files for stream in file.result.streams):
+        return SIMULATED
+    return flight_cause(
+        [
+            _evidence(data, series, replayed, result)
+            for series, replayed, result in zip(data.rss, replays.rss, results, strict=True)
+            if replayed.tower_m is None and not result.training
+        ]
     )
-    cause = likely_cause(evidence)
-    return None if cause.name == "none" else cause
 
 
-def _link_geometry(replayed: Replayed, place_m: FloatArray, rotation: FloatArray) -> dict[str, FloatArray]:
-    """Directions between a place and the UAV at the poses."""
-    return rss.link_geometry(place_m, replayed.poses.position_m, rotation, uav_mount=replayed.link.uav_array.mount)
+def _simulated(telemetry: Stream) -> bool:
+    """Check for the constant receiver of ArduPilot's simulator, which AERPAW's emulator runs."""
+    if telemetry.kind != "telemetry" or len(telemetry.frame) < _FEWEST_ROWS:
+        return False
+    return bool((telemetry.frame["fix"] == 6).all() and (telemetry.frame["satellites"] == 10).all())
 
 
-def _other_towers(site: Site, tower: str, replayed: Replayed, gain_db: FloatArray) -> dict[str, FloatArray]:
-    """Free space from each other tower, with the UAV's gain towards it less that towards its own, at the samples."""
-    link, levels = replayed.link, {}
-    for name, neighbour in site.towers.items():
-        if name != tower:
-            place = neighbour.position_m[None, :]
-            level = free_space_dbm(place, replayed.poses.position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0]
-            level += _gain_db(replayed, _link_geometry(replayed, place, replayed.poses.rotation)) - gain_db
-            levels[name] = replayed.spread(level)
-    return levels
+# Rows of a table from which constant columns tell anything.
+_FEWEST_ROWS = 4
+
+SIMULATED = Cause(
+    name="emulator",
+    sentence="The log is a simulator's: all of its rows have fix 6 and 10 satellites, as ArduPilot's writes them.",
+    next_step="draw no conclusion on the site from this flight",
+)
 
 
-def _turned(site: Site, replayed: Replayed, directions: Mapping[str, FloatArray]) -> dict[float, FloatArray]:
-    """Change of the direct path's gain [dB] at the poses where the heading is greater; none for isotropic antennas."""
-    array = replayed.link.uav_array
-    if all(isinstance(pattern, Isotropic) for pattern in array.patterns):
-        return {}
-    changes = {}
-    for angle in _ANGLES_DEG:
-        turn = math.radians(-angle)  # a heading grows clockwise
-        rotation = np.array(
-            [[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]
-        )
-        turned = _link_geometry(replayed, replayed.source_m(site), rotation @ replayed.poses.rotation)
-        changes[angle] = _gain_db(replayed, turned) - _gain_db(replayed, directions)
-    return changes
+def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: RssResult) -> LevelEvidence:
+    link = _Direct(data.site, series.tower, replayed)
+    time_s = rss.seconds(series.time)
+    order = np.argsort(time_s, kind="stable")
+
+    def at_samples(values: FloatArray) -> FloatArray:
+        return replayed.spread(values)[order]
+
+    def changed(levels_db: Mapping[object, FloatArray]) -> dict[object, FloatArray]:
+        return {key: at_samples(level - link.level_db) for key, level in levels_db.items()}
+
+    directions = link.directions(link.place_m, replayed.poses.position_m, replayed.poses.rotation)
+    predicted = result.simulated_dbm[order]
+    patterns = replayed.link.uav_array.patterns
+    kinds = {"learned": any(isinstance(p, SpherePattern) for p in patterns) or replayed.learned is not None,
+             "isotropic": all(isinstance(p, Isotropic) for p in patterns), "measured": True}  # fmt: skip
+    return LevelEvidence(
+        name=result.name,
+        unit=series.unit,
+        start=series.time.min() if len(series.time) else np.datetime64(0, "s"),
+        antenna=next(name for name, holds in kinds.items() if holds),
+        time_s=time_s[order],
+        measured_db=result.measured_db[order],
+        predicted_db=predicted,
+        uav_azimuth_deg=at_samples(directions["uav_azimuth_deg"]),
+        uav_elevation_deg=at_samples(directions["uav_elevation_deg"]),
+        tower_azimuth_deg=at_samples(directions["azimuth_deg"]),
+        turned_db=changed(link.turned_db()),
+        raised_db=changed(link.raised_db()),
+        attitude_db=changed(link.attitude_db(data.settings.rt.attitude)),
+        other_towers_db={name: predicted + change for name, change in changed(link.other_towers_db()).items()},
+        locked=None if series.locked is None else series.locked[order],
+        serving=None if series.serving is None else series.serving[order],
+        clock=None if replayed.clock is None else replayed.clock.result,
+    )
 
 
-def _gain_db(replayed: Replayed, directions: Mapping[str, FloatArray]) -> FloatArray:
-    """Mean gain of the UAV's elements towards the tower [dB]."""
-    theta, phi = np.radians(90.0 - directions["uav_elevation_deg"]), np.radians(directions["uav_azimuth_deg"])
-    power = np.zeros(len(theta))
-    for pattern in replayed.link.uav_array.patterns:
-        e_theta, e_phi = pattern.field(theta, phi)
-        power += np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2
-    return np.asarray(10.0 * np.log10(np.maximum(power / len(replayed.link.uav_array.patterns), 1e-6)))
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Direct:
+    """Level of the direct path of a series at its poses (m,) [dBm], and what it would be otherwise."""
+
+    site: Site
+    tower: str
+    replayed: Replayed
+
+    @property
+    def place_m(self) -> FloatArray:
+        return self.replayed.source_m(self.site)
+
+    @property
+    def level_db(self) -> FloatArray:
+        return self._level(self.place_m, self.replayed.poses.position_m, self.replayed.poses.rotation)
+
+    def turned_db(self) -> dict[float, FloatArray]:
+        """Levels where the heading is greater; none for isotropic antennas."""
+        if not self._has_pattern:
+            return {}
+        levels, poses = {}, self.replayed.poses
+        for angle in _ANGLES_DEG:
+            turn = math.radians(-angle)  # a heading grows clockwise
+            rotation = np.array(
+                [[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]
+            )
+            levels[angle] = self._level(self.place_m, poses.position_m, rotation @ poses.rotation)
+        return levels
+
+    def raised_db(self) -> dict[float, FloatArray]:
+        """Levels where the UAV is higher, no lower than the ground."""
+        poses, levels = self.replayed.poses, {}
+        for rise in _RISES_M:
+            place = poses.position_m + np.array([0.0, 0.0, rise])
+            if len(place) and place[:, 2].min() > -_BELOW_GROUND_M:
+                levels[rise] = self._level(self.place_m, place, poses.rotation)
+        return levels
+
+    def attitude_db(self, used: str) -> dict[str, FloatArray]:
+        """Levels with another use of the attitude that the log knows."""
+        track, poses = self.replayed.track, self.replayed.poses
+        if track is None or not self._has_pattern or not track.attitude_known.any():
+            return {}
+        return {
+            mode: self._level(self.place_m, poses.position_m, attitude_rotation(track, mode))
+            for mode in ("logged", "ignored")
+            if mode != used
+        }
+
+    def other_towers_db(self) -> dict[str, FloatArray]:
+        """Levels from each other tower of the site."""
+        poses = self.replayed.poses
+        return {
+            name: self._level(neighbour.position_m[None, :], poses.position_m, poses.rotation)
+            for name, neighbour in self.site.towers.items()
+            if name != self.tower
+        }
+
+    @property
+    def _has_pattern(self) -> bool:
+        return not all(isinstance(pattern, Isotropic) for pattern in self.replayed.link.uav_array.patterns)
+
+    def directions(self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> dict[str, FloatArray]:
+        """Directions between a place and the UAV."""
+        return rss.link_geometry(place_m, position_m, rotation, uav_mount=self.replayed.link.uav_array.mount)
+
+    def _level(self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> FloatArray:
+        """Free space and the mean gain of the UAV's elements towards the tower [dB]."""
+        link, at = self.replayed.link, self.directions(place_m, position_m, rotation)
+        theta, phi = np.radians(90.0 - at["uav_elevation_deg"]), np.radians(at["uav_azimuth_deg"])
+        power = np.zeros(len(theta))
+        for pattern in link.uav_array.patterns:
+            e_theta, e_phi = pattern.field(theta, phi)
+            power += np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2
+        gain = 10.0 * np.log10(np.maximum(power / len(link.uav_array.patterns), 1e-6))
+        return np.asarray(free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0] + gain)
+
+
+# A track under another datum may begin so far below the ground [m].
+_BELOW_GROUND_M = 20.0

@@ -93,13 +93,10 @@ def _clock_warning(clock: ClockResult) -> str:
     """Sentence on what one receiver's clock does to its numbers; "" when there is nothing to know."""
     if clock.applied == NOT_APPLIED:
         return f"rss.lag: apply was asked for, but the radio clock was not corrected: {clock.reason}."
-    low, high = clock.ci95_s
-    side = "ahead of" if clock.radio_minus_telemetry_s > 0 else "behind"
-    shown = f"{abs(clock.radio_minus_telemetry_s):.2f} s {side} the telemetry clock [{low:+.2f}, {high:+.2f}]"
     if clock.applied == APPLIED:
-        return f"the radio clock is {shown}; it was corrected."
-    if clock.verdict == "shifted":
-        return f"the radio clock is {shown}; it was not corrected (rss.lag: apply would)."
+        return f"the radio clock is {clock.in_words}; it was corrected."
+    if clock.shifted:
+        return f"the radio clock is {clock.in_words}; it was not corrected (rss.lag: apply would)."
     if clock.verdict == "cannot tell":
         return f"the radio clock could not be checked: {clock.reason}."
     return ""

@@ -49,6 +49,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         KEY: list(union(*(f.learned_on for f in data.inputs))),
         "rss": rss,
         "verdict": data.verdict,
+        **named(data, "likely_cause next_step"),
         "offsets": offset_sentences(data.rss),
         "rank": {item.tower: _rank_metrics(item) for item in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),

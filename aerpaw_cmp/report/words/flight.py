@@ -17,7 +17,7 @@ from ...compare.level.rss import ErrorSpan
 from ...compare.result import BASELINE_TITLE, AuditResult, FlightVerdict, RankResult, RssResult
 from ...compare.statistics.intervals import Interval, paired_verdict
 from ..content.flight import ReportData
-from .phrases import MINUS, filled
+from .phrases import MINUS
 
 # Name of the ladder's rung with the settings of the flight file.
 AS_SET = "as set in flight.yaml"
@@ -196,48 +196,7 @@ def expected_sentence(panels: Sequence[RssResult]) -> str:
     return f"Expect {error:.1f} dB on another flight." if math.isfinite(error) else ""
 
 
-# Causes of :mod:`aerpaw_cmp.compare.judge.causes` in words, and what to do next.
-CAUSES: dict[str, tuple[str, str]] = {
-    "clock": (
-        "the radio clock is {size:.1f} s {side} the telemetry clock [{low:+.1f}, {high:+.1f}]",
-        "`rss: {{lag: apply}}`",
-    ),
-    "heading": (
-        "the UAV antenna is turned clockwise by {value:.0f} degrees [{low:.0f}, {high:.0f}]",
-        "check the antenna's mount and the logged yaw",
-    ),
-    "tower": ("the log is that of {where}", "check `node:` of this log"),
-    "pattern": ("the antenna pattern of the UAV", "`aerpaw-cmp calibrate`"),
-    "blocked": (
-        "a loss of {value:.0f} dB [{low:.0f}, {high:.0f}] towards {where} degrees",
-        "add to the site what stands there",
-    ),
-    "floor": ("the receiver shows no level below {value:.0f} {unit}", "`floor_db: {typed}` for this log"),
-    "gain step": (
-        "the level steps by {value:+.1f} dB [{low:+.1f}, {high:+.1f}] at {at} UTC",
-        "check the receiver's gain",
-    ),
-}
-
-
 NO_CAUSE = "No likely cause was identified."
-
-
-def cause_sentence(panel: RssResult) -> str:
-    """Likely cause with its interval and the error with it, and the next step; nothing where none was identified."""
-    cause = panel.further.likely_cause
-    if cause is None:
-        return ""
-    value, (low, high) = cause.estimate, cause.ci95
-    at = ""
-    if cause.name == "gain step" and len(panel.time):
-        instant = panel.time.min() + np.timedelta64(int(float(cause.where)), "s")
-        at = str(instant.astype("datetime64[s]"))[-8:]
-    text, action = filled(
-        CAUSES[cause.name], value=value, low=low, high=high, size=abs(value), unit=panel.unit, at=at,
-        side="ahead of" if value > 0 else "behind", where=cause.where, typed=f"{value:.0f}",
-    )  # fmt: skip
-    return f"Likely cause at {panel.name}: {text}; RMSE {cause.rmse_with_db:.1f} dB with it. Next: {action}."
 
 
 def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetime64]:
@@ -284,23 +243,6 @@ def audit_paths(audit: AuditResult) -> str:
     if math.isfinite(audit.rss_max_error_db):
         parts.append(f"RSS of the two engines within {audit.rss_max_error_db:.2g} dB")
     return ", ".join(parts)
-
-
-def _recommended(data: ReportData) -> str:
-    """Model that the ladder recommends; nothing without a ladder."""
-    return next((row.model for row in data.ladder if row.recommended), "")
-
-
-# What to do next where no likely cause says it.
-NEXT: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
-    (lambda d: _recommended(d) not in ("", AS_SET), "Next: `report --recommend FILE` writes the recommended model."),
-    (lambda d: bool(d.rss), "Next: `aerpaw-cmp calibrate` with two flights of this site."),
-)
-
-
-def next_step(data: ReportData) -> str:
-    """The first step whose condition holds."""
-    return next((text for holds, text in NEXT if holds(data)), "")
 
 
 # Outlying samples that move an RMSE by more than this [dB] are named.

@@ -39,15 +39,15 @@ def paragraph(data: ReportData) -> str:
     """
     panels = scored(data.rss)
     error = _level_sentence(data.verdict, panels) if panels else _rank_sentence(data.rank)
+    advice = None if data.next_step is None else f"Next: {data.next_step}."
     if learned := _training(data):
         other = error if panels or not data.rss else _baseline_sentence(data.rss)
         parts = [learned, other, words.expected_sentence(data.rss)]
     elif error and data.against is not None and data.against.scores:
-        parts = [error, before_flight(data.against.scores), words.next_step(data)]
+        parts = [error, before_flight(data.against.scores), advice]
     elif error:
-        cause = _cause(panels)
-        without = (words.NO_CAUSE if panels else "", words.next_step(data))
-        parts = [error, words.expected_sentence(panels), *([cause] if cause else without)]
+        cause = data.cause or (words.NO_CAUSE if panels else None)
+        parts = [error, words.expected_sentence(panels), cause, advice]
     else:
         most = max([panel.score.n for panel in data.rss], default=0)
         parts = [words.TOO_FEW_COMPARED.format(n=most) if most else words.NOTHING_COMPARED]
@@ -171,12 +171,6 @@ def _rank_sentence(panels: Sequence[RankResult]) -> str:
                 + (agree if math.isfinite(at.agreement) else "")
             )
     return ""
-
-
-def _cause(panels: Sequence[RssResult]) -> str:
-    """The cause that explains most of a channel's error; nothing where no channel shows one."""
-    gains = [(cause.gain, i) for i, panel in enumerate(panels) if (cause := panel.further.likely_cause) is not None]
-    return words.cause_sentence(panels[max(gains)[1]]) if gains else ""
 
 
 def headlines(data: ReportData) -> list[Headline]:

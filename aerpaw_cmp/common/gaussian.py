@@ -137,7 +137,7 @@ class Factor:
         right = inverse @ values
         for code in np.unique(part):
             index = np.flatnonzero(part == code)
-            covariance = np.linalg.inv(inverse[np.ix_(index, index)])
+            covariance = np.linalg.inv(inverse[np.ix_(index, index)]).astype(np.float64, copy=False)
             yield index, values[index] - covariance @ right[index], covariance
 
 

@@ -153,7 +153,8 @@ class Feed:
         utc_ns: Callable[[], int] = time.time_ns,
     ) -> None:
         shift = utc_ns() - mono_ns()
-        self._utc_ns, self._steady_ns = utc_ns, lambda: mono_ns() + shift
+        self._utc_ns = utc_ns
+        self._steady_ns: Callable[[], int] = lambda: mono_ns() + shift
         self.epoch = secrets.token_hex(4)
         self.start_ns = self._steady_ns()
         self._modems = [_Modem(name, shift_ns=shift, predicted=Rows(len(PREDICTED))) for name in names]

@@ -136,7 +136,8 @@ def _courses(table: pd.DataFrame) -> pd.Series[float]:
     east = table["longitude_deg"].diff().shift(-1) * np.cos(np.radians(table["latitude_deg"]))
     moves = ((north != 0) | (east != 0)).to_numpy()
     courses: pd.Series[float] = table["yaw_deg"].mask(moves, bearing_deg(np.column_stack([east, north])))
-    return courses.where(moves).bfill().ffill()
+    filled: pd.Series[float] = courses.where(moves).bfill().ffill()
+    return filled
 
 
 def _log(path: str | Path) -> _Route:

@@ -6,6 +6,7 @@ import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 from ...common.content import content_digest
 from ...common.files import cache_folder, read_sealed, write_sealed
@@ -15,6 +16,7 @@ from ...compare.result import AuditResult
 from ...flight.data import FlightData
 from ...flight.replay import Replayed
 from ...propagation.replay import PER_LINK
+from ..tasks.outcomes import code_digest
 
 # Stands behind the entry, before its SHA-256.
 _SEAL = b"AERPAWAU"
@@ -24,13 +26,13 @@ _SETTINGS = {"rt", "link", "rank", "antennas", "towers"}
 
 
 def entry_of(data: FlightData, replays: Sequence[Replayed]) -> Path:
-    """Place of the audit of these replays: its name is the SHA-256 of versions, site, logs, settings and replays."""
+    """Place of the audit of these replays: named by the SHA-256 of versions, code, site, logs, settings and replays."""
     settings = data.settings.model_dump(mode="json", include=_SETTINGS)
     seen = [
         (r.poses, r.tower_m, *(getattr(r.replay, name) for name in ("towers", "faces", "contributions", *PER_LINK)))
         for r in replays
     ]
-    digest = content_digest(versions(), settings, data.site, [file.sha256 for file in data.files], seen)
+    digest = content_digest(versions(), code_digest(), settings, data.site, [file.sha256 for file in data.files], seen)
     return cache_folder("audits", f"{digest}.json")
 
 
@@ -44,7 +46,7 @@ def read_audit(entry: Path) -> AuditResult | None:
         return None
     record = json.loads(content)
     if record["fields"] is not None:
-        lists = {name: tuple(x) if isinstance(x, list) else x for name, x in record["fields"].items()}
+        lists: dict[str, Any] = {name: tuple(x) if isinstance(x, list) else x for name, x in record["fields"].items()}
         record["fields"] = FieldAudit(**lists)
     record["rank_disagreement"] = {float(k): share for k, share in record["rank_disagreement"].items()}
     return AuditResult(**record)

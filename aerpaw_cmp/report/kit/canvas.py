@@ -159,8 +159,9 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
     dots_per_inch = 300.0 if kind == "paper" else _RASTER_DPI
     fig.set_dpi(dots_per_inch)
     for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
-        if isinstance(axis.get_major_locator(), AutoLocator):
-            axis.get_major_locator().set_params(min_n_ticks=3)
+        locator = axis.get_major_locator()
+        if isinstance(locator, AutoLocator):
+            locator.set_params(min_n_ticks=3)
     images = {name: io.BytesIO() for name in formats}
     # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
     agg = FigureCanvasAgg(fig)

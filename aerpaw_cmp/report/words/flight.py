@@ -175,7 +175,7 @@ def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> st
     'Ray tracing (RMSE 2.0 dB) is 0.23 dB better than two-ray ground [0.14, 0.33] over 10 channels (95 %).'
     """
     word = paired_verdict(*verdict.ci95_db)
-    ends = sorted(map(abs, verdict.ci95_db)) if word in ("better", "worse") else list(verdict.ci95_db)
+    ends = sorted(map(abs, verdict.ci95_db)) if word in ("better", "worse") else verdict.ci95_db
     name, over = with_article(verdict.against), f" over {verdict.channels} channels" if verdict.channels > 1 else ""
     floor = "" if floor_db is None else f", floor {floor_db:.0f}".replace("-", MINUS)
     signs = "+" if word == "not significant" else ""

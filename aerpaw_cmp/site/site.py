@@ -199,6 +199,11 @@ class Site:
         """True if trees or stands can shade a path."""
         return len(self.trees) > 0 or any(forest.height_m is not None for forest in self.forests)
 
+    @property
+    def mapped(self) -> bool:
+        """True if a map says what stands there: nothing drawn is nothing known otherwise."""
+        return bool(self.forests or self.buildings or len(self.trees) or self.scene is not None)
+
     def ground_under_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
         """Up of the ground (n,) [m]: the terrain's, else of the lowest plane; in a scene that of the take-off point."""
         level = min((0.0, *(tower.ground_m for tower in self.towers.values())))

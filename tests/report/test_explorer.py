@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 from aerpaw_cmp.report.content.flight import Source
 from aerpaw_cmp.report.kit import canvas, page
 from aerpaw_cmp.report.pages import explorer
+from aerpaw_cmp.site.site import Trees
 
 
 def array(content, number):
@@ -93,3 +94,13 @@ def test_a_pose_shows_the_probability_of_each_rank(report_data):
     _, second_rank, *_ = content["rank"][0]["probability"]
     assert second_rank["name"] == "probability_rank2"
     np.testing.assert_allclose(array(content, second_rank["values"]), share, atol=1e-6)
+
+
+def test_a_plan_of_a_place_without_a_map_says_so(report_data):
+    site = report_data.site
+    bare = dataclasses.replace(
+        site, buildings=(), forests=(), trees=Trees.none(), opaque_trees=Trees.none(), scene=None
+    )
+    assert (site.mapped, bare.mapped) == (True, False)
+    assert explorer.scene(site)["credit"] == site.credit
+    assert explorer.scene(bare)["credit"] == "no map here"

@@ -532,7 +532,7 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None) -> N
         ax.add_patch(PathPatch(outline, **options))
 
     draw_credit(ax, site)
-    if not (site.forests or site.buildings or len(site.trees) or site.scene is not None):
+    if not site.mapped:
         ax.text(0.5, 0.02, "no map here", transform=ax.transAxes, ha="center", color="#777777", fontsize=8, zorder=7)
     for number, forest in enumerate(site.forests):
         patch(

@@ -185,7 +185,7 @@ def scene(site: Site, most_trees: int = _TREES) -> dict[str, Any]:
     columns = ("east_m", "north_m", "ground_m", "height_m", "crown_diameter_m", "crown_base_m")
     return {
         "name": site.name,
-        "credit": site.credit,
+        "credit": site.credit if site.mapped else "no map here",
         "towers": [
             {"name": t.name, "at": listed([t.east_m, t.north_m, t.ground_m]), "top": round(float(t.position_m[2]), 2)}
             for t in site.towers.values()

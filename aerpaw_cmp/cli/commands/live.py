@@ -55,7 +55,7 @@ def tap(
     wait: Annotated[float, Option(help="Seconds to wait for the port.")] = 0.0,
     web: Annotated[
         str | None,
-        Option(help=f"Also show the flight as a page, at HOST:PORT [default: {WEB}]; 0.0.0.0 asks for a token."),
+        Option(help=f"Also show the flight as a page, opened with a token, at HOST:PORT [default: {WEB}]."),
     ] = None,
     flight: Annotated[Path | None, Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
     telemetry: Annotated[Path | None, Option(help="The growing vehicleOut file that --flight follows.")] = None,

@@ -52,19 +52,14 @@ def learned_patterns(link: Link, folder: Path, site: str | Path) -> list[Measure
     """
     arrays = [*link.tower_arrays.values(), link.uav_array]
     patterns = [p for array in arrays for p in array.patterns if isinstance(p, MeasuredPattern)]
-    known = (p if p.trained_on or p.learned_from else _original(p, folder, folder_of(site)) for p in patterns)
+    known = (p if p.trained_on else _original(p, folder, folder_of(site)) for p in patterns)
     return [pattern for pattern in known if pattern is not None]
 
 
 def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, ...]:
-    """Logs of a series that its antennas, or the settings of its flight file, were learned from; none: it is unseen.
-
-    Antenna files of 0.3 name flights, not logs: there the name decides.
-    """
+    """Logs of a series that its antennas, or the settings of its flight file, were learned from; none: it is unseen."""
     logs, settings = logs_of(data, series), data.settings
     patterns = learned_patterns(link, data.folder, site_place(settings.site.file, data.folder))
-    if any(not p.trained_on and settings.flight.name in p.learned_from for p in patterns):
-        return logs
     if among(series_mark(series), union(settings.marks, *(p.marks for p in patterns))):
         return logs
     return common(logs, [settings.trained_on, *(p.trained_on for p in patterns)])

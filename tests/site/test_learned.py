@@ -187,26 +187,13 @@ def test_a_damaged_receiver_is_left_out_and_said(folder: Path, content: bytes | 
 
 
 @pytest.mark.parametrize(
-    "text", ["format: aerpaw-cmp learned 3\n", "entries: [1]\n", "\0", "entries: {d12: {made: x}}\n"]
+    "text", ["format: aerpaw-cmp learned 1\n", "entries: [1]\n", "\0", "entries: {d12: {made: x}}\n"]
 )
 def test_a_damaged_memory_is_one_message(folder: Path, text: str) -> None:
     (folder_of(folder / "mine.yaml") / "learned.yaml").write_text(text)
     with pytest.raises(UsageError):
         read_learned(folder / "mine.yaml")
     assert load_with_learned(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
-
-
-def test_a_memory_of_the_first_format_reads_and_is_written_in_the_second(folder: Path) -> None:
-    index = folder_of(folder / "mine.yaml") / "learned.yaml"
-    text = index.read_text()
-    assert text.startswith("format: aerpaw-cmp learned 2\n")
-    index.write_text(text.replace("learned 2", "learned 1"))
-    known = read_learned(folder / "mine.yaml")
-    assert known.entries["d12"].model_copy(update={"tables": {}}) == entry("A")
-    table = sphere_csv(np.zeros((7, 8)), np.ones((7, 8))).encode()
-    remember(folder / "mine.yaml", "other", entry("B"), {"B.t.csv.gz": table, "B.u.csv.gz": table})
-    assert index.read_text().startswith("format: aerpaw-cmp learned 2\n")
-    assert read_learned(folder / "mine.yaml").entries["d12"] == known.entries["d12"]
 
 
 def test_a_second_entry_joins_the_first_and_one_of_the_same_name_replaces_it(folder: Path) -> None:

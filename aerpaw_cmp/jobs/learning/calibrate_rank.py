@@ -113,16 +113,14 @@ class FittedReceiver:
     flights: tuple[str, ...]
     """Names of those that it was fitted on."""
     trained_on: tuple[str, ...] = ()
-    """SHA-256 of their logs: no score there is worth anything; receivers of 0.3 have none."""
+    """SHA-256 of their logs: no score there is worth anything."""
     marks: tuple[str, ...] = ()
-    """Of their reports; receivers of 0.3 have none."""
+    """Of their reports."""
     mixture: receiver.ReceiverMixture
     timing: Timing = Timing()
 
     def knows(self, samples: RankSamples) -> bool:
-        """Check whether it was fitted on these reports: by their logs or readings, or, in 0.3, the flight's name."""
-        if not self.trained_on:
-            return samples.flight in self.flights
+        """Check whether it was fitted on these reports, by their logs or readings."""
         return not set(self.trained_on).isdisjoint(samples.logs) or among(samples.mark, self.marks)
 
     def forecast(self, samples: RankSamples) -> tuple[FloatArray, IntArray]:
@@ -146,19 +144,19 @@ class FittedReceiver:
 
     @classmethod
     def from_dict(cls, tower: str, content: Mapping[str, Any]) -> FittedReceiver:
-        """From :meth:`as_dict`; files of 0.3 have no timing and no logs."""
+        """From :meth:`as_dict`."""
         return cls(
             tower=tower,
             geometries=tuple(_geometry(g) for g in content["geometries"]),
             tied=int(content["tied"]),
             flights=tuple(str(name) for name in content["flights"]),
-            trained_on=tuple(str(digest) for digest in content.get(KEY, ())),
-            marks=tuple(str(mark) for mark in content.get(MARKS, ())),
+            trained_on=tuple(str(digest) for digest in content[KEY]),
+            marks=tuple(str(mark) for mark in content[MARKS]),
             mixture=receiver.ReceiverMixture(
                 members=tuple(receiver.Receiver.from_dict(m) for m in content["members"]),
                 decision_weight=np.asarray(content["decision_weight"], dtype=np.float64),
             ),
-            timing=Timing(shift_s=float(content.get("shift_s", 0.0)), average_s=float(content.get("average_s", 0.0))),
+            timing=Timing(shift_s=float(content["shift_s"]), average_s=float(content["average_s"])),
         )
 
 

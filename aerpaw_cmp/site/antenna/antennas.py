@@ -118,13 +118,10 @@ class MeasuredPattern:
         Mean gain over the sphere (radiation efficiency times mismatch).
     trained_on, marks : tuple of str
         SHA-256 and marks of the logs that it was learned from, as its file says: on those it must not be scored.
-    learned_from : tuple of str
-        Names of their flights.
     """
 
     trained_on: tuple[str, ...] = ()
     marks: tuple[str, ...] = ()
-    learned_from: tuple[str, ...] = ()
 
     def __init__(
         self, name: str, e_theta: ComplexArray, e_phi: ComplexArray | None, frequency_hz: float | None = None

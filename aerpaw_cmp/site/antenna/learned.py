@@ -24,8 +24,6 @@ from ...common.outputs import explained_os_errors, file_digest, new_folder
 from ...common.yamlfile import StrictModel, dump_yaml, load_yaml
 
 _INDEX = "learned.yaml"
-# Since 2 the comments of a tower's table may hold the gain towards both ends at once (:mod:`.pair_gain`).
-FORMAT: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
 
 # Share by which a carrier may differ from the one that an antenna was learned at.
 BAND = 0.02
@@ -93,7 +91,7 @@ class LearnedSeries(StrictModel):
     """Mean standard deviation of the level over directions that were flown."""
     lock: LearnedLock | None = None
     level: LearnedLevel | None = None
-    """None of receivers that lose their lock, and of memories before 0.5."""
+    """None of receivers that lose their lock."""
 
 
 class LearnedReceiver(StrictModel):
@@ -146,7 +144,7 @@ class Entry(StrictModel):
 class Learned(StrictModel):
     """All that a site remembers, by name."""
 
-    format: Literal["aerpaw-cmp learned 1", "aerpaw-cmp learned 2"] = FORMAT
+    format: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
     entries: dict[Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")], Entry] = Field(default_factory=dict)
 
 

@@ -42,7 +42,7 @@ class SpherePattern(MeasuredPattern):
         notes: str = "",
     ) -> None:
         super().__init__(name, np.sqrt(power_from_db(gain_dbi)).astype(np.complex128), None, frequency_hz)
-        self.learned_from, self.trained_on, self.marks = _flights_in(notes), trained_on(notes), marks(notes)
+        self.trained_on, self.marks = trained_on(notes), marks(notes)
         self.notes = notes
         self.pair = PairGain.from_notes(notes)
         self._sd_db = np.asarray(sd_db, dtype=np.float64)
@@ -147,11 +147,6 @@ def read_sphere_csv(path: str | Path) -> SpherePattern:
 
 # Begins the comment that names a calibration and, after ``, from``, its flights.
 LEARNED = "# aerpaw-cmp calibrate: "
-
-
-def _flights_in(text: str) -> tuple[str, ...]:
-    first = next((line for line in text.splitlines() if line.startswith(LEARNED)), "")
-    return tuple(name.strip() for name in first.partition(", from ")[2].split(",") if name.strip())
 
 
 def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> FloatArray:

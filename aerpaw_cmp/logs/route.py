@@ -28,7 +28,6 @@ import numpy as np
 
 from ..common import kml
 from ..common.errors import InputError, parsing
-from ..common.geodesy import bearing_deg
 from ..common.xmlfiles import named, outermost, plain, xml_root
 from . import dictionary
 from .ingest import as_utf8, read_bytes, read_file
@@ -60,8 +59,8 @@ def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFra
     Returns
     -------
     pandas.DataFrame
-        :data:`COLUMNS`. Where the file says no yaw, it is the course to the next point. ``attrs["remarks"]`` is a list
-        of sentences that the user should read.
+        :data:`COLUMNS`; yaw NaN where the file says none. ``attrs["remarks"]`` is a list of sentences that the user
+        should read.
 
     Raises
     ------
@@ -122,22 +121,9 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
             place = f"{int(silent.sum())} of {len(table)} points have no height"
             raise InputError(place, expected="heights above take-off in the file, or one height for all points")
         table["altitude_m"] = table["altitude_m"].fillna(height_m)
-    if table["yaw_deg"].isna().any():
-        route.remark("Points without a yaw face the next point.")
-        table["yaw_deg"] = table["yaw_deg"].fillna(_courses(table)).fillna(0.0)
     table["yaw_deg"] = table["yaw_deg"] % 360.0
     table.attrs["remarks"] = list(route.remarks)
     return table
-
-
-def _courses(table: pd.DataFrame) -> pd.Series[float]:
-    """Course [deg] from each point to the next that lies elsewhere; the last keeps the one before."""
-    north = table["latitude_deg"].diff().shift(-1)
-    east = table["longitude_deg"].diff().shift(-1) * np.cos(np.radians(table["latitude_deg"]))
-    moves = ((north != 0) | (east != 0)).to_numpy()
-    courses: pd.Series[float] = table["yaw_deg"].mask(moves, bearing_deg(np.column_stack([east, north])))
-    filled: pd.Series[float] = courses.where(moves).bfill().ffill()
-    return filled
 
 
 def _log(path: str | Path) -> _Route:

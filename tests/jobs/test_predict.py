@@ -353,10 +353,17 @@ def test_directions_are_evaluated_once_per_degree_over_all_parts(monkeypatch: py
     np.testing.assert_allclose(other[0], -at_once[0], atol=0.6)
 
 
-def test_a_heading_counts_for_points_without_one(tmp_path):
-    (tmp_path / "p.csv").write_text("east_m,north_m,height_m,yaw_deg\n1,2,30,\n1,2,30,90\n")
-    targets = find_targets(tmp_path / "p.csv", load_site("lake_wheeler"), TargetOptions(heading_deg=200.0))
-    assert targets.yaw_deg.tolist() == [200.0, 90.0]
+@pytest.mark.parametrize("text", ["east_m,north_m,height_m,yaw_deg\n1,2,30,\n1,2,30,90\n",
+                                  "lat,lon,alt,yaw_deg\n35.7275,-78.696,30,\n35.7276,-78.696,30,90\n"])  # fmt: skip
+def test_a_heading_that_is_given_counts_then_that_of_the_route_else_all(tmp_path, text):
+    (tmp_path / "p.csv").write_text(text)
+    given, own = (
+        find_targets(tmp_path / "p.csv", load_site("lake_wheeler"), TargetOptions(heading_deg=heading)).yaw_deg
+        for heading in (200.0, None)
+    )
+    assert set(given) == {200.0}
+    assert np.isnan(own[0])
+    assert own[-1] == 90.0
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ def predict(
     spacing: Annotated[float, Option(min=1.0, help="Spacing of a grid [m].")] = 30.0,
     heading: Annotated[
         float | None,
-        Option(help="Heading of a grid, and of points without yaw [deg]; without it all headings count alike."),
+        Option(help="Heading at all points [deg]  [default: that of the route; where it says none, all count alike]"),
     ] = None,
     logs_root: LogsRoot = None,
     force: Force = False,

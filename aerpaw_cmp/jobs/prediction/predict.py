@@ -29,7 +29,7 @@ from ...maps import export
 from ...maps.grid import Grid, Layer
 from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
 from ...report.pages.prediction import PredictionPage, outside_share, prediction_metrics, write_prediction
-from ...report.words.prediction import FLAGS, TITLES, cautions, first_words, memory_cautions
+from ...report.words.prediction import FLAGS, TITLES, cautions, first_words, heading_words, memory_cautions
 from ...site.antenna.antennas import MeasuredPattern
 from ...site.antenna.learned import BAND as CARRIER_BAND
 from ...site.antenna.learned import folder_of, read_learned
@@ -161,7 +161,11 @@ def _model_fields(
 ) -> dict[str, Any]:
     """Fields of the page that tell of the model and what it learned from."""
     guess = outside_share(table)
-    expected = float(np.sqrt((table["slow_sd_db"] ** 2).mean())), float((table["q95_db"] - table["q05_db"]).mean()) / 2
+    expected = (
+        float(np.sqrt((table["slow_sd_db"] ** 2).mean())),
+        float((table["q95_db"] - table["q05_db"]).mean()) / 2.0,
+        heading_words(table["yaw_deg"].to_numpy(np.float64)),
+    )
     logs, marks = ([getattr(receiver, key) for receiver in receivers] for key in (KEY, MARKS))
     if isinstance(model, Memory):
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -82,7 +82,7 @@ class TargetOptions:
     spacing_m : float
         Of a grid.
     heading_deg : float, optional
-        Of a grid and of points without yaw; without it all headings count alike.
+        At all points; without it that of the route, and where none is said all headings count alike.
     site : str, optional
         Where neither flights nor the place name it.
     """
@@ -177,10 +177,12 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
         targets = _planned(flight, site) if flight.flight.plan is not None else _flown(flight, where, logs_root)
     elif is_settings(where) or not where.exists():
         targets = _grid(site, options)
-    elif (local := _local_points(where, options.heading_deg)) is not None:
+    elif (local := _local_points(where)) is not None:
         targets = local
     else:
         targets = _route(where, site, options)
+    if options.heading_deg is not None:
+        targets = replace(targets, yaw_deg=np.full(len(targets), options.heading_deg % 360.0))
     if len(targets) > _MOST_POINTS:
         raise UsageError(f"{len(targets)} points", expected=f"at most {_MOST_POINTS}", cause="too fine a spacing")
     if not targets.known.any():
@@ -194,12 +196,11 @@ def _grid(site: Site, options: TargetOptions) -> Targets:
     position = np.concatenate([grid.positions_m(h) for h in options.heights_m])
     if site.dem is not None:
         position[:, 2] += site.dem.ground_m(position[:, 0], position[:, 1])
-    heading = np.nan if options.heading_deg is None else options.heading_deg
     return Targets(
         kind="grid",
         name=site.name,
         position_m=position,
-        yaw_deg=np.full(len(position), heading),
+        yaw_deg=np.full(len(position), np.nan),
         time_s=np.zeros(len(position)),
         grid=grid,
         heights_m=options.heights_m,
@@ -230,8 +231,8 @@ def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
     )
 
 
-def _local_points(path: Path, heading_deg: float | None) -> Targets | None:
-    """Points of a CSV with east_m, north_m and height_m (and yaw_deg, else the heading); None for another file."""
+def _local_points(path: Path) -> Targets | None:
+    """Points of a CSV with east_m, north_m and height_m (and yaw_deg); None for another file."""
     if path.suffix.lower() != ".csv":
         return None
     with parsing(path, "columns east_m, north_m, height_m"):
@@ -241,13 +242,12 @@ def _local_points(path: Path, heading_deg: float | None) -> Targets | None:
         table = pd.read_csv(path, skipinitialspace=True)
     numbers = table.reindex(columns=["east_m", "north_m", "height_m", "yaw_deg"]).apply(pd.to_numeric, errors="coerce")
     position = numbers[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
-    yaw = numbers["yaw_deg"].to_numpy(np.float64)
     lost = int((~np.isfinite(position).all(axis=1)).sum())
     return Targets(
         kind="points",
         name=path.stem,
         position_m=position,
-        yaw_deg=yaw if heading_deg is None else np.where(np.isfinite(yaw), yaw, heading_deg),
+        yaw_deg=numbers["yaw_deg"].to_numpy(np.float64),
         time_s=np.zeros(len(position)),
         remarks=(f"{lost} of {len(position)} points have no position: they are flagged no_position.",) if lost else (),
     )

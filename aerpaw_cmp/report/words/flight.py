@@ -454,7 +454,7 @@ _LARGE_OFFSET_DB = 20.0
 # Reason of such an offset, by the unit of the log.
 OFFSETS = {
     "dB re full scale": "the log is relative to full scale, and the offset turns it into dBm",
-    "dB": "the log is a ratio to the noise, and the offset is the level of that noise in dBm",
+    "dB": "the log is a ratio to the noise, and the offset holds the level of that noise",
     "dBm": "the transmit power, gains or losses of the settings are not those of the flight; RSRP is the level of one "
     "subcarrier alone",
 }

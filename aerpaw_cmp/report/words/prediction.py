@@ -97,8 +97,8 @@ FLOWN: dict[str, tuple[str, str]] = {
 
 
 EXPECTED = (
-    "Expect an RMSE of {error:.1f} dB over 4 s means at these points on a new flight; 90 % of the samples lie within "
-    "\u00b1{band:.1f} dB."
+    "Expect an RMSE of {error:.1f} dB over 4 s means at these points on a new flight ({heading}); 90 % of the samples "
+    "lie within \u00b1{band:.1f} dB."
 )
 REMEMBERED = "No flight is named: antennas and levels are those that the site remembers."
 OUTSIDE = {
@@ -108,7 +108,22 @@ OUTSIDE = {
 PLAN = "Next: `aerpaw-cmp plan` names the flight that helps most."
 
 
-def first_words(correction: Correction | None, outside: float, expected_db: float, band_db: float) -> str:
+def heading_words(yaw_deg: FloatArray) -> str:
+    """Heading for which a prediction holds.
+
+    Examples
+    --------
+    >>> heading_words(np.array([90.0, 90.0])), heading_words(np.array([0.0, 90.0])), heading_words(np.array([np.nan]))
+    ('heading 90 degrees', 'headings of the route', 'heading open')
+    """
+    if not np.isfinite(yaw_deg).all():
+        return "heading open"
+    return "headings of the route" if np.ptp(yaw_deg) else f"heading {yaw_deg[0]:.0f} degrees"
+
+
+def first_words(
+    correction: Correction | None, outside: float, expected_db: float, band_db: float, heading: str = "heading open"
+) -> str:
     """First paragraph of terminal, page and metrics.json: one error with its band, best baseline, one next step.
 
     Parameters
@@ -121,12 +136,14 @@ def first_words(correction: Correction | None, outside: float, expected_db: floa
         Stated standard deviation of a mean over 4 s on a new flight, root mean square over the points [dB].
     band_db : float
         Half of the 90 % interval of a sample, mean over the points [dB].
+    heading : str
+        As :func:`heading_words` has it.
 
     Returns
     -------
     str
     """
-    texts = filled([EXPECTED], error=expected_db, band=band_db)
+    texts = filled([EXPECTED], error=expected_db, band=band_db, heading=heading)
     step = ""
     if correction is None:
         texts.append(REMEMBERED)

@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 
 from ...common.errors import InputError, UsageError
+from ...common.geodesy import bearing_deg
 from ...common.outputs import OutputFolder
 from ...common.stages import Stages
 from ...common.units import FloatArray
@@ -282,13 +283,15 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     out = []
     for path in plan.routes:
         targets = find_targets(path, site, TargetOptions(heights_m=plan.heights_m))
-        if targets.kind == "grid" or len(targets) < 2:
+        if targets.kind == "grid" or targets.known.sum() < 2:
             raise InputError("no route", expected="a .plan, KML, CSV or log with two points or more", path=path)
-        good = targets.known
+        place, yaw = targets.position_m[targets.known], targets.yaw_deg[targets.known]
+        steps = np.diff(place, axis=0)
+        yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))  # else the nose goes ahead
         ground = site.datum.takeoff_ground_m
         points = [
             Waypoint(east_m=float(p[0]), north_m=float(p[1]), height_m=float(p[2]) - ground, yaw_deg=float(y))
-            for p, y in zip(targets.position_m[good], targets.yaw_deg[good], strict=True)
+            for p, y in zip(place, yaw, strict=True)
         ]
         route = _raised(flown(path.name, _corners(points), plan.speed_mps), site)
         refused = "leaves the allowed area" if _leaves_area(route, area) else ""

@@ -277,10 +277,7 @@ def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
         how = "the best on other flights ({:.1f} dB, free space {:.1f} dB)".format(*best.elsewhere_db)
     if chosen == AS_SET:
         return f"{text} The settings of this flight file are {how}."
-    return (
-        f"{text} \u201c{chosen}\u201d is {how}: {error[chosen]:.1f} dB. "
-        "Next: report --recommend FILE writes its settings."
-    )
+    return f"{text} \u201c{chosen}\u201d is {how}: {error[chosen]:.1f} dB."
 
 
 def training_sentence(names: Sequence[str], what: str) -> str:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import os
+import shlex
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -73,11 +74,11 @@ def tap_modems(
     stop = Stop()
     with contextlib.ExitStack() as stack:
         stack.callback(stop.close)
-        stack.enter_context(stop.on_signals())
         feed = None
         if shown.web is not None:
             feed = Feed(names)
             _serve(stack, feed, twin, shown, ", ".join(names))
+        stack.enter_context(stop.on_signals())  # nothing is logged before, so nothing has to end in order
         sessions = []
         for number, (port, name) in enumerate(zip(ports, names, strict=True)):
             alone = len(ports) == 1
@@ -148,11 +149,20 @@ def _names(paths: Sequence[str]) -> list[str]:
 
 
 def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str, Any]:
-    from .live_twin import report_commands
-
     records, gaps = sum(s.records for s in summaries), sum(s.gaps for s in summaries)
     lost = sum(s.lost_records for s in summaries)
     at = time.strftime("%H:%M:%S", time.gmtime())
     counts = f"{records} records, {counted(gaps, 'gap')}" + (f", {lost} records lost" if lost else "")
     text = f"The tap ended at {at} UTC ({summaries[0].reason}): {counts}. The log is in {folder}."
-    return {"text": text, "commands": report_commands(folder, twin)}
+    return {"text": text, "commands": _report_commands(folder, twin)}
+
+
+def _report_commands(folder: Path, twin: Any) -> list[str]:
+    """Commands that make the report of a tapped flight."""
+    log = shlex.quote(str(folder))
+    telemetry = "VEHICLEOUT_LOG" if twin is None else shlex.quote(str(twin.telemetry))
+    zone = "ZONE" if twin is None else twin.settings.timezone
+    return [
+        f"aerpaw-cmp ingest {log} {telemetry} --timezone {zone} --draft flight.yaml",
+        "aerpaw-cmp report flight.yaml",
+    ]

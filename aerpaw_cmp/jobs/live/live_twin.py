@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -174,17 +173,6 @@ class LiveTwin:
 
 def _telemetry_log(settings: FlightFile) -> LogSettings:
     return next((entry for entry in settings.logs if entry.reader in (None, "vehicle_out")), settings.logs[0])
-
-
-def report_commands(folder: Path, twin: LiveTwin | None) -> list[str]:
-    """Commands that make the report of a tapped flight."""
-    log = shlex.quote(str(folder))
-    telemetry = "VEHICLEOUT_LOG" if twin is None else shlex.quote(str(twin.telemetry))
-    zone = "ZONE" if twin is None else twin.settings.timezone
-    return [
-        f"aerpaw-cmp ingest {log} {telemetry} --timezone {zone} --draft flight.yaml",
-        "aerpaw-cmp report flight.yaml",
-    ]
 
 
 class FlownAgain:

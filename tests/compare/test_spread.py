@@ -4,9 +4,10 @@ import dataclasses
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from aerpaw_cmp.compare.gains.direction_gain import LinkSamples
-from aerpaw_cmp.compare.gains.spread import SHARES, Spread, StatedSpread, fading_of, inside_shares
+from aerpaw_cmp.compare.gains.spread import NO_SPREAD, SHARES, LostLock, Spread, StatedSpread, fading_of, inside_shares
 
 N = 60_000
 
@@ -54,6 +55,31 @@ def test_intervals_hold_their_share_where_paths_fade(direct: float, gone_db: flo
     for share in SHARES:
         assert held[f"inside_{100 * share:.0f}"] == pytest.approx(share, abs=0.025)
     assert error.std() == pytest.approx(float(np.sqrt(np.mean(spread.total_db(gain) ** 2))), rel=0.02)
+
+
+def test_two_parts_hold_their_share_and_their_score_is_the_integral_over_levels() -> None:
+    """Levels in lock lie about the prediction, others 20 dB below and less: no normal distribution holds both."""
+    random = np.random.default_rng(7)
+    probability, lost_db = random.uniform(0.0, 1.0, N), random.uniform(-25.0, -15.0, N)
+    locked = random.random(N) < probability
+    error = np.where(locked, random.normal(1.0, 3.0, N), random.normal(lost_db, 6.0))
+    lock = LostLock(probability=probability, locked_db=1.0, lost_db=lost_db, locked_sd_db=3.0, lost_sd_db=6.0)
+    stated = StatedSpread(gain_sd_db=np.ones(N), spread=NO_SPREAD, lock=lock)
+    for share, held in zip(SHARES, inside_shares(error, stated).values(), strict=True):
+        assert held == pytest.approx(share, abs=0.015)
+    grid = np.linspace(-80.0, 60.0, 7001)
+    for first in range(3):
+        part = {name: getattr(lock, name)[first : first + 1] for name in ("probability", "lost_db")}
+        alone = StatedSpread(gain_sd_db=np.ones(1), spread=NO_SPREAD, lock=dataclasses.replace(lock, **part))
+        below = probability[first] * norm.cdf(grid, 1.0, 3.0) + (1 - probability[first]) * norm.cdf(
+            grid, lost_db[first], 6.0
+        )
+        score = 0.02 * ((below - (grid > error[first])) ** 2).sum()
+        assert alone.crps_db(error[first : first + 1]) == pytest.approx(score, abs=0.02)
+    spread = Spread(own_sd_db=3.0, noise_sd_db=4.0, fading_sd_db=0.0, fading_kurtosis=0.0, bin_s=4.0)
+    normal = StatedSpread(gain_sd_db=np.array([0.0, np.nan]), spread=spread)
+    assert normal.crps_db(np.array([0.0, 2.0])) == pytest.approx(5.0 * (np.sqrt(2.0) - 1.0) / np.sqrt(np.pi))
+    assert np.isnan(normal.crps_db(np.array([np.nan, 2.0])))
 
 
 def test_a_file_says_its_spread_and_one_of_another_kind_none() -> None:

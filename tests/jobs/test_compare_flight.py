@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,16 +13,19 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import noise_floor_dbm
+from aerpaw_cmp.compare.gains.spread import NO_SPREAD, StatedSpread
 from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.reporting import compare_flight as compared
 from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series, compare_rss_series, pairs_of
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.foliage_notes import foliage_notes
 from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
 from aerpaw_cmp.report.content.flight_parts import rank_warnings, rss_warnings, track_of
 from aerpaw_cmp.report.words.flight import instants
+from aerpaw_cmp.site.antenna.learned import Errors
 from tests.simulated import write_yaml
 from tests.tables import LW1, ORIGIN, POSITIONS, eastwards, rank_log, rss_log, write_csv
 
@@ -433,3 +437,39 @@ def test_the_noise_under_an_snr_cuts_nothing_off(tmp_path: Path) -> None:
     assert deaf.score.n == 120  # a level below -20 dBm would be out of coverage
     assert deaf.further.snr.noise_dbm == -20.0
     assert snr_flight(tmp_path / "b", 0.0).further.snr is None
+
+
+@pytest.mark.parametrize(("low_db", "expected"), [(3.4, True), (3.6, False), (float("nan"), True)])
+def test_an_expectation_that_the_flight_refutes_is_withdrawn(
+    monkeypatch: pytest.MonkeyPatch, low_db: float, expected: bool
+) -> None:
+    """Flights left out had 3.5 dB: a flight whose interval begins above has another airframe, or another fault."""
+    errors = Errors(series=2, rmse_db=3.5, rmse_4s_db=2.8, free_space_rmse_db=6.1, inside_90=0.9)
+    monkeypatch.setattr(compared, "errors_elsewhere", lambda *_: errors)
+    data = SimpleNamespace(settings=SimpleNamespace(antennas={}), folder=Path())
+    known = compared._elsewhere(data, SimpleNamespace(locked=None), SimpleNamespace(rmse_ci95_db=(low_db, 9.0)))
+    assert (known is not None and known["rmse_db"] == 3.5) == expected
+
+
+def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In lock about the prediction and the flight's mean error in lock, else about what other flights wrote without."""
+    lock = SimpleNamespace(
+        gain_db=-100.0, per_db=0.1, share=0.7, locked_sd_db=7.0, lost_db=-27.0, lost_per_db=0.5, lost_sd_db=8.0
+    )
+    monkeypatch.setattr(compared, "lock_elsewhere", lambda *_: lock)
+    case = SimpleNamespace(
+        series=SimpleNamespace(locked=np.array([1.0, 1.0, 0.0]), link=SimpleNamespace(transmit_power_dbm=40.0)),
+        data=SimpleNamespace(settings=SimpleNamespace(antennas={}), folder=Path()),
+        levels=SimpleNamespace(simulated_db=np.array([-50.0, -60.0, -70.0])),
+    )
+    score = SimpleNamespace(residual_db=np.array([2.0, 4.0, -9.0]), offset_db=-5.0)
+    stated = StatedSpread(gain_sd_db=np.ones(3), spread=NO_SPREAD)
+    parts = compared._with_lock(case, score, stated).lock
+    assert parts.locked_db == 3.0
+    assert parts.probability == pytest.approx(1.0 / (1.0 + np.exp([-1.0, 0.0, 1.0])))
+    assert parts.lost_db == pytest.approx(
+        [-27.0 + shift - 5.0 + level for shift, level in ((5, 50), (0, 60), (-5, 70))]
+    )
+    assert (parts.locked_sd_db, parts.lost_sd_db) == (7.0, 8.0)
+    case.series.locked = None
+    assert compared._with_lock(case, score, stated) is stated

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass
 import numpy as np
 
 from ...common.units import FloatArray
+from ..judge.entries import crps_normal
 from .direction_gain import LinkSamples
 
 # Nominal shares of samples within an interval.
@@ -92,42 +93,113 @@ NO_SPREAD = Spread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurt
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LostLock:
+    """Error of a prediction whose receiver may have lost its lock: normal in lock, and about another level without.
+
+    Parameters
+    ----------
+    probability : (n,)
+        Of lock.
+    locked_db : float
+        Mean error in lock.
+    lost_db : (n,)
+        Mean error without.
+    locked_sd_db, lost_sd_db : float
+    """
+
+    probability: FloatArray
+    locked_db: float
+    lost_db: FloatArray
+    locked_sd_db: float
+    lost_sd_db: float
+
+    def quantile_db(self, share: float) -> FloatArray:
+        """Error (n,) below which a share of the samples lies, to a hundredth of a dB."""
+        from scipy.special import ndtr
+
+        reach = 6.0 * max(self.locked_sd_db, self.lost_sd_db)
+        low = np.minimum(self.locked_db, self.lost_db) - reach
+        high = np.maximum(self.locked_db, self.lost_db) + reach
+        for _ in range(16):
+            middle = 0.5 * (low + high)
+            below = self.probability * ndtr((middle - self.locked_db) / self.locked_sd_db)
+            below += (1.0 - self.probability) * ndtr((middle - self.lost_db) / self.lost_sd_db)
+            low, high = np.where(below < share, middle, low), np.where(below < share, high, middle)
+        return np.asarray(0.5 * (low + high))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class StatedSpread:
-    """Error bars of one series: standard deviation of the gain (n,) [dB], NaN without a pose, and what is beside it."""
+    """Error bars of one series: standard deviation of the gain (n,) [dB], NaN without a pose, and what is beside it.
+
+    ``lock``: in place of the spread, of a receiver that loses its lock.
+    """
 
     gain_sd_db: FloatArray
     spread: Spread
+    lock: LostLock | None = None
 
     @property
     def total_db(self) -> FloatArray:
         """Standard deviation (n,) of a sample about its prediction [dB]."""
         return self.spread.total_db(self.gain_sd_db)
 
+    def band_db(self, share: float) -> tuple[FloatArray, FloatArray]:
+        """Ends (n,) of the interval about the prediction that holds a share of the samples [dB]."""
+        if self.lock is None:
+            half = self.spread.half_width_db(self.gain_sd_db, share)
+            return -half, half
+        return self.lock.quantile_db(0.5 - 0.5 * share), self.lock.quantile_db(0.5 + 0.5 * share)
+
+    def crps_db(self, error_db: FloatArray) -> float:
+        """Mean continuous ranked probability score of errors (n,) [dB]; NaN does not count.
+
+        Notes
+        -----
+        Of a mixture of normal distributions in closed form (Grimit, Gneiting, Berrocal and Johnson 2006,
+        doi:10.1256/qj.05.235).
+        """
+        zero, lock = np.zeros(len(error_db)), self.lock
+        parts = [(zero + 1.0, zero, self.total_db)] if lock is None else [
+            (lock.probability, zero + lock.locked_db, zero + lock.locked_sd_db),
+            (1.0 - lock.probability, lock.lost_db, zero + lock.lost_sd_db),
+        ]  # fmt: skip
+
+        def distance(mean: FloatArray, sd: FloatArray) -> FloatArray:
+            return crps_normal(mean, sd) + sd / np.sqrt(np.pi)
+
+        score = sum(p * distance(error_db - mean, sd) for p, mean, sd in parts)
+        score -= 0.5 * sum(
+            p * q * distance(mean - other, np.hypot(sd, other_sd))
+            for p, mean, sd in parts
+            for q, other, other_sd in parts
+        )
+        return float(np.nanmean(score)) if np.isfinite(score).any() else math.nan
+
     def columns(self, level_dbm: FloatArray) -> dict[str, FloatArray]:
         """Parts and 90 % interval about a level (n,), by the names of rss.csv."""
         known = np.where(np.isfinite(self.gain_sd_db), 1.0, np.nan)
-        half = self.spread.half_width_db(self.gain_sd_db, BAND)
+        low, high = self.band_db(BAND)
         return {
             "simulated_sd_db": self.total_db,
             "gain_sd_db": self.gain_sd_db,
             "own_sd_db": known * self.spread.own_sd_db,
             "noise_sd_db": known * self.spread.noise_sd_db,
             "fading_sd_db": known * self.spread.fading_sd_db,
-            "simulated_low_dbm": level_dbm - half,
-            "simulated_high_dbm": level_dbm + half,
+            "simulated_low_dbm": level_dbm + low,
+            "simulated_high_dbm": level_dbm + high,
         }
 
 
 def inside_shares(error_db: FloatArray, stated: StatedSpread) -> dict[str, float]:
     """Share of errors (n,) inside the interval of each nominal share: ``inside_50`` and so on; NaN does not count."""
     good = np.isfinite(error_db) & np.isfinite(stated.gain_sd_db)
-    error, sd = np.abs(error_db[good]), stated.gain_sd_db[good]
-    return {
-        f"inside_{100 * share:.0f}": float(np.mean(error < stated.spread.half_width_db(sd, share)))
-        if len(error)
-        else math.nan
-        for share in SHARES
-    }
+    out = {}
+    for share in SHARES:
+        low, high = stated.band_db(share)
+        inside = (low < error_db) & (error_db < high)
+        out[f"inside_{100 * share:.0f}"] = float(inside[good].mean()) if good.any() else math.nan
+    return out
 
 
 def fading_of(series: Sequence[LinkSamples], bin_s: float) -> tuple[float, float]:

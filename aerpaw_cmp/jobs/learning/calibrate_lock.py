@@ -77,6 +77,7 @@ def _learned(flights: Sequence[_Levels]) -> LearnedLock | None:
         gain_db=round(every.level_db, 2),
         per_db=round(every.per_db, 4),
         share=round(every.share, 3),
+        **_two_parts(flights, every.level_db),
         flights=len(scores),
         brier=mean("brier"),
         constant_brier=mean("constant_brier"),
@@ -86,6 +87,26 @@ def _learned(flights: Sequence[_Levels]) -> LearnedLock | None:
         floor_rmse_db=mean("rmse_db"),
         free_space_floor_rmse_db=mean("free_space_rmse_db"),
     )
+
+
+# Of a receiver that always writes the same level without lock.
+_LEAST_SD_DB = 0.5
+
+
+def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
+    """Spread of the level in lock, and the line of its mean over path gain without, with the spread about it."""
+    errors = [(f.measured_db - f.level_db)[f.detected] for f in flights if f.detected.any()]
+    gain, lost = (np.concatenate([getattr(f, k)[~f.detected] for f in flights]) for k in ("level_db", "measured_db"))
+    slope, level = np.polyfit(gain - gain_db, lost, 1)
+    beside = lost - level - slope * (gain - gain_db)
+    spread = float(np.sqrt(np.mean([e.var() for e in errors])))
+    numbers = {
+        "locked_sd_db": spread,
+        "lost_db": level,
+        "lost_per_db": slope,
+        "lost_sd_db": max(beside.std(), _LEAST_SD_DB),
+    }
+    return {name: round(float(value), 3) for name, value in numbers.items()}
 
 
 def lock_words(lock: LearnedLock) -> str:

@@ -22,7 +22,7 @@ from ...common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ...compare import offset as offsets
 from ...compare import rank as ranks
 from ...compare.flight_verdict import flight_verdict, with_corrected_verdicts
-from ...compare.gains.spread import StatedSpread, inside_shares
+from ...compare.gains.spread import LostLock, StatedSpread, inside_shares
 from ...compare.judge.ladder import log_distance_level_db
 from ...compare.level import rss
 from ...compare.level.detection import DetectionForecast, DetectionScore, score_detection
@@ -51,6 +51,7 @@ from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...flight.settings import RssSettings, RtSettings
 from ...flight.training import learned_here
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
+from ...site.antenna.learned import LearnedLock
 from ...site.site import Site
 from .ground_error import agreement_by_ground
 from .levels import Levels, levels_of, stated_spread
@@ -163,7 +164,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     spans = _worst(series.time, score.residual_db, case.position_m, case.geometry, direct)
     if case.trained:
         score, residual_by, spans = rss.without_errors(score), {}, []
-    stated = stated_spread(replayed)
+    stated = _with_lock(case, score, stated_spread(replayed))
     return RssResult(
         **named(series, "tower channel unit time"),
         **named(case, "position_m geometry"),
@@ -179,6 +180,30 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         further=_further(case, score, stated, {name: table.explained for name, table in residual_by.items()}),
         stated=stated,
     )
+
+
+def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> StatedSpread | None:
+    """Error bars in two parts, where other flights taught when the receiver loses its lock."""
+    series, error_db = case.series, score.residual_db
+    lock = None if series.locked is None else lock_elsewhere(case.data.settings.antennas, series, case.data.folder)
+    locked = None if lock is None else error_db[(series.locked == 1.0) & np.isfinite(error_db)]
+    if stated is None or lock is None or locked is None or not len(locked):
+        return stated
+    above_db = case.levels.simulated_db - series.link.transmit_power_dbm - lock.gain_db
+    parts = LostLock(
+        probability=_forecast(series, lock).probability(case.levels.simulated_db),
+        locked_db=float(locked.mean()),
+        lost_db=lock.lost_db + lock.lost_per_db * above_db + score.offset_db - case.levels.simulated_db,
+        locked_sd_db=lock.locked_sd_db,
+        lost_sd_db=lock.lost_sd_db,
+    )
+    return dataclasses.replace(stated, lock=parts)
+
+
+def _forecast(series: RssSeries, lock: LearnedLock) -> DetectionForecast:
+    """P(lock) of the levels of a series."""
+    level_db = lock.gain_db + series.link.transmit_power_dbm
+    return DetectionForecast(level_db=level_db, per_db=lock.per_db, share=lock.share)
 
 
 def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
@@ -240,7 +265,7 @@ def _further(
         repeatability={name: repeatability(*pair, _PASSES_WITHIN_M) for name, pair in passes.items()},
         simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
         error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
-        elsewhere=_elsewhere(case.data, series),
+        elsewhere=_elsewhere(case.data, series, score),
         trained_on=case.trained or None,
         rmse_bound=_bound(series, score),
     )
@@ -275,9 +300,11 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
     return offsets.grid_offset(inliers_db, levels.simulated_db, span_db=settings.span_db).rmse_db
 
 
-def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
-    """Error to expect on another flight, where the antennas of the site say it."""
+def _elsewhere(data: FlightData, series: RssSeries, score: rss.RssComparison) -> dict[str, float] | None:
+    """Error to expect on another flight, where the antennas of the site say it and this flight does not refute it."""
     errors = errors_elsewhere(data.settings.antennas, series, data.folder)
+    if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:
+        return None
     lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
     out = {} if errors is None else named(errors, "rmse_db free_space_rmse_db rmse_4s_db")
     out |= {} if lock is None else named(lock, "floor_rmse_db free_space_floor_rmse_db")
@@ -287,7 +314,9 @@ def _elsewhere(data: FlightData, series: RssSeries) -> dict[str, float] | None:
 def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[str, float]:
     """Parts of the stated standard deviation [dB], and the shares of samples that its intervals hold, where scored."""
     parts = {"gain_sd_db": float(np.nanmean(stated.gain_sd_db)), **dataclasses.asdict(stated.spread)}
-    return parts | ({} if residual_db is None else inside_shares(residual_db, stated))
+    if residual_db is None:
+        return parts
+    return parts | inside_shares(residual_db, stated) | {"crps_db": stated.crps_db(residual_db)}
 
 
 def _baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
@@ -381,9 +410,7 @@ def _detection(data: FlightData, series: RssSeries, levels: Levels, free_space_d
         floor_db = float(np.nanmin(levels.measured_db))
     at = known & levels.posed
     lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
-    forecast = None if lock is None else DetectionForecast(
-        level_db=lock.gain_db + series.link.transmit_power_dbm, per_db=lock.per_db, share=lock.share
-    )  # fmt: skip
+    forecast = None if lock is None else _forecast(series, lock)
     score = score_detection(
         rss.seconds(series.time[at]),
         levels.measured_db[at],

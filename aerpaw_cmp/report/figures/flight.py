@@ -75,8 +75,11 @@ def _band_words(panel: RssResult) -> str:
     if not bars:
         return ""
     parts = ", ".join(f"{what} {bars[name]:.1f} dB" for name, what in SPREAD_PARTS.items())
-    inside = bars.get("inside_90")
-    return f" Band: 90 % interval of a sample about the prediction; its standard deviation joins {parts}." + (
+    inside, two_parts = bars.get("inside_90"), panel.stated is not None and panel.stated.lock is not None
+    made = "it joins levels in lock and without, by the probability of lock" if two_parts else (
+        f"its standard deviation joins {parts}"
+    )  # fmt: skip
+    return f" Band: 90 % interval of a sample about the prediction; {made}." + (
         "" if inside is None else f" It holds {100 * inside:.0f} % of the samples of this flight."
     )
 

@@ -52,6 +52,8 @@ class Errors(StrictModel):
 class LearnedLock(StrictModel):
     """Lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) of the predicted path gain [dB].
 
+    ``locked_sd_db``: of levels about their prediction, in lock. Without, they lie about ``lost_db`` at ``gain_db``,
+    ``lost_per_db`` higher for each dB of path gain, with ``lost_sd_db`` [unit of the measurement].
     The scores are means over flights left out: Brier and log score (nat) beside those of the constant ``share``, and
     the RMSE [dB] of all samples where levels below the floor count as the floor.
     """
@@ -59,6 +61,10 @@ class LearnedLock(StrictModel):
     gain_db: float
     per_db: Annotated[float, Field(gt=0)]
     share: Annotated[float, Field(gt=0, lt=1)]
+    locked_sd_db: Annotated[float, Field(gt=0)]
+    lost_db: float
+    lost_per_db: float
+    lost_sd_db: Annotated[float, Field(gt=0)]
     flights: int
     brier: float
     constant_brier: float

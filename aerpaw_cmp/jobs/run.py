@@ -629,7 +629,7 @@ def run_calibrate(
     from ..site.siteyaml import site_model
     from .learning.calibrate import calibrate, load_calibration, read_flights
     from .learning.calibrate_rank import fit_rank
-    from .learning.calibration_files import Calibrated, site_entries, write_files
+    from .learning.calibration_files import Calibrated, site_entry, write_files
     from .tasks.manifest import inputs_of_flights, inputs_of_site
 
     settings = load_calibration(path)
@@ -661,6 +661,6 @@ def run_calibrate(
         file.write(sealed(text))
     if into_site is not None:
         command = f"aerpaw-cmp calibrate {path.name} --into-site {into_site}"
-        entries = site_entries(calibrated, command)
-        metrics["into_site"] = [str(f) for entry in entries for f in remember(into_site, *entry)]
+        entry, tables = site_entry(calibrated, command)
+        metrics["into_site"] = [str(f) for f in remember(into_site, settings.calibration, entry, tables)]
     return JobOutcome(folder=folder, metrics=metrics, files=(target,))

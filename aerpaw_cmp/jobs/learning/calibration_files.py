@@ -273,19 +273,36 @@ def write_files(
     return metrics, text
 
 
-def site_entries(calibrated: Calibrated, command: str) -> list[tuple[str, Entry, dict[str, bytes]]]:
-    """Entries that a site remembers of a calibration: their names, the entries, and their tables by name."""
-    name, out = calibrated.settings.calibration, []
+def site_entry(calibrated: Calibrated, command: str) -> tuple[Entry, dict[str, bytes]]:
+    """Entry that a site remembers of a calibration, antennas and rank receivers, and its tables by name.
+
+    Parameters
+    ----------
+    calibrated : Calibrated
+    command : str
+        That makes the entry.
+
+    Returns
+    -------
+    entry : Entry
+    tables : dict of str to bytes
+    """
+    made = Entry(**_provenance(calibrated.settings, calibrated.flights, command))
+    tables: dict[str, bytes] = {}
     if calibrated.calibration is not None:
-        out.append((name, *site_entry(calibrated.calibration, command)))
+        series, tables = _learned_series(calibrated.calibration)
+        ground_m = calibrated.calibration.ground.used_m
+        errors = _errors(calibrated.calibration)
+        made = made.model_copy(update={"errors": errors, "series": series, "ground_roughness_m": ground_m})
     if calibrated.ranked is not None:
-        rank_name = f"{name}_rank" if out else name
-        out.append((rank_name, *receiver_entry(calibrated.settings, calibrated.flights, calibrated.ranked, command)))
-    return out
+        file = f"{safe_name(calibrated.settings.calibration)}.receiver.json.gz"
+        made = made.model_copy(update={"receivers": _learned_receivers(calibrated.flights, calibrated.ranked, file)})
+        tables = {**tables, file: calibrated.ranked.text().encode()}
+    return made, tables
 
 
-def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str, bytes]]:
-    """Entry that a site remembers of a calibration, and its tables by name."""
+def _learned_series(calibration: Calibration) -> tuple[list[LearnedSeries], dict[str, bytes]]:
+    """Antennas of every tower and channel, and their tables by name."""
     name, maps = calibration.settings.calibration, _antenna_maps(calibration)
     tables: dict[str, bytes] = {}
     series = []
@@ -312,15 +329,7 @@ def site_entry(calibration: Calibration, command: str) -> tuple[Entry, dict[str,
                 level=_level(calibration, first[1], *ends),
             )
         )
-    return (
-        Entry(
-            **_provenance(calibration.settings, calibration.flights, command),
-            errors=_errors(calibration),
-            series=series,
-            ground_roughness_m=calibration.ground.used_m,
-        ),
-        tables,
-    )
+    return series, tables
 
 
 # Of a series: their standard deviations stand for its mean.
@@ -357,27 +366,8 @@ def _at_unit_gain(lock: LearnedLock | None, *ends: AntennaMap) -> LearnedLock | 
     return lock.model_copy(update={"gain_db": round(lock.gain_db - sum(end.level_db for end in ends), 2)})
 
 
-def receiver_entry(
-    settings: CalibrationFile, flights: Sequence[FlightData], ranked: RankCalibration, command: str
-) -> tuple[Entry, dict[str, bytes]]:
-    """Entry that a site remembers of rank receivers, and its tables.
-
-    Parameters
-    ----------
-    settings : CalibrationFile
-    flights : sequence of FlightData
-        That the receivers were fitted on.
-    ranked : RankCalibration
-    command : str
-        That makes the entry.
-
-    Returns
-    -------
-    entry : Entry
-    files : dict of str to bytes
-        By name.
-    """
-    file = f"{safe_name(settings.calibration)}.receiver.json.gz"
+def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, file: str) -> list[LearnedReceiver]:
+    """Receivers that were fitted on flights, with their scores on flights left out."""
     receivers = []
     for tower in ranked.receivers:
         scores = [score for _, at, score in ranked.scores["flight_left_out"] if at == tower]
@@ -391,7 +381,7 @@ def receiver_entry(
         receivers.append(
             LearnedReceiver(tower=tower, quantity=_quantity_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
         )
-    return Entry(**_provenance(settings, flights, command), receivers=receivers), {file: ranked.text().encode()}
+    return receivers
 
 
 def _reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:

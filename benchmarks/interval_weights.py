@@ -29,8 +29,11 @@ from aerpaw_cmp.compare.statistics.memory import (
 )
 
 TAIL, STEEP, SMOOTH = 0.025, 5.0, 3e-5
-# Coverage aimed at; price of the width; price of a coverage that is too large, over that of one too small.
-AIM = {"mean": (0.952, 5e-3, 1.0), "power": (0.955, 1.9e-2, 1.0), "ratio": (0.951, 8e-3, 0.15)}
+# Coverage aimed at; price of the width; price of a coverage that is too large, over that of one too small; distance
+# from the aim at which a cell counts twice what its square says, so that none pays for the others.
+AIM = {
+    "mean": (0.952, 5e-3, 1.0, 0.02), "power": (0.955, 1.9e-2, 1.0, np.inf), "ratio": (0.951, 8e-3, 0.15, np.inf),
+}  # fmt: skip
 SHAPE = (len(WHITE_SHARES) + 1, len(RATES))
 
 
@@ -58,7 +61,7 @@ def power_cell(x: FloatArray, truth: float) -> tuple[FloatArray, FloatArray, Flo
     third, below = 2.0 / (9.0 * freedom), np.zeros_like(square)
     normals = ndtri((np.arange(48) + 0.5) / 48)
     for z, other in zip(normals, np.random.default_rng(1).permutation(normals), strict=True):
-        rest = truth * np.exp(-tails * other * CALM[int(other > 0.0)])
+        rest = truth * np.exp(-tails * other * (CALM if other > 0.0 else 1.0))
         rest = (rest - fast / np.maximum(1.0 - third + np.sqrt(third) * z, 0.05) ** 3)[:, None]
         share = gammaincc(0.5 * terms, 0.5 * square * known.power / np.maximum(rest, 1e-12))
         below += np.where(rest > 0.0, share, 0.0) / len(normals)
@@ -97,7 +100,7 @@ def scaled(parts: tuple[FloatArray, FloatArray, FloatArray], of_coverage: float,
 
 def loss(log_weight: FloatArray, made: list[Cell], kind: str) -> tuple[float, FloatArray]:
     """Sum to be minimised, and its gradient."""
-    aim, price, idle = AIM[kind]
+    aim, price, idle, far = AIM[kind]
     prior, total, gradient = np.exp(log_weight - log_weight.max()), 0.0, np.zeros(log_weight.size)
     for likelihood, below, width, weight, of_width in made:
         share = likelihood * prior
@@ -108,8 +111,9 @@ def loss(log_weight: FloatArray, made: list[Cell], kind: str) -> tuple[float, Fl
         cost = weight * (1.0 if excess < 0.0 else idle)
         slope = STEEP * over * under * (under - over) / (chance * (1.0 - chance)) / len(chance)
         size = (share * width).sum(axis=1)
-        total += cost * excess**2 + of_width * 0.5 * price * np.log(size).mean()
-        gradient += cost * ((2.0 * excess * slope)[:, None] * share * (below - chance[:, None])).sum(axis=0)
+        total += cost * (excess**2 + excess**4 / far**2) + of_width * 0.5 * price * np.log(size).mean()
+        pull = 2.0 * excess + 4.0 * excess**3 / far**2
+        gradient += cost * ((pull * slope)[:, None] * share * (below - chance[:, None])).sum(axis=0)
         gradient += of_width * 0.5 * price * (share * (width - size[:, None]) / size[:, None]).mean(axis=0)
     table = log_weight.reshape(SHAPE)
     bend, away = np.diff(table, 2, axis=1), table - table.mean()

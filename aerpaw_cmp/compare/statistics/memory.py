@@ -42,9 +42,9 @@ Kind = Literal["mean", "power", "ratio"]
 # Logarithms of the weights in tenths, by kind, rough memories of each white share and smooth ones, and rate.
 _TENTHS = Path(__file__).with_name("memory_weights.json")
 
-# Standard deviations of the logarithm of the power below and above, in those that the fourth moment says; by
-# simulation with Student's t of four degrees of freedom. Most sequences with heavy tails look calmer than the process.
-CALM = 0.7, 1.8
+# Of the standard deviation of the logarithm of the power upwards, over that which the fourth moment says; by simulation
+# with Student's t of four degrees of freedom. Most sequences with heavy tails look calmer than the process.
+CALM = 1.8
 
 # Draws come in pairs of opposite sign, so that exchanging two models turns an interval about exactly.
 _PAIRS = 2048
@@ -197,8 +197,8 @@ def mean_draws(values: FloatArray, kind: Kind = "mean") -> FloatArray:
 def heavy_tails(values: FloatArray, terms: Terms) -> float:
     """Standard deviation of the logarithm of the mean square (see :data:`CALM`) for tails heavier than normal."""
     square = np.square(values - values.mean())
-    # a short normal sequence shows heavy tails by chance: only what is beyond counts
-    excess = float(np.mean(square * square)) / float(square.mean()) ** 2 - 3.0 - np.sqrt(24.0 / terms.freedom)
+    # a short normal sequence shows heavy tails by chance: only what is beyond half of its spread counts
+    excess = float(np.mean(square * square)) / float(square.mean()) ** 2 - 3.0 - np.sqrt(6.0 / terms.freedom)
     return float(np.sqrt(max(excess, 0.0) / terms.freedom))
 
 
@@ -220,5 +220,5 @@ def power_draws(values: FloatArray) -> FloatArray:
     third = 2.0 / (9.0 * terms.fast_freedom)
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
-    tails = np.exp(heavy_tails(values, terms) * np.where(normal > 0.0, CALM[1], CALM[0]) * normal)
+    tails = np.exp(heavy_tails(values, terms) * np.where(normal > 0.0, CALM, 1.0) * normal)
     return np.tile((scale * memories(len(terms.slow)).power[index] + fast) * tails, 2)

@@ -365,7 +365,7 @@ def test_the_packaged_memory_is_small_and_says_where_it_comes_from() -> None:
 
 @pytest.mark.parametrize(
     ("name", "rmse_db", "rmse_4s_db", "of_free_space"),
-    [("dataset12", 3.7, 3.0, 0.62), ("lte", 6.1, 3.75, 0.9), ("afar", 12.0, 8.8, 0.8)],
+    [("dataset12", 3.7, 3.0, 0.62), ("lte", 6.1, 3.75, 0.9), ("afar", 12.0, 8.8, 0.8), ("nr_rank", 3.7, 3.1, 0.75)],
 )
 def test_packaged_antennas_predict_flights_left_out(name, rmse_db, rmse_4s_db, of_free_space) -> None:
     """Bounds on what tests/field/test_learned_site.py makes anew from the logs."""

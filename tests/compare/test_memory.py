@@ -135,7 +135,7 @@ def test_each_draw_is_one_memory_by_its_weight_its_scale_and_two_normals(
             assert (drawn[k], drawn[k + 4]) == pytest.approx(expected)
     every = np.append(slow, np.sqrt(terms.fast_power))
     away = values - values.mean()
-    excess = np.mean(away**4) / np.mean(away**2) ** 2 - 3.0 - np.sqrt(24.0 / terms.freedom)
+    excess = np.mean(away**4) / np.mean(away**2) ** 2 - 3.0 - np.sqrt(6.0 / terms.freedom)
     assert excess > 0.0
     assert np.square(every).sum() == pytest.approx(values.var())
     third = 2.0 / (9.0 * terms.fast_freedom)
@@ -143,7 +143,7 @@ def test_each_draw_is_one_memory_by_its_weight_its_scale_and_two_normals(
     for k, i in enumerate(picked("power")):
         cube_root = max(1.0 - third + np.sqrt(third) * other[k], 0.05)  # Wilson and Hilferty
         power = square[i] / chi_squared[k] * known.power[i] + terms.fast_power / cube_root**3
-        side = CALM[int(normal[k] > 0.0)]
+        side = CALM if normal[k] > 0.0 else 1.0
         expected = power * np.exp(side * np.sqrt(excess / terms.freedom) * normal[k])
         assert (drawn[k], drawn[k + 4]) == pytest.approx((expected, expected))
     with_one_term = np.cos(np.pi * 3 * (np.arange(200) + 0.5) / 200)
@@ -168,7 +168,7 @@ def test_draws_follow_unit_and_zero_and_do_not_know_the_direction_of_time() -> N
 
 @pytest.mark.parametrize(("share", "widened"), [(0.99, False), (1.01, True)])
 def test_only_tails_beyond_chance_widen_the_power(share: float, widened: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The excess kurtosis of n normal samples has a standard error of sqrt(24 / n): only beyond it the last draw counts."""
+    """The excess kurtosis of n normal samples has a standard error of sqrt(24 / n): only beyond half of it the last draw counts."""
     signs = np.where(np.random.default_rng(5).random(400) < 0.5, -1.0, 1.0)
 
     def sequence(large: float) -> np.ndarray:
@@ -178,7 +178,7 @@ def test_only_tails_beyond_chance_widen_the_power(share: float, widened: bool, m
     def beyond(large: float) -> float:
         values = sequence(large)
         excess = np.mean(values**4) / np.mean(values**2) ** 2 - 3.0
-        return float(excess - share * np.sqrt(24.0 / cosine_terms(values).freedom))
+        return float(excess - share * np.sqrt(6.0 / cosine_terms(values).freedom))
 
     values = sequence(brentq(beyond, 1.0, 8.0))
     usual, drawn = memory.power_draws(values), memory._random(TERMS)

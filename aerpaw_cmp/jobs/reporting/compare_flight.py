@@ -185,9 +185,11 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
 def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> StatedSpread | None:
     """Error bars in two parts, where other flights taught when the receiver loses its lock."""
     series, error_db = case.series, score.residual_db
-    lock = None if series.locked is None else lock_elsewhere(case.data.settings.antennas, series, case.data.folder)
-    locked = None if lock is None else error_db[(series.locked == 1.0) & np.isfinite(error_db)]
-    if stated is None or lock is None or locked is None or not len(locked):
+    if stated is None or series.locked is None:
+        return stated
+    lock = lock_elsewhere(case.data.settings.antennas, series, case.data.folder)
+    locked = error_db[(series.locked == 1.0) & np.isfinite(error_db)]
+    if lock is None or not len(locked):
         return stated
     above_db = case.levels.simulated_db - series.link.transmit_power_dbm - lock.gain_db
     parts = LostLock(

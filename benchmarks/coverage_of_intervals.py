@@ -280,6 +280,7 @@ def sample_verdicts(draws: int) -> float:
     folder = Path(__file__).parents[1] / "sample_logs"
     data = load_data(load_flight(folder / "flight.yaml"), folder)
     plan, run = data.settings.flight.plan, run_flight(data, audit=False)
+    assert plan is not None
     rng, better = np.random.default_rng(1), 0
     for _ in range(draws):
         panels = []

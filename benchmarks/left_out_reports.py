@@ -25,7 +25,14 @@ import yaml
 
 from aerpaw_cmp.compare.learning.calibration import SPLITS, Learned, Score, flight_left_out, flights_of, learn
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.learning.calibrate import Calibration, load_calibration, observe, read_flights, recipe_of
+from aerpaw_cmp.jobs.learning.calibrate import (
+    Calibration,
+    GroundFit,
+    load_calibration,
+    observe,
+    read_flights,
+    recipe_of,
+)
 from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks
 from aerpaw_cmp.jobs.learning.calibrate_rank import fit_rank
 from aerpaw_cmp.jobs.learning.calibration_files import Calibrated, site_entry
@@ -33,6 +40,7 @@ from aerpaw_cmp.site.antenna.learned import folder_of, remember
 
 RECIPES = Path(__file__).parents[1] / "tests" / "field" / "learned"
 TIMEZONE = "America/New_York"
+_NO_RAY = GroundFit(roughness_m=(float("inf"),), log_likelihood=(0.0,))  # drafts have none
 GOALS = {
     "dataset12": "goal: 3.4 as logged, 2.8 over 4 s, 90 % holds 87-93",
     "lte": "goal: 5.8 as logged, 3.4 over 4 s",
@@ -61,7 +69,7 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
         scores["flight_left_out"] = flight_left_out(observed, chosen, learned)
     calibration = Calibration(
         settings=settings, flights=tuple(flights), observed=tuple(observed), place=None, scores=scores, controls={},
-        learned=learn([o.samples for o in observed], chosen), ground=None, curve=(), warnings=(), words=(),
+        learned=learn([o.samples for o in observed], chosen), curve=(), ground=_NO_RAY, warnings=(), words=(),
         locks=learned_locks(observed, chosen, learned),
     )  # fmt: skip
     calibrated = Calibrated(settings, tuple(flights), (), calibration, ranked)

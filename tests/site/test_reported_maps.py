@@ -79,7 +79,8 @@ def test_what_lies_below_the_ground_is_not_drawn(tmp_path: Path, tags: dict[str,
 
 
 def test_a_building_with_cellars_stands(tmp_path: Path) -> None:
-    tags = {"building": "yes", "building:levels": "2", "building:levels:underground": "1"}
+    """Its cellars do not count, nor does the height of the roof by itself."""
+    tags = {"building": "yes", "building:levels": "2", "building:levels:underground": "1", "roof:height": "4"}
     assert heights(osm(tmp_path / "a.osm", ((0, 0, 20), tags))) == [6.0]
 
 

@@ -427,7 +427,7 @@ def _describe(shape: _Shape, outline: Outline, default_m: float, path: Path, act
     if height is None:
         height = levels * _LEVEL_M if levels else default_m
         notes = [f"{note}; it is drawn {height:g} m high" for note in notes]
-    lowest = tags.get("min_height", tags.get("building:min_level", "0"))
+    lowest = tags.get("min_height", tags.get("building:min_level", tags.get("min_level", "0")))
     if (metres(lowest) or 0.0) > 0:
         notes.append("it begins above the ground (min_height, min_level), but is drawn from the ground up")
     actions += [f"{shape.source}: {note}" for note in notes]

@@ -128,8 +128,9 @@ def positive_metres(tags: Mapping[str, str], keys: tuple[str, ...], notes: list[
     return None
 
 
+# OSM's ``roof:height`` is that of the roof alone.
 _OTHER_HEIGHTS = re.compile(
-    "min|base|ground|eave|ceil|level|floor|stor|sourc|method|accura|confid|varian|std|tree|canopy|veg|antenna|unit|elev"
+    "roof:|min|base|ground|eave|ceil|level|floor|stor|sourc|method|accura|confid|varian|std|tree|canopy|veg|antenna|unit|elev"
 )
 _UNIT_AT_END = re.compile(
     r"(?:[^a-z]|(?<=height)|(?<=hgt)|(?<=hght)|(?<=ht))(ft|feet|foot|cm|m|met(?:er|re)s?)[^a-z]*$"

@@ -3,6 +3,9 @@
 ``cases/`` holds the files; right values follow from what the files say, not from what a reader gives.
 """
 
+import json
+import zipfile
+import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -480,3 +483,27 @@ def test_rows_whose_identity_says_nothing_are_one_part_and_none_is_lost(tmp_path
     streams = read(tmp_path / "x.csv", (), {}).streams
     assert len({item.name for item in streams}) == len(streams)
     assert sorted(level for item in streams for level in item.frame["rss_db"]) == [-95.0, -94, -93, -92, -91, -90]
+
+
+@pytest.mark.parametrize("name", ["flight.xlsx", "flight.csv"])
+def test_a_spreadsheet_is_called_one(name: str, tmp_path: Path) -> None:
+    with zipfile.ZipFile(tmp_path / name, "w") as book:
+        book.writestr("[Content_Types].xml", "<Types/>")
+        book.writestr("xl/workbook.xml", "<workbook/>")
+    with pytest.raises(InputError, match=r"a spreadsheet \(\.xlsx\); expected its table saved as CSV"):
+        read(tmp_path / name, (), {})
+
+
+def test_the_log_of_the_tap_gives_the_level_of_lte_beside_that_of_nr(tmp_path: Path) -> None:
+    header = (CASES / "autopilots" / "tap_handover.jsonl").read_text().splitlines()[0]
+    cell = {"pcid": 7, "arfcn": 2300, "band": 4, "rsrp_dbm": -100, "rsrq_db": -12, "rssi_dbm": -70, "sinr_raw": 15}
+    asked = {
+        "query": "servingcell",
+        "status": "ok",
+        "sent_utc_ns": 1_749_564_000 * 10**9,
+        "last_utc_ns": 1_749_564_000 * 10**9,
+    }
+    text = json.dumps({"kind": "exchange", "n": 1, **asked, "decoded": {"lte": cell}})[:-1]
+    (tmp_path / "x.jsonl").write_text(f'{header}\n{text},"crc":"{zlib.crc32(text.encode()):08x}"}}\n')
+    right = {"lte_rsrp": {"rss_db": [-100.0], "rsrq_db": [-12.0], "rssi_dbm": [-70.0]}}
+    check(read(tmp_path / "x.jsonl", (), {}), Right(right, about={"pci": 7, "arfcn": 2300, "rat": "lte"}))

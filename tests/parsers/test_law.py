@@ -1,17 +1,19 @@
 """What every reader owes: it knows its own format only, accounts for each line, and never fails raw."""
 
 import io
+import random
 
 import numpy as np
 import pytest
 import scipy.io
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError
 from aerpaw_cmp.logs import limits
-from aerpaw_cmp.logs.readers import by_name, catalogue, identify
+from aerpaw_cmp.logs.readers import ReadOptions, by_name, catalogue, identify
 from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_parsers import drive_test
 from benchmarks import fuzz_inputs
 from tests.parsers.samples import BINARY, CASES, NO_LOGS, OPTIONS, SAMPLES
 
@@ -197,3 +199,28 @@ def test_damaged_hdf5(at: int) -> None:
 def test_any_bytes(rubbish: bytes) -> None:
     for reader in catalogue():
         check_law(reader.name, rubbish)
+
+
+_NAMES = ("rsrp", "NB1_PCI", "NB1_RSRP", "PCI_2", "RSRP_2", "pci", "nr_rsrp", "rscp", "sim1_rsrp", "sim2_rsrp", "rsrp_max",
+          "operator", "sim slot", "device")  # fmt: skip
+_CELLS = ("", "nan", "-", "A", "B", "7", "0", "2147483647")
+
+
+@given(st.lists(st.sampled_from(_NAMES), min_size=2, max_size=9, unique=True), st.randoms(use_true_random=False))
+@settings(max_examples=60, deadline=None)
+def test_each_level_of_a_table_is_a_record_or_flagged(names: list[str], chance: random.Random) -> None:
+    """Reading law: whoever is named beside it, by whichever columns, or by none."""
+    level, rows = -60.0, []
+    for i in range(8):
+        cells = [str(1_749_564_000 + i)]
+        for name in names:
+            level -= 0.25
+            cells.append(f"{level}" if "rs" in name else chance.choice(_CELLS))
+        rows.append(cells)
+    data = "\n".join(",".join(cells) for cells in [["time", *names], *rows]) + "\n"
+    assume(drive_test.sniff(data.encode()))
+    result = drive_test.read(data.encode(), ReadOptions())
+    shown = {value for item in result.streams for value in item.frame.select_dtypes("number").to_numpy().ravel()}
+    rejected = {line.number for line in result.rejected}
+    kept = [row for i, row in enumerate(rows) if i + 2 not in rejected]
+    assert {float(cell) for row in kept for cell, name in zip(row[1:], names, strict=True) if "rs" in name} <= shown

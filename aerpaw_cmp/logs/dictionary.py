@@ -164,7 +164,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("RSRP", "rss", (
         r"\brs ?rp\b|\bss ?rsrp\b|\b(nrx)?rsrp\d{0,2}\b|\b(n|nb|nbr)\d{0,2}rsrp\b",
     ), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0, 255.0), can_be=_DB),
+    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0, 255.0), can_be=(-60.0, 30.0)),
     Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", can_be=_DB),
     Quantity("RSSI", "rss", (r"\brssi\d{0,2}\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RSCP", "rss", (r"\brscp\b",), "dBm", none=(0.0,), can_be=_DBM),
@@ -173,10 +173,10 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("PCI", "cell", (
         r"\b(\w{0,5}pci\d{0,2}|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci|phy ?id)\b",
         r"\bpsc or pci\b",
-    ), can_be=(0.0, 1007.0)),
+    ), none=(-1.0,), can_be=(0.0, 1007.0)),
     Quantity("ARFCN", "cell", (
         r"\b(nr ?|e ?|u ?)?arfcn\d{0,2}\b|\bchannel number\b|\bfreq(uency)? channel\b",
-    ), can_be=(0.0, 3_279_165.0)),
+    ), none=(-1.0,), can_be=(0.0, 3_279_165.0)),
     Quantity("CQI", "kpi", (r"\bcqi\b",), none=(255.0,), can_be=(0.0, 100.0)),
     Quantity("path loss", "kpi", (r"\bpath ?loss\b",), "dB"),
     Quantity("throughput", "kpi", (r"\b(throughput|tput|bit ?rate|thr?put)\b",), "bit/s"),

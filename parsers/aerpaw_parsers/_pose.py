@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.records import Attribute, Stream
 from aerpaw_cmp.logs.text import rows as _rows
@@ -46,6 +47,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
         "longitude_deg": _signed(sheet, longitude, "EW"),
     }
     lost = clean(rows, values)
+    _refuse_whole_degrees(sheet.names[latitude], sheet.names[longitude], values)
     datum, height = _height(rows, sheet)
     values["altitude_m"] = height
     about: Height = {"height_from": rows.height_from}
@@ -61,6 +63,18 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
     where = None if lost.all() else ~lost
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
+
+
+def _refuse_whole_degrees(latitude: str, longitude: str, values: dict[str, AnyArray]) -> None:
+    """Refuse positions of which one angle has whole degrees alone: the values stand beside their names."""
+    known = [angle[np.isfinite(angle)] for angle in values.values()]
+    whole = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
+    if whole[0] != whole[1]:
+        raise InputError(
+            f"the rows do not fit the header: {latitude if whole[0] else longitude!r} has whole degrees alone",
+            expected="positions",
+            cause="a column is missing in the header or in the rows, and all values stand beside their names",
+        )
 
 
 def _signed(sheet: _sheet.Sheet, column: int, letters: str) -> FloatArray:

@@ -251,6 +251,10 @@ class Sheet:
                 values = self._angles(column, meaning.quantity, values)
                 if meaning.quantity.role not in ("rss", "rank", "position", "time") or meaning.indirect:
                     values = np.where(dictionary.is_none(meaning.quantity, values), np.nan, values)
+                odd = dictionary.impossible(meaning.quantity, values)
+                if meaning.quantity.role == "kpi" and 2 * odd.sum() > np.isfinite(values).sum():
+                    text = f"column {self.names[column]!r}: most values cannot be, such as {values[odd][0]:g}"
+                    self.notes[column] = f"{text} (another unit, or the column of another quantity?)"
             values.flags.writeable = False  # the next who asks gets the same
             self._numbers[column] = values
         return self._numbers[column]
@@ -370,8 +374,8 @@ class _Table:
         """The next line that is not blank."""
         width = len(self._place)
         words = [text.strip() for text in fields]
-        if not any(_VALUE.match(text) for text in words) and self._is_header(words):
-            self.comments.append(i)  # files joined by hand
+        if not any(_VALUE.match(text) for text in words) and (self._is_units(words) or self._is_header(words)):
+            self.comments.append(i)  # units below the names, or files joined by hand
         elif len(fields) == width:
             self._row.append(i)
             self._cells.append(self._placed(fields))
@@ -380,6 +384,15 @@ class _Table:
             self._odd.append((i, len(fields), width))
         else:
             self._odd.append((i, len(fields), width))
+
+    def _is_units(self, texts: list[str]) -> bool:
+        """Check whether the line below the names has their units, which become parts of the names."""
+        filled = [text for text in texts if text]
+        units = sum(dictionary.is_unit(text) or text in _HARMLESS for text in filled)
+        if self._row or len(texts) != len(self.names) or len(filled) < 2 or 2 * units <= len(filled):
+            return False
+        self.names[:] = [f"{name} [{unit}]" if unit else name for name, unit in zip(self.names, texts, strict=True)]
+        return True
 
     def _is_header(self, texts: list[str]) -> bool:
         """Check whether a line is a header, of the same columns or of others; what follows is read under it."""
@@ -415,13 +428,17 @@ class _Table:
 
     def sheet(self, lines: _lines.Lines, last_line: int) -> Sheet:
         """The table; rows shorter than their header are read where that is a habit of the program."""
-        inner = [i for i, _ in self._short if i != last_line]
+        inner, full = [i for i, _ in self._short if i != last_line], bool(self._row)
         if len(inner) >= max(2, len(self._row) // 20):
             meanings = [dictionary.meaning(name) for name in self.names]
             read = {i for i, cells in self._short if not _torn(cells, meanings)}
             both = [*zip(self._row, self._cells, strict=True), *(item for item in self._short if item[0] in read)]
             self._row, self._cells = [list(part) for part in zip(*sorted(both), strict=True)] if both else ([], [])
             self._odd = [item for item in self._odd if item[0] not in read]
+        notes = {}
+        if not full and self._cells:
+            text = "no row has as many fields as the header: the last columns were read as empty"
+            notes = {len(self.names): text}
         last = self._row[-1] if self._row else self.comments[-1]
         torn = len(lines) - 1 if lines.unterminated else -1
         # words below the table, as Nemo writes them, have no separator and begin with no number
@@ -441,6 +458,7 @@ class _Table:
                 for i, count, width in self._odd
                 if i not in foot
             ],
+            notes=notes,
         )
 
 
@@ -485,13 +503,12 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         Of the times; by default the one that the dictionary finds.
     """
     refuse_shifted(
-        [(sheet.names[i], m.quantity, sheet.numbers(i)) for i, m in enumerate(sheet.meanings)
-         if m is not None and m.quantity.role in ("position", "cell") and m.quantity.can_be[1] < np.inf]
-        + [(sheet.names[i], m.quantity, sheet.numbers(i)) for i, m in enumerate(sheet.meanings)
-           if m is not None and m.quantity.role == "rss" and not m.indirect]
+        (sheet.names[i], m.quantity, sheet.numbers(i)) for i, m in enumerate(sheet.meanings)
+        if m is not None and m.quantity.role in ("position", "cell", "rss") and m.quantity.can_be[1] < np.inf
+        and not m.indirect
     )  # fmt: skip
     mapped = column is not None
-    column = sheet.find("time") if column is None else column
+    column = _time_column(sheet) if column is None else column
     weeks = None if mapped else _gps_weeks(sheet, column)
     if column is None and weeks is None:
         return None
@@ -513,6 +530,15 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     if (counter := sheet.named("time millisecond")) not in (None, column):
         _finer(timed, sheet.numbers(counter))
     return timed
+
+
+def _time_column(sheet: Sheet) -> int | None:
+    """The surest column of times; where that is a local one, the one beside it that is UTC."""
+    column = sheet.find("time")
+    if column is None or "local" not in sheet.plain[column]:
+        return column
+    utc = (i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name == "time")
+    return next((i for i in utc if re.search(r"\butc\b", sheet.plain[i])), column)
 
 
 def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> tuple[str, FloatArray, list[str]]:
@@ -578,13 +604,15 @@ def refuse_shifted(columns: Iterable[tuple[str, dictionary.Quantity, FloatArray]
     if not wrong or not len(wrong[0][1]):
         return
     count = np.sum([mask for *_, mask in wrong], axis=0)
-    fractions = [
-        (name, values, mask) for name, values, mask in wrong
-        if 2 * (mask & (values != np.round(values))).sum() > np.isfinite(values).sum() and "pci" in name.lower()
+    few = max(3, len(count) // 20)
+    alone = [
+        mask for name, values, mask in wrong
+        if ("pci" in name.lower() and (mask & (values < 0)).sum() >= few)
+        or ("pci" in name.lower() and 2 * mask.sum() > np.isfinite(values).sum())
     ]  # fmt: skip
-    if not fractions and (count > 1).sum() < max(3, len(count) // 20):
+    if not alone and (count > 1).sum() < few:
         return
-    row = int(np.argmax(fractions[0][2] if fractions else count > 1))
+    row = int(np.argmax(alone[0] if alone else count > 1))
     shown = "; ".join(f"{name!r} is {values[row]:g}" for name, values, mask in wrong if mask[row])
     raise InputError(
         f"the rows do not fit the header: {shown}",

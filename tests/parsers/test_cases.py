@@ -255,6 +255,14 @@ COUSINS: dict[str, tuple[str, Right]] = {
     "SIMs in columns": (
         table("time,sim1_pci,sim1_rsrp,sim2_pci,sim2_rsrp", f"{EPOCH},11,{{l}},11,-12{{i}}"),
         Right({"pci11_sim1": {"rss_db": down(-90, 4)}, "pci11_sim2": {"rss_db": down(-120, 4)}})),
+    "units below the names": (
+        "time,lat,lon,alt_rel,pci,rsrp\ns,deg,deg,ft,,dBm\n" + table("", f"{EPOCH},{PLACE},10,11,{{l}}")[1:],
+        Right({**LEVELS, "phone": {"altitude_m": [3.048] * 4}})),
+    "RSSI and RSRP exchanged": (
+        table("time,pci,rssi,rsrp", f"{EPOCH},11,{{l}},-60"), Right({"pci11": {"rss_db": [-60] * 4}}, said="RSSI lies below RSRP")),
+    "RSRQ in tenths": radio("rsrq", "-110", LEVELS, said="most values cannot be"),
+    "no row as long as the header": (
+        table("time,pci,rsrp,rsrq,sinr", f"{EPOCH},11,{{l}}"), Right(LEVELS, said="as many fields as the header")),
     "a second header in another unit": (
         table("time,lat,lon,alt_rel [m],pci,p_dbm", f"{EPOCH},{PLACE},3,11,{{l}}")
         + table("time,lat,lon,alt_rel [ft],pci,p_dbw", f"174956401{{i}},{PLACE},10,11,{{l}}"),
@@ -273,6 +281,8 @@ COUSINS: dict[str, tuple[str, Right]] = {
     "above the ellipsoid in brackets": height("altitude (WGS84)", "{a}", [0, 1, 2, 3], said="ellipsoid"),
     "offsets of a column in minutes": (
         table("Time,utc_offset,pci,rsrp", f"{LOCAL},-240,11,{{l}}"), Right(LEVELS, options={"timezone": "Asia/Tokyo"})),
+    "UTC beside local time": (
+        table("local_time,utc_time,pci,rsrp", f"{LOCAL},2025-06-10 14:00:0{{i}},11,{{l}}"), Right(LEVELS, options={"timezone": "Asia/Tokyo"})),
     "zone of a header in small letters": phone("time_edt", LOCAL, timezone="Asia/Tokyo"),
     "weeks beside GPS milliseconds": (
         table("GPSWeek,GPSTime_ms,pci,rsrp", "2370,22401{i}000,11,{l}"), Right(LEVELS, start="2025-06-10T14:13:12", said="GPS weeks")),
@@ -399,6 +409,9 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "minutes of a spreadsheet": (phone("Time", "47:3{i}.2")[0], InputError, "without the hour"),
     "shifted by a column": (table("time,pci,lat,lon,rsrp", EPOCH + ",35.728,-78.696,{l},11"), InputError, SHIFTED),
     "a PCI with a fraction": (table("time,lat,lon,pci,rsrp,rsrq", EPOCH + ",35.7,-78.7,1234.5,11,{l}"), InputError, SHIFTED),
+    "whole degrees": (table("time,lat,lon,alt", EPOCH + ",7,35.728,-78.696"), InputError, SHIFTED),
+    "later rows shifted": (
+        table("time,lat,lon,pci,rsrp", EPOCH + ",35.7,-78.7,11,{l}") + table("", EPOCH + ",11,35.7,-78.7,{l}")[1:], InputError, SHIFTED),
     "a latitude of 999": (table("time,lat,lon,pci,rsrp", EPOCH + ",999,35.7,-78.7,{l}"), InputError, SHIFTED),
     "weeks modulo 1024": (table("week,tow,pci,rsrp", "322,22401{i},11,{l}"), InputError, "modulo 1024"),
     "a month of no language": (phone("Time", "10 foo 2025 10:00:0{i}")[0], InputError, "of a form that is not read"),

@@ -584,6 +584,10 @@ NO_LOGS: dict[str, bytes] = {
     ),
     "wifi_scan": b'{"rel_time":1.0,"abs_time":1740927600000,"log_type":"wifi","aps":[]}\n',
     "nmea": b"$GPGGA,140000.00,3543.68,N,07841.76,W,1,08,0.9,111.3,M,-32.0,M,,*50\r\n",
+    "wifi_other": b"WigleWifi-1.4,appRelease=2.53\nMAC,SSID,FirstSeen,RSSI\n",
+    "subtitles": b"1\n00:00:00,000 --> 00:00:00,033\n[latitude: 35.728] [longitude: -78.696]\n",
+    "pdf": b"%PDF-1.4\n",
+    "at_answers": b'[2025-03-02 10:00:00] #RFSTS: "310 26",1795,-101,-67,-15\n' * 2,
     "web_page": b"<!DOCTYPE html>\n<html><body>Log in</body></html>\n",
     "kml_levels": (
         b"<?xml version='1.0'?>\n<kml><Document><Placemark><description>10:00:00 RSRP: -81 dBm</description>"

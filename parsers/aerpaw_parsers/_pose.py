@@ -68,10 +68,10 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
 def _refuse_whole_degrees(latitude: str, longitude: str, values: dict[str, AnyArray]) -> None:
     """Refuse positions of which one angle has whole degrees alone: the values stand beside their names."""
     known = [angle[np.isfinite(angle)] for angle in values.values()]
-    whole = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
-    if whole[0] != whole[1]:
+    coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
+    if coarse[0] != coarse[1]:
         raise InputError(
-            f"the rows do not fit the header: {latitude if whole[0] else longitude!r} has whole degrees alone",
+            f"the rows do not fit the header: {latitude if coarse[0] else longitude!r} has whole degrees alone",
             expected="positions",
             cause="a column is missing in the header or in the rows, and all values stand beside their names",
         )

@@ -58,7 +58,9 @@ def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -
         if what is not None and np.isfinite(value) and not name.startswith("csi"):  # SS-RSRP is the cell's level
             known.setdefault(what.quantity.name, value)
     pci, arfcn, level, *qualities = (known.get(name, np.nan) for name in _QUANTITIES)
-    return Reading(row, rat, pci, arfcn, level, serving, tuple(qualities))
+    return Reading(
+        row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level, serving=serving, qualities=tuple(qualities)
+    )  # fmt: skip
 
 
 _QUANTITIES = ("PCI", "ARFCN", "RSRP", "RSRQ", "RSSI", "SINR", "path loss")

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 import shapely
@@ -155,10 +154,10 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
     flat[np.hypot(*(flat - start_m[moved, :2]).T) < _UPRIGHT_M, 0] += _UPRIGHT_M  # a line has a length
     near, stand = tree.query(shapely.linestrings(np.stack([start_m[moved, :2], flat], axis=1)))
     for number in np.unique(stand):
-        mine, (edges, following) = near[stand == number], _edges(stands[number])
-        step = max(1, _PAIRS_AT_ONCE // len(edges))
+        mine, (corner, last) = near[stand == number], _corners(stands[number])
+        step = max(1, _PAIRS_AT_ONCE // len(corner))
         for some in (mine[first : first + step] for first in range(0, len(mine), step)):
-            row, share = _pieces(start_m[moved[some], :2], flat[some], edges, following)
+            row, share = _pieces(start_m[moved[some], :2], flat[some], corner, last)
             crossing, piece = np.unique(row, return_inverse=True)
             if not len(crossing):
                 continue
@@ -173,21 +172,21 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
             )
 
 
-def _edges(stand: Forest) -> tuple[FloatArray, IntArray]:
-    """Ends (edges, 2, 2) of the sides of a stand, holes included, and the side (edges,) that follows each."""
+def _corners(stand: Forest) -> tuple[FloatArray, IntArray]:
+    """Corners (n, 2) of the rings of a stand, each closed, and the last corners of all rings but the last."""
     rings = [shapely.get_coordinates(ring) for ring in (stand.area.exterior, *stand.area.interiors)]
-    edges = np.concatenate([np.stack([ring[:-1], ring[1:]], axis=1) for ring in rings])
-    first = np.cumsum([0, *(len(ring) - 1 for ring in rings)])
-    return edges, np.concatenate([np.roll(np.arange(*pair), -1) for pair in pairwise(first)])
+    return np.concatenate(rings), np.cumsum([len(ring) for ring in rings[:-1]], dtype=np.int64) - 1
 
 
-def _pieces(start: FloatArray, end: FloatArray, edges: FloatArray, following: IntArray) -> tuple[IntArray, FloatArray]:
-    """Pieces of lines (k, 2) inside an outline of edges: their lines (n,), and where they begin and end (n, 2)."""
-    way, corner = end - start, edges[:, 0]
-    side, off = edges[:, 1] - corner, corner - start[:, None]  # k, edges, 2
-    left = way[:, :1] * off[..., 1] - way[:, 1:] * off[..., 0] > 0
-    line, edge = np.nonzero(left != left[:, following])  # a corner belongs to one of its sides alone
-    (east, north), (side_east, side_north), (way_east, way_north) = off[line, edge].T, side[edge].T, way[line].T
+def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArray) -> tuple[IntArray, FloatArray]:
+    """Pieces of lines (k, 2) inside rings of corners: their lines (n,), and where they begin and end (n, 2)."""
+    way = end - start
+    left = way[:, :1] * (corner[:, 1] - start[:, 1:]) - way[:, 1:] * (corner[:, 0] - start[:, :1]) > 0
+    crosses = left[:, 1:] != left[:, :-1]  # a corner belongs to one of its sides alone
+    crosses[:, last] = False
+    line, edge = np.nonzero(crosses)
+    (east, north), (side_east, side_north) = (corner[edge] - start[line]).T, (corner[edge + 1] - corner[edge]).T
+    way_east, way_north = way[line].T
     share = (east * side_north - north * side_east) / (way_east * side_north - way_north * side_east)
     inside = np.bincount(line[share <= 0.0], minlength=len(way)) % 2 == 1
     line, share = line[between := (share > 0.0) & (share < 1.0)], share[between]

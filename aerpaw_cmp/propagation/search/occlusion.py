@@ -145,13 +145,14 @@ class Occlusion:
 
         ``touches`` are, per piece, the segments that run along it and the shares of their length from and to which.
         """
-        row = np.concatenate([t[0] for t in touches])
-        several = np.bincount(row, minlength=len(result)) > 1
-        for index in np.flatnonzero(several & ~result):
+        row, enter, leave = (np.concatenate([t[column] for t in touches]) for column in range(3))
+        touch = np.repeat(np.arange(len(touches)), [len(t[0]) for t in touches])
+        order = np.argsort(row, kind="stable")
+        first = np.searchsorted(row[order], np.arange(len(result) + 1))
+        for index in np.flatnonzero((np.diff(first) > 1) & ~result):
             mine = [
-                (enter[at], leave[at], self.pieces[solid][number])
-                for rows, enter, leave, solid, number in touches
-                for at in np.flatnonzero(rows == index)
+                (enter[at], leave[at], self.pieces[touches[touch[at]][3]][touches[touch[at]][4]])
+                for at in order[first[index] : first[index + 1]]
             ]
             result[index] = self._surrounded(start[index], end[index], mine)
 

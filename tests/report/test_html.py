@@ -228,3 +228,12 @@ def test_thousands_and_signs_are_written_alike_everywhere(report_data):
     text = render(report_data).text
     assert not re.search(r"\d,\d{3}\b", text)
     assert not re.search(r"offset of -\d", text)
+
+
+def test_agreement_of_ranks_bears_the_error_bar_of_the_ground(small_report):
+    rank = small_report.rank[0]
+    k = next(iter(rank.score.simulated))
+    assert not re.search(r"\d\s%\s±\d", render(small_report).text)
+    further = dataclasses.replace(rank.further, agreement_sd_by_ground={f"{k:g}": 0.0714})
+    page = render(dataclasses.replace(small_report, rank=(dataclasses.replace(rank, further=further),)))
+    assert len(re.findall(r"\d\s%\s±7", page.text)) == 1

@@ -59,6 +59,11 @@ def sealed(text: str) -> bytes:
     return f"{_SEAL}{hashlib.sha256(content).hexdigest()}\n".encode("ascii") + content
 
 
+def unsealed(text: str) -> str:
+    """Text without the line that :func:`sealed` begins it with."""
+    return text.partition("\n")[2] if text.startswith(_SEAL) else text
+
+
 def is_sealed(path: Path) -> bool:
     """Check whether a file is as :func:`sealed` made it, and nobody changed it since."""
     with path.open("rb") as stream:

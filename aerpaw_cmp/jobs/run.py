@@ -207,8 +207,8 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
     JobOutcome
     """
     from ..flight.data import load_data
-    from ..flight.gains.memory import load_with_learned
     from ..flight.replay import replay_flight
+    from ..flight.settings import load_flight
     from ..report.content.flight_parts import report_data
     from ..report.exports.formats import chosen_formats
     from ..report.exports.tables import metrics as metrics_of
@@ -254,7 +254,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
             extra = {**record.extra_metrics, "against": before.metrics()}
             record = replace(record, against=before, extra_metrics=extra)
         if target is not None:
-            target.write(sealed(recommended_text(load_with_learned(flight, learned), flight_run.ladder, flight.name)))
+            target.write(sealed(recommended_text(load_flight(flight), flight_run.ladder, flight)))
         with output.filling() as place:
             written = write_report(
                 record, place, drawn=chosen.figures, style=chosen.style, exports=formats, stages=stages

@@ -8,9 +8,9 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.flight.gains.losses import path_loss, roughness_loss
 from aerpaw_cmp.flight.replay import replay_poses
-from aerpaw_cmp.flight.settings import RtSettings
+from aerpaw_cmp.flight.settings import RtSettings, load_flight
 from aerpaw_cmp.jobs.learning.calibrate import GroundFit
-from aerpaw_cmp.jobs.reporting.ladder import Model, recommended_settings
+from aerpaw_cmp.jobs.reporting.ladder import Model, recommended_changes
 from aerpaw_cmp.propagation.check import reference
 from aerpaw_cmp.propagation.check.field_audit import Expected
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
@@ -73,8 +73,12 @@ def test_a_calibration_uses_a_ray_only_where_none_is_less_likely():
     assert GroundFit(roughness_m=heights, log_likelihood=(-9.0, 1.5, 0.0)).used_m is None
 
 
-def test_the_ladder_writes_and_takes_away_the_roughness():
-    set_ = {"rt": {"max_depth": 1, "ground_roughness_m": 0.05}}
-    rough = Model(ground="rough", roughness_m=0.05)
-    assert recommended_settings(set_, rough)["rt"]["ground_roughness_m"] == 0.05
-    assert "ground_roughness_m" not in recommended_settings(set_, Model(ground="coherent"))["rt"]
+def test_the_ladder_writes_and_takes_away_the_roughness(tmp_path):
+    path = tmp_path / "flight.yaml"
+    for roughness, model in ((0.0, Model(ground="rough", roughness_m=0.05)), (0.05, Model(ground="coherent"))):
+        path.write_text(
+            f"flight: planted\nlogs: [{{path: a}}]\nrt: {{max_depth: 1, ground_roughness_m: {roughness}}}\n"
+        )
+        settings = load_flight(path)
+        changes = recommended_changes(settings, {"rt": {"ground_roughness_m": roughness}}, model)
+        assert changes["rt", "ground_roughness_m"] == (model.roughness_m or None)

@@ -213,8 +213,9 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         return None
     shown = [table for table in tables if name in _names(_best(table, best))]
     shown.sort(key=lambda table: -table[frozenset([name])].gain)
-    steps = ((_SOUND, frozenset([name])), (best - {name}, best))
-    if not any(_takes_its_share(shown, before, after) for before, after in steps):
+    # also alone it must bring levels and prediction together, not only their changes from second to second
+    alone = _share_of_error(shown, _SOUND, {name})
+    if alone > 1.0 or min(alone, _share_of_error(shown, best - {name}, best)) > 1.0 - _LEAST_SHARE:
         return None
     return _named(name, shown, gains[best] - without[name])
 
@@ -251,9 +252,9 @@ def _models(e: LevelEvidence) -> _Models:
     return {_SOUND: model(), **{frozenset([name]): best[name] for name in likely}, **pairs}
 
 
-def _takes_its_share(shown: Sequence[_Models], before: Set[str], after: Set[str]) -> bool:
-    rmse, rmse_with = (_rmse_db([_best(table, some) for table in shown]) for some in (before, after))
-    return rmse_with <= (1.0 - _LEAST_SHARE) * rmse
+def _share_of_error(shown: Sequence[_Models], before: Set[str], after: Set[str]) -> float:
+    """RMSE with further troubles over that before."""
+    return _rmse_db([_best(table, after) for table in shown]) / _rmse_db([_best(table, before) for table in shown])
 
 
 def _rmse_db(models: Sequence[_Model]) -> float:
@@ -529,6 +530,7 @@ def _saturation(e: LevelEvidence) -> Iterator[Trial]:
 
 # Of clipped samples: so many lie further beyond the limit [dB], and they spread by at most so much of the others.
 _BEYOND_DB, _MOST_BEYOND, _MOST_SPREAD = 2.0, 0.02, 0.6
+_FAR_DB, _LEAST_FAR = 3.0, 0.1
 _LEAST_BINS = 5
 
 
@@ -546,8 +548,8 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     if (side * (e.measured_db - limit) < -_BEYOND_DB).mean() > _MOST_BEYOND:
         return None
     name, words, step = _LIMITS[side]
-    texts = {"sentence": words.format(level=_level(limit, e.unit)), "next_step": step.format(typed=f"{limit:.0f}")}
-    return Trial(name=name, cost=2.0, **texts)
+    sentence, next_step = words.format(level=_level(limit, e.unit)), step.format(typed=f"{limit:.0f}")
+    return Trial(name=name, cost=2.0, sentence=sentence, next_step=next_step)
 
 
 def _clipped(e: LevelEvidence, limit: float, side: float) -> Trial | None:
@@ -573,7 +575,10 @@ def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
         shown = limit + side * 10.0 * np.log10(1.0 + 10.0 ** (side * (level - limit) / 10.0))
         offset += float(np.mean(e.measured_db - shown))
     trial = _limited(e, limit, side)
-    return None if trial is None else dataclasses.replace(trial, change_db=shown - level)
+    # a prediction that fades too deep here and there meets no limit of the receiver
+    if trial is None or (side * (limit - level) > _FAR_DB).mean() < _LEAST_FAR:
+        return None
+    return dataclasses.replace(trial, change_db=shown - level)
 
 
 _LIMITS = {

@@ -11,16 +11,20 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import yaml
 
 from ...common.errors import UsageError
+from ...common.outputs import unsealed
 from ...common.units import FloatArray
+from ...common.yamledit import KeyPath, edited
 from ...common.yamlfile import parse_yaml
 from ...compare.judge.ladder import Ladder, Rung, climb
 from ...compare.result import BASELINE_TITLE
+from ...compare.statistics.intervals import pooled_difference
 from ...flight.data import FlightData, RssSeries, choose_site, site_place
 from ...flight.drafting.remembered import errors_elsewhere, offered
 from ...flight.gains.learned_gain import pair_db
@@ -209,7 +213,24 @@ class _Climber:
             names=names,
             offered={} if self._offer is None else self._offer.antennas,
         )
-        return self._by_flights_left_out(climbed)
+        return self._better_than_set(self._by_flights_left_out(climbed), climbed)
+
+    def _better_than_set(self, *climbed: FlightLadder) -> FlightLadder:
+        """The first whose recommended model is better than the flight as set, significantly; else the flight as set."""
+        better = (each for each in climbed if self._is_better(each.ladder))
+        as_set = climbed[-1].ladder
+        if as_set.recommended is not None:
+            as_set = dataclasses.replace(as_set, recommended=len(as_set.rungs) - 1)
+        return next(better, dataclasses.replace(climbed[-1], ladder=as_set))
+
+    def _is_better(self, ladder: Ladder) -> bool:
+        """Check a recommended model against the last rung, the flight as set, over all series at once."""
+        if ladder.recommended is None:
+            return False
+        as_set = len(ladder.rungs) - 1
+        chosen, stated = ladder.error_db[ladder.recommended], ladder.error_db[as_set]
+        columns = [(s.time_s, a, b) for s, a, b in zip(self._series, chosen, stated, strict=True)]
+        return pooled_difference(columns, free_offset=False).verdict == "better"
 
     def _by_flights_left_out(self, climbed: FlightLadder) -> FlightLadder:
         """The learned model, as it was calibrated, where flights left out say that it beats free space."""
@@ -436,16 +457,18 @@ def _isotropic_link(link: Link) -> Link:
     return dataclasses.replace(link, tower_arrays=towers, uav_array=other(link.uav_array))
 
 
-def recommended_settings(
-    settings: Mapping[str, Any], model: Model | None, offered: Mapping[str, str] | None = None
-) -> dict[str, Any]:
-    """flight.yaml as nested mappings with the settings of a model; None leaves it as it is.
+def recommended_changes(
+    settings: FlightFile, stated: Mapping[str, Any], model: Model, offered: Mapping[str, str] | None = None
+) -> dict[KeyPath, Any]:
+    """Keys of a flight file that a model needs otherwise, by path; None for one that has to go.
 
     Parameters
     ----------
-    settings : mapping
-        The keys that the flight file states.
-    model : Model or None
+    settings : FlightFile
+        As set, defaults included.
+    stated : mapping
+        Plain values of the keys that the file states.
+    model : Model
         See :attr:`FlightLadder.recommended`.
     offered : mapping of str to str, optional
         Learned antennas of the site by name, which a learned model takes.
@@ -454,45 +477,43 @@ def recommended_settings(
     -------
     dict
     """
-    result = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
-    result.pop("antennas", None)  # the names of learned antennas: link holds their files by now
-    if model is None:
-        return result
-    if offered and model.antennas == "learned":
-        result["antennas"] = dict(offered)
-    changes = model.settings(int(result.get("rt", {}).get("max_depth", 2)))
-    for section, change in changes.items():
-        result[section] = {**result.get(section, {}), **change}
-    if model.ground != "rough":
-        result["rt"].pop("ground_roughness_m", None)
-    if not model.diffraction:
-        result["rt"].pop("diffraction", None)
-    if model.trees not in ("p833", "weissberger"):
-        result["rt"].pop("foliage_model", None)
-    if model.antennas == "isotropic":
-        link = dict(result.get("link", {}))
-        for name in [key for key in ("rss",) if key in link]:
-            link[name] = _isotropic(link[name])
-        if "channels" in link:
-            link["channels"] = {name: _isotropic(channel) for name, channel in link["channels"].items()}
-        if link:
-            result["link"] = link
-    return result
-
-
-def _isotropic(value: Any) -> Any:
-    """Nested link settings with isotropic antennas."""
-    if not isinstance(value, Mapping):
-        return value
-    iso = {"model": "iso"}
-    return {
-        key: [iso for _ in item] if key == "antennas" and item else iso if key == "antenna" else _isotropic(item)
-        for key, item in value.items()
+    current = settings.model_dump(mode="json")
+    changes: dict[KeyPath, Any] = {
+        (section, key): value
+        for section, wanted in model.settings(settings.rt.max_depth).items()
+        for key, value in wanted.items()
+        if current[section].get(key) != value
     }
+    rt = stated.get("rt") or {}
+    gone = {"ground_roughness_m": model.ground != "rough", "diffraction": not model.diffraction}
+    changes |= {("rt", key): None for key, unused in gone.items() if unused and key in rt}
+    if isinstance(stated.get("site"), str):
+        of_site = {key: changes.pop(("site", key)) for section, key in list(changes) if section == "site"}
+        if of_site:
+            changes["site",] = {"file": stated["site"], **of_site}
+    if offered and model.antennas == "learned":
+        changes["antennas",] = dict(offered)
+    if model.antennas == "isotropic":
+        changes |= {("antennas",): None} if "antennas" in stated else {}
+        link = stated.get("link") or {}
+        changes |= _isotropic({key: link[key] for key in ("rss", "channels") if key in link}, ("link",))
+    return changes
 
 
-def recommended_text(settings: FlightFile, ladder: FlightLadder | None, name: str) -> str:
-    """The flight file ``name`` with the settings of the recommended model, as text.
+def _isotropic(content: Mapping[str, Any], path: KeyPath) -> dict[KeyPath, Any]:
+    """Isotropic antennas in the place of all below some keys of a link."""
+    iso, changes = {"model": "iso"}, dict[KeyPath, Any]()
+    for key, value in content.items():
+        if key in ("antenna", "antennas"):
+            new = [iso for _ in value] if isinstance(value, list) else iso
+            changes |= {} if new == value else {(*path, key): new}
+        elif isinstance(value, Mapping):
+            changes |= _isotropic(value, (*path, key))
+    return changes
+
+
+def recommended_text(settings: FlightFile, ladder: FlightLadder | None, flight: Path) -> str:
+    """The flight file with the lines changed that the recommended model needs, all others as they are.
 
     Raises
     ------
@@ -504,14 +525,9 @@ def recommended_text(settings: FlightFile, ladder: FlightLadder | None, name: st
             "no model can be recommended for this flight",
             expected="RSS with known poses, replayed by the image engine (rt.engine: image)",
         )
-    stated = settings.model_dump(mode="json", exclude_unset=True)
-    changed = recommended_settings(stated, ladder.recommended, ladder.offered)
-    chosen = ladder.ladder.rungs[ladder.ladder.recommended].model
-    rmse = ladder.ladder.rmse_db[ladder.ladder.recommended]
-    head = f"# {name} with the model that its ladder recommends: {chosen} ({rmse:.2f} dB on held-out segments).\n"
-    if ladder.ladder.elsewhere_db is not None:
-        learned, free = ladder.ladder.elsewhere_db
-        head += f"# On flights left out of its antennas: {learned:.2f} dB, free space {free:.2f} dB.\n"
-    text = head + yaml.safe_dump(changed, sort_keys=False, allow_unicode=True, width=120)
+    text = unsealed(flight.read_text(encoding="utf-8"))
+    if ladder.recommended is None:  # no model is better than the flight as set
+        return text
+    text = edited(text, recommended_changes(settings, yaml.safe_load(text), ladder.recommended, ladder.offered))
     parse_yaml(text, FlightFile)  # a flight file that its own reader refuses is a fault of ours
     return text

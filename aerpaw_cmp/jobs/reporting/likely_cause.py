@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence
+from typing import TypeVar
 
 import numpy as np
 
@@ -20,6 +21,7 @@ from ...site.antenna.antennas import Isotropic
 from ...site.antenna.sphere_pattern import SpherePattern
 from ...site.site import Site
 
+_Key = TypeVar("_Key")
 _ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
 _RISES_M = (-150.0, -100.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 100.0, 150.0)
 
@@ -74,7 +76,7 @@ def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: R
     def at_samples(values: FloatArray) -> FloatArray:
         return replayed.spread(values)[order]
 
-    def changed(levels_db: Mapping[object, FloatArray]) -> dict[object, FloatArray]:
+    def changed(levels_db: Mapping[_Key, FloatArray]) -> dict[_Key, FloatArray]:
         return {key: at_samples(level - link.level_db) for key, level in levels_db.items()}
 
     directions = link.directions(link.place_m, replayed.poses.position_m, replayed.poses.rotation)

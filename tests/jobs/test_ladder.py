@@ -1,5 +1,6 @@
 """The ladder of models on a flight whose truth is planted, from logs to page and recommended flight file."""
 
+import hashlib
 import json
 from pathlib import Path
 from types import SimpleNamespace
@@ -102,8 +103,9 @@ def test_a_replay_that_loses_to_a_line_says_so_first(tmp_path: Path, capsys: pyt
 def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> None:
     """Antennas that a calibration learned: a rung of their own, and none on the flights that they were learned from."""
     path = flight(tmp_path)
-    for named, scored in (("elsewhere, other", True), ("elsewhere, planted", False), ("planted_too", True)):
-        notes = (f"aerpaw-cmp calibrate: some, from {named}",)
+    own = hashlib.sha256((tmp_path / "A.csv").read_bytes()).hexdigest()
+    for logs, scored in (("b" * 64, True), (f"{'b' * 64}, {own}", False)):
+        notes = (f"aerpaw-cmp calibrate: some, trained_on: {logs}",)
         (tmp_path / "a.csv").write_text(sphere_csv(np.zeros((7, 8)), np.ones((7, 8)), notes))
         settings = load_flight(path)
         stated = settings.model_dump(mode="json", exclude_unset=True)

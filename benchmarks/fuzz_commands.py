@@ -25,6 +25,7 @@ import time
 import zipfile
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import entry_points
 from pathlib import Path
 
 SAMPLE = Path(__file__).resolve().parents[1] / "sample_logs"
@@ -129,7 +130,7 @@ def drawn(draw: random.Random, root: Path) -> Call:
 
 def child(call: Call, root: Path, said: Path) -> None:
     """Become the call; never returns."""
-    from aerpaw_cmp.__main__ import main
+    main = next(iter(entry_points(group="console_scripts", name="aerpaw-cmp"))).load()
 
     if call.folder.endswith("gone"):
         (root / "removed").mkdir()

@@ -39,6 +39,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
@@ -72,11 +73,17 @@ class Tally:
 # --- the small jobs -----------------------------------------------------------------------------------------------
 
 
+def installed_program() -> Callable[[list[str]], int]:
+    """The program as its users start it."""
+    main: Callable[[list[str]], int] = next(iter(entry_points(group="console_scripts", name="aerpaw-cmp"))).load()
+    return main
+
+
 def make_inputs(folder: Path, wanted: list[str] | None = None) -> dict[str, Job]:
     """Inputs of both variants below ``folder``, and the wanted commands on them."""
     import yaml
 
-    from aerpaw_cmp.__main__ import main
+    main = installed_program()
 
     plan = yaml.safe_load((SAMPLE / "flight.yaml").read_text(encoding="utf-8"))
     plan["flight"]["plan"] |= {
@@ -139,7 +146,7 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
     """
     from typer import main as typer_main
 
-    from aerpaw_cmp.__main__ import main
+    main = installed_program()
     from aerpaw_cmp.flight import replay
     from aerpaw_cmp.jobs.campaigns import campaign
     from aerpaw_cmp.jobs.mapping import coverage_map
@@ -203,7 +210,7 @@ class Runs:
         self, variant: str, fault: tuple[int, int, int, int, str] = (0, NOTHING, 0, 0, ""), limit: int | None = None
     ) -> int:
         """Begin a run; gives its process id. ``fault`` is (at, kind, error, sticky, command)."""
-        from aerpaw_cmp.__main__ import main
+        main = installed_program()
 
         self.folder.mkdir(parents=True, exist_ok=True)
         if self.pipe is not None:

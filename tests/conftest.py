@@ -133,7 +133,7 @@ def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest
 @pytest.fixture(scope="module")
 def sionna() -> Any:
     """The module that drives Sionna RT, its variant loaded; skips where Sionna or a device for Dr.Jit is missing."""
-    from aerpaw_cmp.machine.llvm import let_sionna_load
+    from aerpaw_cmp.propagation.native.llvm import let_sionna_load
 
     let_sionna_load()
     pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")

@@ -19,7 +19,7 @@ from ..common import versions
 from ..common.counting import counted
 from ..common.errors import AerpawCmpError
 from ..common.files import cache_folder
-from . import llvm
+from ..propagation.native import llvm
 
 Status = Literal["ok", "warn", "fail"]
 

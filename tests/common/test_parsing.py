@@ -133,7 +133,7 @@ OWN = {
     "logs/files/checksums.py": "inside ingest",
     "logs/text/lines.py": "inside ingest",
     "logs/matfile.py": "inside ingest",
-    "machine/llvm.py": "the answer of a child",
+    "propagation/native/llvm.py": "the answer of a child",
     "propagation/engine/engines.py": "sealed by this user",
     "propagation/check/reference.py": "tables that the run has read",
     "jobs/reporting/audit_flight.py": "tables that the run has read",

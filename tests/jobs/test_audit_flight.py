@@ -15,8 +15,8 @@ from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.pose import track as tracks
 from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, RtSettings, load_flight
 from aerpaw_cmp.jobs.reporting import audit_flight
-from aerpaw_cmp.machine.llvm import INSTALL_AGAIN
 from aerpaw_cmp.propagation.geometry.arrays import Poses
+from aerpaw_cmp.propagation.native.llvm import INSTALL_AGAIN
 from tests.jobs.test_audit_raw import write_flight
 
 FRAME = SiteFrame(35.7275, -78.696)

@@ -98,7 +98,7 @@ def test_export_is_well_formed(tmp_path: Path) -> None:
 def test_sionna_opens_the_scene(tmp_path: Path) -> None:
     path = export_scene(load_site("lake_wheeler"), tmp_path)[0]
     script = (
-        "from aerpaw_cmp.machine.llvm import let_sionna_load; let_sionna_load()\n"
+        "from aerpaw_cmp.propagation.native.llvm import let_sionna_load; let_sionna_load()\n"
         "import sys, mitsuba as mi; mi.set_variant('llvm_ad_mono_polarized')\n"
         "from sionna.rt import load_scene\n"
         "scene = load_scene(sys.argv[1]); scene.frequency = 3.4e9\n"

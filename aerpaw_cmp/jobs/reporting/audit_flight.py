@@ -25,12 +25,12 @@ from ...flight.gains.losses import path_loss
 from ...flight.replay import Replayed, attitude_rotation, part_of
 from ...flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ...logs.ingest import IngestedFile
-from ...machine.llvm import SionnaMissingError
 from ...propagation.check import reference
 from ...propagation.check.audit import Audit, Second, audit
 from ...propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
 from ...propagation.drivers.moving import site_with_tower_at
 from ...propagation.geometry.arrays import Poses
+from ...propagation.native.llvm import SionnaMissingError
 from ...propagation.options import Field, Run, Search
 from ...propagation.search.sionna import free_memory
 from ...site.site import Site

@@ -1,1 +1,1 @@
-"""Compiled kernels: when to use them, where to keep them."""
+"""Compiled kernels: when to use them, where to keep them; and the LLVM that Dr.Jit compiles with."""

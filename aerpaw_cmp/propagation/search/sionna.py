@@ -34,11 +34,11 @@ import numpy as np
 from ...common.errors import CheckError, UsageError
 from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ...common.versions import version
-from ...machine.llvm import INSTALL_AGAIN, SionnaMissingError, let_sionna_load, prepare_llvm
 from ...site.materials import material
 from ..geometry.arrays import Array, Link
 from ..geometry.faces import inside, triangles
 from ..geometry.paths import Faces, Links, PathSet, Surfaces, path_lengths
+from ..native.llvm import INSTALL_AGAIN, SionnaMissingError, let_sionna_load, prepare_llvm
 from ..options import Progress
 from .mirror import (
     MINIMUM_LENGTH_M,

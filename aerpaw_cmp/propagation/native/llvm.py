@@ -23,9 +23,9 @@ from functools import cache
 from hashlib import sha256
 from pathlib import Path
 
-from ..common.errors import CheckError
-from ..common.files import cache_folder
-from ..common.versions import version
+from ...common.errors import CheckError
+from ...common.files import cache_folder
+from ...common.versions import version
 
 # 14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine.
 MINIMUM_MAJOR = 17

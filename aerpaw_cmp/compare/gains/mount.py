@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...common.units import FloatArray
+from ...common.units import FloatArray, wrap_degrees
 from .direction_gain import LinkSamples
 
 # Between the azimuths that are tried.
@@ -103,7 +103,7 @@ def _mount(
 ) -> MountFit:
     phasor = complex((probability * np.exp(1j * np.radians(grid))).sum())
     spread = np.degrees(np.sqrt(-2.0 * np.log(min(max(abs(phasor), 1e-9), 1.0))))
-    apart = np.abs((grid - best[0] + 180.0) % 360.0 - 180.0)
+    apart = np.abs(wrap_degrees(grid - best[0]))
     mean = tilt @ tilts
     return MountFit(
         azimuth_deg=best[0],

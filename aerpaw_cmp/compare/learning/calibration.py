@@ -12,7 +12,7 @@ import numpy as np
 
 from ...common.errors import InputError
 from ...common.geodesy import azimuth_rad
-from ...common.units import BoolArray, FloatArray, IntArray, spread_out
+from ...common.units import BoolArray, FloatArray, IntArray, spread_out, wrap_degrees
 from ..gains.direction_gain import GainFit, GainModel, LinkSamples, Term, chosen_fit, fit_gain
 from ..gains.mount import GainOf, MountFit, fit_mounts
 from ..gains.spread import Spread, StatedSpread, fading_of, inside_shares
@@ -473,8 +473,8 @@ def _angular(mine: FloatArray, sources: FloatArray, count: int, guard_deg: float
     out = []
     for k in range(count):
         centre = 2.0 * half * (k + 0.5)
-        near = np.abs((mine - centre + 180.0) % 360.0 - 180.0) <= half
-        far = np.abs((sources - centre + 180.0) % 360.0 - 180.0) > half + guard_deg
+        near = np.abs(wrap_degrees(mine - centre)) <= half
+        far = np.abs(wrap_degrees(sources - centre)) > half + guard_deg
         out.append((near, far))
     return out
 

@@ -31,6 +31,7 @@ from ...common.units import (
     db_from_power,
     power_from_db,
     unmasked,
+    wrap_degrees,
 )
 from ...logs.matfile import read_arrays
 
@@ -89,7 +90,7 @@ class TR38901:
         """All in E_theta: the slant is the array's."""
         zeros = _zeros(theta_rad, phi_rad)
         theta_deg = np.degrees(np.asarray(theta_rad, dtype=np.float64))
-        phi_deg = (np.degrees(np.asarray(phi_rad, dtype=np.float64)) + 180.0) % 360.0 - 180.0
+        phi_deg = wrap_degrees(np.degrees(phi_rad))
         vertical = np.minimum(12 * ((theta_deg - 90) / 65) ** 2, 30.0)
         horizontal = np.minimum(12 * (phi_deg / 65) ** 2, 30.0)
         gain_db = 8.0 - np.minimum(vertical + horizontal, 30.0)

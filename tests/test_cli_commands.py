@@ -51,7 +51,7 @@ def test_formats_shows_every_reader(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_doctor_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    """What this machine's LLVM did in its trial is remembered; tests/machine/test_llvm.py tries it anew."""
+    """What this machine's LLVM did in its trial is remembered; tests/propagation/test_llvm.py tries it anew."""
     trials = list(llvm._trials())
     monkeypatch.setattr(llvm, "first_that_works", lambda _: trials)
     capsys.readouterr()

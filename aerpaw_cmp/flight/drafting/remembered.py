@@ -15,10 +15,11 @@ from ...compare.gains.direction_gain import LinkSamples
 from ...compare.gains.spread import NO_SPREAD, Spread
 from ...compare.learning.locate import LevelModel
 from ...site.antenna import learned
+from ...site.antenna.named import check_logs
 from ...site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
 from ..data import FlightData, RssSeries, site_place
 from ..gains.learned_gain import pair_and_sd_db, sphere_angles
-from ..gains.memory import check_logs, with_learned
+from ..gains.memory import with_learned
 from ..marks import among
 from ..settings import FlightFile
 from .node import Taught

@@ -5,20 +5,20 @@ Reading flight.yaml opens no table; a job that replays or lists its inputs takes
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from ...common.errors import InputError, UsageError, parsing
-from ...site.antenna.learned import BAND, Named, find_named, read_table
-from ...site.antenna.sphere_pattern import read_sphere_csv
+from ...common.errors import InputError, UsageError
+from ...site.antenna.learned import Named, find_named
+from ...site.antenna.named import antenna_file, receiver_file
 from ..settings import AntennaSettings, ArraySettings, FlightFile, LinkSettings, load_flight
 
 
 def load_with_learned(path: str | Path, learned: Path | None = None) -> FlightFile:
     """A flight.yaml as :func:`~aerpaw_cmp.flight.settings.load_flight` reads it, with what its site remembers."""
-    return with_learned(load_flight(path, learned), Path(path).parent)
+    settings = load_flight(path, learned)
+    return with_learned(settings, Path(path).parent)
 
 
 def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
@@ -49,7 +49,7 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
     if receiver is not None and "/" in receiver and not (folder / receiver).is_file():
         try:
             content["rank"] = settings.rank.model_copy(
-                update={"receiver": _receiver_file(find_named(receiver, folder))}
+                update={"receiver": str(receiver_file(find_named(receiver, folder)))}
             )
         except (InputError, UsageError) as error:
             if Path(receiver).suffix != ".json":  # else a file of another place: reading it says what is wrong
@@ -66,60 +66,18 @@ def _reason(error: InputError | UsageError) -> str:
     return f"{error.found}{where}; expected: {error.expected}"
 
 
-def _receiver_file(named: Named) -> str:
-    """File of a learned rank receiver that can be read and was made from the logs that its entry names."""
-    if not named.entry.receivers:
-        raise UsageError("the entry has no rank receiver", expected="one learned from ranks")
-    path = named.folder / named.entry.receivers[0].file
-    with parsing(path, "a rank receiver"):
-        content = json.loads(read_table(path, "a rank receiver"))
-    check_logs(content.get("trained_on", []) if isinstance(content, dict) else [], named, path)
-    return str(path)
-
-
-def check_logs(trained_on: Sequence[str], named: Named, path: Path) -> None:
-    """Refuse a table that was learned from logs which its entry does not name: scores would trust the wrong ones."""
-    strange = set(trained_on) - set(named.entry.trained_on)
-    if strange:
-        raise InputError(
-            f"learned from logs (SHA-256 {min(strange)[:12]}...) that its entry does not name",
-            expected="the table that was written with the entry",
-            cause="a table of another calibration",
-            path=path,
-        )
-
-
 def _with_antenna(
     settings: FlightFile, channels: Mapping[str, LinkSettings], key: str, named: Named
 ) -> dict[str, LinkSettings]:
-    """Links of the channels that a learned antenna belongs to.
-
-    Raises
-    ------
-    UsageError
-        No antenna of that name for this end, or one of another band.
-    InputError
-        A table that is damaged, or learned from other logs than its entry says.
-    """
-    end = "uav" if key == "uav" else "tower"
+    """Links of the channels that a learned antenna belongs to."""
     tower, _, channel = key.partition(".")
-    names = [channel] if end == "tower" else list(channels) or [s.channel for s in named.entry.series]
+    names = [channel] if key != "uav" else list(channels) or [s.channel for s in named.entry.series]
     out = {}
     for name in names:
         link = channels.get(name, settings.link.rss)
-        series = named.antenna(tower, name, end)
-        if series is None:
-            raise UsageError(f"no learned antenna of {key}", expected="one that the entry has")
-        if abs(link.carrier_hz / series.carrier_hz - 1.0) > BAND:
-            raise UsageError(
-                f"learned at {series.carrier_hz / 1e9:g} GHz, used at {link.carrier_hz / 1e9:g} GHz",
-                expected="an antenna of the same band",
-            )
-        path = named.folder / (series.uav_file if end == "uav" else series.tower_file)
-        check_logs(read_sphere_csv(path).trained_on, named, path)
-        antenna = AntennaSettings(model="sphere", file=str(path))
-        if end == "uav":
-            out[name] = link.model_copy(update={"uav": ArraySettings(antenna=antenna)})
-        else:
-            out[name] = link.model_copy(update={"towers": {**link.towers, tower: ArraySettings(antenna=antenna)}})
+        file = str(antenna_file(named, key, name, link.carrier_hz))
+        array = ArraySettings(antenna=AntennaSettings(model="sphere", file=file))
+        out[name] = link.model_copy(
+            update={"uav": array} if key == "uav" else {"towers": {**link.towers, tower: array}}
+        )
     return out

@@ -59,7 +59,7 @@ DEAREST = (
     "report/test_diff.py",
     "jobs/test_compare_flight.py",
     "report/test_browser_map.py",
-    "machine/test_llvm.py",
+    "propagation/test_llvm.py",
 )
 
 

@@ -12,11 +12,11 @@ import typer
 
 from ..common.errors import UsageError
 from .app import Interrupted, app
-from .commands import campaign, diff, explain, flight, live, logs, machine, plan, predict, site
+from .commands import flight, live, logs, machine, planning, reports, site
 from .shown import say
 
 # The modules whose commands there are: importing them registers these.
-GROUPS = (logs, flight, explain, campaign, diff, predict, plan, live, site, machine)
+GROUPS = (logs, flight, reports, planning, live, site, machine)
 
 
 @cache

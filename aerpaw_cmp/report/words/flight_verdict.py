@@ -39,14 +39,14 @@ def paragraph(data: ReportData) -> str:
     """
     panels = scored(data.rss)
     error = _level_sentence(data.verdict, panels) if panels else _rank_sentence(data.rank)
-    advice = None if data.next_step is None else f"Next: {data.next_step}."
+    advice = "" if data.next_step is None else f"Next: {data.next_step}."
     if learned := _training(data):
         other = error if panels or not data.rss else _baseline_sentence(data.rss)
         parts = [learned, other, words.expected_sentence(data.rss)]
     elif error and data.against is not None and data.against.scores:
         parts = [error, before_flight(data.against.scores), advice]
     elif error:
-        cause = data.cause or (words.NO_CAUSE if panels else None)
+        cause = data.cause or (words.NO_CAUSE if panels else "")
         parts = [error, words.expected_sentence(panels), cause, advice]
     else:
         most = max([panel.score.n for panel in data.rss], default=0)

@@ -68,7 +68,7 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
     if len(flights_of(observed)) > 1:  # the errors to expect; the other splits and the controls are not read
         scores["flight_left_out"] = flight_left_out(observed, chosen, learned)
     calibration = Calibration(
-        settings=settings, flights=tuple(flights), observed=tuple(observed), place=None, scores=scores, controls={},
+        settings=settings, flights=tuple(flights), observed=tuple(observed), scores=scores, controls={},
         learned=learn([o.samples for o in observed], chosen), curve=(), ground=_NO_RAY, warnings=(), words=(),
         locks=learned_locks(observed, chosen, learned),
     )  # fmt: skip

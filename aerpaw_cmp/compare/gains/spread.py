@@ -166,14 +166,15 @@ class StatedSpread:
         ]  # fmt: skip
 
         def distance(mean: FloatArray, sd: FloatArray) -> FloatArray:
-            return crps_normal(mean, sd) + sd / np.sqrt(np.pi)
+            return np.asarray(crps_normal(mean, sd) + sd / np.sqrt(np.pi))
 
-        score = sum(p * distance(error_db - mean, sd) for p, mean, sd in parts)
-        score -= 0.5 * sum(
+        to_error = np.sum([p * distance(error_db - mean, sd) for p, mean, sd in parts], axis=0)
+        apart = np.sum([
             p * q * distance(mean - other, np.hypot(sd, other_sd))
             for p, mean, sd in parts
             for q, other, other_sd in parts
-        )
+        ], axis=0)  # fmt: skip
+        score = to_error - 0.5 * apart
         return float(np.nanmean(score)) if np.isfinite(score).any() else math.nan
 
     def columns(self, level_dbm: FloatArray) -> dict[str, FloatArray]:

@@ -10,7 +10,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.jsonable import json_safe
-from aerpaw_cmp.compare.level import rss
 from aerpaw_cmp.compare.level.rss import (
     averaged_fits,
     bin_residual,
@@ -245,31 +244,6 @@ def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
         assert fit.correlation > 0.5
 
 
-@pytest.mark.parametrize(
-    ("context", "mean_db", "words"),
-    [
-        ({"height_m": 4.9, "los": 0.0}, -1.0, "take-off"),
-        ({"height_m": 5.0, "los": 0.49, "foliage_m": 9.0}, 1.0, "simulated obstruction"),
-        ({"los": 0.49}, -1.0, "deeper than simulated"),
-        ({"los": 0.5, "foliage_m": 1.01, "elevation_deg": 80.0}, 1.0, "less loss"),
-        ({"foliage_m": 1.01}, -1.0, "more loss"),
-        ({"foliage_m": 1.0, "elevation_deg": 50.1}, -1.0, "steep"),
-        ({"elevation_deg": -50.1, "coherent_minus_power_sum_db": -7.0}, 1.0, "steep"),
-        ({"elevation_deg": 50.0, "coherent_minus_power_sum_db": -6.01}, 1.0, "fade"),
-        ({"coherent_minus_power_sum_db": -6.01}, -1.0, "unmodelled loss"),
-        ({"coherent_minus_power_sum_db": -6.0}, 1.0, "unmodelled path"),
-        ({"heading_deg": 45.0}, 1.0, "unmodelled path"),
-        ({"heading_deg": 45.1}, -1.0, "turn by 45"),
-    ],
-)
-def test_causes_in_their_order_and_by_their_limits(context, mean_db, words):
-    """The typical value is the median of the span; a heading goes from 0 to the value."""
-    of_span = {k: np.array([9e9, v, v, np.nan, v, -9e9]) for k, v in context.items()}
-    if "heading_deg" in context:
-        of_span["heading_deg"] = np.array([180.0, 350.0, np.nan, 350.0, 350.0 + context["heading_deg"], 180.0]) % 360.0
-    assert words in rss._likely_cause(of_span, slice(1, 5), mean_db)
-
-
 def test_bins_and_their_intervals_are_those_by_hand():
     rng = np.random.default_rng(14)
     quantity, residual = rng.uniform(0.0, 10.0, 200), rng.normal(size=200)
@@ -329,7 +303,6 @@ def test_spans_are_runs_of_smoothed_errors_of_one_sign():
         assert span.worst_db == residual[run][np.abs(residual[run]).argmax()]
         assert span.position_m == pytest.approx(place[run].mean(axis=0))
         assert span.geometry["x"] == pytest.approx(np.median(time[run]))
-        assert span.cause == rss._likely_cause(around, slice(run[0], run[-1] + 1), span.mean_db)
     json.dumps(json_safe(spans), allow_nan=False)
     assert error_spans(time, np.full(len(time), NAN)) == []
     assert len(error_spans(np.arange(600.0), np.tile(np.repeat([9.0, -9.0], 10), 30), threshold_db=1.0)) == 10

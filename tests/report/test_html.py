@@ -117,7 +117,6 @@ def hostile_report(data: ReportData, text: str) -> ReportData:
     )
     panel = with_numbers(
         data.rss[0], tower=text, channel=text, unit=text, clock=clock, fitted_on_scored=(text,),
-        spans=(dataclasses.replace(data.rss[0].spans[0], cause=text),),
     )  # fmt: skip
     bad_input = InputFile(
         path=text, sha256=text, reader=text, lines=1, accepted=0, rejected=1, blank=0, role=text, warnings=(text,),

@@ -509,8 +509,6 @@ class ErrorSpan:
         The residual of largest magnitude.
     position_m : tuple of float
         Mean east, north, up of the span [m]; empty if no positions were given.
-    cause : str
-        Likely cause, by rules of thumb from the geometry.
     geometry : mapping of str to float
         Median of each context quantity in the span.
     """
@@ -521,7 +519,6 @@ class ErrorSpan:
     mean_db: float
     worst_db: float
     position_m: tuple[float, ...]
-    cause: str
     geometry: Mapping[str, float] = field(default_factory=dict)
 
 
@@ -587,7 +584,6 @@ def error_spans(
                 mean_db=float(part.mean()),
                 worst_db=float(part[np.argmax(np.abs(part))]),
                 position_m=centre,
-                cause=_likely_cause(where, slice(a, b), float(part.mean())),
                 geometry={name: _typical(values[a:b]) for name, values in where.items()},
             )
         )
@@ -595,42 +591,11 @@ def error_spans(
     return spans[:largest]
 
 
-def _likely_cause(context: Mapping[str, Any], span: slice, mean_db: float) -> str:
-    """The first rule of thumb that the geometry of a span fits, strongest physics first."""
-
-    def typical(name: str) -> float:
-        return _typical(context[name][span]) if name in context else float("nan")
-
-    if typical("height_m") < 5.0:
-        return "take-off or landing: the UAV is near the ground and near its own obstacles"
-    if typical("los") < 0.5:
-        return "simulated obstruction of the line of sight" if mean_db > 0 else "obstruction deeper than simulated"
-    if typical("foliage_m") > 1.0:
-        return "foliage on the path: " + ("less" if mean_db > 0 else "more") + " loss than modelled"
-    if abs(typical("elevation_deg")) > 50.0:
-        return "steep elevation: null or lobe of the antennas"
-    if typical("coherent_minus_power_sum_db") < -6.0 and mean_db > 0:
-        return "simulated fade of two paths that did not cancel in the field"
-    turn = _turn_deg(context["heading_deg"][span]) if "heading_deg" in context else 0.0
-    if turn > 45.0:
-        return f"turn by {turn:.0f} deg: the airframe or the UAV pattern"
-    return "unmodelled loss or pattern" if mean_db < 0 else "unmodelled path or pattern"
-
-
 def _typical(values: Any) -> float:
     """Median without NaN."""
     known = np.asarray(values, dtype=np.float64)
     known = known[np.isfinite(known)]
     return float(np.median(known)) if len(known) else float("nan")
-
-
-def _turn_deg(heading_deg: Any) -> float:
-    heading = np.asarray(heading_deg, dtype=np.float64)
-    heading = heading[np.isfinite(heading)]
-    if len(heading) < 2:
-        return 0.0
-    path = np.unwrap(heading, period=360.0)
-    return float(np.ptp(path))
 
 
 @dataclass(frozen=True, slots=True)

@@ -562,7 +562,7 @@ def _worst(
     geometry: Mapping[str, FloatArray],
     line_of_sight: FloatArray,
 ) -> list[rss.ErrorSpan]:
-    """The spans of largest error, with place and likely cause."""
+    """The spans of largest error, with place and geometry."""
     context = {
         "los": line_of_sight,
         "elevation_deg": geometry["elevation_deg"],

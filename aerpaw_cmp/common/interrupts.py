@@ -146,7 +146,7 @@ def _watch(signals: int, ended: threading.Event) -> None:
 
 
 def said(number: int) -> str:
-    """How a message calls the end by a signal."""
+    """Words of a message for the end by a signal."""
     return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
 
 

@@ -124,7 +124,10 @@ def _is_of(quantity: dictionary.Quantity, name: str, unit: str | None) -> bool:
     """Check whether a column of a quantity can be mapped to a column of the record model."""
     if name == "rss_db":
         return quantity.role == "rss" or (quantity.unit == "dB" and unit != "dBm")
-    return name not in COLUMNS["telemetry"] or quantity.name in (name, *_NO_POSE)
+    if name == "ri_raw":
+        return quantity.role == "rank"
+    of_axes = quantity.role == "velocity" and name.startswith("velocity")  # 'vx' is east where x is
+    return name not in COLUMNS["telemetry"] or quantity.name in (name, *_NO_POSE) or of_axes
 
 
 def _odd(sheet: _sheet.Sheet, column: int) -> BoolArray:

@@ -441,6 +441,9 @@ def test_a_header_and_a_mapping_that_disagree_are_refused(tmp_path: Path) -> Non
         read(tmp_path / "x.csv", (*place, "h [deg]=altitude_m"), {})
     with pytest.raises(UsageError, match="'lon' says longitude_deg, the mapping latitude_deg"):
         read(tmp_path / "x.csv", (*place[:2], "lon=latitude_deg", "lat=longitude_deg"), {})
+    (tmp_path / "y.csv").write_text(table("time,cqi", f"{EPOCH},2"))
+    with pytest.raises(UsageError, match="'cqi' says CQI, the mapping ri_raw"):
+        read(tmp_path / "y.csv", ("time=time", "cqi=ri_raw"), {"ri_base": "one"})
     with pytest.raises(UsageError, match="says dBm"):
         read(tmp_path / "x.csv", place, {"unit": "dB re full scale"})
 

@@ -137,8 +137,8 @@ QUANTITIES: tuple[Quantity, ...] = (
     )),
     # who
     Quantity("device", "identity", (
-        r"^(device|phone|modem|ue|vehicle|drone|uav|logger|serial|node|station|client|user|robot|rover|aircraft|tail|host"
-        r"|antenna|interface|mac|bssid|sensor|gps|gps receiver)"
+        r"^(device|phone|modem|ue|vehicle|drone|uav|logger|serial|client|user|robot|rover|aircraft|tail|host"
+        r"|interface|mac|bssid|gps|gps receiver)"
         r"( ?(id|name|no|num|number|sn|serial|index|instance|port|model|address))?$",
         r"^(imei|imsi|sys ?id|system ?id|comp ?id|component ?id)$",
         r"^(receiver|rx)( ?(id|name|channel|port|antenna|serial number))?$",

@@ -203,7 +203,7 @@ def _stream(rows: _rows.Rows, columns: Table, pick: IntArray, served: FloatArray
             "read as out of coverage"
         )
     rssi = columns.qualities[QUALITIES.index("rssi_dbm"), pick]
-    if cell.quantity == "RSRP" and 2 * (rssi < level).sum() > len(level):
+    if cell.quantity == "RSRP" and (rssi < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell.name}: RSSI lies below RSRP, which cannot be: are the columns exchanged?")
     _lines.add_flag(flag, outside, "out_of_coverage")
     _lines.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")

@@ -251,7 +251,9 @@ COUSINS: dict[str, tuple[str, Right]] = {
     "SIMs": (alternating("SIM slot", 1, 2), Right({"pci11_sim1": HIGH, "pci11_sim2": LOW})),
     "SIMs from 0": (alternating("Sim", 0, 1), Right({"pci11_sim0": HIGH, "pci11_sim1": LOW})),
     "subscriptions of Android": (alternating("subId", 1, 2), Right({"pci11_subid1": HIGH, "pci11_subid2": LOW})),
-    "nodes": (alternating("node", "A", "B"), Right({"pci11_A": HIGH, "pci11_B": LOW})),
+    "G-NetTrack's node is a base station": (
+        alternating("NODE", 1, 1).replace("1,-78.7", "2,-78.7", 2), Right({"pci11": {"rss_db": [-70, -110] * 4}})),
+    "clients": (alternating("client", "A", "B"), Right({"pci11_A": HIGH, "pci11_B": LOW})),
     "SIMs in columns": (
         table("time,sim1_pci,sim1_rsrp,sim2_pci,sim2_rsrp", f"{EPOCH},11,{{l}},11,-12{{i}}"),
         Right({"pci11_sim1": {"rss_db": down(-90, 4)}, "pci11_sim2": {"rss_db": down(-120, 4)}})),

@@ -229,8 +229,10 @@ def test_one_wild_sample_that_moves_the_error_is_said(report_data):
 
 def test_a_single_sample_is_no_result(report_data):
     panels = tuple(with_numbers(panel, n=1, rmse_db=0.01) for panel in report_data.rss)
-    first = paragraph(dataclasses.replace(report_data, rss=panels, rank=()))
+    data = dataclasses.replace(report_data, rss=panels, rank=())
+    first = paragraph(data)
     assert first.startswith("Nothing could be compared")
+    assert paragraph(with_cause(data)) == f"{first} {CAUSE.sentence} Next: {CAUSE.next_step}."
     assert "at most 1" in first
     assert "0.01" not in first
 

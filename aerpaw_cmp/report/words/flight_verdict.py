@@ -50,7 +50,8 @@ def paragraph(data: ReportData) -> str:
         parts = [error, words.expected_sentence(panels), cause, advice]
     else:
         most = max([panel.score.n for panel in data.rss], default=0)
-        parts = [words.TOO_FEW_COMPARED.format(n=most) if most else words.NOTHING_COMPARED]
+        none = words.TOO_FEW_COMPARED.format(n=most) if most else words.NOTHING_COMPARED
+        parts = [none, data.cause, advice if data.cause else None]
     return " ".join(part for part in parts if part)
 
 

@@ -194,7 +194,7 @@ def main() -> int:
     parser.add_argument("--moments", type=int, default=7)
     parser.add_argument("--json", action="store_true")
     given = parser.parse_args()
-    rows = []
+    rows: list[dict[str, Any]] = []
     with tempfile.TemporaryDirectory() as home:
         root = Path(home)
         furnish(root)

@@ -113,9 +113,9 @@ def _variant(kinds: Sequence[str]) -> str:
     import mitsuba as mi
 
     # Mitsuba looks for its plugins, native code, in the working folder first: a stranger's, it may be
-    plugins: Any = mi.file_resolver()
-    plugins.clear()
-    plugins.append(str(Path(mi.__file__).parent))
+    resolver: Any = mi.file_resolver
+    resolver().clear()
+    resolver().append(str(Path(mi.__file__).parent))
     current = mi.variant()
     if current in [f"{kind}_ad_mono_polarized" for kind in kinds]:
         return str(current)

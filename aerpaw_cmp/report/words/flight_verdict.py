@@ -51,7 +51,7 @@ def paragraph(data: ReportData) -> str:
     else:
         most = max([panel.score.n for panel in data.rss], default=0)
         none = words.TOO_FEW_COMPARED.format(n=most) if most else words.NOTHING_COMPARED
-        parts = [none, data.cause, advice if data.cause else None]
+        parts = [none, data.cause or "", advice if data.cause else ""]
     return " ".join(part for part in parts if part)
 
 

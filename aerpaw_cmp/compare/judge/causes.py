@@ -520,7 +520,8 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 def _floor(e: LevelEvidence) -> Iterator[Trial]:
     """A receiver that shows no level below its floor; what it shows there spreads less."""
-    yield from _clipping(e, 1.0)
+    if e.least is None:  # else the log itself says where nothing was detected
+        yield from _clipping(e, 1.0)
 
 
 def _saturation(e: LevelEvidence) -> Iterator[Trial]:

@@ -270,7 +270,7 @@ def _named(name: str, shown: Sequence[_Models], gain: float) -> Cause:
     value, low, high = trial.estimate
     return Cause(
         name=name,
-        sentence=f"Likely cause at {where}: {trial.sentence}; RMSE {rmse_with:.1f} dB with it.",
+        sentence=f"Likely cause at {where}: {trial.sentence}; RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
         next_step=trial.next_step,
         estimate=value,
         ci95=(low, high),

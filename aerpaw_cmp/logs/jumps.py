@@ -22,7 +22,6 @@ _JITTER_M = 15.0
 
 # Jumps are few; where more rows do not fit, the track is not one track, or its times are wrong.
 _FEW_SHARE = 0.2
-_MOST_SHARE = 0.6
 
 _DEGREE_M = 111_200.0
 

@@ -44,7 +44,6 @@ _FORMS = (
                r"(?:\.?(?P<fraction>\d{1,9}))?" + _ZONE),
     *(re.compile(rf"{_CLOCK}{_ZONE}[ ,]{{1,2}}" + date) for date in _DATES),
 )  # fmt: skip
-_TWICE = _FORMS[2], _FORMS[len(_DATES) + 4]
 _DIGITS = _FORMS[len(_DATES) + 1]
 _OF_DAY = re.compile(r"T?" + _CLOCK.replace("[:.h-]", ":", 1).replace("[:.m-](?P<second>", ":(?P<second>") + _ZONE)
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")

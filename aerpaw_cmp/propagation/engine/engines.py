@@ -6,7 +6,6 @@ one entry serves every array.
 
 from __future__ import annotations
 
-import hashlib
 import io
 import time
 import warnings
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ... import __version__
+from ...common.content import content_digest
 from ...common.files import cache_folder, read_sealed, write_sealed
 from ...common.units import AnyArray, FloatArray
 from ...common.versions import version
@@ -253,22 +253,14 @@ class PathCache:
         str
             SHA-256, in hexadecimal.
         """
-        digest = hashlib.sha256()
-        versions = [__version__, str(LAYOUT)]
+        faces, surfaces = scene.faces, scene.surfaces
+        decides: list[object] = [__version__, LAYOUT, sorted(search.deciding.items())]
         if search.engine == "sionna":
-            versions += [version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
-            versions += [str(carrier_hz), *scene.faces.material]
-        text = "\n".join([*versions, *(f"{k}={v}" for k, v in sorted(search.deciding.items()))])
-        digest.update(text.encode())
-        faces = scene.faces
-        for polygon in faces.polygon:
-            digest.update(b"-" if polygon is None else polygon.wkb)
-        if scene.surfaces is not None:
-            digest.update(scene.surfaces.corners_m.tobytes() + scene.surfaces.first.tobytes())
+            decides += [[version(name) for name in ("sionna-rt", "mitsuba", "drjit")], carrier_hz, faces.material]
         columns = (faces.normal, faces.offset_m, faces.along, faces.lower, faces.upper, faces.solid)
-        for column in (*columns, scene.sources_m, scene.usable, scene.excluded, targets_m):
-            digest.update(str(column.shape).encode() + np.ascontiguousarray(column).tobytes())
-        return digest.hexdigest()
+        mesh = None if surfaces is None else (surfaces.corners_m, surfaces.first)
+        links = (scene.sources_m, scene.usable, scene.excluded, targets_m)
+        return content_digest(decides, faces.polygon, columns, mesh, links)
 
     def load(self, key: str) -> tuple[PathSet, float] | None:
         """Paths and the seconds that their search took; None where there is no whole entry (see ``warnings``)."""

@@ -57,6 +57,7 @@ SMALLEST: dict[str, list[str]] = {
     "freeze": ["record", "{folder}/record.npz"],
     "fuzz_commands": ["--calls", "20"],
     "fuzz_inputs": ["--inputs", "20"],
+    "interrupts": ["--only", "formats", "--moments", "2"],
     "ingest": ["--scale", "2000", "--format", "sounder_log"],
     "interval_weights": ["mean", "--sequences", "4"],
     "kriging": ["--quick", "--pairs", "60"],

@@ -205,7 +205,7 @@ def test_batches_hold_one_to_a_hundred_poses(scenes, monkeypatch, batch, refused
     class LoadedError(Exception):
         pass
 
-    def load(_):
+    def load():
         raise LoadedError
 
     monkeypatch.setattr(sionna, "load_variant", load)

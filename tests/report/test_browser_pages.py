@@ -36,5 +36,5 @@ def test_the_first_words_need_no_scrolling(
         assert bottom < 0.75 * height  # the first picture or table begins above the fold, too
         assert wide <= width
         assert any(unit in text for unit in (" dB", " %"))
-        assert "Next: " in text
+        assert "Next: " in text or page == "report"  # a flight has one next step or none
         assert "`" not in text

@@ -930,9 +930,14 @@ def _is_text(path: str) -> bool:
     return True
 
 
+# Times before it are relative, or of a clock that was never set: no flight is called by them.
+_FIRST_CLOCK = np.datetime64("1981")
+
+
 def _name(flown: tuple[Stream, Span] | None, files: Sequence[IngestedFile]) -> str:
-    """The time of take-off, or the folder."""
-    if flown is None:
-        folder = Path(files[0].path).resolve().parent.name
-        return re.sub(r"[^A-Za-z0-9_.-]", "_", folder).lstrip("_.-") or "flight"
+    """The time of take-off, else the log where it is one, else the folder."""
+    if flown is None or flown[1][0] < _FIRST_CLOCK:
+        place = Path(files[0].path).resolve()
+        stem = place.stem if flown is not None and len(files) == 1 else place.parent.name
+        return re.sub(r"[^A-Za-z0-9_.-]", "_", stem).lstrip("_.-") or "flight"
     return "flight_" + str(flown[1][0].astype("datetime64[m]")).replace("T", "_").replace(":", "")

@@ -96,7 +96,7 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
             cause="the log has altitudes of its own, or no positions",
         )
     note = f"no altitude in the log: {log.height_m:g} m above take-off in all of it, as height_m says"
-    warnings = [text for text in file.result.warnings if not text.startswith("the log has no altitude")]
+    warnings = [text for text in file.result.warnings if not text.startswith("no column is known as a height")]
     return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, note)))
 
 

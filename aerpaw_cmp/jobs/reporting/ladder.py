@@ -7,6 +7,7 @@ so far, by the RMSE on held-out segments. Everything but the offset is fixed bef
 from __future__ import annotations
 
 import dataclasses
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -216,12 +217,16 @@ class _Climber:
         return self._better_than_set(self._by_flights_left_out(climbed), climbed)
 
     def _better_than_set(self, *climbed: FlightLadder) -> FlightLadder:
-        """The first whose recommended model is better than the flight as set, significantly; else the flight as set."""
+        """The first whose recommended model is better than the flight as set, significantly; else the flight as set.
+
+        Nothing is recommended of a flight that taught its own antennas: as set it has no score.
+        """
         better = (each for each in climbed if self._is_better(each.ladder))
-        as_set = climbed[-1].ladder
-        if as_set.recommended is not None:
-            as_set = dataclasses.replace(as_set, recommended=len(as_set.rungs) - 1)
-        return next(better, dataclasses.replace(climbed[-1], ladder=as_set))
+        ladder, last = climbed[-1].ladder, len(climbed[-1].ladder.rungs) - 1
+        if ladder.recommended is not None:
+            scored = math.isfinite(ladder.rmse_db[last])
+            ladder = dataclasses.replace(ladder, recommended=last if scored else None)
+        return next(better, dataclasses.replace(climbed[-1], ladder=ladder))
 
     def _is_better(self, ladder: Ladder) -> bool:
         """Check a recommended model against the last rung, the flight as set, over all series at once."""

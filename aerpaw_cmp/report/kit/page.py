@@ -155,7 +155,7 @@ def coded(text: str) -> Markup:
     >>> str(coded("Next: `a < b`."))
     'Next: <code>a &lt; b</code>.'
     """
-    parts = str(text).split("`")
+    parts = str(text).replace("(95 %)", "(95\N{NO-BREAK SPACE}%)").split("`")
     return Markup("").join(
         Markup("<code>{}</code>").format(part) if i % 2 else escape(part) for i, part in enumerate(parts)
     )

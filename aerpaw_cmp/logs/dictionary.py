@@ -275,6 +275,8 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     """
     bare, unit = without_unit(name)
     texts = [plain(name) if words is None else words]
+    if not re.search("[a-z]", texts[0]):  # a number or a time: sniffers ask of every cell of the first lines
+        return None
     if texts[0] == plain(name):
         # 'Time (+02:00)'; 'heightAboveGround'
         texts += [bare, plain(in_brackets(name)[2]), plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))]

@@ -8,7 +8,9 @@ their last cells; rows that do not fit their header by the ranges of the diction
 from __future__ import annotations
 
 import csv
+import math
 import re
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -264,13 +266,15 @@ class Sheet:
             texts = [text.replace(",", "") for text in texts]
         meaning = self.meanings[column]
         reads = _angle if meaning is not None and meaning.quantity.role == "position" else _number
-        parsed = {text: reads(text) for text in set(texts)}  # tables repeat themselves
+        counts = Counter(texts)  # tables repeat themselves
+        parsed = {text: reads(text) for text in counts}
         values = np.array([parsed[text][0] for text in texts], dtype=np.float64)
-        words = [text for text in texts if np.isnan(parsed[text][0]) and text.lower() not in NO_VALUE]
-        if 2 * len(words) > sum(text.lower() not in NO_VALUE for text in texts):
+        told = {text: count for text, count in counts.items() if text.lower() not in NO_VALUE}
+        words = {text: count for text, count in told.items() if math.isnan(parsed[text][0])}
+        if 2 * sum(words.values()) > sum(told.values()):
             self.notes[column] = (
-                f"column {self.names[column]!r}: {len(words)} cells are no number (the first: {words[0][:30]!r}) and "
-                "read as missing"
+                f"column {self.names[column]!r}: {sum(words.values())} cells are no number (the first: "
+                f"{next(iter(words))[:30]!r}) and read as missing"
             )
         unit = meaning.unit if meaning is not None and "[" in self.names[column] else ""
         if unit and meaning is not None and meaning.quantity.unit and not dictionary.is_unit(unit):

@@ -36,7 +36,7 @@ _WANTED = {"RNTI": 16, "cqi": 10, "ri": 10, "mcs": 10}
 
 def sniff(head: bytes) -> bool:
     """Check whether the table's title line stands behind a stamp."""
-    return _TITLE.search(head) is not None
+    return b"RNTI" in head and _TITLE.search(head) is not None
 
 
 def _table(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, dict[str, float]]], list[RejectedLine]]:

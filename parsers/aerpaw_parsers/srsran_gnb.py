@@ -50,7 +50,8 @@ _TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +(?:0x)?[0-9a
 
 def sniff(head: bytes) -> bool:
     """Check whether it is the console with its title line, or the log with scheduler metrics."""
-    return not head.startswith(_lines.MARKUP) and any(mark.search(head) for mark in (_TITLE, _SCHEDULER))
+    known = b" rnti " in head or b"[METRICS" in head
+    return known and not head.startswith(_lines.MARKUP) and any(mark.search(head) for mark in (_TITLE, _SCHEDULER))
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

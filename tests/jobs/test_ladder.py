@@ -213,7 +213,8 @@ def test_the_rung_with_diffraction_is_what_its_settings_replay(tmp_path: Path) -
     """Free space with edges has no reflection off the ground beside it."""
     path = flight(tmp_path)
     stated = yaml.safe_load(path.read_text(encoding="utf-8"))
-    path.write_text(yaml.safe_dump({**stated, "site": "lake_wheeler"}), encoding="utf-8")
+    asked = {**stated["rt"], "diffraction": "edges"}
+    path.write_text(yaml.safe_dump({**stated, "site": "lake_wheeler", "rt": asked}), encoding="utf-8")
     model, rungs = Model(buildings=True, diffraction=True), []
     for file in (path, with_model(path, model)):
         result = run_flight(load_data(load_flight(file), tmp_path), audit=False, ladder=True).result

@@ -292,8 +292,10 @@ class _Climber:
         return [dataclasses.replace(best, buildings=True)]
 
     def _edges(self, best: Model) -> list[Model]:
+        # where the flight asks for them: they were the dearest rung, and the best on none of 28 real series
         moving = any(s.replayed.tower_m is not None for s in self._series)
-        if not self._data.site.buildings or self._data.site.scene is not None or moving:
+        site, asked = self._data.site, self._data.settings.rt.diffraction != "none"
+        if not asked or not site.buildings or site.scene is not None or moving:
             return []
         return [dataclasses.replace(best, buildings=True, diffraction=True)]
 

@@ -163,7 +163,7 @@
     host.className = "chart";
     target.append(host);
     const options = {
-      width: Math.max(host.clientWidth, 200), height, legend: { show: false }, padding: [6, 12, 0, 0],
+      width: Math.max(host.clientWidth, 200), height, legend: { show: false }, padding: [6, 26, 0, 0],
       scales: { x: { time: false, range: () => range }, ...(extra.scales || {}) },
       axes: [timeAxis(), { ...axis(label), ...(extra.axis || {}) }],
       bands: extra.bands,

@@ -118,13 +118,13 @@ def modem(root: Path) -> Iterator[None]:
         process.wait()
 
 
-def used_s(pid: int) -> float:
-    """Processor time of a process, of its children that ended, too."""
+def used_s(pid: int, *, children: bool = True) -> float:
+    """Processor time of a process, and of its children that ended."""
     try:
         fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     except OSError:
         return 0.0
-    return sum(map(int, fields[11:15])) / TICKS
+    return sum(map(int, fields[11 : 15 if children else 13])) / TICKS
 
 
 def group(number: int) -> list[int]:
@@ -132,7 +132,8 @@ def group(number: int) -> list[int]:
     members = []
     for place in Path("/proc").iterdir():
         with suppress(OSError, ValueError):
-            if os.getpgid(int(place.name)) == number:
+            zombie = (place / "stat").read_text().rpartition(") ")[2].startswith("Z")  # waits for its parent to look
+            if os.getpgid(int(place.name)) == number and not zombie:
                 members.append(int(place.name))
     return members
 
@@ -156,12 +157,12 @@ def one_run(words: str, root: Path, after_s: float | None) -> dict[str, Any]:
             stdout=subprocess.DEVNULL, stderr=subprocess.PIPE,
             preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # a job in the background ignores it
         )  # fmt: skip
-        used, begun, sent_at, at_signal = 0.0, time.monotonic(), None, 0.0
+        used, own, begun, sent_at, at_signal, own_then = 0.0, 0.0, time.monotonic(), None, 0.0, 0.0
         while process.poll() is None:
-            used = used_s(process.pid) or used
+            used, own = used_s(process.pid) or used, used_s(process.pid, children=False) or own
             spent = time.monotonic() - begun if live else used
             if sent_at is None and after_s is not None and spent >= after_s:
-                at_signal, sent_at = used, time.monotonic()
+                at_signal, own_then, sent_at = used, own, time.monotonic()
                 os.killpg(process.pid, signal.SIGINT)
             time.sleep(0.004)
         ended = time.monotonic()
@@ -178,7 +179,7 @@ def one_run(words: str, root: Path, after_s: float | None) -> dict[str, Any]:
         faults += [said[-1500:]] if "Traceback" in said or "Exception ignored" in said else []
         faults += [f"{len(others)} processes stay" for others in [group(process.pid)] if others]
         faults += [f"left {name}" for name in left_behind(folder)]
-        after = used - at_signal
+        after = own - own_then  # a worker's whole time is added where it is reaped
         faults += [f"{after:.2f} s of the processor after the signal"] if after > MOST_S else []
         return row | {
             "at_s": round(at_signal, 2),

@@ -240,11 +240,15 @@ def test_the_miss_is_the_median_distance_whatever_the_heights_count_from() -> No
     time = np.arange(10.0)
     way = np.column_stack([10.0 * time, 0 * time, 5.0 * time])
     here = way + np.array([3.0, -4.0, 70.0])
-    assert time_origin._median_distance(time, here, time, way) == pytest.approx(5.0)
-    assert time_origin._median_distance(time - 5.0, here, time, way) == pytest.approx(
-        np.hypot(53.0, 4.0)
-    )  # half lies inside
-    assert np.isnan(time_origin._median_distance(time - 5.5, here, time, way))
+    misses = time_origin._median_distances(np.array([0.0, -5.0, -5.5]), time, here, time, way)
+    assert misses[0] == pytest.approx(5.0)
+    assert misses[1] == pytest.approx(np.hypot(53.0, 4.0)), "half lies inside"
+    assert np.isnan(misses[2])
+    rng = np.random.default_rng(3)
+    values, counts = rng.normal(size=(50, 9)), rng.uniform(size=(50, 9)) < 0.6
+    counts[0] = False
+    expected = [np.median(row[inside]) if inside.any() else np.nan for row, inside in zip(values, counts, strict=True)]
+    np.testing.assert_array_equal(time_origin._medians(values, counts), expected)
     frame = pd.DataFrame({"time": pd.to_datetime(np.arange(500.0), unit="s"), "latitude_deg": 35.0 + 1e-5 * np.arange(500.0),
                           "longitude_deg": -78.0, "altitude_m": np.nan})  # fmt: skip
     sampled = time_origin._points(frame.sample(frac=1.0, random_state=1), 240)

@@ -124,9 +124,11 @@ def _shared(first: Span | None, second: Span) -> np.timedelta64:
 
 def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
     """Origin under which a log with positions lies on the track of a flight."""
-    tracks = [track for member in flight.files for track in _tracks(member)]
-    origins = [origin_of(stream, track) for stream in file.result.streams for track in tracks[:1]]
-    return min((item for item in origins if item is not None), key=lambda origin: origin.distance_m, default=None)
+    track = next((track for member in flight.files for track in _tracks(member)), None)
+    # the fullest: a log of a hundred cells has the places of one receiver a hundred times
+    placed = [stream for stream in file.result.streams if "latitude_deg" in stream.frame]
+    fullest = max(placed, key=lambda stream: stream.frame["latitude_deg"].count(), default=None)
+    return None if track is None or fullest is None else origin_of(fullest, track)
 
 
 # Two tracks that a log lies on about as well: it may be of either flight.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import pandas as pd
 
-from ...common.units import AnyArray, FloatArray
+from ...common.units import AnyArray, BoolArray, FloatArray
 from ...logs.records import Stream, has_wall_clock
 from .track import interpolated
 
@@ -55,16 +55,20 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     time_s = mine[0].astype(np.int64) / 1e9
     track_s = tracked[0].astype(np.int64) / 1e9 - zero_s
     log_m, track_m = _metres(mine[1], tracked[1]), _metres(tracked[1], tracked[1])
+    low, high = track_m[:, :2].min(axis=0) - _AGREE_M, track_m[:, :2].max(axis=0) + _AGREE_M
+    # half of the half that lies within the track's time has to be that near to it
+    if 4 * ((log_m[:, :2] >= low) & (log_m[:, :2] <= high)).all(axis=1).sum() < len(log_m):
+        return None
     length = time_s[-1] - time_s[0]
     # half of the log may stick out at either end of the track
     shifts = np.arange(-time_s[0] - 0.5 * length, track_s[-1] - time_s[0] - 0.5 * length, 1.0)
-    misses = np.array([_median_distance(time_s + shift, log_m, track_s, track_m) for shift in shifts])
+    misses = _median_distances(shifts, time_s, log_m, track_s, track_m)
     if not len(misses) or not np.isfinite(misses).any():
         return None
     best = int(np.nanargmin(misses))
     apart = np.abs(shifts - shifts[best]) > 60
     fine = shifts[best] + np.arange(-15, 16) / 10
-    finer = np.array([_median_distance(time_s + shift, log_m, track_s, track_m) for shift in fine])
+    finer = _median_distances(fine, time_s, log_m, track_s, track_m)
     distance = float(np.nanmin(finer))
     second = float(np.nanmin(misses[apart])) if np.isfinite(misses[apart]).any() else np.inf
     # like with like: the other places were tried each second, and between two seconds an aircraft flies some metres
@@ -95,11 +99,28 @@ def _metres(points: FloatArray, about: FloatArray) -> FloatArray:
     return np.stack([east, north, np.nan_to_num(points[:, 2])], axis=1)
 
 
-def _median_distance(time_s: FloatArray, log_m: FloatArray, track_s: FloatArray, track_m: FloatArray) -> float:
-    """Median distance; NaN where less than half of the log lies within the track."""
-    inside = (time_s >= track_s[0]) & (time_s <= track_s[-1])
-    if 2 * inside.sum() < len(time_s):
-        return float("nan")
-    apart = log_m[inside] - interpolated(time_s[inside], track_s, track_m)
-    apart[:, 2] -= np.median(apart[:, 2])  # the logs count heights from grounds of their own
-    return float(np.median(np.linalg.norm(apart, axis=1)))
+def _median_distances(
+    shifts: FloatArray, time_s: FloatArray, log_m: FloatArray, track_s: FloatArray, track_m: FloatArray
+) -> FloatArray:
+    """Median distance under each shift; NaN where less than half of the log lies within the track."""
+    parts = [np.zeros(0)]
+    for some in np.array_split(shifts, -(-len(shifts) // _SHIFTS_AT_ONCE) or 1):
+        time = time_s + some[:, None]
+        inside = (time >= track_s[0]) & (time <= track_s[-1])
+        apart = log_m - interpolated(time.ravel(), track_s, track_m).reshape(*time.shape, 3)
+        apart[..., 2] -= _medians(apart[..., 2], inside)[:, None]  # the logs count heights from grounds of their own
+        median = _medians(np.linalg.norm(apart, axis=2), inside)
+        parts.append(np.where(2 * inside.sum(axis=1) < len(time_s), np.nan, median))
+    return np.concatenate(parts)
+
+
+_SHIFTS_AT_ONCE = 500
+
+
+def _medians(values: FloatArray, counts: BoolArray) -> FloatArray:
+    """Median of each row (n, m) over the values that count; NaN where none does."""
+    ordered = np.sort(np.where(counts, values, np.inf), axis=1)
+    number, row = counts.sum(axis=1), np.arange(len(values))
+    low, high = np.maximum(number - 1, 0) // 2, np.minimum(number // 2, values.shape[1] - 1)
+    with np.errstate(invalid="ignore"):
+        return np.where(number > 0, 0.5 * (ordered[row, low] + ordered[row, high]), np.nan)

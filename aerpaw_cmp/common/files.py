@@ -67,21 +67,25 @@ def cache_folder(*parts: str) -> Path:
     return folder.expanduser().joinpath(*parts)
 
 
-# Entries of the cache: named by a digest of what they were made of, or compiled code below such a name.
-_ENTRY = re.compile(r"(kernels-)?[0-9a-f]{16,64}(\.\w+)?")
+# Entries of the cache by their place: the name alone would fit a Git object, where the folder is one of the user's.
+_ENTRY = re.compile(
+    r"[0-9a-f]{64}\.npz|llvm/[0-9a-f]{24}|(outcomes|audits)/[0-9a-f]{64}\.(npz|json)"
+    r"|compiled/kernels-[0-9a-f]{16}/[^\n]+\.(nb[ci]|compiled)"
+)
 
 
 def clear_cache() -> tuple[int, int]:
     """Remove what the cache holds, and nothing that only stands in its folder; number of files and their bytes."""
     folder, files, size = cache_folder(), 0, 0
-    for path in sorted(folder.rglob("*"), reverse=True):
-        names = path.relative_to(folder).parts
-        if path.is_symlink() or not path.is_file() or not any(_ENTRY.fullmatch(name) for name in names):
-            continue
-        size, files = size + path.stat().st_size, files + 1
-        path.unlink()
-        with contextlib.suppress(OSError):  # the last one takes its folder along
-            path.parent.rmdir()
+    for place, below, names in os.walk(folder):  # follows no link
+        if Path(place) == folder:
+            below[:] = sorted({"llvm", "outcomes", "audits", "compiled"}.intersection(below))
+        for path in (Path(place, name) for name in names):
+            if _ENTRY.fullmatch(path.relative_to(folder).as_posix()) and not path.is_symlink():
+                size, files = size + path.stat().st_size, files + 1
+                path.unlink()
+                with contextlib.suppress(OSError):  # the last one takes its folder along
+                    path.parent.rmdir()
     return files, size
 
 

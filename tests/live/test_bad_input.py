@@ -13,7 +13,6 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.live.record.log import LogSettings
 from aerpaw_cmp.live.serial.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
 from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.session import TapSettings
@@ -355,50 +354,6 @@ def test_numbers_that_swap_are_followed_by_the_interface(modem, tap, tools, tmp_
     (closed,) = [r for r in records if r["kind"] == "gap" and r["state"] == "closed"]
     assert closed["port"]["path"] == str(roots.dev / "ttyUSB5")
     assert not [h for r in records for h in r.get("lines", []) if isinstance(h, str) and h.startswith("$GP")]
-
-
-@pytest.fixture
-def small_disk(tmp_path):
-    """A real file system of 256 KiB; skips where mounting is not allowed."""
-    folder = tmp_path / "disk"
-    folder.mkdir()
-    done = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", folder], capture_output=True, check=False
-    )
-    if done.returncode:
-        pytest.skip("mounting is not allowed here; RLIMIT_FSIZE and /dev/full stand in for it in the other tests")
-    yield folder
-    subprocess.run(["umount", "-l", folder], check=True)
-
-
-def test_a_real_disk_that_fills_up_and_has_room_again(modem, tap, tools, small_disk):
-    sim = modem(faults=Faults(latency_s=0.0))
-    session = tap(sim.port, folder=small_disk / "log", log=LogSettings(retry_s=0.05))
-    session.wait(lambda: len(sim.journal) > 10)
-    filler = small_disk / "filler"
-    with filler.open("wb", buffering=0) as file:
-        try:
-            while True:
-                file.write(b"x" * 512)
-        except OSError:
-            pass
-    session.wait(lambda: any("the disk is full" in text for text in session.said))
-    count = len(sim.journal)
-    session.wait(lambda: len(sim.journal) > count + 40)  # it goes on polling
-    filler.unlink()
-    session.wait(lambda: any("takes records again; 0 were lost" in text for text in session.said))
-    assert session.end().lost_records == 0
-    records, bad = tools.records_of(small_disk / "log")
-    assert not bad
-    assert tools.all_kept(sim, small_disk / "log")
-    assert sum(r["kind"] == "disk" for r in records) == 1
-
-
-def test_a_read_only_disk(modem, small_disk, tmp_path):
-    sim = modem(faults=Faults(latency_s=0.0))
-    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
-    with pytest.raises(InputError, match=r"Read-only file system.*the disk is mounted read-only"):
-        run_tap(TapSettings(small_disk / "log", str(sim.port)))
 
 
 @pytest.mark.parametrize(

@@ -16,7 +16,6 @@ from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from tests.live.terminals import held
-from tests.real_logs import REAL
 
 TRANSCRIPT = b"""AT+QNWCFG="nr5g_csi"
 +QNWCFG: "nr5g_csi",21,3,9,11
@@ -44,13 +43,6 @@ def test_transcript_as_a_modem(tmp_path):
     assert modem.reply("AT+QNWINFO")[-1] == "OK"
     assert modem.reply("AT+QRSRP") == ("ERROR",)
     assert modem.reply("AT") == ("OK",)
-
-
-@pytest.mark.field
-def test_recorded_transcripts_as_modems():
-    modem = load_recorded(REAL / "modem/at_csi_teltonika_5568.txt")
-    ranks = [decode("nr5g_csi", modem.reply('AT+QNWCFG="nr5g_csi"')[:-1]).values["rank"] for _ in range(2)]
-    assert ranks == [2, 2]
 
 
 def test_tap_of_a_transcript(modem, tap, tools, tmp_path):

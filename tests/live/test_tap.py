@@ -66,7 +66,6 @@ def test_one_command_in_flight(modem, tap, tools, tmp_path):
     assert all(a[1] <= b[0] for a, b in pairwise(spans))
 
 
-@pytest.mark.usefixtures("web")
 @pytest.mark.parametrize(
     "faults",
     [
@@ -89,7 +88,6 @@ def test_faults_cost_no_answer(modem, tap, tools, tmp_path, faults):
     assert all(r["decoded"]["rank"] is not None for r in answered)
 
 
-@pytest.mark.usefixtures("web")
 def test_late_answers_are_kept_and_taken_for_nothing(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0, late_every=9, late_s=0.35))
     session = tap(sim.port, answer_timeout_s=0.2, probe_timeout_s=0.5)
@@ -106,7 +104,6 @@ def test_late_answers_are_kept_and_taken_for_nothing(modem, tap, tools, tmp_path
             assert "no_csi_line" not in r["flags"]
 
 
-@pytest.mark.usefixtures("web")
 def test_missing_final_result_times_out_and_keeps_the_lines(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0, no_final_every=7))
     session = tap(sim.port, answer_timeout_s=0.1, probe_timeout_s=0.3)
@@ -153,7 +150,6 @@ def test_unplug_and_back_under_another_number(modem, tap, tools, tmp_path):
     assert {s.lines for s in sim.journal if s.command == CSI and s.read} <= logged
 
 
-@pytest.mark.usefixtures("web")
 def test_the_end_inside_a_gap(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     session = tap(sim.port)
@@ -226,7 +222,6 @@ def test_alarm_when_no_csi_comes(modem, tap, tools, tmp_path):
     assert kinds(tools.records_of(tmp_path / "log")[0])["alarm"] == 1
 
 
-@pytest.mark.usefixtures("web")
 def test_silent_modem_is_a_gap(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0, silent_after=25))
     session = tap(sim.port, silent_s=0.5, answer_timeout_s=0.1, probe_timeout_s=0.1, reconnect_min_s=0.05)
@@ -253,7 +248,6 @@ def test_signals_end_it_cleanly(modem, child, tools, tmp_path, name):
     assert sim.csi == [0, 0]
 
 
-@pytest.mark.usefixtures("web")
 def test_sigkill_loses_no_answer(modem, child, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     process = child(sim.port, ri_hz=100.0)
@@ -282,7 +276,6 @@ def test_clock_steps_are_recorded(modem, tap, tools, tmp_path):
     assert abs(record["step_ns"] + 3_600_000_000_000) < 1_000_000_000
 
 
-@pytest.mark.usefixtures("web")
 def test_a_disk_fault_does_not_stop_the_polling(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     session = tap(sim.port, log=LogSettings(retry_s=0.05))
@@ -373,7 +366,6 @@ def test_a_broken_terminal_does_not_end_the_log(modem, tmp_path):
     assert run_tap(settings, on_status=broken).reason == "duration"
 
 
-@pytest.mark.usefixtures("web")
 def test_a_hanging_terminal_does_not_hold_the_polling(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     hang = threading.Event()
@@ -449,7 +441,6 @@ def test_schedule_catches_up_after_a_short_stall_and_not_after_a_long_one():
         assert polls + missed == 1 + stall // 500, "every slot is polled or missed, once"
 
 
-@pytest.mark.usefixtures("web")
 def test_an_unfinished_line_between_commands_is_in_the_gap_record(modem, tap, tools, tmp_path):
     """It belonged to no command, and went with the old framer: not a byte of it was in the log."""
     sim = modem(faults=Faults(latency_s=0.0))

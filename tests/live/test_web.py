@@ -7,7 +7,6 @@ import json
 import math
 import random
 import socket
-import struct
 import subprocess
 import sys
 import threading
@@ -625,9 +624,3 @@ def test_the_page_gets_every_answer_of_the_log(modem, tap, tools, tmp_path):
         count += len(rows)
         shown += rows[:, 1].tolist()
     assert shown == logged
-
-
-def test_struct_of_rows_is_little_endian():
-    rows = Rows(1, 2)
-    rows.add((1.5,))
-    assert base64.b64decode(rows.after(0)[1]) == struct.pack("<f", 1.5)

@@ -30,6 +30,19 @@ MINIMUM_HEIGHT_M = 0.5
 THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
 
 
+class Printed(float):
+    """A number of a sentence: its minus is one in print, and names that stand beside it keep their hyphens.
+
+    Examples
+    --------
+    >>> f"{Printed(-10.4):+.1f}"
+    '−10.4'
+    """
+
+    def __format__(self, form: str) -> str:
+        return super().__format__(form).replace("-", "\N{MINUS SIGN}")
+
+
 def unmasked(values: ArrayLike, dtype: Any = np.float64) -> AnyArray:
     """An array of numbers in which what NumPy's mask hides is missing (NaN), as gaps of NetCDF and GeoTIFF come.
 

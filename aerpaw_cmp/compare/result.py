@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, db_from_amplitude
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, db_from_amplitude
 from .gains.spread import StatedSpread
 from .judge.causes import Cause
 from .judge.ladder import LadderRow
@@ -66,9 +66,9 @@ class ClockResult:
     @property
     def in_words(self) -> str:
         """Its lag with the interval, as every sentence has them."""
-        low, high = self.ci95_s
+        ends = "[{:+.2f}, {:+.2f}]".format(*map(Printed, self.ci95_s))
         side = "ahead of" if self.radio_minus_telemetry_s > 0 else "behind"
-        return f"{abs(self.radio_minus_telemetry_s):.2f} s {side} the telemetry clock [{low:+.2f}, {high:+.2f}]"
+        return f"{abs(self.radio_minus_telemetry_s):.2f} s {side} the telemetry clock {ends}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

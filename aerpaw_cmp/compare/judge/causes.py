@@ -24,7 +24,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ...common.units import BoolArray, FloatArray
+from ...common.units import BoolArray, FloatArray, Printed
 from ..statistics.intervals import Interval
 
 # Samples are averaged over so long [s], over longer where a flight has more than so many seconds.
@@ -363,14 +363,6 @@ def _autoregressive(residual: FloatArray, design: FloatArray) -> _Fit:
 # --- the troubles --------------------------------------------------------------------------------------------------
 
 
-def _signed(value: float, digits: int = 0) -> str:
-    return f"{value:+.{digits}f}".replace("-", "\N{MINUS SIGN}")
-
-
-def _level(value: float, unit: str) -> str:
-    return f"{value:.0f} {unit}".replace("-", "\N{MINUS SIGN}")
-
-
 def _clock(e: LevelEvidence) -> Iterator[Trial]:
     """The lag that the judgement of the radio clock has, and no other."""
     if e.clock is not None and e.clock.shifted:
@@ -513,7 +505,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
         level, share = float(e.measured_db[e.least].min()), 100 * e.least.mean()
         yield Trial(
             name="no detection", cost=2.0, clipped=e.least, estimate=(level, level, level),
-            sentence=f"{share:.0f} % of the samples are at {_level(level, e.unit)}: nothing was detected",
+            sentence=f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: nothing was detected",
             next_step=f"`floor_db: {math.ceil(level * 100.0 + 1.0) / 100.0:.2f}` for this log",
         )  # fmt: skip
 
@@ -549,7 +541,7 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     if (side * (e.measured_db - limit) < -_BEYOND_DB).mean() > _MOST_BEYOND:
         return None
     name, words, step = _LIMITS[side]
-    sentence, next_step = words.format(level=_level(limit, e.unit)), step.format(typed=f"{limit:.0f}")
+    sentence, next_step = words.format(level=f"{Printed(limit):.0f} {e.unit}"), step.format(typed=f"{limit:.0f}")
     return Trial(name=name, cost=2.0, sentence=sentence, next_step=next_step)
 
 
@@ -657,11 +649,11 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     for phi in _SEARCHED_PHI:
         shift, gain = _shift(residual, masks, phi)
         at = int(np.argmax(gain))
-        instant = e.start + np.timedelta64(round(float(e.time_s[starts[at]])), "s")
+        instant = (e.start + np.timedelta64(round(float(e.time_s[starts[at]])), "s")).astype("datetime64[s]")
         step = _bounded(residual, masks[at], float(shift[at]), phi)
         yield Trial(
             name="gain step", cost=2.0, columns=masks[at][:, None].astype(np.float64), estimate=step,
-            sentence=f"the level steps by {_signed(step[0], 1)} dB at {str(instant.astype('datetime64[s]'))[-8:]} UTC",
+            sentence=f"the level steps by {Printed(step[0]):+.1f} dB at {str(instant)[-8:]} UTC",
             next_step="check the receiver's gain; compare both parts apart",
         )  # fmt: skip
 

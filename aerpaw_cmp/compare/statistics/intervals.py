@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ...common.units import FloatArray, unmasked
+from ...common.units import FloatArray, Printed, unmasked
 from .memory import FEWEST, mean_draws, power_draws
 
 # Bootstrap replicates.
@@ -457,11 +457,9 @@ class PairedDifference:
         if self.verdict == "no interval":
             more = "more" if self.difference_db > 0 else "less"
             return f"{size} {more} error than {other_model}, too few samples for an interval"
-        low, high = self.difference_ci95_db
+        difference, low, high = map(Printed, (self.difference_db, *self.difference_ci95_db))
         if self.verdict == "not significant":
-            return (
-                f"no significant difference from {other_model} ({self.difference_db:+.1f} dB [{low:+.1f}, {high:+.1f}])"
-            )
+            return f"no significant difference from {other_model} ({difference:+.1f} dB [{low:+.1f}, {high:+.1f}])"
         near, far = sorted((abs(low), abs(high)))
         digits = 1 if near >= 0.05 else 2
         return f"{self.verdict} than {other_model} by {size} [{near:.{digits}f}, {far:.{digits}f}]"

@@ -15,7 +15,7 @@ import numpy as np
 
 from ...common.gaussian import Factor, determining, gaussian_kernel
 from ...common.jsonable import fields_of
-from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed
 from ...compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
 
 # Verdicts.
@@ -328,7 +328,8 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
     low, high = max(float(first) - STAMPS_S, -window_s), min(float(last) + STAMPS_S, window_s)
     against = -float(total[np.abs(lags) <= _SAME_S + 1e-9].max())
     agree = first >= -_AGREE_S and last <= _AGREE_S
-    verdict, reason = CANNOT_TELL, f"lags from {low:+.1f} to {high:+.1f} s explain the level about as well"
+    lowest, highest = Printed(low), Printed(high)
+    verdict, reason = CANNOT_TELL, f"lags from {lowest:+.1f} to {highest:+.1f} s explain the level about as well"
     if against > EVIDENCE_NAT and (near[0] == 0 or near[-1] == len(lags) - 1):
         reason = f"the best lag lies near the edge of the window ({window_s:g} s): widen rss.advanced.lag_window_s"
     elif not low <= 0.0 <= high and (against > EVIDENCE_NAT or agree):

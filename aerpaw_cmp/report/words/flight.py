@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.counting import counted
-from ...common.units import AnyArray
+from ...common.units import AnyArray, Printed
 from ...compare.flight_verdict import lock_lost, pooled_db
 from ...compare.judge.ladder import LadderRow
 from ...compare.level.detection import DetectionScore
@@ -17,7 +17,6 @@ from ...compare.level.rss import ErrorSpan
 from ...compare.result import BASELINE_TITLE, AuditResult, FlightVerdict, RankResult, RssResult
 from ...compare.statistics.intervals import Interval, paired_verdict
 from ..content.flight import ReportData
-from .phrases import MINUS
 
 # Name of the ladder's rung with the settings of the flight file.
 AS_SET = "as set in flight.yaml"
@@ -55,7 +54,7 @@ def signed(value: float) -> str:
     >>> signed(12.91), signed(-10.4)
     ('+12.9', '−10.4')
     """
-    return f"{value:+.1f}".replace("-", "−")
+    return f"{Printed(value):+.1f}"
 
 
 def _within(value: Interval, bound: str | None) -> str:
@@ -177,13 +176,13 @@ def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> st
     word = paired_verdict(*verdict.ci95_db)
     ends = sorted(map(abs, verdict.ci95_db)) if word in ("better", "worse") else verdict.ci95_db
     name, over = with_article(verdict.against), f" over {verdict.channels} channels" if verdict.channels > 1 else ""
-    floor = "" if floor_db is None else f", floor {floor_db:.0f}".replace("-", MINUS)
+    floor = "" if floor_db is None else f", floor {Printed(floor_db):.0f}"
     signs = "+" if word == "not significant" else ""
     return _DECIDED[word].format(
         ray=f"{verdict.rmse_db:.1f} dB{floor}", other=f"{verdict.baseline_rmse_db:.1f} dB", over=over,
         name=name,
         size=abs(verdict.difference_db),
-        ends=f"[{', '.join(format(end, f'{signs}.2f').replace('-', MINUS) for end in ends)}]",
+        ends=f"[{', '.join(format(Printed(end), f'{signs}.2f') for end in ends)}]",
     )  # fmt: skip
 
 
@@ -313,7 +312,7 @@ def rss_verdict(panel: RssResult) -> str:
     best = min(errors, key=lambda name: errors[name])
     paired = panel.further.compared_with.get(best)
     if paired is not None:
-        text += ": " + paired.in_words(pretty(best)).replace("(-", f"({MINUS}").replace("[-", f"[{MINUS}")
+        text += ": " + paired.in_words(pretty(best))
     return f"{text}; {pretty(best)}: {errors[best]:.1f} dB.{_detection_words(panel)}{_snr_words(panel)}"
 
 
@@ -322,7 +321,7 @@ def _detection_words(panel: RssResult) -> str:
     score = panel.further.detection
     if score is None:
         return ""
-    floor = f"{score.floor_db:.0f}".replace("-", MINUS)
+    floor = f"{Printed(score.floor_db):.0f}"
     return (
         f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of {score.n} samples: the "
         f"Brier score is {score.brier:.2f} by the predicted level ({learned_on(score)}), {score.constant_brier:.2f} by "
@@ -429,7 +428,7 @@ def cautions(data: ReportData) -> list[str]:
 def _rss_cautions(panel: RssResult) -> list[str]:
     texts, score, lock, further = [], panel.score, lock_lost(panel), panel.further
     if lock is not None:
-        share, floor = 100 - 100 * lock.n_detected / lock.n, f"{lock.floor_db:.0f}".replace("-", MINUS)
+        share, floor = 100 - 100 * lock.n_detected / lock.n, f"{Printed(lock.floor_db):.0f}"
         texts.append(
             f"{panel.name} lost its lock in {share:.0f} % of the samples; levels below {floor} {panel.unit} count as "
             f"{floor} in the first sentence."

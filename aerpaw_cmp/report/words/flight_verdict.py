@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from ...common.counting import counted
+from ...common.units import Printed
 from ...compare.flight_verdict import baseline_errors, lock_lost, pooled_db, scored
 from ...compare.ranks.forecast import ForecastScore
 from ...compare.result import AuditResult, FlightVerdict, RankResult, RssResult
@@ -222,7 +223,7 @@ def _interval(ends: Interval, form: str, unit: str = "") -> str:
         return NO_INTERVAL
     if not math.isfinite(ends[1]):
         return f"95 %: at least {format(ends[0], form)}{unit}"
-    return "95 %: " + " to ".join(format(end, form).replace("-", "−") for end in ends) + unit
+    return "95 %: " + " to ".join(format(Printed(end), form) for end in ends) + unit
 
 
 def _ends(panels: Sequence[RssResult]) -> str:
@@ -238,7 +239,7 @@ def _difference(pooled: FlightVerdict | None) -> list[Headline]:
     return [
         Headline(
             label=f"Against {words.pretty(pooled.against)}, same samples",
-            value=f"{pooled.difference_db:+.2f} dB".replace("-", "−"),
+            value=f"{Printed(pooled.difference_db):+.2f} dB",
             interval=_interval(pooled.ci95_db, "+.2f", " dB"),
             reference="negative: smaller error of ray tracing",
         )

@@ -5,21 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from ...common.units import Printed
 from ...compare.judge.verdicts import Verdict
-
-MINUS = "\N{MINUS SIGN}"
-
-
-class _Number(float):
-    """A number whose minus is one in print; names that stand beside it keep their hyphens."""
-
-    def __format__(self, form: str) -> str:
-        return super().__format__(form).replace("-", MINUS)
 
 
 def filled(texts: Sequence[str], **facts: Any) -> list[str]:
     """Texts with numbers and names put in."""
-    known = {name: _Number(fact) if isinstance(fact, float) else fact for name, fact in facts.items()}
+    known = {name: Printed(fact) if isinstance(fact, float) else fact for name, fact in facts.items()}
     return [text.format_map(known) for text in texts]
 
 

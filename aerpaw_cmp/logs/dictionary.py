@@ -135,6 +135,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("satellites", "count", (
         r"^(number of satellites?|satellites( used)?|num ?sat|osd gpsnum|nsats|numberofsatellites|gps count)$",
     )),
+    Quantity("battery_v", "count", (r"^(battery ?)?(volts?|voltage)( v)?$",), "V"),
     # who
     Quantity("device", "identity", (
         r"^(device|phone|modem|ue|vehicle|drone|uav|logger|serial|client|user|robot|rover|aircraft|tail|host"

@@ -11,7 +11,8 @@ Columns (UTC ``time`` as naive ``datetime64[ns]``; units in names). Every frame 
 telemetry
     ``latitude_deg longitude_deg altitude_m`` (above take-off) ``roll_deg pitch_deg yaw_deg`` (nose up +,
     right wing down +, yaw clockwise from north) ``velocity_north_mps velocity_east_mps velocity_down_mps
-    fix satellites``. What a log does not have is NaN (``fix`` and ``satellites``: -1).
+    fix satellites``, and where the log has it ``battery_v``. What a log does not have is NaN (``fix`` and
+    ``satellites``: -1).
 rss
     ``rss_db``; NaN where out of coverage. Attributes: ``node``, ``channel``, ``unit``
     (``"dBm"`` or ``"dB re full scale"``), ``frequency_hz``.

@@ -54,7 +54,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     if np.isfinite(height).any():
         values["altitude_m"], about = above_takeoff(rows, values, datum, lost)
     values |= _attitude(rows, sheet)
-    for key in _VELOCITIES:
+    for key in (*_VELOCITIES, "battery_v"):
         if (column := sheet.find(key)) is not None:
             values[key] = sheet.numbers(column)
     for key in ("fix", "satellites"):

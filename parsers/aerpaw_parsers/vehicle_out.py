@@ -28,16 +28,18 @@ from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 
 _NUMBERS = (
-    "index", "longitude", "latitude", "altitude", "pitch", "yaw", "roll", "north", "east", "down", "fix", "satellites"
+    "index", "longitude", "latitude", "altitude", "pitch", "yaw", "roll", "north", "east", "down", "volt", "fix",
+    "satellites",
 )  # fmt: skip
 _CELL = rb'"?(?P<%s>' + _lines.NUMBER + rb'|nan|NaN|None)"?'
 _TRIPLE = rb'"?[(\[]' + b", ?".join([_CELL] * 3) + rb'[)\]]"?'
-_UNUSED = rb'"?(?:' + _lines.NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge: a row without them is one
+_CHARGE = rb'"?(?:' + _lines.NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge: a row without them is one
+_VOLT = rb'"?(?P<volt>' + _lines.NUMBER + rb'|nan|NaN|None|)"?'
 _SEP = rb", ?"
 _BODY = (
-    _SEP.join((_TRIPLE % (b"pitch", b"yaw", b"roll"), _TRIPLE % (b"north", b"east", b"down"), _UNUSED)),  # 10 fields
-    _SEP.join((_CELL % b"pitch_11", _CELL % b"yaw_11", _CELL % b"roll_11", _UNUSED)),  # 11 fields
-    _UNUSED + rb"(?:" + _SEP + _UNUSED + rb")?",  # 8 and 9 fields
+    _SEP.join((_TRIPLE % (b"pitch", b"yaw", b"roll"), _TRIPLE % (b"north", b"east", b"down"), _VOLT)),  # 10 fields
+    _SEP.join((*(_CELL % name for name in (b"pitch_11", b"yaw_11", b"roll_11")), _VOLT.replace(b"volt", b"volt_11"))),
+    _VOLT.replace(b"volt", b"volt_9") + rb"(?:" + _SEP + _CHARGE + rb")?",  # 8 and 9 fields
 )
 _FIELDS = _SEP.join(
     (
@@ -90,8 +92,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     pattern = _EITHER if _lines.mostly(data, _LONGER) and not _lines.mostly(data, _ROW) else _ROW
     rows = _rows.matched(data, pattern, options, reader="vehicle_out", reason=_reason)
     number = {name: _numbers(rows, name) for name in _NUMBERS}
-    for name in ("pitch", "yaw", "roll"):  # the angles stand elsewhere in the 11-field layout
-        number[name] = np.fmax(number[name], _numbers(rows, name + "_11"))
+    for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # they stand elsewhere in other layouts
+        own = name.partition("_")[0]
+        number[own] = np.fmax(number[own], _numbers(rows, name))
     jumps = int((np.diff(number["index"]) != 1).sum())
     if jumps:
         rows.warnings.append(f"the row index jumps at {jumps} places: rows are missing or files were joined")
@@ -129,7 +132,7 @@ def _values(rows: _rows.Rows, number: dict[str, FloatArray]) -> dict[str, AnyArr
     rows.warnings = [*warnings, *rows.warnings]
     if len(rows) > 10 and (number["fix"] == 6).all() and (number["satellites"] == 10).all():
         rows.warnings.append("fix 6 with 10 satellites throughout: a digital-twin run looks like this, not a flight")
-    counts = {name: number[name].astype(np.int64) for name in ("fix", "satellites")}
+    counts = {name: number[name].astype(np.int64) for name in ("fix", "satellites")} | {"battery_v": number["volt"]}
     return {name: np.where(no_fix | outside, np.nan, part) for name, part in place.items()} | motion | counts
 
 

@@ -10,6 +10,8 @@ from scipy.stats import multivariate_normal
 from aerpaw_cmp.compare.judge import causes
 from aerpaw_cmp.compare.judge.causes import LevelEvidence, Trial, flight_cause
 from aerpaw_cmp.compare.result import APPLIED, ESTIMATED, ClockResult
+from aerpaw_cmp.jobs.reporting.likely_cause import is_simulated
+from aerpaw_cmp.logs.readers import ReadOptions, identify
 from benchmarks.planted_causes import NONE, TROUBLES, situation
 
 MEASURED_DB = -60.0
@@ -153,6 +155,37 @@ def test_situations_of_the_benchmark_are_named() -> None:
         wrong += [(planted, name)] if name not in (planted or (NONE,)) else []
     assert len(wrong) <= 3, wrong
     assert sum(name != NONE for _, name in wrong) <= 1, wrong
+
+
+LOADED = (12.587, 12.193, 12.242)  # V, of ArduPilot's simulated battery on the ground and in the air
+SAGGING = tuple(np.round(np.linspace(50.3, 44.1, 40), 3))
+
+
+# As vehicleOut has it, and as somebody's own table.
+@pytest.mark.parametrize(("title", "row"), [
+    ("", "{i},-78.6962747,35.7274823,{i}.1,{volt},2026-05-22 10:05:{i:02d}.5,{fix},{satellites}\n"),
+    ("time,lat,lon,altitude,battery voltage,gps fix type,num sat\n",
+     "2026-05-22T10:05:{i:02d}.5Z,35.7274823,-78.6962747,{i}.1,{volt},{fix},{satellites}\n"),
+])  # fmt: skip
+@pytest.mark.parametrize(
+    ("volts", "fix", "satellites", "rows", "simulated"),
+    [
+        (LOADED, 6, 10, 40, True),
+        (SAGGING, 6, 10, 40, False),  # a fixed RTK solution with ten satellites, and a battery that is drained
+        (LOADED, 3, 10, 40, False),
+        ((12.587,), 6, 10, 5, True),
+        ((50.3, 50.2, 50.1), 6, 10, 40, True),  # tenths of a volt tell nothing: the receiver does
+        (LOADED, 6, 10, 3, False),
+    ],
+)
+def test_a_simulators_log_is_known_by_receiver_and_battery(
+    title: str, row: str, volts: tuple[float, ...], fix: int, satellites: int, rows: int, simulated: bool
+) -> None:
+    count = range(1, rows + 1)
+    lines = [row.format(i=i, volt=volts[i % len(volts)], fix=fix, satellites=satellites) for i in count]
+    text = (title + "".join(lines)).encode()
+    stream = identify(text).read(text, ReadOptions(timezone="UTC")).streams[0]
+    assert is_simulated(stream) == simulated
 
 
 @pytest.mark.parametrize("columns", [False, True])

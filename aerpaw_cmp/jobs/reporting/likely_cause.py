@@ -40,7 +40,7 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     -------
     Cause or None
     """
-    if any(_simulated(stream) for file in data.files for stream in file.result.streams):
+    if any(is_simulated(stream) for file in data.files for stream in file.result.streams):
         return SIMULATED
     return flight_cause(
         [
@@ -51,19 +51,32 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     )
 
 
-def _simulated(telemetry: Stream) -> bool:
-    """Check for the constant receiver of ArduPilot's simulator, which AERPAW's emulator runs."""
-    if telemetry.kind != "telemetry" or len(telemetry.frame) < _FEWEST_ROWS:
+def is_simulated(telemetry: Stream) -> bool:
+    """Check for the receiver and the battery of ArduPilot's simulator, which AERPAW's emulator runs.
+
+    Of fix 6, 10 satellites and the few voltages of its battery, two are in the log, and what else it has agrees.
+    """
+    rows = telemetry.frame
+    if telemetry.kind != "telemetry" or len(rows) < _FEWEST_ROWS:
         return False
-    return bool((telemetry.frame["fix"] == 6).all() and (telemetry.frame["satellites"] == 10).all())
+    signs = [bool((rows[name] == value).all()) for name, value in _RECEIVER.items() if (rows[name] >= 0).any()]
+    if "battery_v" in rows and len(rows) >= _FEWEST_VOLTAGES:
+        volts = rows["battery_v"].dropna().to_numpy()
+        # a log of tenths of a volt has few voltages of any battery
+        if len(volts) and (np.abs(volts * 10.0 - np.round(volts * 10.0)) > 1e-6).any():
+            commonest = np.sort(np.unique(volts, return_counts=True)[1])[-3:]
+            signs.append(bool(commonest.sum() >= _SHARE_OF_VOLTAGES * len(volts)))
+    return len(signs) > 1 and all(signs)
 
 
-# Rows of a table from which constant columns tell anything.
-_FEWEST_ROWS = 4
+_RECEIVER = {"fix": 6, "satellites": 10}
+# Rows of a table from which constant columns, and from which few voltages tell anything. The simulator's battery has
+# three for flying and standing (97 % of the rows of one flight), a real one another in each row (at most 5 %).
+_FEWEST_ROWS, _FEWEST_VOLTAGES, _SHARE_OF_VOLTAGES = 4, 15, 0.8
 
 SIMULATED = Cause(
     name="emulator",
-    sentence="The log is a simulator's: all of its rows have fix 6 and 10 satellites, as ArduPilot's writes them.",
+    sentence="The log is a simulator's: receiver and battery (fix 6, 10 satellites, few voltages) are ArduPilot's.",
     next_step="draw no conclusion on the site from this flight",
 )
 

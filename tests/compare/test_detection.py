@@ -44,6 +44,7 @@ def test_the_probability_is_calibrated_and_beats_the_constant() -> None:
     for said, seen, count in score.reliability:
         assert abs(said - seen) < 4.0 * np.sqrt(0.25 / count) + 0.02
     assert score.offset_db == pytest.approx(-40.0, abs=0.5)
+    assert score.rmse_ci95_db[0] < score.rmse_db < score.rmse_ci95_db[1]
 
 
 def test_a_level_that_says_nothing_gains_nothing() -> None:

@@ -439,15 +439,23 @@ def test_the_noise_under_an_snr_cuts_nothing_off(tmp_path: Path) -> None:
     assert snr_flight(tmp_path / "b", 0.0).further.snr is None
 
 
-@pytest.mark.parametrize(("low_db", "expected"), [(3.4, True), (3.6, False), (float("nan"), True)])
+@pytest.mark.parametrize(
+    ("low_db", "floor_low_db", "expected"),
+    [(3.4, None, True), (3.6, None, False), (np.nan, None, True), (3.4, 7.6, True), (3.4, 7.8, False)],
+)
 def test_an_expectation_that_the_flight_refutes_is_withdrawn(
-    monkeypatch: pytest.MonkeyPatch, low_db: float, expected: bool
+    monkeypatch: pytest.MonkeyPatch, low_db: float, floor_low_db: float | None, expected: bool
 ) -> None:
-    """Flights left out had 3.5 dB: a flight whose interval begins above has another airframe, or another fault."""
+    """Flights left out had 3.5 dB, 7.7 with the floor: one whose interval begins above has another fault."""
     errors = Errors(series=2, rmse_db=3.5, rmse_4s_db=2.8, free_space_rmse_db=6.1, inside_90=0.9)
     monkeypatch.setattr(compared, "errors_elsewhere", lambda *_: errors)
     data = SimpleNamespace(settings=SimpleNamespace(antennas={}), folder=Path())
-    known = compared._elsewhere(data, SimpleNamespace(locked=None), SimpleNamespace(rmse_ci95_db=(low_db, 9.0)))
+    lock = SimpleNamespace(floor_rmse_db=7.7, free_space_floor_rmse_db=9.9)
+    monkeypatch.setattr(compared, "lock_elsewhere", lambda *_: lock)
+    locks = floor_low_db is not None
+    floored = SimpleNamespace(rmse_ci95_db=(floor_low_db, 12.0)) if locks else None
+    series = SimpleNamespace(locked=np.ones(3) if locks else None)
+    known = compared._elsewhere(data, series, SimpleNamespace(rmse_ci95_db=(low_db, 9.0)), floored)
     assert (known is not None and known["rmse_db"] == 3.5) == expected
 
 

@@ -11,6 +11,7 @@ from ...common.units import BoolArray, FloatArray, IntArray
 from ..offset import STEP_DB, OffsetFit, offset_grid
 from ..ranks.forecast import brier_losses, log_losses
 from ..ranks.receiver import out_of_group
+from ..statistics.intervals import NO_INTERVAL, Interval, spread_interval
 
 # Held-out segments of a flight, equally long.
 _SEGMENTS = 10
@@ -102,6 +103,8 @@ class DetectionScore:
         ``other flights``, or ``held-out segments``: each segment of this flight from the others.
     offset_db, rmse_db : float
         All samples, both sides no lower than the floor; the offset is added to the measurement.
+    rmse_ci95_db : (low, high)
+        Of ``rmse_db``, as other levels have it.
     free_space_rmse_db : float
         The same of free space.
     detected_rmse_db : float
@@ -123,6 +126,7 @@ class DetectionScore:
     detected_rmse_db: float
     reliability: tuple[tuple[float, float, int], ...]
     learned_on: str
+    rmse_ci95_db: Interval = NO_INTERVAL
     locks: bool = False
     """The log itself says when the receiver was in lock; else a sample without a level was not detected."""
 
@@ -180,6 +184,7 @@ def score_detection(
         constant_log_score=float(log_losses(constant, outcome).mean()),
         offset_db=fit.offset_db,
         rmse_db=fit.rmse_db,
+        rmse_ci95_db=spread_interval(residual[np.argsort(time, kind="stable")]),
         free_space_rmse_db=floored_fit(measured, free, floor_db).rmse_db,
         detected_rmse_db=float(np.sqrt(np.mean(residual[detected] ** 2))),
         reliability=_reliability(stated[:, 1], detected),

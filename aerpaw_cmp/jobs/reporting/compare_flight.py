@@ -250,6 +250,7 @@ def _further(
     settings, levels, series, replayed = case.settings, case.levels, case.series, case.replayed
     wild = rss.outliers(levels.measured_db)
     passes = _halves(series.time, case.position_m, levels.measured_db, case.geometry.get("heading_deg"))
+    detection = None if case.trained else _detection(case.data, series, levels, case.simple["free_space"])
     further = RssFurther(
         **named(score, "n_measured_out n_simulated_out identifiable_db"),
         block_length=score.intervals.autocorrelation.block_length,
@@ -267,7 +268,7 @@ def _further(
         repeatability={name: repeatability(*pair, _PASSES_WITHIN_M) for name, pair in passes.items()},
         simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
         error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
-        elsewhere=_elsewhere(case.data, series, score),
+        elsewhere=_elsewhere(case.data, series, score, detection),
         trained_on=case.trained or None,
         rmse_bound=_bound(series, score),
     )
@@ -278,7 +279,7 @@ def _further(
         compared_with=_paired(levels, case.simple),
         averaged=_averaged(series, replayed, levels, case.position_m, settings),
         censored=_censored(settings, levels),
-        detection=_detection(case.data, series, levels, case.simple["free_space"]),
+        detection=detection,
         snr=_snr(series, levels),
     )
 
@@ -302,12 +303,16 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
     return offsets.grid_offset(inliers_db, levels.simulated_db, span_db=settings.span_db).rmse_db
 
 
-def _elsewhere(data: FlightData, series: RssSeries, score: rss.RssComparison) -> dict[str, float] | None:
+def _elsewhere(
+    data: FlightData, series: RssSeries, score: rss.RssComparison, detection: DetectionScore | None
+) -> dict[str, float] | None:
     """Error to expect on another flight, where the antennas of the site say it and this flight does not refute it."""
     errors = errors_elsewhere(data.settings.antennas, series, data.folder)
+    lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
     if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:
         return None
-    lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
+    if lock is not None and detection is not None and detection.rmse_ci95_db[0] > lock.floor_rmse_db:
+        return None
     out = {} if errors is None else named(errors, "rmse_db free_space_rmse_db rmse_4s_db")
     out |= {} if lock is None else named(lock, "floor_rmse_db free_space_floor_rmse_db")
     return out or None

@@ -13,15 +13,13 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.check.explain import further_path_lines
-from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
-from aerpaw_cmp.propagation.edges import EdgePaths, Edges, diffracted, over_edges, wedge_axes
-from aerpaw_cmp.propagation.geometry.arrays import Array, Isotropic, Link, Poses, single_element
+from aerpaw_cmp.propagation.edges import EdgePaths, Edges, diffracted, wedge_axes
+from aerpaw_cmp.propagation.geometry.arrays import Array, Link, Poses, single_element
 from aerpaw_cmp.propagation.geometry.faces import site_faces
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import Replay, replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.trace import trace
-from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building, Site, Tower
 
@@ -50,56 +48,7 @@ def bent(replayed: Replay) -> EdgePaths:
     return paths
 
 
-# --- a second way: plain loops, the shortest way over each edge by a search, Kouyoumjian and Pathak's own formula ----
-
-
-@pytest.mark.parametrize(
-    ("seed", "patterns"), [(1, (Isotropic(),) * 3), (2, (TR38901(), Isotropic(), Isotropic())),
-                           (3, (HalfWaveDipole(), TR38901(), HalfWaveDipole()))],
-)  # fmt: skip
-def test_paths_and_field_by_plain_loops(seed: int, patterns: tuple) -> None:
-    """Slanted arrays at both ends, H with the reflections: the audit's second implementation."""
-    site, link, flown = random_scene(40, buildings=5, seed=seed, towers=1 + (seed == 3))
-    flown.position_m[::2, 2], flown.position_m[1::2, 2] = 2.0, 25.0
-    arrays = dict(zip(link.tower_arrays, patterns, strict=False))
-    arrays = {name: replace(link.tower_arrays[name], patterns=(pattern,)) for name, pattern in arrays.items()}
-    link = replace(link, tower_arrays=arrays, uav_array=replace(link.uav_array, patterns=patterns[2:]))
-    ours = replay(site, link, flown, Search(further=(over_edges,)))
-    assert len(bent(ours)) > 300
-    chosen = np.arange(0, 40, 3 * len(arrays))
-    audit = against_reference(site, flown, ours, chosen, Expected.of(link), ks=(10.0, 1000.0), max_depth=2)
-    assert audit.failures == ()
-    assert audit.doubtful <= 3
-    assert audit.not_covered == ()
-
-
-def test_the_audit_sees_a_path_over_an_edge_that_is_not_there() -> None:
-    where = poses((70.0, 3.0, 2.0), (60.0, -40.0, 9.0))
-    raised = Tower("T", 35.7, -78.7, 0.0, 0.0, antenna_height_m=8.5, ground_m=1.5)
-    barn, array = replace(place(BARN), towers={"T": raised}), Array(np.array([[0.0, 0.3, 0.1]]), np.array([0.4]))
-    link = Link(HZ, {"T": array}, array)
-    ours = trace(barn, link, where, diffraction="edges")
-    few = bent(ours).select(np.arange(1, len(bent(ours))))
-    assert {tuple(row) for row in (bent(ours).ground >= 0).tolist()} == {
-        (False, False),
-        (False, True),
-        (True, False),
-    }
-    for planted in (ours, replace(ours, contributions=(ours.paths, few)), replace(ours, h=0.9999 * ours.h)):
-        audit = against_reference(barn, where, planted, np.arange(2), Expected.of(link), ks=(10.0,), max_depth=2)
-        assert bool(audit.failures) == (planted is not ours)
-        assert audit.doubtful == 0
-
-
-def test_the_audit_allows_a_ten_thousandth_of_a_percent_unless_its_series_for_edges_is_in_it() -> None:
-    # the second transition function is a series cut off at 1e-5; all else of both ways is float64
-    barn, where = place(BARN), poses((70.0, 3.0, 2.0), (60.0, -40.0, 9.0))
-    for diffraction, allowed in (("none", 1e-6), ("edges", 3e-5)):
-        ours = trace(barn, LINK, where, diffraction=diffraction)
-        for share in (0.5, 2.0):
-            off = replace(ours, h=(1.0 + share * allowed) * ours.h)
-            audit = against_reference(barn, where, off, np.arange(1, 2), Expected.of(LINK), ks=(10.0,), max_depth=2)
-            assert any("H differs" in failure for failure in audit.failures) == (share > 1.0)
+# --- a second way: the shortest way over each edge by a search, legs cut by their shadows -----------------------------
 
 
 class ByForce:

@@ -22,9 +22,8 @@ from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray
 from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
 from ..drivers.pairs import replay_pairs
-from ..edges import EdgePaths
 from ..field.stands import over_stands
-from ..field.sum import Further, channel_matrices
+from ..field.sum import channel_matrices
 from ..geometry.arrays import Array, Isotropic, Link, Poses
 from ..geometry.paths import Faces, Links, PathSet, legs
 from ..options import Field, Search
@@ -32,7 +31,6 @@ from ..replay import Replay
 from ..scene import Scene
 from ..search.mirror import plane_keys, planes_of
 from ..search.terrain import TERRAIN
-from .bent import bent_matrix
 from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
 
 if TYPE_CHECKING:
@@ -54,9 +52,6 @@ _LINK_TOLERANCE_DB = 0.1
 
 # Of H against the second implementation, relative to the root of the links' mean path power; both are float64.
 _EXACT_TOLERANCE = 1e-6
-
-# As that, where paths over edges are in H: their second transition function is a series cut off at 1e-5.
-_EDGE_TOLERANCE = 3e-5
 
 # A path that a move of an edge by this much makes or breaks may differ in float32.
 _SIONNA_MARGIN_M = 2e-3
@@ -267,6 +262,8 @@ class _OneLink:
     def field_checked(self, ks: Sequence[float]) -> FieldAudit:
         """H, RSS and rank from the replay's own list of paths."""
         paths, replay = [], self.replay
+        if replay.further:  # the second implementation knows straight ways and mirrors
+            return FieldAudit(not_covered=tuple(f"paths {some.kind}" for some in replay.further))
         for path in self.mine:
             sequence = self.sequence(path)
             if sequence is None:
@@ -275,25 +272,10 @@ class _OneLink:
             if loss is None:
                 return FieldAudit(doubtful=1)
             paths.append((sequence, loss))
-        link = self.reference.link
-        turn = matrix_of(self.poses.rotation[self.row])
-        h, power = self.reference.matrix(paths, self.target, turn)
-        failures: list[str] = []
-        bent = replay.further[0] if replay.further else None
-        if bent is not None:
-            if reason := self._beyond(bent):
-                return FieldAudit(not_covered=(reason,))
-            again = bent_matrix(self.reference, self.target, turn)
-            if again is None:
-                return FieldAudit(doubtful=1)
-            h, power = h + again[1], power + again[2]
-            count = int(((bent.pose == self.row) & (bent.tower == self.tower)).sum())
-            if count != again[0]:
-                failures.append(f"{self.name}: {count} paths over edges, expected {again[0]}")
-        h, tolerance = h.T if link.uav_transmits else h, _EXACT_TOLERANCE if bent is None else _EDGE_TOLERANCE
-        return FieldAudit(failures=tuple(failures)) + self._against(h, power, ks, tolerance, len(paths))
+        h, power = self.reference.matrix(paths, self.target, matrix_of(self.poses.rotation[self.row]))
+        return self._against(h.T if self.reference.link.uav_transmits else h, power, ks, len(paths))
 
-    def _against(self, h: ComplexArray, power: float, ks: Sequence[float], tolerance: float, paths: int) -> FieldAudit:
+    def _against(self, h: ComplexArray, power: float, ks: Sequence[float], paths: int) -> FieldAudit:
         """H, RSS and rank of the replay against those of so many paths with their sum of powers."""
         link, ours, failures = self.reference.link, self.replay.h[self.row, self.tower], []
         over = _decibel(float((np.abs(h) ** 2).mean())) + link.transmit_power_dbm - link.noise_floor_dbm
@@ -306,7 +288,7 @@ class _OneLink:
         size = math.sqrt(power) or 1e-30
         under = _decibel(power) + link.transmit_power_dbm < link.noise_floor_dbm
         error = float(np.abs(ours - h).max()) / size
-        if not error <= tolerance:
+        if not error <= _EXACT_TOLERANCE:
             failures.append(f"{self.name}: H differs by {error:.2g} of its size")
         worst, level_of_h = 0.0, float((np.abs(h) ** 2).mean())
         for level, value in ((self.replay.rss_dbm, level_of_h), (self.replay.rss_power_dbm, 0.0 if under else power)):
@@ -321,15 +303,6 @@ class _OneLink:
             reference_paths=paths, h_max_error=error, rss_max_error_db=worst, rank_differs=int(differs),
             failures=tuple(failures),
         )  # fmt: skip
-
-    def _beyond(self, bent: Further) -> str:
-        """Name the further paths that the second implementation does not know; "" where it knows all."""
-        site = self.reference.site
-        if not isinstance(bent, EdgePaths) or len(self.replay.further) > 1:
-            return f"paths {self.replay.further[-1].kind}"
-        if site.dem is not None or (len(site.trees) and self.reference.loss.model != "none"):
-            return "paths over edges through trees or over terrain"
-        return "" if not any(b.footprint.interiors for b in site.buildings) else "edges of courtyards"
 
 
 def _another_rank(ours: ComplexArray, expected: ComplexArray, ks: Sequence[float]) -> bool:

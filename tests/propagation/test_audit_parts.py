@@ -14,7 +14,6 @@ from aerpaw_cmp.propagation.check.audit import Second, _spread, compare, extra_r
 from aerpaw_cmp.propagation.check.field_audit import (
     Expected,
     _another_rank,
-    _explicit,
     _lacking,
     _level_error,
     _link_error,
@@ -25,13 +24,11 @@ from aerpaw_cmp.propagation.check.field_audit import (
     impossible,
     spread_over_paths,
 )
-from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.geometry.arrays import (
     Isotropic,
     Link,
     Poses,
-    linear_array,
     rotation_from_yaw_pitch_roll,
     single_element,
 )
@@ -257,46 +254,6 @@ def test_two_replays_differ_by_what_was_planted() -> None:
     assert extra_rows(planted, few, chosen).tolist() == [int(np.flatnonzero(rows == bent)[0])]
     none = compare(dataclasses.replace(planted, rss_dbm=np.full((6, 1), np.nan)), few, chosen)
     assert np.isnan([none.rss_max_error_db, none.rss_rms_error_db]).all()
-
-
-@pytest.mark.parametrize(("off", "failed"), [(0.0, False), (0.009, False), (0.011, True)])
-def test_explicit_arrays_are_asked_next_to_the_towers(
-    monkeypatch: pytest.MonkeyPatch, off: float, failed: bool
-) -> None:
-    """The ten nearest poses within 150 m of a tower; the better half of the links decides."""
-    array = linear_array(2, 0.04)
-    link = Link(3.3e9, dict.fromkeys(("LW1", "LW2"), array), array)
-    there = np.stack([SITE.towers[name].position_m for name in ("LW1", "LW2")])
-    away = np.array([20.0, 149.0, 151.0, 40.0, 60.0, 80.0, 90.0, 100.0, 110.0, 120.0, 130.0, 140.0, 145.0])
-    spots = there[np.arange(13) % 2] + np.stack([0.0 * away, 0.6 * away, 0.8 * away], axis=1)
-    poses, asked = Poses(spots, np.tile(np.eye(3), (13, 1, 1))), []
-
-    def own(faces, links, rotation, link, rays, **named) -> np.ndarray:
-        assert named["explicit"]
-        assert len(rotation) == len(links.targets_m)
-        asked.extend(sorted(np.linalg.norm(links.targets_m[:, None] - there, axis=2).min(axis=1).round().tolist()))
-        ours = replay_pairs(SITE, link, Poses(links.targets_m, rotation), Search(max_depth=1)).h
-        wrong = (
-            np.abs(ours).max(axis=(2, 3), keepdims=True)
-            * np.where(np.arange(len(ours)) % 5 < 3, off, 0.5)[:, None, None, None]
-        )
-        return ours + np.where(np.arange(2) == 1, wrong, 0.0)
-
-    monkeypatch.setattr("aerpaw_cmp.propagation.search.sionna.own_channels", own)
-    audit = _explicit(SITE, link, poses, 1)
-    assert asked == [20, 40, 60, 80, 90, 100, 110, 120, 130, 140]
-    assert audit.explicit_links == 20
-    assert audit.explicit_max_error == pytest.approx(off, abs=1e-12)
-    assert bool(audit.failures) == failed
-    slanted = dataclasses.replace(array, positions_m=2 * array.positions_m)
-    element = single_element(Isotropic())
-    for other in (
-        dataclasses.replace(link, uav_array=single_element(HalfWaveDipole())),
-        dataclasses.replace(link, tower_arrays={"LW1": array, "LW2": slanted}),
-        dataclasses.replace(link, tower_arrays={"LW1": element, "LW2": element}, uav_array=element),
-    ):
-        assert _explicit(SITE, other, poses, 1).explicit_links == 0
-    assert _explicit(SITE, link, Poses(spots[2:3], np.eye(3)[None]), 1).explicit_links == 0
 
 
 @pytest.mark.parametrize(("samples", "rays"), [("auto", 100_000), (5_000, 5_000), (300_000, 100_000)])

@@ -19,12 +19,6 @@ class FieldAudit:
         Of the coherent RSS of links whose paths are all shorter than 300 m, against Sionna.
     reference_links, reference_paths, h_max_error, rss_max_error_db, rank_differs
         Against the second implementation: largest difference of H, relative; of RSS; links with another rank.
-    pairs_links, pairs_differ, pairs_rss_max_db, pairs_rank_differs
-        Links computed with each element pair's own paths; those that differ, by how much RSS does, how many have
-        another rank at one of the K. Not a failure: it is what one path set per array centre leaves out.
-    explicit_links, explicit_max_error
-        H with each pair's own paths against Sionna's explicit arrays at short range: largest relative difference of
-        the better half of the links (float32 loses or finds a pair's path at an edge).
     attitude_rows, attitude_max_rad
         Logged attitudes turned into rotations a second time.
     missing_paths, phantom_paths : int
@@ -48,12 +42,6 @@ class FieldAudit:
     h_max_error: float = 0.0
     rss_max_error_db: float = 0.0
     rank_differs: int = 0
-    pairs_links: int = 0
-    pairs_differ: int = 0
-    pairs_rss_max_db: float = 0.0
-    pairs_rank_differs: int = 0
-    explicit_links: int = 0
-    explicit_max_error: float = 0.0
     attitude_rows: int = 0
     attitude_max_rad: float = 0.0
     missing_paths: int = 0

@@ -24,7 +24,6 @@ from .field_audit import (
     against_reference,
     against_sionna,
     impossible,
-    per_pair,
     spread_over_paths,
 )
 
@@ -158,7 +157,6 @@ def audit(
             fields = against_reference(
                 site, poses, replay, few_kinds, expected, ks=ks, max_depth=search.max_depth, complete=complete
             )
-        fields += per_pair(site, link, poses, replay, chosen, replace(search, engine="image"), Field(field.loss), ks=ks)
         if site.scene is None:
             fields += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
         rayed = replace(search, samples=min(rays, _FIELD_SAMPLES))

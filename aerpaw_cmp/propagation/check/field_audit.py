@@ -21,12 +21,11 @@ from ...common.content import content_digest
 from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray
 from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
-from ..drivers.pairs import replay_pairs
 from ..field.stands import over_stands
 from ..field.sum import channel_matrices
 from ..geometry.arrays import Array, Isotropic, Link, Poses
 from ..geometry.paths import Faces, Links, PathSet, legs
-from ..options import Field, Search
+from ..options import Search
 from ..replay import Replay
 from ..scene import Scene
 from ..search.mirror import plane_keys, planes_of
@@ -401,7 +400,7 @@ def against_sionna(
     search : Search
         Depth, rays and batch of Sionna's search.
     complete : bool
-        Ask for the explicit arrays at short range, too.
+        Whether the replay claims to have every path.
     known : dict, optional
         What Sionna answered before, by what it was asked.
 
@@ -451,90 +450,6 @@ def _own(
     slants = np.stack([array.slant_parts for _, array in arrays])[known[key].paths.tower]
     gain = np.einsum("pab,au,pbv->puv", known[key].gain, probe.uav_array.slant_parts, slants)
     return replace(known[key], gain=gain)  # type: ignore[no-any-return]
-
-
-def per_pair(
-    site: Site,
-    link: Link,
-    poses: Poses,
-    replay: Replay,
-    chosen: IntArray,
-    search: Search,
-    field: Field = Field(),
-    *,
-    ks: Sequence[float],
-) -> FieldAudit:
-    """Error of one set of paths per array centre: the audited links with each element pair's own paths.
-
-    Parameters
-    ----------
-    site, link, poses, replay, chosen
-        As in :func:`against_sionna`.
-    search, field
-        Of the replay, engine ``image``.
-    ks : sequence of float
-
-    Returns
-    -------
-    FieldAudit
-        Links that differ, the largest change of level [dB], and ranks that change.
-    """
-    from ...compare.rank import channel_rank
-
-    arrays = (link.uav_array, *link.tower_arrays.values())
-    if not any(np.any(array.positions_m) for array in arrays):
-        return FieldAudit()  # the centre is the only pair
-    few = Poses(poses.position_m[chosen], poses.rotation[chosen])
-    pairs = replay_pairs(site, link, few, search, field)
-    change = np.abs(pairs.rss_dbm - replay.rss_dbm[chosen])
-    ranks = [channel_rank(pairs.h, k) != channel_rank(replay.h[chosen], k) for k in ks]
-    size = np.abs(pairs.h).max(axis=(2, 3)) + np.abs(replay.h[chosen]).max(axis=(2, 3))
-    differs = np.abs(pairs.h - replay.h[chosen]).max(axis=(2, 3)) > 1e-9 * size
-    audit = FieldAudit(
-        pairs_links=differs.size,
-        pairs_differ=int(differs.sum()),
-        pairs_rss_max_db=float(np.nanmax(change, initial=0.0)),
-        pairs_rank_differs=int(np.any(ranks, axis=0).sum()),
-    )
-    return audit + _explicit(site, link, few, search.max_depth)
-
-
-# Sionna's explicit arrays are asked at the nearest poses within this range: beyond, their float32 phases are noise.
-EXPLICIT_POSES, EXPLICIT_RANGE_M = 10, 150.0
-
-# Of the largest entry of H, on the better half of the links; found: 4e-4.
-_EXPLICIT_TOLERANCE = 0.01
-
-_EXPLICIT_SAMPLES = 50_000
-
-
-def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
-    """H with each pair's own paths against Sionna's explicit arrays at short range."""
-    from ..search.sionna import Rays, own_channels
-
-    arrays = list(link.tower_arrays.values())
-    names = {pattern.name for array in (*arrays, link.uav_array) for pattern in array.patterns}
-    distances = [np.linalg.norm(few.position_m - site.towers[t].position_m, axis=1) for t in link.tower_arrays]
-    gap = np.min(distances, axis=0)
-    near = np.argsort(gap)[:EXPLICIT_POSES]
-    near = near[gap[near] < EXPLICIT_RANGE_M]
-    alike = all(np.array_equal(a.positions_m, arrays[0].positions_m) for a in arrays)
-    pairs = len(link.uav_array) * len(arrays[0])
-    if not len(near) or pairs == 1 or names != {"iso"} or not alike or site.dem is not None:
-        return FieldAudit()
-    some = Poses(few.position_m[near], few.rotation[near])
-    scene = Scene.of(site, link, some)
-    rays = Rays(max_depth=max_depth, samples=_EXPLICIT_SAMPLES, batch=EXPLICIT_POSES)
-    theirs = own_channels(
-        scene.faces, scene.links_to(some), some.rotation, link, rays, explicit=True, surfaces=scene.surfaces
-    )
-    ours = replay_pairs(site, link, some, Search(max_depth=max_depth)).h  # without foliage
-    size = np.abs(ours).max(axis=(2, 3))
-    error = np.sort(np.abs(theirs - ours).max(axis=(2, 3))[size > 0] / size[size > 0])
-    worst = float(error[: (len(error) + 1) // 2].max(initial=0.0))
-    bad = worst > _EXPLICIT_TOLERANCE
-    failures = (f"H differs from Sionna's explicit arrays by {worst:.2g} of its size at short range",) if bad else ()
-    return FieldAudit(explicit_links=len(error), explicit_max_error=worst, failures=failures)
 
 
 def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:

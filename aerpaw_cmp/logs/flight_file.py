@@ -232,30 +232,37 @@ def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> N
     count = len(column)
     # the shuffle filter and light deflate: a tenth of the size for smooth columns, at little time
     packing = {"compression": "gzip", "compression_opts": 1, "shuffle": True, "chunks": (min(count, _CHUNK),)}
-    place = group.create_dataset(name, (count,), numbers[kind], **(packing if count > 256 else {}))
+    packing = packing if count > 256 else {}
     number: dict[str | None, int] = {None: -1}  # no text at all
-    for first in range(0, count, _AT_ONCE):
-        part = column.iloc[first : first + _AT_ONCE]
+
+    def converted(part: Any) -> AnyArray:
         if kind == "text":
-            values = _codes(part, number)
-        elif kind == "time":
-            values = part.to_numpy().astype("datetime64[ns]").astype(np.int64)
-        else:
-            values = part.to_numpy().astype(numbers[kind])
-        place[first : first + len(values)] = values
+            return _codes(part, number)
+        stamps = part.astype("datetime64[ns]") if kind == "time" else part
+        return np.asarray(stamps.astype(numbers[kind]))
+
+    cells = column.to_numpy()
+    if count <= _AT_ONCE:
+        group.create_dataset(name, data=converted(cells), **packing)
+    else:
+        place = group.create_dataset(name, (count,), numbers[kind], **packing)
+        for first in range(0, count, _AT_ONCE):
+            place[first : first + _AT_ONCE] = converted(cells[first : first + _AT_ONCE])
     if kind == "text":
         _write_json(group, f"{name}.words", list(number)[1:])
 
 
-def _codes(part: pd.Series[Any], number: dict[str | None, int]) -> AnyArray:
+def _codes(part: AnyArray, number: dict[str | None, int]) -> AnyArray:
     """Numbers of texts; new texts get the next. Not by pandas: up to 2.3 its factorize ends a text at a NUL."""
     import numpy as np
+    import pandas as pd
 
-    missing = part.isna().tolist()
-    texts = [None if gone else str(text) for text, gone in zip(part.tolist(), missing, strict=True)]
-    for text in dict.fromkeys(texts):
-        number.setdefault(text, len(number) - 1)
-    return np.array([number[text] for text in texts], dtype=np.int32)
+    cells = part.tolist()
+    code = {}
+    for cell in dict.fromkeys(cells):  # few of a column differ
+        text = None if pd.isna(cell) else str(cell)
+        code[cell] = number.setdefault(text, len(number) - 1)
+    return np.fromiter(map(code.__getitem__, cells), np.int32, len(cells))
 
 
 def _write_json(group: Any, name: str, content: Any) -> None:

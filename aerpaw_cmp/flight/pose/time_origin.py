@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pandas as pd
+import shapely
 
 from ...common.units import AnyArray, BoolArray, FloatArray
 from ...logs.records import Stream, has_wall_clock
@@ -55,9 +56,10 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     time_s = mine[0].astype(np.int64) / 1e9
     track_s = tracked[0].astype(np.int64) / 1e9 - zero_s
     log_m, track_m = _metres(mine[1], tracked[1]), _metres(tracked[1], tracked[1])
-    low, high = track_m[:, :2].min(axis=0) - _AGREE_M, track_m[:, :2].max(axis=0) + _AGREE_M
-    # half of the half that lies within the track's time has to be that near to it
-    if 4 * ((log_m[:, :2] >= low) & (log_m[:, :2] <= high)).all(axis=1).sum() < len(log_m):
+    line = shapely.linestrings(track_m[:, :2])
+    shapely.prepare(line)
+    # half of the half that lies within the track's time has to be that near to it, at whatever time
+    if 4 * shapely.dwithin(line, shapely.points(log_m[:, :2]), _AGREE_M).sum() < len(log_m):
         return None
     length = time_s[-1] - time_s[0]
     # half of the log may stick out at either end of the track
@@ -83,12 +85,13 @@ def _points(frame: pd.DataFrame, most: int | None) -> tuple[AnyArray, FloatArray
     names = ["latitude_deg", "longitude_deg", "altitude_m"]
     if not set(names) <= set(frame.columns):
         return None
-    known = frame[["time", *names]].dropna(subset=names[:2]).drop_duplicates("time").sort_values("time")
-    if len(known) < 20:
+    places = np.column_stack([frame[name].to_numpy(np.float64) for name in names])
+    known = np.flatnonzero(np.isfinite(places[:, :2]).all(axis=1))
+    time, first = np.unique(frame["time"].to_numpy("datetime64[ns]")[known], return_index=True)
+    if len(time) < 20:
         return None
-    if most is not None and len(known) > most:
-        known = known.iloc[np.linspace(0, len(known) - 1, most).astype(int)]
-    return known["time"].to_numpy("datetime64[ns]"), known[names].to_numpy(np.float64)
+    at = slice(None) if most is None or len(time) <= most else np.linspace(0, len(time) - 1, most).astype(int)
+    return time[at], places[known[first]][at]
 
 
 def _metres(points: FloatArray, about: FloatArray) -> FloatArray:

@@ -330,6 +330,7 @@ def part_of(replayed: Replay, start: int, stop: int) -> Replay:
         replayed,
         **columns,
         contributions=tuple(map(cut, replayed.contributions)),
+        ends=replayed.ends.part(slice(start, stop)),
         seconds=replayed.seconds * share,
         search_seconds=replayed.search_seconds * share,
     )

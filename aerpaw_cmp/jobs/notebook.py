@@ -227,6 +227,23 @@ class Flight:
         run_report(self.path, ReportOptions(**options), RunOptions(out=out, logs_root=self.logs_root, force=force))
         return out / "report.html"
 
+    def channel(self, **options: Any) -> Any:
+        """Paths, channel matrices and calibrated levels along the track, as ``aerpaw-cmp channel`` writes them.
+
+        Parameters
+        ----------
+        options
+            Fields of :class:`aerpaw_cmp.jobs.channel.ChannelOptions`.
+
+        Returns
+        -------
+        xarray.Dataset
+        """
+        from ..report.exports.channel import channel_dataset
+        from .channel import ChannelOptions, flight_channel
+
+        return channel_dataset(flight_channel(self.data, ChannelOptions(**options)))
+
     def plot(self, axes: Any = None) -> Any:
         """Draw the trajectory with the towers, seen from above, on matplotlib axes (default: new ones); give them."""
         axes = axes if axes is not None else _new_axes()

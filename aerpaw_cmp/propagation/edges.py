@@ -88,6 +88,17 @@ class EdgePaths(Further):
         nothing = np.full(self.vertices_m.shape[:2], -1, dtype=np.int64)
         return PathSet(self.pose, self.tower, used.sum(axis=1), nothing, vertices)
 
+    @property
+    def touched(self) -> IntArray:
+        """Ground, both faces of the edge, ground (paths, 4); -1 is none."""
+        return np.column_stack([self.ground[:, :1], self.wedge, self.ground[:, 1:]])
+
+    @property
+    def turns(self) -> IntArray:
+        """2 for the edge, 1 before and after it where the ground reflects (paths,)."""
+        before, after = (self.ground >= 0).T
+        return np.where(after, 10 * (2 + 10 * before) + 1, 2 + 10 * before)
+
     def words(self, faces: Faces) -> list[str]:
         """Corners of each path, from tower to UAV."""
         label = (*faces.label, "")  # of -1, no face

@@ -8,15 +8,17 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.units import BoolArray, ComplexArray, FloatArray, wavelength_m
+from ..common.units import BoolArray, ComplexArray, FloatArray, db_from_power, wavelength_m
 from ..site.site import Site
 from .engine.engines import chosen_samples, path_cache, search_or_read
 from .field.sum import Fields, Further, channel_matrices, mean_pair_power, rss_dbm
 from .geometry.arrays import Link, Poses
 from .geometry.paths import Faces, PathSet, Surfaces, legs
 from .options import Field, Run, Search
+from .path_table import KINDS, Ends, PathTable, frequency_responses, impulse_responses, path_table
 from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.terrain import on_terrain
@@ -45,6 +47,8 @@ class Replay:
         All that H and both levels are made of: the reflections and lines of sight, then the paths of each further kind
         (:class:`~aerpaw_cmp.propagation.field.sum.Further`) that was asked for.
     faces : Faces
+    ends : Ends
+        Link, poses, places of the towers and further losses.
     seconds : float
         Of this call: path search (or reading the cache) and fields.
     search_seconds : float
@@ -70,6 +74,7 @@ class Replay:
     has_path: BoolArray
     contributions: tuple[Any, ...]
     faces: Faces
+    ends: Ends
     seconds: float
     search_seconds: float
     engine: str
@@ -101,6 +106,41 @@ class Replay:
             f"Replay({len(self.has_path)} poses, towers {', '.join(self.towers)}, engine {self.engine!r}, "
             f"{len(self.paths)} paths, coverage {100 * self.has_path.mean():.0f} %, {self.seconds:.2f} s)"
         )
+
+    def path_table(self) -> PathTable:
+        """Every path with delay, gain per element pair and directions."""
+        return path_table(self.contributions, self.faces, self.ends, self.has_path)
+
+    def paths_frame(self) -> Any:
+        """A row per path: ``pose tower kind faces delay_s power_db`` and the angles [deg] of departure and arrival.
+
+        ``power_db`` is the mean over the element pairs.
+        """
+        import pandas as pd
+
+        table = self.path_table()
+        power = (np.abs(table.gain) ** 2).mean(axis=(1, 2))
+        return pd.DataFrame(
+            {
+                "pose": table.pose,
+                "tower": np.array(self.towers)[table.tower],
+                "kind": np.array(KINDS)[table.kind],
+                "faces": np.array([*table.names, ""])[table.via],
+                "delay_s": table.delay_s,
+                "power_db": db_from_power(power),
+                **table.angles_deg(self.ends),
+            }
+        )
+
+    def cir(
+        self, velocity_mps: FloatArray | None = None, times_s: ArrayLike = (0.0,)
+    ) -> tuple[ComplexArray, FloatArray]:
+        """Gains and delays in Sionna's axis order: :func:`aerpaw_cmp.propagation.path_table.impulse_responses`."""
+        return impulse_responses(self.path_table(), self.ends, velocity_mps, times_s)
+
+    def cfr(self, offsets_hz: ArrayLike) -> ComplexArray:
+        """H about the carrier: :func:`aerpaw_cmp.propagation.path_table.frequency_responses`."""
+        return frequency_responses(self.path_table(), self.ends, offsets_hz)
 
     def to_xarray(self) -> Any:
         """The replay as an ``xarray.Dataset`` with dimensions pose, tower, n_rx, n_tx.
@@ -317,6 +357,7 @@ def _evaluated(
         has_path=has_path,
         contributions=contributions,
         faces=scene.faces,
+        ends=Ends(link, poses, scene.sources_m, field.loss),
         seconds=0.0,
         search_seconds=0.0,
         engine=search.engine,

@@ -1,4 +1,4 @@
-"""Before a flight: ``predict``, ``plan``."""
+"""Before a flight: ``predict``, ``plan``, ``channel``."""
 
 from __future__ import annotations
 
@@ -143,3 +143,57 @@ def _print_plan(outcome: Any) -> None:
     records([_in_km(p) for p in m["length"]], length, "What a longer flight buys")
     warn_all(m["warnings"])
     show(f"page: {outcome.folder / 'plan.html'}")
+
+
+@command(
+    "channel",
+    examples=[
+        "aerpaw-cmp channel flight.yaml -o channel",
+        "aerpaw-cmp channel flight.yaml --route plan.kml --tower LW1 --format netcdf --format csv",
+        "aerpaw-cmp channel flight.yaml --link rank --bandwidth 20e6 --subcarriers 64 --step 5",
+    ],
+)
+def channel(
+    flight: Annotated[Path, Argument(help="flight.yaml with logs, with a plan, or with --route.")],
+    out: Annotated[Path | None, output("Output folder  [default: reports/channel-<flight>]")] = None,
+    route: Annotated[
+        Path | None, Option(metavar="FILE", help="Route in place of the track: .plan, KML, CSV or log.")
+    ] = None,
+    link: Annotated[
+        str | None, Option(help="rss, rank or a channel of the flight file  [default: its first channel, else rss]")
+    ] = None,
+    tower: Annotated[list[str] | None, Option(help="Tower; repeatable  [default: those of the logs]")] = None,
+    step: Annotated[float, Option(min=0.001, help="Time between poses [s].")] = 1.0,
+    formats: Annotated[
+        list[str] | None,
+        Option("--format", metavar="NAME", help="netcdf, npz, deepmimo, mat or csv; repeatable  [default: netcdf]"),
+    ] = None,
+    bandwidth: Annotated[
+        float | None, Option(min=1.0, help="Also H at the subcarriers of a band of this width [Hz] (NetCDF).")
+    ] = None,
+    subcarriers: Annotated[int, Option(min=1, max=65536, help="Subcarriers of the band.")] = 1024,
+    logs_root: LogsRoot = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write the channel along a flight or a route for the next simulation."""
+    from ...jobs.channel import ChannelOptions, run_channel
+
+    chosen = ChannelOptions(
+        route=route,
+        link=link,
+        towers=tuple(tower or ()),
+        step_s=step,
+        formats=tuple(formats or ("netcdf",)),
+        bandwidth_hz=bandwidth,
+        subcarriers=subcarriers,
+    )
+    outcome = run_channel(flight, chosen, RunOptions(out=out, logs_root=logs_root, force=force, progress=say))
+    if as_json:
+        print_json(outcome.metrics)
+        return
+    m = outcome.metrics
+    show(f"{m['paths']} paths, {m['poses']} poses, towers {', '.join(m['towers'])}, link {m['link']}")
+    warn_all(m["warnings"])
+    for file in outcome.files:
+        show(file)

@@ -19,6 +19,7 @@ from ...site.site import Site, Tower
 from ..geometry.arrays import Link, Poses
 from ..geometry.paths import PathSet
 from ..options import Field, Job, Loss, Run, Search
+from ..path_table import Ends
 from ..replay import PER_LINK, Replay, replay
 from .parts import in_turn
 
@@ -138,7 +139,8 @@ def replay_moving(
         moved_site, several, some, links = _scene_of(site, link, name, poses, block)
         return _of_one_tower(replay(moved_site, several, some, replace(search, links=links), field, run), name, block)
 
-    return in_turn([block.rows for block in blocks], map(of, blocks), progress)
+    result = in_turn([block.rows for block in blocks], map(of, blocks), progress)
+    return replace(result, ends=Ends(link, poses, sources_m[:, None], field.loss))
 
 
 def _shared_by_blocks(link: Link, poses: Poses, sources_m: FloatArray) -> Job:

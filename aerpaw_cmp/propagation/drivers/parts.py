@@ -44,7 +44,8 @@ def replay_in_parts(
     def of(at: IntArray) -> Replay:
         return replay(site, link, Poses(poses.position_m[at], poses.rotation[at]), search, field, run)
 
-    return in_turn(rows, map(of, rows), progress)
+    result = in_turn(rows, map(of, rows), progress)
+    return replace(result, ends=replace(result.ends, poses=poses))
 
 
 def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | None) -> Replay:

@@ -89,6 +89,16 @@ class Further(Rows):
         """Corners of each path, from tower to UAV."""
         raise NotImplementedError
 
+    @property
+    def touched(self) -> IntArray:
+        """Faces (paths, n) that each path touches, from tower to UAV; -1 is none."""
+        raise NotImplementedError
+
+    @property
+    def turns(self) -> IntArray:
+        """A digit for each corner (paths,), from tower to UAV: 1 a reflection, 2 an edge."""
+        raise NotImplementedError
+
 
 def channel_matrices(
     paths: PathSet,

@@ -245,6 +245,16 @@ class PathSet(Rows):
         """The paths as polylines: themselves."""
         return self
 
+    @property
+    def touched(self) -> IntArray:
+        """Faces (paths, max_depth) from tower to UAV, -1 where unused."""
+        return self.faces
+
+    @property
+    def turns(self) -> IntArray:
+        """A digit 1 for each reflection (paths,)."""
+        return np.asarray((10**self.depth - 1) // 9)
+
     @classmethod
     def from_tower(cls, tower: int, pose: IntArray, faces: IntArray, vertices_m: FloatArray, max_depth: int) -> PathSet:
         """Paths of one tower over sequences (paths, depth), padded to ``max_depth``; -1 is no face.

@@ -1,0 +1,355 @@
+"""Table of the paths of a replay: delay, gain per element pair, directions and Doppler, each path by itself.
+
+H is the sum of the gains; the field of a path alone is the sum over a path set of one path, so there is no second law.
+
+Directions are unit vectors away from the ends: azimuth counter-clockwise from east and elevation above the horizon in
+the site frame, from the boresight and its plane in the array frame (:mod:`aerpaw_cmp.propagation.geometry.arrays`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.errors import UsageError
+from ..common.geodesy import azimuth_rad, elevation_rad
+from ..common.units import SPEED_OF_LIGHT_MPS, AnyArray, ComplexArray, FloatArray, IntArray
+from .field.sum import channel_matrices
+from .geometry.arrays import Link, Poses
+from .geometry.paths import Faces, PathSet, path_lengths
+from .options import Loss
+
+# Codes of ``kind``.
+KINDS = ("line_of_sight", "reflection", "edge")
+
+# Gains are those of the carrier: materials, patterns and foliage are not evaluated at other frequencies.
+WIDEST_BAND = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Ends:
+    """Ends of the paths of a replay.
+
+    Parameters
+    ----------
+    link : Link
+    poses : Poses
+    sources_m : (towers, 3) or (poses, 1, 3)
+        Centres of the tower arrays; the latter of one tower that moves.
+    loss : callable or None
+        Further loss per path.
+    """
+
+    link: Link
+    poses: Poses
+    sources_m: FloatArray
+    loss: Loss | None = None
+
+    def part(self, rows: slice) -> Ends:
+        """Those of some poses."""
+        poses = Poses(self.poses.position_m[rows], self.poses.rotation[rows])
+        return replace(self, poses=poses, sources_m=self.sources_m[rows] if self.moving else self.sources_m)
+
+    @property
+    def moving(self) -> bool:
+        """Whether the tower has a place of its own at every pose."""
+        return self.sources_m.ndim == 3
+
+    def loss_db(self, lines: PathSet) -> FloatArray | None:
+        """Further loss (paths,) [dB]."""
+        if self.loss is None:
+            return None
+        if self.moving:
+            return self.loss(replace(lines, tower=lines.pose), self.sources_m[:, 0], self.poses.position_m)
+        return self.loss(lines, self.sources_m, self.poses.position_m)
+
+    def alike(self, paths: Any) -> Iterator[tuple[IntArray | slice, str, FloatArray]]:
+        """Paths that share an array: rows, the tower's name, and its place (1, 3), or (paths, 1, 3) of each."""
+        names = tuple(self.link.tower_arrays)
+        if self.moving and isinstance(paths, PathSet):
+            yield slice(None), names[0], self.sources_m[paths.pose]
+            return
+        places, member = self.sources_m, paths.tower
+        if self.moving:
+            places, member = np.unique(self.sources_m[paths.pose, 0], axis=0, return_inverse=True)
+        for number, place in enumerate(places):
+            yield np.flatnonzero(member.ravel() == number), names[0 if self.moving else number], place[None, :]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathTable:
+    """Paths of a replay, a row each, by pose and tower, the shortest first.
+
+    Parameters
+    ----------
+    pose, tower, number : (paths,) int
+        ``number`` counts the paths of a link.
+    kind : (paths,) int
+        Of :data:`KINDS`.
+    via : (paths,) int
+        Which of ``names``: the faces from tower to UAV.
+    gain : (paths, n_rx, n_tx) complex
+        With the phase of the carrier.
+    length_m : (paths,)
+        Between the centres of the arrays.
+    at_tower, at_uav : (paths, 3)
+        Directions in which the path leaves the ends, site frame.
+    turns : (paths,) int
+        A digit a corner from tower to UAV, 1 a reflection, 2 an edge; 0 is the line of sight.
+    vertices_m : (paths, most, 3)
+        Corners; NaN where unused.
+    names : tuple of str
+    """
+
+    pose: IntArray
+    tower: IntArray
+    number: IntArray
+    kind: IntArray
+    via: IntArray
+    gain: ComplexArray
+    length_m: FloatArray
+    at_tower: FloatArray
+    at_uav: FloatArray
+    turns: IntArray
+    vertices_m: FloatArray
+    names: tuple[str, ...]
+
+    @property
+    def delay_s(self) -> FloatArray:
+        """Delay (paths,) between the centres of the arrays."""
+        return np.asarray(self.length_m / SPEED_OF_LIGHT_MPS)
+
+    def doppler_hz(self, carrier_hz: float, velocity_mps: FloatArray, tower_mps: ArrayLike = 0.0) -> FloatArray:
+        """Doppler shift (paths,), positive while a path gets shorter.
+
+        ``f = f0 / c (v . k)``, k towards the first corner seen from each end.
+
+        Parameters
+        ----------
+        carrier_hz : float
+        velocity_mps : (poses, 3)
+            Of the UAV: east, north, up.
+        tower_mps : (poses, 3), optional
+            Of a tower that moves.
+
+        Returns
+        -------
+        (paths,)
+        """
+        tower = np.broadcast_to(np.asarray(tower_mps, dtype=np.float64), velocity_mps.shape)
+        closing = np.einsum("ni,ni->n", velocity_mps[self.pose], self.at_uav)
+        closing += np.einsum("ni,ni->n", tower[self.pose], self.at_tower)
+        return np.asarray(carrier_hz / SPEED_OF_LIGHT_MPS * closing)
+
+    def angles_deg(self, ends: Ends) -> dict[str, FloatArray]:
+        """Azimuth and elevation (paths,) of departure and arrival, in the site frame and in the array frame."""
+        mounts = np.stack([array.mount for array in ends.link.tower_arrays.values()])[self.tower]
+        mounted = ends.poses.rotation[self.pose] @ ends.link.uav_array.mount
+        names = ("arrival", "departure") if ends.link.uav_transmits else ("departure", "arrival")
+        out = {}
+        for name, way, frame in zip(names, (self.at_tower, self.at_uav), (mounts, mounted), strict=True):
+            for suffix, seen in (("", way), ("_array", np.einsum("nji,nj->ni", frame, way))):
+                out[f"azimuth_{name}{suffix}_deg"] = np.degrees(azimuth_rad(seen))
+                out[f"elevation_{name}{suffix}_deg"] = np.degrees(elevation_rad(seen))
+        return out
+
+
+def path_table(contributions: tuple[Any, ...], faces: Faces, ends: Ends, counts: AnyArray) -> PathTable:
+    """Paths of a replay, each with its own gain.
+
+    Parameters
+    ----------
+    contributions : tuple
+        Reflections and lines of sight, then the paths of further kinds.
+    faces : Faces
+    ends : Ends
+    counts : (poses, towers) bool
+        Links that have a channel; paths of the others are left out.
+
+    Returns
+    -------
+    PathTable
+    """
+    pieces, names = [], dict[str, int]()
+    most = max(item.lines().vertices_m.shape[1] for item in contributions)
+    for item in contributions:
+        lines = item.lines()
+        loss_db = ends.loss_db(lines)
+        good = counts[lines.pose, lines.tower]
+        good &= True if loss_db is None else np.isfinite(loss_db)
+        item, lines, loss_db = item.select(good), lines.select(good), None if loss_db is None else loss_db[good]
+        labels = (*faces.label, "")
+        unique, via = np.unique(item.touched, axis=0, return_inverse=True)
+        texts = [", ".join(labels[i] for i in row if i >= 0) for row in unique.tolist()]
+        codes = np.array([names.setdefault(text, len(names)) for text in texts], dtype=np.int64)
+        sources = ends.sources_m[lines.pose, 0] if ends.moving else ends.sources_m[lines.tower]
+        targets, own = ends.poses.position_m[lines.pose], np.arange(len(lines))
+        last = lines.vertices_m[own, lines.depth - 1] if lines.vertices_m.shape[1] else targets
+        first = lines.vertices_m[:, 0] if lines.vertices_m.shape[1] else targets
+        bent = lines.depth[:, None] > 0
+        pieces.append(
+            {
+                "pose": item.pose,
+                "tower": item.tower,
+                "kind": np.minimum(lines.depth, 1 if isinstance(item, PathSet) else 2),
+                "via": codes[via.ravel()],
+                "gain": _gains(item, faces, ends, loss_db),
+                "length_m": path_lengths(replace(lines, pose=own, tower=own), sources, targets),
+                "at_tower": _unit(np.where(bent, first, targets) - sources),
+                "at_uav": _unit(np.where(bent, last, sources) - targets),
+                "turns": item.turns,
+                "vertices_m": np.pad(
+                    lines.vertices_m, ((0, 0), (0, most - lines.vertices_m.shape[1]), (0, 0)), constant_values=np.nan
+                ),
+            }
+        )
+    columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    order = np.lexsort((columns["length_m"], columns["tower"], columns["pose"]))
+    columns = {name: value[order] for name, value in columns.items()}
+    link = columns["pose"] * counts.shape[1] + columns["tower"]
+    number = np.arange(len(link)) - np.searchsorted(link, link)
+    return PathTable(**columns, number=number, names=tuple(names))
+
+
+def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> ComplexArray:
+    """Gain (paths, n_rx, n_tx) of each path: H of a pose of its own, where it is the only path."""
+    link = ends.link
+    ports, uavs = len(next(iter(link.tower_arrays.values()))), len(link.uav_array)
+    gain = np.empty((len(item), *((ports, uavs) if link.uav_transmits else (uavs, ports))), dtype=np.complex128)
+    for rows, name, places in ends.alike(item):
+        some = item.select(rows)
+        own = np.arange(len(some))
+        alone = replace(some, pose=own, tower=0 * own)
+        poses = Poses(ends.poses.position_m[some.pose], ends.poses.rotation[some.pose])
+        single = replace(link, tower_arrays={name: link.tower_arrays[name]})
+        lost = None if loss_db is None else loss_db[rows]
+        if isinstance(alone, PathSet):
+            gain[rows] = channel_matrices(alone, faces, places, poses, single, lost).h[:, 0]
+        else:
+            gain[rows] = alone.fields(faces, places, poses, single, lost).h[:, 0]
+    return gain
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300))
+
+
+def impulse_responses(
+    table: PathTable, ends: Ends, velocity_mps: FloatArray | None = None, times_s: ArrayLike = (0.0,)
+) -> tuple[ComplexArray, FloatArray]:
+    """Gains and delays in the axis order of Sionna RT's ``Paths.cir()``, poses as devices.
+
+    Parameters
+    ----------
+    table : PathTable
+    ends : Ends
+    velocity_mps : (poses, 3), optional
+        Turns the paths by their Doppler shift over the times.
+    times_s : (times,)
+
+    Returns
+    -------
+    a : (rx, rx_ant, tx, tx_ant, paths, times) complex
+        With the phase of the carrier, as Sionna's baseband equivalents; zero where there is no path.
+    tau : (rx, tx, paths)
+        Delay [s]; zero where there is no path.
+    """
+    most = int(table.number.max(initial=-1)) + 1
+    shape = len(ends.poses), len(ends.link.tower_arrays)
+    turned = table.gain[..., None]
+    if velocity_mps is not None:
+        cycles = table.doppler_hz(ends.link.carrier_hz, velocity_mps)[:, None] * np.asarray(times_s)
+        turned = turned * np.exp(2j * np.pi * cycles)[:, None, None, :]
+    a = np.zeros((*shape, most, *turned.shape[1:]), dtype=np.complex128)
+    tau = np.zeros((*shape, most))
+    at = table.pose, table.tower, table.number
+    a[at], tau[at] = turned, table.delay_s
+    # a is (pose, tower, path, rx_ant, tx_ant, time)
+    ways = (1, 3, 0, 4, 2, 5) if ends.link.uav_transmits else (0, 3, 1, 4, 2, 5)
+    return np.ascontiguousarray(a.transpose(ways)), np.ascontiguousarray(
+        tau.swapaxes(0, 1) if ends.link.uav_transmits else tau
+    )
+
+
+def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> ComplexArray:
+    """Channel matrices at frequencies about the carrier.
+
+    Parameters
+    ----------
+    table : PathTable
+    ends : Ends
+    offsets_hz : (frequencies,)
+        From the carrier, such as those of :func:`subcarriers_hz`.
+
+    Returns
+    -------
+    (poses, towers, n_rx, n_tx, frequencies) complex
+
+    Raises
+    ------
+    UsageError
+        A band wider than a tenth of the carrier.
+
+    Notes
+    -----
+    ``H(f0 + f) = sum_p a_p exp(-j 2 pi f tau_p)`` with gains of the carrier and delays of the array centres.
+    """
+    offsets = np.asarray(offsets_hz, dtype=np.float64)
+    band = float(np.ptp(offsets)) if len(offsets) else 0.0
+    if band > WIDEST_BAND * ends.link.carrier_hz:
+        raise UsageError(
+            f"a band of {band / 1e6:g} MHz about {ends.link.carrier_hz / 1e9:g} GHz",
+            expected=f"at most {WIDEST_BAND * ends.link.carrier_hz / 1e6:g} MHz, a tenth of the carrier",
+            cause="materials, antennas and foliage are those of the carrier",
+        )
+    links = len(ends.poses), len(ends.link.tower_arrays)
+    h = np.zeros((*links, *table.gain.shape[1:], len(offsets)), dtype=np.complex128)
+    for number in range(int(table.number.max(initial=-1)) + 1):  # one path a link: no row is added to twice
+        rows = np.flatnonzero(table.number == number)
+        phase = np.exp(-2j * np.pi * table.delay_s[rows][:, None] * offsets)
+        h[table.pose[rows], table.tower[rows]] += table.gain[rows][..., None] * phase[:, None, None, :]
+    return h
+
+
+def subcarriers_hz(bandwidth_hz: float, count: int) -> FloatArray:
+    """Offsets (count,) of subcarriers from the carrier, as an FFT centred on it has them.
+
+    Examples
+    --------
+    >>> subcarriers_hz(4.0, 4).tolist()
+    [-2.0, -1.0, 0.0, 1.0]
+    """
+    return np.asarray((np.arange(count) - count // 2) * (bandwidth_hz / count))
+
+
+def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1.0, gap_s: float = 3.0) -> FloatArray:
+    """Velocity (n, 3) by the central difference of positions over twice ``span_s``, linear between them.
+
+    Parameters
+    ----------
+    time_s : (n,)
+        Ascending.
+    position_m : (n, 3)
+    span_s : float
+        Before and after; at the ends and beside gaps one side alone.
+    gap_s : float
+        Longer steps are not bridged.
+
+    Returns
+    -------
+    (n, 3)
+        NaN where an instant has no neighbour.
+    """
+    velocity = np.full(position_m.shape, np.nan)
+    for part in np.split(np.arange(len(time_s)), np.flatnonzero(~(np.diff(time_s) <= gap_s)) + 1):
+        t = time_s[part]
+        if len(part) < 2 or not (np.diff(t) > 0.0).all():
+            continue
+        early, late = np.maximum(t - span_s, t[0]), np.minimum(t + span_s, t[-1])
+        for axis, values in enumerate(position_m[part].T):
+            velocity[part, axis] = (np.interp(late, t, values) - np.interp(early, t, values)) / (late - early)
+    return velocity

@@ -1,0 +1,193 @@
+"""The channel along a plan and along the sample flight: one set of numbers in every format."""
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+import xarray
+
+import aerpaw_cmp
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.units import SPEED_OF_LIGHT_MPS
+from aerpaw_cmp.jobs.channel import ChannelOptions, run_channel
+from aerpaw_cmp.jobs.options import RunOptions
+from tests.json_page import listed
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
+FORMATS = ("netcdf", "npz", "deepmimo", "mat", "csv")
+PLAN = """
+flight:
+  name: To the tower
+  plan:
+    start: 2025-06-01T10:00:00
+    speed_mps: 8
+    waypoints:
+      - {east_m: 10, north_m: 300, height_m: 40}
+      - {east_m: 10, north_m: 60, height_m: 40}
+timezone: America/New_York
+logs: [{path: LW1.txt, reader: gnu_radio_power, node: LW1, channel: A}]
+link:
+  rank: {carrier_hz: 3.4e9, uav_transmits: false, tower: {layout: tower_comparison}, uav: {layout: uav_comparison}}
+"""
+OWN_SITE = """
+name: field
+origin: {latitude_deg: 35.7275, longitude_deg: -78.696}
+area_m: [-400, 400, -400, 400]
+towers:
+  LW1: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna_height_m: 10}
+"""
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    place = tmp_path_factory.mktemp("channel")
+    (place / "plan.yaml").write_text(PLAN)
+    return place
+
+
+@pytest.fixture(scope="module")
+def written(folder):
+    chosen = ChannelOptions(
+        link="rank", towers=("LW1", "LW2"), step_s=2.0, formats=FORMATS, bandwidth_hz=20e6, subcarriers=8
+    )
+    outcome = run_channel(folder / "plan.yaml", chosen, RunOptions(out=folder / "out"))
+    with xarray.open_dataset(folder / "out" / "channel.nc") as book:
+        return outcome, book.load()
+
+
+def complex_of(book, name):
+    return (book[f"{name}_real"] + 1j * book[f"{name}_imag"]).to_numpy()
+
+
+def test_the_netcdf_file_has_h_as_the_sum_of_its_paths(written, cf_faults):
+    outcome, book = written
+    h, gain = complex_of(book, "h"), complex_of(book, "gain")
+    assert h.shape == (16, 2, 4, 4)
+    assert gain.sum(axis=0) == pytest.approx(h, rel=0, abs=1e-12 * np.abs(h).max())
+    assert complex_of(book, "cfr")[..., 4] == pytest.approx(h, rel=1e-12)
+    assert book.attrs["transmitter"] == "tower"
+    assert list(book.tower_name.astype(str).values) == ["LW1", "LW2"]
+    sight = book.kind.to_numpy() == 0
+    place = book[["east_m", "north_m", "up_m"]].to_array().to_numpy().T
+    towers = book[["tower_east_m", "tower_north_m", "tower_up_m"]].to_array().to_numpy().T
+    direct = np.linalg.norm(place[:, None] - towers[None], axis=2)
+    assert sight[0].all()
+    assert book.delay_s.to_numpy()[0] == pytest.approx(direct / SPEED_OF_LIGHT_MPS, rel=1e-12)
+    assert (book.doppler_hz.to_numpy()[0, :, 0] > 0.0).all()  # it comes nearer all the way
+    assert np.diff(book.time) == pytest.approx(2.0)
+    assert cf_faults(outcome.files[0]) == []
+
+
+def test_the_level_and_its_standard_deviation_stand_beside(written):
+    _, book = written
+    assert book.level_db.shape == book.level_sd_db.shape == (16, 2)
+    assert (book.level_sd_db > 1.0).all()
+    assert np.isfinite(book.level_db[:, 0]).all()
+
+
+def test_arrays_for_sionna_and_matlab_hold_the_same(written, folder):
+    _, book = written
+    h, gain = complex_of(book, "h"), complex_of(book, "gain")
+    with np.load(folder / "out" / "channel.npz") as arrays:
+        a, tau = arrays["a"], arrays["tau"]
+        assert a.shape == (16, 4, 2, 4, len(gain), 1)
+        assert tau.shape == (16, 2, len(gain))
+        assert a[..., 0].transpose(4, 0, 2, 1, 3) == pytest.approx(gain)
+        assert list(arrays["towers"]) == ["LW1", "LW2"]
+    matlab = scipy.io.loadmat(folder / "out" / "channel.mat")
+    assert matlab["a"] == pytest.approx(a[..., 0])  # MATLAB drops a last axis of one
+    assert matlab["h"] == pytest.approx(h)
+    assert matlab["doppler_hz"] == pytest.approx(book.doppler_hz.to_numpy(), nan_ok=True)
+
+
+def test_the_table_of_an_emulator_has_a_row_per_instant_and_tower(written, folder):
+    _, book = written
+    table = pd.read_csv(folder / "out" / "channel.csv")
+    assert list(table) == ["time", "tower", "gain_db", "delay_s", "doppler_hz"]
+    assert len(table) == 32
+    power = 10.0 * np.log10((np.abs(complex_of(book, "gain")) ** 2).mean(axis=(3, 4)).sum(axis=0))
+    coherent = 10.0 * np.log10((np.abs(complex_of(book, "h")) ** 2).mean(axis=(2, 3)))
+    given = table.gain_db.to_numpy().reshape(16, 2)
+    assert min(np.abs(given - power).max(), np.abs(given - coherent).max()) < 1e-3
+    assert table.delay_s.to_numpy().reshape(16, 2) == pytest.approx(book.delay_s.to_numpy()[0], rel=1e-8)
+
+
+def test_a_deepmimo_scenario_is_read_as_its_loader_reads_it(written, folder, monkeypatch):
+    """By the loader itself where it is installed; else by the names and keys that DeepMIMO 4 documents."""
+    _, book = written
+    gain = complex_of(book, "gain")[:, :, 1, 0, 0]
+    scenario = folder / "out" / "deepmimo" / "to_the_tower"
+    about = json.loads((scenario / "params.json").read_text())
+    assert about["rt_params"]["frequency"] == 3.4e9
+    sets = about["txrx_sets"]
+    assert [(s["is_tx"], s["is_rx"], s["num_points"]) for s in sets.values()] == [(True, False, 2), (False, True, 16)]
+    try:
+        import deepmimo
+
+        monkeypatch.chdir(folder / "out")
+        deepmimo.config.set("scenarios_folder", "deepmimo")
+        second = deepmimo.load("to_the_tower")[1]
+    except ImportError:
+        names = ("power", "phase", "delay", "aoa_az", "aoa_el", "aod_az", "aod_el", "inter", "rx_pos", "tx_pos")
+        second = {name: np.load(scenario / f"{name}_t000_tx001_r001.npz")[name] for name in names}
+    amplitude = np.nan_to_num(10.0 ** (second["power"] / 20.0) * np.exp(1j * np.radians(second["phase"])))
+    read = {"delay": second["delay"], "aod": second["aod_az"], "up": 90.0 - second["aoa_el"]}
+    own = {"delay": "delay_s", "aod": "azimuth_departure_deg", "up": "elevation_arrival_deg"}
+    np.testing.assert_allclose(amplitude.T, gain, rtol=1e-9)
+    for name, values in read.items():
+        np.testing.assert_allclose(values.T, book[own[name]][:, :, 1].to_numpy(), rtol=1e-9)
+    assert (second["inter"][:, 0] == 0).all()  # line of sight
+    assert second["inter"][:, 1].tolist() == [1] * 16  # the ground
+
+
+def test_a_flown_flight_gives_the_same_in_a_notebook(tmp_path):
+    flight = aerpaw_cmp.open_flight(SAMPLE)
+    book = flight.channel(towers=("LW2",), step_s=20.0)
+    assert book.sizes["pose"] == 17
+    assert str(flight.track.time.iloc[0])[:19].replace(" ", "T") in book.time.attrs["units"].replace(" ", "T")
+    h = complex_of(book, "h")
+    assert complex_of(book, "gain").sum(axis=0) == pytest.approx(h, rel=0, abs=1e-12 * np.abs(h).max())
+
+
+def test_points_without_times_have_no_doppler_and_a_site_without_memory_no_level(folder, capsys):
+    (folder / "own.yaml").write_text(OWN_SITE)
+    (folder / "own_flight.yaml").write_text(PLAN + "site: own.yaml\n")
+    points = "east_m,north_m,height_m\n50,0,30\n50,40,30\n90,90,30\n"
+    (folder / "points.csv").write_text(points)
+    line = ["channel", str(folder / "own_flight.yaml"), "--route", str(folder / "points.csv"), "--json"]
+    assert main([*line, "-o", str(folder / "own_out"), "--format", "csv"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert list(printed) == ["schema", *listed("channel")]
+    assert (printed["has_doppler"], printed["has_level"], printed["poses"]) == (False, False, 3)
+    assert any("No Doppler shift" in text for text in printed["warnings"])
+    assert any("No calibrated level" in text for text in printed["warnings"])
+    assert pd.read_csv(folder / "own_out" / "channel.csv").doppler_hz.isna().all()
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        (["--format", "hdf"], "netcdf"),
+        (["--link", "nope"], "rank"),
+        (["--tower", "nope"], "LW1"),
+        (["--bandwidth", "5e9"], "tenth of the carrier"),
+        (["--step", "0.001", "--link", "rank", "--bandwidth", "1e6", "--subcarriers", "65536"], "coarser|--step"),
+    ],
+)
+def test_what_cannot_be_is_refused_in_one_line(folder, options, expected, capsys, tmp_path):
+    assert main(["channel", str(folder / "plan.yaml"), "-o", str(tmp_path / "out"), *options]) == 2
+    said = capsys.readouterr().err
+    assert "Traceback" not in said
+    assert any(word in said for word in expected.split("|"))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_others_stays(folder, capsys, tmp_path):
+    shutil.copy(folder / "plan.yaml", tmp_path / "notes.txt")
+    assert main(["channel", str(folder / "plan.yaml"), "-o", str(tmp_path), "--format", "csv"]) == 2
+    assert "notes.txt" in capsys.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]

@@ -18,7 +18,8 @@ from tests.json_page import listed
 
 PROGRAM: Any = typer.main.get_command(app)
 VERBS = {name: command for name, command in PROGRAM.commands.items() if not hasattr(command, "commands")}
-VERBS |= {f"site {name}": command for name, command in PROGRAM.commands["site"].commands.items()}
+GROUPS = {name: group for name, group in PROGRAM.commands.items() if hasattr(group, "commands")}
+VERBS |= {f"{group} {name}": verb for group, verbs in GROUPS.items() for name, verb in verbs.commands.items()}
 
 
 OUTPUTS = {name: option for name, verb in VERBS.items() for option in verb.params if "-o" in option.opts}
@@ -42,7 +43,7 @@ MISSING = [
     "explain nope.yaml --time 1 --tower LW1", "diff nope other",
     "tap nope --flight nope.yaml", "map nope.yaml",
     "predict nope.kml --with nope.yaml", "plan nope.kml --site lake_wheeler", "plan sphere --with nope.yaml",
-    "channel nope.yaml",
+    "channel nope.yaml", "antenna export nope.txt -o out.py",
     "plan sphere --site lake_wheeler --geofence nope.kml", "simulate nope.yaml", "site show nope.yaml",
     "site export nope.yaml -o scene", "site import nope.osm -o site.yaml",
 ]  # fmt: skip

@@ -38,6 +38,8 @@ app = typer.Typer(
 )
 site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(site_app, name="site", help=COMMANDS["site"])
+antenna_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(antenna_app, name="antenna", help=COMMANDS["antenna"])
 
 Json = Annotated[bool, Option("--json", help="Print one JSON object on standard output and nothing else there.")]
 Force = Annotated[bool, Option("--force", help="Replace files that this tool did not write; never an input.")]

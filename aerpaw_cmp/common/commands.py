@@ -19,6 +19,7 @@ COMMANDS: dict[str, str] = {
     "simulate": "Write the logs of a planned flight in the real formats, with their truth.",
     "sample": "Copy the sample flight, logs and flight.yaml, into a folder of your own.",
     "site": "Make a site of maps or of a Mitsuba scene (import), look at it (show), export it.",
+    "antenna": "An antenna pattern in the formats of other programs (export).",
     "bench": "Speed against error of the replay on this machine.",
     "doctor": "Is this machine ready? LLVM, Sionna RT, memory, serial ports, with remedies.",
 }

@@ -27,7 +27,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     str
     """
     words = [word for word in arguments[:2] if not word.startswith("-")]
-    command = " ".join(["aerpaw-cmp", *words[: 2 if words[:1] == ["site"] else 1]])
+    command = " ".join(["aerpaw-cmp", *words[: 2 if words[:1] in (["site"], ["antenna"]) else 1]])
     place = None if error.path is None else Path(error.path)
     if place is not None and not _exists(place):  # as the flight file names it
         candidates = (Path(word).parent / place for word in arguments if word.endswith(_SETTINGS))

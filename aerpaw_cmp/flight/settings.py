@@ -47,11 +47,15 @@ class AntennaSettings(StrictModel):
     file: str | None = None
     variable: str | None = None
     """Name of the grid inside a .mat file."""
+    elevation: str | None = None
+    """CSV of the elevation cut, where ``file`` is one of the azimuth cut."""
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
         if (self.file is None) != (self.model not in ("file", "gain_grid", "sphere")):
             raise ValueError("'file' belongs to model 'file', 'gain_grid' or 'sphere', and only there")
+        if self.elevation is not None and self.model != "file":
+            raise ValueError("'elevation' belongs to model 'file', beside an azimuth cut")
         return self
 
 
@@ -114,8 +118,10 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
     if settings.model == "tr38901":
         return antennas.TR38901()
     if settings.model == "file":
-        from ..site.antenna.pattern_files import read_pattern_file
+        from ..site.antenna.pattern_files import read_cut_files, read_pattern_file
 
+        if settings.elevation is not None:
+            return read_cut_files(file, folder / settings.elevation)
         return read_pattern_file(file, carrier_hz=carrier_hz)
     if settings.model == "sphere":
         return read_sphere_csv(file)

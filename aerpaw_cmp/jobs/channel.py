@@ -72,7 +72,7 @@ class _Along:
 
     @property
     def has_times(self) -> bool:
-        """Whether a velocity is known anywhere."""
+        """True where the poses follow each other in time."""
         return len(self.time_s) > 1 and bool((np.diff(self.time_s) > 0.0).all())
 
 
@@ -155,7 +155,7 @@ def _chosen_towers(data: FlightData, named: Sequence[str], remarks: list[str]) -
     """Towers by name; those that move stand alone, since each pose has another scene."""
     if unknown := [name for name in named if name not in data.site.towers]:
         raise UsageError(f"the site has no tower {unknown[0]!r}", expected="one of " + ", ".join(data.site.towers))
-    logs = [log.node for log in data.settings.logs if log.node in data.site.towers]
+    logs = [str(log.node) for log in data.settings.logs if log.node in data.site.towers]
     towers = list(dict.fromkeys(named or [s.tower for _, s in data.series] or logs or data.site.towers))
     fixed = [tower for tower in towers if tower not in data.nodes]
     if len(towers) == 1 or len(fixed) == len(towers):

@@ -97,7 +97,7 @@ class EdgePaths(Further):
     def turns(self) -> IntArray:
         """2 for the edge, 1 before and after it where the ground reflects (paths,)."""
         before, after = (self.ground >= 0).T
-        return np.where(after, 10 * (2 + 10 * before) + 1, 2 + 10 * before)
+        return np.asarray(np.where(after, 10 * (2 + 10 * before) + 1, 2 + 10 * before))
 
     def words(self, faces: Faces) -> list[str]:
         """Corners of each path, from tower to UAV."""

@@ -56,7 +56,7 @@ class Ends:
 
     @property
     def moving(self) -> bool:
-        """Whether the tower has a place of its own at every pose."""
+        """True where the tower has a place of its own at every pose."""
         return self.sources_m.ndim == 3
 
     def loss_db(self, lines: PathSet) -> FloatArray | None:

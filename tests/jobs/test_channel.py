@@ -21,7 +21,7 @@ SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
 FORMATS = ("netcdf", "npz", "deepmimo", "mat", "csv")
 PLAN = """
 flight:
-  name: To the tower
+  name: To_the_tower
   plan:
     start: 2025-06-01T10:00:00
     speed_mps: 8
@@ -82,13 +82,6 @@ def test_the_netcdf_file_has_h_as_the_sum_of_its_paths(written, cf_faults):
     assert cf_faults(outcome.files[0]) == []
 
 
-def test_the_level_and_its_standard_deviation_stand_beside(written):
-    _, book = written
-    assert book.level_db.shape == book.level_sd_db.shape == (16, 2)
-    assert (book.level_sd_db > 1.0).all()
-    assert np.isfinite(book.level_db[:, 0]).all()
-
-
 def test_arrays_for_sionna_and_matlab_hold_the_same(written, folder):
     _, book = written
     h, gain = complex_of(book, "h"), complex_of(book, "gain")
@@ -99,7 +92,7 @@ def test_arrays_for_sionna_and_matlab_hold_the_same(written, folder):
         assert a[..., 0].transpose(4, 0, 2, 1, 3) == pytest.approx(gain)
         assert list(arrays["towers"]) == ["LW1", "LW2"]
     matlab = scipy.io.loadmat(folder / "out" / "channel.mat")
-    assert matlab["a"] == pytest.approx(a[..., 0])  # MATLAB drops a last axis of one
+    assert matlab["a"] == pytest.approx(a)
     assert matlab["h"] == pytest.approx(h)
     assert matlab["doppler_hz"] == pytest.approx(book.doppler_hz.to_numpy(), nan_ok=True)
 
@@ -175,14 +168,14 @@ def test_points_without_times_have_no_doppler_and_a_site_without_memory_no_level
         (["--link", "nope"], "rank"),
         (["--tower", "nope"], "LW1"),
         (["--bandwidth", "5e9"], "tenth of the carrier"),
-        (["--step", "0.001", "--link", "rank", "--bandwidth", "1e6", "--subcarriers", "65536"], "coarser|--step"),
+        (["--step", "0.1", "--link", "rank", "--bandwidth", "1e6", "--subcarriers", "65536"], "--step"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(folder, options, expected, capsys, tmp_path):
     assert main(["channel", str(folder / "plan.yaml"), "-o", str(tmp_path / "out"), *options]) == 2
     said = capsys.readouterr().err
     assert "Traceback" not in said
-    assert any(word in said for word in expected.split("|"))
+    assert expected in said
     assert not (tmp_path / "out").exists()
 
 

@@ -1,4 +1,4 @@
-"""``site import``, ``site show``, ``map``."""
+"""``site import``, ``site show``, ``antenna export``, ``map``."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typer import Argument, Option
 
 from ...common.errors import UsageError
 from ...jobs.options import RunOptions
-from ..app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, command, output, site_app
+from ..app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
 from ..shown import print_files, print_json, print_plan, say, show, table
 
 
@@ -120,6 +120,36 @@ def site_show(
         for line in memory_lines(site):
             say(line)
     print_files(shown.files, as_json)
+
+
+@command(
+    "export",
+    of=antenna_app,
+    text="A pattern file to Sionna RT's custom pattern (.py), MSI Planet (.msi) or a table over the sphere (.csv).",
+    examples=[
+        "aerpaw-cmp antenna export SA3300.txt -o sa3300.py",
+        "aerpaw-cmp antenna export azimuth.csv --elevation elevation.csv --carrier 3.4e9 -o horn.msi",
+        "aerpaw-cmp antenna export rad_pat.mat --variable SA3300 -o sa3300.csv",
+    ],
+)
+def antenna_export(
+    file: Annotated[Path, Argument(help="Pattern: AERPAW text or .mat, MSI, NSMA, a sphere .csv, an azimuth cut .csv")],
+    out: Annotated[Path, output("File to write: .py, .msi or .csv.", "FILE")],
+    elevation: Annotated[
+        Path | None, Option(metavar="CSV", help="Elevation cut, where FILE is an azimuth cut.")
+    ] = None,
+    variable: Annotated[str | None, Option(help="Grid inside a .mat file.")] = None,
+    carrier: Annotated[
+        float | None, Option(min=1.0, help="Frequency [Hz]: which of several, and that of .msi.")
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write a pattern for another program."""
+    from ...jobs.antenna import run_antenna_export
+
+    outcome = run_antenna_export(file, out, elevation=elevation, variable=variable, carrier_hz=carrier, force=force)
+    print_files(outcome.files, as_json)
 
 
 @command(

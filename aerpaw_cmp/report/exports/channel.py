@@ -249,12 +249,9 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
     shown = {"time": np.repeat(time, towers), "tower": np.tile(channel.replay.towers, poses)}
     shown["gain_db"] = channel.gain_db.ravel().round(3)
     for name, values in columns.items():
-        known = values is not None and len(power)
-        at = (
-            np.take_along_axis(channel.by_link(values, np.nan), strongest, axis=0)[0]
-            if known
-            else channel.gain_db * np.nan
-        )
+        at = channel.gain_db * np.nan
+        if values is not None and len(power):
+            at = np.take_along_axis(channel.by_link(values, np.nan), strongest, axis=0)[0]
         shown[name] = at.ravel()
     pd.DataFrame(shown).to_csv(folder / "channel.csv", index=False, float_format="%.9g")
     return folder / "channel.csv"

@@ -227,3 +227,57 @@ def _great_circle(text: str, name: str, path: Path, carrier_hz: float | None) ->
     share = np.minimum(np.degrees(phi), 360.0 - np.degrees(phi)) / 180.0
     front, back = np.interp(theta, angle, gain), np.interp(-theta, angle, gain)
     return _pattern((1.0 - share) * front[:, None] + share * back[:, None], name, path, frequency)
+
+
+# Columns of a cut by the first letters of its angle: degrees clockwise from the front, degrees below the horizon.
+_CUT_ANGLES = {"az": -1.0, "phi": -1.0, "el": -1.0, "th": 1.0, "zen": 1.0}
+
+
+@parsed("a cut of an antenna pattern")
+def read_cut_files(azimuth: Path, elevation: Path) -> MeasuredPattern:
+    """A pattern of two CSV files of an angle [deg] and a gain [dBi], as users of Sionna RT keep them.
+
+    Parameters
+    ----------
+    azimuth : Path
+        Angles counter-clockwise from the front, a full circle: ``azimuth_deg,gain_dbi`` (or ``phi_deg``).
+    elevation : Path
+        Through the front: ``elevation_deg`` up from the horizon or ``theta_deg`` down from the zenith; a half circle
+        stands for both halves.
+
+    Returns
+    -------
+    MeasuredPattern
+
+    Raises
+    ------
+    InputError
+        Other columns, gaps, cuts that differ in front.
+    """
+    cuts = {"HORIZONTAL": _cut_file(azimuth, ("az", "phi")), "VERTICAL": _cut_file(elevation, ("el", "th", "zen"))}
+    apart = abs(float(cuts["HORIZONTAL"][0] - cuts["VERTICAL"][0]))
+    if apart > _RIPPLE_DB:
+        raise InputError(
+            f"in front the cuts of {azimuth.name} and {elevation.name} differ by {apart:.1f} dB",
+            expected="two cuts of one antenna through its front, gains in dBi",
+            cause="one of them is relative to its own peak, or the files are exchanged",
+            path=elevation,
+        )
+    return _from_cuts(cuts, azimuth.stem, azimuth, None)
+
+
+def _cut_file(path: Path, angles: tuple[str, ...]) -> FloatArray:
+    """Gain [dBi] at each degree, as :func:`_planet` has it, of a CSV file with a header."""
+    text = read_input(path, LARGEST_TABLE, "a cut of an antenna pattern").decode("utf-8-sig", errors="replace")
+    header, *lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")] or [""]
+    names = [name.strip().lower() for name in header.split(",")]
+    begin = next((word for word in angles if names[0].startswith(word)), None)
+    if len(names) < 2 or begin is None or "gain" not in names[1] or "rad" in names[0]:
+        raise InputError(
+            f"the columns are {', '.join(names)}",
+            expected=f"an angle ({' or '.join(angles)}..., degrees) and a gain [dBi], named in the first line",
+            path=path,
+        )
+    rows = _pairs([line.replace(",", " ") for line in lines], len(lines), path)
+    rows[:, 0] = _CUT_ANGLES[begin] * rows[:, 0] - (90.0 if begin in ("th", "zen") else 0.0)
+    return _each_degree(rows, path.name, path)

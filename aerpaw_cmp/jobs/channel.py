@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,13 @@ from ..flight.gains.memory import load_with_learned
 from ..flight.pose.track import interpolated
 from ..flight.replay import replay_poses, valid_poses
 from ..flight.settings import FlightFile, LinkSettings
-from ..flight.simulate import planned_poses
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
-from ..propagation.path_table import WIDEST_BAND, subcarriers_hz, velocities_mps
+from ..propagation.path_table import check_band, subcarriers_hz, velocities_mps
 from ..report.exports.channel import FORMATS, Channel
 from ..site.antenna.learned import BAND
 from .options import DEFAULT, JobOutcome, RunOptions
 from .prediction.sources import memory_of
-from .prediction.where import TargetOptions, Targets, find_targets, target_files
+from .prediction.where import TargetOptions, find_targets, target_files
 from .tasks.manifest import inputs_of_flight
 
 
@@ -64,20 +63,16 @@ class ChannelOptions:
 class _Along:
     """Poses at equal steps: ``start`` is the instant of ``time_s`` 0 where it is known."""
 
+    name: str
     poses: Poses
     time_s: FloatArray
     start: Any = None
     towers_m: FloatArray | None = None
     remarks: tuple[str, ...] = ()
 
-    @property
-    def has_times(self) -> bool:
-        """True where the poses follow each other in time."""
-        return len(self.time_s) > 1 and bool((np.diff(self.time_s) > 0.0).all())
-
 
 def flight_channel(
-    data: FlightData, chosen: ChannelOptions = ChannelOptions(), stages: Stages | None = None, flown: bool = True
+    data: FlightData, chosen: ChannelOptions = ChannelOptions(), stages: Stages | None = None
 ) -> Channel:
     """The channel along a flight.
 
@@ -88,8 +83,6 @@ def flight_channel(
     chosen : ChannelOptions
     stages : Stages, optional
         Times "replay" and "paths".
-    flown : bool
-        Whether its track is the route, in place of its plan.
 
     Returns
     -------
@@ -104,27 +97,21 @@ def flight_channel(
     settings, remarks = data.settings, list[str]()
     name, link_settings = _chosen_link(settings, chosen)
     towers = _chosen_towers(data, chosen.towers, remarks)
-    if (chosen.bandwidth_hz or 0.0) > WIDEST_BAND * link_settings.carrier_hz:
-        raise UsageError(
-            f"--bandwidth {chosen.bandwidth_hz:g} at {link_settings.carrier_hz / 1e9:g} GHz",
-            expected=f"at most {WIDEST_BAND * link_settings.carrier_hz:g} Hz, a tenth of the carrier",
-            cause="materials, antennas and foliage are those of the carrier",
-        )
+    check_band(chosen.bandwidth_hz or 0.0, link_settings.carrier_hz)
     link = link_settings.build(towers, data.folder)
-    along = _flown(data, chosen, towers) if flown and chosen.route is None else _planned(data, chosen)
+    along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
     with stages("replay"):
-        replayed = replay_poses(
-            data.site, settings.rt, link, along.poses, towers_m=along.towers_m, progress=stages.progress
-        )
+        run = {"towers_m": along.towers_m, "progress": stages.progress}
+        replayed = replay_poses(data.site, settings.rt, link, along.poses, **run)
     with stages("paths"):
         table = replayed.path_table()
-    velocity = velocities_mps(along.time_s, along.poses.position_m) if along.has_times else None
-    if velocity is None or not np.isfinite(velocity).any():
+    velocity: FloatArray | None = velocities_mps(along.time_s, along.poses.position_m)
+    if not np.isfinite(velocity).any():
         velocity = None
         remarks.append("No Doppler shift: the points have no times, so the UAV has no velocity.")
     level, sd, unit = _levels(data, link, name, along.poses, remarks)
     return Channel(
-        name=settings.flight.name if chosen.route is None else chosen.route.stem,
+        name=along.name,
         link=name,
         replay=replayed,
         table=table,
@@ -178,6 +165,7 @@ def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> _
         raise UsageError("no instant of the flight has a pose", expected="positions", cause=data.track.why_not(track))
     left = int((~track.valid).sum())
     return _Along(
+        name=data.settings.flight.name,
         poses=valid_poses(track, data.settings.rt.attitude),
         time_s=((time - time[0]) / np.timedelta64(1, "s"))[track.valid],
         start=time[0],
@@ -186,13 +174,12 @@ def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> _
     )
 
 
-def _planned(data: FlightData, chosen: ChannelOptions) -> _Along:
+def _planned(data: FlightData, route: Path, step_s: float) -> _Along:
     """Poses of a level aircraft along a route or a plan, nose as the route says, else along the course."""
-    targets = _targets(data, chosen)
-    time, position, yaw = targets.time_s, targets.position_m, targets.yaw_deg
-    remarks = targets.remarks
+    targets = find_targets(route, data.site, TargetOptions())
+    time, position, yaw, remarks = targets.time_s, targets.position_m, targets.yaw_deg, targets.remarks
     if len(time) > 1 and (np.diff(time) > 0.0).all():
-        wanted = np.arange(0.0, time[-1] + 1e-9, chosen.step_s)
+        wanted = np.arange(0.0, time[-1] + 1e-9, step_s)
         yaw = yaw[np.searchsorted(time, wanted, side="right") - 1]
         time, position = wanted, interpolated(wanted, time, position)
     known = np.isfinite(position).all(axis=1)
@@ -202,19 +189,8 @@ def _planned(data: FlightData, chosen: ChannelOptions) -> _Along:
         yaw = np.where(np.isfinite(yaw), yaw, course)
         remarks = (*remarks, "The route gives no heading: the nose points along the course.")
     level = np.zeros(len(yaw))
-    ignored = data.settings.rt.attitude == "ignored"
-    rotation = rotation_from_aircraft(level, level, level + 90.0 if ignored else yaw)
-    return _Along(poses=Poses(position, rotation), time_s=time, remarks=remarks)
-
-
-def _targets(data: FlightData, chosen: ChannelOptions) -> Targets:
-    if chosen.route is not None:
-        return find_targets(chosen.route, data.site, TargetOptions())
-    plan = data.settings.flight.plan
-    if plan is None:
-        raise UsageError("a flight file without logs and without a plan", expected="flight.plan or --route FILE")
-    time, position, yaw = planned_poses(plan, data.site.datum.takeoff_ground_m, chosen.step_s)
-    return Targets(kind="route", name=data.settings.flight.name, position_m=position, yaw_deg=yaw % 360.0, time_s=time)
+    rotation = rotation_from_aircraft(level, level, level + 90.0 if data.settings.rt.attitude == "ignored" else yaw)
+    return _Along(name=targets.name, poses=Poses(position, rotation), time_s=time, remarks=remarks)
 
 
 def _levels(
@@ -266,18 +242,21 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
         raise UsageError(f"--format {unknown[0]!r}", expected="one of " + ", ".join(FORMATS))
     settings, stages = load_with_learned(flight), Stages(options.progress)
     root = options.logs_root or flight.parent
-    needs_logs = chosen.route is None and (
-        settings.flight.plan is None or all((root / log.path).exists() for log in settings.logs)
-    )
-    inputs = inputs_of_flight(settings if needs_logs else settings.model_copy(update={"logs": []}), flight, root)
-    inputs += [] if chosen.route is None else target_files(chosen.route, None, None)
+    if chosen.route is None and settings.flight.plan and not all((root / log.path).exists() for log in settings.logs):
+        chosen = replace(chosen, route=flight)  # not flown yet: its plan
+    flown = chosen.route is None
+    inputs = inputs_of_flight(settings if flown else settings.model_copy(update={"logs": []}), flight, root)
+    inputs += [] if chosen.route is None else target_files(chosen.route, None, root)
     folder = options.out or Path("reports") / f"channel-{settings.flight.name}"
     with OutputFolder(folder, job="channel", inputs=inputs, force=options.force) as output:
         with stages("read"):
-            data = (
-                load_data(settings, flight.parent, options.logs_root) if needs_logs else _without_logs(settings, flight)
-            )
-        channel = flight_channel(data, chosen, stages, flown=needs_logs)
+            if flown:
+                data = load_data(settings, flight.parent, options.logs_root)
+            else:
+                nothing: dict[str, Any] = dict.fromkeys(("files", "rss", "rank", "warnings"), ())
+                site = choose_site(settings.site, flight.parent)
+                data = FlightData(settings=settings, folder=root, site=site, track=None, **nothing)
+        channel = flight_channel(data, chosen, stages)
         with stages("write"), output.filling() as place:
             written = [FORMATS[name](channel, place) for name in dict.fromkeys(chosen.formats)]
         metrics = {
@@ -294,16 +273,3 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
             "stages": stages.seconds,
         }
         return JobOutcome(folder=folder, metrics=metrics, files=output.placed(written))
-
-
-def _without_logs(settings: FlightFile, flight: Path) -> FlightData:
-    return FlightData(
-        settings=settings,
-        folder=flight.parent,
-        site=choose_site(settings.site, flight.parent),
-        files=(),
-        track=None,
-        rss=(),
-        rank=(),
-        warnings=(),
-    )

@@ -299,13 +299,7 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
     ``H(f0 + f) = sum_p a_p exp(-j 2 pi f tau_p)`` with gains of the carrier and delays of the array centres.
     """
     offsets = np.asarray(offsets_hz, dtype=np.float64)
-    band = float(np.ptp(offsets)) if len(offsets) else 0.0
-    if band > WIDEST_BAND * ends.link.carrier_hz:
-        raise UsageError(
-            f"a band of {band / 1e6:g} MHz about {ends.link.carrier_hz / 1e9:g} GHz",
-            expected=f"at most {WIDEST_BAND * ends.link.carrier_hz / 1e6:g} MHz, a tenth of the carrier",
-            cause="materials, antennas and foliage are those of the carrier",
-        )
+    check_band(float(np.ptp(offsets)) if len(offsets) else 0.0, ends.link.carrier_hz)
     links = len(ends.poses), len(ends.link.tower_arrays)
     h = np.zeros((*links, *table.gain.shape[1:], len(offsets)), dtype=np.complex128)
     for number in range(int(table.number.max(initial=-1)) + 1):  # one path a link: no row is added to twice
@@ -313,6 +307,16 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
         phase = np.exp(-2j * np.pi * table.delay_s[rows][:, None] * offsets)
         h[table.pose[rows], table.tower[rows]] += table.gain[rows][..., None] * phase[:, None, None, :]
     return h
+
+
+def check_band(bandwidth_hz: float, carrier_hz: float) -> None:
+    """UsageError for a band wider than :data:`WIDEST_BAND` of the carrier."""
+    if bandwidth_hz > WIDEST_BAND * carrier_hz:
+        raise UsageError(
+            f"a band of {bandwidth_hz / 1e6:g} MHz about {carrier_hz / 1e9:g} GHz",
+            expected=f"at most {WIDEST_BAND * carrier_hz / 1e6:g} MHz, a tenth of the carrier",
+            cause="materials, antennas and foliage are those of the carrier",
+        )
 
 
 def subcarriers_hz(bandwidth_hz: float, count: int) -> FloatArray:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from ...common.errors import UsageError
-from .antennas import MeasuredPattern
+from .antennas import MeasuredPattern, check_power
 from .sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid
 
 _STEP_DEG = 3.0
@@ -99,6 +99,7 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
         return planning_cuts(pattern, name, frequency, lines)
     theta, phi, _ = sphere_grid(_STEP_DEG)
     if target.suffix == ".csv":
+        check_power(pattern, target)  # what the reader of spheres asks: two cuts may make more power than goes in
         at = np.meshgrid(np.radians(theta), np.radians(phi), indexing="ij")
         sd = pattern.gain_sd_db(*at) if isinstance(pattern, SpherePattern) else np.zeros(at[0].shape)
         return sphere_csv(pattern.gain_dbi(*at), sd, lines)

@@ -101,13 +101,13 @@ def flight_channel(
     link = link_settings.build(towers, data.folder)
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
     with stages("replay"):
-        run = {"towers_m": along.towers_m, "progress": stages.progress}
+        run: dict[str, Any] = {"towers_m": along.towers_m, "progress": stages.progress}
         replayed = replay_poses(data.site, settings.rt, link, along.poses, **run)
     with stages("paths"):
         table = replayed.path_table()
-    velocity: FloatArray | None = velocities_mps(along.time_s, along.poses.position_m)
-    if not np.isfinite(velocity).any():
-        velocity = None
+    velocity = velocities_mps(along.time_s, along.poses.position_m)
+    moves = bool(np.isfinite(velocity).any())
+    if not moves:
         remarks.append("No Doppler shift: the points have no times, so the UAV has no velocity.")
     level, sd, unit = _levels(data, link, name, along.poses, remarks)
     return Channel(
@@ -117,7 +117,7 @@ def flight_channel(
         table=table,
         time_s=along.time_s,
         start=along.start,
-        velocity_mps=velocity,
+        velocity_mps=velocity if moves else None,
         tower_mps=0.0 if along.towers_m is None else velocities_mps(along.time_s, along.towers_m),
         summed=settings.rss.field,
         level_db=level,

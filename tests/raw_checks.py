@@ -8,7 +8,6 @@ Taken from this package are the settings and, per sample, which paths there are:
 from __future__ import annotations
 
 import contextlib
-import gzip
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
@@ -19,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import InputError, parsing
 from aerpaw_cmp.common.units import FloatArray, IntArray, spread_out
 from aerpaw_cmp.compare.result import APPLIED, GIVEN
 from aerpaw_cmp.flight.data import FlightData, RankSeries, RssSeries
@@ -35,12 +33,6 @@ from tests.raw_bytes import LOWEST_M, Log, Matrix, Pose, RawPath, Reading, east_
 # Of all RSS series together, at least three of each; and moments of the track between its rows.
 SAMPLES = 48
 
-# Larger logs are not read twice: a report of some gigabytes stays quick.
-_LARGEST_LOG = 1 << 25
-
-# From the site's origin; beyond it the plane of the second way parts from the geodesic.
-_FURTHEST_M = 5_000.0
-
 # Largest differences by kind, with the unit. Coherent levels have more in fades, as much as 0.01 rad does there.
 _TOLERANCES = {
     "time": (1e-3, "s"), "position": (0.005, "m"), "rotation": (1e-5, "rad"), "measured level": (1e-3, "dB"),
@@ -48,23 +40,8 @@ _TOLERANCES = {
 }  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RawAudit:
-    """Readings, poses with attitude (between telemetry rows too) and levels, and the largest differences."""
-
-    samples: int
-    poses: int
-    levels: int
-    position_max_m: float
-    attitude_max_rad: float
-    measured_max_db: float
-    level_max_db: float
-    failures: tuple[str, ...]
-    not_covered: tuple[str, ...]
-
-
 @dataclass(slots=True)
-class _Account:
+class Account:
     """Worst difference by kind with its place, how many were compared and failed, and what could not be."""
 
     count: dict[str, int] = field(default_factory=dict)
@@ -86,30 +63,22 @@ class _Account:
         if text not in self.not_covered:
             self.not_covered.append(text)
 
-    def result(self) -> RawAudit:
-        """All of it as one record."""
-        failures = []
-        for kind, count in self.failed.items():
-            if count:
-                off, where = self.worst[kind]
-                shown = f"by {off:.3g} {_TOLERANCES[kind][1]}" if math.isfinite(off) else "altogether"
-                share = f"{count} of {self.count[kind]}"
-                failures.append(f"from raw bytes: {kind} differs {shown} at {where} ({share} differ)")
-        most = {kind: self.worst.get(kind, (0.0, ""))[0] for kind in _TOLERANCES}
-        return RawAudit(
-            samples=self.count.get("measured level", 0),
-            poses=self.count.get("rotation", 0),
-            levels=self.count.get("simulated level", 0),
-            position_max_m=most["position"],
-            attitude_max_rad=most["rotation"],
-            measured_max_db=most["measured level"],
-            level_max_db=most["simulated level"],
-            failures=(*failures, *self.broken),
-            not_covered=tuple(f"from raw bytes: {text}" for text in self.not_covered),
-        )
+    def most(self, kind: str) -> float:
+        """Largest difference of a kind."""
+        return self.worst.get(kind, (0.0, ""))[0]
+
+    @property
+    def failures(self) -> list[str]:
+        """What is out of tolerance, with the worst place of each kind."""
+        lines = [
+            f"{kind} differs by {self.worst[kind][0]:.3g} {_TOLERANCES[kind][1]} at {self.worst[kind][1]} ({count} differ)"
+            for kind, count in self.failed.items()
+            if count
+        ]
+        return [*lines, *self.broken]
 
 
-def raw_checked(data: FlightData, replays: Sequence[Replayed], expected: Sequence[Expected]) -> RawAudit:
+def raw_checked(data: FlightData, replays: Sequence[Replayed], expected: Sequence[Expected]) -> Account:
     """Positions, datum, attitude, readings and levels of some samples, from the bytes of the logs.
 
     Parameters
@@ -122,11 +91,11 @@ def raw_checked(data: FlightData, replays: Sequence[Replayed], expected: Sequenc
 
     Returns
     -------
-    RawAudit
+    Account
         The numbers, what is out of tolerance, and what could not be checked.
     """
-    account = _Account()
-    logs = _logs(data, account)
+    account = Account()
+    logs = [_log(data, *pair, account) for pair in zip(data.settings.logs, data.files, strict=True)]
     towers = _towers_checked(data, account)
     path = _path(data, logs, account)
     if path is not None:
@@ -140,24 +109,18 @@ def raw_checked(data: FlightData, replays: Sequence[Replayed], expected: Sequenc
         check.poses_and_levels(rows)
     for rank in data.rank:
         _rank_checked(data, rank, logs, path, account)
-    return account.result()
+    return account
 
 
 # ---------------------------------------------------------------- bytes
 
 
-def _logs(data: FlightData, account: _Account) -> list[Log | None]:
-    """Each log of the flight, read a second time; None with a word where it cannot be."""
-    return [_log(data, *pair, account) for pair in zip(data.settings.logs, data.files, strict=True)]
-
-
-def _log(data: FlightData, settings: LogSettings, file: IngestedFile, account: _Account) -> Log | None:
+def _log(data: FlightData, settings: LogSettings, file: IngestedFile, account: Account) -> Log | None:
+    """A log of the flight, read a second time; None with a word where it cannot be."""
     zone = "UTC" if settings.clock == "utc" else settings.timezone or data.settings.timezone
-    content = _content(data.folder / settings.path, file.sha256)
-    if content is None:
-        account.leave(f"{settings.path} (packed, larger than 32 MiB, or read in pieces)")
-        return None
-    if zone is None or settings.clock == "local_as_utc" or settings.time_origin or settings.columns:
+    content = (data.folder / settings.path).read_bytes()
+    assert hashlib.sha256(content).hexdigest() == file.sha256, "the report names its inputs by their hash"
+    if zone is None or settings.time_origin or settings.columns:
         account.leave(f"{settings.path} (the flight file states its times or columns)")
         return None
     with contextlib.suppress(ValueError, KeyError, IndexError, NotImplementedError):
@@ -167,19 +130,7 @@ def _log(data: FlightData, settings: LogSettings, file: IngestedFile, account: _
     return None
 
 
-def _content(path: Path, sha256: str) -> bytes | None:
-    """The bytes that the report names by their hash."""
-    with contextlib.suppress(InputError), parsing(path):
-        if path.stat().st_size <= _LARGEST_LOG:
-            content = path.read_bytes()
-            if content[:2] == b"\x1f\x8b":
-                with gzip.open(path) as book:
-                    content = book.read(_LARGEST_LOG)
-            return content if hashlib.sha256(content).hexdigest() == sha256 else None
-    return None
-
-
-def _path(data: FlightData, logs: Sequence[Log | None], account: _Account) -> RawPath | None:
+def _path(data: FlightData, logs: Sequence[Log | None], account: Account) -> RawPath | None:
     """The flight between the rows of the first telemetry log."""
     for settings, file, log in zip(data.settings.logs, data.files, logs, strict=True):
         if not any(s.kind == "telemetry" and s.name not in settings.skip for s in file.result.streams):
@@ -188,13 +139,9 @@ def _path(data: FlightData, logs: Sequence[Log | None], account: _Account) -> Ra
             account.leave(f"the track, since {settings.path} has no rows for it")
             return None
         origin = data.site.frame.latitude_deg, data.site.frame.longitude_deg
-        content = _site_file(data)
-        if "origin" not in content:
-            account.leave("the track, since the site's file is not beside the logs")
-            return None
         jumped = _flagged_us(file, "position_jump")
         rows = [row for row in log.rows if row.time_us not in jumped]
-        takeoff_m = float(content["origin"].get("takeoff_ground_m", 0.0))
+        takeoff_m = float(_site_file(data)["origin"].get("takeoff_ground_m", 0.0))
         path = RawPath(rows, origin, takeoff_m, lambda *at: float(data.site.ground_under_m(*np.array(at)[:, None])[0]))
         if path.out_of_order or not path.rows:
             account.leave("the track, whose rows are out of time order")
@@ -220,62 +167,44 @@ def _site_file(data: FlightData) -> Mapping[str, Any]:
     name = data.settings.site.file
     path = data.folder / name
     if not path.is_file():
-        path = Path(str(resources.files("aerpaw_cmp.site"))) / "data" / f"{name.lower().replace('-', '_')}.yaml"
-    with contextlib.suppress(InputError), parsing(path):
-        return dict(yaml.load(path.read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)))
-    return {}
+        path = Path(str(resources.files("aerpaw_cmp.site"))) / "data" / f"{name}.yaml"
+    return dict(yaml.safe_load(path.read_bytes()))
 
 
-def _towers_checked(data: FlightData, account: _Account) -> dict[str, Tower]:
+def _towers_checked(data: FlightData, account: Account) -> dict[str, Tower]:
     """Towers of the site a second time, by name."""
     content, choice = _site_file(data), data.settings.site
-    offsets = content.get("tower_ground") == "offsets"
-    if "dem" in content or "scene" in content:
-        account.leave("towers on an elevation model or in a scene")
-        return {}
-    origin = content.get("origin", {})
-    center = (float(origin.get("latitude_deg", math.nan)), float(origin.get("longitude_deg", math.nan)))
+    center = (content["origin"]["latitude_deg"], content["origin"]["longitude_deg"])
     out = {}
-    for name, tower in content.get("towers", {}).items():
-        if {"antenna", "ground"} & set(tower) or name not in data.site.towers:
-            account.leave(f"tower {name} (heights of another reference)")
-            continue
+    for name, tower in content["towers"].items():
         known = tower.get("positions")
         coordinates = choice.coordinates or content.get("coordinates") or next(iter(known or {}), "")
         place = known[coordinates] if known else tower
         east, north = east_north_m(place["latitude_deg"], place["longitude_deg"], center)
         height = tower.get("antenna_height_m") or place.get("antenna_height_m") or 10.0
-        ground = float(tower.get("ground_offset_m") or 0.0) if offsets else 0.0
         height = float(choice.antenna_height_m or height)
         ours = data.site.towers[name]
-        apart_m = float(np.linalg.norm(ours.position_m - np.array([east, north, ground + height])))
-        spare = 1e-6 * math.hypot(east, north)
-        account.add(
-            "tower", apart_m, f"tower {name}", spare=spare if math.hypot(east, north) < _FURTHEST_M else math.inf
-        )
-        out[name] = replace(ours, east_m=east, north_m=north, ground_m=ground, antenna_height_m=height)
+        apart_m = float(np.linalg.norm(ours.position_m - np.array([east, north, height])))
+        account.add("tower", apart_m, f"tower {name}", spare=1e-6 * math.hypot(east, north))
+        out[name] = replace(ours, east_m=east, north_m=north, ground_m=0.0, antenna_height_m=height)
     return out
 
 
 def _reference(
-    data: FlightData, replayed: Replayed, expected: Expected, towers: Mapping[str, Tower], tower: str, account: _Account
+    data: FlightData, replayed: Replayed, expected: Expected, towers: Mapping[str, Tower], tower: str, account: Account
 ) -> Reference | None:
     """The second implementation of a link, with the tower where the second way has it; None where it cannot be."""
     if replayed.tower_m is not None or tower not in towers:
         account.leave(f"levels of {tower} (a node of the flight, or one that moves)")
         return None
-    rt = data.settings.rt
-    if data.site.scene is not None or data.site.dem is not None or rt.diffraction != "none":
-        account.leave("levels over terrain, in scenes of triangles, with diffraction")
-        return None
-    site = replace(data.site.under(rt.foliage), towers={tower: towers[tower]})
+    site = replace(data.site.under(data.settings.rt.foliage), towers={tower: towers[tower]})
     return Reference(site, tower, expected.link, expected.loss)
 
 
 # ---------------------------------------------------------------- track
 
 
-def _track_checked(data: FlightData, path: RawPath, account: _Account) -> None:
+def _track_checked(data: FlightData, path: RawPath, account: Account) -> None:
     """Poses of the track between its rows, where a turn that is held or late shows."""
     assert data.track is not None
     rows = np.unique(np.linspace(0, len(path.times_us) - 2, SAMPLES).round().astype(np.int64)).clip(0)
@@ -291,10 +220,9 @@ def _track_checked(data: FlightData, path: RawPath, account: _Account) -> None:
             _pose_checked(pose, track.position_m[at], known, f"{times[at]} UTC", account)
 
 
-def _pose_checked(pose: Pose, place: FloatArray, turn: FloatArray | None, where: str, account: _Account) -> None:
-    horizontal_m = math.hypot(*pose.place_m[:2])
-    if horizontal_m < _FURTHEST_M:
-        account.add("position", math.dist(pose.place_m, place.tolist()), where, spare=1e-6 * horizontal_m)
+def _pose_checked(pose: Pose, place: FloatArray, turn: FloatArray | None, where: str, account: Account) -> None:
+    spare = 1e-6 * math.hypot(*pose.place_m[:2])
+    account.add("position", math.dist(pose.place_m, place.tolist()), where, spare=spare)
     if turn is not None and pose.turn is not None:
         account.add("rotation", float(np.abs(np.array(pose.turn) - turn).max()), where)
 
@@ -327,7 +255,7 @@ class _Series:
     replayed: Replayed
     path: RawPath | None
     reference: Reference | None
-    account: _Account
+    account: Account
 
     @property
     def name(self) -> str:
@@ -350,7 +278,7 @@ class _Series:
                 account.leave(f"readings of {self.name} (no column of {settings.path} is known to be its level)")
                 return
             if settings.node is not None and settings.node != series.tower and not settings.cells:
-                account.broken.append(f"from raw bytes: {settings.path} is of {settings.node}, not of {series.tower}")
+                account.broken.append(f"{settings.path} is of {settings.node}, not of {series.tower}")
             stamp = int(series.time[row].astype("datetime64[us]").astype(np.int64))
             account.add("time", abs(stamp - reading.time_us) * 1e-6, where)
             measured = float(series.measured_db[row])
@@ -452,7 +380,7 @@ def _as_asked(pose: Pose, mode: str) -> Matrix | None:
 
 
 def _rank_checked(
-    data: FlightData, series: RankSeries, logs: Sequence[Log | None], path: RawPath | None, account: _Account
+    data: FlightData, series: RankSeries, logs: Sequence[Log | None], path: RawPath | None, account: Account
 ) -> None:
     """Rank and position of samples against the lines of a table that holds both, found by their times."""
     for number in np.unique(series.log).tolist():

@@ -1,12 +1,15 @@
 """Files that appear whole or not at all."""
 
 import os
+from importlib import import_module
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.files import atomic_path, inside, read_bounded
+from aerpaw_cmp.common.geodesy import SiteFrame
 
 
 @pytest.mark.parametrize("durable", [False, True])
@@ -61,87 +64,41 @@ def test_what_a_killed_run_left_is_removed_after_an_hour(tmp_path: Path) -> None
     assert {p.name for p in tmp_path.iterdir()} == {"a", new.name, other.name}
 
 
-def _yaml(path):
-    from aerpaw_cmp.flight.settings import load_flight
-
-    return load_flight(path)
-
-
-def _map(path):
-    from aerpaw_cmp.site.imports.mapfiles import read_map_file
-
-    return read_map_file(path)
-
-
-def _scene(path):
-    from aerpaw_cmp.site.mesh_scenes.mitsuba import _root
-
-    return _root(path)
+# Functions that read a whole file, by their place in the package, with what they want beside its path.
+READERS_OF_WHOLE_FILES: dict[str, dict[str, Any]] = {
+    "flight.settings.load_flight": {},
+    "site.imports.mapfiles.read_map_file": {},
+    "site.mesh_scenes.mitsuba._root": {},
+    "site.mesh_scenes.meshfiles.read_mesh": {},
+    "site.antenna.antennas.read_pattern_text": {},
+    "site.relief.dem.read_dem": {"frame": SiteFrame(35.7, -78.7), "crs": "EPSG:4326"},
+    "site.antenna.sphere_pattern.read_sphere_csv": {},
+    "site.antenna.antennas.read_gain_grid": {"variable": "rad_pat"},
+    "jobs.learning.calibrate_rank.read_receiver": {},
+    "jobs.diff_reports._metrics": {"named": Path()},
+}
 
 
-def _mesh(path):
-    from aerpaw_cmp.site.mesh_scenes.meshfiles import read_mesh
-
-    return read_mesh(path)
-
-
-def _elevation(path):
-    from aerpaw_cmp.common.geodesy import SiteFrame
-    from aerpaw_cmp.site.relief.dem import read_dem
-
-    return read_dem(path, SiteFrame(35.7, -78.7), crs="EPSG:4326")
+def read_by(name: str, path: Path) -> Any:
+    module, _, function = name.rpartition(".")
+    return getattr(import_module(f"aerpaw_cmp.{module}"), function)(path, **READERS_OF_WHOLE_FILES[name])
 
 
-def _pattern(path):
-    from aerpaw_cmp.site.antenna.antennas import read_pattern_text
-
-    return read_pattern_text(path)
-
-
-def _sphere(path):
-    from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv
-
-    return read_sphere_csv(path)
-
-
-def _gain_grids(path):
-    from aerpaw_cmp.site.antenna.antennas import read_gain_grid
-
-    return read_gain_grid(path, "rad_pat")
-
-
-def _numbers_of_a_report(path):
-    from aerpaw_cmp.jobs.diff_reports import _metrics
-
-    return _metrics(path, path)
-
-
-def _receiver(path):
-    from aerpaw_cmp.jobs.learning.calibrate_rank import read_receiver
-
-    return read_receiver(path)
-
-
-READERS_OF_WHOLE_FILES = (
-    _yaml, _map, _scene, _mesh, _elevation, _pattern, _sphere, _gain_grids, _numbers_of_a_report, _receiver,
-)  # fmt: skip
-
-
-@pytest.mark.parametrize("read", READERS_OF_WHOLE_FILES)
-def test_a_file_that_is_far_too_large_is_not_read(read, tmp_path):
+@pytest.mark.parametrize("name", READERS_OF_WHOLE_FILES)
+def test_a_file_that_is_far_too_large_is_not_read(name: str, tmp_path: Path) -> None:
     """A log named by mistake may be larger than the memory."""
     path = tmp_path / "large"
     with path.open("wb") as file:
         file.truncate(1 << 40)  # a hole: takes no room
     with pytest.raises((InputError, UsageError), match=f"the file has {1 << 40} bytes.*at most"):
-        read(path)
+        read_by(name, path)
 
 
 @pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device without an end")
-@pytest.mark.parametrize("read", [_yaml, _pattern, _receiver])
-def test_a_device_without_an_end_is_read_to_the_limit_only(read):
+@pytest.mark.parametrize("name", list(READERS_OF_WHOLE_FILES)[::4])
+def test_a_device_without_an_end_is_read_to_the_limit_only(name: str) -> None:
     with pytest.raises((InputError, UsageError), match=r"it has more than \d+ bytes; expected .* at most"):
-        read(Path("/dev/zero"))
+        read_by(name, Path("/dev/zero"))
 
 
 @pytest.mark.parametrize("size", [0, 1, (1 << 20) - 1, 1 << 20, (1 << 20) + 1])

@@ -95,7 +95,7 @@ def test_ranking_follows_the_true_error_on_fields_of_known_covariance():
     expected = [rms_db(Known(series=[known], model=MODEL).sd_db([r], {"T.A": TARGET})) for r in routes]
     squares = np.zeros(len(routes))
     rng = np.random.default_rng(5)
-    for _ in range(40):
+    for _ in range(20):
         uav, mast = (drawn(t.length, t.sd_db, int(rng.integers(1 << 30))) for t in TERMS)
 
         def level(s, uav=uav, mast=mast):
@@ -111,6 +111,6 @@ def test_ranking_follows_the_true_error_on_fields_of_known_covariance():
         first, truth = measured(known), level(TARGET)
         for k, route in enumerate(routes):
             error = truth - fit_gain([first, measured(route)], MODEL).mean(TARGET)
-            squares[k] += error.var() / 40
+            squares[k] += error.var() / 20
     assert spearmanr(expected, squares).statistic > 0.85
     np.testing.assert_allclose(np.sqrt(squares), expected, rtol=0.12)  # and the size is the error's

@@ -33,7 +33,6 @@ from aerpaw_cmp.compare.statistics.intervals import (
     SEED,
     autocorrelation,
     bootstrap_means,
-    interval,
     share_interval,
 )
 from aerpaw_cmp.compare.statistics.passes import Visit
@@ -398,16 +397,6 @@ def statistics_by_hand(a, b):
     return agree, (agree - chance) / (1 - chance), sum(abs(p - q)) / 2, move
 
 
-def test_the_statistics_of_means_are_those_of_the_sequences(pair):
-    a, b = pair
-    equal, first, second = (a == b).astype(float), ranks.one_hot(a), ranks.one_hot(b)
-    rows = ranks._pair_statistics(equal, first, second)
-    columns = np.column_stack([equal, first, second])
-    for (_, statistic, _), expected in zip(rows, statistics_by_hand(a, b), strict=True):
-        assert statistic(columns.mean(axis=0)[None])[0] == pytest.approx(expected, rel=1e-12)
-    assert [bounds for _, _, bounds in rows] == [(0.0, 1.0), (-1.0, 1.0), (0.0, 1.0), (0.0, MAX_RANK - 1.0)]
-
-
 def test_the_influence_of_a_pose_is_the_slope_of_the_statistic_towards_it(pair):
     a, b = pair
     equal, first, second = (a == b).astype(float), ranks.one_hot(a), ranks.one_hot(b)
@@ -423,31 +412,6 @@ def test_the_influence_of_a_pose_is_the_slope_of_the_statistic_towards_it(pair):
     np.testing.assert_array_equal(of_kappa, columns)
     assert ranks.kappa_of_means(mean[None])[0] == pytest.approx(statistics_by_hand(a, b)[1])
     np.testing.assert_array_equal(influence, ranks._pair_statistics(equal, first, second)[1][0])
-
-
-def test_sequences_that_agree_by_chance_alone_have_no_kappa_to_resample():
-    ones = np.ones(50, dtype=int)
-    equal, first = np.ones(50), ranks.one_hot(ones)
-    influence, kappa, _ = ranks._pair_statistics(equal, first, first)[1]
-    assert np.isfinite(influence).all()
-    assert np.isnan(kappa(np.column_stack([equal, first, first]).mean(axis=0)[None])).all()
-
-
-def test_intervals_come_from_one_bootstrap_each_with_its_own_memory(pair):
-    a, b = pair
-    values = statistics_by_hand(a, b)
-    intervals = ranks._pair_intervals(a, b, values, 300)
-    equal, first, second = (a == b).astype(float), ranks.one_hot(a), ranks.one_hot(b)
-    columns = np.column_stack([equal, first, second])
-    for number, (influence, statistic, bounds) in enumerate(ranks._pair_statistics(equal, first, second)):
-        memory = autocorrelation(influence)
-        drawn = statistic(bootstrap_means(columns, memory.block_length, replicates=300))
-        if number == 0:
-            assert intervals[0] == share_interval(values[0], float(drawn.std()), memory)  # a share keeps within 0 and 1
-        else:
-            assert intervals[number] == interval(values[number], drawn, memory, bounds=bounds)
-    assert intervals[0] != interval(values[0], drawn, memory, bounds=(0.0, 1.0))
-    assert ranks._pair_intervals(a[:1], b[:1], values, 10) == [NO_INTERVAL] * 4
 
 
 def test_bars_of_a_histogram_have_wilsons_intervals(pair):

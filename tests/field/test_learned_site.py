@@ -18,13 +18,14 @@ from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv
 from tests.real_logs import REAL
 
 HERE = Path(__file__).parent / "learned"
+LEFT_OUT = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "left_out_reports.py"))
 pytestmark = [pytest.mark.usefixtures("few_pictures"), pytest.mark.field]
 
 
-def calibrated(name: str, folder: Path, flights: list[str]) -> Path:
-    """A site in a folder that remembers the calibration of some flights."""
+def calibrated(name: str, folder: Path) -> Path:
+    """A site in a folder that remembers a calibration."""
     content = yaml.safe_load((HERE / f"{name}.yaml").read_text(encoding="utf-8"))
-    content["flights"] = [str((HERE / flight).resolve()) for flight in flights or content["flights"]]
+    content["flights"] = [str((HERE / flight).resolve()) for flight in content["flights"]]
     (folder / f"{name}.yaml").write_text(yaml.safe_dump(content), encoding="utf-8")
     site = folder / "mine.yaml"
     packaged = Path(str(folder_of("lake_wheeler"))).with_suffix(".yaml")
@@ -60,7 +61,7 @@ def first_words(folder: Path, site: Path, log: str) -> tuple[str, dict]:
 
 
 def test_a_drafted_flight_opens_with_what_other_flights_taught(tmp_path: Path) -> None:
-    site = calibrated("dataset12", tmp_path, ["ds12_40m_fs10MHz.yaml", "ds12_40m_fs5MHz.yaml"])
+    site = LEFT_OUT["site_without"](HERE / "dataset12.yaml", "ds12_70m_fs20MHz.yaml", REAL, tmp_path)
     words, metrics = first_words(tmp_path, site, "dataset12/70m_fs20MHz.mat")
     said = re.search(r"(\d\.\d)(?:\N{NARROW NO-BREAK SPACE}| )dB", words)
     assert said is not None
@@ -73,12 +74,13 @@ def test_a_drafted_flight_opens_with_what_other_flights_taught(tmp_path: Path) -
 
 
 def test_an_unseen_flight_of_the_sounder_is_told_its_lock_by_other_flights(tmp_path: Path) -> None:
-    left_out = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "left_out_reports.py"))
-    site = left_out["site_without"](HERE / "afar.yaml", "../calibrations/afar300_loc_2.yaml", REAL, tmp_path)
-    sentence, metrics = left_out["reported"](
-        REAL / "afar/results_useful_ori_exp_300_loc_2.mat", site, tmp_path
-    )  # fmt: skip
-    (numbers,) = (scores for _, scores in left_out["rows"](metrics))
+    recipe = yaml.safe_load((HERE / "afar.yaml").read_text(encoding="utf-8"))
+    recipe["flights"] = [str(HERE / name) for name in recipe["flights"] if "300" in name or "328" in name]
+    (tmp_path / "afar.yaml").write_text(yaml.safe_dump(recipe), encoding="utf-8")
+    unseen = str(HERE / "../calibrations/afar300_loc_2.yaml")
+    site = LEFT_OUT["site_without"](tmp_path / "afar.yaml", unseen, REAL, tmp_path)
+    sentence, metrics = LEFT_OUT["reported"](REAL / "afar/results_useful_ori_exp_300_loc_2.mat", site, tmp_path)
+    (numbers,) = (scores for _, scores in LEFT_OUT["rows"](metrics))
     assert "floor \N{MINUS SIGN}15" in sentence
     assert "Expect " in sentence
     assert numbers["P(detected) brier"] < 0.75 * numbers["P(detected) constant_brier"]
@@ -92,11 +94,12 @@ def test_an_unseen_flight_of_the_sounder_is_told_its_lock_by_other_flights(tmp_p
     assert np.hypot(111_000.0 * north, 90_400.0 * east) < 40.0
 
 
-@pytest.mark.parametrize("name", ["dataset12", "lte", "nr_rank", pytest.param("afar", marks=pytest.mark.skipif(
-    not os.environ.get("AERPAW_CMP_REMAKE"), reason="two minutes: AERPAW_CMP_REMAKE=1 runs it"
-))])  # fmt: skip
+LONG = pytest.mark.skipif(not os.environ.get("AERPAW_CMP_REMAKE"), reason="minutes: AERPAW_CMP_REMAKE=1 runs it")
+
+
+@pytest.mark.parametrize("name", ["lte", *(pytest.param(n, marks=LONG) for n in ("dataset12", "nr_rank", "afar"))])
 def test_packaged_numbers_are_what_the_command_gives(name: str, tmp_path: Path) -> None:
-    site = calibrated(name, tmp_path, [])
+    site = calibrated(name, tmp_path)
     packaged, entries = read_learned("lake_wheeler").entries[name], read_learned(site).entries
     made = entries[name]
     assert made.trained_on == packaged.trained_on
@@ -124,7 +127,7 @@ def test_packaged_numbers_are_what_the_command_gives(name: str, tmp_path: Path) 
             assert marks[0] == marks[1] != []
 
 
-@pytest.mark.parametrize("name", ["afar", "nr_rank"])
+@pytest.mark.parametrize("name", ["afar", "dataset12", "nr_rank"])
 def test_packaged_entries_name_the_logs_of_the_field_folder(name: str) -> None:
     """Their commands take minutes (``make learned``): here only that they are of these very logs."""
     known = {hashlib.sha256(path.read_bytes()).hexdigest() for path in REAL.rglob("*") if path.is_file()}

@@ -20,12 +20,8 @@ def test_times_levels_and_positions_are_those_of_the_bytes(path: Path) -> None:
     data = load_data(load_flight(path), REAL)
     replays = replay_flight(data).all
     audit = raw_checked(data, replays, expectations(data, replays))
-    assert audit.failures == ()
-    assert audit.samples + audit.poses > 40 or path.stem.startswith("nr_rank")
-    assert audit.position_max_m < 0.005
-    assert audit.attitude_max_rad < 1e-5
-    assert audit.measured_max_db < 1e-3
-    assert audit.level_max_db < 0.01
+    assert audit.failures == []
+    assert sum(audit.count.get(kind, 0) for kind in ("measured level", "rotation")) > 40 or "nr_rank" in path.stem
 
 
 def test_there_are_flights() -> None:

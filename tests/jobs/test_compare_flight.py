@@ -172,22 +172,6 @@ def test_too_low_samples_are_counted_apart(tmp_path: Path) -> None:
     assert low.score.n == low.score.n_out_of_coverage == 0
 
 
-def test_ri_only_ever_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    at = np.arange(0, 60, 0.5)
-    path = flight(tmp_path, rank=(at, np.full(len(at), 2.0)))
-    data = gathered(path)
-    (replayed,) = replay_rank(data)
-    score = compare_rank_series(data, data.rank[0], replayed).score
-    assert score.histogram.tolist() == [0.0, 1.0, 0.0, 0.0]
-    assert score.simulated
-    for at_k in score.simulated.values():
-        assert 0.0 <= at_k.agreement <= 1.0
-        assert np.isnan(at_k.kappa) or at_k.kappa <= 1e-9  # a constant modem agrees by chance alone
-        assert at_k.total_variation == pytest.approx(1.0 - at_k.histogram[1])
-    metrics = report_completes(path, capsys)["rank"]["LW1"]
-    assert metrics["measured"]["histogram"] == {"1": 0.0, "2": 1.0, "3": 0.0, "4": 0.0}
-
-
 def test_no_csi_is_never_a_rank(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
     data = gathered(flight(tmp_path, rank=(at, np.zeros(len(at)))))

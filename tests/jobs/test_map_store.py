@@ -332,34 +332,25 @@ def test_a_full_disk_is_one_message_and_the_run_goes_on_later(tmp_path, in_one_p
     assert crew.numbers == [2, 3, 4, 5, 6, 7]
 
 
-def kills_once(order):
-    """As ``map_tile``, but the worker of tile 4 ends: once, or every time where the folder says so."""
-    folder = Path(os.environ["TEST_MAP_STORE"])
-    with (folder / "tries").open("a") as stream:
+def killed(order):
+    """As ``map_tile``, but the worker of tile 4 ends."""
+    with Path(os.environ["TEST_MAP_STORE"]).open("a") as stream:
         stream.write(f"{order.number}\n")
-    if order.number == 4 and ((folder / "always").exists() or not (folder / "killed").exists()):
-        (folder / "killed").touch()
+    if order.number == 4:
         os.kill(os.getpid(), signal.SIGKILL)
     return mapping.map_tile(order)
 
 
-@pytest.mark.parametrize("always", [False, True], ids=["once", "always"])
-def test_a_killed_worker_costs_one_tile(always, tmp_path, in_one_piece, monkeypatch):
-    monkeypatch.setenv("TEST_MAP_STORE", str(tmp_path))
-    if always:
-        (tmp_path / "always").touch()
+def test_a_worker_that_is_killed_each_time_costs_one_tile(tmp_path, in_one_piece, monkeypatch):
+    monkeypatch.setenv("TEST_MAP_STORE", str(tmp_path / "tries"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mapping, "map_tile", kills_once)
-        if always:
-            with pytest.raises(InputError, match="1 of 8 tiles were lost: its worker process ended"):
-                make(tmp_path / "map.zarr", workers=Processes(2))
-        else:
-            assert_like(make(tmp_path / "map.zarr", workers=Processes(2)), in_one_piece)
-    tries = sorted(int(line) for line in (tmp_path / "tries").read_text().split())
-    assert tries == sorted([*range(TILES), *[4] * (2 if always else 1)])
+        patch.setattr(mapping, "map_tile", killed)
+        with pytest.raises(InputError, match="1 of 8 tiles were lost: its worker process ended"):
+            make(tmp_path / "map.zarr", workers=Processes(2))
+    assert sorted(map(int, (tmp_path / "tries").read_text().split())) == sorted([*range(TILES), 4, 4])
     crew = Watched()
     assert_like(make(tmp_path / "map.zarr", workers=crew), in_one_piece)
-    assert crew.numbers == ([4] if always else [])
+    assert crew.numbers == [4]
 
 
 def test_without_zarr_the_message_says_how_to_get_it(tmp_path, monkeypatch):

@@ -311,20 +311,6 @@ def rows_of(prediction, tower, channel):
     return table[(table["tower"] == tower) & (table["channel"] == channel)]
 
 
-def test_many_directions_are_those_of_a_degree():
-    """A gain of known slope: taken a degree at a time it may be off by that slope times half a degree's diagonal."""
-    rng = np.random.default_rng(1)
-    ray = rng.normal(size=(6000, 3)) * [1.0, 1.0, 0.3]
-    ray /= np.linalg.norm(ray, axis=1, keepdims=True)
-    zero = np.zeros(len(ray))
-    samples = LinkSamples("f", "t", "c", zero, ray, ray, ray, zero)
-    exact = correction.by_degree(lambda s: (10.0 * s.at_uav[:, 2], 1.0 + 0.0 * s.time_s))
-    gain, sd = exact(samples)
-    assert np.abs(gain - 10.0 * ray[:, 2]).max() < 10.0 * np.radians(1.01)
-    assert np.abs(gain - 10.0 * ray[:, 2]).max() > 0.0
-    assert set(sd) == {1.0}
-
-
 def test_directions_are_evaluated_once_per_degree_over_all_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(correction, "MOST_DIRECTIONS", 10)
     asked = []

@@ -3,8 +3,6 @@
 import contextlib
 import dataclasses
 import io
-import os
-import stat
 import tracemalloc
 from collections.abc import Iterator
 from pathlib import Path
@@ -144,23 +142,6 @@ def test_a_failure_leaves_the_old_file_and_no_rest(tmp_path: Path, monkeypatch: 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["flight.h5", "log"]
 
 
-def test_the_old_file_stands_until_the_new_one_takes_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    path = tmp_path / "flight.h5"
-    write_flight(path, [])
-    before = path.read_bytes()
-    seen = []
-
-    def refuse(self: Path, target: Path) -> Path:
-        seen.append((self.parent, self.read_bytes()[:4], path.read_bytes() == before))
-        raise OSError(5, "Input/output error")
-
-    monkeypatch.setattr(Path, "rename", refuse)
-    with pytest.raises(OutputError, match="Input/output"):
-        write_flight(path, all_samples_of_one(tmp_path))
-    assert seen == [(tmp_path, b"\x89HDF", True)]
-    assert path.read_bytes() == before
-
-
 class _Full(io.BytesIO):
     """A disk with so many bytes left."""
 
@@ -227,20 +208,6 @@ def sealed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     folder = tmp_path_factory.mktemp("sealed")
     write_flight(folder / "flight.h5", all_samples_of_one(folder))
     return (folder / "flight.h5").read_bytes()
-
-
-def test_the_file_has_ordinary_permissions(tmp_path: Path) -> None:
-    old = os.umask(0o022)
-    try:
-        write_flight(tmp_path / "flight.h5", [])
-    finally:
-        os.umask(old)
-    assert stat.S_IMODE((tmp_path / "flight.h5").stat().st_mode) == 0o644
-
-
-def test_no_folder_to_write_to(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="no such folder"):
-        write_flight(tmp_path / "no" / "flight.h5", [])
 
 
 def test_files_that_are_no_flight_file(tmp_path: Path) -> None:

@@ -527,31 +527,6 @@ def test_systems_that_are_almost_singular_are_solved_where_they_carry_variance()
     assert kriging._solve_reduced(np.zeros((3, 1, 1)), np.ones((3, 1))).tolist() == [[1.0]] * 3
 
 
-def test_definite_is_what_has_a_cholesky_factor_whatever_stands_beside_it():
-    good = 1.0 - np.exp(-np.abs(np.subtract.outer(np.arange(4.0), np.arange(4.0))))
-    bad = good.copy()
-    bad[0, 1] = bad[1, 0] = 3.0  # no variogram
-    assert kriging._is_definite(np.stack([good, good])).tolist() == [True, True]
-    assert kriging._is_definite(np.stack([good, bad, good])).tolist() == [True, False, True]
-    assert kriging._is_definite(np.zeros((2, 1, 1))).tolist() == [True, True]
-    assert kriging._is_definite(good[None, :2, :2]).tolist() == [True]
-    assert kriging._is_definite(np.zeros((1, 2, 2))).tolist() == [False]
-
-
-def test_targets_with_neighbours_at_equal_offsets_are_told_from_others():
-    rng = np.random.default_rng(6)
-    shapes = rng.uniform(-50, 50, (3, 4, 2))
-    pick = rng.integers(0, 3, 40)
-    example, group = kriging._same_geometry(np.moveaxis(shapes[pick], 0, 2).swapaxes(0, 1))
-    assert len(example) == 3
-    assert (pick[example][group] == pick).all()
-    swapped = np.stack([shapes[0], shapes[0][::-1], shapes[0] + [0.0, 1e-3]])
-    assert len(np.arange(3)[kriging._same_geometry(np.moveaxis(swapped, 0, 2).swapaxes(0, 1))[0]]) == 3
-    first_alike = shapes.copy()
-    first_alike[:, 0] = shapes[0, 0]
-    assert len(np.arange(3)[kriging._same_geometry(np.moveaxis(first_alike, 0, 2).swapaxes(0, 1))[0]]) == 3
-
-
 def test_estimates_do_not_depend_on_how_many_are_made_at_once(monkeypatch):
     rng = np.random.default_rng(7)
     points, values, targets = rng.uniform(0, 100, (30, 2)), rng.normal(size=30), rng.uniform(0, 100, (50, 2))

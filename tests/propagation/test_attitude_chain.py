@@ -16,11 +16,8 @@ from aerpaw_cmp.propagation.geometry.arrays import (
     Array,
     Link,
     Poses,
-    linear_array,
     rotation_from_aircraft,
     single_element,
-    tower_comparison_array,
-    uav_comparison_array,
 )
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
@@ -139,21 +136,3 @@ def test_each_tower_has_its_own_array(scenes, tmp_path):
     free = abs(replay(site, ahead, scenes.poses([[100.0, 0.0, 10.0]]), Search(max_depth=0)).h[0, 0, 0, 0])
     assert 20 * np.log10(abs(east[0]) / free) == pytest.approx(8.0, abs=1e-6)
     assert 20 * np.log10(abs(east[1]) / free) == pytest.approx(8.0 - 30.0 + 20 * np.log10(0.5), abs=1e-6)
-
-
-def test_where_the_arrays_of_the_paper_face_unless_told_otherwise():
-    """Boresight and first port, in words: north-east; across the nose to the right; north, from west to east."""
-    tower, uav, line = tower_comparison_array(), uav_comparison_array(0.0875), linear_array(4, 0.04)
-    ahead, half = np.array([1.0, 0, 0]), np.sqrt(0.5)
-    assert np.degrees(tower.slant_rad) == pytest.approx([45, -45, 45, -45], abs=1e-12)
-    assert np.degrees(uav.slant_rad) == pytest.approx([45, -45, -45, 45], abs=1e-12)
-    assert not line.slant_rad.any()
-    assert tower.mount @ ahead == pytest.approx([half, half, 0], abs=1e-12)
-    assert tower.mount @ tower.positions_m[0] == pytest.approx([-0.9 * half, 0.9 * half, 0], abs=1e-12)
-    assert uav.mount @ ahead == pytest.approx([half, -half, 0], abs=1e-12)
-    # rolled by 90 degrees: the column on the left stands on top
-    assert (uav.positions_m[:2] @ uav.mount.T)[:, 2] == pytest.approx([0.0875 / 4] * 2, abs=1e-12)
-    assert line.mount @ ahead == pytest.approx([0, 1, 0], abs=1e-12)
-    assert line.positions_m @ line.mount.T == pytest.approx(
-        np.array([[-0.06, 0, 0], [-0.02, 0, 0], [0.02, 0, 0], [0.06, 0, 0]]), abs=1e-12
-    )

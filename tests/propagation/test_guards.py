@@ -13,9 +13,6 @@ from aerpaw_cmp.common.errors import CheckError, UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.jobs.bench import random_scene, speed_against_error
 from aerpaw_cmp.propagation.geometry.arrays import (
-    Array,
-    rotation_from_aircraft,
-    rotation_from_yaw_pitch_roll,
     tower_comparison_array,
     uav_comparison_array,
 )
@@ -80,32 +77,6 @@ def test_slots_leave_room_and_towers_share_scenes_by_their_ground(scenes):
     assert (towers.tolist(), len(chosen)) == ([0, 1, 2], len(faces))
 
 
-class Made:
-    """In place of a finder: says for what it was made."""
-
-    batch = 3
-
-    def __init__(self, towers, chosen):
-        self.made = (towers.tolist(), chosen.tolist())
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *error):
-        pass
-
-
-def test_batches_hold_every_link_that_is_alive_once():
-    alive = np.zeros((3, 9), dtype=bool)
-    alive[0, [0, 2, 3, 7]], alive[1, [2, 8]] = True, True
-    groups = [(np.array([2]), np.array([5])), (np.array([0, 1]), np.array([4]))]
-    batches = [(finder.made, t.tolist(), p.tolist()) for finder, t, p in sionna._each_batch(Made, groups, alive)]
-    assert batches == [(([0, 1], [4]), [0, 1], [0, 2, 3]), (([0, 1], [4]), [0, 1], [7, 8])]
-    ends = sionna._Ends(np.arange(6.0).reshape(2, 3), np.stack([np.eye(3), -np.eye(3)]), np.zeros((1, 3)))
-    assert ends.padded(4).centres_m[:, 0].tolist() == [0.0, 3.0, 3.0, 3.0]
-    assert ends.padded(4).turns[:, 0, 0].tolist() == [1.0, -1.0, -1.0, -1.0]
-
-
 @pytest.mark.parametrize(
     ("candidates", "limit", "slots"),
     [
@@ -156,25 +127,6 @@ def test_a_batch_with_nearly_as_many_paths_as_fit_is_refused(many):
     assert searched["gain"][1, 0, 4] == pytest.approx(np.linalg.norm(a[:, 1, :, 0, :, 4]))
 
 
-def test_slanted_elements_take_their_share_of_both_halves():
-    generator = np.random.default_rng(3)
-    uav, tower = (Array(np.zeros((n, 3)), generator.uniform(-2, 2, n)) for n in (2, 3))
-    a = generator.normal(size=(4, 2 * 2, 5, 2 * 3)) + 1j * generator.normal(size=(4, 2 * 2, 5, 2 * 3))
-    h = sionna._slanted(a, uav, tower)
-    for rx, u, tx, t in ((0, 0, 0, 0), (3, 1, 4, 2), (2, 0, 1, 1)):
-        halves = a[rx, [[u], [u + 2]], tx, [t, t + 3]]
-        weights = [np.array([np.cos(s), np.sin(s)]) for s in (uav.slant_rad[u], tower.slant_rad[t])]
-        assert h[rx, u, tx, t] == pytest.approx(weights[0] @ halves @ weights[1])
-
-
-def test_primitives_become_faces_and_other_interactions_are_dropped():
-    paths = raw()
-    paths["kind"][1, 1, 0, 1] = 4  # a refraction
-    pose, tower, sequence = sionna._sequences(paths, {7: np.array([3, 5])}, np.array([40, 41]), np.array([2]), 2)
-    rows = {tuple(row) for row in np.column_stack([pose, tower, sequence]).tolist()}
-    assert rows == {(40, 2, -1, -1), (41, 2, -1, -1), (40, 2, 5, -1)}
-
-
 def test_refinement_drops_duplicates_and_points_outside_their_face(scenes):
     faces = site_faces(scenes.site([Building("b", box(40, -20, 45, 20), 30.0)]))
     wall = int(np.flatnonzero(faces.normal[:, 0] == -1.0)[0])
@@ -212,11 +164,6 @@ def test_batches_hold_one_to_a_hundred_poses(scenes, monkeypatch, batch, refused
     links = Links(SOURCES, TARGETS)
     with pytest.raises(UsageError if refused else LoadedError, match=f"batch {batch}" if refused else None):
         sionna.find_paths(site_faces(scenes.site()), links, sionna.Rays(batch=batch), carrier_hz=3.4e9)
-
-
-def test_euler_angles_give_the_rotation_back():
-    turns = rotation_from_aircraft(*np.random.default_rng(1).uniform(-80, 80, (3, 50)))
-    assert rotation_from_yaw_pitch_roll(*sionna._euler(turns).T) == pytest.approx(turns)
 
 
 def peak_bytes(poses, link, site):

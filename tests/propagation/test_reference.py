@@ -348,16 +348,3 @@ def test_audit_of_several_replays_adds_up():
     both = first + second
     assert (both.paths, both.power_max_db, both.failed) == (4, 2.0, 2)
     assert both.power_rms_db == pytest.approx(np.sqrt((3 * 1 + 9) / 4))
-
-
-def test_audited_poses_meet_every_kind_of_path(case):
-    site, link, poses = case
-    replayed = replay(site, link, poses)
-    few = field_audit.spread_over_paths(replayed, np.arange(len(poses)), 3)
-    assert len(few) == 3
-
-    def kinds(rows):
-        chosen = np.isin(replayed.paths.pose, rows)
-        return len(np.unique(np.column_stack([replayed.paths.tower, replayed.paths.faces])[chosen], axis=0))
-
-    assert kinds(few) >= kinds([0, 1, 2])

@@ -12,8 +12,6 @@ from aerpaw_cmp.common.errors import AerpawCmpError, InputError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.antenna.antennas import read_gain_grid, read_pattern_text
 from aerpaw_cmp.site.imports.footprints import import_footprints
-from aerpaw_cmp.site.relief.dem import read_dem
-from aerpaw_cmp.site.siteyaml import load_site
 
 FRAME = SiteFrame(35.7275, -78.696)
 GEOJSON = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "id": 7, "properties": {"building": "yes",
@@ -50,41 +48,7 @@ PATTERN = (
     ).encode()
 )
 
-READERS = {
-    "v.json": (GEOJSON, lambda path: import_footprints([path], FRAME)),
-    "o.json": (OVERPASS, lambda path: import_footprints([path], FRAME)),
-    "v.osm": (OSM, lambda path: import_footprints([path], FRAME)),
-    "v.kml": (KML, lambda path: import_footprints([path], FRAME)),
-    "site.yaml": (SITE, load_site),
-    "d.asc": (DEM, lambda path: read_dem(path, FRAME, crs="local")),
-    "p.txt": (PATTERN, read_pattern_text),
-}
 SPOIL = [b"", b"\xff", b"\x00", b"\n", *b'- 0 9e999 nan null [ } " < 1e30 true 180'.split()]
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_the_whole_file_reads(tmp_path: Path, name: str) -> None:
-    content, read = READERS[name]
-    (tmp_path / name).write_bytes(content)
-    assert read(tmp_path / name) is not None
-
-
-@pytest.mark.parametrize("name", READERS)
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(
-    cuts=st.lists(
-        st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 12), st.sampled_from(SPOIL)), min_size=1, max_size=3
-    )
-)
-def test_mutilated_files_give_one_message(tmp_path: Path, name: str, cuts: list[tuple[float, int, bytes]]) -> None:
-    content, read = READERS[name]
-    for place, length, spoil in cuts:
-        at = int(place * len(content))
-        content = content[:at] + spoil + content[at + length :]
-    path = tmp_path / name
-    path.write_bytes(content)
-    with contextlib.suppress(AerpawCmpError):
-        read(path)
 
 
 @settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

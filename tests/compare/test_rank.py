@@ -414,6 +414,14 @@ def test_the_influence_of_a_pose_is_the_slope_of_the_statistic_towards_it(pair):
     np.testing.assert_array_equal(influence, ranks._pair_statistics(equal, first, second)[1][0])
 
 
+def test_sequences_that_agree_by_chance_alone_have_no_kappa_to_resample():
+    ones = np.ones(50, dtype=int)
+    equal, first = np.ones(50), ranks.one_hot(ones)
+    influence, kappa, _ = ranks._pair_statistics(equal, first, first)[1]
+    assert np.isfinite(influence).all()
+    assert np.isnan(kappa(np.column_stack([equal, first, first]).mean(axis=0)[None])).all()
+
+
 def test_bars_of_a_histogram_have_wilsons_intervals(pair):
     measured = np.minimum(pair[0], 3).astype(float)
     intervals = ranks._histogram_intervals(measured, 200)

@@ -398,6 +398,14 @@ def test_of_quantities_of_one_cell_the_power_of_its_signal_leads() -> None:
     assert drafting._leading([rssi, other, stream("rank", [1.0])]) == {}
 
 
+@pytest.mark.parametrize(("share", "known"), [(0.5, False), (0.51, True)])
+def test_an_attitude_is_there_where_most_rows_hold_it(share: float, known: bool) -> None:
+    frame = pd.DataFrame(dict.fromkeys(("roll_deg", "pitch_deg"), np.zeros(100)))
+    frame["yaw_deg"] = np.where(np.arange(100) < 100 * share, 1.0, np.nan)
+    assert drafting._has_attitude(frame) is known
+    assert not drafting._has_attitude(frame[["roll_deg", "pitch_deg"]])
+
+
 def test_a_flight_file_keeps_and_names_five_flights(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     days = [f"2025-06-0{day}" for day in range(1, 6)]
     for day in days:

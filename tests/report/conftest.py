@@ -207,7 +207,7 @@ def make_maps() -> MapsData:
     return MapsData(
         title="Coverage and rank of Lake Wheeler", name="lw", site=site, generated="2026-11-21T00:00:00Z", east_m=east, north_m=north,
         borders_m=lines, rss=tuple(rss), rank=tuple(rank),
-        layers=(*(MapLayer(quantity="Singular value spread", label="sigma 1 over sigma 2 [dB]", unit="dB", axes=at_height(h), values=20 + d / 30 + h / 10) for h in (30.0, 70.0)), MapLayer(quantity="Foliage loss", label="RSS with minus without trees [dB]", unit="dB", axes=at_height(30.0), values=np.where(wood, -12.0, 0.0), difference=True),),
+        layers=(*(MapLayer(quantity="Singular value spread", unit="dB", axes=at_height(h), values=20 + d / 30 + h / 10) for h in (30.0, 70.0)), MapLayer(quantity="Foliage loss", unit="dB", axes=at_height(30.0), values=np.where(wood, -12.0, 0.0), difference=True),),
         correlation=(Correlation(title="Rank, horizontal", distance_m=distance, correlation=model + 0.01 * np.cos(distance), fit_distance_m=distance, fit=model, fit_label="bi-exponential, RMSE 0.007", excluded=7),),
         errors=tuple(errors),
         paper=(PaperRow(where="Fig. 12", what="c1", paper="0.2932", ours="0.2931", figure="correlation"), PaperRow(where="Fig. 13", what="lowest MAE", paper="K = 10", ours="K = 10", figure="mae_leave_one_out")),

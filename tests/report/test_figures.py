@@ -13,7 +13,6 @@ from PIL import Image
 from aerpaw_cmp.compare.result import RankResult, RssResult
 from aerpaw_cmp.report.content.flight import ReportData, Track, start_of, used_towers
 from aerpaw_cmp.report.figures import flight as figures
-from aerpaw_cmp.report.figures import flight_rss as rss_figures
 from aerpaw_cmp.report.figures import maps as map_figures
 from aerpaw_cmp.report.kit import canvas
 from aerpaw_cmp.report.pages import flight as html
@@ -45,7 +44,6 @@ def test_every_figure_has_labels_with_units_and_a_legend(small_report):
             fig.legends or any(ax.get_legend() for ax in axes) or any(ax.get_label() == "<colorbar>" for ax in fig.axes)
         )
         assert has_legend, spec.name
-        assert all((spec.caption, spec.title)), spec.name
     assert {"trajectory", "altitude", "rss_LW4_USRP1", "rank_map_LW1", "rank_histogram_LW1"} <= set(seen)
     assert len(seen) == len(set(seen))
 
@@ -79,7 +77,7 @@ def test_svg_stays_small_however_long_the_flight(report_data):
     panel = long_panel(report_data.rss[2], 8)
     data = dataclasses.replace(report_data, rss=(panel,))
     with canvas.style():
-        svg = canvas.save_as(rss_figures.rss_over_time(data, panel), ("svg",))["svg"]
+        svg = canvas.save_as(figures.rss_over_time(data, panel), ("svg",))["svg"]
     assert len(panel.time) == 48_000
     assert len(svg) < 500_000
 
@@ -154,7 +152,11 @@ def test_odd_flights_are_drawn_without_a_warning(report_data, drawn_before, chan
     data = dataclasses.replace(report_data, **change(report_data))
     left_alone = data.track is report_data.track and data.site is report_data.site
     for spec in figures.figure_specs(data):
-        if left_alone and spec.section.startswith("flight"):  # these have of the panels only what is named:
+        if left_alone and spec.name in (
+            "trajectory",
+            "altitude",
+            "rss_channels_LW1_USRP1_USRP2",
+        ):  # these have of the panels only what is named:
             what = (spec.name, start_of(data), *used_towers(data))
             if what in drawn_before:
                 continue
@@ -238,25 +240,6 @@ def test_relative_times_count_from_the_first_sample(small_report):
     page = html.page(data, [])
     assert "From (s)" in page
     assert "23:57" not in page
-
-
-def test_captions_speak_of_what_is_drawn(report_data):
-    bare = dataclasses.replace(report_data, waypoints=(), site=dataclasses.replace(report_data.site, buildings=()))
-    captions = {p.name: p.caption for p in figures.figure_specs(bare)}
-    assert "waypoints" not in captions["altitude"]
-    for panel in bare.rss:
-        name = f"rss_{panel.tower}_{panel.channel}"
-        assert ("marked Z" in captions[name]) == bool(panel.simulated_out_of_coverage.any())
-
-
-def test_a_log_axis_says_plain_numbers(small_report):
-    spec = next(p for p in figures.figure_specs(small_report) if p.name.startswith("rank_k_"))
-    with canvas.style():
-        fig = spec.draw()
-        fig.draw_without_rendering()
-    shown = [t.get_text() for t in fig.axes[0].get_xticklabels() if t.get_text()]
-    assert "100" in shown
-    assert not any("$" in text for text in shown)
 
 
 ODD_NAMES = ("A_$", r"$\frac{", "_hidden", "a$b$c_{", "<b>&amp;", "%s {0} \\")

@@ -22,7 +22,6 @@ TABLE = Path(__file__).with_name("sentences.md")
 GAP = "…"
 SOURCES = {
     "report": ("words/flight.py", "words/flight_verdict.py", "figures/flight.py", "figures/charts.py",
-               "figures/flight_rss.py", "figures/flight_rank.py",
                "templates/report.html.jinja", "templates/explorer.html.jinja",
                "templates/method.html.jinja", "templates/plates.html.jinja", "templates/spans.html.jinja",
                "templates/site_view.html.jinja"),

@@ -671,33 +671,25 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     """Singular-value spread and condition number, then what foliage changes."""
     result, s = outcome.shown, outcome.settings
     raster = result.grid.raster
-    for name, label, values in (
-        ("Singular-value spread", "σ1/σ2 [dB]", result.spread_db),
-        ("Condition number", f"σ1/σ{s.elements} [dB], at most {job.RATIO_LIMIT_DB:g}", result.condition_db),
-    ):
+    for name, values in (("Singular-value spread", result.spread_db), ("Condition number", result.condition_db)):
         joint = values[..., result.serving, np.arange(len(result.grid))]
         for row, height in enumerate(result.rank_altitudes_m):
             shown = raster(np.minimum(joint[row], job.RATIO_LIMIT_DB))
             yield page.MapLayer(
-                quantity=f"{name}, foliage {s.shown}",
-                label=label,
-                unit="dB",
-                axes=page.at_height(height),
-                values=shown,
+                quantity=f"{name}, foliage {s.shown}", unit="dB", axes=page.at_height(height), values=shown
             )
     for mode, maps, change in _foliage_changes(outcome):
         for row, height in enumerate(maps.rss_altitudes_m):
             yield page.MapLayer(
-                quantity=f"RSS lost by foliage, {mode}", label="RSS without minus with foliage [dB], arrays",
-                unit="dB", axes=page.at_height(height), values=raster(change.rss_loss_db[row]), difference=True,
+                quantity=f"RSS lost by foliage, {mode}", unit="dB", axes=page.at_height(height),
+                values=raster(change.rss_loss_db[row]), difference=True,
             )  # fmt: skip
         for column, k in enumerate(maps.ks if mode == s.shown else ()):
             for row, height in enumerate(maps.rank_altitudes_m):
                 covered = maps.ranks()[row, column] > 0
                 yield page.MapLayer(
-                    quantity=f"Rank change by foliage, {mode}, K = {k:g}", label="rank with minus without foliage",
-                    unit="", axes=page.at_height(height), difference=True,
-                    values=raster(np.where(covered, change.rank_change[row, column], np.nan)),
+                    quantity=f"Rank change by foliage, {mode}, K = {k:g}", unit="", axes=page.at_height(height),
+                    values=raster(np.where(covered, change.rank_change[row, column], np.nan)), difference=True,
                 )  # fmt: skip
 
 

@@ -72,8 +72,6 @@ class MapLayer:
         Names of the values 0, 1, ... where the layer holds classes.
     difference : bool
         Its zero means something: a scale around it.
-    label : str
-        Of the colour bar of its figure; layers without one are shown in the linked map alone.
     """
 
     quantity: str
@@ -82,7 +80,6 @@ class MapLayer:
     values: FloatArray = field(repr=False, compare=False)
     classes: tuple[str, ...] = ()
     difference: bool = False
-    label: str = ""
 
 
 def at_height(altitude_m: float) -> dict[str, str]:

@@ -13,7 +13,7 @@ from ...common.units import FloatArray, spread_out
 from ...site.scenes import drawn_buildings
 from ...site.site import Site
 from ..content.flight import RANKS
-from ..content.maps import JOINT, Correlation, MapError, MapLayer, MapsData, RankMap, RssMap
+from ..content.maps import JOINT, Correlation, MapError, MapsData, RankMap, RssMap
 from ..kit.canvas import (
     RANK_HATCH,
     TOWER,
@@ -195,30 +195,6 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
     return fig
 
 
-def layer_maps(data: MapsData, layers: Sequence[MapLayer]) -> Figure:
-    """One further quantity at every height, on one colour scale."""
-    fig, axes = map_axes(data, len(layers))
-    finite = np.concatenate([layer.values[np.isfinite(layer.values)] for layer in layers])
-    low, high = np.percentile(finite, [1, 99]) if len(finite) else (0.0, 1.0)
-    options: dict[str, Any] = {"cmap": "cividis", "vmin": low, "vmax": high}
-    if layers[0].difference:
-        reach = max(abs(low), abs(high))
-        if reach < 1e-6:  # few positions change: their own range
-            reach = max(float(np.abs(finite).max(initial=0.0)), 1e-6)
-        options = {"cmap": "cividis", "vmin": -reach, "vmax": reach}  # dark to light: signs differ in grey too
-    image = None
-    for ax, shown in zip(axes, layers, strict=True):
-        image = draw_map(ax, data, shown.values, **options)
-        ax.set_title(shown.axes["Height"], fontsize=9)
-    bar = colour_bar(fig, image, axes, layers[0].label, beyond(finite, options["vmin"], options["vmax"]))
-    if np.array_equal(finite, np.round(finite)):  # ranks: no colour stands for half of one
-        from matplotlib.ticker import MaxNLocator
-
-        bar.locator = MaxNLocator(integer=True)
-    fig.legend(handles=overlay_legend(data, borders=True), loc="outside lower center", ncols=3)
-    return fig
-
-
 def cdfs(maps: Sequence[RssMap]) -> Figure:
     """Distribution of RSS per tower and jointly: a panel per height, positions out of coverage counted as below."""
     panels = grouped(maps, lambda m: m.altitude_m)
@@ -321,7 +297,7 @@ def figure_specs(data: MapsData) -> list[FigureSpec]:
     """Every figure that the data allow, in reading order."""
     flown = [
         replace(spec, name=f"{spec.name}_{safe_name(flight.flight)}", title=f"{flight.flight}, {spec.title}")
-        for flight in data.flights for spec in channel_specs(flight, "flights")
+        for flight in data.flights for spec in channel_specs(flight)
     ]  # fmt: skip
     return [*_rss_specs(data), *flown, *_rank_specs(data), *_kriging_specs(data)]
 
@@ -374,9 +350,6 @@ def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
             "receiver: mean probability of each rank.",
             partial(rank_shares, maps),
         )  # fmt: skip
-    for name, layers in grouped((m for m in data.layers if m.label), lambda m: m.quantity).items():
-        caption = f"{layers[0].label[0].upper()}{layers[0].label[1:]}. Hatched: no path."
-        yield FigureSpec(f"layer_{safe_name(name)}", "layers", name, caption, partial(layer_maps, data, layers))
 
 
 def _kriging_specs(data: MapsData) -> Iterator[FigureSpec]:

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...common.stages import Progress, silent
-from ...common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, spread_out
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray, spread_out
 from ...logs.records import has_wall_clock
 from ...site.scenes import drawn_buildings
 from ...site.site import Site, Trees
@@ -25,7 +25,6 @@ from .files import write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 
@@ -280,14 +279,6 @@ def time_axis(ax: Axes, start: np.datetime64) -> None:
     low, high = ax.get_xlim()
     ax.set_xticks(*_clock_ticks(low, high, start))
     ax.set_xlim(low, high)
-
-
-def plain_ticks(axis: Axis) -> None:
-    """Decades of a logarithmic axis as plain numbers (0.01, 1, 1000): read at a glance, and drawn faster."""
-    from matplotlib.ticker import FuncFormatter, NullFormatter
-
-    axis.set_major_formatter(FuncFormatter(lambda value, _at: f"{Printed(value):.10g}"))
-    axis.set_minor_formatter(NullFormatter())
 
 
 def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:

@@ -88,7 +88,7 @@ def _row(
         n=len(measured), n_out_of_coverage=0, at_search_edge=False, rmse_ci95_db=None, offset_ci95_db=None,
         correlation_ci95=None, n_effective=float(len(measured)), lag_s=0.0, lag_verdict="", fitted=("offset_db",),
         baselines={"free_space": 7.0}, span_db=(-50.0, 50.0),
-        time_s=np.arange(len(measured)) * 5.0 if reference else empty, measured_db=measured, simulated_dbm=simulated,
+        measured_db=measured, simulated_dbm=simulated,
         position_m=position if reference else np.zeros((0, 3)),
         distance_m=np.hypot(*position[:, :2].T) if reference else empty,
         start_ns=start,

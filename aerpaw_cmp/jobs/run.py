@@ -503,7 +503,6 @@ def run_campaign(
     *,
     keep: Path | None = None,
     fresh: bool = False,
-    export: Sequence[str] = (),
 ) -> JobOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
 
@@ -517,8 +516,6 @@ def run_campaign(
         interruption, computes only what is missing.
     fresh : bool
         Keep nothing and take nothing.
-    export : sequence of str
-        Formats of the samples of the first setting, besides those that campaign.yaml names.
 
     Returns
     -------
@@ -529,7 +526,6 @@ def run_campaign(
     UsageError
         A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
     """
-    from ..report.exports.formats import chosen_formats
     from ..report.pages.campaign import campaign_metrics, write_campaign
     from ..report.words.campaign import warnings
     from .campaigns.campaign import load_campaign
@@ -539,7 +535,6 @@ def run_campaign(
 
     stages = Stages(options.progress)
     campaign = load_campaign(path)
-    formats = chosen_formats(export)
     inputs = [path, *inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)]
     folder = options.out or Path("reports") / campaign.campaign
     store = None if fresh else _campaign_keep(campaign, path, keep)
@@ -549,7 +544,7 @@ def run_campaign(
         data = with_season(data, find_reports(data.flights, folder, [folder.parent, Path("reports")]))
         with stages("report"), output.filling() as place:
             finished = replace(data, stages_s=dict(stages.seconds))
-            write_campaign(finished, place, exports=formats, progress=options.progress)
+            write_campaign(finished, place)
             _write_tracebacks(data.failures, place)
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
     failed += [text for text in warnings(data) if "edge of the searched span" in text]

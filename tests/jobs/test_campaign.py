@@ -3,7 +3,6 @@
 import csv
 import json
 import sys
-import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +25,6 @@ pytestmark = pytest.mark.usefixtures("few_pictures")
 YAW_DEG = 110.0
 OFFSETS_DB = {"first": 12.3, "second": 9.1}
 FADING_DB = 1.0
-# The start of the plan: 2025-06-01 10:00 in New York, 14:00 UTC.
-START_POSIX_S = 1_748_786_400
 YAW = "link.rss.tower.yaw_deg"
 
 
@@ -71,29 +68,9 @@ def summary(folder: Path) -> dict[str, Any]:
     broken["logs"][1]["path"] = "gone/<b>USRP1.txt"
     write_yaml(folder / "broken.yaml", broken)
     return result(
-        folder, "whole", "--export", "geojson,kmz", flights=["first.yaml", "second.yaml", "broken.yaml", "missing.yaml"],
+        folder, "whole", flights=["first.yaml", "second.yaml", "broken.yaml", "missing.yaml"],
         settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}}, calibration="channel",
     )  # fmt: skip
-
-
-def test_the_samples_of_all_flights_are_exported(summary: dict[str, Any], folder: Path) -> None:
-    """Read as JSON: each link's residual gives the RMSE of its row, and its times are those of the plan."""
-    place = folder / "whole_out" / "exports"
-    points = json.loads((place / "rss.geojson").read_text(encoding="utf-8"))["features"]
-    links: dict[tuple[str, str, str], list[dict[str, Any]]] = {}
-    for point in (p["properties"] for p in points):
-        links.setdefault((point["flight"], point["tower"], point["channel"]), []).append(point)
-    rows = {(r["flight"], r["tower"], r["channel"]): r for r in summary["rss"] if r["setting"] == "as written"}
-    assert set(links) == set(rows)
-    for key, samples in links.items():
-        residual = [p["residual_db"] for p in samples if p["residual_db"] is not None]
-        assert np.sqrt(np.mean(np.square(residual))) == pytest.approx(rows[key]["rmse_db"], abs=1e-3)
-        first = np.datetime64(samples[0]["time"].rstrip("Z")).astype("datetime64[s]").astype(int)
-        assert first == pytest.approx(START_POSIX_S, abs=60)
-    with zipfile.ZipFile(place / "samples.kmz") as archive:
-        assert archive.read("doc.kml").decode().count("<gx:Track>") == 2
-    assert "exports/rss.geojson" in (folder / "whole_out" / "campaign.html").read_text(encoding="utf-8")
-    assert "exports/rss.geojson" in (folder / "whole_out" / "SHA256SUMS").read_text(encoding="utf-8")
 
 
 def test_settings_are_run_on_every_flight(summary: dict[str, Any]) -> None:
@@ -162,8 +139,8 @@ def test_broken_flights_are_rows_with_their_message(summary: dict[str, Any], fol
 def test_every_figure_is_there(summary: dict[str, Any], folder: Path) -> None:
     figures = folder / "whole_out" / "figures"
     expected = {
-        "settings_rmse", "tracks", "distance_LW1_USRP1", "distance_LW1_USRP2", "places_LW1_USRP1", "places_LW1_USRP2",
-        "season_errors", "season_drift", "season_places",
+        "tracks", "distance_LW1_USRP1", "distance_LW1_USRP2", "places_LW1_USRP1", "places_LW1_USRP2",
+        "season_drift", "season_places",
     }  # fmt: skip
     assert {p.stem for p in figures.glob("*.svg")} == {p.stem for p in figures.glob("*.png")} == expected
 
@@ -261,7 +238,7 @@ def row(flight: str, channel: str, measured: Any, simulated: Any, **keys: Any) -
         "unit": "dBm", "offset_db": float(np.nanmean(simulated - measured)), "rmse_db": nan, "correlation": nan, "n": n,
         "n_out_of_coverage": 0, "at_search_edge": False, "rmse_ci95_db": None, "offset_ci95_db": None,
         "correlation_ci95": None, "n_effective": nan, "lag_s": nan, "lag_verdict": "", "fitted": (), "baselines": {},
-        "span_db": (-50.0, 50.0), "time_s": np.arange(n) * 1.0,
+        "span_db": (-50.0, 50.0),
         "distance_m": np.arange(n) * 3.0,
         "position_m": np.stack([np.arange(n) * 3.0, np.zeros(n), np.full(n, 40.0)], axis=-1),
     }  # fmt: skip
@@ -376,13 +353,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
         settings["logs"] = [track, {"path": f"{name}/ri.csv", "reader": "quectel_ri", "node": "LW1"}]
         settings["rank"] = {"k": [10, 100]}
         simulate(write_yaml(folder / f"rank_{name}.yaml", settings))
-    campaign = result(folder, "ranks", "--export", "geojson", flights=["rank_first.yaml", "rank_second.yaml"])
-    points = json.loads((folder / "ranks_out" / "exports" / "rank.geojson").read_text(encoding="utf-8"))["features"]
-    for row in campaign["rank"]:
-        ranks = [p["properties"] for p in points if p["properties"]["flight"] == row["flight"]]
-        pairs = [(r["measured_rank"], r[f"simulated_rank_k{row['k']:g}"]) for r in ranks]
-        alike = [a == b for a, b in pairs if a is not None and b]
-        assert sum(alike) / len(alike) == pytest.approx(row["agreement"], abs=1e-9)
+    campaign = result(folder, "ranks", flights=["rank_first.yaml", "rank_second.yaml"])
     assert campaign["rss"] == []
     assert {(r["flight"], r["k"]) for r in campaign["rank"]} == {
         (f"rank_{n}", k) for n in OFFSETS_DB for k in (10, 100)
@@ -390,7 +361,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
     for transfer in campaign["rank_transfers"]:
         assert transfer["k"] == 10  # the simulated modem's
         assert transfer["total_variation"] < 0.05
-    assert {p.stem for p in (folder / "ranks_out" / "figures").glob("*.svg")} == {"rank_tv", "tracks"}
+    assert {p.stem for p in (folder / "ranks_out" / "figures").glob("*.svg")} == {"tracks"}
     page = (folder / "ranks_out" / "campaign.html").read_text(encoding="utf-8")
     assert "Mean RMSE over towers" not in page
     assert "K chosen on the other flights" in page

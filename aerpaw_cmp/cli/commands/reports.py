@@ -12,7 +12,7 @@ from ...common.counting import counted
 from ...common.errors import one_line
 from ...common.stages import duration
 from ...jobs.options import RunOptions
-from ..app import Export, Force, Json, LogsRoot, Scheduler, Workers, command, output
+from ..app import Force, Json, LogsRoot, Scheduler, Workers, command, output
 from ..shown import number, print_json, records, say, show, table
 
 
@@ -177,7 +177,6 @@ def campaign(
         bool, Option("--dry-run", help="List finished tasks, open tasks and the time estimate; compute nothing.")
     ] = False,
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a flight or a stated check failed.")] = False,
-    export: Export = None,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -189,7 +188,7 @@ def campaign(
         status = run.campaign_status(campaign_yaml, options, keep=keep, fresh=fresh)
         print_json(status.metrics()) if as_json else _print_status(status)
         return 0
-    outcome = run.run_campaign(campaign_yaml, options, keep=keep, fresh=fresh, export=export or ())
+    outcome = run.run_campaign(campaign_yaml, options, keep=keep, fresh=fresh)
     if as_json:
         print_json(outcome.metrics)
     else:

@@ -148,15 +148,7 @@ def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
         ),
         track=_flown(task, result),
         flown=tuple(
-            FlownRank(
-                flight=task.flight,
-                tower=item.tower,
-                position_m=item.position_m,
-                rank=item.measured,
-                simulated=item.rank,
-                time_s=_elapsed_s(item.time),
-                start_ns=_start_ns(item.time),
-            )
+            FlownRank(flight=task.flight, tower=item.tower, position_m=item.position_m, rank=item.measured)
             for item in result.rank
         ),
     )
@@ -272,7 +264,6 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
         return dataclasses.replace(
             named,
             difference=kept_row.moments,
-            time_s=none,
             measured_db=none,
             simulated_dbm=none,
             distance_m=none,
@@ -334,11 +325,9 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mappin
         },
         span_db=rules.span_db,
         measured_db=measured_db,
-        time_s=_elapsed_s(result.time),
         start_ns=_start_ns(result.time),
         distance_m=result.geometry["distance_m"],
         heading_deg=result.geometry.get("heading_deg"),
-        within=result.further.repeatability,
         difference=offset.difference_moments(measured_db, result.simulated_dbm),
         **identity,
     )

@@ -11,7 +11,7 @@ import numpy as np
 from ...common.units import FloatArray, IntArray
 from ...compare.offset import Moments, difference_moments
 from ...compare.statistics.intervals import Interval
-from ...compare.statistics.passes import Repeated, cell_means
+from ...compare.statistics.passes import cell_means
 from ...site.site import Site
 from .made import Made
 
@@ -24,9 +24,8 @@ class RssRow:
     ``calibration`` says, ``pooled_rmse_db`` what it leaves on this row; ``held_out_offset_db`` comes from the other
     flights of the same setting, tower and channel, ``held_out_rmse_db`` is what that leaves here (NaN without another).
     ``baselines`` are RMSE [dB] by name, each with an offset of its own; ``span_db`` is that of the
-    offset search; ``within`` is the repeatability of the flight's two halves. Arrays (n,) are at the samples, NaN where
-    a side is missing; they are kept for the first setting only, elsewhere they are empty and ``difference`` stands for
-    them.
+    offset search. Arrays (n,) are at the samples, NaN where a side is missing; they are kept for the first setting
+    only, elsewhere they are empty and ``difference`` stands for them.
     """
 
     flight: str
@@ -49,15 +48,13 @@ class RssRow:
     fitted: tuple[str, ...]
     baselines: Mapping[str, float]
     span_db: tuple[float, float]
-    time_s: FloatArray = field(repr=False)
     measured_db: FloatArray = field(repr=False)
     simulated_dbm: FloatArray = field(repr=False)
     position_m: FloatArray = field(repr=False)
     distance_m: FloatArray = field(repr=False)
     heading_deg: FloatArray | None = field(repr=False, default=None)
     start_ns: int = 0
-    """Instant of ``time_s`` = 0, nanoseconds after 1970-01-01."""
-    within: Mapping[str, Repeated] = field(default_factory=dict)
+    """First instant, nanoseconds after 1970-01-01."""
     difference: Moments | None = None
     pooled_offset_db: float = float("nan")
     pooled_rmse_db: float = float("nan")
@@ -126,17 +123,13 @@ class RankRow:
 class FlownRank:
     """Samples of the rank of one flight and tower under the first setting.
 
-    ``rank`` (n,) as reported, NaN where none; ``simulated`` by K (n,), 0 where there is no path; ``position_m`` (n, 3);
-    ``time_s`` (n,) after ``start_ns``, nanoseconds after 1970-01-01.
+    ``rank`` (n,) as reported, NaN where none; ``position_m`` (n, 3).
     """
 
     flight: str
     tower: str
     position_m: FloatArray
     rank: FloatArray
-    simulated: Mapping[float, IntArray] = field(default_factory=dict)
-    time_s: FloatArray = field(default_factory=lambda: np.zeros(0))
-    start_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -19,9 +19,8 @@ from ...common.jsonable import fields_of, named
 from ...common.units import AnyArray, FloatArray
 from ...logs.records import has_wall_clock
 from ...site.site import Site
-from ..content.campaign import CampaignData, FlownRank, RssRow
 from ..content.flight import ReportData, Track
-from ..names import RANK_COLUMNS, RSS_COLUMNS, k_key
+from ..names import RANK_COLUMNS, RSS_COLUMNS
 from .tables import DECIMALS, rank_tables, rss_tables
 
 # 1 mm.
@@ -266,56 +265,3 @@ def _clock(times: Iterable[AnyArray]) -> bool:
     known = [time[~np.isnat(time)] for time in times]
     first = [time.min() for time in known if len(time)]
     return bool(first) and has_wall_clock(min(first))
-
-
-# --- from a campaign ------------------------------------------------------------------------------------------------
-
-
-def of_campaign(data: CampaignData) -> Export | None:
-    """The samples of all flights under the reference setting; None where no flight could be read."""
-    if data.site is None:
-        return None
-    rss = [_rss_link(row) for row in data.reference_rows]
-    rank = [_rank_link(flown_rank) for flown_rank in data.flown_ranks]
-    lines = []
-    for track in data.tracks:
-        start = next((x["time"][0] for x in (*rss, *rank) if x["flight"] == track.flight and len(x["time"])), None)
-        if start is not None:
-            east, north, up = track.position_m.T
-            time = start + _nanoseconds(track.time_s)
-            lines.append(Line(flight=track.flight, time=time, east_m=east, north_m=north, up_m=up))
-    return Export(
-        **named(data, "name title site"),
-        sets=(*points_table("rss", rss, data.site.frame), *points_table("rank", rank, data.site.frame)),
-        lines=tuple(lines),
-        clock=_clock(item["time"] for item in (*rss, *rank)),
-        synthetic=bool(data.synthetic),
-        attributes=_made(data.generated, data.versions),
-    )
-
-
-def _nanoseconds(seconds: FloatArray) -> AnyArray:
-    return np.round(seconds * 1e9).astype("timedelta64[ns]")
-
-
-def _flown(series: RssRow | FlownRank) -> dict[str, Any]:
-    time = np.datetime64(series.start_ns, "ns") + _nanoseconds(series.time_s)
-    places = dict(zip(("east_m", "north_m", "up_m"), series.position_m.T, strict=True))
-    return {"time": time, **named(series, "flight tower"), **places}
-
-
-def _rss_link(row: RssRow) -> dict[str, Any]:
-    placed = np.isfinite(row.position_m).all(axis=1)
-    return {
-        **_flown(row),
-        **named(row, "channel unit measured_db"),
-        "calibrated_db": row.measured_db + row.offset_db,
-        **named(row, "simulated_dbm residual_db"),
-        "measured_out_of_coverage": placed & ~np.isfinite(row.measured_db),
-        "simulated_out_of_coverage": placed & ~np.isfinite(row.simulated_dbm),
-    }
-
-
-def _rank_link(flown_rank: FlownRank) -> dict[str, Any]:
-    ranks = {f"simulated_rank_k{k_key(k)}": rank for k, rank in flown_rank.simulated.items()}
-    return {**_flown(flown_rank), "measured_rank": flown_rank.rank, **ranks}

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ...common.units import FloatArray, IntArray
-from ...compare.statistics.intervals import Interval
 from ...site.site import Site
 from ..content.campaign import CampaignData, RssRow, place_means
 from ..kit.canvas import (
-    BASELINE,
     TOWER,
     FigureSpec,
     beyond,
@@ -26,8 +24,8 @@ from ..kit.canvas import (
     thinned,
     thinned_plan,
 )
-from ..names import k_key, safe_name
-from ..words.flight import count, pretty
+from ..names import safe_name
+from ..words.flight import count
 from .maps import COLOURS, MARKERS, curve_style, grouped
 
 if TYPE_CHECKING:
@@ -42,17 +40,8 @@ _FEWEST_PER_BIN = 8
 
 _MAPS_PER_ROW = 3
 
-# Flights, links and settings together that a figure with a line for each still shows; the season's figures stand for
-# more.
-MOST_BARS = 200
-
-_MOST_SETTINGS = 40
-
 # Flights that are told apart by colour, or have a map each.
 MOST_FLIGHTS = 12
-
-# No figure is higher than this [inch], however many flights there are.
-_TALLEST = 40.0
 
 
 def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
@@ -112,26 +101,6 @@ def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
     handles, labels = plan.get_legend_handles_labels()
     if len(firsts) <= MOST_FLIGHTS:
         fig.legend(handles, labels, loc="outside lower center", ncols=4)
-    return fig
-
-
-def season_errors(data: CampaignData) -> Figure:
-    """Errors of the flights under every setting: 10 to 90 %, 25 to 75 %, median and mean, best setting on top."""
-    ranking = data.season.over_all()[:_MOST_SETTINGS]
-    fig, ax = subplots((9.2, 1.2 + 0.27 * len(ranking)))
-    for y, entry in enumerate(ranking):
-        q = entry.quantiles_db
-        ax.plot([q[1], q[5]], [y, y], color="#555555", linewidth=1.2, label="10 to 90 %" if not y else None)
-        ax.plot([q[2], q[4]], [y, y], color="#56B4E9", linewidth=7, alpha=0.8, label="25 to 75 %" if not y else None)
-        ax.plot(q[3], y, marker="|", markersize=11, color="black", linestyle="none", label="median" if not y else None)
-        ax.plot(entry.mean_db, y, marker="o", markersize=4, color="#D55E00", label="mean" if not y else None,
-                linestyle="none")  # fmt: skip
-    ax.set_yticks(range(len(ranking)), [entry.setting for entry in ranking])
-    ax.invert_yaxis()
-    ax.grid(visible=False, axis="y")
-    kind = "Held-out error" if data.season.held_out else "Error with the flight's own offset"
-    ax.set_xlabel(f"{kind} of a flight, mean over towers and channels [dB]")
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
     return fig
 
 
@@ -249,71 +218,6 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     return fig
 
 
-# Setting, its error and the 95 % interval.
-Scored: TypeAlias = "tuple[str, float, Interval | None]"
-
-
-def _by_setting(names: Sequence[str], groups: Mapping[str, Sequence[Scored]]) -> tuple[Figure, Axes, list[FloatArray]]:
-    """Errors with intervals, a group of rows one below the other and a row per setting; also the rows of each group."""
-    step = len(names) + 1.0
-    fig, ax = subplots((9.2, min(1.6 + 0.24 * step * len(groups), _TALLEST)))
-    places = [np.arange(len(names), dtype=np.float64) + index * step for index in range(len(groups))]
-    shown: set[str] = set()
-    for index, (at, rows) in enumerate(zip(places, groups.values(), strict=True)):
-        if index % 2:
-            ax.axhspan(at[0] - 1.0, at[-1] + 1.0, color="#F3F3F3", zorder=0)
-        for name, error, interval in rows:
-            number = names.index(name)
-            colour = COLOURS[number % len(COLOURS)]
-            ax.plot(interval or (np.nan, np.nan), [at[number]] * 2, color=colour, linewidth=1.2)
-            ax.plot(
-                error, at[number], marker=MARKERS[number % len(MARKERS)], markersize=6, linestyle="none", color=colour,
-                label=None if name in shown else name, zorder=3,
-            )  # fmt: skip
-            shown.add(name)
-    ax.set_yticks([float(np.mean(at)) for at in places], list(groups))
-    ax.set_ylim(len(groups) * step, -1.0)
-    ax.grid(visible=False, axis="y")
-    return fig, ax, places
-
-
-def settings_rmse(data: CampaignData) -> Figure:
-    """RMSE of every setting, flight and link with its interval; baselines and repeatability beside it."""
-    groups = grouped(data.rss, lambda r: (r.flight, r.link))
-    scored = {
-        f"{flight}\n{link}": [(row.setting, row.rmse_db, row.rmse_ci95_db) for row in rows]
-        for (flight, link), rows in groups.items()
-    }
-    fig, ax, places = _by_setting(list(data.settings), scored)
-    for index, (at, ((flight, link), rows)) in enumerate(zip(places, groups.items(), strict=True)):
-        ends = [at[0] - 0.6, at[-1] + 0.6]
-        for name, value in rows[0].baselines.items():
-            colour, line = BASELINE[name]
-            label = None if index else f"{pretty(name)} (own offset)"
-            ax.plot([value, value], ends, color=colour, linestyle=line, linewidth=1.5, label=label)
-        floors = [r for r in data.repeats if flight in (r.first, r.second) and f"{r.tower} {r.channel}".strip() == link]
-        best = max((r for r in floors if np.isfinite(r.rmse_db)), key=lambda r: r.n, default=None)
-        if best is not None:
-            label = None if index else f"two flights, same places ({100 * best.share:.0f} % of samples)"
-            ax.plot([best.rmse_db] * 2, ends, color="#888888", linewidth=3.5, alpha=0.7, label=label)
-    ax.set_xlim(left=0.0)
-    ax.set_xlabel("RMSE after the row's own offset, with 95 % interval [dB]")
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    return fig
-
-
-def rank_tv(data: CampaignData) -> Figure:
-    """Total variation of every flight and K, settings side by side, with intervals."""
-    groups = {
-        f"{flight}, {tower}, K = {k_key(k)}": [(r.setting, r.total_variation, r.total_variation_ci95) for r in rows]
-        for (flight, tower, k), rows in grouped(data.rank, lambda r: (r.flight, r.tower, r.k)).items()
-    }
-    fig, ax, _ = _by_setting(list(data.settings), groups)
-    ax.set(xlim=(0.0, 1.02), xlabel="Total variation, measured against simulated rank")
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
-    return fig
-
-
 def figure_specs(data: CampaignData) -> list[FigureSpec]:
     """Every figure that the campaign has numbers for."""
     return [*_season_specs(data), *_flight_specs(data)]
@@ -323,11 +227,6 @@ def _season_specs(data: CampaignData) -> Iterator[FigureSpec]:
     """Figures of the season."""
     if not data.season.over_all():
         return
-    some = f", {_MOST_SETTINGS} of {len(data.settings)}" if len(data.settings) > _MOST_SETTINGS else ""
-    yield FigureSpec(
-        "season_errors", "season", "Error of the flights under every setting", f"Best setting on top{some}.",
-        partial(season_errors, data),
-    )  # fmt: skip
     yield FigureSpec(
         "season_drift", "season", "Offsets over the season",
         f"Each flight's own offset under “{data.reference}”, by tower and channel.",
@@ -344,21 +243,6 @@ def _season_specs(data: CampaignData) -> Iterator[FigureSpec]:
 
 def _flight_specs(data: CampaignData) -> Iterator[FigureSpec]:
     numbers = {track.flight: number for number, track in enumerate(data.tracks)}
-    if data.rss and len(data.rss) <= MOST_BARS:
-        yield FigureSpec(
-            "settings_rmse", "result", "RMSE of every setting and flight",
-            "Each row has its own best offset. Lines: 95 % interval from blocks as long as the residual remembers. The "
-            "grey bar is what two flights differ by at the same places (the pair with most of them); where few samples "
-            "have a pair, it speaks for those places only.",
-            partial(settings_rmse, data),
-        )  # fmt: skip
-    if data.rank and len(data.rank) <= MOST_BARS:
-        yield FigureSpec(
-            "rank_tv", "result", "Total variation of rank, every setting and flight",
-            "Distance between the histograms of measured and simulated rank, 0 when equal, 1 when apart, with 95 % "
-            "intervals. Equal histograms do not mean that ranks agree pose by pose: see kappa.",
-            partial(rank_tv, data),
-        )  # fmt: skip
     if numbers and data.site is not None:
         yield FigureSpec(
             "tracks", "overlay", "The flights laid over each other", "Where the radio was sampled.",

@@ -12,12 +12,8 @@ import pandas as pd
 
 from ...common.cells import guarded
 from ...common.jsonable import fields_of, json_safe, named
-from ...common.stages import Progress, silent
-from ...compare.statistics.passes import Repeated
-from ..content.campaign import CampaignData, RankPairing, Repeat, RssRow
+from ..content.campaign import CampaignData, RankPairing, Repeat
 from ..content.made import about
-from ..exports.formats import write_exports
-from ..exports.points import of_campaign
 from ..figures import campaign as campaign_figures
 from ..kit import canvas
 from ..kit.canvas import Picture
@@ -39,7 +35,7 @@ ROWS_SHOWN = 300
 _COMPACT_ROWS = 2000
 
 # Fields of a row that are samples, not numbers of a table.
-ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
+ARRAYS = ("measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
 
 
 def _entries(items: Iterable[Any], without: Sequence[str]) -> list[dict[str, Any]]:
@@ -115,16 +111,6 @@ def _errors_of_pairs(data: CampaignData) -> list[tuple[Any, float, float]]:
     ]
 
 
-def halves(data: CampaignData) -> list[tuple[RssRow, Repeated | None, Repeated]]:
-    """Rows whose first and second half pass the same places: with like headings, and with any."""
-    rows = []
-    for row in data.reference_rows:
-        every = row.within.get("any_heading")
-        if every is not None and every.n:
-            rows.append((row, row.within.get("same_heading"), every))
-    return rows
-
-
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
     return rendered(
@@ -133,7 +119,6 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         sections=by_section(pictures),
         mean_rmse=words.mean_rmse(data),
         pair_errors=_errors_of_pairs(data),
-        halves=halves(data),
         headline=words.headline(data),
         verdict=words.verdict(data),
         against_baselines=words.against_baselines,
@@ -154,28 +139,10 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
     )
 
 
-def write_campaign(
-    data: CampaignData, folder: str | Path, *, exports: Sequence[str] = (), progress: Progress = silent
-) -> list[Path]:
+def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; gives the files, page first.
 
     Pairs of flights at the same places stand in ``pairs.csv``, all of them; campaign.json has the telling ones.
-
-    With ``exports`` also the samples of the first setting in those formats
-    (:data:`aerpaw_cmp.report.exports.formats.FORMATS`).
-
-    Parameters
-    ----------
-    data : CampaignData
-    folder : str or Path
-    exports : sequence of str
-        Formats.
-    progress : Progress
-        Figures done.
-
-    Returns
-    -------
-    list of Path
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None
@@ -192,11 +159,7 @@ def write_campaign(
     tables = [path.name for path in written]
     drawn, pictures = canvas.write_figures(campaign_figures.figure_specs(data), folder / "figures")
     written += pictures
-    samples = of_campaign(data) if exports else None
-    exported = [] if samples is None else write_exports(samples, folder, exports, progress)
-    files = [*tables, *(path.relative_to(folder).as_posix() for path in exported)]
-    written += exported
-    page = write_file(folder / "campaign.html", campaign_page(data, drawn, files))
+    page = write_file(folder / "campaign.html", campaign_page(data, drawn, tables))
     return [page, *written]
 
 

@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from tap_common import conditions, read_lines, show, start_tap
 
 from aerpaw_cmp.live.record.log import BadLine, read_log
-from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
+from benchmarks.simulated_modem import Faults, FaultyModem
 
 FINAL = {"ok": "OK", "error": "ERROR", "cme": "+CME ERROR: ", "cms": "+CMS ERROR: "}
 
@@ -64,7 +64,7 @@ def cycles(count: int, seed: int, folder: Path, bytewise_s: float = 3e-4) -> dic
     unplugged: list[tuple[int, int]] = []
     nodes = set()
     faults = Faults(latency_s=0.001, jitter_s=0.01, bytewise_s=bytewise_s, seed=seed)
-    with ModemSimulator(ModemSimSettings(link=link, faults=faults)) as modem:
+    with FaultyModem(link=link, faults=faults) as modem:
         process = start_tap(
             link, log, ri_hz=40.0, other_hz=10.0, pause_s=0.0, reconnect_min_s=0.02, reconnect_max_s=0.1,
             capture=str(folder / "given"),

@@ -20,15 +20,14 @@ sys.path.insert(0, str(Path(__file__).parent))
 from tap_common import conditions, free_port, read_lines, show, start_browser, start_tap
 
 from aerpaw_cmp.live.record.log import BadLine, read_log
-from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
+from benchmarks.simulated_modem import Faults, FaultyModem
 
 
 def one_kill(number: int, seed: int, folder: Path, *, web: bool = False, patience_s: float = 0.25) -> dict[str, int]:
     """One tap, killed; what it had acknowledged against what is on disk."""
     chance = random.Random(f"{seed}/{number}")
     link, log = folder / f"modem{number}", folder / f"log{number}"
-    settings = ModemSimSettings(link=link, faults=Faults(latency_s=0.001, jitter_s=0.01, seed=number))
-    with ModemSimulator(settings) as modem:
+    with FaultyModem(link=link, faults=Faults(latency_s=0.001, jitter_s=0.01, seed=number)) as modem:
         port = free_port() if web else None
         browser = start_browser(port) if port else None
         settings = {"segment_bytes": 20_000, "patience_s": patience_s}

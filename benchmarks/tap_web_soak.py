@@ -22,11 +22,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from tap_common import CSI, conditions, cpu_s, damaged, free_port, resident_kib, show, start_browser, start_tap
 
 from aerpaw_cmp.live.record.log import BadLine, read_log
-from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.report.pages.live import live_page
+from benchmarks.simulated_modem import Faults, FaultyModem
 
 
-def log_against_modem(log: Path, modem: ModemSimulator) -> dict[str, int]:
+def log_against_modem(log: Path, modem: FaultyModem) -> dict[str, int]:
     """Answers that the modem saw read against the log: lost, out of order; lines that are no record."""
     bad: list[BadLine] = []
     logged = [tuple(r["lines"]) for r in read_log(log, bad) if r["kind"] == "exchange" and r["query"] == "nr5g_csi"]
@@ -45,7 +45,7 @@ def soak(simulated_s: float, speed: float, folder: Path, *, web: bool) -> dict[s
     link, log, port, duration_s = folder / f"modem-{name}", folder / name, free_port(), simulated_s / speed
     browsers = [start_browser(port) for _ in range(3)] if web else []
     memory: list[int] = []
-    with ModemSimulator(ModemSimSettings(link=link, faults=Faults(latency_s=0.0))) as modem:
+    with FaultyModem(link=link, faults=Faults(latency_s=0.0)) as modem:
         process = start_tap(
             link, log, ri_hz=2.0 * speed, other_hz=speed, pause_s=0.0, duration_s=duration_s, status_s=1.0 / speed,
             log={"sync_interval_s": 1.0 / speed, "segment_s": 3600.0 / speed / 6}, web=port if web else None,
@@ -80,7 +80,7 @@ def pace(seconds: float, folder: Path, *, web: bool) -> dict[str, Any]:
     name = "paced-web" if web else "paced"
     link, port = folder / f"modem-{name}", free_port()
     browsers = [start_browser(port) for _ in range(3)] if web else []
-    with ModemSimulator(ModemSimSettings(link=link, faults=Faults(latency_s=0.02))) as modem:
+    with FaultyModem(link=link, faults=Faults(latency_s=0.02)) as modem:
         process = start_tap(link, folder / name, ri_hz=10.0, duration_s=seconds + 60, web=port if web else None)
         while len(modem.journal) < 20:
             time.sleep(0.05)
@@ -102,7 +102,7 @@ def fuzz(requests: int, folder: Path) -> dict[str, Any]:
     link, log, port, chance = folder / "modem-fuzz", folder / "fuzz", free_port(), random.Random(1)
     page, answers = live_page(None, "benchmark")[0], Counter[str]()
     others, memory = 0, 0
-    with ModemSimulator(ModemSimSettings(link=link, faults=Faults(latency_s=0.01))) as modem:
+    with FaultyModem(link=link, faults=Faults(latency_s=0.01)) as modem:
         process = start_tap(link, log, ri_hz=10.0, web=port)
         while len(modem.journal) < 20:
             time.sleep(0.05)

@@ -17,11 +17,11 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import plan_trajectory, telemetry_frame
 from aerpaw_cmp.jobs.live.live_twin import LiveTwin
 from aerpaw_cmp.live.follow import TelemetrySample
-from aerpaw_cmp.live.serial.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.logs.writers import format_vehicle_out
 from aerpaw_cmp.propagation.geometry.arrays import Poses
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
+from benchmarks.simulated_modem import FaultyModem
 
 ROOT = Path(__file__).parents[2]
 FLIGHT = ROOT / "sample_logs" / "flight.yaml"
@@ -92,7 +92,7 @@ def test_tap_writes_predictions_and_residuals(tmp_path: Path) -> None:
     frame = telemetry_frame(plan_trajectory(settings.flight.plan), now, 1.0, site.frame)
     telemetry = tmp_path / "now_vehicleOut.txt"
     telemetry.write_bytes(format_vehicle_out(frame.iloc[:120], "UTC"))
-    with ModemSimulator(ModemSimSettings()) as modem:
+    with FaultyModem() as modem:
         done = subprocess.run(
             [
                 *(sys.executable, "-m", "aerpaw_cmp", "tap", str(modem.port), "-o", str(tmp_path / "log")),

@@ -9,8 +9,8 @@ import pytest
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.jobs.live.live_tap import TOKEN, Shown, tap_modems
 from aerpaw_cmp.live.record.log import read_log
-from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.session import TapSettings
+from benchmarks.simulated_modem import Faults, FaultyModem
 
 
 def shown(web=None, **values):
@@ -22,7 +22,7 @@ def shown(web=None, **values):
 def modems(tmp_path):
     """Two modems: one reports rank 1, the other rank 4."""
     made = [
-        ModemSimulator(ModemSimSettings(link=tmp_path / name, rank=lambda _s, k=k: k, faults=Faults(latency_s=0.0)))
+        FaultyModem(link=tmp_path / name, rank=lambda _s, k=k: k, faults=Faults(latency_s=0.0))
         for name, k in (("left", 1), ("right", 4))
     ]
     with made[0], made[1]:
@@ -53,8 +53,8 @@ def test_a_modem_that_is_not_there_ends_all_at_the_start(modems, tmp_path):
 def test_ports_of_one_name_get_folders_of_their_own(tmp_path):
     links = [tmp_path / "a" / "modem", tmp_path / "b" / "modem"]
     with (
-        ModemSimulator(ModemSimSettings(link=links[0])) as first,
-        ModemSimulator(ModemSimSettings(link=links[1])) as second,
+        FaultyModem(link=links[0]) as first,
+        FaultyModem(link=links[1]) as second,
     ):
         settings = TapSettings(tmp_path / "log", duration_s=0.3)
         tap_modems(settings, [str(first.port), str(second.port)], shown()[0], lambda *_: None)

@@ -11,9 +11,9 @@ import pytest
 from aerpaw_cmp.live.feed import Feed
 from aerpaw_cmp.live.record.log import BadLine, read_log
 from aerpaw_cmp.live.serial.modem import QUERIES
-from aerpaw_cmp.live.serial.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.tap import Stop, TapSettings, run_tap
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
+from benchmarks.simulated_modem import FaultyModem
 from benchmarks.tap_common import free_port, start_tap
 
 PAGE = Page(b"<!doctype html><title>t</title>", "default-src 'none'")
@@ -166,7 +166,7 @@ def modem(tmp_path):
 
         def make(**settings):
             settings.setdefault("link", tmp_path / "modem")
-            return stack.enter_context(ModemSimulator(ModemSimSettings(**settings)))
+            return stack.enter_context(FaultyModem(**settings))
 
         yield make
 

@@ -14,9 +14,9 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.live.serial.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
-from aerpaw_cmp.live.serial.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.session import TapSettings
 from aerpaw_cmp.live.tap import run_tap
+from benchmarks.simulated_modem import Faults, FaultyModem
 from tests.live.terminals import held, until
 
 
@@ -53,7 +53,7 @@ def test_a_port_that_comes_later(tap, tmp_path):
     link = tmp_path / "modem"
     session = tap(link, wait_for_port_s=10.0)
     time.sleep(0.3)
-    with ModemSimulator(ModemSimSettings(link=link, faults=Faults(latency_s=0.0))) as sim:
+    with FaultyModem(link=link, faults=Faults(latency_s=0.0)) as sim:
         session.wait(lambda: len(sim.journal) > 5)
         assert session.end().exit_code == 0
 

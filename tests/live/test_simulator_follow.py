@@ -6,53 +6,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.follow import TelemetryFollower, predict_along
 from aerpaw_cmp.live.predict import Prediction
 from aerpaw_cmp.live.serial import simulator
-from aerpaw_cmp.live.serial.modem import decode
-from aerpaw_cmp.live.serial.simulator import ModemSimSettings, ModemSimulator, load_recorded, ranks_of
+from aerpaw_cmp.live.serial.simulator import ranks_of
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.logs.records import ReadResult, Stream
+from benchmarks.simulated_modem import FaultyModem
 from tests.live.terminals import held
-
-TRANSCRIPT = b"""AT+QNWCFG="nr5g_csi"
-+QNWCFG: "nr5g_csi",21,3,9,11
-
-OK
-AT+QNWCFG="nr5g_csi"
-+QNWCFG: "nr5g_csi",5,1,4,2
-
-OK
-at+qnwinfo;+qeng="servingcell"
-+QNWINFO: "TDD NR5G","99999","NR5G BAND 78",633984
-+QENG: "servingcell","NOCONN","NR5G-SA","TDD",999,99,0002A4001,77,1F,633984,78,12,-80,-11,25,1,-
-
-OK
-"""
-
-
-def test_transcript_as_a_modem(tmp_path):
-    path = tmp_path / "t.txt"
-    path.write_bytes(TRANSCRIPT)
-    modem = load_recorded(path)
-    ranks = [decode("nr5g_csi", modem.reply('AT+QNWCFG="nr5g_csi"')[:-1]).values["rank"] for _ in range(4)]
-    assert ranks == [3, 1, 3, 1]
-    assert decode("servingcell", modem.reply('AT+QENG="servingcell"')[:-1]).values["nr"]["rsrp_dbm"] == -80
-    assert modem.reply("AT+QNWINFO")[-1] == "OK"
-    assert modem.reply("AT+QRSRP") == ("ERROR",)
-    assert modem.reply("AT") == ("OK",)
-
-
-def test_tap_of_a_transcript(modem, tap, tools, tmp_path):
-    path = tmp_path / "t.txt"
-    path.write_bytes(TRANSCRIPT)
-    session = tap(modem(source=path).port)
-    session.wait(lambda: len(tools.exchanges(tmp_path / "log", "nr5g_csi")) >= 4)
-    session.end()
-    ranks = [r["decoded"]["rank"] for r in tools.exchanges(tmp_path / "log", "nr5g_csi")]
-    assert ranks[:4] == [3, 1, 3, 1]
 
 
 def test_the_ranks_of_a_log_are_flown_again(tmp_path, monkeypatch):
@@ -72,20 +35,10 @@ def test_the_ranks_of_a_log_are_flown_again(tmp_path, monkeypatch):
     assert ranks == [1, 1, 4, 4, 0, 2, 2, 1]  # and again from the start
 
 
-@pytest.mark.parametrize("content", [b"", b"\0" * 100, b"no answer here\n"])
-def test_nothing_to_replay(tmp_path, content):
-    path = tmp_path / "t.txt"
-    path.write_bytes(content)
-    with pytest.raises(InputError, match="no answer to any known command"):
-        load_recorded(path)
-    with pytest.raises(InputError):
-        load_recorded(tmp_path / "missing.txt")
-
-
 def test_what_two_threads_say_at_once_comes_one_behind_the_other():
     """Longer than the system's buffer of a terminal, so that each writer has to wait in the middle."""
     sent = [letter * 200_000 + b"\n" for letter in (b"a", b"b")]
-    with ModemSimulator() as modem, held(modem.port) as reader:
+    with FaultyModem() as modem, held(modem.port) as reader:
         threads = [threading.Thread(target=modem._write, args=(text,)) for text in sent]
         for thread in threads:
             thread.start()
@@ -100,7 +53,7 @@ def test_what_two_threads_say_at_once_comes_one_behind_the_other():
 
 def test_simulator_cleans_up(tmp_path):
     link = tmp_path / "by-id/modem"
-    with ModemSimulator(ModemSimSettings(link=link)) as modem:
+    with FaultyModem(link=link) as modem:
         node = modem.node
         assert link.resolve() == node
         modem.unplug()
@@ -108,28 +61,26 @@ def test_simulator_cleans_up(tmp_path):
         modem.replug()
         assert link.resolve() == modem.node != node
     assert not link.is_symlink()
-    with pytest.raises(UsageError):
-        ModemSimSettings(kind="toaster")
 
 
 def test_simulator_never_removes_what_is_not_its_own_link(tmp_path):
     path = tmp_path / "precious"
     path.write_text("x")
     with pytest.raises(UsageError, match="the name is taken"):
-        ModemSimulator(ModemSimSettings(link=path))
+        FaultyModem(link=path)
     assert path.read_text() == "x"
     name = tmp_path / "name"
     name.symlink_to(path)
     with pytest.raises(UsageError, match="the name is taken"):
-        ModemSimulator(ModemSimSettings(link=name))
+        FaultyModem(link=name)
     assert name.is_symlink()
     name.unlink()
     name.symlink_to("/dev/ttyUSB2")  # the user's, to her modem
     with pytest.raises(UsageError, match="the name is taken"):
-        ModemSimulator(ModemSimSettings(link=name))
+        FaultyModem(link=name)
     assert str(name.readlink()) == "/dev/ttyUSB2"
     name.unlink()
-    with ModemSimulator(ModemSimSettings(link=name)):
+    with FaultyModem(link=name):
         name.unlink()
         name.symlink_to("/dev/ttyUSB2")
     assert str(name.readlink()) == "/dev/ttyUSB2", "put there while it ran"

@@ -15,10 +15,10 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.predict import Prediction
 from aerpaw_cmp.live.record.log import Clock, LogSettings
 from aerpaw_cmp.live.schedule import Schedule
-from aerpaw_cmp.live.serial.simulator import Faults
 from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status, run_tap
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER
+from benchmarks.simulated_modem import Faults
 from tests.live.terminals import until
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from typer import Argument, Option
 from typer.core import TyperCommand
@@ -137,25 +137,21 @@ def _needs_posix(command: str) -> None:
     examples=[
         "aerpaw-cmp modem-sim --link /tmp/modem",
         "aerpaw-cmp modem-sim --link demo/modem --flight sample_logs/flight.yaml --telemetry demo/vehicleOut.txt",
-        "aerpaw-cmp modem-sim --source taplog --fault echo=true --fault unplug_every_s=20",
     ],
 )
 def modem_sim(
     link: Annotated[Path | None, Option(help="Symbolic link to the port, updated when the port changes.")] = None,
-    source: Annotated[Path | None, Option(help="Log to play: a transcript or a tap log.")] = None,
-    kind: Annotated[Literal["modem", "gps", "diag", "silent", "rubbish"], Option(help="Device to imitate.")] = "modem",
     flight: Annotated[
         Path | None, Option(help="flight.yaml: fly it again from now on, with its ranks; needs --telemetry.")
     ] = None,
     telemetry: Annotated[
         Path | None, Option(help="New telemetry file for --flight; it grows during the flight.")
     ] = None,
-    fault: Annotated[list[str] | None, Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,
     as_json: Json = False,
 ) -> int:
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
     _needs_posix("modem-sim")
-    from ...live.serial.simulator import ModemSimSettings, run_modem_sim
+    from ...live.serial.simulator import FlightModem, ModemSimulator, run_modem_sim
 
     if (flight is None) != (telemetry is None):
         raise UsageError("--flight or --telemetry stands alone", expected="both: the flight to fly, and its new log")
@@ -164,14 +160,7 @@ def modem_sim(
         from ...jobs.live.live_twin import FlownAgain
 
         flown = FlownAgain(flight, telemetry)
-    settings = ModemSimSettings(
-        link=link,
-        source=source,
-        kind=kind,
-        faults=_faults(fault or []),
-        rank=None if flown is None else flown.rank,
-        rsrp=None if flown is None else flown.rsrp,
-    )
+    modem = FlightModem() if flown is None else FlightModem(flown.rank, rsrp=flown.rsrp)
 
     def ready(port: object) -> None:
         if as_json:
@@ -179,24 +168,4 @@ def modem_sim(
         else:
             show(port)
 
-    return run_modem_sim(settings, on_ready=ready, meanwhile=flown)
-
-
-def _faults(pairs: list[str]) -> Any:
-    """Faults from NAME=VALUE pairs."""
-    import dataclasses
-
-    from ...live.serial.simulator import Faults
-
-    known: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(Faults)}
-    values: dict[str, Any] = {}
-    for pair in pairs:
-        name, _, text = pair.partition("=")
-        if name not in known:
-            raise UsageError(f"--fault {pair!r}", expected="NAME=VALUE with one of " + ", ".join(known))
-        kind: Any = type(known[name])
-        try:
-            values[name] = text.lower() in ("", "1", "true", "yes") if kind is bool else kind(text)
-        except ValueError as error:
-            raise UsageError(f"--fault {pair!r}", expected=f"a value of type {kind.__name__}") from error
-    return Faults(**values)
+    return run_modem_sim(ModemSimulator(modem, link=link), on_ready=ready, meanwhile=flown)

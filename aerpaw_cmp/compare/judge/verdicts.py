@@ -16,7 +16,6 @@ from ...common.units import BoolArray, FloatArray
 from ..statistics.intervals import (
     NO_INTERVAL,
     Interval,
-    PairedDifference,
     mean_interval,
     paired_verdict,
     spread_interval,
@@ -308,38 +307,3 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
 
 def _fraction(value: float) -> float:
     return max(value, 0.0) if math.isfinite(value) else 0.0
-
-
-# --- diff -----------------------------------------------------------------------------------------------------------
-
-
-def changed_verdict(
-    pooled: PairedDifference | None, differs: bool, measured_moved: bool, changed: Mapping[str, int]
-) -> Verdict:
-    """Cause of a difference between two reports.
-
-    Parameters
-    ----------
-    pooled : PairedDifference, optional
-        RMSE over all links, second minus first report.
-    differs, measured_moved : bool
-        Any number, and the measured levels, by more than the tolerance.
-    changed : mapping of str to int
-        How many settings, inputs and versions differ.
-
-    Returns
-    -------
-    Verdict
-        ``measured``, the only kind of ``changed`` that differs, ``several``, ``unexplained`` (numbers differ, nothing
-        else does) or ``none``; effect and interval of the RMSE, ``where``: the word of that interval.
-    """
-    kinds = [name for name, n in changed.items() if n]
-    if not differs:
-        cause = NONE
-    elif measured_moved:
-        cause = "measured"
-    else:
-        cause = kinds[0] if len(kinds) == 1 else "several" if kinds else "unexplained"
-    if pooled is None or not pooled.n:
-        return Verdict(cause=cause)
-    return Verdict(cause=cause, effect=pooled.difference_db, interval=pooled.difference_ci95_db, where=pooled.verdict)

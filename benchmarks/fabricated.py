@@ -14,7 +14,7 @@ from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare.flight_verdict import flight_verdict
 from aerpaw_cmp.compare.level.rss import compare_rss, error_spans
 from aerpaw_cmp.compare.rank import channel_rank, commonest_rank, compare_rank, singular_values
-from aerpaw_cmp.compare.result import Fit, ModelLevel, RankFurther, RankResult, RssFurther, RssResult
+from aerpaw_cmp.compare.result import ModelLevel, RankFurther, RankResult, RssFurther, RssResult
 from aerpaw_cmp.jobs.campaigns.season import with_season
 from aerpaw_cmp.report.content.campaign import CampaignData, Failure, FlownTrack, RssRow
 from aerpaw_cmp.report.content.flight import ReportData, Track
@@ -118,7 +118,7 @@ def rss_result(
     score = compare_rss(time, measured, simulated, baselines=baselines)
     further = RssFurther(
         n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out, block_length=1,
-        identifiable_db=score.identifiable_db, trimmed=Fit(offset_db=score.offset_db, rmse_db=score.rmse_db),
+        identifiable_db=score.identifiable_db,
         n_too_low=0, n_no_pose=0, n_outliers=0, rmse_without_outliers_db=score.rmse_db, n_flagged={}, clock=None,
         baseline_rmse_ci95_db=score.baseline_intervals, compared_with={}, averaged={}, repeatability={},
         explained_by={},

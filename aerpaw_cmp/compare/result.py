@@ -22,7 +22,6 @@ from .level.detection import DetectionScore
 from .level.field_difference import FieldAudit
 from .level.rss import LEARNED_HERE, ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .level.serving import ServingComparison
-from .offset import Censored
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .ranks.forecast import ForecastScore
 from .statistics.intervals import Interval, PairedDifference
@@ -73,11 +72,10 @@ class ClockResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fit:
-    """An offset [dB], what it leaves [dB], and over how many values where that is not the number of samples."""
+    """An offset and what it leaves [dB]."""
 
     offset_db: float
     rmse_db: float
-    n: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -112,7 +110,7 @@ class RssFurther:
     ``n_flagged`` is by reason; ``compared_with`` says by the name of each baseline and of each other assumption whether
     the replay is better or worse on the same samples; ``averaged`` is by simulation and window.
     ``n_outliers`` samples lie far outside the distribution of the channel's own levels: they count in all numbers but
-    ``rmse_without_outliers_db``. ``trimmed``, ``identifiable_db``, ``block_length`` and the other counts are those of
+    ``rmse_without_outliers_db``. ``identifiable_db``, ``block_length`` and the other counts are those of
     :class:`~aerpaw_cmp.compare.level.rss.RssComparison`.
     """
 
@@ -120,7 +118,6 @@ class RssFurther:
     n_simulated_out: int
     block_length: int
     identifiable_db: Interval
-    trimmed: Fit
     n_too_low: int
     n_no_pose: int
     n_outliers: int
@@ -130,7 +127,6 @@ class RssFurther:
     baseline_rmse_ci95_db: Mapping[str, Interval]
     compared_with: Mapping[str, PairedDifference]
     averaged: Mapping[str, Mapping[str, Fit]]
-    censored: Censored | None = None
     detection: DetectionScore | None = None
     """Of a receiver that loses its lock or ends at a floor."""
     snr: SnrScore | None = None

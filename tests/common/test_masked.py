@@ -10,7 +10,7 @@ import pytest
 
 import aerpaw_cmp as ac
 from aerpaw_cmp.common.units import finite_mean, unmasked
-from aerpaw_cmp.compare import offset, rank
+from aerpaw_cmp.compare import rank
 from aerpaw_cmp.compare.judge import season
 from aerpaw_cmp.compare.level import rss
 from aerpaw_cmp.compare.statistics import intervals as statistics
@@ -49,7 +49,6 @@ CASES: dict[str, tuple[Callable[[Any], Any], Any]] = {
     ),
     "offset": (lambda z: ac.grid_offset(z, LEVELS + 2.0), LEVELS),
     "offset of a list": (lambda z: ac.grid_offset([z, z], [LEVELS, LEVELS]), LEVELS),
-    "trimmed offset": (lambda z: offset.trimmed_offset(LEVELS, z), LEVELS + CHANCE.normal(size=40)),
     "rank": (lambda h: ac.channel_rank(h, 10.0), H),
     "capacity": (lambda h: rank.capacity_rank(h, np.full(40, 10.0)), H),
     "histogram": (rank.histogram, RANKS),

@@ -7,11 +7,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.optimize import minimize
-from scipy.stats import norm
 
 from aerpaw_cmp.compare.offset import (
-    censored_offset,
     difference_moments,
     grid_offset,
     identifiable_range,
@@ -19,7 +16,6 @@ from aerpaw_cmp.compare.offset import (
     offset_curve,
     offset_grid,
     pooled_moments,
-    trimmed_offset,
 )
 
 tenths = st.integers(-2000, 2000).map(lambda k: k / 100)
@@ -72,17 +68,6 @@ def test_sides_of_different_length_are_refused():
         grid_offset([1.0], [1.0], step_db=10.0, span_db=(1.0, 9.0))
 
 
-def test_trimming_ignores_one_tenth_of_rubbish():
-    rng = np.random.default_rng(1)
-    simulated = rng.normal(-80, 8, 1000)
-    measured = simulated - 12.3 + rng.normal(0, 0.01, 1000)
-    measured[:90] += 40.0
-    assert trimmed_offset(measured, simulated).offset_db == 12.3
-    assert trimmed_offset(measured, simulated).n == 900
-    assert grid_offset(measured, simulated).offset_db == pytest.approx(12.3 - 3.6, abs=0.1)
-    assert trimmed_offset(measured, simulated, keep=1.0).offset_db == grid_offset(measured, simulated).offset_db
-
-
 @pytest.mark.parametrize("level", [1e30, -1e30, 1e18, -1e17, 1e308, -1e308, 60.0, -60.0, 50.0, 49.96])
 def test_the_edge_of_the_span_is_told_for_any_input(level: float) -> None:
     fit = grid_offset([0.0, 0.0], [level, level])
@@ -100,101 +85,22 @@ def test_a_grid_that_fits_in_no_memory_is_refused() -> None:
 NAN = float("nan")
 
 
-def tobit_by_hand(full, above, below):
-    """Mean and standard deviation of most likelihood, by SciPy's distribution and simplex."""
-
-    def negative(x):
-        mean, sigma = x[0], math.exp(x[1])
-        likely = norm.logpdf(full, mean, sigma).sum()
-        return -(likely + norm.logsf(above, mean, sigma).sum() + norm.logcdf(below, mean, sigma).sum())
-
-    options = {"xatol": 1e-9, "fatol": 1e-12, "maxiter": 20_000, "maxfev": 20_000}
-    start = [np.mean(full), math.log(np.std(full) + 0.1)]
-    best = minimize(negative, start, method="Nelder-Mead", options=options).x
-    return best[0], math.exp(best[1])
-
-
-@pytest.mark.parametrize("sides", ["measured", "simulated", "both"])
-@pytest.mark.parametrize("share", [0.1, 0.6])
-@pytest.mark.parametrize("seed", [1])
-def test_the_censored_fit_is_that_of_most_likelihood(seed, share, sides):
-    """Below either floor or both, few samples or most: the mean is far from that of the pairs that are known."""
-    rng = np.random.default_rng(seed)
-    simulated = rng.uniform(-100, -60, 400)
-    measured = simulated + 20.0 + rng.normal(0, 7, 400)
-    measured_floor = np.quantile(measured, share) if sides != "simulated" else -300.0
-    simulated_floor = np.quantile(simulated, share) if sides != "measured" else -300.0
-    fit = censored_offset(
-        measured, simulated, measured_floor_db=measured_floor, simulated_floor_db=simulated_floor, step_db=1e-5,
-        span_db=(-60.0, 20.0),
-    )  # fmt: skip
-    low_m, low_s = measured <= measured_floor, simulated <= simulated_floor
-    full = (simulated - measured)[~low_m & ~low_s]
-    above = (simulated - measured_floor)[low_m & ~low_s]
-    below = (simulated_floor - measured)[~low_m & low_s]
-    mean, sigma = tobit_by_hand(full, above, below)
-    assert fit.offset_db == pytest.approx(mean, abs=2e-3)
-    assert fit.sigma_db == pytest.approx(sigma, abs=2e-3)
-    assert (fit.n, fit.n_measured_below, fit.n_simulated_below) == (len(full), len(above), len(below))
-    assert not fit.at_search_edge
-    if share > 0.5:
-        assert abs(full.mean() - mean) > 1.0 or sides == "both"
-
-
-def test_levels_that_are_all_alike_leave_a_spread_of_a_thousandth():
-    fit = censored_offset([-60.0] * 5, [-50.0] * 5, measured_floor_db=-100, simulated_floor_db=-100)
-    assert fit.offset_db == 10.0
-    assert fit.sigma_db == pytest.approx(1e-3, rel=1e-6)
-    spread = censored_offset([-60.0, -60.4], [-50.0] * 2, measured_floor_db=-100, simulated_floor_db=-100)
-    assert spread.sigma_db == pytest.approx(0.2, rel=1e-4)
-
-
 @pytest.mark.parametrize("difference", [50.0, -50.0, 49.9, -49.9, 0.0])
 def test_every_fit_tells_the_edge_of_its_grid(difference):
     edge = abs(difference) == 50.0
     measured, simulated = np.zeros(10), np.full(10, difference) + np.tile([-0.01, 0.01], 5)
     assert grid_offset(measured, simulated).at_edge == edge
-    assert trimmed_offset(measured, simulated).at_edge == edge
-    assert trimmed_offset(measured, simulated).offset_db == difference
-    assert censored_offset(measured, simulated, measured_floor_db=-99, simulated_floor_db=-99).at_search_edge == edge
     (shared,) = pooled_offsets({("f", "t", "c"): (measured, simulated)}, "all").values()
     assert (shared.at_edge, shared.offset_db) == (edge, difference)
 
 
 def test_nothing_known_is_no_number_and_no_edge():
     for fit in (
-        grid_offset([NAN], [1.0]), trimmed_offset([NAN], [1.0]),
+        grid_offset([NAN], [1.0]),
         *pooled_offsets({("f", "t", "c"): ([NAN], [1.0])}).values(),
     ):  # fmt: skip
         assert np.isnan([fit.offset_db, fit.rmse_db]).all()
         assert (fit.n, fit.at_edge) == (0, False)
-    none = censored_offset([NAN], [1.0], measured_floor_db=-9, simulated_floor_db=-9)
-    assert np.isnan([none.offset_db, none.sigma_db]).all()
-    assert (none.n, none.n_measured_below, none.n_simulated_below, none.at_search_edge) == (0, 1, 0, False)
-
-
-@pytest.mark.parametrize("seed", range(6))
-@pytest.mark.parametrize("keep", [0.51, 0.7, 0.95, 1.0])
-def test_the_trimmed_fit_is_that_of_the_smallest_residuals_at_every_offset(keep, seed):
-    rng = np.random.default_rng(seed)
-    n = int(rng.integers(5, 40))
-    measured, simulated = rng.normal(-60, 4, n), rng.normal(-57, 4, n) + 15 * (rng.random(n) < 0.2)
-    count = math.ceil(keep * n - 1e-9)
-    grid = np.arange(-100, 101) / 2
-    brute = [np.sqrt(np.mean(np.sort((measured + o - simulated) ** 2)[:count])) for o in grid]
-    fit = trimmed_offset(measured, simulated, keep=keep, step_db=0.5)
-    assert fit.n == count
-    assert fit.rmse_db == pytest.approx(min(brute), abs=1e-9)
-    assert fit.offset_db == grid[int(np.argmin(brute))]
-
-
-def test_ties_of_the_trimmed_fit_go_to_the_offset_nearer_zero():
-    # half a step either way of an even pair is as good
-    assert trimmed_offset(np.zeros(2), [2.0, 3.0], keep=1.0, step_db=1.0).offset_db == 2.0
-    assert trimmed_offset(np.zeros(2), [-2.0, -3.0], keep=1.0, step_db=1.0).offset_db == -2.0
-    for wrong in (0.5, 1.01, NAN):
-        with pytest.raises(ValueError, match="keep must be above"):
-            trimmed_offset([0.0], [1.0], keep=wrong)
 
 
 @pytest.mark.parametrize(

@@ -6,8 +6,6 @@ from functools import partial
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from aerpaw_cmp.common.jsonable import json_safe
 from aerpaw_cmp.compare.level.rss import (
@@ -20,8 +18,6 @@ from aerpaw_cmp.compare.level.rss import (
     local_mean_db,
     outliers,
     seconds,
-    stretch_means_db,
-    stretches,
 )
 from aerpaw_cmp.compare.statistics.intervals import autocorrelation, error_intervals
 from tests.real_logs import dataset12
@@ -156,43 +152,6 @@ def test_fading_averages_out_on_the_same_footing():
     assert fits["local_mean"]["each"].rmse_db == pytest.approx(5.57, abs=0.4)  # standard deviation of Rayleigh in dB
     assert fits["local_mean"]["4 s"].rmse_db < 1.0
     assert fits["other"]["4 s"].rmse_db > 4.0
-
-
-def test_a_stretch_counts_once_however_long_the_hover():
-    east = np.concatenate([np.arange(0.0, 100.0, 1.0), np.full(500, 100.0), np.arange(101.0, 201.0, 1.0)])
-    position = np.column_stack([east, 0 * east, 0 * east + 40.0])
-    level = np.where(east < 100.0, -60.0, np.where(east == 100.0, -50.0, -60.0))
-    averages = {"path": partial(stretch_means_db, stretches(position, 10.0))}
-    fit = averaged_fits(level, {"flat": np.full(len(east), -60.0)}, averages)["flat"]["path"]
-    assert fit.n == 21
-    alone = 10.0  # one stretch of 21 is off by almost 10 dB
-    assert fit.rmse_db == pytest.approx(alone * np.sqrt(20) / 21, rel=0.02)
-
-
-@given(st.lists(st.floats(0.0, 5.0), min_size=2, max_size=60), st.floats(0.5, 20.0))
-def test_stretches_are_as_long_as_said(steps, length):
-    way = np.cumsum([0.0, *steps])
-    number = stretches(np.column_stack([way, 0 * way, 0 * way]), length)
-    assert number[0] == 0
-    assert (np.diff(number) >= 0).all()
-    inside = [np.ptp(way[number == i]) for i in np.unique(number)]
-    assert max(inside) <= length * (1 + 1e-9)
-
-
-def test_means_of_stretches_are_means_of_power():
-    number = np.array([0, 0, 2, 2, 5])
-    level = np.array([-300.0, -300.0 + 10 * np.log10(3), 0.0, np.nan, 20.0])
-    assert stretch_means_db(number, level) == pytest.approx([-300.0 + 10 * np.log10(2), 0.0, 20.0], abs=1e-9)
-    assert stretch_means_db(number, np.full(5, np.nan)).size == 0
-
-
-def test_unknown_positions_belong_to_the_stretch_before():
-    position = np.array([[0.0, 0, 0], [np.nan] * 3, [10.0, 0, 0], [12.0, 0, 0], [np.nan] * 3])
-    assert stretches(position, 5.0).tolist() == [0, 0, 2, 2, 2]
-    assert stretches(np.full((3, 3), np.nan), 5.0).tolist() == [0, 0, 0]
-
-
-# --- residuals ---
 
 
 def test_link_geometry_in_the_antenna_frames():

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ...common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
-from ..offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, trimmed_offset
+from ..offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve
 from ..statistics.intervals import NO_INTERVAL, ErrorIntervals, Interval, autocorrelation, correlation, error_intervals
 
 # Two channels of one receiver "part" where they differ by more than this [dB].
@@ -59,8 +59,6 @@ class RssComparison:
         95 % intervals and the residual's memory.
     identifiable_db : (low, high)
         Offsets within 0.1 dB of the least RMSE.
-    trimmed : OffsetFit
-        Offset and RMSE of the 90 % of samples that agree best.
     baselines : mapping of str to OffsetFit
         Free space, two-ray and others, each with its own offset, over the same pairs.
     baseline_intervals : mapping of str to (low, high)
@@ -84,7 +82,6 @@ class RssComparison:
     correlation: float
     intervals: ErrorIntervals
     identifiable_db: Interval
-    trimmed: OffsetFit
     baselines: Mapping[str, OffsetFit]
     baseline_intervals: Mapping[str, Interval]
     residual_db: FloatArray = field(repr=False)
@@ -152,7 +149,6 @@ def compare_rss(
         correlation=correlation(m, s),
         intervals=error_intervals(m, s),
         identifiable_db=identifiable_range(offsets, curve),
-        trimmed=trimmed_offset(m, s, step_db=step_db, span_db=span_db),
         baselines={
             name: grid_offset(m, level[order], step_db=step_db, span_db=span_db) for name, level in simple.items()
         },
@@ -174,7 +170,6 @@ def without_errors(score: RssComparison) -> RssComparison:
         correlation=float("nan"),
         intervals=replace(score.intervals, rmse_db=none, correlation=none),
         identifiable_db=none,
-        trimmed=replace(score.trimmed, rmse_db=float("nan")),
         fitted_on_scored=(*score.fitted_on_scored, LEARNED_HERE),
     )
 
@@ -251,40 +246,6 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
     return result
 
 
-def stretches(position_m: FloatArray, length_m: float) -> IntArray:
-    """Number (n,) of the stretch of path that each sample belongs to.
-
-    Parameters
-    ----------
-    position_m : (n, 3)
-        In the order flown; NaN where unknown (counted to the stretch before).
-    length_m : float
-        Path of one stretch. A UAV that hovers stays in its stretch.
-    """
-    known = np.isfinite(position_m).all(axis=1)
-    way = np.zeros(len(position_m))
-    rows = np.flatnonzero(known)
-    if len(rows):
-        steps = np.linalg.norm(np.diff(position_m[rows], axis=0), axis=1)
-        way[rows] = np.concatenate([[0.0], np.cumsum(steps)])
-    return np.asarray(np.maximum.accumulate(way) // length_m, dtype=np.int64)
-
-
-def stretch_means_db(stretch: IntArray, level_db: ArrayLike) -> FloatArray:
-    """Mean power [dB] of each stretch that has a level (stretches,), in the order of their numbers.
-
-    The local mean over 20 to 40 wavelengths is what a prediction without fast fading can hold for (Lee 1985,
-    doi:10.1109/T-VT.1985.24030). Every stretch counts once, however long the UAV hovered in it.
-    """
-    level = _levels(level_db)
-    known = np.isfinite(level)
-    if not known.any():
-        return np.zeros(0)
-    _, at = np.unique(stretch[known], return_inverse=True)
-    top = level[known].max()
-    return np.asarray(db_from_power(np.bincount(at, power_from_db(level[known] - top)) / np.bincount(at)) + top)
-
-
 def _window_sums(values: FloatArray, first: Any, last: Any) -> FloatArray:
     """Sums of values[first:last] for windows that move forward.
 
@@ -325,7 +286,7 @@ def averaged_fits(
     simulations : mapping of str to array_like (n,)
         Levels by name, such as "coherent", "power_sum" or "local_mean".
     averages : mapping of str to callable
-        Means of levels (n,), NaN where either side has none: by :func:`local_mean_db` or :func:`stretch_means_db`.
+        Means of levels (n,), NaN where either side has none, such as :func:`local_mean_db`.
     step_db, span_db
         Offset search.
 

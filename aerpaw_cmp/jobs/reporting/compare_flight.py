@@ -18,7 +18,7 @@ import numpy as np
 from ...common.errors import InputError
 from ...common.jsonable import named
 from ...common.stages import give_memory_back
-from ...common.units import BoolArray, FloatArray, IntArray, wavelength_m
+from ...common.units import BoolArray, FloatArray, IntArray
 from ...compare import offset as offsets
 from ...compare import rank as ranks
 from ...compare.flight_verdict import flight_verdict, with_corrected_verdicts
@@ -59,9 +59,6 @@ from .likely_cause import cause_of
 
 # Both sides are averaged over these windows to see how much of the error is fading.
 _AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
-
-# And over stretches of path, each of which counts once, however long the UAV hovered there.
-_AVERAGING_WAVELENGTHS, _AVERAGING_LENGTH_M = 40, 20.0
 
 # Two passes of one place, first and second half of a flight, come this near.
 _PASSES_WITHIN_M = 3.0
@@ -254,7 +251,6 @@ def _further(
     further = RssFurther(
         **named(score, "n_measured_out n_simulated_out identifiable_db"),
         block_length=score.intervals.autocorrelation.block_length,
-        trimmed=Fit(**named(score.trimmed, "offset_db rmse_db n")),
         n_too_low=int((replayed.valid & ~levels.posed).sum()),
         n_no_pose=int((~replayed.valid).sum()),
         n_outliers=int(wild.sum()),
@@ -277,8 +273,7 @@ def _further(
     return dataclasses.replace(
         further,
         compared_with=_paired(levels, case.simple),
-        averaged=_averaged(series, replayed, levels, case.position_m, settings),
-        censored=_censored(settings, levels),
+        averaged=_averaged(series, replayed, levels, settings),
         detection=detection,
         snr=_snr(series, levels),
     )
@@ -365,26 +360,17 @@ def _paired(levels: Levels, models: Mapping[str, FloatArray]) -> dict[str, stati
 
 
 def _averaged(
-    series: RssSeries, replayed: Replayed, levels: Levels, position_m: FloatArray, settings: RssSettings
+    series: RssSeries, replayed: Replayed, levels: Levels, settings: RssSettings
 ) -> dict[str, dict[str, Fit]]:
-    """Both sides averaged alike, over windows of time and stretches of path, per simulation."""
+    """Both sides averaged alike over windows of time, per simulation."""
     simulations = {
         "coherent": replayed.spread(replayed.level_dbm("coherent")),
         "power_sum": replayed.spread(replayed.level_dbm("power")),
     }
-    wavelength = wavelength_m(series.link.carrier_hz)
-    lengths = {
-        f"{_AVERAGING_WAVELENGTHS} wavelengths of path": _AVERAGING_WAVELENGTHS * wavelength,
-        f"{_AVERAGING_LENGTH_M:g} m of path": _AVERAGING_LENGTH_M,
-    }
     averages = {f"{w:g} s": partial(rss.local_mean_db, series.time, window_s=w) for w in _AVERAGING_WINDOWS_S}
-    averages |= {name: partial(rss.stretch_means_db, rss.stretches(position_m, m)) for name, m in lengths.items()}
     fits = rss.averaged_fits(levels.measured_db, simulations, averages, span_db=settings.span_db)
     return {
-        name: {
-            average: Fit(offset_db=fit.offset_db, rmse_db=fit.rmse_db, n=fit.n if average in lengths else None)
-            for average, fit in each.items()
-        }
+        name: {average: Fit(**named(fit, "offset_db rmse_db")) for average, fit in each.items()}
         for name, each in fits.items()
     }
 
@@ -428,24 +414,6 @@ def _detection(data: FlightData, series: RssSeries, levels: Levels, free_space_d
         forecast=forecast,
     )
     return None if score is None else dataclasses.replace(score, locks=series.locked is not None)
-
-
-def _censored(settings: RssSettings, levels: Levels) -> offsets.Censored | None:
-    """Offset when samples without a signal, or without a path, count as "below the weakest level seen"."""
-    measured, simulated = levels.measured_db[levels.posed], levels.simulated_db[levels.posed]
-    if not len(measured) or (np.isfinite(measured) & np.isfinite(simulated)).all():
-        return None
-    floors = [float(np.min(side, where=np.isfinite(side), initial=np.inf)) for side in (measured, simulated)]
-    if not np.isfinite(floors).all():
-        return offsets.Censored(n=0)
-    return offsets.censored_offset(
-        measured,
-        simulated,
-        # the weakest level itself is a measurement: it is no "below"
-        measured_floor_db=floors[0] - 1e-9,
-        simulated_floor_db=floors[1] - 1e-9,
-        span_db=settings.span_db,
-    )
 
 
 def _halves(

@@ -70,6 +70,9 @@ def utc_now() -> str:
 
 def versions() -> dict[str, str]:
     """Versions by name; "not installed" where a package is not."""
-    return {"aerpaw-cmp": tool_version(), "python": platform.python_version()} | {
-        name: version(name) for name in _PACKAGES
-    }
+    return {"aerpaw-cmp": tool_version(), **library_versions()}
+
+
+def library_versions() -> dict[str, str]:
+    """The same without this program."""
+    return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import shapely
 
+from aerpaw_cmp.common import versions
 from aerpaw_cmp.common.files import cache_folder
 from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.compare.result import AuditResult
@@ -54,6 +55,15 @@ def test_the_second_audit_of_the_same_is_read_and_says_its_day(flight):
     assert dataclasses.replace(again, read_from_cache_of="") == MADE
     assert f"Read from the cache of {again.read_from_cache_of}" in audit_summary(again)
     assert "cache" not in audit_summary(MADE)
+
+
+def test_a_commit_that_changes_no_code_audits_nothing_anew(flight, monkeypatch):
+    data, made = flight
+    assert made(data)
+    monkeypatch.setattr(versions, "commit", lambda: "abc1234.dirty")
+    assert not made(data)
+    monkeypatch.setattr(versions, "version", lambda name: f"{name} of tomorrow")
+    assert made(data), "another library"
 
 
 def test_a_changed_input_audits_anew(flight):

@@ -10,7 +10,7 @@ from typing import Any
 
 from ...common.content import content_digest
 from ...common.files import cache_folder, read_sealed, write_sealed
-from ...common.versions import utc_now, versions
+from ...common.versions import library_versions, utc_now
 from ...compare.level.field_difference import FieldAudit
 from ...compare.result import AuditResult
 from ...flight.data import FlightData
@@ -26,13 +26,14 @@ _SETTINGS = {"rt", "link", "rank", "antennas", "towers"}
 
 
 def entry_of(data: FlightData, replays: Sequence[Replayed]) -> Path:
-    """Place of the audit of these replays: named by the SHA-256 of versions, code, site, logs, settings and replays."""
+    """Place of the audit of these replays: named by the SHA-256 of libraries, code, site, logs, settings and replays."""
     settings = data.settings.model_dump(mode="json", include=_SETTINGS)
     seen = [
         (r.poses, r.tower_m, *(getattr(r.replay, name) for name in ("towers", "faces", "contributions", *PER_LINK)))
         for r in replays
     ]
-    digest = content_digest(versions(), code_digest(), settings, data.site, [file.sha256 for file in data.files], seen)
+    logs = [file.sha256 for file in data.files]
+    digest = content_digest(library_versions(), code_digest(), settings, data.site, logs, seen)
     return cache_folder("audits", f"{digest}.json")
 
 

@@ -36,6 +36,22 @@ MOST_ROWS = 3000
 _TOWER_FACTORS = (1.0, 0.5)
 
 
+def link_directions(tower_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Unit vectors (n, 3) of both ends towards each other: at the UAV in its body frame, at the tower in the mast's.
+
+    Parameters
+    ----------
+    tower_m : (3,) or (n, 3)
+        Place of the tower's array [m].
+    position_m : (n, 3)
+    rotation : (n, 3, 3)
+        From the body frame to the site's.
+    """
+    ray = position_m - tower_m
+    at_tower = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
+    return np.einsum("nji,nj->ni", rotation, -at_tower), at_tower
+
+
 @dataclass(frozen=True, slots=True)
 class LinkSamples:
     """Measurements of one flight on one channel of one tower, against a model without the gain to be learned.

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.units import FloatArray
+from ...compare.gains.direction_gain import link_directions
 from ...propagation.geometry.arrays import Array, Link, Poses
 from ...site.antenna.sphere_pattern import SpherePattern
 
@@ -47,10 +48,8 @@ def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain 
     -------
     LearnedGain or None
     """
-    ray = poses.position_m - source_m
-    ray = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
+    towards = dict(zip(("uav", "tower"), link_directions(source_m, poses.position_m, poses.rotation), strict=True))
     (tower_array,) = link.tower_arrays.values()
-    towards = {"uav": np.einsum("nji,nj->ni", poses.rotation, -ray), "tower": ray}
     ends: dict[str, tuple[SpherePattern, FloatArray]] = {}
     for end, array in (("uav", link.uav_array), ("tower", tower_array)):
         pattern = array.patterns[0]

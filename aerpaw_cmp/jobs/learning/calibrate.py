@@ -328,8 +328,7 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float, floa
     position = pose.position_m[keep]
     if series.tower in data.nodes:
         place = place[keep]
-    ray = position - place
-    at_tower = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    at_uav, at_tower = direction_gain.link_directions(place, position, pose.rotation[keep])
     ends = place[:, None, :] if series.tower in data.nodes else place
     free = free_space_dbm(ends, position, series.link.carrier_hz, series.link.transmit_power_dbm)[:, 0]
     time = series.time[keep]
@@ -341,7 +340,7 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float, floa
         channel=series.channel,
         time_s=np.asarray(seconds, dtype=np.float64),
         position_m=position,
-        at_uav=np.einsum("nji,nj->ni", pose.rotation[keep], -at_tower),
+        at_uav=at_uav,
         at_tower=at_tower,
         residual_db=series.measured_db[keep] - free,
         floor_db=None if series.locked is None else LOCK_FLOOR_DB - free,

@@ -11,7 +11,7 @@ import pandas as pd
 
 from ...common.errors import InputError, UsageError, parsing
 from ...common.units import BoolArray, FloatArray
-from ...compare.gains.direction_gain import LinkSamples
+from ...compare.gains.direction_gain import LinkSamples, link_directions
 from ...flight.data import FAR_M, FlightData, load_data, nearest_m
 from ...flight.gains.memory import load_with_learned
 from ...flight.pose.heights import raised
@@ -113,18 +113,17 @@ def level_samples(
     -------
     LinkSamples
     """
-    ray = position_m - tower_m
-    at_tower = ray / np.maximum(np.linalg.norm(ray, axis=1, keepdims=True), 1e-9)
     rotation = rotation_from_aircraft(0.0 * yaw_deg, 0.0 * yaw_deg, yaw_deg)
+    at_uav, at_tower = link_directions(tower_m, position_m, rotation)
     return LinkSamples(
         flight="",
         tower=end[0],
         channel=end[1],
         time_s=time_s,
         position_m=position_m,
-        at_uav=np.einsum("nji,nj->ni", rotation, -at_tower),
+        at_uav=at_uav,
         at_tower=at_tower,
-        residual_db=np.zeros(len(ray)),
+        residual_db=np.zeros(len(yaw_deg)),
     )
 
 

@@ -26,7 +26,7 @@ _SETTINGS = {"rt", "link", "rank", "antennas", "towers"}
 
 
 def entry_of(data: FlightData, replays: Sequence[Replayed]) -> Path:
-    """Place of the audit of these replays: named by the SHA-256 of libraries, code, site, logs, settings and replays."""
+    """Place of the audit of these replays: the SHA-256 of libraries, code, site, logs, settings and replays."""
     settings = data.settings.model_dump(mode="json", include=_SETTINGS)
     seen = [
         (r.poses, r.tower_m, *(getattr(r.replay, name) for name in ("towers", "faces", "contributions", *PER_LINK)))

@@ -68,6 +68,10 @@ class FaultyModem(ModemSimulator):
         self._speaking = threading.Lock()
         super().__init__(FlightModem(rank, csi_on), link=link)
 
+    def __enter__(self) -> FaultyModem:
+        super().__enter__()
+        return self
+
     @property
     def node(self) -> Path:
         """The present node."""

@@ -1,4 +1,4 @@
-"""A simulated modem with faults on request and a journal of its answers, for tests and benchmarks of the tap."""
+"""A simulated modem with faults and a journal of its answers, and the tap's log, for tests and benchmarks of the tap."""
 
 from __future__ import annotations
 
@@ -6,12 +6,13 @@ import os
 import pty
 import random
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from aerpaw_cmp.live.serial.simulator import FlightModem, ModemSimulator, framed
+from aerpaw_cmp.logs.files.checksums import Record, decode_record
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,3 +175,28 @@ class FaultyModem(ModemSimulator):
         if hit(faults.huge_line_every):
             chunks.insert(0, b"x" * 10_000_000 + b"\r\n")
         return b"".join(chunks), tuple(lines[:-1])
+
+
+@dataclass(frozen=True, slots=True)
+class BadLine:
+    """A line of a log that is no record."""
+
+    path: Path
+    number: int
+    reason: str
+    torn_tail: bool
+
+
+def read_log(folder: Path, bad: list[BadLine] | None = None) -> Iterator[Record]:
+    """Records of the tap's log in a folder, in order; bad lines go to ``bad``."""
+    bad = [] if bad is None else bad
+    for path in sorted(folder.glob("tap_*.jsonl")):
+        lines = path.read_bytes().split(b"\n")
+        for number, line in enumerate(lines, 1):
+            try:
+                record = decode_record(line) if line.strip() else None
+            except ValueError as error:
+                bad.append(BadLine(path, number, str(error), number == len(lines)))
+                continue
+            if record is not None:
+                yield record

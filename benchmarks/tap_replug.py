@@ -21,10 +21,8 @@ from pathlib import Path
 from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
+from simulated_modem import BadLine, Faults, FaultyModem, read_log
 from tap_common import conditions, read_lines, show, start_tap
-
-from aerpaw_cmp.live.record.log import BadLine, read_log
-from benchmarks.simulated_modem import Faults, FaultyModem
 
 FINAL = {"ok": "OK", "error": "ERROR", "cme": "+CME ERROR: ", "cms": "+CMS ERROR: "}
 

@@ -17,10 +17,8 @@ from functools import partial
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
+from simulated_modem import BadLine, Faults, FaultyModem, read_log
 from tap_common import conditions, free_port, read_lines, show, start_browser, start_tap
-
-from aerpaw_cmp.live.record.log import BadLine, read_log
-from benchmarks.simulated_modem import Faults, FaultyModem
 
 
 def one_kill(number: int, seed: int, folder: Path, *, web: bool = False, patience_s: float = 0.25) -> dict[str, int]:

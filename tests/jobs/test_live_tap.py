@@ -8,9 +8,8 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.jobs.live.live_tap import TOKEN, Shown, tap_modems
-from aerpaw_cmp.live.record.log import read_log
 from aerpaw_cmp.live.session import TapSettings
-from benchmarks.simulated_modem import Faults, FaultyModem
+from benchmarks.simulated_modem import Faults, FaultyModem, read_log
 
 
 def shown(web=None, **values):

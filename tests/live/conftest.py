@@ -9,11 +9,10 @@ import time
 import pytest
 
 from aerpaw_cmp.live.feed import Feed
-from aerpaw_cmp.live.record.log import BadLine, read_log
 from aerpaw_cmp.live.serial.modem import QUERIES
 from aerpaw_cmp.live.tap import Stop, TapSettings, run_tap
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
-from benchmarks.simulated_modem import FaultyModem
+from benchmarks.simulated_modem import BadLine, FaultyModem, read_log
 from benchmarks.tap_common import free_port, start_tap
 
 PAGE = Page(b"<!doctype html><title>t</title>", "default-src 'none'")

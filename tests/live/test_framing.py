@@ -6,24 +6,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.live.serial.framing import Answer, Framer, Late, TranscriptFramer, Unsolicited, frame_transcript, unglue
-from tests.real_logs import REAL
+from aerpaw_cmp.live.serial.framing import Framer, Late, Unsolicited, unglue
 
 CSI = ('AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',))
 QENG = ('AT+QENG="servingcell"', ("+QENG:",))
-
-# rebuilt in the layouts of real transcripts, with invented values
-TRANSCRIPTS = {
-    "crlf with echo": b'AT+QNWCFG="nr5g_csi"\r\r\n+QNWCFG: "nr5g_csi",11,2,9,7\r\n\r\nOK\r\n',
-    "lf only": b'AT+QNWCFG="lte_csi"\n+QNWCFG: "lte_csi",5,1,6,3\n\nAT+QNWCFG="nr5g_csi"\n+QNWCFG: "nr5g_csi",3,1,4,5 \n',
-    "cr only": b"AT+QRSRP\r+QRSRP: -90,-91,-92,-93,NR5G\rOK\r",
-    "errors": b"AT+CFUN=1\r\n+CME ERROR: 0\r\nAT+X\r\nERROR\r\nAT+CMGS=1\r\n+CMS ERROR: 301\r\n",
-    "chained": b'at+qnwinfo;+qeng="servingcell"\n+QNWINFO: "TDD NR5G","99999","NR5G BAND 78",633984\n\n+QENG: "servingcell","SEARCH"\n',
-    "glued": b'AT+QCAINFO\n+QCAINFO: "PCC",633984,12,"NR5G BAND 78",9\n+QCAINFO: "SCC",1300,2,"NR5G BAND 3",1,9,0,-,-+QCAINFO: "SCC",520000,11,"NR5G BAND 41",1,8,0,-,-\nOK\n',
-    "unsolicited": b'\r\nRDY\r\n\r\n+QIND: "csq",20,99\r\nATI\r\nQuectel\r\nRM502Q-AE\r\nRevision: X\r\n\r\nOK\r\n',
-    "binary": bytes(range(256)) + b"\r\nAT\r\nOK\r\n" + b"\xff\xfe\0\0",
-    "operator": b'AT+QSPN\r\n+QSPN: "TOKYO OK","OK","",0,"99999"\r\nOK\r\n',
-}
 
 
 def every_cut(data, feed_all):
@@ -32,43 +18,6 @@ def every_cut(data, feed_all):
     for cut in range(len(data) + 1):
         assert feed_all([data[:cut], data[cut:]]) == uncut, f"cut at byte {cut}"
     return uncut
-
-
-def framed(pieces):
-    framer = TranscriptFramer()
-    return [event for piece in pieces for event in framer.feed(piece)] + framer.close()
-
-
-@pytest.mark.parametrize("name", TRANSCRIPTS)
-def test_transcripts_at_every_cut(name):
-    assert every_cut(TRANSCRIPTS[name], framed)
-
-
-@pytest.mark.field
-def test_recorded_transcripts_at_every_cut():
-    files = sorted((REAL / "modem").glob("at_*.txt"))
-    assert len(files) >= 11
-    for path in files:
-        data = path.read_bytes()
-        events = every_cut(data, framed)
-        assert every_cut(data.replace(b"\n", b"\r\n"), framed) == events
-        # nothing is lost: every line but echoes, finals and blanks stands in an event
-        text = "".join("".join(e.lines) for e in events if isinstance(e, Answer)).replace(" ", "")
-        for line in data.decode("latin-1").split("\n"):
-            if line.startswith("+Q"):
-                assert line.strip().replace(" ", "") in text, path.name
-
-
-def test_transcript_meaning():
-    answers = {name: [e for e in frame_transcript(data) if isinstance(e, Answer)] for name, data in TRANSCRIPTS.items()}
-    assert [(a.status, a.code) for a in answers["errors"]] == [("cme", "0"), ("error", None), ("cms", "301")]
-    assert answers["lf only"][1].lines == ('+QNWCFG: "nr5g_csi",3,1,4,5',)
-    assert answers["lf only"][1].status == "cut"
-    assert len(answers["glued"][0].lines) == 3
-    assert "glued" in answers["glued"][0].flags
-    assert answers["operator"][0].lines == ('+QSPN: "TOKYO OK","OK","",0,"99999"',)
-    assert answers["unsolicited"][0].lines == ("Quectel", "RM502Q-AE", "Revision: X")
-    assert frame_transcript(TRANSCRIPTS["unsolicited"])[:2] == [Unsolicited("RDY"), Unsolicited('+QIND: "csq",20,99')]
 
 
 def sent(*commands):
@@ -178,7 +127,6 @@ def test_two_commands_in_flight_are_refused():
 def test_any_bytes_in_any_pieces(data, cuts):
     places = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     pieces = [data[a:b] for a, b in pairwise(places)]
-    assert framed(pieces) == framed([data])
     assert live(pieces) == live([data])
 
 

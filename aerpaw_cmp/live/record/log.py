@@ -22,7 +22,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ...common.errors import InputError
-from ...logs.files.checksums import Record, decode_record, encode_record
+from ...logs.files.checksums import Record, encode_record
 
 
 @dataclass(frozen=True, slots=True)
@@ -410,49 +410,3 @@ def _disk_cause(error: OSError) -> str:
         errno.ENOTDIR: "part of the path is a file",
         errno.EEXIST: "part of the path is a file",
     }.get(error.errno or 0, "a failing disk or card")
-
-
-@dataclass(frozen=True, slots=True)
-class BadLine:
-    """A line of a log that is no record."""
-
-    path: Path
-    number: int
-    reason: str
-    torn_tail: bool
-
-
-def segments(source: Path) -> list[Path]:
-    """Log files of a folder in order, or the file itself.
-
-    Raises
-    ------
-    InputError
-        If there is none.
-    """
-    if source.is_dir():
-        files = sorted(source.glob("tap_*.jsonl"))
-        if files:
-            return files
-        raise InputError("no tap log in this folder", expected="tap_*.jsonl files", path=source)
-    if not source.exists():
-        raise InputError("no such file", expected="a tap log or its folder", path=source)
-    return [source]
-
-
-def read_log(source: Path, bad: list[BadLine] | None = None) -> Iterator[Record]:
-    """Records of a log, file or folder, in order; bad lines go to ``bad``."""
-    bad = [] if bad is None else bad
-    for path in segments(source):
-        try:
-            lines = path.read_bytes().split(b"\n")
-        except OSError as error:
-            raise InputError(f"cannot be read ({error.strerror})", expected="a tap log", path=path) from None
-        for number, line in enumerate(lines, 1):
-            try:
-                record = decode_record(line) if line.strip() else None
-            except ValueError as error:
-                bad.append(BadLine(path, number, str(error), number == len(lines)))
-                continue
-            if record is not None:
-                yield record

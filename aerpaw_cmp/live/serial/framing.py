@@ -1,9 +1,8 @@
 """Bytes of an AT port to answers and unsolicited lines: no file, no port, no clock.
 
-:class:`Framer` serves the tap, which knows the command in flight. :class:`TranscriptFramer` serves captured
-text, where commands show only as echoes. Both give the same events however the bytes are cut into pieces, and
-both hold a bounded buffer: a line is kept up to ``max_line_bytes``, an answer up to ``max_lines``; the rest is
-counted, not stored.
+:class:`Framer` knows the command in flight. It gives the same events however the bytes are cut into pieces, and holds
+a bounded buffer: a line is kept up to ``max_line_bytes``, an answer up to ``max_lines``; the rest is counted, not
+stored.
 
 A line ends at any run of CR and LF (a modem with echo ends the echo with CR CR LF). Bytes become text as Latin-1,
 so nothing that came in is lost, whatever it was.
@@ -85,7 +84,6 @@ _UNSOLICITED = re.compile(
 )
 _GLUE = re.compile(r"\"|\+[A-Z][A-Z0-9]{1,15}(?: ERROR)?:")
 _GLUED_OK = re.compile(r"[0-9\"\-]OK$")
-_ECHO = re.compile(r"AT(?:[+$&#*%^][A-Z]|[A-Z]?\d?$)", re.IGNORECASE)
 
 
 def _final_result(text: str) -> tuple[Status, str | None] | None:
@@ -386,71 +384,3 @@ class Framer:
     def _flag(self, flag: str) -> None:
         if self._open is not None and flag not in self._open.flags:
             self._open.flags.append(flag)
-
-
-class TranscriptFramer:
-    r"""Answers in captured text: an echoed command opens one, a final result or the next echo ends it.
-
-    Examples
-    --------
-    >>> framer = TranscriptFramer()
-    >>> [a.command for a in framer.feed(b"ATI\nQuectel\nOK\nAT\nOK\n")]
-    ['ATI', 'AT']
-    """
-
-    def __init__(self, *, max_line_bytes: int = _MAX_LINE_BYTES, max_lines: int = _MAX_LINES) -> None:
-        self._buffer = LineBuffer(max_line_bytes)
-        self._max_lines = max_lines
-        self._command: str | None = None
-        self._lines: list[str] = []
-        self._flags: list[str] = []
-
-    def feed(self, data: bytes) -> list[Event]:
-        """Events that these bytes complete, in their order."""
-        events: list[Event] = []
-        for line in self._buffer.feed(data):
-            self._line(line, events)
-        return events
-
-    def close(self) -> list[Event]:
-        """Events of what was left unfinished."""
-        events: list[Event] = []
-        for line in self._buffer.flush():
-            self._line(line, events)
-        self._end("cut", None, events)
-        return events
-
-    def _line(self, line: Line, events: list[Event]) -> None:
-        if line.dropped:
-            self._flags.append(f"overlong:{line.dropped}")
-        pieces = unglue(line.text) if not line.dropped else (line.text,)
-        if len(pieces) > 1:
-            self._flags.append("glued")
-        for text in pieces:
-            self._piece(text, events)
-
-    def _piece(self, text: str, events: list[Event]) -> None:
-        final = _final_result(text)
-        if final is not None:
-            self._end(final[0], final[1], events, even_empty=True)
-            return
-        if _ECHO.match(text):
-            self._end("cut", None, events)
-            self._command = text
-        elif self._command is None and is_unsolicited(text):
-            events.append(Unsolicited(text))
-        elif len(self._lines) < self._max_lines:
-            self._lines.append(text)
-
-    def _end(self, status: Status, code: str | None, events: list[Event], *, even_empty: bool = False) -> None:
-        if even_empty or self._command is not None or self._lines:
-            flags = tuple(dict.fromkeys(self._flags))
-            events.append(Answer(self._command, tuple(self._lines), status, code, flags))
-        self._command = None
-        self._lines, self._flags = [], []
-
-
-def frame_transcript(data: bytes) -> list[Event]:
-    """All events of a captured transcript."""
-    framer = TranscriptFramer()
-    return [*framer.feed(data), *framer.close()]

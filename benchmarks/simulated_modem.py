@@ -1,4 +1,4 @@
-"""A simulated modem with faults and a journal of its answers, and the tap's log, for tests and benchmarks of the tap."""
+"""A simulated modem with faults and a journal of its answers, and the log of the tap, for its tests and benchmarks."""
 
 from __future__ import annotations
 

@@ -25,13 +25,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, quote, urlsplit
 
 from ..common.errors import UsageError
 from .feed import Feed
-from .serial.ports import holders_of_sockets
 
 DEFAULT = "127.0.0.1:8765"
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
@@ -479,37 +477,11 @@ def _outward() -> list[str]:
 
 def _refused(address: Address, error: OSError) -> UsageError:
     """The error for an address that cannot be had."""
-    if error.errno != errno.EADDRINUSE:
-        cause = {
-            errno.EACCES: "ports below 1024 belong to the administrator",
-            errno.EADDRNOTAVAIL: "this computer has no such address",
-        }.get(error.errno or 0, "the name of another computer")
-        return UsageError(
-            f"--web {address}: {error.strerror}", expected=f"an address of this computer, e.g. {DEFAULT}", cause=cause
-        )
-    who = ", ".join(f"{h.name} (process {h.pid})" for h in holders_of_sockets(_listeners(address.port))[:4])
-    free = next((port for port in range(address.port + 1, 65_536) if _is_free(address.host, port)), None)
-    return UsageError(
-        f"--web {address}: port {address.port} is taken by {who or 'a process that we may not look at'}",
-        expected="a free port" if free is None else f"a free port, e.g. '--web {Address(address.host, free)}'",
-        cause="another tap or another server runs",
-    )
-
-
-def _is_free(host: str, port: int) -> bool:
-    family = socket.AF_INET6 if ":" in host else socket.AF_INET
-    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_STREAM) as probe:
-        probe.bind((host, port))
-        return True
-    return False
-
-
-def _listeners(port: int) -> set[int]:
-    """Inodes of the sockets that listen on a port, by ``/proc/net``."""
-    lines: list[str] = []
-    for name in ("tcp", "tcp6"):
-        with contextlib.suppress(OSError):
-            lines += Path(f"/proc/net/{name}").read_text().splitlines()[1:]
-    rows = [line.split() for line in lines]
-    listening = "0A"  # TCP_LISTEN
-    return {int(row[9]) for row in rows if row[3] == listening and int(row[1].rpartition(":")[2], 16) == port}
+    cause = {
+        errno.EADDRINUSE: "another tap or another server has this port",
+        errno.EACCES: "ports below 1024 belong to the administrator",
+        errno.EADDRNOTAVAIL: "this computer has no such address",
+    }.get(error.errno or 0, "the name of another computer")
+    taken = error.errno == errno.EADDRINUSE
+    expected = "a free port; 0 takes any" if taken else f"an address of this computer, e.g. {DEFAULT}"
+    return UsageError(f"--web {address}: {error.strerror}", expected=expected, cause=cause)

@@ -19,7 +19,7 @@ import select
 import stat
 import termios
 import time
-from collections.abc import Callable, Iterator, Set
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -186,24 +186,13 @@ def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
         wanted = path.stat().st_rdev
     except OSError:
         return []
-    # the master of a pseudo-terminal has another device number, so only openers of the port count
-    holding = _processes_with(lambda file: stat.S_ISCHR(file.st_mode) and file.st_rdev == wanted)
-    return [holder for holder in holding if not others_only or holder.pid != os.getpid()]
-
-
-def holders_of_sockets(inodes: Set[int]) -> list[Holder]:
-    """Processes that have one of these sockets open, as far as we may look."""
-    return _processes_with(lambda file: stat.S_ISSOCK(file.st_mode) and file.st_ino in inodes)
-
-
-def _processes_with(wanted: Callable[[os.stat_result], bool]) -> list[Holder]:
-    """Processes that have an open file of this kind, by their numbers."""
     holding = []
     for process in _processes():
         with contextlib.suppress(OSError):
-            if any(map(wanted, _open_files(process))):
+            # the master of a pseudo-terminal has another device number, so only openers of the port count
+            if any(stat.S_ISCHR(file.st_mode) and file.st_rdev == wanted for file in _open_files(process)):
                 holding.append(_holder(process))
-    return sorted(holding, key=lambda h: h.pid)
+    return sorted((h for h in holding if not others_only or h.pid != os.getpid()), key=lambda h: h.pid)
 
 
 def _processes() -> Iterator[Path]:

@@ -22,7 +22,6 @@ from aerpaw_cmp.jobs.learning.calibrate_rank import rank_samples
 from aerpaw_cmp.jobs.prediction import corrected_map
 from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.against import score_against
-from aerpaw_cmp.jobs.prediction.predict import write_maps
 from aerpaw_cmp.jobs.prediction.sources import named_flights
 from aerpaw_cmp.jobs.prediction.where import TargetOptions, Targets, find_targets
 from aerpaw_cmp.propagation.geometry.arrays import Link, single_element
@@ -259,28 +258,6 @@ def test_a_grid_has_its_heights_one_after_the_other():
     assert half == len(targets.grid)
     assert set(targets.position_m[:half, 2]) == {30.0}
     assert np.isnan(targets.yaw_deg).all()
-
-
-def test_maps_of_a_grid_hold_levels_and_their_spread_height_by_height(prediction, tmp_path):
-    rasterio = pytest.importorskip("rasterio")
-    targets = find_targets(
-        Path("lake_wheeler"), load_site("lake_wheeler"), TargetOptions(heights_m=(30.0, 50.0), spacing_m=300.0)
-    )
-    n = len(targets)
-    level, sd = np.arange(float(n)) - 100.0, np.full(n, 3.0)
-    table = pd.DataFrame({"tower": "LW1", "channel": "USRP1", "level_db": level, "sd_db": sd})
-    ranked = pd.DataFrame({"tower": ["LW1"], "channel": ["rank"]})
-    page = dataclasses.replace(prediction.page, table=pd.concat([table, ranked], ignore_index=True))
-    on_grid = dataclasses.replace(prediction, targets=targets, page=page)
-    files, notes = write_maps(on_grid, targets.grid, tmp_path)
-    assert [file.name for file in files] == ["prediction.kmz", "prediction.tif"]
-    assert notes == []
-    with rasterio.open(tmp_path / "prediction.tif") as book:
-        assert book.descriptions == tuple(
-            f"{name}_h{height}m_LW1_USRP1" for height in ("030", "050") for name in ("level_db", "sd_db")
-        )
-        np.testing.assert_array_equal(book.read(3)[::-1], targets.grid.raster(level[n // 2 :]))
-        assert set(np.unique(book.read(2))) == {3.0}
 
 
 def test_a_planned_flight_faces_its_course():

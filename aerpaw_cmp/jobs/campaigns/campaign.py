@@ -123,7 +123,6 @@ def run(
         rank=rank,
         rank_transfers=tuple(transfer_ranks(rank)),
         tracks=tuple(tracks[name] for name in files if name in tracks),
-        flown_ranks=flown,
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(repeated),

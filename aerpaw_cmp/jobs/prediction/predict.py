@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from html import escape
@@ -25,8 +24,6 @@ from ...flight.data import FlightData, choose_site, site_place
 from ...flight.drafting.remembered import remembered
 from ...flight.settings import FlightFile, LinkSettings, LinksSettings
 from ...flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
-from ...maps import export
-from ...maps.grid import Grid, Layer
 from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
 from ...report.pages.prediction import PredictionPage, outside_share, prediction_metrics, write_prediction
 from ...report.words.prediction import FLAGS, TITLES, cautions, first_words, heading_words, memory_cautions
@@ -531,7 +528,7 @@ def run_predict(
     target: TargetOptions,
     options: RunOptions = DEFAULT,
 ) -> JobOutcome:
-    """Predict and write ``prediction.csv``, ``.nc``, ``.html`` (of a grid ``.tif``, ``.kmz``) and figures.
+    """Predict and write ``prediction.csv``, ``.nc``, ``.html`` and figures.
 
     Parameters
     ----------
@@ -555,51 +552,6 @@ def run_predict(
         with output.filling() as place:
             options.progress("page")
             written, remarks = write_prediction(prediction.page, place)
-            if prediction.targets.grid is not None:
-                more, missing = write_maps(prediction, prediction.targets.grid, place)
-                written, remarks = [*written, *more], [*remarks, *missing]
         for text in remarks:
             options.progress(text)
         return JobOutcome(folder=folder, metrics=prediction_metrics(prediction.page), files=output.placed(written))
-
-
-# Cells of a grid that is also written as pictures for Google Earth.
-MOST_CELLS = 50_000
-
-
-def write_maps(prediction: Prediction, grid: Grid, folder: Path) -> tuple[list[Path], list[str]]:
-    """prediction.tif and, of smaller grids, prediction.kmz: level and its standard deviation by series and height.
-
-    Parameters
-    ----------
-    prediction : Prediction
-    grid : Grid
-        Of its targets.
-    folder : Path
-
-    Returns
-    -------
-    files : list of Path
-    said : list of str
-        What could not be written, and why.
-    """
-    heights, layers, n = prediction.targets.heights_m, [], len(grid)
-    levels = prediction.table[prediction.table["channel"] != "rank"]
-    for (tower, channel), rows in levels.groupby(["tower", "channel"], sort=False, observed=True):
-        for k, height in enumerate(heights):
-            part = rows.iloc[k * n : (k + 1) * n]
-            unit = prediction.sources[f"{tower}.{channel}"].unit
-            for name, quantity, of in (("level_db", "Level", unit), ("sd_db", "Standard deviation of the level", "dB")):
-                at = f"{name}_h{height:03.0f}m_" + re.sub(r"[^0-9A-Za-z]", "_", f"{tower}_{channel}")
-                title = f"{quantity}, {tower} {channel}, {height:g} m"
-                layers.append(Layer(at, part[name].to_numpy(np.float64).round(2), of, title))
-    towers = {name: tower.position_m.tolist() for name, tower in prediction.page.site.towers.items()}
-    maps = export.MapLayers(grid=grid, frame=prediction.page.site.frame, layers=layers, towers_m=towers)
-    written, remarks = [], []
-    if n <= MOST_CELLS:
-        written.append(export.write_kmz(folder / "prediction.kmz", maps, title=prediction.targets.name))
-    try:
-        written.append(export.write_geotiff(folder / "prediction.tif", maps))
-    except UsageError as missing:
-        remarks.append(str(missing))
-    return written, remarks

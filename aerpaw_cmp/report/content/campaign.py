@@ -359,7 +359,6 @@ class CampaignData(Made):
     rank_repeats: tuple[RankPairing, ...] = ()
     rank_transfers: tuple[RankTransfer, ...] = ()
     tracks: tuple[FlownTrack, ...] = ()
-    flown_ranks: tuple[FlownRank, ...] = ()
     radius_m: float = 3.0
     heading_within_deg: float | None = 20.0
     cell_m: float = 20.0

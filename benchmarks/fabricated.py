@@ -120,12 +120,11 @@ def rss_result(
         n_measured_out=score.n_measured_out, n_simulated_out=score.n_simulated_out, block_length=1,
         identifiable_db=score.identifiable_db,
         n_too_low=0, n_no_pose=0, n_outliers=0, rmse_without_outliers_db=score.rmse_db, n_flagged={}, clock=None,
-        baseline_rmse_ci95_db=score.baseline_intervals, compared_with={}, averaged={}, repeatability={},
-        explained_by={},
+        baseline_rmse_ci95_db=score.baseline_intervals, compared_with={}, averaged={},
     )  # fmt: skip
     given: dict[str, Any] = {
         "unit": "dB re full scale", "posed": np.ones(len(time), bool), "line_of_sight": np.ones(len(time)),
-        "geometry": {}, "residual_by": {}, "further": further,
+        "geometry": {}, "further": further,
         "spans": tuple(error_spans(time, score.residual_db, position_m=position_m, largest=1)),
     }  # fmt: skip
     return RssResult(

@@ -20,12 +20,11 @@ from .judge.causes import Cause
 from .judge.ladder import LadderRow
 from .level.detection import DetectionScore
 from .level.field_difference import FieldAudit
-from .level.rss import LEARNED_HERE, ChannelDifference, ErrorSpan, ResidualBins, RssComparison
+from .level.rss import LEARNED_HERE, ChannelDifference, ErrorSpan, RssComparison
 from .level.serving import ServingComparison
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .ranks.forecast import ForecastScore
 from .statistics.intervals import Interval, PairedDifference
-from .statistics.passes import Repeated
 
 # Models that a replay is held against, with their names in words; the last two know no physics.
 BASELINE_TITLE = {
@@ -131,8 +130,6 @@ class RssFurther:
     """Of a receiver that loses its lock or ends at a floor."""
     snr: SnrScore | None = None
     """Of a ratio to the noise whose receiver's bandwidth is given."""
-    repeatability: Mapping[str, Repeated]
-    explained_by: Mapping[str, float]
     rmse_bound: str | None = None
     """Reason why the interval of the RMSE is a lower bound alone, where it is."""
     simulated_sd_db: float | None = None
@@ -170,8 +167,6 @@ class RssResult:
         Free space, two-ray and lines.
     spans : tuple of ErrorSpan
         Stretches with the largest errors.
-    residual_by : mapping of str to ResidualBins
-        Residual against each quantity of the geometry, time and line of sight.
     further : RssFurther
     """
 
@@ -188,7 +183,6 @@ class RssResult:
     score: RssComparison
     baselines: Mapping[str, ModelLevel]
     spans: tuple[ErrorSpan, ...]
-    residual_by: Mapping[str, ResidualBins]
     further: RssFurther
     stated: StatedSpread | None = None
     """Error bars of the simulated level that learned antennas state."""

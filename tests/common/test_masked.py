@@ -54,7 +54,6 @@ CASES: dict[str, tuple[Callable[[Any], Any], Any]] = {
     "histogram": (rank.histogram, RANKS),
     "agreement": (lambda r: (rank.agreement(r, RANKS), rank.cohen_kappa(RANKS, r)), np.roll(RANKS, 1)),
     "comparison": (lambda z: rss.compare_rss(TIMES, z, LEVELS), LEVELS + CHANCE.normal(size=40)),
-    "bins": (lambda z: rss.bin_residual(LEVELS, z, 4), TIMES),
     "curve": (lambda y: fit_biexponential(1.0 + TIMES, y), fall_off(1.0 + TIMES)),
     "variogram": (lambda z: variogram.Variogram().fit(PLACES, z)(TIMES), LEVELS),
     "correlation": (lambda z: statistics.correlation(z, TIMES), LEVELS),
@@ -102,4 +101,4 @@ def test_no_function_of_arrays_looks_under_a_mask() -> None:
     assert not wrong
 
 
-ALLOWED = {"seconds", "nanoseconds", "local_text", "compare_rss", "bin_residual", "raster", "unmasked"}
+ALLOWED = {"seconds", "nanoseconds", "local_text", "compare_rss", "raster", "unmasked"}

@@ -1,6 +1,5 @@
 """Comparison of levels: hard cases, the same footing, residuals and spans."""
 
-import itertools
 import json
 from functools import partial
 
@@ -10,7 +9,6 @@ import pytest
 from aerpaw_cmp.common.jsonable import json_safe
 from aerpaw_cmp.compare.level.rss import (
     averaged_fits,
-    bin_residual,
     channel_difference,
     compare_rss,
     error_spans,
@@ -19,7 +17,7 @@ from aerpaw_cmp.compare.level.rss import (
     outliers,
     seconds,
 )
-from aerpaw_cmp.compare.statistics.intervals import autocorrelation, error_intervals
+from aerpaw_cmp.compare.statistics.intervals import error_intervals
 from tests.real_logs import dataset12
 
 NAN = float("nan")
@@ -178,14 +176,6 @@ def test_link_geometry_in_the_antenna_frames():
     np.testing.assert_allclose(level["heading_deg"], 30.0)
 
 
-def test_empty_and_constant_quantities():
-    empty = bin_residual([NAN], [1.0])
-    assert empty.n.sum() == 0
-    assert np.isnan(empty.explained)
-    constant = bin_residual([1.0, 2.0], [5.0, 5.0], 3)
-    assert constant.n.sum() == 2
-
-
 @pytest.mark.field
 @pytest.mark.parametrize("name", ["40m_fs10MHz", "70m_fs20MHz"])
 def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
@@ -201,33 +191,6 @@ def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
         assert 4.5 < fit.rmse_db < 7.2
         assert fit.intervals.autocorrelation.n_effective < 0.05 * fit.n  # 0.26 s apart: neighbours repeat each other
         assert fit.correlation > 0.5
-
-
-def test_bins_and_their_intervals_are_those_by_hand():
-    rng = np.random.default_rng(14)
-    quantity, residual = rng.uniform(0.0, 10.0, 200), rng.normal(size=200)
-    residual[1:] += 0.6 * residual[:-1]
-    quantity[:4] = 2.0, 4.0, 10.0, 11.0  # a border belongs to the bin above it, the last one to its own
-    edges = np.array([0.0, 2.0, 4.0, 10.0])
-    bins, inside = bin_residual(residual, quantity, edges), quantity <= 10.0
-    memory = autocorrelation(residual[inside])
-    rest = 0.0
-    for k, (low, high) in enumerate(itertools.pairwise(edges)):
-        part = residual[(quantity >= low) & ((quantity < high) | ((quantity == 10.0) & (high == 10.0)))]
-        reach = 1.96 * part.std() / np.sqrt(len(part) * memory.n_effective / memory.n - 1.0)
-        assert bins.n[k] == len(part)
-        assert (bins.mean_db[k], bins.rmse_db[k]) == pytest.approx((part.mean(), np.sqrt(np.mean(part**2))))
-        assert (bins.low_db[k], bins.high_db[k]) == pytest.approx(
-            (part.mean() - reach, part.mean() + reach), nan_ok=True
-        )
-        rest += np.sum((part - part.mean()) ** 2)
-    assert np.isfinite(bins.low_db).any()
-    total = np.sum((residual[inside] - residual[inside].mean()) ** 2)
-    assert bins.explained == pytest.approx(1.0 - rest / total)
-    assert bin_residual(residual, quantity).edges == pytest.approx(np.linspace(quantity.min(), 11.0, 13))
-    assert bin_residual([1.0], [3.0], 2).edges.tolist() == [3.0, 3.5, 4.0]
-    halves = bin_residual(residual, quantity > 5.0)  # a truth value has two bins
-    assert halves.n.tolist() == [(quantity <= 5.0).sum(), (quantity > 5.0).sum()]
 
 
 def test_spans_are_runs_of_smoothed_errors_of_one_sign():

@@ -20,7 +20,7 @@ from aerpaw_cmp.compare.statistics.intervals import (
     paired_difference,
     share_interval,
 )
-from aerpaw_cmp.compare.statistics.passes import Visit, repeatability, same_places
+from aerpaw_cmp.compare.statistics.passes import Visit, same_places
 
 
 def shadowing(rng, n, samples, sigma):
@@ -368,24 +368,6 @@ def test_pairs_that_cannot_be_compared():
     same = paired_difference(np.arange(100.0), np.arange(100.0))
     assert same.verdict == "not significant"
     assert same.difference_db == 0.0
-
-
-def test_repeatability_floor_of_two_passes():
-    rng = np.random.default_rng(9)
-    here = np.column_stack([np.linspace(0, 500, 2000), np.zeros(2000), np.full(2000, 40.0)])
-    there = here[::-1] + rng.normal(0, 0.1, (2000, 3))
-    field = 5 * np.sin(here[:, 0] / 20)
-    first = -60 + field + rng.normal(0, 2, 2000)
-    second = -57 + field[::-1] + rng.normal(0, 2, 2000)
-    first[:50] = np.nan
-    repeated = repeatability(Visit(here, first), Visit(there, second))
-    assert repeated.rmse_db == pytest.approx(np.sqrt(8.0), rel=0.1)
-    assert repeated.rmse_ci95_db[0] < np.sqrt(8.0) < repeated.rmse_ci95_db[1]
-    north, south = np.zeros(2000), np.full(2000, 180.0)
-    assert repeatability(Visit(here, first, north), Visit(there, second, south)).n == 0
-    nowhere = repeatability(Visit(here, first), Visit(there + 100.0, second))
-    assert nowhere.n == 0
-    assert np.isnan(nowhere.rmse_db)
 
 
 def test_same_places_pairs_the_nearest_and_wraps_headings():

@@ -16,9 +16,9 @@ from numpy.typing import ArrayLike
 
 from ...common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ...common.jsonable import named
-from ...common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
+from ...common.units import BoolArray, FloatArray, db_from_power, power_from_db, unmasked
 from ..offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve
-from ..statistics.intervals import NO_INTERVAL, ErrorIntervals, Interval, autocorrelation, correlation, error_intervals
+from ..statistics.intervals import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals
 
 # Two channels of one receiver "part" where they differ by more than this [dB].
 PART_DB = 10.0
@@ -368,90 +368,6 @@ def link_geometry(
 def _direction_deg(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Azimuth from x towards y and elevation above the x-y plane [deg]."""
     return np.degrees(azimuth_rad(vector)), np.degrees(elevation_rad(vector))
-
-
-@dataclass(frozen=True, slots=True)
-class ResidualBins:
-    """Residual against one quantity.
-
-    Parameters
-    ----------
-    edges : (bins + 1,)
-        Of the quantity.
-    n : (bins,) int
-        Samples per bin.
-    mean_db, rmse_db : (bins,)
-        Of the residual; NaN in empty bins.
-    low_db, high_db : (bins,)
-        95 % interval of the mean, from the bin's share of the effective sample size; NaN below two.
-    explained : float
-        Share of the residual's variance that the bin means explain (eta squared).
-    """
-
-    edges: FloatArray
-    n: IntArray
-    mean_db: FloatArray
-    rmse_db: FloatArray
-    low_db: FloatArray
-    high_db: FloatArray
-    explained: float
-
-
-def bin_residual(residual_db: ArrayLike, quantity: ArrayLike, edges: ArrayLike | int = 12) -> ResidualBins:
-    """Mean and RMSE of the residual in bins of a quantity.
-
-    Parameters
-    ----------
-    residual_db, quantity : array_like, (n,)
-        Pairs with a NaN do not count. A quantity of booleans (line of sight) makes two bins.
-    edges : array_like or int
-        Bin edges, or the number of equal bins between the extremes.
-
-    Examples
-    --------
-    >>> bins = bin_residual([1.0, 3.0, -2.0], [10.0, 11.0, 30.0], [0, 20, 40])
-    >>> bins.mean_db.tolist(), bins.n.tolist()
-    ([2.0, -2.0], [2, 1])
-    """
-    residual = _levels(residual_db)
-    values = unmasked(quantity)
-    ok = np.isfinite(residual) & np.isfinite(values)
-    r, v = residual[ok], values[ok]
-    limits = np.array([-0.5, 0.5, 1.5]) if np.asarray(quantity).dtype == bool else _edges(v, edges)
-    bins = len(limits) - 1
-    where = np.clip(np.searchsorted(limits, v, side="right") - 1, -1, bins)
-    where = np.where(v == limits[-1], bins - 1, where)  # the last bin is closed
-    inside = (where >= 0) & (where < bins)
-    where, r = where[inside], r[inside]
-    n = np.bincount(where, minlength=bins).astype(np.int64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        mean = np.bincount(where, weights=r, minlength=bins) / n
-        centred = r - mean[where]
-        variance = np.bincount(where, weights=centred**2, minlength=bins) / n
-        known = autocorrelation(r)
-        share = known.n_effective / max(known.n, 1)
-        reach = 1.96 * np.sqrt(variance / np.maximum(n * share - 1.0, 0.0))
-    reach = np.where(np.isfinite(reach), reach, np.nan)
-    total = float(np.sum((r - r.mean()) ** 2)) if len(r) else 0.0
-    explained = 1.0 - float(np.sum(centred**2)) / total if total > 0 else float("nan")
-    return ResidualBins(
-        edges=limits,
-        n=n,
-        mean_db=mean,
-        rmse_db=np.sqrt(mean**2 + variance),
-        low_db=mean - reach,
-        high_db=mean + reach,
-        explained=explained,
-    )
-
-
-def _edges(values: FloatArray, edges: ArrayLike | int) -> FloatArray:
-    if not isinstance(edges, (int, np.integer)):
-        return unmasked(edges)
-    if not len(values):
-        return np.array([0.0, 1.0])
-    low, high = float(values.min()), float(values.max())
-    return np.linspace(low, high if high > low else low + 1.0, int(edges) + 1)
 
 
 @dataclass(frozen=True, slots=True)

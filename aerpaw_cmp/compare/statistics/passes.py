@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ...common.units import BoolArray, FloatArray, IntArray, wrap_degrees
-from .intervals import NO_INTERVAL, Interval, correlation, error_intervals, spread_interval
+from .intervals import Interval, correlation, spread_interval
 
 # Samples of two passes nearer than this were taken at the same place.
 SAME_PLACE_M = 2.0
@@ -43,25 +43,6 @@ class Visit:
 def same_places(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> tuple[IntArray, IntArray]:
     """Indices into both passes: samples with a value, and the nearest ones of the other pass within a radius [m]."""
     return first.places.partners(second.places, radius_m, _HEADING_WITHIN_DEG)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Repeated:
-    """Difference of two passes of the same places [dB], over ``n`` pairs: no model can be expected to do better."""
-
-    rmse_db: float
-    rmse_ci95_db: Interval
-    n: int
-
-
-def repeatability(first: Visit, second: Visit, radius_m: float = SAME_PLACE_M) -> Repeated:
-    """Standard deviation of the difference of levels of two passes: two flights, or two parts of one."""
-    rows, partners = same_places(first, second, radius_m)
-    if not len(rows):
-        return Repeated(rmse_db=float("nan"), rmse_ci95_db=NO_INTERVAL, n=0)
-    level, repeated = first.value[rows], second.value[partners]
-    bounds = error_intervals(level, repeated).rmse_db
-    return Repeated(rmse_db=float((repeated - level).std()), rmse_ci95_db=bounds, n=len(rows))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

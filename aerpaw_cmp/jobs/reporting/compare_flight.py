@@ -42,7 +42,7 @@ from ...compare.result import (
 )
 from ...compare.statistics import intervals as statistics
 from ...compare.statistics.memory import memory_share
-from ...compare.statistics.passes import Visit, repeatability
+from ...compare.statistics.passes import Visit
 from ...flight.data import FlightData, RankSeries, RssSeries
 from ...flight.drafting.remembered import errors_elsewhere, lock_elsewhere
 from ...flight.gains.losses import direct_foliage_m
@@ -156,11 +156,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         lag_s = clock.result.radio_minus_telemetry_s
         score = dataclasses.replace(score, lag_s=lag_s, fitted_on_scored=(*score.fitted_on_scored, *also))
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
-    quantities = {**case.geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
-    residual_by = {name: rss.bin_residual(score.residual_db, values) for name, values in quantities.items()}
     spans = _worst(series.time, score.residual_db, case.position_m, case.geometry, direct)
     if case.trained:
-        score, residual_by, spans = rss.without_errors(score), {}, []
+        score, spans = rss.without_errors(score), []
     stated = _with_lock(case, score, stated_spread(replayed))
     return RssResult(
         **named(series, "tower channel unit time"),
@@ -173,8 +171,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         score=score,
         baselines=_baselines(case.simple, score),
         spans=tuple(spans),
-        residual_by=residual_by,
-        further=_further(case, score, stated, {name: table.explained for name, table in residual_by.items()}),
+        further=_further(case, score, stated),
         stated=stated,
     )
 
@@ -226,9 +223,7 @@ def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
     )
 
 
-def _further(
-    case: _Case, score: rss.RssComparison, stated: StatedSpread | None, explained_by: Mapping[str, float]
-) -> RssFurther:
+def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> RssFurther:
     """Counts, conditions and, where it may be scored, further views of the error.
 
     Parameters
@@ -237,8 +232,6 @@ def _further(
     score : RssComparison
     stated : StatedSpread, optional
         Error bars that learned antennas state.
-    explained_by : mapping of str to float
-        Share of the residual's variance by quantity.
 
     Returns
     -------
@@ -246,7 +239,6 @@ def _further(
     """
     settings, levels, series, replayed = case.settings, case.levels, case.series, case.replayed
     wild = rss.outliers(levels.measured_db)
-    passes = _halves(series.time, case.position_m, levels.measured_db, case.geometry.get("heading_deg"))
     detection = None if case.trained else _detection(case.data, series, levels, case.simple["free_space"])
     further = RssFurther(
         **named(score, "n_measured_out n_simulated_out identifiable_db"),
@@ -260,8 +252,6 @@ def _further(
         baseline_rmse_ci95_db=score.baseline_intervals,
         compared_with={},
         averaged={},
-        explained_by=explained_by,
-        repeatability={name: repeatability(*pair, _PASSES_WITHIN_M) for name, pair in passes.items()},
         simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
         error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
         elsewhere=_elsewhere(case.data, series, score, detection),

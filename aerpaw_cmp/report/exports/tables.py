@@ -79,7 +79,6 @@ def _rss_metrics(series: RssResult) -> dict[str, Any]:
         "fitted": score.fitted_on_scored,
         "baselines": {name: named(model, "offset_db rmse_db") for name, model in series.baselines.items()},
         **fields_of(series.further),
-        "residual_by": series.residual_by,
     }
 
 

@@ -20,7 +20,6 @@ from .statistics.intervals import (
     SEED,
     Interval,
     autocorrelation,
-    block_variance,
     bootstrap_means,
     interval,
     share_interval,
@@ -865,7 +864,7 @@ class RankRepeat:
 def repeat_rank(
     first: Visit, second: Visit, radius_m: float = SAME_PLACE_M, *, replicates: int = REPLICATES
 ) -> RankRepeat:
-    """Kappa of the ranks that two passes report at the same places (two flights, or two parts of one).
+    """Kappa of the ranks that two passes of a flight report at the same places.
 
     Parameters
     ----------
@@ -874,7 +873,7 @@ def repeat_rank(
     radius_m : float
         A sample pairs with the nearest one of the other pass within this distance.
     replicates : int
-        Bootstrap; with 0 replicates the interval is in closed form, to first order.
+        Of the bootstrap.
 
     Returns
     -------
@@ -887,23 +886,8 @@ def repeat_rank(
         return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
     a, b = _pairs(ranks[0][rows], ranks[1][partners])
     agree, kappa = agreement(a, b), cohen_kappa(a, b)
-    if replicates:
-        bounds = _pair_intervals(a, b, (agree, kappa, float("nan"), float("nan")), replicates)[1]
-    else:
-        bounds = _kappa_interval(a, b, kappa)
+    bounds = _pair_intervals(a, b, (agree, kappa, float("nan"), float("nan")), replicates)[1]
     return RankRepeat(kappa=kappa, kappa_ci95=bounds, agreement=agree, n=len(a))
-
-
-def _kappa_interval(a: IntArray, b: IntArray, kappa: float) -> Interval:
-    """95 % interval of kappa to first order: block variance of what each pair adds to it, without resamples."""
-    if len(a) < 2 or not np.isfinite(kappa):
-        return NO_INTERVAL
-    influence, _, (low, high) = _pair_statistics((a == b).astype(np.float64), one_hot(a), one_hot(b))[1]
-    known = autocorrelation(influence)
-    if not known.enough or not _explored(a, b):
-        return NO_INTERVAL
-    reach = known.half_width * float(np.sqrt(block_variance(influence - influence.mean(), known.block_length)))
-    return max(low, kappa - reach), min(high, kappa + reach)
 
 
 def _explored(a: IntArray, b: IntArray) -> bool:

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.jobs.campaigns import over_flights
 from aerpaw_cmp.jobs.campaigns.campaign_plan import Outcomes
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Outcome, Task
-from aerpaw_cmp.jobs.campaigns.over_flights import pool_offsets, rank_repeats
-from aerpaw_cmp.report.content.campaign import FlownRank, FlownTrack, RssRow
+from aerpaw_cmp.jobs.campaigns.over_flights import pool_offsets
+from aerpaw_cmp.report.content.campaign import FlownTrack, RssRow
 
 
 def rows(flights: int = 6, links: int = 2, samples: int = 120) -> list[RssRow]:
@@ -27,29 +26,13 @@ def rows(flights: int = 6, links: int = 2, samples: int = 120) -> list[RssRow]:
                     flight=f"f{flight}", setting="s", tower="LW1", channel=f"USRP{link}", unit="dBm", offset_db=0.0,
                     rmse_db=2.0, correlation=1.0, n=samples, n_out_of_coverage=0, at_search_edge=False,
                     rmse_ci95_db=None, offset_ci95_db=None, correlation_ci95=None, n_effective=1.0, lag_s=0.0,
-                    lag_verdict="", fitted=(), baselines={}, span_db=(-50.0, 50.0), time_s=share,
+                    lag_verdict="", fitted=(), baselines={}, span_db=(-50.0, 50.0),
                     distance_m=np.zeros(samples), position_m=place, simulated_dbm=simulated,
                     measured_db=np.where(rng.random(samples) < 0.1, np.nan, simulated + rng.normal(0, 2, samples)),
                     heading_deg=None if flight == 2 else rng.normal(90.0, 5.0, samples),
                 )
             )  # fmt: skip
     return out
-
-
-def test_flights_of_ranks_that_lie_apart_are_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
-    asked = []
-    real = over_flights.repeat_rank
-    monkeypatch.setattr(over_flights, "repeat_rank", lambda *a, **k: asked.append(1) or real(*a, **k))
-    rng = np.random.default_rng(1)
-    place = np.column_stack([np.linspace(0.0, 300.0, 300), np.zeros(300), np.full(300, 30.0)])
-    rank = rng.integers(1, 5, 300).astype(float)
-    flown = [
-        FlownRank(flight=f"f{i}", tower="LW1", position_m=place + np.array([0.0, away, 0.0]), rank=rank)
-        for i, away in enumerate((0.0, 1.0, 500.0))
-    ]
-    (pair,) = rank_repeats(flown, 3.0)
-    assert (pair.first, pair.second, pair.n, pair.kappa) == ("f0", "f1", 300, 1.0)
-    assert len(asked) == 1
 
 
 def test_many_settings_are_held_in_the_memory_of_one() -> None:

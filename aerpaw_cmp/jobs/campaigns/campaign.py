@@ -24,7 +24,7 @@ from ..options import DEFAULT, RunOptions
 from ..tasks.workers import open_workers
 from .campaign_plan import compute, kept_outcomes
 from .campaign_tasks import Task, counted_once, flight_data, outcome_store
-from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
+from .over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 
 # Label of the only setting of a campaign that names none.
 _AS_WRITTEN = "as written"
@@ -105,12 +105,10 @@ def run(
         compute(orders, crew, outcomes, store, progress)
     results = counted_once(tasks, [outcomes[number] for number in range(len(tasks))])
     rank = tuple(row for o in results for row in o.rank)
-    flown = tuple(flown_rank for o in results for flown_rank in o.flown)
     failures += [o.failure for o in results if o.failure is not None]
     with stages("pool"):
         rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
         repeated = repeats([r for r in rows if r.setting == next(iter(settings))], campaign.repeatability)
-        ranks_again = rank_repeats(flown, campaign.repeatability.radius_m)
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
     tracks = {o.track.flight: o.track for o in reversed(results) if o.track is not None}
     return CampaignData(
@@ -126,7 +124,6 @@ def run(
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(repeated),
-        rank_repeats=tuple(ranks_again),
         **named(campaign.repeatability, "radius_m heading_within_deg cell_m"),
         site=flight_data(good[0]).site if good else None,
         synthetic=tuple(name for name, (_, f) in files.items() if f.flight.synthetic),

@@ -27,7 +27,7 @@ from ...flight.marks import among
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import logs_of, series_mark
-from ...report.content.campaign import Failure, FlownRank, FlownTrack, RankRow, RssRow
+from ...report.content.campaign import Failure, FlownTrack, RankRow, RssRow
 from ..reporting.flight_run import run_flight
 from ..tasks.outcomes import OutcomeStore, code_digest, task_inputs, task_key
 
@@ -53,7 +53,6 @@ class Outcome:
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
     track: FlownTrack | None = None
-    flown: tuple[FlownRank, ...] = ()
 
 
 def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -147,10 +146,6 @@ def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
             for row in _rank_rows(task, compared, _identity(data, series))
         ),
         track=_flown(task, result),
-        flown=tuple(
-            FlownRank(flight=task.flight, tower=item.tower, position_m=item.position_m, rank=item.measured)
-            for item in result.rank
-        ),
     )
 
 
@@ -277,7 +272,6 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
         rank=tuple(dataclasses.replace(item, flight=task.flight, setting=task.setting) for item in outcome.rank),
         failure=failure,
         track=outcome.track and dataclasses.replace(outcome.track, flight=task.flight),
-        flown=tuple(dataclasses.replace(item, flight=task.flight) for item in outcome.flown) if task.reference else (),
     )
 
 

@@ -4,19 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from ...common.jsonable import named
-from ...common.units import FloatArray, finite_mean
+from ...common.units import finite_mean
 from ...common.yamlfile import StrictModel
 from ...compare.offset import Pooling, pooled_moments
-from ...compare.rank import repeat_rank
-from ...compare.statistics.passes import Pass, PassPair, PassTable, Visit
+from ...compare.statistics.passes import Pass, PassPair, PassTable
 from ...flight.settings import Positive
-from ...report.content.campaign import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
+from ...report.content.campaign import PooledOffset, RankRow, RankTransfer, Repeat, RssRow
 
 
 class RepeatSettings(StrictModel):
@@ -112,39 +110,6 @@ def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat
         single_db=pair.rmse_db / 2.0**0.5,
         **named(pair, same),
     )
-
-
-def rank_repeats(flown: Sequence[FlownRank], radius_m: float) -> list[RankPairing]:
-    """Every pair of flights that reported ranks to one tower at the same places."""
-    out = []
-    boxes = [_box(item.position_m) for item in flown]
-    for (i, first), (j, second) in combinations(enumerate(flown), 2):
-        if first.tower != second.tower or first.flight == second.flight:
-            continue
-        if not _near(boxes[i], boxes[j], radius_m):
-            continue
-        passes = Visit(first.position_m, first.rank), Visit(second.position_m, second.rank)
-        repeated = repeat_rank(*passes, radius_m, replicates=0)
-        if repeated.n:
-            out.append(
-                RankPairing(
-                    tower=first.tower,
-                    first=first.flight,
-                    second=second.flight,
-                    **named(repeated, "n agreement kappa kappa_ci95"),
-                )
-            )
-    return out
-
-
-def _box(position_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Lowest and highest coordinates of the places that are known."""
-    placed = position_m[np.isfinite(position_m).all(axis=1)]
-    return placed.min(axis=0, initial=np.inf), placed.max(axis=0, initial=-np.inf)
-
-
-def _near(first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray], radius_m: float) -> bool:
-    return bool((first[0] <= second[1] + radius_m).all() and (second[0] <= first[1] + radius_m).all())
 
 
 def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:

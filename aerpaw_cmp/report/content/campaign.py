@@ -120,35 +120,6 @@ class RankRow:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlownRank:
-    """Samples of the rank of one flight and tower under the first setting.
-
-    ``rank`` (n,) as reported, NaN where none; ``position_m`` (n, 3).
-    """
-
-    flight: str
-    tower: str
-    position_m: FloatArray
-    rank: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RankPairing:
-    """Reported ranks of two flights at the same places: no model can be expected to agree better.
-
-    ``kappa`` and ``agreement`` are those of the ``n`` pairs (:func:`~aerpaw_cmp.compare.rank.repeat_rank`).
-    """
-
-    tower: str
-    first: str
-    second: str
-    n: int
-    agreement: float
-    kappa: float
-    kappa_ci95: Interval | None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
     """A flight (and setting) that gave no numbers, and why; ``traceback`` for whoever mends it, never on the page."""
 
@@ -356,7 +327,6 @@ class CampaignData(Made):
     failures: tuple[Failure, ...] = ()
     pooled: tuple[PooledOffset, ...] = ()
     repeats: tuple[Repeat, ...] = ()
-    rank_repeats: tuple[RankPairing, ...] = ()
     rank_transfers: tuple[RankTransfer, ...] = ()
     tracks: tuple[FlownTrack, ...] = ()
     radius_m: float = 3.0

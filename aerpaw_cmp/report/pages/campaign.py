@@ -5,14 +5,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterable, Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from ...common.cells import guarded
 from ...common.jsonable import fields_of, json_safe, named
-from ..content.campaign import CampaignData, RankPairing, Repeat
+from ..content.campaign import CampaignData, Repeat
 from ..content.made import about
 from ..figures import campaign as campaign_figures
 from ..kit import canvas
@@ -61,9 +61,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "pairs_total": len(data.repeats),
             "links": by_link(data.repeats),
             "pairs": telling(data.repeats),
-            "rank_pairs_total": len(data.rank_repeats),
-            "rank_pairs": telling(data.rank_repeats),
-            "table": f"{_PAIR_TABLE}.csv" if data.repeats or data.rank_repeats else None,
+            "table": f"{_PAIR_TABLE}.csv" if data.repeats else None,
         },
         "season": {
             **named(data.season, "held_out started ranking drift"),
@@ -151,7 +149,7 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
         write_file(folder / "campaign.json", json_text(campaign_metrics(data), indent)),
         write_file(folder / "campaign.csv", guarded(table).to_csv(index=False, lineterminator="\n")),
     ]
-    if data.repeats or data.rank_repeats:
+    if data.repeats:
         pairs = pair_frame(data)
         written.append(
             write_file(folder / f"{_PAIR_TABLE}.csv", guarded(pairs).to_csv(index=False, lineterminator="\n"))
@@ -165,17 +163,14 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
 
 # --- pairs of flights at the same places -----------------------------------------------------------------------------
 
-# Pairs of each kind that campaign.json lists; of more, those with the most places.
+# Pairs that campaign.json lists; of more, those with the most places.
 LISTED_PAIRS = 1000
 
 # The file with all of them, less its ending.
 _PAIR_TABLE = "pairs"
 
 
-Pair = TypeVar("Pair", Repeat, RankPairing)
-
-
-def telling(pairs: Sequence[Pair], most: int = LISTED_PAIRS) -> list[Pair]:
+def telling(pairs: Sequence[Repeat], most: int = LISTED_PAIRS) -> list[Repeat]:
     """All pairs, or of more than ``most`` those with the most places, in their order."""
     chosen = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))[:most]
     return [pairs[i] for i in sorted(chosen)]
@@ -206,9 +201,8 @@ def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
 
 
 def pair_frame(data: CampaignData) -> pd.DataFrame:
-    """One row per pair of flights, tower and channel (``kind`` rss), or tower (``kind`` rank)."""
-    kinds: dict[str, Sequence[Any]] = {"rss": data.repeats, "rank": data.rank_repeats}
-    table: pd.DataFrame = pd.DataFrame([{"kind": kind, **cells(p)} for kind, pairs in kinds.items() for p in pairs])
+    """One row per pair of flights, tower and channel."""
+    table: pd.DataFrame = pd.DataFrame([cells(pair) for pair in data.repeats])
     return table
 
 

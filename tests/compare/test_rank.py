@@ -435,25 +435,6 @@ def test_bars_of_a_histogram_have_wilsons_intervals(pair):
     assert ranks._histogram_intervals(measured[:1], 10) == [NO_INTERVAL] * MAX_RANK
 
 
-def test_kappa_without_resamples_has_the_variance_of_what_each_pair_adds(pair):
-    a, b = (x.astype(float) for x in pair)
-    kappa = ranks.cohen_kappa(a, b)
-    low, high = ranks._kappa_interval(a, b, kappa)
-    influence = ranks.kappa_parts(*pair)[1]
-    known = autocorrelation(influence)
-    drawn = bootstrap_means((influence - influence.mean())[:, None], known.block_length, replicates=20_000, seed=1)
-    reach = known.half_width * float(drawn.std())
-    assert (kappa - low, high - kappa) == pytest.approx((reach, reach), rel=0.03)
-    assert ranks._kappa_interval(a, b, float("nan")) == NO_INTERVAL
-    assert ranks._kappa_interval(a[:1], b[:1], 1.0) == NO_INTERVAL
-    few, other = np.repeat([1.0, 2.0], 40), np.repeat([1.0, 2.0], [30, 50])  # one change: no independent samples
-    assert ranks._kappa_interval(few, other, ranks.cohen_kappa(few, other)) == NO_INTERVAL
-    high_end = ranks._kappa_interval(a, np.where(np.arange(len(a)) < 6, 5 - a, a), 0.99)
-    assert high_end[1] <= 1.0
-    with_resamples = ranks._pair_intervals(*pair, (0, kappa, 0, 0), 2000)[1]
-    assert (low, high) == pytest.approx(with_resamples, abs=0.15 * (high - low))
-
-
 @pytest.mark.parametrize(("n", "given"), [(8, None), (9, None), (41, None), (120, 5), (120, 31), (12, 4)])
 def test_the_shift_test_counts_every_shift_that_is_apart(n, given):
     """Shifts nearer than a block (at most a quarter of the flight) on either side do not count."""

@@ -38,7 +38,6 @@ BASELINE = {
     "log_distance": ("#CC79A7", (0, (6, 2, 1, 2))),
     "constant": ("#0072B2", (0, (8, 3))),
 }
-OUT_OF_COVERAGE = "#BBBBBB"
 TOWER = "#C1121F"
 _BUILDING = "#8A8A8A"
 _FOREST = "#B9D8B0"

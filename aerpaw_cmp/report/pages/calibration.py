@@ -84,24 +84,6 @@ def draw_antenna(antenna: AntennaMap) -> Figure:
     return fig
 
 
-def draw_scores(data: CalibrationData) -> Figure:
-    """Mean RMSE of every split and control beside free space."""
-    left_out = data.scores["flight_left_out"]
-    rows = [(title, _mean(left_out, key)) for key, title in BASELINES.items()]
-    rows += [(SPLIT_TITLE.get(k, k), _mean(v)) for k, v in data.scores.items()]
-    rows += [(f"control: {k}", _mean(v)) for k, v in data.controls.items()]
-    rows = [(name, value) for name, value in rows if np.isfinite(value)]
-    fig, ax = canvas.subplots((9.2, 0.4 * len(rows) + 1.0))
-    names, values = [r[0] for r in rows][::-1], [r[1] for r in rows][::-1]
-    pale = [n in BASELINES.values() or "control" in n for n in names]
-    colours = [canvas.OUT_OF_COVERAGE if reference else canvas.SIMULATED for reference in pale]
-    ax.barh(names, values, color=colours)
-    for y, value in enumerate(values):
-        ax.text(value, y, f" {value:.2f}", va="center", fontsize=8)
-    ax.set_xlabel("mean RMSE over flights and channels [dB]")
-    return fig
-
-
 def draw_curve(data: CalibrationData) -> Figure:
     """Error on flights left out against the number of flights learned from, and what one more would bring."""
     fig, ax = canvas.subplots((7.0, 3.8))
@@ -127,12 +109,6 @@ def _mean(rows: Sequence[Mapping[str, Any]], key: str = "rmse_db") -> float:
 
 def figure_specs(data: CalibrationData) -> Iterator[FigureSpec]:
     """All figures."""
-    if data.scores.get("flight_left_out"):
-        yield FigureSpec(
-            "scores", "scores", "Errors on what was left out",
-            "Mean RMSE after one offset per flight and channel. Nothing is scored where it was learned.",
-            partial(draw_scores, data),
-        )  # fmt: skip
     if len(data.curve) > 1:
         yield FigureSpec(
             "learning_curve", "scores", "Expected gain of one flight more",

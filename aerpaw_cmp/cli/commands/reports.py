@@ -210,12 +210,12 @@ def _print_status(status: Any) -> None:
         time = "nothing to compute"
     show(
         f"{status.name}: {counted(len(status.states), 'task')}, {status.kept} kept in {status.keep}, "
-        f"{status.failed} failed the last time, {status.to_do} to do, {time} with {counted(status.workers, 'worker')}"
+        f"{status.to_do} to do, {time} with {counted(status.workers, 'worker')}"
     )
-    rows = [[s.task.flight, s.task.setting, (s.failure or s.trouble)[:100]] for s in status.states if not s.stored]
+    rows = [[s.task.flight, s.task.setting, s.trouble[:100]] for s in status.states if not s.stored]
     if rows:
         title = "To do" if len(rows) <= _SHOWN else f"To do: the first {_SHOWN} of {len(rows)}"
-        table(["flight", "setting", "last failure"], rows[:_SHOWN], title)
+        table(["flight", "setting", "trouble"], rows[:_SHOWN], title)
     for failure in status.failures:
         show(f"{failure.flight}: {failure.message}")
 

@@ -15,21 +15,19 @@ from ...common.stages import Progress
 from ...report.content.campaign import Failure, FlownTrack
 from ..tasks.outcomes import OutcomeStore
 from ..tasks.workers import Lost, Workers
-from .campaign_tasks import Done, Order, Outcome, Task, carry_out, fitted_to, task_facts
+from .campaign_tasks import Done, Order, Outcome, Task, carry_out, digest_of, fitted_to
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TaskState:
     """One task of a campaign before it runs.
 
-    ``seconds`` is what it cost, where it is stored; ``failure`` the message of the last run, where that failed, and
-    ``trouble`` which input cannot be read.
+    ``seconds`` is what it cost, where it is stored; ``trouble`` says which input cannot be read.
     """
 
     task: Task
     stored: bool = False
     seconds: float | None = None
-    failure: str = ""
     trouble: str = ""
 
 
@@ -54,11 +52,6 @@ class CampaignStatus:
         return sum(state.stored for state in self.states)
 
     @property
-    def failed(self) -> int:
-        """Tasks that failed the last time; they are to do."""
-        return sum(bool(state.failure) and not state.stored for state in self.states)
-
-    @property
     def to_do(self) -> int:
         """Tasks that a run would compute."""
         return len(self.states) - self.kept
@@ -69,10 +62,8 @@ class CampaignStatus:
         return {
             "campaign": self.name,
             "tasks": len(self.states),
-            **named(self, "keep kept failed to_do estimate_s workers"),
-            "to_do_tasks": [
-                {**named(s.task, "flight setting"), "last_failure": s.failure or s.trouble or None} for s in waiting
-            ],
+            **named(self, "keep kept to_do estimate_s workers"),
+            "to_do_tasks": [{**named(s.task, "flight setting"), "trouble": s.trouble or None} for s in waiting],
             "failures": [named(failure, "flight setting message") for failure in self.failures],
         }
 
@@ -122,16 +113,10 @@ def campaign_status(
 def _state(task: Task, store: OutcomeStore) -> TaskState:
     """Outcome and cost of a task, by what the store says of itself."""
     try:
-        key = task_facts(task).key
+        key = digest_of(task)
     except (AerpawCmpError, OSError) as error:
         return TaskState(task=task, trouble=str(error))
-    seconds = store.manifest(key).get("seconds")
-    return TaskState(
-        task=task,
-        stored=store.has(key),
-        seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
-        failure=str(store.manifest(key, failed=True).get("message", "")),
-    )
+    return TaskState(task=task, stored=store.has(key), seconds=store.seconds(key))
 
 
 class Outcomes(dict[int, Outcome]):
@@ -173,7 +158,7 @@ def kept_outcomes(
         return outcomes, orders
     for number, task in enumerate(tasks):
         with suppress(AerpawCmpError, OSError):  # such a task will say itself what is wrong
-            key = task_facts(task).key
+            key = digest_of(task)
             orders[number] = Order(task=task, key=key)
             if isinstance(outcome := store.load(key), Outcome):
                 outcomes.put(number, outcome)
@@ -198,7 +183,7 @@ def compute(
     outcomes : Outcomes
         Gets the new ones.
     store : OutcomeStore, optional
-        Keeps the new ones, and failures.
+        Keeps the new ones.
     progress : Progress
         Tasks done.
     """
@@ -212,12 +197,8 @@ def compute(
             lost = Failure(flight=task.flight, setting=task.setting, message=result.message)
             result = Done(outcome=Outcome(failure=lost))
         failure = result.outcome.failure
-        if store is not None and order.key is not None:
-            if failure is None:
-                store.save(order.key, result.outcome, result.about)
-            else:
-                failure_facts = {"message": failure.message, "traceback": failure.traceback}
-                store.save_failure(order.key, {**result.about, **failure_facts})
+        if store is not None and order.key is not None and failure is None:
+            store.save(order.key, result.outcome, result.seconds)
         outcomes.put(numbers[place], result.outcome)
         failed += failure is not None
         progress(f"flights\t{len(outcomes)} of {total} done, {failed} failed", len(outcomes) / total)

@@ -18,7 +18,7 @@ import numpy as np
 from ...common.errors import AerpawCmpError
 from ...common.jsonable import named
 from ...common.units import AnyArray, FloatArray
-from ...common.versions import utc_now, versions
+from ...common.versions import versions
 from ...compare import offset
 from ...compare.result import FlightResult, RankResult, RssResult
 from ...flight.data import FlightData, RankSeries, RssSeries, gather, read_logs
@@ -29,7 +29,7 @@ from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import logs_of, series_mark
 from ...report.content.campaign import Failure, FlownTrack, RankRow, RssRow
 from ..reporting.flight_run import run_flight
-from ..tasks.outcomes import OutcomeStore, code_digest, task_inputs, task_key
+from ..tasks.outcomes import OutcomeStore, task_inputs, task_key
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,13 +170,10 @@ class Order:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Done:
-    """Answer of a worker.
-
-    ``about`` is the manifest of the outcome: what was read, where and when it was computed, what it cost.
-    """
+    """Answer of a worker, and what it cost [s]."""
 
     outcome: Outcome
-    about: Mapping[str, Any] = field(default_factory=dict)
+    seconds: float = 0.0
 
 
 def carry_out(order: Order) -> Done:
@@ -185,32 +182,16 @@ def carry_out(order: Order) -> Done:
     The key is computed anew here: a worker that sees another file or runs other code fails the task instead of
     giving a wrong number under a right name.
     """
-    task, facts = order.task, None
+    task = order.task
     try:
-        facts = None if order.key is None else task_facts(task)
+        same = order.key is None or digest_of(task) == order.key
     except (AerpawCmpError, OSError) as error:
         return Done(outcome=_failed(task, f"an input can no longer be read: {error}", error))
-    if facts is not None and facts.key != order.key:
+    if not same:
         return Done(outcome=_not_the_same(task))
-    start, cpu = time.perf_counter(), _cpu_s()
+    start = time.perf_counter()
     outcome = run_task(task)
-    if facts is None:
-        return Done(outcome=outcome)
-    about = {
-        "flight": task.flight, "setting": task.setting, "flight_file": str(task.path),
-        "logs_root": None if task.logs_root is None else str(task.logs_root), "overrides": dict(task.overrides),
-        "seconds": time.perf_counter() - start, "cpu_s": _cpu_s() - cpu, "host": platform.node(),
-        "process": os.getpid(), "finished": utc_now(),
-        "versions": versions(), "code": code_digest(), "inputs": facts.inputs,
-        "settings": facts.settings.model_dump(mode="json"),
-    }  # fmt: skip
-    return Done(outcome=outcome, about=about)
-
-
-def _cpu_s() -> float:
-    """Processor time of this process and of those that it waited for."""
-    spent = os.times()
-    return time.process_time() + spent.children_user + spent.children_system
+    return Done(outcome=outcome, seconds=time.perf_counter() - start)
 
 
 def _not_the_same(task: Task) -> Outcome:
@@ -221,17 +202,8 @@ def _not_the_same(task: Task) -> Outcome:
     return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Facts:
-    """Settings and inputs on which an outcome depends, and its key."""
-
-    settings: FlightFile
-    inputs: list[dict[str, str]]
-    key: str
-
-
-def task_facts(task: Task) -> Facts:
-    """Settings, inputs and key of a task.
+def digest_of(task: Task) -> str:
+    """Digest of the settings and inputs on which the outcome of a task depends.
 
     Raises
     ------
@@ -239,8 +211,7 @@ def task_facts(task: Task) -> Facts:
         If an input cannot be read.
     """
     settings = overridden(_flight_file(task.path, *_stamp(task.path)), task.overrides)
-    inputs = task_inputs(settings, task.path, task.logs_root)
-    return Facts(settings=settings, inputs=inputs, key=task_key(settings, inputs))
+    return task_key(settings, task_inputs(settings, task.path, task.logs_root))
 
 
 def outcome_store(keep: Path) -> OutcomeStore:

@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import io
 import json
+import math
 import os
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -35,7 +36,7 @@ READERS = "aerpaw_cmp.readers"
 
 
 class OutcomeStore:
-    """Results of tasks by key: ``<key>.npz``, sealed by the digest of its content, and ``<key>.json``, its manifest.
+    """Results of tasks by key: ``<key>.npz``, sealed by the digest of its content, and what it cost in ``<key>.s``.
 
     Parameters
     ----------
@@ -92,8 +93,8 @@ class OutcomeStore:
             self.warnings.append(f"an outcome that this tool did not write was not used: {file}")
             return None
 
-    def save(self, key: str, outcome: Any, manifest: Mapping[str, Any] | None = None) -> None:
-        """Write an entry whole or not at all, then its manifest; nothing where the disk does not take it."""
+    def save(self, key: str, outcome: Any, seconds: float = 0.0) -> None:
+        """Write an entry whole or not at all, then its cost; nothing where the disk does not take it."""
         arrays = _Arrays()
         text = json.dumps(_plain(outcome, arrays), default=lambda number: number.item())
         content = np.frombuffer(text.encode(), dtype=np.uint8)
@@ -101,20 +102,14 @@ class OutcomeStore:
         np.savez(entry, content=content, **arrays.by_name)  # type: ignore[arg-type]
         with contextlib.suppress(OSError):
             self._write(f"{key}.npz", seal(entry.getvalue(), _SEAL))
-            self._write(f"{key}.json", _text(manifest or {}))
-            (self.folder / f"{key}.failed.json").unlink(missing_ok=True)
+            self._write(f"{key}.s", f"{seconds:.3f}\n".encode())
 
-    def save_failure(self, key: str, manifest: Mapping[str, Any]) -> None:
-        """Remember that a task failed, and how; it is never taken for an outcome."""
-        with contextlib.suppress(OSError):
-            self._write(f"{key}.failed.json", _text(manifest))
-
-    def manifest(self, key: str, *, failed: bool = False) -> dict[str, Any]:
-        """Manifest beside an outcome (or a failure); empty where it cannot be read."""
-        place = self.folder / f"{key}{'.failed' if failed else ''}.json"
-        with contextlib.suppress(InputError), parsing(place, any_shape=True):
-            return dict(json.loads(place.read_bytes()))
-        return {}
+    def seconds(self, key: str) -> float | None:
+        """Cost of an outcome; None where it is not known."""
+        with contextlib.suppress(OSError, ValueError):
+            seconds = float((self.folder / f"{key}.s").read_bytes())
+            return seconds if math.isfinite(seconds) else None
+        return None
 
     def has(self, key: str) -> bool:
         """Check whether there is an entry."""
@@ -158,10 +153,6 @@ class _Arrays:
         name = self._names.setdefault((array.dtype.str, array.shape, array.tobytes()), f"a{len(self._names)}")
         self.by_name[name] = array
         return name
-
-
-def _text(manifest: Mapping[str, Any]) -> bytes:
-    return (json.dumps(dict(manifest), indent=1, default=str) + "\n").encode()
 
 
 # Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit, caches.

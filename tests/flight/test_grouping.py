@@ -95,10 +95,17 @@ def test_a_log_on_the_route_of_two_flights_is_asked_about(tmp_path: Path) -> Non
     assert "its positions lie on the track of the flight at 2025-03-02 1" in asked
 
 
-def _phone_without_date(path: Path, hour: int) -> None:
+def _phone_without_date(path: Path, hour: int, quantity: str = "RSRP") -> None:
     """Levels and positions with times of the day alone, as the urban LTE flights have them."""
     rows = [f"{hour}:00:{i:02d},{35.7275 + 1e-5 * i},{-78.696 + 2e-5 * i},{-70 - i % 5}" for i in range(40)]
-    path.write_text("\n".join(["Time,Latitude,Longitude,RSRP", *rows]) + "\n", encoding="utf-8")
+    path.write_text("\n".join([f"Time,Latitude,Longitude,{quantity}", *rows]) + "\n", encoding="utf-8")
+
+
+def test_a_log_of_no_level_on_two_dateless_flights_names_the_other_by_its_log(tmp_path: Path) -> None:
+    for name, hour, quantity in (("a", 11, "RSRP"), ("b", 13, "RSRP"), ("c", 12, "Throughput")):
+        _phone_without_date(tmp_path / f"{name}.csv", hour, quantity)
+    (asked,) = (text for flight in flights(ingest(tmp_path, options=OPTIONS)) for text in flight.unsure.values())
+    assert asked == "its positions lie on the track of the flight of b.csv too: which flight?"
 
 
 def test_phones_that_know_no_date_are_a_flight_each(tmp_path: Path) -> None:

@@ -135,9 +135,10 @@ def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
 _ALIKE, _ALIKE_M = 2.0, 5.0
 
 
-def _begin(flight: Flight) -> str:
-    assert flight.span is not None
-    return str(flight.span[0].astype("datetime64[m]")).replace("T", " ")
+def _called(flight: Flight) -> str:
+    if flight.span is None:
+        return f"of {Path(flight.files[0].path).name}"
+    return f"at {str(flight.span[0].astype('datetime64[m]')).replace('T', ' ')} UTC"
 
 
 def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
@@ -152,8 +153,8 @@ def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
         (near_m, best), *others = sorted(by_track)
         rivals = [i for away_m, i in others if away_m < max(_ALIKE * near_m, _ALIKE_M)]
         if rivals:
-            begins = " and ".join(_begin(known[i]) for i in rivals)
-            text = f"its positions lie on the track of the flight at {begins} UTC too: which flight?"
+            called = " and ".join(_called(known[i]) for i in rivals)
+            text = f"its positions lie on the track of the flight {called} too: which flight?"
             known[best].unsure[file.path] = text
         return known[best]
     folder = Path(file.path).parent

@@ -205,9 +205,15 @@ class Site:
         return bool(self.forests or self.buildings or len(self.trees) or self.scene is not None)
 
     def ground_under_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
-        """Up of the ground (n,) [m]: the terrain's, else of the lowest plane; in a scene that of the take-off point."""
-        level = min((0.0, *(tower.ground_m for tower in self.towers.values())))
-        ground = np.full(len(east_m), self.datum.takeoff_ground_m if self.scene is not None else level)
+        """Up of the ground (n,) [m]: the terrain's, else of the nearest tower's plane; in a scene that of take-off.
+
+        A plane above up = 0 ends at its tower: who flies lower beside it flies over lower ground between them.
+        """
+        ground = np.full(len(east_m), self.datum.takeoff_ground_m if self.scene is not None else 0.0)
+        if self.scene is None and self.towers:
+            towers = list(self.towers.values())
+            apart = [np.hypot(east_m - tower.east_m, north_m - tower.north_m) for tower in towers]
+            ground = np.minimum(0.0, np.array([tower.ground_m for tower in towers])[np.argmin(apart, axis=0)])
         if self.dem is None:
             return ground
         terrain = self.dem.ground_m(east_m, north_m)

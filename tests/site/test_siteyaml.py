@@ -98,6 +98,8 @@ def test_ground_is_flat_unless_offsets_are_asked_for() -> None:
     assert [t.ground_m for t in flat.towers.values()] == [0.0] * 5
     assert [t.ground_m for t in lifted.towers.values()] == [0.0, -4.45, -10.23, 6.53, 15.03]
     assert lifted.towers["LW5"].position_m[2] == pytest.approx(25.03)
+    at = np.array([tower.position_m[:2] for tower in lifted.towers.values()]).T  # beside LW1 no flight sinks to LW3's
+    assert list(lifted.ground_under_m(*at)) == [0.0, -4.45, -10.23, 0.0, 0.0]
 
 
 def test_trees_stand_in_forests_and_clear_of_masts() -> None:

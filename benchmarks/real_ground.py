@@ -1,8 +1,9 @@
 """Each part of Lake Wheeler's map and ground, and its effect on every field flight: levels, rank agreement, variation.
 
 Each part is added alone to free ground without buildings and woods, at one reflection. Levels: RMSE with it minus RMSE
-without it, each with its own offset, paired (95 %). Rank: agreement and total variation, paired by eighths of the
-flight (95 %, Student's t of 7). Then a fit of the woods' specific attenuation and height on the four towers of AADM.
+without it, each with its own offset, paired (95 %). Rank: agreement and total variation, paired, each eighth of the
+flight left out in turn (jackknife, 95 %, Student's t of 7). Then a fit of the woods' specific attenuation and height on
+the four towers of AADM.
 
 Run: AERPAW_CMP_FIELD_DATA=DIR python benchmarks/real_ground.py [--only NAME ...] [--no-fit] [-o FILE]
 """
@@ -11,7 +12,7 @@ import argparse
 import dataclasses
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import product
 from pathlib import Path
 
@@ -24,7 +25,13 @@ from aerpaw_cmp.flight.data import FlightData
 from aerpaw_cmp.flight.replay import replay_flight
 
 FLIGHTS = Path(__file__).parents[1] / "tests" / "field"
-NAMES = ("dataset12_40m", "dataset12_70m", "nr_rank_flight1", "nr_rank_flight3", "aadm")
+NAMES = (
+    "dataset12_40m", "learned/ds12_40m_fs5MHz", "dataset12_70m", "calibrations/lte50", "calibrations/lte90",
+    "nr_rank_flight1", "nr_rank_flight3", "aadm",
+    *(f"calibrations/afar{run}" for run in (
+        "288_loc_1", "300_loc_1", "300_loc_2", "309_loc_2", "328_loc_1", "328_loc_3",
+    )),
+)  # fmt: skip
 
 _BARE = {"site.without_buildings": True, "rt.foliage": "none", "rt.max_depth": 1, "rss.field": "power"}
 PARTS: dict[str, dict[str, object]] = {
@@ -43,13 +50,6 @@ def flight(name: str) -> aerpaw_cmp.Flight:
     return aerpaw_cmp.open_flight(FLIGHTS / f"{name}.yaml", logs_root=os.environ["AERPAW_CMP_FIELD_DATA"])
 
 
-def by_eighths(change: np.ndarray) -> str:
-    """Mean of a change by eighths and its 95 % interval."""
-    means = np.array([np.mean(part) for part in np.array_split(change, EIGHTHS)])
-    half = student.ppf(0.975, EIGHTHS - 1) * means.std(ddof=1) / np.sqrt(EIGHTHS)
-    return f"{means.mean():+.3f} [{means.mean() - half:+.3f}, {means.mean() + half:+.3f}]"
-
-
 def variation(measured: np.ndarray, rank: np.ndarray) -> float:
     """Total variation of two samples of ranks."""
     known = np.isfinite(measured) & (rank > 0)
@@ -57,9 +57,18 @@ def variation(measured: np.ndarray, rank: np.ndarray) -> float:
     return float(np.abs(shares[0] - shares[1]).sum() / 2)
 
 
+def by_eighths(change: Callable[[np.ndarray], float], rows: int) -> str:
+    """A change of rows of a flight and its 95 % interval by the jackknife: each eighth left out in turn."""
+    parts = np.array_split(np.arange(rows), EIGHTHS)
+    without = np.array([change(np.setdiff1d(np.arange(rows), part)) for part in parts])
+    half = student.ppf(0.975, EIGHTHS - 1) * np.sqrt((EIGHTHS - 1) / EIGHTHS * np.sum((without - without.mean()) ** 2))
+    middle = change(np.arange(rows))
+    return f"{middle:+.3f} [{middle - half:+.3f}, {middle + half:+.3f}]"
+
+
 def rows_of(name: str) -> Iterator[list[str]]:
     """Rows of the table for a flight."""
-    opened = flight(name)
+    opened, short = flight(name), Path(name).name
     bare = opened.compare(**_BARE).result
     for part, keys in PARTS.items():
         added = opened.compare(**{**_BARE, **keys}).result
@@ -69,14 +78,20 @@ def rows_of(name: str) -> Iterator[list[str]]:
             low, high = level.difference_ci95_db
             lost = int(np.isnan(errors[0]).sum() - np.isnan(errors[1]).sum())
             change = f"{level.difference_db:+.2f} [{low:+.2f}, {high:+.2f}]"
-            yield [name, f"{a.tower} {a.channel}", part, f"{level.other_rmse_db:.2f}", change, str(lost), "", ""]
+            yield [short, f"{a.tower} {a.channel}", part, f"{level.other_rmse_db:.2f}", change, str(lost), "", ""]
         for before, after in zip(bare.rank, added.rank, strict=True):
             known = np.isfinite(before.measured)
             for k in (10.0, 100.0):
-                first, second = ((x.rank[k] == before.measured)[known].astype(float) for x in (before, after))
-                shift = variation(before.measured, after.rank[k]) - variation(before.measured, before.rank[k])
+                seen = before.measured[known]
+                first, second = (x.rank[k][known] for x in (before, after))
+                agreement = by_eighths(
+                    lambda i, s=seen, a=first, b=second: np.mean(b[i] == s[i]) - np.mean(a[i] == s[i]), len(seen)
+                )
+                shift = by_eighths(
+                    lambda i, s=seen, a=first, b=second: variation(s[i], b[i]) - variation(s[i], a[i]), len(seen)
+                )
                 what = f"{before.tower} rank, K = {k:g}"
-                yield [name, what, part, f"{first.mean():.3f}", "", "", by_eighths(second - first), f"{shift:+.3f}"]
+                yield [short, what, part, f"{np.mean(first == seen):.3f}", "", "", agreement, shift]
 
 
 def fit_woods() -> Iterator[str]:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, TypeVar, get_args
 
 import numpy as np
 import shapely
-from pydantic import AfterValidator, Discriminator, Field, Tag, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from shapely.geometry import Point, Polygon
 
 from ..common.errors import UsageError
@@ -31,7 +31,7 @@ from .relief.heights import Height, HeightReference, VerticalDatum
 from .relief.surface import Surface, surface_through
 from .scenes import placed_scene, without_traps
 from .site import Building, Forest, Geofence, Site, Tower, Trees
-from .trees import Distribution, TreeSizes, join_trees, place_trees, trees_at, wanted_trees
+from .trees import TreeSizes, join_trees, place_trees, trees_at, wanted_trees
 
 # Sites that come with the package, by name.
 PACKAGED = ("lake_wheeler",)
@@ -211,26 +211,8 @@ class ForestModel(PolygonModel):
 OutlineT = TypeVar("OutlineT", bound=PolygonModel)
 
 
-class DistributionModel(StrictModel):
-    """A size drawn from a normal distribution between limits."""
-
-    mean: Positive
-    deviation: _NotNegative = 0.0
-    minimum: _NotNegative = 0.0
-    maximum: Annotated[float, Field(gt=0, allow_inf_nan=True)] = math.inf
-
-
-def _which_size(value: Any) -> str:
-    return "distribution" if isinstance(value, dict | DistributionModel) else "number"
-
-
-Size = Annotated[  # told apart beforehand: a wrong number is one message, not one per member of the union
-    Annotated[Positive, Tag("number")] | Annotated[DistributionModel, Tag("distribution")], Discriminator(_which_size)
-]
-
-
 class SingleTreeModel(StrictModel):
-    """A tree with sizes of its own; what is absent is drawn like that of all trees."""
+    """A tree with sizes of its own; what is absent is as of all trees."""
 
     at_m: tuple[float, float] | None = None
     at_deg: tuple[float, float] | None = None
@@ -249,22 +231,15 @@ class TreesModel(StrictModel):
     """Sizes of all trees, the seed of the placement, and single trees."""
 
     seed: Annotated[int, Field(ge=0)] = 0
-    height_m: Size = 20.0
-    crown_diameter_m: Size = 10.0
-    trunk_diameter_m: Size = 0.4
+    height_m: Positive = 20.0
+    crown_diameter_m: Positive = 10.0
+    trunk_diameter_m: Positive = 0.4
     crown_base_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.25
-    points_m: list[tuple[float, float]] = Field(default_factory=list)
-    points_deg: list[tuple[float, float]] = Field(default_factory=list)
     single: list[SingleTreeModel] = Field(default_factory=list)
 
     def sizes(self) -> TreeSizes:
         """For the placement."""
-        return TreeSizes(
-            _distribution(self.height_m),
-            _distribution(self.crown_diameter_m),
-            _distribution(self.trunk_diameter_m),
-            self.crown_base_fraction,
-        )
+        return TreeSizes(**named(self, "height_m crown_diameter_m trunk_diameter_m crown_base_fraction"))
 
 
 class DemModel(StrictModel):
@@ -734,14 +709,6 @@ def _trees(
                 f"{forest.name}: {len(placed)} of {wanted} trees fit at {forest.minimum_spacing_m:g} m spacing"
             )
         (parts if forest.height_m is None else of_stands).append(placed)
-    points = list(model.points_m)
-    if points:
-        _check_near(points, "trees.points_m")
-    if model.points_deg:
-        points += _ring_from_degrees(model.points_deg, frame, "trees")
-    if points:
-        east, north = zip(*points, strict=True)
-        parts.append(trees_at(east, north, sizes))  # type: ignore[arg-type]
     if model.single:
         parts.append(_single(model.single, sizes, frame))
     return join_trees(parts), join_trees(of_stands)
@@ -815,9 +782,3 @@ def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: 
             cause = "latitude and longitude are swapped"
         raise UsageError(f"'{name}' reaches {away / 1000:.0f} km from the site's origin", cause=cause)
     return list(zip(east.tolist(), north.tolist(), strict=True))
-
-
-def _distribution(size: float | DistributionModel) -> Distribution:
-    if isinstance(size, DistributionModel):
-        return Distribution(size.mean, size.deviation, size.minimum, size.maximum)
-    return Distribution(size)

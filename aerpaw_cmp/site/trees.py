@@ -7,10 +7,9 @@ assumed here.
 
 from __future__ import annotations
 
-import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 import shapely
@@ -28,57 +27,19 @@ _STALLED_ROUNDS = 12  # batches of darts in a row that add less than a thousandt
 
 
 @dataclass(frozen=True, slots=True)
-class Distribution:
-    """A size: a constant, or a normal distribution cut off at ``minimum`` and ``maximum``.
-
-    Parameters
-    ----------
-    mean, deviation : float
-        Of the uncut normal distribution; deviation 0 is the constant ``mean``.
-    minimum, maximum : float
-        Values outside are drawn again.
-    """
-
-    mean: float
-    deviation: float = 0.0
-    minimum: float = 0.0
-    maximum: float = math.inf
-
-    def __post_init__(self) -> None:
-        if not (self.deviation >= 0 and 0 <= self.minimum <= self.mean <= self.maximum and math.isfinite(self.mean)):
-            raise UsageError(
-                f"a size distribution with mean {self.mean}, deviation {self.deviation}, limits {self.minimum} to "
-                f"{self.maximum}",
-                expected="0 <= minimum <= mean <= maximum and deviation >= 0",
-            )
-
-    def draw(self, count: int, random: np.random.Generator) -> FloatArray:
-        """``count`` values; rejected draws are repeated, so the limits do not pile up."""
-        values = np.full(count, float(self.mean))
-        wrong = np.ones(count, dtype=bool) if self.deviation > 0 else np.zeros(count, dtype=bool)
-        for _ in range(100):
-            if not wrong.any():
-                return values
-            values[wrong] = random.normal(self.mean, self.deviation, int(wrong.sum()))
-            wrong = (values < self.minimum) | (values > self.maximum)
-        return np.asarray(np.clip(values, self.minimum, self.maximum))
-
-
-@dataclass(frozen=True, slots=True)
 class TreeSizes:
     """Sizes of trees.
 
     Parameters
     ----------
-    height_m, crown_diameter_m, trunk_diameter_m : Distribution
-        Drawn independently.
+    height_m, crown_diameter_m, trunk_diameter_m : float
     crown_base_fraction : float
         Height of the crown's base as a share of the tree's height, 0 to below 1.
     """
 
-    height_m: Distribution = field(default_factory=lambda: Distribution(20.0))
-    crown_diameter_m: Distribution = field(default_factory=lambda: Distribution(10.0))
-    trunk_diameter_m: Distribution = field(default_factory=lambda: Distribution(0.4))
+    height_m: float = 20.0
+    crown_diameter_m: float = 10.0
+    trunk_diameter_m: float = 0.4
     crown_base_fraction: float = 0.25
 
     def __post_init__(self) -> None:
@@ -86,42 +47,29 @@ class TreeSizes:
             raise UsageError(f"crown_base_fraction is {self.crown_base_fraction}", expected="0 to below 1")
 
 
-def trees_at(
-    east_m: FloatArray,
-    north_m: FloatArray,
-    sizes: TreeSizes | None = None,
-    *,
-    random: np.random.Generator | None = None,
-) -> Trees:
-    """Trees at given points (n,) [m], with drawn sizes.
+def trees_at(east_m: FloatArray, north_m: FloatArray, sizes: TreeSizes) -> Trees:
+    """Trees of one size at given points (n,) [m].
 
     Parameters
     ----------
     east_m, north_m : (n,)
         Trunks [m].
-    sizes : TreeSizes, optional
-        What is drawn from.
-    random : Generator, optional
-        By default of seed 0.
+    sizes : TreeSizes
 
     Returns
     -------
     Trees
         Of n trees.
     """
-    sizes = sizes or TreeSizes()
-    random = random or np.random.default_rng(0)
-    east = np.asarray(east_m, dtype=np.float64)
-    count = len(east)
-    height = sizes.height_m.draw(count, random)
+    count = len(east_m)
     return Trees(
-        east_m=east,
-        north_m=np.asarray(north_m, dtype=np.float64),
+        east_m=east_m,
+        north_m=north_m,
         ground_m=np.zeros(count),
-        height_m=height,
-        crown_diameter_m=sizes.crown_diameter_m.draw(count, random),
-        crown_base_m=height * sizes.crown_base_fraction,
-        trunk_diameter_m=sizes.trunk_diameter_m.draw(count, random),
+        height_m=np.full(count, sizes.height_m),
+        crown_diameter_m=np.full(count, sizes.crown_diameter_m),
+        crown_base_m=np.full(count, sizes.height_m * sizes.crown_base_fraction),
+        trunk_diameter_m=np.full(count, sizes.trunk_diameter_m),
     )
 
 
@@ -134,7 +82,7 @@ def join_trees(parts: Sequence[Trees]) -> Trees:
 
 def place_trees(
     forest: Forest,
-    sizes: TreeSizes | None = None,
+    sizes: TreeSizes = TreeSizes(),
     *,
     seed: int = 0,
     keep_clear: BaseGeometry | None = None,
@@ -165,7 +113,7 @@ def place_trees(
     area = forest.area if keep_clear is None else shapely.difference(forest.area, keep_clear)
     random = np.random.default_rng([seed, zlib.crc32(forest.name.encode())])
     points = _scatter(area, wanted_trees(forest, keep_clear), forest.minimum_spacing_m, random)
-    return trees_at(points[:, 0], points[:, 1], sizes, random=random)
+    return trees_at(points[:, 0], points[:, 1], sizes)
 
 
 def wanted_trees(forest: Forest, keep_clear: BaseGeometry | None = None) -> int:

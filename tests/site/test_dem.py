@@ -97,7 +97,7 @@ towers:
   T: {latitude_deg: 35.7284, longitude_deg: -78.696}
 dem: {path: d.asc, crs: local}
 buildings: [{name: b, height_m: 5, polygon_m: [[100, 0], [120, 0], [120, 20], [100, 20]]}]
-trees: {points_m: [[-200, 50]]}
+trees: {single: [{at_m: [-200, 50]}]}
 """
 
 

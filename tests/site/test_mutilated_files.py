@@ -36,7 +36,7 @@ buildings:
 - {name: a, height_m: 4, material: wood, polygon_m: [[10, 10], [20, 10], [20, 20]]}
 forests:
 - {name: w, polygon_deg: [[35.728, -78.697], [35.729, -78.697], [35.729, -78.696]], trees_per_hectare: 9}
-trees: {seed: 3, height_m: {mean: 9, deviation: 1, maximum: 12}, points_m: [[50, 60]]}
+trees: {seed: 3, height_m: 9, single: [{at_m: [50, 60]}]}
 """
 DEM = b"ncols 3\nnrows 3\nxllcorner -150\nyllcorner -150\ncellsize 100\nNODATA_value -9999\n1 2 3\n4 5 6\n7 8 -9999\n"
 PATTERN = (

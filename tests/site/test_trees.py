@@ -9,7 +9,7 @@ from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.site.site import Forest
-from aerpaw_cmp.site.trees import Distribution, TreeSizes, _first_come, place_trees, wanted_trees
+from aerpaw_cmp.site.trees import TreeSizes, _first_come, place_trees, wanted_trees
 
 SQUARE = Forest("wood", box(0, 0, 200, 200), 100.0, 4.0)
 
@@ -66,14 +66,9 @@ def test_trunks_keep_clear() -> None:
 
 
 def test_sizes() -> None:
-    sizes = TreeSizes(height_m=Distribution(18, 4, 8, 25), crown_base_fraction=0.3)
-    trees = place_trees(Forest("w", box(0, 0, 1000, 1000), 100, 3.0), sizes)
-    assert trees.height_m.min() >= 8
-    assert trees.height_m.max() <= 25
-    assert (trees.height_m == 25).sum() == 0  # drawn again, not piled up at the limit
-    assert trees.height_m.mean() == pytest.approx(17.6, abs=0.3)
-    np.testing.assert_allclose(trees.crown_base_m, 0.3 * trees.height_m)
-    assert set(trees.crown_diameter_m) == {10.0}
+    trees = place_trees(SQUARE, TreeSizes(height_m=18.0, crown_base_fraction=0.3))
+    assert set(trees.height_m) == {18.0}
+    np.testing.assert_allclose(trees.crown_base_m, 0.3 * 18.0)
 
 
 def test_the_papers_tree_is_the_default() -> None:
@@ -82,8 +77,6 @@ def test_the_papers_tree_is_the_default() -> None:
 
 
 def test_impossible_wishes() -> None:
-    with pytest.raises(UsageError, match="size distribution with mean 5"):
-        Distribution(5, 1, 6, 9)
     with pytest.raises(UsageError, match="asks for 100000000 trees"):
         place_trees(Forest("w", box(0, 0, 1e5, 1e5), 100, 4))
     with pytest.raises(UsageError, match="crown_base_fraction"):

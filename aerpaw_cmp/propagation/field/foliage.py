@@ -22,7 +22,7 @@ from ...site.site import Trees
 from ..geometry.paths import legs
 
 # Form of a crown between its base and the tree's top; the paper's is the cone.
-Shape = Literal["cone", "ellipsoid", "cylinder"]
+Shape = Literal["cone", "cylinder"]
 
 # ITU-R P.833: near 1 GHz trees in leaf attenuate about 20 % more (dB/m) than leafless ones.
 LEAFLESS_FACTOR = 1 / 1.2
@@ -289,8 +289,8 @@ class CrownIndex:
     ----------
     trees : Trees
         Any number.
-    shape : {"cone", "ellipsoid", "cylinder"}
-        Form of all crowns.
+    shape : {"cone", "cylinder"}
+        Form of all bodies.
     """
 
     def __init__(self, trees: Trees, shape: Shape = "cone") -> None:
@@ -448,11 +448,6 @@ def _chord_share(start: FloatArray, move: FloatArray, bodies: FloatArray, shape:
         a = a - (slope * move[:, 2]) ** 2
         b = b - slope**2 * below * move[:, 2]
         c = c - (slope * below) ** 2
-    elif shape == "ellipsoid":
-        flat, below = 2 * radius / (top - base), start[:, 2] - (base + top) / 2
-        a = a + (flat * move[:, 2]) ** 2
-        b = b + flat**2 * below * move[:, 2]
-        c = c + (flat * below) ** 2 - radius**2
     else:
         c = c - radius**2
     return _quadric_share(a, b, c, first, last, move[:, 2])

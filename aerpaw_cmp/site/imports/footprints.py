@@ -663,7 +663,7 @@ def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
         "credit": "; ".join(imports.credits),
         "assumed": imports.assumed,
     }
-    content["trees"] |= {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in imports.trees]}
+    content["trees"] |= {"single": [_tree_dict(tree) for tree in imports.trees]}
     return imports.actions
 
 

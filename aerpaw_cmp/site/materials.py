@@ -17,50 +17,26 @@ from ..common.units import SPEED_OF_LIGHT_MPS, VACUUM_PERMITTIVITY_F_PER_M
 # Lowest and highest frequency [GHz], a, b, c, d.
 Band = tuple[float, float, float, float, float, float]
 
-# Usual thickness of a wall or roof [m], None of a half-space (no second face echoes); P.2040-4 table 3. Where bands
-# overlap the first that contains the frequency holds.
-_TABLE: dict[str, tuple[float | None, tuple[Band, ...]]] = {
-    "vacuum": (None, ((0.001, 100.0, 1.0, 0.0, 0.0, 0.0),)),
-    "concrete": (0.3, ((1.0, 100.0, 5.24, 0.0, 0.0462, 0.7822), (110.0, 330.0, 5.17, 0.0, 0.0145, 1.09))),
-    "brick": (0.2, ((1.0, 40.0, 3.91, 0.0, 0.0238, 0.16), (110.0, 330.0, 4.15, 0.0, 0.0006, 1.5712))),
-    "plasterboard": (0.025, (
-        (1.0, 100.0, 2.73, 0.0, 0.0085, 0.9395),
-        (110.0, 330.0, 2.56, 0.0, 0.0001, 1.7799),
-        (100.0, 400.0, 2.65, 0.0, 0.0002, 1.598),
-    )),
-    "wood": (0.15, (
-        (0.001, 100.0, 1.99, 0.0, 0.0047, 1.0718),
-        (110.0, 330.0, 1.82, 0.0, 0.0040, 1.0761),
-        (100.0, 400.0, 2.1183, 0.0, 0.0055, 1.1113),
-    )),
-    "glass": (0.006, (
-        (0.1, 100.0, 6.31, 0.0, 0.0036, 1.3394),
-        (220.0, 450.0, 5.79, 0.0, 0.0004, 1.658),
-        (100.0, 400.0, 6.5767, 0.0, 0.0012, 1.4697),
-    )),
-    "ceiling_board": (0.02, (
-        (1.0, 100.0, 1.48, 0.0, 0.0011, 1.075),
-        (220.0, 450.0, 1.52, 0.0, 0.0029, 1.029),
-        (100.0, 400.0, 1.2567, 0.0, 0.00013, 1.454),
-    )),
-    "chipboard": (0.02, ((1.0, 100.0, 2.58, 0.0, 0.0217, 0.78), (100.0, 200.0, 2.16, 0.0, 0.0023, 1.359))),
-    "plywood": (0.02, (
-        (1.0, 40.0, 2.71, 0.0, 0.33, 0.0),
-        (110.0, 330.0, 1.94, 0.0, 0.0067, 0.9982),
-        (100.0, 400.0, 2.17, 0.0, 0.0063, 1.045),
-    )),
-    "marble": (0.03, (
-        (1.0, 60.0, 7.074, 0.0, 0.0055, 0.9262),
-        (110.0, 330.0, 7.94, 0.0, 0.0001, 1.733),
-        (100.0, 400.0, 8.62, 0.0, 0.0027, 1.15),
-    )),
-    "floorboard": (0.02, ((50.0, 100.0, 3.66, 0.0, 0.0044, 1.3515), (100.0, 400.0, 3.1575, 0.0, 0.001675, 1.32775))),
-    "asphalt_concrete": (None, ((1.0, 40.0, 4.83, 0.0, 0.0108, 1.3969),)),
-    "metal": (0.005, ((1.0, 100.0, 1.0, 0.0, 1e7, 0.0),)),
-    "very_dry_ground": (None, ((1.0, 10.0, 3.0, 0.0, 0.00015, 2.52),)),
-    "medium_dry_ground": (None, ((1.0, 10.0, 15.0, -0.1, 0.035, 1.63),)),
-    "wet_ground": (None, ((1.0, 10.0, 30.0, -0.4, 0.15, 1.30),)),
-}  # fmt: skip
+# Usual thickness of a wall or roof [m], None of a half-space (no second face echoes); P.2040-4 table 3, whose bands
+# above 100 GHz are left out.
+_TABLE: dict[str, tuple[float | None, Band]] = {
+    "vacuum": (None, (0.001, 100.0, 1.0, 0.0, 0.0, 0.0)),
+    "concrete": (0.3, (1.0, 100.0, 5.24, 0.0, 0.0462, 0.7822)),
+    "brick": (0.2, (1.0, 40.0, 3.91, 0.0, 0.0238, 0.16)),
+    "plasterboard": (0.025, (1.0, 100.0, 2.73, 0.0, 0.0085, 0.9395)),
+    "wood": (0.15, (0.001, 100.0, 1.99, 0.0, 0.0047, 1.0718)),
+    "glass": (0.006, (0.1, 100.0, 6.31, 0.0, 0.0036, 1.3394)),
+    "ceiling_board": (0.02, (1.0, 100.0, 1.48, 0.0, 0.0011, 1.075)),
+    "chipboard": (0.02, (1.0, 100.0, 2.58, 0.0, 0.0217, 0.78)),
+    "plywood": (0.02, (1.0, 40.0, 2.71, 0.0, 0.33, 0.0)),
+    "marble": (0.03, (1.0, 60.0, 7.074, 0.0, 0.0055, 0.9262)),
+    "floorboard": (0.02, (50.0, 100.0, 3.66, 0.0, 0.0044, 1.3515)),
+    "asphalt_concrete": (None, (1.0, 40.0, 4.83, 0.0, 0.0108, 1.3969)),
+    "metal": (0.005, (1.0, 100.0, 1.0, 0.0, 1e7, 0.0)),
+    "very_dry_ground": (None, (1.0, 10.0, 3.0, 0.0, 0.00015, 2.52)),
+    "medium_dry_ground": (None, (1.0, 10.0, 15.0, -0.1, 0.035, 1.63)),
+    "wet_ground": (None, (1.0, 10.0, 30.0, -0.4, 0.15, 1.3)),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,32 +47,31 @@ class Material:
     ----------
     name : str
         Without the ``itu_`` prefix.
-    bands : tuple of Band
-        Constants per frequency range.
+    band : Band
+        Constants, and the frequencies of which they are.
     thickness_m : float or None
         Thickness of a wall of it; None is a half-space.
     """
 
     name: str
-    bands: tuple[Band, ...]
+    band: Band
     thickness_m: float | None = None
 
     def _band(self, frequency_hz: float) -> Band:
         frequency_ghz = frequency_hz / 1e9
-        for band in self.bands:
-            if band[0] <= frequency_ghz <= band[1]:
-                return band
-        ranges = ", ".join(f"{low:g}-{high:g} GHz" for low, high, *_ in self.bands)
-        edge = min((end for band in self.bands for end in band[:2]), key=lambda end: abs(math.log(end / frequency_ghz)))
+        low, high, *_ = self.band
+        if low <= frequency_ghz <= high:
+            return self.band
+        edge = low if frequency_ghz < low else high
         near = stated_name(self.relative_permittivity(edge * 1e9).real, self.conductivity_s_per_m(edge * 1e9), None)
         raise UsageError(
             f"ITU-R P.2040 gives no values for '{self.name}' at {frequency_ghz:g} GHz",
-            expected=f"{ranges}, or numbers of your own in the site.yaml, '{near}' say (those of {edge:g} GHz)",
+            expected=f"{low:g}-{high:g} GHz, or numbers of your own, '{near}' say (those of {edge:g} GHz)",
             cause="the carrier was given in MHz or GHz where hertz are expected" if frequency_hz < 1e6 else None,
         )
 
     def conductivity_s_per_m(self, frequency_hz: float) -> float:
-        """Conductivity [S/m] at a frequency [Hz]; UsageError outside the table's bands.
+        """Conductivity [S/m] at a frequency [Hz]; UsageError outside the table's band.
 
         Source: ITU-R P.2040 table 3.
         """
@@ -111,7 +86,7 @@ class Material:
         Raises
         ------
         UsageError
-            Outside the frequency ranges of the table.
+            Outside the frequencies of the table.
         """
         _, _, a, b, _, _ = self._band(frequency_hz)
         loss = self.conductivity_s_per_m(frequency_hz) / (2 * math.pi * frequency_hz * VACUUM_PERMITTIVITY_F_PER_M)
@@ -129,15 +104,13 @@ CROWN_PERMITTIVITY = 1.1
 _CROWN_ATTENUATION_DB_PER_M = 0.5
 
 
-def lossy_conductivity_s_per_m(permittivity: float, gamma_db_per_m: float) -> float:
-    """Conductivity that attenuates by ``gamma``: ``2 n a eps0 c`` for weak loss, whatever the frequency."""
-    neper_per_m = gamma_db_per_m / (20 / math.log(10))
-    return 2 * math.sqrt(permittivity) * neper_per_m * VACUUM_PERMITTIVITY_F_PER_M * SPEED_OF_LIGHT_MPS
-
-
-_CROWN_S_PER_M = lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, _CROWN_ATTENUATION_DB_PER_M)
+# ``2 n a eps0 c`` with the attenuation in neper: of weak loss, whatever the frequency.
+_CROWN_S_PER_M = (
+    2 * math.sqrt(CROWN_PERMITTIVITY) * _CROWN_ATTENUATION_DB_PER_M * math.log(10) / 20
+    * VACUUM_PERMITTIVITY_F_PER_M * SPEED_OF_LIGHT_MPS
+)  # fmt: skip
 # Crowns as a half-space, 30 MHz to 100 GHz (the scope of P.833).
-VEGETATION = Material(CROWN, ((0.03, 100.0, CROWN_PERMITTIVITY, 0.0, _CROWN_S_PER_M, 0.0),))
+VEGETATION = Material(CROWN, (0.03, 100.0, CROWN_PERMITTIVITY, 0.0, _CROWN_S_PER_M, 0.0))
 
 
 def face_material(name: str) -> Material:
@@ -186,8 +159,8 @@ def material(name: str) -> Material:
             expected="one of " + ", ".join(MATERIALS),
             cause=f"did you mean '{near[0]}'?" if near else None,
         )
-    thickness, bands = _TABLE[key]
-    return Material(key, bands, thickness)
+    thickness, band = _TABLE[key]
+    return Material(key, band, thickness)
 
 
 def _stated(plain: str, numbers: str, name: str) -> Material:
@@ -206,9 +179,9 @@ def _stated(plain: str, numbers: str, name: str) -> Material:
     thickness = values.get("thickness")
     if plain != CONSTANT:
         base = material(plain)
-        return Material(f"{base.name} with thickness={thickness:.9g}", base.bands, thickness or 1e-9)
+        return Material(f"{base.name} with thickness={thickness:.9g}", base.band, thickness or 1e-9)
     band = (0.0, math.inf, values["permittivity"], 0.0, values.get("conductivity", 0.0), 0.0)
-    return Material(stated_name(band[2], band[4], thickness), (band,), None if thickness is None else thickness or 1e-9)
+    return Material(stated_name(band[2], band[4], thickness), band, None if thickness is None else thickness or 1e-9)
 
 
 # Begins the name of a material that is not of ITU-R P.2040; its numbers follow.

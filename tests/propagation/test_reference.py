@@ -107,7 +107,7 @@ def test_materials_a_second_time():
         eta, thickness = reference.permittivity(name, carrier)
         assert eta == pytest.approx(what.relative_permittivity(carrier), rel=1e-12)
         assert thickness == what.thickness_m
-        for ghz, beyond in ((what.bands[0][0], 0.999), (what.bands[0][1], 1.001)):
+        for ghz, beyond in ((what.band[0], 0.999), (what.band[1], 1.001)):
             eta = reference.permittivity(name, 1e9 * ghz)[0]
             assert eta == pytest.approx(what.relative_permittivity(1e9 * ghz), rel=1e-12)
             assert reference.permittivity(name, 1e9 * ghz * beyond) is None

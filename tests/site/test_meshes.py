@@ -11,7 +11,7 @@ from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.site.export import export_scene
-from aerpaw_cmp.site.materials import CROWN_PERMITTIVITY, lossy_conductivity_s_per_m
+from aerpaw_cmp.site.materials import VEGETATION
 from aerpaw_cmp.site.meshes import WALL_DEPTH_M, _bodies, building_mesh, site_meshes
 from aerpaw_cmp.site.site import Building
 from aerpaw_cmp.site.siteyaml import load_site
@@ -74,7 +74,7 @@ def test_one_mesh_per_material_with_owners() -> None:
 
 def test_conductivity_gives_gamma() -> None:
     # 2.506 dB per 5 m at 3.4 GHz was measured with 3.21e-4 S/m
-    assert lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, 0.5) == pytest.approx(3.21e-4, rel=0.003)
+    assert VEGETATION.conductivity_s_per_m(1e9) == pytest.approx(3.21e-4, rel=0.003)
 
 
 def test_export_is_well_formed(tmp_path: Path) -> None:

@@ -6,14 +6,15 @@ triangles; one that is not flat is counted, since how it is cut then decides its
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from ...common.errors import InputError, parsing
 from ...common.files import read_input
-from ...common.units import FloatArray, IntArray
+from ...common.units import AnyArray, FloatArray, IntArray
 
 # Bytes within which a PLY header ends; a longer one is no header.
 _LARGEST_HEADER = 65_536
@@ -83,19 +84,18 @@ def check(mesh: RawMesh, path: Path) -> RawMesh:
 def read_ply(data: bytes, path: Path) -> RawMesh:
     """A PLY file."""
     kind, elements, start = _header(data, path)
-    order = ">" if kind == "binary_big_endian" else "<"
-    words = data[start:].split() if kind == "ascii" else []
+    body = _Body(data, ">" if kind == "binary_big_endian" else "<", start, path)
+    if kind == "ascii":  # the words as numbers of one kind: from here on a binary file
+        body = _Body(_numbers(data[start:].split(), path).tobytes(), "=", 0, path)
+        elements = [replace(e, properties=tuple((n, "f8", k and "f8") for n, _, k in e.properties)) for e in elements]
     vertices: FloatArray = np.zeros((0, 3))
     triangles, bent = np.zeros((0, 3), dtype=np.int64), 0
-    place = 0
     for element in elements:
+        columns = body.read(element)
         if element.name == "vertex":
-            vertices, place = _vertices(element, data[start:], words, place, order, path)
+            vertices = _vertices(element, columns, path)
         elif element.name == "face":
-            polygons, place = _polygons(element, data[start:], words, place, order, path)
-            triangles, bent = _fans(polygons, vertices, path)
-        else:
-            place = _skip(element, data[start:], words, place, order, path)
+            triangles, bent = _fans(_polygons(element, columns, path), vertices, path)
     return RawMesh(vertices, triangles, bent)
 
 
@@ -136,34 +136,6 @@ def _declare(words: list[str], elements: list[_Element]) -> None:
         elements[-1] = _Element(last.name, last.count, (*last.properties, item))
 
 
-def _cut_off(element: _Element, path: Path) -> InputError:
-    return InputError(
-        f"the file ends before the {element.count} entries of '{element.name}' that its header promises",
-        cause="it was cut off, or the header is damaged",
-        path=path,
-    )
-
-
-def _vertices(
-    element: _Element, data: bytes, words: list[bytes], place: int, order: str, path: Path
-) -> tuple[FloatArray, int]:
-    names = [name for name, _, _ in element.properties]
-    if not {"x", "y", "z"} <= set(names) or any(length for *_, length in element.properties):
-        raise InputError("its vertices have no x, y and z", expected="a PLY mesh", path=path)
-    if words:
-        width = len(names)
-        if place + width * element.count > len(words):
-            raise _cut_off(element, path)
-        table = _numbers(words[place : place + width * element.count], path).reshape(element.count, width)
-        return table[:, [names.index(axis) for axis in "xyz"]].copy(), place + width * element.count
-    record = np.dtype([(f"{i}", order + kind) for i, (_, kind, _) in enumerate(element.properties)])
-    if place + record.itemsize * element.count > len(data):
-        raise _cut_off(element, path)
-    rows = np.frombuffer(data, dtype=record, count=element.count, offset=place)
-    columns = [rows[f"{names.index(axis)}"].astype(np.float64) for axis in "xyz"]
-    return np.column_stack(columns), place + record.itemsize * element.count
-
-
 def _numbers(words: list[bytes], path: Path) -> FloatArray:
     try:
         return np.array(words, dtype=np.bytes_).astype(np.float64) if words else np.zeros(0)
@@ -171,83 +143,75 @@ def _numbers(words: list[bytes], path: Path) -> FloatArray:
         raise InputError(f"not a number: {error}", path=path) from None
 
 
-def _polygons(
-    element: _Element, data: bytes, words: list[bytes], place: int, order: str, path: Path
-) -> tuple[list[IntArray], int]:
-    """Corner indices of the polygons, as arrays (polygons, corners) of one number of corners each."""
+@dataclass(slots=True)
+class _Body:
+    """What stands behind the header, read from ``place`` on."""
+
+    data: bytes
+    order: str
+    place: int
+    path: Path
+
+    def take(self, kind: Any, count: int, element: _Element) -> AnyArray:
+        """The next ``count`` items of a type."""
+        what = np.dtype(kind).newbyteorder(self.order)
+        if count < 0 or self.place + count * what.itemsize > len(self.data):
+            raise InputError(
+                f"the file ends before the {element.count} entries of '{element.name}' that its header promises",
+                cause="it was cut off, or the header is damaged",
+                path=self.path,
+            )
+        values = np.frombuffer(self.data, what, count, self.place)
+        self.place += count * what.itemsize
+        return values
+
+    def read(self, element: _Element) -> dict[str, Any]:
+        """Values of each property, a row an entry: an array, or a list of arrays where lists differ in length."""
+        least = sum(np.dtype(length or kind).itemsize for _, kind, length in element.properties)
+        begun = self.place
+        if not element.count or not least:
+            return {name: np.zeros((0, 1)) for name, *_ in element.properties}
+        self.take(("V", least), element.count, element)  # or no row need be looked at
+        self.place = begun
+        first, fields = self._row(element), list[Any]()
+        for i, ((_, kind, length), values) in enumerate(zip(element.properties, first, strict=True)):
+            fields += [(f"length {i}", length)] if length else []
+            fields.append((f"{i}", kind, (len(values),)))
+        self.place, record = begun, np.dtype(fields)
+        if begun + element.count * record.itemsize <= len(self.data):
+            rows = self.take(record, element.count, element)
+            if all((rows[f"length {i}"] == len(first[i])).all() for i, p in enumerate(element.properties) if p[2]):
+                return {name: rows[f"{i}"] for i, (name, *_) in enumerate(element.properties)}
+            self.place = begun
+        several = [self._row(element) for _ in range(element.count)]
+        return {name: [row[i] for row in several] for i, (name, *_) in enumerate(element.properties)}
+
+    def _row(self, element: _Element) -> list[AnyArray]:
+        """Values of the properties of the next entry."""
+        return [
+            self.take(kind, int(self.take(length, 1, element)[0]) if length else 1, element)
+            for _, kind, length in element.properties
+        ]
+
+
+def _vertices(element: _Element, columns: dict[str, Any], path: Path) -> FloatArray:
+    if not {"x", "y", "z"} <= set(columns) or any(length for *_, length in element.properties):
+        raise InputError("its vertices have no x, y and z", expected="a PLY mesh", path=path)
+    return np.column_stack([columns[axis][:, 0].astype(np.float64) for axis in "xyz"])
+
+
+def _polygons(element: _Element, columns: dict[str, Any], path: Path) -> list[IntArray]:
+    """Corners of the polygons, those of one size together."""
     lists = [name for name, _, length in element.properties if length]
     which = next((name for name in lists if name in ("vertex_indices", "vertex_index")), None)
     if which is None:
         raise InputError("its faces list no vertices", expected="'vertex_indices' or 'vertex_index'", path=path)
-    if not words:
-        even = _even_polygons(element, data, place, order, which)
-        if even is not None:
-            return [even[0]], even[1]
-    by_size: dict[int, list[list[int]]] = {}
-    for _ in range(element.count):
-        corners: list[int] = []
-        for name, kind, length in element.properties:
-            count, place = _read_count(data, words, place, order + length, element, path) if length else (1, place)
-            values, place = _several(data, words, place, order + kind, int(count), element, path)
-            corners = values if name == which else corners
-        if len(corners) >= 3:
-            by_size.setdefault(len(corners), []).append(corners)
-    return [np.array(group, dtype=np.int64) for group in by_size.values()], place
-
-
-def _even_polygons(element: _Element, data: bytes, place: int, order: str, which: str) -> tuple[IntArray, int] | None:
-    """All polygons at once where all have as many corners as the first, as nearly every file has it."""
-    first = place
-    record: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
-    for name, kind, length in element.properties:
-        if length:
-            if name != which or first >= len(data) or element.count == 0:
-                return None
-            corners = int(np.frombuffer(data, dtype=order + length, count=1, offset=first)[0]) if name == which else 0
-            record += [("n", order + length), ("corners", order + kind, (corners,))]
-        else:
-            record.append((f"other {name}", order + kind))
-        first = place + np.dtype(record).itemsize
-    what = np.dtype(record)
-    if place + what.itemsize * element.count > len(data):
-        return None
-    rows = np.frombuffer(data, dtype=what, count=element.count, offset=place)
-    if not (rows["n"] == rows["n"][0]).all() or rows["n"][0] < 3:
-        return None
-    return rows["corners"].astype(np.int64).reshape(element.count, -1), place + what.itemsize * element.count
-
-
-def _read_count(
-    data: bytes, words: list[bytes], place: int, kind: str, element: _Element, path: Path
-) -> tuple[int, int]:
-    values, place = _several(data, words, place, kind, 1, element, path)
-    return values[0], place
-
-
-def _several(
-    data: bytes, words: list[bytes], place: int, kind: str, count: int, element: _Element, path: Path
-) -> tuple[list[int], int]:
-    if words:
-        if count < 0 or place + count > len(words):
-            raise _cut_off(element, path)
-        return [int(value) for value in _numbers(words[place : place + count], path)], place + count
-    end = place + count * np.dtype(kind).itemsize
-    if count < 0 or end > len(data):
-        raise _cut_off(element, path)
-    return np.frombuffer(data, dtype=kind, count=count, offset=place).astype(np.int64).tolist(), end
-
-
-def _skip(element: _Element, data: bytes, words: list[bytes], place: int, order: str, path: Path) -> int:
-    if not any(length for *_, length in element.properties):
-        width = len(element.properties) if words else sum(np.dtype(k).itemsize for _, k, _ in element.properties)
-        if place + width * element.count > len(words or data):
-            raise _cut_off(element, path)
-        return place + width * element.count
-    for _ in range(element.count):
-        for _, kind, length in element.properties:
-            count, place = _read_count(data, words, place, order + length, element, path) if length else (1, place)
-            _, place = _several(data, words, place, order + kind, int(count), element, path)
-    return place
+    corners, by_size = columns[which], dict[int, list[AnyArray]]()
+    for row in [corners] if isinstance(corners, np.ndarray) else corners:
+        by_size.setdefault(row.shape[-1], []).append(row.reshape(-1, row.shape[-1]))
+    # no index is as large: what is no number becomes one that no vertex has
+    polygons = {size: np.concatenate(rows) for size, rows in by_size.items() if size >= 3}
+    return [np.where(np.abs(rows) < 2**53, rows, -1).astype(np.int64) for rows in polygons.values()]
 
 
 def _fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[IntArray, int]:

@@ -29,14 +29,13 @@ _MOST_OF_CUTS_DB = 5.0
 _PLANET = re.compile(r"(?im)^\s*(HORIZONTAL|VERTICAL)\s+(\d{1,4})\s*$")
 _GAIN = re.compile(r"(?im)^\s*GAIN\s+([-+]?\d{1,3}(?:\.\d{1,6})?)\s*(dBd|dBi)?\s*$")
 _FREQUENCY = re.compile(r"(?im)^\s*FREQUENCY\s+(\d{1,6}(?:\.\d{1,6})?)\s*(?:MHz)?\s*$")
-_NSMA = re.compile(r"(?im)^\s*PATCUT:\s*,\s*(AZ|H|EL|V)\b")
 _PHI_CUT = re.compile(r"(?im)^\s*Phi\s*=\s*(-?\d{1,3}(?:\.\d{1,6})?)\s*\(deg\)")
 _GAIN_TABLE = re.compile(r"(?im)^\s*Frequency\s+E ?Total\. ?dB\s*$")
 
 
 @parsed("an antenna pattern file")
 def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> MeasuredPattern:
-    """An antenna pattern: AERPAW's text over the sphere or along one great circle, MSI Planet (.msi, .pln) or NSMA.
+    """An antenna pattern: AERPAW's text over the sphere or along one great circle, MSI Planet (.msi, .pln).
 
     Parameters
     ----------
@@ -78,8 +77,6 @@ def _of_any_kind(text: str, path: Path, carrier_hz: float | None) -> MeasuredPat
     if _PLANET.search(text):
         carrier = _FREQUENCY.search(text)
         return _from_cuts(_planet(text, path), name, path, float(carrier[1]) * 1e6 if carrier else None)
-    if _NSMA.search(text):
-        return _from_cuts(_nsma(text, path), name, path, None)
     if _PHI_CUT.search(text):
         return _great_circle(text, name, path, carrier_hz)
     if _GAIN_TABLE.search(text):
@@ -122,30 +119,6 @@ def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dic
             path=path,
         )
     return {name: peak_dbi - np.abs(cut) for name, cut in cuts.items()}
-
-
-def _nsma(text: str, path: Path) -> dict[str, FloatArray]:
-    """Gain [dBi] of NSMA's (TIA-804-B) first azimuth and elevation cut, as :func:`_planet` has them."""
-    fields = {key.upper(): value for key, value in re.findall(r"(?m)^\s*([A-Za-z]{4,7}):\s*,\s*([^\n,]*)", text)}
-    relative = "DBR" in fields.get("GUNITS", "DBI/DBR").upper().partition("/")[2]
-    gain = next((fields[key] for key in ("MDGAIN", "LWGAIN", "HGGAIN") if fields.get(key, "").strip()), None)
-    if gain is None:
-        raise InputError("no gain", expected="a line such as 'MDGAIN:,16.5' [dBi]", path=path)
-    unit = fields.get("GUNITS", "DBI").upper().partition("/")[0]
-    peak = float(gain) + (_DBI_OF_DBD if "DBD" in unit else 0.0)
-    cuts: dict[str, FloatArray] = {}
-    for cut in _NSMA.finditer(text):
-        kind = "HORIZONTAL" if cut[1].upper() in ("AZ", "H") else "VERTICAL"
-        if kind in cuts:
-            continue  # the first of each: others are of another frequency or cross-polarised
-        ends = re.search(r"(?m)^\s*(PATCUT|ENDFIL):", text[cut.end() :])
-        body = text[cut.end() : cut.end() + ends.start()] if ends else text[cut.end() :]
-        lines = [line.replace(",", " ") for line in body.split("\n") if re.match(r"\s*[-+]?\d", line)]
-        rows = _pairs(lines, len(lines), path)
-        if kind == "VERTICAL":
-            rows = rows * [-1.0, 1.0]  # elevation is positive upwards there
-        cuts[kind] = _each_degree(rows, cut[1], path)
-    return _about_peak(cuts, peak, path) if relative and cuts else cuts
 
 
 def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:

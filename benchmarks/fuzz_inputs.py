@@ -590,6 +590,7 @@ def _mesh(path: Path) -> None:
 def _scene(path: Path) -> None:
     from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
 
+    (path.parent / "mesh.ply").write_bytes(PLY)
     read_scene(path)
 
 
@@ -630,7 +631,7 @@ FENCE = (
 )
 SCENE = (
     b'<scene version="2.1.0"><bsdf type="itu-radio-material" id="w"><string name="type" value="concrete"/></bsdf>'
-    b'<shape type="cube"><ref id="w"/><transform name="to_world"><scale value="3"/></transform></shape></scene>'
+    b'<shape type="ply"><string name="filename" value="mesh.ply"/><ref id="w"/></shape></scene>'
 )
 SPHERE = b"azimuth_deg,elevation_deg,gain_dbi\n" + b"".join(
     b"%d,%d,0.0\n" % (a, e) for a in range(0, 360, 60) for e in range(-90, 91, 30)

@@ -18,21 +18,23 @@ from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
 from aerpaw_cmp.site.scenes import without_traps
 from aerpaw_cmp.site.siteyaml import load_site
+from tests.scene_files import box
 from tests.simulated import planned, simulate, write_yaml
 
 ROOM = """<scene version="2.1.0">
 <bsdf type="itu-radio-material" id="stone"><string name="type" value="marble"/><float name="thickness" value="0.2"/></bsdf>
 <bsdf type="radio-material" id="mine"><float name="relative_permittivity" value="4"/><float name="conductivity" value="0.01"/></bsdf>
-<shape type="rectangle" id="floor"><transform name="to_world"><scale value="50"/></transform><ref id="stone" name="bsdf"/></shape>
-<shape type="cube" id="block"><transform name="to_world"><scale value="5"/><translate x="20" z="5"/></transform><ref id="mine" name="bsdf"/></shape>
+{}
 </scene>"""
 
 
 @pytest.fixture
 def room(tmp_path: Path) -> Path:
-    (tmp_path / "room").mkdir()
-    (tmp_path / "room" / "room.xml").write_text(ROOM)
-    return tmp_path / "room" / "room.xml"
+    folder = tmp_path / "room"
+    folder.mkdir()
+    floor = box(folder, "floor", "stone", (-50, -50, 0), (50, 50, 0))
+    (folder / "room.xml").write_text(ROOM.format(floor + box(folder, "block", "mine", (15, -5, 0), (25, 5, 10))))
+    return folder / "room.xml"
 
 
 def paths_of(site_file: Path):
@@ -88,7 +90,7 @@ def test_towers_of_a_base_site_are_kept(room: Path, tmp_path: Path) -> None:
 def test_a_scene_that_changed_or_went_is_said(room: Path, tmp_path: Path) -> None:
     out = tmp_path / "site.yaml"
     run_scene_import(room, out, SceneOptions(origin="local", towers=["A=1,2,3"]))
-    room.write_text(ROOM.replace("marble", "brick"))
+    room.write_text(room.read_text().replace("marble", "brick"))
     with pytest.raises(UsageError, match="they changed since the site was made") as refused:
         load_site(out)
     assert refused.value.exit_code == 2
@@ -190,18 +192,19 @@ TWIN = """<scene version="2.1.0">
 <bsdf type="itu-radio-material" id="mat-metal"><string name="type" value="metal"/></bsdf>
 <bsdf type="radio-material" id="mat-ground"><float name="relative_permittivity" value="3"/><float name="conductivity" value="0.005"/><float name="thickness" value="1"/></bsdf>
 <bsdf type="radio-material" id="mat-tree_canopy"><float name="relative_permittivity" value="1.2"/><float name="scattering_coefficient" value="0.4"/></bsdf>
-<shape type="rectangle" id="Terrain"><transform name="to_world"><scale value="200"/></transform><ref id="mat-ground" name="bsdf"/></shape>
-<shape type="cube" id="mast"><transform name="to_world"><scale x="0.4" y="0.4" z="6"/><translate z="6"/></transform><ref id="mat-metal" name="bsdf"/></shape>
-<shape type="cube" id="sector"><transform name="to_world"><scale x="0.1" y="0.1" z="0.7"/><translate x="0.6" z="10"/></transform><ref id="mat-metal" name="bsdf"/></shape>
-<shape type="cube" id="street"><transform name="to_world"><scale x="5" y="5" z="4"/><translate x="-40" z="4"/></transform><ref id="mat-metal" name="bsdf"/></shape>
-<shape type="cube" id="a_canopy"><transform name="to_world"><scale x="3" y="9" z="4"/><translate x="50" z="10"/></transform><ref id="mat-tree_canopy" name="bsdf"/></shape>
-<shape type="cube" id="tree_1__trunk"><transform name="to_world"><scale x="0.2" y="0.2" z="3"/><translate x="50" z="3"/></transform><ref id="mat-ground" name="bsdf"/></shape>
+{}
 </scene>"""
+TWINS = (
+    ("Terrain", "mat-ground", (-200, -200, 0), (200, 200, 0)), ("mast", "mat-metal", (-0.4, -0.4, 0), (0.4, 0.4, 12)),
+    ("sector", "mat-metal", (0.5, -0.1, 9.3), (0.7, 0.1, 10.7)), ("street", "mat-metal", (-45, -5, 0), (-35, 5, 8)),
+    ("a_canopy", "mat-tree_canopy", (47, -9, 6), (53, 9, 14)),
+    ("tree_1__trunk", "mat-ground", (49.8, -0.2, 0), (50.2, 0.2, 6)),
+)  # fmt: skip
 
 
 def test_masts_hide_nothing_and_meshes_of_trees_are_media(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """An antenna inside its mast and beside its sector sees all round; a canopy takes what its chord does."""
-    (tmp_path / "twin.xml").write_text(TWIN)
+    (tmp_path / "twin.xml").write_text(TWIN.format("".join(box(tmp_path, *mesh) for mesh in TWINS)))
     out = tmp_path / "site.yaml"
     arguments = ["site", "import", str(tmp_path / "twin.xml"), "--origin", "35.7,-78.7", "--tower", "T=0,0,10"]
     assert main([*arguments, "-o", str(out)]) == 0

@@ -8,16 +8,18 @@ from aerpaw_cmp.site.materials import material
 from aerpaw_cmp.site.mesh_scenes.meshfiles import read_ply
 from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
 from aerpaw_cmp.site.scenes import ground_share, placed_scene, with_ground
+from tests.scene_files import box
 
 ITU = '<bsdf type="itu-radio-material" id="m"><string name="type" value="concrete"/></bsdf>'
 REF = '<ref id="m" name="bsdf"/>'
-SQUARE = "v 0 0 0\nv 2 0 0\nv 2 2 0\nv 0 2 0\n"
+SQUARE = '<shape type="ply" id="s"><string name="filename" value="square.ply"/>{}</shape>'
 PLY_HEAD = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face {}\nproperty list uchar int vertex_indices\nend_header\n"
 PLY_POINTS = "0 0 0\n2 0 0\n2 2 0\n0 2 0\n"
 
 
 def write(folder, body, bsdf=ITU):
     path = folder / "scene.xml"
+    (folder / "square.ply").write_bytes(ply("ascii"))
     path.write_text(f'<scene version="2.1.0">{bsdf}{body}</scene>')
     return path
 
@@ -58,37 +60,14 @@ def test_a_ply_cut_off_anywhere_is_one_message(kind, tmp_path):
         assert len(mesh.triangles) == 2, "only a last number cut short is still a number"
 
 
-@pytest.mark.parametrize(
-    ("steps", "corner"),
-    [
-        ('<translate x="5" y="-1"/>', (7, 1, 0)),
-        ('<translate value="5, -1, 2"/>', (7, 1, 2)),
-        ('<scale value="3"/><translate z="1"/>', (6, 6, 1)),
-        ('<scale x="2" y="1" z="1"/>', (4, 2, 0)),
-        ('<rotate z="1" angle="90"/>', (-2, 2, 0)),
-        ('<translate x="1"/><rotate x="2" angle="90"/>', (3, 0, 2)),
-        ('<matrix value="1 0 0 9 0 1 0 8 0 0 1 7 0 0 0 1"/>', (11, 10, 7)),
-        ('<matrix value="0 1 0 1 0 0 0 0 1"/>', (2, 2, 0)),
-    ],
-)
-def test_to_world_applies_its_steps_in_order(steps, corner, tmp_path):
-    (tmp_path / "a.obj").write_text(SQUARE + "f 1 2 3 4\n")
-    shape = f'<shape type="obj" id="s"><string name="filename" value="a.obj"/><transform name="to_world">{steps}</transform>{REF}</shape>'
-    scene = read_scene(write(tmp_path, shape))
-    assert scene.vertices_m[2] == pytest.approx(np.array(corner), abs=1e-12)
-
-
-def test_rectangle_cube_merge_and_parameters(tmp_path):
-    body = f'<default name="half" value="4"/><shape type="merge"><shape type="rectangle">{REF}<transform name="to_world"><scale value="$half"/></transform></shape><shape type="cube">{REF}</shape></shape><shape type="sphere">{REF}</shape>'
+def test_closed_boxes_look_outward_and_other_shapes_are_told(tmp_path):
+    body = box(tmp_path, "b", "m", (1, 2, 0), (3, 5, 4)) + '<shape type="sphere"/>'
     scene = read_scene(write(tmp_path, body))
     corners = scene.vertices_m[scene.triangles]
-    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
-    assert np.bincount(scene.shape, weights=area).tolist() == [64.0, 24.0]
-    assert scene.notes == (
-        "warning: 1 shapes of type 'sphere' were left out; read are ply, obj, rectangle, cube, merge",
-    )
-    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[2:]
-    assert (np.einsum("ti,ti->t", outward, corners[2:].mean(axis=1)) > 0).all()
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert 0.5 * np.linalg.norm(outward, axis=1).sum() == pytest.approx(2 * (6 + 8 + 12))
+    assert (np.einsum("ti,ti->t", outward, corners.mean(axis=1) - [2, 3.5, 2]) > 0).all()
+    assert scene.notes == ("warning: 1 shapes of type 'sphere' were left out; read is ply",)
 
 
 @pytest.mark.parametrize(
@@ -113,7 +92,7 @@ def test_rectangle_cube_merge_and_parameters(tmp_path):
 )
 def test_radio_materials(bsdf, permittivity, thickness, tmp_path):
     name = "mat-itu_wood" if "mat-itu_wood" in bsdf else "m"
-    scene = read_scene(write(tmp_path, f'<shape type="rectangle"><ref id="{name}" name="bsdf"/></shape>', bsdf))
+    scene = read_scene(write(tmp_path, SQUARE.format(f'<ref id="{name}" name="bsdf"/>'), bsdf))
     what = material(scene.materials[0])
     assert what.relative_permittivity(3.4e9).real == pytest.approx(permittivity)
     assert what.thickness_m == thickness
@@ -121,9 +100,8 @@ def test_radio_materials(bsdf, permittivity, thickness, tmp_path):
 
 
 def test_a_material_inside_a_shape_and_one_named_by_hand(tmp_path):
-    inner = f'<shape type="rectangle">{ITU}</shape>'
-    assert read_scene(write(tmp_path, inner, "")).materials == ("concrete with thickness=0.1",)
-    path = write(tmp_path, f'<shape type="rectangle">{REF}</shape>', '<bsdf type="principled" id="m"/>')
+    assert read_scene(write(tmp_path, SQUARE.format(ITU), "")).materials == ("concrete with thickness=0.1",)
+    path = write(tmp_path, SQUARE.format(REF), '<bsdf type="principled" id="m"/>')
     with pytest.raises(UsageError, match=r"'m' is of type 'principled'.*--material 'm=concrete'"):
         read_scene(path)
     assert read_scene(path, {"m": "brick"}).materials == ("brick",)
@@ -148,14 +126,12 @@ MESH = '<shape type="ply" id="s"><string name="filename" value="{}"/>' + REF + "
         (MESH.format("nan.ply"), ITU, "a vertex is not a finite number"),
         (MESH.format("index.ply"), ITU, "a face names vertex 9"),
         (MESH.format("text.ply"), ITU, "does not begin with 'ply'"),
-        ('<shape type="obj"><string name="filename" value="bad.obj"/></shape>', ITU, "'f 1 two 3'"),
         ('<shape type="ply" id="s">' + REF + "</shape>", ITU, "the shape 's' names no file"),
-        ('<shape type="rectangle" id="s"/>', ITU, "the shape 's' has no material"),
-        ('<shape type="rectangle"><ref id="other"/></shape>', ITU, "names the material 'other', which the scene has not"),
-        (f'<shape type="rectangle">{REF}</shape>', ITU.replace("concrete", "cheese"), "unknown material 'cheese'"),
-        (f'<shape type="rectangle">{REF}<transform name="to_world"><scale value="0"/></transform></shape>', ITU, "singular"),
-        (f'<shape type="rectangle">{REF}<transform name="to_world"><scale value="a"/></transform></shape>', ITU, "'a'"),
-        (f'<shape type="rectangle">{REF}<transform name="to_world"><skew/></transform></shape>', ITU, "'skew'"),
+        (SQUARE.format(""), ITU, "the shape 's' has no material"),
+        (SQUARE.format('<ref id="other"/>'), ITU, "names the material 'other', which the scene has not"),
+        (SQUARE.format(REF), ITU.replace("concrete", "cheese"), "unknown material 'cheese'"),
+        (SQUARE.format(REF + '<transform name="to_world"><scale value="2"/></transform>'), ITU, "moved by a to_world"),
+        (SQUARE.format(REF), ITU.replace("</bsdf>", '<float name="thickness" value="a"/></bsdf>'), "'a'; expected a finite"),
         ('<include filename="/etc/passwd"/>', ITU, "includes another XML file"),
         ("", ITU, "no triangle"),
         ("<shape", ITU, "not XML"),
@@ -171,7 +147,6 @@ def test_bad_scenes_are_one_message(body, bsdf, message, tmp_path):
     (folder / "nan.ply").write_text(PLY_HEAD.format(2) + PLY_POINTS.replace("2 2 0", "2 nan 0") + "3 0 1 2\n3 0 2 3\n")
     (folder / "index.ply").write_text(PLY_HEAD.format(2) + PLY_POINTS + "3 0 1 9\n3 0 2 3\n")
     (folder / "text.ply").write_text("solid\n")
-    (folder / "bad.obj").write_text(SQUARE + "f 1 two 3\n")
     with pytest.raises(AerpawCmpError, match=message) as refused:
         read_scene(write(folder, body, bsdf))
     assert "\n" not in str(refused.value)
@@ -189,21 +164,16 @@ def test_entities_are_refused(encoding, tmp_path):
 
 
 def test_bent_quads_are_counted(tmp_path):
-    (tmp_path / "a.obj").write_text(SQUARE.replace("2 2 0", "2 2 0.1") + "f 1 2 3 4\n")
-    body = f'<shape type="obj"><string name="filename" value="a.obj"/>{REF}</shape>'
-    assert "1 polygons are not flat" in read_scene(write(tmp_path, body)).notes[0]
+    path = write(tmp_path, SQUARE.format(REF))
+    (tmp_path / "square.ply").write_bytes(ply("quad").replace(b"2 2 0", b"2 2 0.1"))
+    assert "1 polygons are not flat" in read_scene(path).notes[0]
 
 
 def test_ground_is_looked_for_and_added(tmp_path):
-    cube = f'<shape type="cube">{REF}</shape>'
-    wide = f'<shape type="rectangle">{REF}<transform name="to_world"><scale value="20"/></transform></shape>'
-    upright = f'<shape type="rectangle">{REF}<transform name="to_world"><rotate x="1" angle="90"/></transform></shape>'
-    assert ground_share(read_scene(write(tmp_path, cube + wide))) == 1.0
-    scene = read_scene(
-        write(
-            tmp_path, upright + cube.replace("/>", '/><transform name="to_world"><scale value="0.2"/></transform>', 1)
-        )
-    )
+    small, flat = box(tmp_path, "a", "m", (-1, -1, -1), (1, 1, 1)), box(tmp_path, "b", "m", (-20, -20, 0), (20, 20, 0))
+    assert ground_share(read_scene(write(tmp_path, small + flat))) == 1.0
+    upright = box(tmp_path, "c", "m", (-1, 0, -1), (1, 1e-3, 1))
+    scene = read_scene(write(tmp_path, upright + box(tmp_path, "d", "m", (-0.2,) * 3, (0.2,) * 3)))
     assert ground_share(scene) < 0.5
     grounded = with_ground(scene, "wet_ground")
     assert ground_share(grounded) == 1.0
@@ -212,10 +182,10 @@ def test_ground_is_looked_for_and_added(tmp_path):
 
 
 def test_a_scene_is_turned_moved_and_recognised(tmp_path):
-    path = write(tmp_path, f'<shape type="rectangle">{REF}</shape>')
+    path = write(tmp_path, SQUARE.format(REF))
     plain = read_scene(path)
     moved = placed_scene(path, offset_m=(10.0, 0.0, 1.0), turn_deg=90.0, sha256=plain.sha256)
-    assert moved.vertices_m[1] == pytest.approx([11.0, 1.0, 1.0])  # (1, -1, 0) turned by a quarter
+    assert moved.vertices_m[1] == pytest.approx([10.0, 2.0, 1.0])  # (2, 0, 0) turned by a quarter
     path.write_text(path.read_text().replace("concrete", "brick"))
     with pytest.raises(UsageError, match="they changed since the site was made"):
         placed_scene(path, sha256=plain.sha256)

@@ -1,7 +1,6 @@
-"""Triangles of PLY and OBJ files; pure functions of bytes.
+"""Triangles of PLY files in their three formats (ASCII, binary of either byte order); pure functions of bytes.
 
-PLY in its three formats (ASCII, binary of either byte order), OBJ without its materials. Polygons become fans of
-triangles; one that is not flat is counted, since how it is cut then decides its shape.
+Polygons become fans of triangles; one that is not flat is counted, since how it is cut then decides its shape.
 """
 
 from __future__ import annotations
@@ -50,7 +49,7 @@ class _Element:
 
 
 def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
-    """A PLY or OBJ file and its bytes (for a digest).
+    """A PLY file and its bytes (for a digest).
 
     Raises
     ------
@@ -59,7 +58,7 @@ def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
     """
     data = read_input(path, _LARGEST_FILE, "a mesh")
     with parsing(path, "a mesh"):
-        return check(_read_obj(data, path) if path.suffix.lower() == ".obj" else read_ply(data, path), path), data
+        return check(read_ply(data, path), path), data
 
 
 def check(mesh: RawMesh, path: Path) -> RawMesh:
@@ -76,9 +75,6 @@ def check(mesh: RawMesh, path: Path) -> RawMesh:
         if not np.isfinite(mesh.vertices[mesh.triangles.ravel()]).all():
             raise InputError("a vertex is not a finite number", expected="coordinates in metres", path=path)
     return mesh
-
-
-# ---------------------------------------------------------------- PLY
 
 
 def read_ply(data: bytes, path: Path) -> RawMesh:
@@ -230,33 +226,3 @@ def _fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[I
         for k in range(1, corners - 1):
             triangles.append(group[:, [0, k, k + 1]])
     return (np.concatenate(triangles) if triangles else np.zeros((0, 3), dtype=np.int64)), bent
-
-
-# ---------------------------------------------------------------- OBJ
-
-
-def _corners(words: list[str], vertices: int) -> list[int]:
-    """Vertices of a face, counted from 1, or back from the last where negative; ValueError where it is none."""
-    numbers = [int(word.split("/")[0]) for word in words]
-    if len(numbers) < 3:
-        raise ValueError
-    return [number - 1 if number > 0 else vertices + number for number in numbers]
-
-
-def _read_obj(data: bytes, path: Path) -> RawMesh:
-    """Vertices and faces of a Wavefront OBJ file; its normals, textures and materials are not read."""
-    vertices: list[list[float]] = []
-    faces: dict[int, list[list[int]]] = {}
-    for number, line in enumerate(data.decode("latin-1").splitlines(), 1):
-        words = line.split()
-        try:
-            if words[:1] == ["v"]:
-                vertices.append([float(words[1]), float(words[2]), float(words[3])])
-            if words[:1] == ["f"]:
-                corners = _corners(words[1:], len(vertices))
-                faces.setdefault(len(corners), []).append(corners)
-        except (ValueError, IndexError):
-            raise InputError(f"'{line.strip()[:60]}'", expected="an OBJ mesh", path=path, line=number) from None
-    points = np.array(vertices, dtype=np.float64).reshape(-1, 3)
-    triangles, bent = _fans([np.array(group, dtype=np.int64) for group in faces.values()], points, path)
-    return RawMesh(points, triangles, bent)

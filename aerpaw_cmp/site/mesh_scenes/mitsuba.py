@@ -1,7 +1,7 @@
 """Triangles and radio materials of a Mitsuba scene, as Sionna RT reads them; without Mitsuba.
 
-Read are shapes of type ``ply``, ``obj``, ``rectangle``, ``cube`` and ``merge`` with their ``to_world``, and the
-materials ``itu-radio-material``, ``radio-material``, ``absorber-radio-material`` or any other whose id begins with
+Read are shapes of type ``ply`` in the coordinates of the scene, as every scene of Sionna RT and of AERPAW has them, and
+the materials ``itu-radio-material``, ``radio-material``, ``absorber-radio-material`` or any other whose id begins with
 ``itu_`` or ``mat-itu_``. A scene may name files in its own folder only.
 """
 
@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from xml.etree import ElementTree
@@ -34,8 +34,6 @@ _MOST_TRIANGLES = 20_000_000
 _VEGETATION = re.compile(
     r"(?<![a-z])(trees?|canop(y|ies)|crowns?|foliage|vegetation|lea(f|ves)|hedges?|bush(es)?|shrubs?|trunks?)(?![a-z])"
 )
-
-_SHAPES = ("ply", "obj", "rectangle", "cube", "merge")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -116,15 +114,13 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
     parameters = dict(materials or {})
     for name in parameters.values():
         material(name)  # or say what is wrong with it
-    defaults = {item.get("name", ""): item.get("value", "") for item in root.iter("default")}
-    _substitute(root, defaults, path)
     radio, unknown, notes = _materials(root, parameters, path)
     reading = _Reading(path, path.parent.resolve(), radio)
     reading.digest.update(data)
-    for shape in _shapes(root):
+    for shape in root.findall("./shape"):
         _add(reading, shape, unknown)
     if not reading.triangles:
-        raise InputError("the scene has no triangle", expected="shapes of type " + ", ".join(_SHAPES), path=path)
+        raise InputError("the scene has no triangle", expected="shapes of type ply", path=path)
     return _gathered(reading, notes)
 
 
@@ -134,7 +130,7 @@ def _gathered(reading: _Reading, notes: list[str]) -> TriangleScene:
     if reading.bent:
         notes.append(f"{reading.bent} polygons are not flat: they were cut into triangles from their first corner")
     for kind, count in reading.skipped.items():
-        notes.append(f"warning: {count} shapes of type '{kind}' were left out; read are {', '.join(_SHAPES)}")
+        notes.append(f"warning: {count} shapes of type '{kind}' were left out; read is ply")
     return TriangleScene(
         vertices_m=np.concatenate(reading.vertices),
         triangles=np.concatenate(triangles),
@@ -154,17 +150,6 @@ def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
     if root.find(".//include") is not None:
         raise InputError("the scene includes another XML file", expected="one file: paste it in", path=path)
     return root, data
-
-
-def _substitute(root: ElementTree.Element, defaults: Mapping[str, str], path: Path) -> None:
-    """Values of the ``$name`` parameters, which ``default`` gives."""
-    for item in root.iter():
-        for key, value in item.attrib.items():
-            for name in sorted(defaults, key=len, reverse=True) if "$" in value else ():
-                value = value.replace(f"${name}", defaults[name])
-            if "$" in value:
-                raise InputError(f"the parameter '{value}' has no default", path=path)
-            item.attrib[key] = value
 
 
 # ---------------------------------------------------------------- materials
@@ -232,42 +217,33 @@ def _radio_material(bsdf: ElementTree.Element, name: str, path: Path) -> str | N
 
 def _float(parent: ElementTree.Element, name: str, default: float, path: Path) -> float:
     item = parent.find(f"float[@name='{name}']")
-    if item is None:
-        return default
-    return _numbers(item.get("value", ""), 1, path)[0]
-
-
-def _numbers(text: str, count: int | None, path: Path) -> list[float]:
+    text = str(default) if item is None else item.get("value", "")
     try:
-        values = [float(word) for word in text.replace(",", " ").split()]
+        value = float(text)
     except ValueError:
-        values = []
-    if not values or (count is not None and len(values) != count) or not all(math.isfinite(v) for v in values):
-        raise InputError(f"'{text[:60]}'", expected=f"{count or 'some'} finite numbers", path=path)
-    return values
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"'{text[:60]}'", expected="a finite number", path=path)
+    return value
 
 
 # ---------------------------------------------------------------- shapes
 
 
-def _shapes(root: ElementTree.Element) -> Iterator[ElementTree.Element]:
-    """Shapes, with those inside a ``merge`` in its place."""
-    for shape in root.findall("./shape"):
-        if shape.get("type") == "merge":
-            yield from _shapes(shape)
-        else:
-            yield shape
-
-
 def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, str]) -> None:
     kind = shape.get("type", "?")
-    if kind not in _SHAPES:
+    if kind != "ply":
         reading.skipped[kind] = reading.skipped.get(kind, 0) + 1
         return
     name = shape.get("id") or f"shape {len(reading.names) + 1}"
-    mesh = _mesh(reading, shape, kind, name)
-    turn = _to_world(shape, reading.path)
-    vertices = mesh.vertices @ turn[:3, :3].T + turn[:3, 3]
+    if len(shape.find("transform[@name='to_world']") or ()):
+        raise InputError(
+            f"the shape '{name}' is moved by a to_world",
+            expected="meshes in the coordinates of the scene, as Sionna RT's own",
+            cause="apply the transform where the scene was made (Blender: Object, Apply), and export it anew",
+            path=reading.path,
+        )
+    mesh = _mesh(reading, shape, name)
     reading.total += len(mesh.triangles)
     if reading.total > _MOST_TRIANGLES:
         raise InputError(
@@ -276,7 +252,7 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
             cause="a terrain or scan that is finer than a wavelength asks for: simplify it first",
             path=reading.path,
         )
-    reading.vertices.append(vertices)
+    reading.vertices.append(mesh.vertices)
     reading.triangles.append(mesh.triangles)
     reading.names.append(name)
     reading.materials.append(_of_shape(reading, shape, name, unknown))
@@ -311,12 +287,7 @@ def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown:
     )
 
 
-def _mesh(reading: _Reading, shape: ElementTree.Element, kind: str, name: str) -> RawMesh:
-    if kind == "rectangle":
-        corners = np.array([(-1.0, -1.0, 0.0), (1.0, -1.0, 0.0), (1.0, 1.0, 0.0), (-1.0, 1.0, 0.0)])
-        return RawMesh(corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    if kind == "cube":
-        return _cube()
+def _mesh(reading: _Reading, shape: ElementTree.Element, name: str) -> RawMesh:
     item = shape.find("string[@name='filename']")
     wanted = "" if item is None else item.get("value", "")
     if not wanted:
@@ -334,71 +305,3 @@ def _mesh(reading: _Reading, shape: ElementTree.Element, kind: str, name: str) -
     mesh, data = read_mesh(place)
     reading.digest.update(hashlib.sha256(data).digest())
     return mesh
-
-
-def _cube() -> RawMesh:
-    """The cube of Mitsuba, -1 to 1 on each axis."""
-    corners = np.array([(x, y, z) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)])
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    return RawMesh(corners, np.array([t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]))
-
-
-def _to_world(shape: ElementTree.Element, path: Path) -> FloatArray:
-    """Homogeneous matrix (4, 4) of a shape; its steps apply in the order they are written."""
-    total = np.eye(4)
-    transform = shape.find("transform[@name='to_world']")
-    for item in () if transform is None else transform:
-        total = _step(item, path) @ total
-    if not abs(np.linalg.det(total[:3, :3])) > 0.0:
-        raise InputError(
-            f"the to_world of '{shape.get('id')}' is singular", expected="a matrix with an inverse", path=path
-        )
-    return total
-
-
-def _step(item: ElementTree.Element, path: Path) -> FloatArray:
-    """Homogeneous matrix (4, 4) of one step."""
-    matrix = np.eye(4)
-    if item.tag == "matrix":
-        return _matrix(item, path)
-    if item.tag == "translate":
-        matrix[:3, 3] = _vector(item, 0.0, path)
-    elif item.tag == "scale":
-        matrix[:3, :3] = np.diag(_vector(item, 1.0, path))
-    elif item.tag == "rotate":
-        matrix[:3, :3] = _rotation(item, path)
-    else:
-        raise InputError(f"the transform '{item.tag}'", expected="matrix, translate, scale or rotate", path=path)
-    return matrix
-
-
-def _matrix(item: ElementTree.Element, path: Path) -> FloatArray:
-    values = _numbers(item.get("value", ""), None, path)
-    if len(values) not in (9, 16):
-        raise InputError(f"a matrix of {len(values)} numbers", expected="9 or 16", path=path)
-    side = 3 if len(values) == 9 else 4
-    matrix = np.eye(4)
-    matrix[:side, :side] = np.reshape(values, (side, side))
-    if not np.array_equal(matrix[3], [0.0, 0.0, 0.0, 1.0]):
-        raise InputError("a matrix that is a perspective", expected="0 0 0 1 as its last row", path=path)
-    return matrix
-
-
-def _rotation(item: ElementTree.Element, path: Path) -> FloatArray:
-    """Rotation (3, 3) about an axis, by Rodrigues' formula."""
-    axis = np.array(_vector(item, 0.0, path))
-    angle = math.radians(_numbers(item.get("angle", ""), 1, path)[0])
-    if not np.linalg.norm(axis) > 0.0:
-        raise InputError("a rotation without an axis", expected='<rotate x="1" angle="90"/>', path=path)
-    x, y, z = axis / np.linalg.norm(axis)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-    return np.asarray(np.eye(3) + math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross)
-
-
-def _vector(item: ElementTree.Element, default: float, path: Path) -> list[float]:
-    """Three numbers of an element: ``value``, or ``x``, ``y`` and ``z``."""
-    text = item.get("value")
-    if text is not None:
-        values = _numbers(text, None, path)
-        return values * 3 if len(values) == 1 else _numbers(text, 3, path)
-    return [_numbers(item.get(axis, str(default)), 1, path)[0] for axis in "xyz"]

@@ -4,41 +4,36 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
 from ..common.outputs import explained_os_errors
-from .materials import CONSTANT, CROWN, face_material, material
+from .materials import CONSTANT, material
 from .meshes import Mesh, site_meshes
 from .site import Site
 
-# Thickness given to ground in the export, a slab from which no echo of its second face returns; and to crowns.
-HALF_SPACE_THICKNESS_M, _CROWN_THICKNESS_M = 1.0, 2.5
+# Thickness given to ground in the export, a slab from which no echo of its second face returns.
+HALF_SPACE_THICKNESS_M = 1.0
 
 
-def export_scene(site: Site, folder: str | Path, *, trees: bool = True) -> list[Path]:
+def export_scene(site: Site, folder: str | Path) -> list[Path]:
     """The site as ``scene.xml`` with ``meshes/*.ply``, which ``sionna.rt.load_scene`` opens.
 
     Parameters
     ----------
     site : Site
-        Any. East is x, north is y, up is z.
+        Any. East is x, north is y, up is z. Trees stay out: to Sionna crowns are slabs and mirrors.
     folder : str or Path
         Made when missing; files of the same names are replaced.
-    trees : bool
-        Crowns and trunks too. Crowns are thin slabs to Sionna, so their loss counts per face, not per metre; the
-        replay keeps them out of the scene for that reason.
 
     Returns
     -------
     list of Path
         The files written, the XML file first.
     """
-    folder, site = Path(folder), site.under("opaque")  # crowns have a shape, a medium has none
-    parts = _parts(site, trees)
+    folder, parts = Path(folder), _parts(site)
     lines = ['<scene version="2.1.0">', f"<!-- {_comment(site)} -->"]
     lines += [_bsdf(name) for name in dict.fromkeys(name for _, name, _ in parts)]
     written = [folder / "scene.xml"]
@@ -57,24 +52,14 @@ def export_scene(site: Site, folder: str | Path, *, trees: bool = True) -> list[
     return written
 
 
-def _parts(site: Site, trees: bool) -> list[tuple[str, str, Mesh]]:
-    """File name, material and mesh of each shape."""
-    meshes = dict(site_meshes(site, trees=trees))
-    if site.scene is None:
-        return [(f"all_{_plain(name)}", name, mesh) for name, mesh in meshes.items()]
-    scene, parts = site.scene, []
-    for number, (label, name) in enumerate(zip(scene.shapes, scene.materials, strict=True)):
-        triangles = scene.triangles[scene.shape == number]
-        used, place = np.unique(triangles, return_inverse=True)
-        mesh = Mesh(scene.vertices_m[used], place.reshape(-1, 3), np.zeros(len(triangles), dtype=np.int64), (label,))
-        parts.append((f"{number}_{_plain(label.removeprefix('mesh-'))[:60]}", name, mesh))
-    # the scene has its own ground
-    ground = material(site.ground_material).name
-    all_of_material = {name: mesh for name, mesh in meshes.items() if name != ground or set(mesh.labels) != {"ground"}}
-    if ground in all_of_material:
-        mesh = all_of_material[ground]
-        all_of_material[ground] = replace(mesh, triangles=mesh.triangles[mesh.owner != mesh.labels.index("ground")])
-    return parts + [(f"all_{_plain(name)}", name, mesh) for name, mesh in all_of_material.items()]
+def _parts(site: Site) -> list[tuple[str, str, Mesh]]:
+    """Title, material and mesh of each part: those of a scene shape by shape, all else by material."""
+    parts, scene = [], site.scene
+    for number in () if scene is None else np.unique(scene.shape):  # none of vegetation, which is a medium
+        used, place = np.unique(scene.triangles[scene.shape == number], return_inverse=True)
+        title = f"{number}_{_plain(scene.shapes[number].removeprefix('mesh-'))[:60]}"
+        parts.append((title, scene.materials[number], (scene.vertices_m[used], place.reshape(-1, 3))))
+    return parts + [(f"all_{_plain(name)}", name, mesh) for name, mesh in site_meshes(site).items()]
 
 
 def _plain(name: str) -> str:
@@ -94,14 +79,13 @@ def _bsdf_id(name: str) -> str:
     if name == "vacuum":
         return "absorber"
     # Sionna takes an id that begins with mat-itu_ for a material of P.2040
-    return f"mat-{_plain(name)}" if name == CROWN or name.startswith(CONSTANT) else f"mat-itu_{_plain(name)}"
+    return f"mat-{_plain(name)}" if name.startswith(CONSTANT) else f"mat-itu_{_plain(name)}"
 
 
 def _bsdf(name: str) -> str:
-    what = face_material(name)
-    of_half_space = _CROWN_THICKNESS_M if name == CROWN else HALF_SPACE_THICKNESS_M
-    thickness = {"thickness": of_half_space if what.thickness_m is None else what.thickness_m}
-    if name == CROWN or name.startswith(CONSTANT):
+    what = material(name)
+    thickness = {"thickness": HALF_SPACE_THICKNESS_M if what.thickness_m is None else what.thickness_m}
+    if name.startswith(CONSTANT):
         values = {
             "relative_permittivity": what.relative_permittivity(1e9).real,
             "conductivity": what.conductivity_s_per_m(1e9),
@@ -120,11 +104,12 @@ def _floats(values: Mapping[str, float]) -> str:
 
 def _write_ply(mesh: Mesh, path: Path) -> None:
     """A binary little-endian PLY, float32 (0.1 mm at 2 km)."""
+    vertices, triangles = mesh
     head = (
         "ply\nformat binary_little_endian 1.0\n"
-        f"element vertex {len(mesh.vertices_m)}\nproperty float x\nproperty float y\nproperty float z\n"
-        f"element face {len(mesh.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+        f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
-    faces = np.empty(len(mesh.triangles), dtype=[("n", "u1"), ("i", "<i4", 3)])
-    faces["n"], faces["i"] = 3, mesh.triangles
-    path.write_bytes(head.encode() + mesh.vertices_m.astype("<f4").tobytes() + faces.tobytes())
+    faces = np.empty(len(triangles), dtype=[("n", "u1"), ("i", "<i4", 3)])
+    faces["n"], faces["i"] = 3, triangles
+    path.write_bytes(head.encode() + vertices.astype("<f4").tobytes() + faces.tobytes())

@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 
 from ..common.errors import UsageError
-from ..common.units import SPEED_OF_LIGHT_MPS, VACUUM_PERMITTIVITY_F_PER_M
+from ..common.units import VACUUM_PERMITTIVITY_F_PER_M
 
 # Lowest and highest frequency [GHz], a, b, c, d.
 Band = tuple[float, float, float, float, float, float]
@@ -96,26 +96,8 @@ class Material:
 # Names that :func:`material` knows.
 MATERIALS: tuple[str, ...] = tuple(_TABLE)
 
-# Name of the crowns' material; not of ITU-R P.2040, and nothing else is made of it.
+# Of vegetation in a scene of triangles: it becomes a medium, nothing reflects off it.
 CROWN = "vegetation"
-
-CROWN_PERMITTIVITY = 1.1
-# Leaves and air, averaged. P.833 gives losses only; the permittivity decides the reflection, the loss hardly does.
-_CROWN_ATTENUATION_DB_PER_M = 0.5
-
-
-# ``2 n a eps0 c`` with the attenuation in neper: of weak loss, whatever the frequency.
-_CROWN_S_PER_M = (
-    2 * math.sqrt(CROWN_PERMITTIVITY) * _CROWN_ATTENUATION_DB_PER_M * math.log(10) / 20
-    * VACUUM_PERMITTIVITY_F_PER_M * SPEED_OF_LIGHT_MPS
-)  # fmt: skip
-# Crowns as a half-space, 30 MHz to 100 GHz (the scope of P.833).
-VEGETATION = Material(CROWN, (0.03, 100.0, CROWN_PERMITTIVITY, 0.0, _CROWN_S_PER_M, 0.0))
-
-
-def face_material(name: str) -> Material:
-    """Material of a reflecting face: :data:`VEGETATION` for crowns, else :func:`material`."""
-    return VEGETATION if name == CROWN else material(name)
 
 
 def material(name: str) -> Material:

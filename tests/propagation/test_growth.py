@@ -237,7 +237,7 @@ def test_a_site_of_prisms_as_a_scene_has_the_paths_of_the_prism_engine(scenes, t
     site = scenes.site(buildings, ((0.0, 0.0, 10.0),), area_m=(-200.0, 200.0, -200.0, 200.0))
     poses = scenes.poses(rng.uniform([-90, -90, 1], [90, 90, 40], (60, 3)))
     prisms = replay(site, scenes.link(site), poses, Search(max_depth=2))
-    export_scene(site, tmp_path, trees=False)
+    export_scene(site, tmp_path)
     open_site = replace(site, buildings=(), scene=placed_scene(tmp_path / "scene.xml"))
     surfaces = replay(open_site, scenes.link(open_site), poses, Search(max_depth=2))
     outside = ~Scene.of(site, scenes.link(site), poses).excluded[0]

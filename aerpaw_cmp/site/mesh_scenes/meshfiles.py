@@ -141,7 +141,7 @@ def _numbers(words: list[bytes], path: Path) -> FloatArray:
 
 @dataclass(slots=True)
 class _Body:
-    """What stands behind the header, read from ``place`` on."""
+    """Bytes behind the header, read from ``place`` on."""
 
     data: bytes
     order: str

@@ -210,20 +210,15 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
     from ..flight.replay import replay_flight
     from ..flight.settings import load_flight
     from ..report.content.flight_parts import report_data
-    from ..report.exports.formats import chosen_formats
     from ..report.exports.tables import metrics as metrics_of
-    from ..report.pages.flight_folder import FIGURES, STYLES, write_report
+    from ..report.pages.flight_folder import write_report
     from .reporting.flight_run import run_flight
     from .reporting.foliage_notes import foliage_notes
     from .reporting.ladder import recommended_text
     from .reporting.pose_paths import pose_paths
     from .tasks.manifest import other_inputs
 
-    for word, words in ((chosen.figures, FIGURES), (chosen.style, STYLES)):
-        if word not in words:
-            raise UsageError(f"found {word!r}", expected="one of " + ", ".join(words), cause="--figures or --style")
-    if chosen.recommend is not None:
-        _require_same_folder(chosen.recommend, flight, options.logs_root)
+    formats = _checked(flight, chosen, options)
     settings, inputs, folder = _report_inputs(flight, chosen, options)
     stages, learned = Stages(options.progress), None if chosen.learned is None else Path(chosen.learned)
     with ExitStack() as outputs:
@@ -232,7 +227,6 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
         if chosen.recommend is not None:
             file = OutputFile(chosen.recommend, own=is_sealed, inputs=inputs, force=options.force)
             target = outputs.enter_context(file)
-        formats = chosen_formats(chosen.export)
         with stages("read"):
             data = load_data(settings, flight.parent, options.logs_root)
             before = None
@@ -263,6 +257,19 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=_failed_checks(metrics))
 
 
+def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[str, ...]:
+    """Refuse options that no report can follow; returns the formats of its exports."""
+    from ..report.exports.formats import chosen_formats
+    from ..report.pages.flight_folder import FIGURES, STYLES
+
+    for word, words in ((chosen.figures, FIGURES), (chosen.style, STYLES)):
+        if word not in words:
+            raise UsageError(f"found {word!r}", expected="one of " + ", ".join(words), cause="--figures or --style")
+    if chosen.recommend is not None:
+        _require_same_folder(chosen.recommend, flight, options.logs_root)
+    return chosen_formats(chosen.export)
+
+
 def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
     """Settings with what the command line says instead, files that they name, folder of the results."""
     from ..flight.gains.memory import load_with_learned
@@ -278,6 +285,7 @@ def plan_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: Run
     """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing."""
     from .plan import report_plan
 
+    _checked(flight, chosen, options)
     settings, inputs, folder = _report_inputs(flight, chosen, options)
     OutputFolder(folder, job="report", inputs=inputs, force=options.force).refuse()
     return report_plan(settings, flight.parent, options.logs_root, inputs=inputs, out=folder, figures=chosen.figures)

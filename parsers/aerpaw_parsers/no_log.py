@@ -172,6 +172,11 @@ def _refuse(what: str) -> Callable[[bytes, ReadOptions], ReadResult]:
     return read
 
 
+_SITE = re.compile(rb"(?m)^origin:[^\0]*^towers:")
+_MAP = re.compile(
+    rb'\A\s*(?:<\?xml[^>]*>\s*)?<osm\b|\A\s*\{[^\[]*"type"\s*:\s*"FeatureCollection"|\A\s*\{[^\[]*"osm3s"'
+)
+
 _KINDS: tuple[tuple[str, str, _Test], ...] = (
     ("antenna_pattern", "a measured antenna pattern (for 'antenna: {model: file}' in flight.yaml)", _antenna_text),
     ("antenna_grid", "antenna gain grids of MATLAB (for 'antenna: {model: gain_grid}' in flight.yaml)", _antenna_mat),
@@ -206,7 +211,9 @@ _KINDS: tuple[tuple[str, str, _Test], ...] = (
      lambda head: _CELL_SEARCH.search(head) is not None and not cell_search.sniff(head)),
     ("flight_plan", "a planned route, not a flight: 'aerpaw-cmp predict' reads it",
      _PLAN),
-    ("flight_yaml", "a flight file of settings, not a log: give it to 'report'", _yaml),
+    ("flight_yaml", "a flight file of settings: give it to 'report'", _yaml),
+    ("site_yaml", "a site: name it under 'site:' in flight.yaml", _SITE),
+    ("map", "a map: 'aerpaw-cmp site import' reads it", _MAP),
 )  # fmt: skip
 
 READERS: tuple[Reader, ...] = tuple(

@@ -60,7 +60,7 @@ def test_what_a_run_would_refuse_a_plan_refuses(tmp_path: Path, capsys: pytest.C
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("x")
     for line in (["report", SAMPLE / "flight.yaml", "-o", tmp_path / "mine"], ["map", "--quick", "-o", tmp_path / "mine"],
-                 ["report", tmp_path / "missing.yaml"], ["map", tmp_path / "missing.yaml"]):  # fmt: skip
+                 ["report", SAMPLE / "flight.yaml", "--export", "bananas"], ["report", tmp_path / "missing.yaml"], ["map", tmp_path / "missing.yaml"]):  # fmt: skip
         assert main([*map(str, line), "--dry-run"]) in (2, 3), line
         assert capsys.readouterr().out == ""
 

@@ -598,5 +598,7 @@ NO_LOGS: dict[str, bytes] = {
         b"Found 1 cells\nFound CELL 930.0 MHz, EARFCN=3500, PHYID=2, 50 PRB, 1 ports, PSS power=-21.3 dBm\n\nBye\n"
     ),
     "flight_plan": b'{\n    "fileType": "Plan",\n    "geoFence": {},\n    "mission": {"items": []}\n}\n',
+    "map": b"<?xml version='1.0'?>\n<osm version='0.6'>\n",
+    "site_yaml": b"name: f\norigin: {latitude_deg: 35.7}\ntowers:\n  T: {}\n",
     "flight_yaml": b"flight:\n  name: f\nsite: lake_wheeler\nlogs:\n  - {path: a.txt}\n",
 }

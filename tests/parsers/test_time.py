@@ -78,6 +78,14 @@ def test_no_or_wrong_zone(name: str | None) -> None:
         _time.local_to_utc(wall("2024-07-02T11:00:00"), name, needed_by="a test")
 
 
+def test_a_winter_time_in_summer_is_refused_with_what_may_be_meant() -> None:
+    """EST is -5 h all year in the zone database; who flies in July and writes it means New York, or does not."""
+    with pytest.raises(UsageError, match=r"New_York \(clocks are turned\) or Etc/GMT\+5"):
+        _time.local_to_utc(wall("2024-07-02T11:00:00"), "EST", needed_by="a test")
+    winter = _time.local_to_utc(wall("2024-01-02T11:00:00"), "EST", needed_by="a test")
+    assert winter.time[0] == np.datetime64("2024-01-02T16:00:00")
+
+
 @given(st.datetimes(datetime(1970, 1, 1), datetime(2261, 1, 1)), st.sampled_from([0, 3, 6]))
 def test_digits(moment: datetime, fraction: int) -> None:
     text = moment.strftime("%Y-%m-%d %H:%M:%S.%f").zfill(26)

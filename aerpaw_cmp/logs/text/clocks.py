@@ -25,6 +25,8 @@ TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
 # Optional offset behind :data:`TIME`.
 ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 
+# Zones of the database without daylight time whose names people use all year: where the clock is turned, and where not.
+_WINTER = {"EST": ("America/New_York", "Etc/GMT+5"), "MST": ("America/Denver", "America/Phoenix")}
 _BUCKET_S = 900  # no zone in use changes its offset within a quarter of an hour of wall clock
 _MONTH_DAYS = np.array([0, 31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
 
@@ -86,6 +88,10 @@ def _offset_s(wall_s: int, where: tzinfo, fold: int) -> int:
     return 0 if offset is None else round(offset.total_seconds())
 
 
+def _offsets_s(buckets: IntArray, where: tzinfo, fold: int) -> IntArray:
+    return np.array([_offset_s(int(bucket) * _BUCKET_S, where, fold) for bucket in buckets.tolist()], dtype=np.int64)
+
+
 def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Instants:
     """Wall clock of a zone to UTC.
 
@@ -105,12 +111,17 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     Raises
     ------
     UsageError
-        If the zone is missing or unknown.
+        If the zone is missing or unknown, or a winter time asked for in summer.
     """
     where = zone(name, needed_by=needed_by)
     starts, buckets, index = _runs(wall_ns)
-    first, second = (np.array([_offset_s(int(b) * _BUCKET_S, where, fold) for b in buckets.tolist()], dtype=np.int64)
-                     for fold in (0, 1))  # fmt: skip
+    first, second = (_offsets_s(buckets, where, fold) for fold in (0, 1))
+    if name in _WINTER and (first != _offsets_s(buckets, zone(_WINTER[name][0], needed_by=needed_by), 0)).any():
+        turned, never = _WINTER[name]
+        raise UsageError(
+            f"{name} is a winter time, and times of {needed_by} lie in summer",
+            expected=f"timezone: {turned} (clocks are turned) or {never} (they are not)",
+        )
     length = np.diff(np.append(starts, len(wall_ns)))
     if np.array_equal(first, second):
         return Instants(_minus(wall_ns, first[index], length), *np.zeros((2, len(wall_ns)), dtype=bool))

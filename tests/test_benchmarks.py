@@ -82,7 +82,7 @@ def test_a_fault_planted_under_random_command_lines_is_seen() -> None:
         "import sys, runpy, aerpaw_cmp.logs.ingest as place\n"
         "def fails(*_): raise ValueError('planted')\n"
         "place.account_rows = fails\n"
-        f"sys.argv = ['x', '--calls', '40', '--seed', '31']\n"
+        f"sys.argv = ['x', '--calls', '12', '--seed', '31']\n"
         f"runpy.run_path({str(BENCHMARKS / 'fuzz_commands.py')!r}, run_name='__main__')\n"
     )
     done = subprocess.run([sys.executable, "-c", planted], capture_output=True, text=True, check=False)

@@ -18,7 +18,6 @@ from aerpaw_cmp.compare.level.rss import (
     seconds,
 )
 from aerpaw_cmp.compare.statistics.intervals import error_intervals
-from tests.real_logs import dataset12
 
 NAN = float("nan")
 
@@ -174,23 +173,6 @@ def test_link_geometry_in_the_antenna_frames():
         )
     level = link_geometry(tower, position, rotation_from_aircraft(np.zeros(50), np.zeros(50), np.full(50, 30.0)))
     np.testing.assert_allclose(level["heading_deg"], 30.0)
-
-
-@pytest.mark.field
-@pytest.mark.parametrize("name", ["40m_fs10MHz", "70m_fs20MHz"])
-def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
-    from aerpaw_cmp.common.geodesy import SiteFrame
-
-    data = dataset12(name)
-    east, north = SiteFrame(35.72750947, -78.69595819).to_local(data["latitude"], data["longitude"])
-    up = np.maximum(data["mZ"], 0.5)
-    flown = up > 20.0
-    free_space = np.where(flown, -20 * np.log10(np.sqrt(east**2 + north**2 + (up - 10) ** 2)), NAN)
-    for channel in ("mpower1", "mpower2"):
-        fit = compare_rss(data["timestamp_power"], data[channel], free_space, span_db=(-100, 100))
-        assert 4.5 < fit.rmse_db < 7.2
-        assert fit.intervals.autocorrelation.n_effective < 0.05 * fit.n  # 0.26 s apart: neighbours repeat each other
-        assert fit.correlation > 0.5
 
 
 def test_spans_are_runs_of_smoothed_errors_of_one_sign():

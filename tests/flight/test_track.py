@@ -9,7 +9,6 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.flight.pose import track as tracks
 from aerpaw_cmp.flight.pose.track import Track, good_positions
 from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
-from tests.real_logs import dataset12
 
 FRAME = SiteFrame(35.7275, -78.6960)
 
@@ -294,24 +293,6 @@ def test_a_position_is_on_earth_and_not_where_a_receiver_without_a_fix_says(plac
 def test_a_gap_limit_must_be_positive():
     with pytest.raises(ValueError, match="positive"):
         Track(telemetry([0.0], 0, 0, 1), FRAME, maximum_gap_s=0)
-
-
-@pytest.mark.field
-@pytest.mark.parametrize(("name", "height"), [("40m_fs10MHz", 40), ("70m_fs20MHz", 70)])
-def test_track_of_a_real_flight(name, height):
-    data = dataset12(name)
-    frame = telemetry(np.zeros(len(data["mZ"])), 0, 0, 0)
-    frame["time"] = pd.to_datetime(data["timestamp_power"], unit="s")
-    columns = {"longitude_deg": "longitude", "latitude_deg": "latitude", "altitude_m": "mZ"}
-    for ours, theirs in (columns | {"roll_deg": "mRoll", "pitch_deg": "mPitch", "yaw_deg": "mYaw"}).items():
-        frame[ours] = data[theirs]
-    track = Track(frame, SiteFrame(35.72750947, -78.69595819))
-    poses = track.pose_at(data["timestamp_power"])
-    assert poses.valid.mean() > 0.99
-    assert np.nanmax(poses.position_m[:, 2]) == pytest.approx(height, abs=3)
-    speed = np.linalg.norm(track._velocity[:, :2], axis=1)
-    assert 3 < np.nanmax(speed) < 25
-    assert poses.attitude_known.mean() > 0.99
 
 
 @pytest.mark.parametrize(("speed_mps", "joined"), [(2.0, True), (15.0, False)])

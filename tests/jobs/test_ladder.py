@@ -195,12 +195,6 @@ def test_every_model_is_a_flight_file(model: Model, tmp_path: Path) -> None:
     assert (settings.rt.foliage == "none") is (model.trees == "none")
 
 
-def test_channels_that_share_a_replay_cost_it_once() -> None:
-    series = [SimpleNamespace(tower=t, settings_key=k) for t, k in (("LW1", "a"), ("LW1", "a"), ("LW1", "b"))]
-    climber = SimpleNamespace(_data=SimpleNamespace(rss=series))
-    assert _Climber._of_flight(climber, [2.0, 3.0, 4.0]) == 7.0
-
-
 def test_a_rung_with_diffraction_states_its_key(tmp_path: Path) -> None:
     model = Model(ground="power sum", buildings=True, diffraction=True)
     assert model.name == "incoherent ground reflection + buildings + diffraction"

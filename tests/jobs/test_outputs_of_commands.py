@@ -243,9 +243,11 @@ def test_a_map_that_fails_in_its_exports_leaves_the_old_one(tmp_path: Path, monk
 def own_folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of this tool that later commands read: ``scene`` of ``site.yaml``, ``flown`` with logs of ``away.yaml``."""
     folder = tmp_path_factory.mktemp("own")
-    scene, site = folder / "scene", folder / "site.yaml"
-    assert main(["site", "export", "lake_wheeler", "-o", str(scene)]) == 0
-    assert main(["site", "import", str(scene / "scene.xml"), "--base", "lake_wheeler", "-o", str(site)]) == 0
+    scene, site, small = folder / "scene", folder / "site.yaml", folder / "small.yaml"
+    (folder / "g.json").write_text(MAP)
+    assert main(["site", "import", str(folder / "g.json"), "-o", str(small)]) == 0
+    assert main(["site", "export", str(small), "-o", str(scene)]) == 0
+    assert main(["site", "import", str(scene / "scene.xml"), "--base", str(small), "-o", str(site)]) == 0
     assert main(["simulate", str(SAMPLE / "flight.yaml"), "-o", str(folder / "flown")]) == 0
     content = yaml.safe_load((SAMPLE / "flight.yaml").read_text())
     for log in content["logs"]:

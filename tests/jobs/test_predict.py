@@ -13,8 +13,6 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.jsonable import json_safe
-from aerpaw_cmp.compare.gains.direction_gain import LinkSamples
-from aerpaw_cmp.compare.learning import correction
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.learning.calibrate import observe
@@ -286,34 +284,6 @@ def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(pr
 def rows_of(prediction, tower, channel):
     table = prediction.table
     return table[(table["tower"] == tower) & (table["channel"] == channel)]
-
-
-def test_directions_are_evaluated_once_per_degree_over_all_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(correction, "MOST_DIRECTIONS", 10)
-    asked = []
-
-    def gain(samples):
-        asked.append(len(samples))
-        return 10.0 * samples.at_tower[:, 0] + 3.0 * samples.at_uav[:, 1], 1.0 + samples.at_tower[:, 2]
-
-    azimuth = np.random.default_rng(3).uniform(-np.pi, np.pi, 4000)
-    ray = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full(4000, 0.2)]) / np.hypot(1.0, 0.2)
-    samples = LinkSamples(
-        flight="", tower="T", channel="a", time_s=np.zeros(4000), position_m=100.0 * ray, at_uav=-ray, at_tower=ray,
-        residual_db=np.zeros(4000),
-    )  # fmt: skip
-    predict = correction.by_degree(gain)
-    at_once = predict(samples)
-    for part in (slice(0, 2000), slice(2000, 4000)):
-        rows = np.arange(4000)[part]
-        again = predict(samples.part(rows))
-        np.testing.assert_array_equal(again[0], at_once[0][rows])
-        np.testing.assert_array_equal(again[1], at_once[1][rows])
-    assert len(asked) == 1
-    assert asked[0] <= 1500  # degrees at either end, not samples
-    np.testing.assert_allclose(at_once[0], gain(samples)[0], atol=0.3)
-    other = predict(dataclasses.replace(samples, channel="b", at_tower=-ray, at_uav=ray))
-    np.testing.assert_allclose(other[0], -at_once[0], atol=0.6)
 
 
 @pytest.mark.parametrize("text", ["east_m,north_m,height_m,yaw_deg\n1,2,30,\n1,2,30,90\n",

@@ -57,10 +57,6 @@ def test_newest_first_and_each_file_once(folders: tuple[Path, dict[str, str]]) -
     assert [library.version for library in libraries] == [(22,), (19, 1), (14,), (9,)]
 
 
-def test_none_found(folders: tuple[Path, dict[str, str]]) -> None:
-    assert llvm.candidates(folders[1]) == []
-
-
 def test_the_users_choice_stands_alone(folders: tuple[Path, dict[str, str]]) -> None:
     folder, environ = folders
     put(folder, "libLLVM.so.19.1", "libLLVM-17.so.1", "mine.so")
@@ -167,15 +163,6 @@ def test_the_child_gets_the_library_and_an_empty_kernel_cache() -> None:
     assert llvm.try_library(llvm.Library(Path("/here/libLLVM.so"), ()), program=program).ok
 
 
-def test_the_next_library_is_tried_after_a_failure() -> None:
-    libraries = [llvm.Library(Path(f"libLLVM.so.{major}"), (major,)) for major in (22, 19, 17)]
-    trials = llvm.first_that_works(
-        libraries,
-        lambda library: llvm.try_library(library, program=ABORTS if library.version == (22,) else ANSWERS % 19),
-    )
-    assert [trial.ok for trial in trials] == [False, True]
-
-
 def test_prepare_points_drjit_to_what_works(
     folders: tuple[Path, dict[str, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -250,13 +237,6 @@ def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
         "libllvm22 libatomic1",
         "libllvm19 libatomic1",
     ]
-
-
-def test_install_refuses_without_root(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(setup, "root_prefix", lambda: None)
-    said: list[str] = []
-    assert setup.install(said.append) is None
-    assert said == []
 
 
 @pytest.mark.parametrize(

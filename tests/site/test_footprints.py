@@ -15,18 +15,7 @@ from aerpaw_cmp.site.imports.footprints import Footprints, import_footprints, im
 from aerpaw_cmp.site.siteyaml import build_site, load_site
 from tests.geojson import collection, feature, polygon
 from tests.real_logs import REAL
-
-FRAME = SiteFrame(35.7275, -78.696)
-Ring = list[tuple[float, float]]
-
-
-def square(east: float, north: float, size: float = 20.0) -> Ring:
-    return [(east, north), (east + size, north), (east + size, north + size), (east, north + size)]
-
-
-def lonlat(ring: Ring, frame: SiteFrame = FRAME) -> list[list[float]]:
-    latitude, longitude = frame.to_geographic(*np.array([*ring, ring[0]]).T)
-    return [[float(x), float(y)] for x, y in zip(longitude, latitude, strict=True)]
+from tests.site.osm import FRAME, Osm, Ring, lonlat, square
 
 
 def geojson(path: Path, *features: tuple[list[Ring], dict[str, object]]) -> Path:
@@ -46,58 +35,38 @@ VILLAGE: list[tuple[str, list[Ring], dict[str, str]]] = [
 ]
 
 
-def osm_parts() -> tuple[
-    list[tuple[int, float, float]],
-    list[tuple[int, list[int], dict[str, str]]],
-    list[tuple[list[tuple[int, str]], dict[str, str]]],
-]:
-    nodes: list[tuple[int, float, float]] = []
-    ways: list[tuple[int, list[int], dict[str, str]]] = []
-    relations = []
+def village() -> Osm:
+    osm = Osm()
     for _, rings, tags in VILLAGE:
         members = []
         for number, ring in enumerate(rings):
-            first = len(nodes) + 1
-            nodes += [(first + i, lat, lon) for i, (lon, lat) in enumerate(lonlat(ring)[:-1])]
-            around = [*range(first, len(nodes) + 1), first]
+            first, *others = [osm.node(*point) for point in lonlat(ring)[:-1]]
+            around = [first, *others, first]
             if len(rings) == 1:
-                ways.append((len(ways) + 1, around, tags))
-            else:  # the outline in two pieces, one of them backwards
-                half = len(around) // 2
-                for piece in (around[: half + 1], around[half:][::-1]):
-                    ways.append((len(ways) + 1, piece, {}))
-                    members.append((len(ways), "inner" if number else "outer"))
+                osm.line(around, **tags)
+                continue
+            half = len(around) // 2  # the outline in two pieces, one of them backwards
+            for piece in (around[: half + 1], around[half:][::-1]):
+                members.append((osm.line(piece), "inner" if number else "outer"))
         if members:
-            relations.append((members, {**tags, "type": "multipolygon"}))
-    ways.append((len(ways) + 1, [1, 2, 6], {"highway": "track"}))
-    return nodes, ways, relations
+            osm.relation(members, **tags, type="multipolygon")
+    osm.line([1, 2, 6], highway="track")
+    return osm
 
 
 def osm_xml(path: Path) -> Path:
-    nodes, ways, relations = osm_parts()
-
-    def tag_lines(tags: dict[str, str]) -> str:
-        return "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
-
-    text = '<?xml version="1.0"?><osm version="0.6">'
-    text += "".join(f'<node id="{i}" lat="{lat!r}" lon="{lon!r}"/>' for i, lat, lon in nodes)
-    for i, refs, tags in ways:
-        text += f'<way id="{i}">' + "".join(f'<nd ref="{r}"/>' for r in refs) + tag_lines(tags) + "</way>"
-    for n, (members, tags) in enumerate(relations):
-        text += f'<relation id="{n}">' + "".join(f'<member type="way" ref="{r}" role="{role}"/>' for r, role in members)
-        text += tag_lines(tags) + "</relation>"
-    path.write_text(text + "</osm>")
+    path.write_text(village().xml())
     return path
 
 
 def overpass(path: Path) -> Path:
-    nodes, ways, relations = osm_parts()
-    where = {i: {"lat": lat, "lon": lon} for i, lat, lon in nodes}
-    lines = {i: [where[r] for r in refs] for i, refs, _ in ways}
+    osm = village()
+    where = {i: {"lat": lat, "lon": lon} for i, lat, lon, _ in osm.nodes}
+    lines = {i: [where[r] for r in refs] for i, refs, _ in osm.ways}
     elements: list[dict[str, object]] = [
-        {"type": "way", "id": i, "tags": tags, "geometry": lines[i]} for i, _, tags in ways if tags
+        {"type": "way", "id": i, "tags": tags, "geometry": lines[i]} for i, _, tags in osm.ways if tags
     ]
-    for n, (members, tags) in enumerate(relations):
+    for n, (members, tags) in enumerate(osm.relations):
         listed = [{"type": "way", "ref": r, "role": role, "geometry": lines[r]} for r, role in members]
         elements.append({"type": "relation", "id": n, "tags": tags, "members": listed})
     path.write_text(json.dumps({"version": 0.6, "elements": elements}))

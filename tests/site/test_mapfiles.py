@@ -14,23 +14,20 @@ import shapely
 from aerpaw_cmp.common import kml as kml_module
 from aerpaw_cmp.common import xmlfiles
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.imports import mapfiles
 from aerpaw_cmp.site.imports.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.imports.mapfiles import MAX_TAGS, read_map_file
 from aerpaw_cmp.site.imports.outlines import OSM_CREDIT
 from aerpaw_cmp.site.siteyaml import build_site, load_site
 from tests.geojson import collection, feature, polygon
+from tests.site.osm import FRAME, Osm, Ring, lonlat
+from tests.site.osm import square as flat
 
-FRAME = SiteFrame(35.7275, -78.696)
-Ring = list[tuple[float, float]]
 BARN = {"building": "barn", "height": "7.5"}
 
 
 def square(east: float, north: float, size: float = 20.0) -> Ring:
-    corners = [(east, north), (east + size, north), (east + size, north + size), (east, north + size), (east, north)]
-    latitude, longitude = FRAME.to_geographic(*np.array(corners).T)
-    return [(float(x), float(y)) for x, y in zip(longitude, latitude, strict=True)]
+    return lonlat(flat(east, north, size))
 
 
 def read(tmp_path: Path, content: Any, name: str = "m.json", **options: Any) -> Footprints:
@@ -45,42 +42,6 @@ def said(footprints: Footprints, words: str) -> bool:
 
 
 # ---------------------------------------------------------------- OSM
-
-
-class Osm:
-    """OSM data written as XML or as Overpass JSON."""
-
-    def __init__(self) -> None:
-        self.nodes: list[tuple[int, float, float, dict[str, str]]] = []
-        self.ways: list[tuple[int, list[int], dict[str, str]]] = []
-        self.relations: list[tuple[list[tuple[int, str]], dict[str, str]]] = []
-
-    def node(self, lon: float, lat: float, **tags: str) -> int:
-        self.nodes.append((len(self.nodes) + 1, lat, lon, tags))
-        return len(self.nodes)
-
-    def way(self, ring: Ring, **tags: str) -> int:
-        ids = [self.node(*point) for point in ring[:-1]]
-        self.ways.append((100 + len(self.ways), [*ids, ids[0]], tags))
-        return self.ways[-1][0]
-
-    def relation(self, members: list[tuple[int, str]], **tags: str) -> None:
-        self.relations.append((members, tags))
-
-    def xml(self, *, drop: tuple[int, ...] = (), root: str = '<osm version="0.6">') -> str:
-        def words(tags: dict[str, str]) -> str:
-            return "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
-
-        lines = ['<?xml version="1.0"?>', root]
-        for i, lat, lon, tags in self.nodes:
-            if i not in drop:
-                lines.append(f'<node id="{i}" lat="{lat!r}" lon="{lon!r}">{words(tags)}</node>')
-        for i, refs, tags in self.ways:
-            lines.append(f'<way id="{i}">' + "".join(f'<nd ref="{r}"/>' for r in refs) + words(tags) + "</way>")
-        for n, (members, tags) in enumerate(self.relations):
-            listed = "".join(f'<member type="way" ref="{r}" role="{role}"/>' for r, role in members)
-            lines.append(f'<relation id="{n}">{listed}{words(tags)}</relation>')
-        return "\n".join([*lines, "</osm>"])
 
 
 @pytest.mark.parametrize("style", ["multipolygon", "tags on the outer way", "tags on both", "no roles"])

@@ -8,7 +8,7 @@ import pytest
 from aerpaw_cmp.site.imports.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.siteyaml import build_site
 from tests.geojson import collection, feature, polygon
-from tests.site.test_footprints import FRAME, lonlat, square
+from tests.site.osm import FRAME, Osm, lonlat, square
 
 REPORTED = Path(__file__).parents[1] / "reported"
 
@@ -26,13 +26,10 @@ def village(path: Path, *tags: dict[str, object]) -> Footprints:
 
 def osm(path: Path, *ways: tuple[tuple[float, float, float], dict[str, str]]) -> Footprints:
     """Squares (east, north, size) with tags as OSM XML."""
-    nodes, lines = [], []
-    for n, ((east, north, size), tags) in enumerate(ways):
-        ring = lonlat(square(east, north, size))[:-1]
-        nodes += [f'<node id="{10 * n + i}" lat="{lat}" lon="{lon}"/>' for i, (lon, lat) in enumerate(ring)]
-        ends = "".join(f'<nd ref="{10 * n + i % 4}"/>' for i in range(5))
-        lines.append(f'<way id="{n}">{ends}' + "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items()) + "</way>")
-    path.write_text(f'<osm version="0.6">{"".join(nodes + lines)}</osm>')
+    content = Osm()
+    for corner_and_size, tags in ways:
+        content.way(lonlat(square(*corner_and_size)), **tags)
+    path.write_text(content.xml())
     return import_footprints([path], FRAME)
 
 

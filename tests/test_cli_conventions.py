@@ -43,7 +43,7 @@ MISSING = [
     "explain nope.yaml --time 1 --tower LW1", "diff nope other",
     "tap nope --flight nope.yaml", "map nope.yaml",
     "predict nope.kml --with nope.yaml", "plan nope.kml --site lake_wheeler", "plan sphere --with nope.yaml",
-    "channel nope.yaml", "antenna export nope.txt -o out.py",
+    "channel nope.yaml", "locate nope.yaml", "antenna export nope.txt -o out.py",
     "plan sphere --site lake_wheeler --geofence nope.kml", "simulate nope.yaml", "site show nope.yaml",
     "site export nope.yaml -o scene", "site import nope.osm -o site.yaml",
 ]  # fmt: skip

@@ -211,3 +211,34 @@ def test_odds_are_those_of_a_node_twenty_metres_about_the_candidate(monkeypatch:
     log_odds = locating._log_odds(track, np.array([[10.0, 5.0, 1.5], [-30.0, 9.0, 10.0]]), 2.0)
     mean = (4.0 + 2.0 * np.cosh(np.sqrt(3.0) * 20.0 / 50.0)) / 6.0
     assert log_odds == pytest.approx(np.array([10.0, -30.0]) / 50.0 + np.log(mean) - 2.0)
+
+
+def test_a_straight_flight_leaves_two_places_and_both_are_regions() -> None:
+    """Levels along a line are the same for a node and for its mirror image: each holds half."""
+    time = np.arange(0.0, 240.0, 2.0)
+    position = np.column_stack([np.zeros(120), 4.0 * time - 480.0, np.full(120, 30.0)])
+    node = np.array([180.0, 40.0, 1.5])
+    away = np.linalg.norm(position - node, axis=1)
+    level = -30.0 * np.log10(away) + np.random.default_rng(3).normal(0.0, 1.0, 120)
+    known = locating.LevelModel(slope_sd=0.1, elevation_sd_db=0.1, shadow_sd_db=0.5, scatter_sd_db=1.0)
+    estimate = locate(level_track(time, position, level), model=known)
+    modes = estimate.regions.modes()
+    assert len(modes) == 2
+    assert modes[0].place_m[0] == pytest.approx(-modes[1].place_m[0], abs=20.0)
+    assert [mode.share for mode in modes] == pytest.approx([0.45, 0.45], abs=0.1)
+    assert estimate.regions.holds(node)
+    assert estimate.regions.holds([-180.0, 40.0])
+    assert not estimate.regions.holds([0.0, 40.0])
+    assert not estimate.regions.holds([5000.0, 40.0])
+
+
+def test_regions_of_one_place_are_the_disks_of_a_normal_distribution() -> None:
+    """Blurred by 20 m an axis, 90 % lie within 20 sqrt(2 ln 10) m and 50 % within 20 sqrt(2 ln 2) m."""
+    regions = locating.Regions.of(np.array([[10.0, -30.0]]), np.ones(1))
+    for part, radius_m in ((0.9, 20.0 * np.sqrt(2.0 * np.log(10.0))), (0.5, 20.0 * np.sqrt(2.0 * np.log(2.0)))):
+        (mode,) = regions.modes(part)
+        assert regions.radius_m(mode.place_m, part) == pytest.approx(radius_m, abs=4.0)
+        assert mode.radius_m < radius_m
+        assert mode.share == pytest.approx(part, abs=0.01)
+        area_m2 = regions.holding(part).sum() * np.diff(regions.east_m)[0] * np.diff(regions.north_m)[0]
+        assert area_m2 == pytest.approx(np.pi * radius_m**2, rel=0.03)

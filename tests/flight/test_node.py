@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.compare.learning.locate import LevelModel, NodeEstimate, level_track
+from aerpaw_cmp.compare.learning.locate import LevelModel, NodeEstimate, Regions, level_track
 from aerpaw_cmp.flight.drafting import node
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
 from aerpaw_cmp.flight.drafting.node import listed_places
@@ -154,7 +154,7 @@ def test_a_place_wants_odds_of_two_and_a_listed_one_as_many_as_any_tower(
     estimate = NodeEstimate(
         anywhere=0.0,
         place_m=at, radius90_m=77.0, height_m=(1.5, 10.0), slope=3.0, slope_sd=0.2,
-        log_odds=np.array([*odds, *listed]), at_edge=False,
+        log_odds=np.array([*odds, *listed]), at_edge=False, regions=Regions.of(at[None], np.ones(1)),
     )  # fmt: skip
     asked: list[FloatArray] = []
     monkeypatch.setattr(node, "locate", lambda _, places: asked.append(places) or estimate)

@@ -29,7 +29,7 @@ flight:
       - {east_m: 10, north_m: 300, height_m: 40}
       - {east_m: 10, north_m: 60, height_m: 40}
 timezone: America/New_York
-logs: [{path: LW1.txt, reader: gnu_radio_power, node: LW1, channel: A}]
+logs: [{path: LW1.txt, reader: sounder_log, node: LW1, channel: A}]
 link:
   rank: {carrier_hz: 3.4e9, uav_transmits: false, tower: {layout: tower_comparison}, uav: {layout: uav_comparison}}
 """

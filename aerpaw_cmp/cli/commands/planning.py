@@ -1,7 +1,8 @@
-"""Before a flight: ``predict``, ``plan``, ``channel``."""
+"""Before a flight: ``predict``, ``plan``, ``channel``; ``locate``."""
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -197,3 +198,33 @@ def channel(
     warn_all(m["warnings"])
     for file in outcome.files:
         show(file)
+
+
+@command(
+    "locate",
+    examples=["aerpaw-cmp locate flight.yaml -o where", "aerpaw-cmp locate flight.yaml --channel USRP1 --follow"],
+)
+def locate(
+    flight: Annotated[Path, Argument(help="flight.yaml with telemetry and a log of levels; its nodes are not used.")],
+    out: Annotated[Path | None, output("Output folder  [default: reports/locate-<flight>]")] = None,
+    channel: Annotated[str | None, Option(help="Channel of the logs  [default: the first]")] = None,
+    follow: Annotated[bool, Option("--follow", help="Again every 10 s while the logs grow, until Ctrl-C.")] = False,
+    logs_root: LogsRoot = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Place an unknown node on the ground by the levels of a flight."""
+    from ...jobs.locate import run_locate
+
+    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+    while True:
+        outcome = run_locate(flight, options, channel)
+        if as_json:
+            print_json(outcome.metrics)
+        else:
+            show(outcome.metrics["sentence"])
+            warn_all(outcome.metrics["warnings"])
+            show(f"page: {outcome.files[0]}")
+        if not follow:
+            return
+        time.sleep(10.0)

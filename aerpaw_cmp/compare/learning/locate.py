@@ -252,6 +252,97 @@ def _likelihood(track: LevelTrack, latent: FloatArray, noise: float) -> tuple[Fl
     return value.sum(axis=1), gradient, weight
 
 
+# Cells of the regions [m].
+_CELL_M = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """A connected part of the 90 % region.
+
+    Parameters
+    ----------
+    place_m : (2,)
+        Its likeliest place, east and north.
+    share : float
+        Of the posterior that it holds.
+    radius_m : float
+        About the place, that holds nine tenths of it.
+    """
+
+    place_m: FloatArray
+    share: float
+    radius_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Regions:
+    """Posterior of a node's place in cells.
+
+    Parameters
+    ----------
+    east_m, north_m : (columns,), (rows,)
+        Middles of the cells.
+    share : (columns, rows)
+        Of the posterior in each cell; 1 in all.
+    """
+
+    east_m: FloatArray
+    north_m: FloatArray
+    share: FloatArray
+
+    @classmethod
+    def of(cls, places: FloatArray, share: FloatArray) -> Regions:
+        """Places (m, 2 or more) that hold shares (m,), each blurred by :data:`SYSTEMATIC_M`."""
+        reach = 4.0 * SYSTEMATIC_M
+        axes = [np.arange(p.min() - reach, p.max() + reach + _CELL_M, _CELL_M) for p in places.T[:2]]
+        weights = [
+            np.exp(-0.5 * ((axis[:, None] - p) / SYSTEMATIC_M) ** 2) for axis, p in zip(axes, places.T, strict=False)
+        ]
+        density = (weights[0] * share) @ weights[1].T
+        return cls(axes[0], axes[1], density / density.sum())
+
+    def holding(self, part: float) -> BoolArray:
+        """The smallest set of cells (columns, rows) that holds a part of the posterior."""
+        order = np.argsort(-self.share, axis=None)
+        held = np.zeros(self.share.size, dtype=np.bool_)
+        held[order[: int(np.searchsorted(np.cumsum(self.share.ravel()[order]), part)) + 1]] = True
+        return held.reshape(self.share.shape)
+
+    def modes(self, part: float = 0.9) -> tuple[Mode, ...]:
+        """Connected parts of the region that holds a part of the posterior, the likeliest first."""
+        from scipy.ndimage import label
+
+        marks, count = label(self.holding(part), structure=np.ones((3, 3)))
+        out = []
+        for number in range(1, count + 1):
+            cells = np.argwhere(marks == number)
+            at = np.column_stack([self.east_m[cells[:, 0]], self.north_m[cells[:, 1]]])
+            share = self.share[tuple(cells.T)]
+            best = at[share.argmax()]
+            out.append(Mode(place_m=best, share=float(share.sum()), radius_m=_within(at - best, share, 0.9)))
+        return tuple(sorted(out, key=lambda mode: -mode.share))
+
+    def radius_m(self, place_m: FloatArray, part: float) -> float:
+        """Radius of the circle about a place that holds a part of the posterior."""
+        east, north = np.meshgrid(self.east_m - place_m[0], self.north_m - place_m[1], indexing="ij")
+        return _within(np.column_stack([east.ravel(), north.ravel()]), self.share.ravel(), part)
+
+    def holds(self, place_m: ArrayLike, part: float = 0.9) -> bool:
+        """Check whether a place lies in the region that holds a part of the posterior."""
+        away = [np.abs(axis - x) for axis, x in zip((self.east_m, self.north_m), unmasked(place_m), strict=False)]
+        cell = tuple(int(distance.argmin()) for distance in away)
+        return bool(max(distance.min() for distance in away) <= _CELL_M and self.holding(part)[cell])
+
+
+def _within(step_m: FloatArray, share: FloatArray, part: float) -> float:
+    """Length of steps (n, 2) within which lies a part of their shares (n,)."""
+    away = np.hypot(*step_m.T)
+    order = np.argsort(away)
+    held = np.cumsum(share[order])
+    return float(away[order][np.searchsorted(held, part * held[-1])])
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NodeEstimate:
     """Place of a node by the levels of a flight.
@@ -272,6 +363,7 @@ class NodeEstimate:
         Log evidence of any place within reach.
     at_edge : bool
         The likeliest place lies at the edge of the search: the node may stand farther away.
+    regions : Regions
     """
 
     place_m: FloatArray
@@ -282,6 +374,7 @@ class NodeEstimate:
     log_odds: FloatArray
     anywhere: float
     at_edge: bool
+    regions: Regions
 
     def __contains__(self, place_m: ArrayLike) -> bool:
         """Check whether a place lies within the 90 % region."""
@@ -289,7 +382,7 @@ class NodeEstimate:
         return bool(np.hypot(*step) <= self.radius90_m)
 
 
-def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
+def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = UNKNOWN) -> NodeEstimate:
     """Place, height and slope that explain the levels of a flight best, and how well given places do.
 
     Parameters
@@ -298,6 +391,8 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
         At least :data:`FEWEST` bins.
     candidates_m : (k, 3)
         Places such as towers: east, north, up.
+    model : LevelModel
+        Narrower where antennas are known.
 
     Raises
     ------
@@ -314,14 +409,14 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
         raise ValueError(f"{len(track.level_db)} levels: a search for a node wants {FEWEST}")
     grid = _grid(track)
     places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
-    evidence = fit_places(track, places).evidence + _log_prior(places)
+    evidence = fit_places(track, places, model).evidence + _log_prior(places)
     candidates = unmasked(candidates_m).reshape(-1, 3)
     anywhere = float(logsumexp(evidence)) - np.log(len(grid))
     log_odds = _log_odds(track, candidates, anywhere)
     places = places[evidence > evidence.max() - _POSSIBLE]
     if len(places) <= _MOST_REFINED:
         places = _refined(places)
-    fits = fit_places(track, places)
+    fits = fit_places(track, places, model)
     log_share = fits.evidence + _log_prior(places)
     share = np.exp(log_share - logsumexp(log_share))
     apart = np.hypot(*(places[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1))
@@ -337,6 +432,7 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = ()) -> NodeEstimate:
         log_odds=log_odds,
         anywhere=anywhere,
         at_edge=_on_edge(places[best], grid),
+        regions=Regions.of(places, share),
     )
 
 

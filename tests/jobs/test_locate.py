@@ -1,0 +1,105 @@
+"""An unknown node of a simulated flight, from its logs to the page."""
+
+import json
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.jobs.options import RunOptions
+from aerpaw_cmp.jobs.run import run_simulate
+from aerpaw_cmp.site.siteyaml import load_site
+from tests.json_page import listed
+
+PLAN = """
+flight:
+  name: search
+  plan:
+    start: 2025-06-01T10:00:00
+    speed_mps: 8
+    fading_db: 2
+    waypoints:
+      - {east_m: -250, north_m: -150, height_m: 30}
+      - {east_m: 250, north_m: -150, height_m: 30}
+      - {east_m: 250, north_m: 60, height_m: 30}
+      - {east_m: -250, north_m: 60, height_m: 30}
+      - {east_m: -250, north_m: 230, height_m: 30}
+      - {east_m: 250, north_m: 230, height_m: 30}
+timezone: America/New_York
+site: {file: lake_wheeler, without_buildings: true}
+logs:
+  - {path: vehicleOut.txt, reader: vehicle_out}
+  - {path: power.txt, reader: sounder_log, node: LW1, channel: A}
+rt: {max_depth: 0}
+"""
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("search")
+    (folder / "plan.yaml").write_text(PLAN)
+    run_simulate(folder / "plan.yaml", RunOptions(out=folder / "flown"))
+    text = PLAN.partition("  plan:")[0] + "timezone" + PLAN.partition("timezone")[2].replace("node: LW1, ", "")
+    (folder / "flown" / "unknown.yaml").write_text(text)
+    return folder / "flown" / "unknown.yaml"
+
+
+def test_the_node_lies_in_its_region_and_the_page_says_what_was_assumed(flight, capsys):
+    out = flight.parents[1] / "out"
+    assert main(["locate", str(flight), "-o", str(out), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert list(printed) == ["schema", *listed("locate")]
+    site = load_site("lake_wheeler")
+    east, north = site.frame.to_local(
+        np.array([printed["position"]["latitude_deg"]]), np.array([printed["position"]["longitude_deg"]])
+    )
+    tower = site.towers["LW1"].position_m
+    away = float(np.hypot(east[0] - tower[0], north[0] - tower[1]))
+    assert away <= printed["region90_m"]
+    assert away < 60.0
+    assert printed["region50_m"] < printed["region90_m"] < 500.0
+    assert sum(mode["share"] for mode in printed["modes"]) == pytest.approx(0.9, abs=0.02)
+    html = (out / "locate.html").read_text()
+    assert printed["sentence"] in html
+    assert "Path-loss exponent" in html
+    assert "Antenna of the UAV: unknown. Antenna of the node: unknown" in html
+    assert html.count("<svg") + html.count("data:image") >= 1
+
+
+def test_what_cannot_be_located_is_refused(flight, capsys, tmp_path):
+    assert main(["locate", str(flight), "--channel", "B", "-o", str(tmp_path / "out")]) == 2
+    assert "one of A" in capsys.readouterr().err
+    text = flight.read_text().replace("  - {path: vehicleOut.txt, reader: vehicle_out}\n", "")
+    (flight.parent / "blind.yaml").write_text(text)
+    assert main(["locate", str(flight.parent / "blind.yaml"), "-o", str(tmp_path / "out")]) == 3
+    assert "no log has telemetry" in capsys.readouterr().err
+    short = flight.parent / "short.txt"
+    short.write_text("".join(flight.with_name("power.txt").read_text().splitlines(keepends=True)[:40]))
+    (flight.parent / "short.yaml").write_text(flight.read_text().replace("path: power.txt", "path: short.txt"))
+    assert main(["locate", str(flight.parent / "short.yaml"), "-o", str(tmp_path / "out")]) == 3
+    assert "bins of 4 s" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_growing_log_is_followed_until_it_is_interrupted(flight, capsys, tmp_path, monkeypatch):
+    from aerpaw_cmp.cli.commands import planning
+
+    whole = flight.with_name("power.txt").read_text().splitlines(keepends=True)
+    growing = flight.with_name("growing.txt")
+    growing.write_text("".join(whole[: len(whole) // 2]) + whole[-1][:9])  # a torn last line
+    (flight.parent / "growing.yaml").write_text(flight.read_text().replace("path: power.txt", "path: growing.txt"))
+    waits = []
+
+    def wait(seconds):
+        waits.append(seconds)
+        growing.write_text("".join(whole))
+        if len(waits) == 2:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(planning.time, "sleep", wait)
+    assert main(["locate", str(flight.parent / "growing.yaml"), "-o", str(tmp_path / "out"), "--follow"]) == 130
+    first, second = (
+        line for line in capsys.readouterr().out.splitlines() if "node most likely" in line or "places" in line
+    )
+    assert first != second
+    assert (tmp_path / "out" / "locate.html").exists()

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 from ..common.outputs import OutputFile, is_sealed, sealed
 from ..flight.settings import AntennaSettings, load_pattern
 from ..site.antenna.antennas import MeasuredPattern
 from ..site.antenna.export import exported
-from ..site.antenna.sphere_pattern import COLUMNS
 from .options import JobOutcome
 
 
@@ -44,22 +43,11 @@ def run_antenna_export(
     inputs = [file, *([] if elevation is None else [elevation])]
     bare = out.suffix == ".msi"  # the format begins with NAME: no line in front
     with OutputFile(out, own=is_sealed, inputs=inputs, force=force) as output:
-        model: Literal["gain_grid", "sphere", "file"] = "gain_grid" if variable is not None else "file"
-        if model == "file" and elevation is None and _is_sphere(file):
-            model = "sphere"
         cut = None if elevation is None else str(elevation.absolute())
-        settings = AntennaSettings(model=model, file=str(file.absolute()), variable=variable, elevation=cut)
+        kind: Any = {"model": "file" if variable is None else "gain_grid"}
+        settings = AntennaSettings(**kind, file=str(file.absolute()), variable=variable, elevation=cut)
         pattern = load_pattern(settings, Path(), carrier_hz)
         assert isinstance(pattern, MeasuredPattern)
         text = exported(pattern, file.stem, out, carrier_hz)
         output.write(text.encode("utf-8") if bare else sealed(text))
     return JobOutcome(folder=out.parent, files=(out,))
-
-
-def _is_sphere(file: Path) -> bool:
-    """Check whether the header of a CSV file is that of a sphere; a missing file is told by its reader."""
-    if file.suffix.lower() != ".csv" or not file.is_file():
-        return False
-    with file.open(encoding="utf-8", errors="replace") as stream:
-        head = next((line for line in stream if line.strip() and not line.startswith("#")), "")
-    return head.replace(" ", "").startswith(",".join(COLUMNS[:2]))

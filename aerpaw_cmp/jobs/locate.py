@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import InputError, UsageError
+from ..common.jsonable import named
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..common.units import FloatArray
@@ -131,17 +132,15 @@ def _name(stream: Stream) -> str:
 def _page(flight: str, level: Stream, site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -> LocatePage:
     regions, modes = estimate.regions, list[dict[str, float]]()
     for mode in regions.modes():
-        latitude, longitude = site.frame.to_geographic(mode.place_m[:1], mode.place_m[1:])
-        modes.append(
-            {
-                "latitude_deg": float(latitude[0]),
-                "longitude_deg": float(longitude[0]),
-                "east_m": float(mode.place_m[0]),
-                "north_m": float(mode.place_m[1]),
-                "share": mode.share,
-                "radius_m": mode.radius_m,
-            }
+        (latitude,), (longitude,) = site.frame.to_geographic(mode.place_m[:1], mode.place_m[1:])
+        place = dict(
+            zip(
+                ("latitude_deg", "longitude_deg", "east_m", "north_m"),
+                (latitude, longitude, *mode.place_m),
+                strict=True,
+            )
         )
+        modes.append({name: float(x) for name, x in place.items()} | named(mode, "share radius_m"))
     low, high = estimate.height_m
     floor = "none shows" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB, below it only that is known"
     edge = "The likeliest place lies at the edge of the search: the node may stand farther away."

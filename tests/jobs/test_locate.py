@@ -57,7 +57,7 @@ def test_the_node_lies_in_its_region_and_the_page_says_what_was_assumed(flight, 
     away = float(np.hypot(east[0] - tower[0], north[0] - tower[1]))
     assert away <= printed["region90_m"]
     assert away < 60.0
-    assert printed["region50_m"] < printed["region90_m"] < 500.0
+    assert printed["region50_m"] < printed["region90_m"]
     assert sum(mode["share"] for mode in printed["modes"]) == pytest.approx(0.9, abs=0.02)
     html = (out / "locate.html").read_text()
     assert printed["sentence"] in html

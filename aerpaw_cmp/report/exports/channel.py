@@ -287,20 +287,15 @@ def _write_deepmimo(channel: Channel, folder: Path) -> Path:
 
 
 def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    most = int(channel.table.vertices_m.shape[1])
+    """What DeepMIMO's loader asks; the sets of devices have its defaults else (one antenna)."""
     sets = {
-        f"txrx_set_{number}": {
-            "name": name, "id_orig": number, "id": number, "is_tx": name == "tx", "is_rx": name == "rx",
-            "num_points": every, "num_active_points": active, "num_ant": 1, "dual_pol": False,
-            "ant_rel_positions": [[0, 0, 0]], "array_orientation": [0, 0, 0], "grid_spacing": None,
-        }
+        f"txrx_set_{number}": {"name": name, "id": number, f"is_{name}": True, "num_points": every,
+                               "num_active_points": active, f"is_{'rx' if name == 'tx' else 'tx'}": False}
         for number, (name, (every, active)) in enumerate(points.items())
     }  # fmt: skip
-    depth = {"max_path_depth": most, "max_reflections": most, "max_diffractions": 1, "max_scattering": 0}
-    rays = {"raytracer_name": "aerpaw-cmp", "raytracer_version": tool_version(), "max_transmissions": 0, **depth}
-    scene = {"num_scenes": 1, "n_objects": 0, "n_vertices": 0, "n_faces": 0, "n_triangular_faces": 0}
-    rays |= {"frequency": channel.carrier_hz, "num_rays": 0, "synthetic_array": True, "raw_params": {}}
-    return {"version": "4.0", "rt_params": rays, "scene": scene, "materials": {}, "txrx_sets": sets}
+    rays = {"raytracer_name": "aerpaw-cmp", "raytracer_version": tool_version(), "frequency": channel.carrier_hz}
+    rays |= {"max_reflections": channel.table.vertices_m.shape[1], "max_diffractions": 1}
+    return {"version": "4.0", "rt_params": rays, "scene": {"num_scenes": 1}, "materials": {}, "txrx_sets": sets}
 
 
 # Writers by the name of their format; each gives the file to open.

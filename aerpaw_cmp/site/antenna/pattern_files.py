@@ -16,6 +16,7 @@ from ...common.files import LARGEST_TABLE, read_input
 from ...common.provenance import marks, trained_on
 from ...common.units import FloatArray, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
+from .sphere_pattern import COLUMNS, read_sphere_csv
 
 _DBI_OF_DBD = 2.15
 STEP_DEG = 3.0
@@ -54,6 +55,8 @@ def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> M
     """
     path = Path(path)
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
+    if any(line.replace(" ", "").startswith(",".join(COLUMNS[:3])) for line in text.splitlines()[:100]):
+        return read_sphere_csv(path)
     pattern = _of_any_kind(text, path, carrier_hz)
     pattern.trained_on, pattern.marks = trained_on(text), marks(text)
     return pattern

@@ -287,7 +287,7 @@ def _write_deepmimo(channel: Channel, folder: Path) -> Path:
 
 
 def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
-    """What DeepMIMO's loader asks; the sets of devices have its defaults else (one antenna)."""
+    """Content of params.json that the loader asks for; all else of its device sets has its defaults."""
     sets = {
         f"txrx_set_{number}": {"name": name, "id": number, f"is_{name}": True, "num_points": every,
                                "num_active_points": active, f"is_{'rx' if name == 'tx' else 'tx'}": False}

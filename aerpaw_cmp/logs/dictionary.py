@@ -55,12 +55,17 @@ class Quantity:
     datum: str = ""
 
     @property
+    def bounded(self) -> bool:
+        """True of what tells by its values that a row does not fit its header."""
+        return self.role in ("position", "height", "cell", "rss") and self.can_be[1] < np.inf
+
+    @property
     def kind(self) -> Kind:
         """Kind of the stream that a level, rank or KPI gives."""
         return "rss" if self.role == "rss" else "rank" if self.role == "rank" else "kpi"
 
 
-_UP = r"\b(alt|altitude|height|hgt|elevation|ele|hoehe)"
+_UP = r"\b(alt|altitude|height|hgt|elevation|ele|hoehe|h he)"
 _ANGLE = (-360.0, 360.0)
 _SPEED = (-400.0, 400.0)
 _DBM, _DB = (-200.0, 30.0), (-60.0, 100.0)
@@ -75,8 +80,9 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| local| epoch)?$",
         r"^time ?millisecond$",
         r"^(rel|relative|elapsed) ?time( ms| s)?$", r"^time boot ms$", r"^(epoch|unix)( ms| s)?$", r"^utc$", r"^t$",
+        r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
     )),
-    Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$",)),
+    Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$", r"^(datum|fecha)$")),
     Quantity("zone", "time", (r"^(time ?)?zone$", r"^tz$", r"^utc offset$", r"^gmt offset$")),
     Quantity("gps_week", "time", (r"^gps ?(week|wk)( number| no)?$", r"^gwk$", r"^(week|wn)( number| no)?$")),
     Quantity("gps_seconds", "time", (
@@ -85,9 +91,11 @@ QUANTITIES: tuple[Quantity, ...] = (
     # where
     Quantity("latitude_deg", "position", (
         r"^(osd |gps )?(lat|latitude)( deg| degrees| int)?( ?1?e ?[67])?$", r" (lat|latitude)( deg)?$",
+        r"^(breite|breitengrad|latitud)( deg)?$",
     ), "deg", can_be=(-90.0, 90.0)),
     Quantity("longitude_deg", "position", (
         r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int)?( ?1?e ?[67])?$", r" (lon|lng|longitude)( deg)?$",
+        r"^(l nge|laenge|l ngengrad|laengengrad|longitud)( deg)?$",
     ), "deg", can_be=(-180.0, 180.0)),
     # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
     Quantity("home", "other", (
@@ -112,7 +120,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"ellips", r"\b(hae|wgs ?84)\b",
     ), "m", can_be=(-1000.0, 20_000.0), datum="ellipsoid"),
     Quantity("altitude_m", "height", (
-        r"^(alt|altitude)( m| meters| metres| ft| feet)?$", r"^(height|hgt)( m| meters| metres| ft| feet)?$",
+        r"^(alt|altitude)( m| meters| metres| ft| feet)?$", r"^(height|hgt|hoehe|h he)( m| meters| metres| ft| feet)?$",
         r"^(baro(metric)?|pressure) " + _UP[2:], _UP + r" baro$",
     ), "m", can_be=(-1000.0, 20_000.0), datum="unknown"),
     # how it lies; a gimbal's or camera's angles are not the aircraft's
@@ -165,7 +173,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("RSRP", "rss", (
         r"\brs ?rp\b|\bss ?rsrp\b|\b(nrx)?rsrp\d{0,2}\b|\b(n|nb|nbr)\d{0,2}rsrp\b",
     ), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0, 255.0), can_be=(-60.0, 30.0)),
+    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0, 255.0), can_be=(-60.0, 3.0)),
     Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", can_be=_DB),
     Quantity("RSSI", "rss", (r"\brssi\d{0,2}\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RSCP", "rss", (r"\brscp\b",), "dBm", none=(0.0,), can_be=_DBM),
@@ -202,7 +210,8 @@ _NUMBER = re.compile(
 )
 # Another cell of a table, or the cell of another device, by its number or its order.
 _OTHER = re.compile(
-    r"\b((?:sim|dev(?:ice)?|modem|ue|phone|slot) ?\d{1,2})\b|\b(second|third|inter|intra|pscell|secondary)\b"
+    r"\b((?:sim|dev(?:ice)?|modem|ue|phone|slot) ?\d{1,2})\b"
+    r"|\b(second|third|2nd|3rd|other|inter|intra|pscell|secondary)\b"
     r"|\b(?:cell|pci|rsrp|rsrq|rssi|sinr|e?arfcn) ?(\d{1,2})\b"
 )
 # What the base station hears, statistics, and what a model says are no level that the receiver measured.
@@ -469,20 +478,31 @@ def _program(
     return Program(name=name, signs=sets, words=words_of, units=units_of, datum=datum, angles=angles)
 
 
+_MAVLINK_UNITS = {
+    "relative alt": "mm", "alt": "mm", "vx": "cm/s", "vy": "cm/s", "vz": "cm/s", "hdg": "cdeg", "lat": "e7",
+    "lon": "e7",
+}  # fmt: skip
+_FULL_SCALE = "dB re full scale"
+AERPAW_MAT = _program(
+    "AERPAW .mat", "mx,my,mz", "lat s,lon s", "lat all,lon all", datum="take-off", angles="deg",
+    words={
+        r"mx|lon s|lon all": "longitude", r"my|lat s|lat all": "latitude", r"mz|height s|h all": "altitude rel",
+        r"mroll|roll all": "roll", r"mpitch|pitch all": "pitch", r"myaw|ori s|ori all": "yaw", r"mspeedx": "vn",
+        r"mspeedy": "ve", r"mspeedz|mvz": "vd", r"mpower\d?|power all": "link power", r"mquality": "link quality"},
+    units={"ori s": "rad", "rsrp": _FULL_SCALE, "rsrp2": _FULL_SCALE, "rssi": _FULL_SCALE},
+)  # fmt: skip
+
+
 PROGRAMS: tuple[Program, ...] = (
     _program("PX4, vehicle_gps_position", "time utc usec,timestamp", datum="sea level",
              units={"timestamp": "us", "alt": "mm", "lat": "e7", "lon": "e7"}),
     _program("PX4", "timestamp,timestamp sample", "timestamp,delta alt", datum="sea level", units={"timestamp": "us"},
              angles="rad"),
-    _program("MAVLink", "time boot ms", "rollspeed", datum="sea level", angles="rad", units={
-        "relative alt": "mm", "alt": "mm", "vx": "cm/s", "vy": "cm/s", "vz": "cm/s", "hdg": "cdeg", "lat": "e7",
-        "lon": "e7"}, words={r"satellites visible": "satellites"}),
+    _program("MAVLink", "time boot ms", "rollspeed", datum="sea level", angles="rad", units=_MAVLINK_UNITS,
+             words={r"satellites visible": "satellites"}),
     _program("ArduPilot", "timeus", "gcrs,spd", "lat,lng,q1,q2", "desroll,roll", datum="sea level", angles="deg",
              words={r"status": "fix"}),
-    _program("AERPAW .mat", "mx,my,mz", "lat s,lon s", "lat all,lon all", datum="take-off", angles="deg", words={
-        r"mx|lon s|lon all": "longitude", r"my|lat s|lat all": "latitude", r"mz|height s|h all": "altitude rel",
-        r"mroll|roll all": "roll", r"mpitch|pitch all": "pitch", r"myaw|ori s|ori all": "yaw", r"mspeedx": "vn",
-        r"mspeedy": "ve", r"mspeedz|mvz": "vd"}, units={"ori s": "rad"}),
+    AERPAW_MAT,
     _program("aerpawlib", "gpsfix,numberofsatellites", "gpsfix,batteryvolts", "numberofsatellites,batteryvolts",
              "volt,number of satellite", "voltage,number of satellites", "volt,number of satellites", datum="take-off"),
     _program("G-NetTrack Pro", "level,qual,networktech", "level,qual,networkmode", datum="sea level", words={
@@ -497,6 +517,7 @@ PROGRAMS: tuple[Program, ...] = (
     _program("CellMapper", "signal,psc or pci", datum="sea level", words={
         r"signal": "rsrp", r"psc or pci": "pci", r"type": "network type"}),
     _program("phone", "cellname", datum="sea level"),
+    _program("MAVLink, positions alone", "lat,lon,relative alt", "lat,lon,alt,hdg", units=_MAVLINK_UNITS),
     _program("AERPAW monitoring", "transmitter,receiver,log type", words={
         r"power": "link power", r"quality": "link quality", r"snr": "link snr"}),
 )  # fmt: skip
@@ -517,6 +538,16 @@ def in_common_words(names: list[str]) -> list[str]:
     for pattern, word in words.items():
         names = [re.sub(f"^(?:{pattern})$", word, name) for name in names]
     return names
+
+
+def by_program(known: Program | None, name: str) -> tuple[Meaning | None, str, str]:
+    """Meaning of a name in a program, its unit as written or as the program writes it, and its common words."""
+    own = plain(name)
+    words = next((word for form, word in known.words.items() if re.fullmatch(form, own)), own) if known else own
+    what = meaning(name, None if words == own else words)
+    if what is None or what.unit or known is None:
+        return what, what.unit if what else "", words
+    return what, known.units.get(own, known.angles if what.quantity.role == "angle" else ""), words
 
 
 def record_columns(
@@ -540,13 +571,11 @@ def record_columns(
     names = [plain(name) for name in fields]
     known = program([*names, *map(plain, of)])
     columns: dict[str, tuple[tuple[int, int], FloatArray]] = {}
-    for name, own in zip(fields, names, strict=True):
-        words = next((word for form, word in known.words.items() if re.fullmatch(form, own)), own) if known else own
-        what = meaning(name, None if words == own else words)
+    for name in fields:
+        what, unit, words = by_program(known, name)
         if what is None or what.quantity.role not in ("position", "height", "angle", "velocity", "count"):
             continue
         row = what.quantity
-        unit = what.unit or (known.units.get(own, known.angles if row.role == "angle" else "") if known else "")
         unit = "" if unit in OF_INTEGERS and name not in integers else unit
         # 65535 mm are a height: of these only the ends of the type are none
         none = np.abs(fields[name]) >= UNAVAILABLE[0] if unit in ("mm", "e7") else is_none(row, fields[name])

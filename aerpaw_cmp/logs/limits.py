@@ -112,6 +112,7 @@ def _checked(stream: Stream, warnings: list[str]) -> Stream:
     frame = _near_in_time(stream, frame, warnings)
     if stream.kind == "rss":
         _two_levels(stream, frame, warnings)
+    _at_a_site_if_exchanged(stream, frame, warnings)
     bad, sentence = jumps_of(stream if frame is stream.frame else replace(stream, frame=frame))
     if bad.any():
         frame = _marked(frame, bad, FLAG, [name for name in PLACE if name in frame.columns])
@@ -161,6 +162,22 @@ def _exchanged(frame: pd.DataFrame, bad: BoolArray) -> str:
     return "; are latitude and longitude exchanged?" if fits.all() else ""
 
 
+# AERPAW's sites, Lake Wheeler and Centennial Campus: latitude, longitude, and how far from them positions are theirs.
+SITES_DEG, NEAR_DEG = ((35.727, -78.696), (35.773, -78.677)), 0.3
+
+
+def _at_a_site_if_exchanged(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> None:
+    """Say where positions that can be would lie at a site of AERPAW with their angles exchanged."""
+    if not {"latitude_deg", "longitude_deg"} <= set(frame.columns):
+        return
+    place = frame[["latitude_deg", "longitude_deg"]].median().to_numpy(dtype=np.float64)
+    if (np.abs(np.array(SITES_DEG) - place[::-1]) < NEAR_DEG).all(axis=1).any():
+        warnings.append(
+            f"{stream.kind} {stream.name!r}: the positions lie at latitude {place[0]:.3f}, longitude {place[1]:.3f}; "
+            "exchanged they lie at a site of AERPAW: are latitude and longitude exchanged?"
+        )
+
+
 def _within_ports(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:
     """No rank is above the number of ports that the log itself tells."""
     ports = stream.attributes.get("ports")
@@ -179,16 +196,23 @@ def _within_ports(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> p
     return _marked(frame, bad, "rank_above_ports", ["rank"])
 
 
+# No receiver in flight meets such levels: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
+# SINR do not.
+_MOST_DBM = {"RSRP": -20.0}
+
+
 def _no_index(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:
-    """Flag levels that are mostly at or above 0 dBm: an index of the standard (0 .. 127), or another unit."""
+    """Flag levels that mostly cannot be received: an index of the standard (0 .. 127), another unit, or a ratio."""
     level = frame["rss_db"].to_numpy(dtype=np.float64)
-    bad = level >= 0
+    quantity = str(stream.attributes.get("quantity"))
+    bad = level >= _MOST_DBM.get(quantity, 0.0)
     if 2 * bad.sum() <= np.isfinite(level).sum() or not bad.any():
         return frame
     row = int(np.argmax(bad))
+    known = "another unit, an RSRQ, or an index?" if quantity in _MOST_DBM else "another unit, or an index?"
     text = (
         f"the first: {level[row]:g} dBm in line {int(frame['line'].iloc[row])}, which is received nowhere "
-        "(another unit, or an index?); not scored"
+        f"({known}); not scored"
     )
     warnings.append(_sentence(stream, int(bad.sum()), "level_out_of_range", text))
     return _marked(frame, bad, "level_out_of_range", ["rss_db"])

@@ -35,8 +35,6 @@ CLOCKS = {
     "srsran_gnb": _TS,
     "srsran_json": "program: srsRAN Project writes UTC",
     "oai_log": _TS,
-    "amarisoft": _TS,
-    "amarisoft_json": "written: key utc",
     "tap_jsonl": "written: UTC",
     "own_csv": "written: UTC",
     "generic_csv": "written",

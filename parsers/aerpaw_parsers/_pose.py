@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
+
 import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
@@ -12,7 +14,7 @@ from aerpaw_cmp.readers import dictionary
 
 from . import _sheet
 
-_PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
+PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
 _VELOCITIES = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
 # Attributes of a stream that say how its heights are known.
@@ -47,12 +49,14 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
         "longitude_deg": _signed(sheet, longitude, "EW"),
     }
     lost = clean(rows, values)
-    _refuse_whole_degrees(sheet.names[latitude], sheet.names[longitude], values)
+    refuse_whole_degrees([sheet.names[latitude], sheet.names[longitude]], values)
     datum, height = _height(rows, sheet)
     values["altitude_m"] = height
     about: Height = {"height_from": rows.height_from}
     if np.isfinite(height).any():
         values["altitude_m"], about = above_takeoff(rows, values, datum, lost)
+    elif sheet.find("altitude_m") is not None:
+        rows.warnings.append("the column of heights holds no number: heights are unknown")
     values |= _attitude(rows, sheet)
     for key in (*_VELOCITIES, "battery_v"):
         if (column := sheet.find(key)) is not None:
@@ -65,15 +69,15 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
 
 
-def _refuse_whole_degrees(latitude: str, longitude: str, values: dict[str, AnyArray]) -> None:
+def refuse_whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> None:
     """Refuse positions of which one angle has whole degrees alone: the values stand beside their names."""
-    known = [angle[np.isfinite(angle)] for angle in values.values()]
+    known = [angle[np.isfinite(angle)] for angle in (values[key] for key in PLACE[:2])]
     coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
     if coarse[0] != coarse[1]:
         raise InputError(
-            f"the rows do not fit the header: {latitude if coarse[0] else longitude!r} has whole degrees alone",
+            f"the rows do not fit the header: {names[coarse.index(True)]!r} has whole degrees alone",
             expected="positions",
-            cause="a column is missing in the header or in the rows, and all values stand beside their names",
+            cause=_sheet.BESIDE,
         )
 
 
@@ -184,9 +188,9 @@ def above_takeoff(
     known = np.flatnonzero(np.isfinite(altitude) & ~lost)
     if datum in ("take-off", "ground") or not len(known):
         return altitude, about
-    altitude = altitude if datum == "unknown" else _without_first_zeros(altitude)
+    altitude = _without_first_zeros(altitude, rows.time if datum == "unknown" else None)
     known, values = known[np.isfinite(altitude[known])], values | {"altitude_m": altitude}
-    rest = _ground(*(column[known] for column in (rows.time, *(values[name] for name in _PLACE))))
+    rest = _ground(*(column[known] for column in (rows.time, *(values[name] for name in PLACE))))
     first = float(altitude[known[0]]) if rest is None else rest
     climbs = rest is not None
     if datum == "unknown" and abs(first if climbs else np.abs(altitude[known]).min()) < _NEAR_ZERO_M:
@@ -206,15 +210,22 @@ def above_takeoff(
 
 # What begins within a few metres of zero is relative to take-off.
 _NEAR_ZERO_M = 10.0
-_REST_S, _REST_M, _REST_MPS, _CLIMB_M = 2.0, 3.0, 0.3, 5.0
+_REST_S, _REST_M, _REST_MPS, _CLIMB_M, _CLIMB_MPS = 2.0, 3.0, 0.3, 5.0, 20.0
 _DEGREE_M = 111_000.0
 
 
-def _without_first_zeros(altitude: FloatArray) -> FloatArray:
-    """Altitudes whose first rows are 0 and all others far from it: a receiver before its first fix; NaN there."""
+def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatArray:
+    """Altitudes whose first rows are 0 and all others far from it: a receiver before its first fix; NaN there.
+
+    Of heights above nobody knows what, with their times, only where no aircraft climbs so fast.
+    """
     begun = int(np.argmax(np.nan_to_num(altitude) != 0))
     if not begun or np.nanmin(np.abs(altitude[begun:])) < _NEAR_ZERO_M:
         return altitude
+    if time is not None:
+        rate = np.abs(np.diff(altitude) / (np.diff(time) / np.timedelta64(1, "s")))[begun - 1 :]
+        if rate[0] < _CLIMB_MPS or rate[0] < 3 * np.nanmax(rate[1:], initial=0.0):
+            return altitude
     return np.where(np.arange(len(altitude)) < begun, np.nan, altitude)
 
 
@@ -255,11 +266,25 @@ def _attitude(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
     if not named and are_radians(values):
         rows.warnings.append("nothing names the unit of the angles: by their values they were read as radians, a guess")
         values = {key: np.degrees(value) for key, value in values.items()}
+    elif not named and not set(ANGLES) <= set(values) and are_small(values):
+        rows.warnings.append(small_angles(values))
     yaw = values.get("yaw_deg")
     if yaw is not None and len(yaw) > 2 and np.isfinite(yaw).any() and not np.nan_to_num(yaw).any():
         rows.warnings.append("the yaw is 0 throughout: read as not known")
         values["yaw_deg"] = np.full(len(yaw), np.nan)
     return values
+
+
+def small_angles(values: Iterable[str]) -> str:
+    """Sentence about angles whose unit neither a name nor the values tell."""
+    words = " and ".join(name.removesuffix("_deg") for name in values)
+    return f"nothing names the unit of {words}, and no value is beyond 2 pi: read as degrees; or is it 'yaw [rad]'?"
+
+
+def are_small(values: dict[str, FloatArray]) -> bool:
+    """Check whether angles, not all of roll, pitch and yaw, may be radians as well as degrees."""
+    most = max((float(np.nanmax(np.abs(value), initial=0.0)) for value in values.values()), default=0.0)
+    return "yaw_deg" in values and 0 < most <= 2 * np.pi + 1e-3
 
 
 def are_radians(values: dict[str, FloatArray]) -> bool:

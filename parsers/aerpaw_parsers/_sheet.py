@@ -14,12 +14,13 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
+from itertools import permutations, product
 
 import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
+from aerpaw_cmp.logs.limits import NEAR_DEG, SITES_DEG
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
@@ -132,6 +133,8 @@ class Sheet:
         Sentences about columns, by the column: read otherwise than written.
     closed : bool
         Do rows end with a mark of their own, whatever ends the line?
+    said : dict
+        Quantities, by the column, of columns whose names say none: what the user says.
     """
 
     lines: _lines.Lines
@@ -142,6 +145,7 @@ class Sheet:
     rejected: list[RejectedLine] = field(default_factory=list)
     notes: dict[int, str] = field(default_factory=dict)
     closed: bool = False
+    said: dict[int, dictionary.Quantity] = field(default_factory=dict)
     _silent: dict[int, BoolArray] = field(default_factory=dict)
     _numbers: dict[int, FloatArray] = field(default_factory=dict)
     _cell_units: dict[int, str] = field(default_factory=dict)
@@ -167,10 +171,12 @@ class Sheet:
     @cached_property
     def meanings(self) -> list[dictionary.Meaning | None]:
         """Meaning of each column."""
-        return [
+        known = [
             dictionary.meaning(name) if written == words else dictionary.meaning(name, words)
             for name, written, words in zip(self.names, self._own, self.plain, strict=True)
         ]
+        said = {i: dictionary.Meaning(row, dictionary.in_brackets(self.names[i])[0]) for i, row in self.said.items()}
+        return [said.get(i) if what is None else what for i, what in enumerate(known)]
 
     def find(self, *quantities: str) -> int | None:
         """The column that surest holds one of the quantities."""
@@ -498,7 +504,9 @@ def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[i
     return rows
 
 
-def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None) -> _rows.Rows | None:
+def rows(
+    sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None
+) -> _rows.Rows | None:  # fmt: skip
     """Rows of a table with their times; None where no column is one of times.
 
     Parameters
@@ -506,14 +514,11 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     column : int, optional
         Of the times; by default the one that the dictionary finds.
     """
-    refuse_shifted(
-        (sheet.names[i], m.quantity, sheet.numbers(i)) for i, m in enumerate(sheet.meanings)
-        if m is not None and m.quantity.role in ("position", "cell", "rss") and m.quantity.can_be[1] < np.inf
-        and not m.indirect
-    )  # fmt: skip
+    known = {i: m.quantity for i, m in enumerate(sheet.meanings) if m is not None and not m.indirect}
+    refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in known.items() if q.bounded])
     mapped = column is not None
     column = _time_column(sheet) if column is None else column
-    weeks = None if mapped else _gps_weeks(sheet, column)
+    weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
     if column is None and weeks is None:
         return None
     if weeks is not None:
@@ -596,7 +601,7 @@ def _counts(sheet: Sheet, column: int) -> bool:
     return bool(np.isfinite(values).any() and np.nanmedian(np.abs(values)) < 0.9e9)
 
 
-def refuse_shifted(columns: Iterable[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
+def refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
     """Refuse a table whose rows are shifted against its header, by what the dictionary knows of its columns.
 
     Raises
@@ -604,7 +609,11 @@ def refuse_shifted(columns: Iterable[tuple[str, dictionary.Quantity, FloatArray]
     InputError
         If some rows have several values that their columns cannot have, or the identities of cells are fractions.
     """
-    wrong = [(name, values, dictionary.impossible(quantity, values)) for name, quantity, values in columns]
+    _refuse_site_elsewhere(columns)
+    wrong = [
+        (name, values, dictionary.impossible(quantity, values))
+        for name, quantity, values in columns if quantity.role != "height"
+    ]  # fmt: skip
     if not wrong or not len(wrong[0][1]):
         return
     count = np.sum([mask for *_, mask in wrong], axis=0)
@@ -621,8 +630,34 @@ def refuse_shifted(columns: Iterable[tuple[str, dictionary.Quantity, FloatArray]
     raise InputError(
         f"the rows do not fit the header: {shown}",
         expected="values that their columns can have",
-        cause="a column is missing in the header or in the rows, and all values stand beside their names",
+        cause=BESIDE,
     )
+
+
+def _refuse_site_elsewhere(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
+    """Refuse a table whose positions, at a site of AERPAW, stand beside the columns of that name.
+
+    Angles that are exchanged lie in their columns: the limits of all readers say so.
+    """
+    middle = [np.nanmedian(values) if np.isfinite(values).any() else np.nan for *_, values in columns]
+    places = {("latitude_deg", "longitude_deg"), ("longitude_deg", "latitude_deg")}
+    pairs = [
+        (first[:2], second[:2])
+        for (first, north), (second, east) in permutations(zip(columns, middle, strict=True), 2)
+        if any(abs(north - lat) < NEAR_DEG and abs(east - lon) < NEAR_DEG for lat, lon in SITES_DEG)
+    ]
+    named = {quantity.name for _, quantity, _ in columns} >= {"latitude_deg", "longitude_deg"}
+    if named and pairs and not any((first[1].name, second[1].name) in places for first, second in pairs):
+        latitude, longitude = (name for name, _ in pairs[0])
+        raise InputError(
+            f"the rows do not fit the header: latitudes of a site of AERPAW stand in {latitude!r}, longitudes in "
+            f"{longitude!r}",
+            expected="values beside their names",
+            cause=BESIDE,
+        )
+
+
+BESIDE = "a column is missing in the header or in the rows, and all values stand beside their names"
 
 
 _MOST_APART_NS = 1_500_000_000

@@ -40,7 +40,7 @@ _DATES = (
 _FORMS = (
     *(re.compile(_DAY + date + rf"(?:{_GAP}{_CLOCK})?{_ZONE}") for date in _DATES),
     re.compile(_DAY + rf"{_WORD} {{1,2}}(?P<day>\d{{1,2}}) {_CLOCK}{_ZONE} (?P<year>\d{{4}})"),
-    re.compile(r"(?P<year>20\d\d)(?P<month>\d\d)(?P<day>\d\d)[T_ -]?(?P<hour>\d\d)(?P<minute>\d\d)(?P<second>\d\d)"
+    re.compile(r"(?P<year>20\d\d)(?P<month>\d\d)(?P<day>\d\d)[T_ -]?(?P<hour>\d\d):?(?P<minute>\d\d):?(?P<second>\d\d)"
                r"(?:\.?(?P<fraction>\d{1,9}))?" + _ZONE),
     *(re.compile(rf"{_CLOCK}{_ZONE}[ ,]{{1,2}}" + date) for date in _DATES),
 )  # fmt: skip
@@ -61,13 +61,14 @@ _IN_NAME = (
 # Hours east of UTC of the abbreviations that say it, and the zone whose clock they are a part of.
 _HOURS = {
     "Z": 0.0, "UT": 0.0, "UTC": 0.0, "GMT": 0.0, "EDT": -4.0, "CDT": -5.0, "MDT": -6.0, "PDT": -7.0, "MST": -7.0,
-    "HST": -10.0, "CEST": 2.0, "EEST": 3.0, "BST": 1.0, "JST": 9.0, "KST": 9.0, "AKDT": -8.0, "AEDT": 11.0,
+    "HST": -10.0, "CEST": 2.0, "MESZ": 2.0, "EEST": 3.0, "BST": 1.0, "JST": 9.0, "KST": 9.0, "AKDT": -8.0, "AEDT": 11.0,
     "WEST": 1.0, "MSK": 3.0, "SGT": 8.0, "HKT": 8.0, "NZDT": 13.0,
 }  # fmt: skip
 # Those of winter that people also write in summer, and those of several countries.
 _STANDARD = {
     "EST": ((-5.0, "America/New_York"),), "CST": ((-6.0, "America/Chicago"),), "PST": ((-8.0, "America/Los_Angeles"),),
-    "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),), "EET": ((2.0, "Europe/Athens"),),
+    "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),), "MEZ": ((1.0, "Europe/Berlin"),),
+    "EET": ((2.0, "Europe/Athens"),),
     "WET": ((0.0, "Europe/Lisbon"),), "AEST": ((10.0, "Australia/Sydney"),), "NZST": ((12.0, "Pacific/Auckland"),),
     "IST": ((5.5, "Asia/Kolkata"), (1.0, "Europe/Dublin"), (2.0, "Asia/Jerusalem")),
 }  # fmt: skip
@@ -275,6 +276,8 @@ def header_zone(name: str, brackets: str) -> str:
     inside = brackets.strip()
     if inside and ("/" in inside or re.fullmatch(_NAMED_ZONE, inside.upper()) or inside.upper() in _WITH_SUMMER):
         return "" if inside.lower() in ("ms", "us", "s", "local", "iso", "date", "time", "unix", "epoch") else inside
+    if (offset := re.search(r"\b(?:UTC|GMT) ?[+-]\d{1,2}(?::?\d\d)?\b", name, re.IGNORECASE)) is not None:
+        return offset[0]
     words = re.split(r"[^A-Za-z0-9+]+", name)
     if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu"}:
         return "UTC"
@@ -325,6 +328,7 @@ def read(
         Bytes or floats for it.
     warnings : list of str
     """
+    texts = [text.replace("\u202f", " ").replace("\xa0", " ") for text in texts]  # in front of AM, as browsers write it
     shown = [text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else text.strip() for text in texts]
     filled = [text for text in shown if text]
     refuse_spreadsheets(filled)

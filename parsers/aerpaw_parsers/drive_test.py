@@ -74,6 +74,12 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
         elif meaning.quantity.role != "cell" or name in ("PCI", "ARFCN"):
             place = (meaning.rat, meaning.place)
             _put(cells.setdefault(place, _Cell(*place)), i, name, others)
+    if sheet.find("neighbouring") is not None and (common := cells.get(("", "serving"))) is not None:
+        for cell in cells.values():  # a cell a row: the identity is that of whichever level the row has
+            cell.pci, cell.arfcn = (
+                own if own is not None else of_row
+                for own, of_row in ((cell.pci, common.pci), (cell.arfcn, common.arfcn))
+            )
     placed = _completed(cells, others)
     if len(placed) == 1:
         placed[0].place = "serving"  # 'rsrp1' alone

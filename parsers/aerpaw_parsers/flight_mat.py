@@ -36,26 +36,15 @@ _TELEMETRY = (
     *("lat_s", "lon_s", "height_s", "ori_s"),
     *("lat_all", "lon_all", "h_all", "ori_all", "roll_all", "pitch_all"),
 )
-LEVELS = {
-    "mpower1": "USRP1",
-    "mpower2": "USRP2",
-    "mpower": "power",
-    "mquality": "quality",
-    "RSRP": "RSRP",
-    "RSRP2": "RSRP2",
-    "RSSI": "RSSI",
-    "RSRP_s": "RSRP",
-    "power_all": "power",
-}
-_KPIS = {"RSRQ": ("RSRQ", "dB")}
+_LEVELS = ("mpower1", "mpower2", "mpower", "mquality", "RSRP", "RSRP2", "RSSI", "RSRP_s", "power_all", "RSRQ")
 _TEXTS = ("timestamp_power_for_csv", "timestamp_for_csv")
 _EPOCHS = ("timestamp_power", "timestamp_meas")
 _UTC, _DECODED = "timestamp_meas", "succes"
 # Levels of files without a clock, and the seconds between rows of the flights that they were made of.
 _PROCESSED = {"RSRP_s": 0.1, "power_all": 0.03276}
-_NAMES = {*_TELEMETRY, *LEVELS, *_KPIS, *_TEXTS, *_EPOCHS, "mSpeed"}
+_NAMES = {*_TELEMETRY, *_LEVELS, *_TEXTS, *_EPOCHS, "mSpeed"}
 # Names that only a flight has.
-_SURE = {*LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
+_SURE = {*_LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
 # Raw positions of the LTE flights, which stand in front of their levels; the interpolated ones are read.
 _GPS = re.compile(r"GPS[xyz]")
 _COMPRESSED, _MATRIX = 15, 14
@@ -184,7 +173,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         If no time zone is given.
     """
     table = _load(data)
-    if not any(name in table for name in (*LEVELS, *_TELEMETRY)):
+    if not any(name in table for name in (*_LEVELS, *_TELEMETRY)):
         raise InputError(
             "the MATLAB file holds no flight", expected=f"variables such as {', '.join(sorted(_NAMES)[:5])}"
         )
@@ -239,18 +228,23 @@ def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream |
 
 def _measured(rows: _rows.Rows, table: dict[str, AnyArray]) -> Iterator[Stream | None]:
     silent = _numeric(table[_DECODED], _DECODED) == 0 if _DECODED in table else np.zeros(len(rows), dtype=bool)
-    for name, channel in LEVELS.items():
-        if name in table:
-            level, flag = rows.level(np.where(silent, -np.inf, _numeric(table[name], name)))
-            unit = (
-                "dB" if name == "mquality" else rows.options.unit or ("dBm" if name == "RSRP_s" else "dB re full scale")
-            )
-            quantity = channel.rstrip("2") if channel.startswith("RS") else None
-            about = {"channel": channel, "unit": unit, "quantity": quantity}
-            yield rows.stream("rss", channel, {"rss_db": level}, flag=flag, about=about)
-    for name, (quantity, unit) in _KPIS.items():
-        if name in table:
-            yield rows.stream("kpi", name, {"value": _numeric(table[name], name)}, quantity=quantity, unit=unit)
+    for name in _LEVELS:
+        if name not in table:
+            continue
+        values = _numeric(table[name], name)
+        what, unit, _ = dictionary.by_program(dictionary.AERPAW_MAT, name)
+        assert what is not None
+        row, unit = what.quantity, unit or what.quantity.unit
+        if row.role == "kpi":
+            yield rows.stream("kpi", name, {"value": values}, quantity=row.name, unit=unit)
+            continue
+        number = re.fullmatch(r"mpower(\d)", name)
+        channel = f"USRP{number[1]}" if number else name if name == "RSRP2" else row.name
+        level, flag = rows.level(np.where(silent, -np.inf, values))
+        unit = unit if row.name == "quality" else rows.options.unit or unit
+        quantity = row.name if row.unit == "dBm" else None
+        about = {"channel": channel, "unit": unit, "quantity": quantity}
+        yield rows.stream("rss", channel, {"rss_db": level}, flag=flag, about=about)
 
 
 READER = Reader(

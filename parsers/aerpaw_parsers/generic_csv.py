@@ -12,7 +12,7 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, Stream
@@ -31,6 +31,8 @@ _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": (
 _INK = re.compile(rb"\S")
 # Units of record columns, by the ends of their names.
 _UNITS = {"_deg": "deg", "_m": "m", "_mps": "m/s", "_dbm": "dBm", "_db": "dB"}
+# Quantities of record columns whose values tell their unit, or that rows do not fit their header.
+_QUANTITIES = {row.name: row for row in dictionary.QUANTITIES if row.role in ("position", "height")}
 # Quantities whose names alone contradict no mapping to a column of the telemetry.
 _NO_POSE = ("time", "fix", "satellites")
 # Keys that divide a mapped table, besides devices: each part is a series.
@@ -117,6 +119,8 @@ def _values(sheet: _sheet.Sheet, column: int, name: str, options: ReadOptions) -
         )
     if name == "rss_db" and unit == "dBm" and options.unit not in (None, "dBm"):
         raise UsageError(f"column {sheet.names[column]!r} says dBm and --unit says {options.unit}", expected="one unit")
+    if name == "rss_db" and unit == "dB" and options.unit == "dBm":
+        sheet.notes[column] = f"column {written!r} says dB and --unit dBm: read as dBm"
     return values
 
 
@@ -153,28 +157,45 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     first, separator, header = top
     kind, where = _checked(options, header)
     sheet = _sheet.cut(_lines.split(data), first, separator, header)
+    sheet.said = {where[name]: quantity for name, quantity in _QUANTITIES.items() if name in where}
     rows = _sheet.rows(sheet, options, reader="generic_csv", column=where.pop("time"))
     assert rows is not None
+    _refuse_empty(sheet, [where[name] for name in _VALUE[kind]])
     unit = sheet.unit_read(where["rss_db"]) if kind == "rss" else ""
     if kind == "rss" and options.unit is None and not unit:
         rows.warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
     streams: list[Stream | None] = []
     angles = {name: sheet.numbers(where[name]) for name in _pose.ANGLES if name in where}
-    if not any(sheet.unit(where[name]) for name in angles) and _pose.are_radians(angles):
-        rows.warnings.append(
-            "the angles are read as degrees, but their values look like radians: name them 'yaw [rad]'"
-        )
+    if not any(sheet.unit(where[name]) for name in angles) and _pose.are_small(angles):
+        rows.warnings.append(_pose.small_angles(angles))
     for device, of_device, table in _sheet.parts(rows, sheet, "device"):
         for label, part, cells in _divided(of_device, table, kind):
             values = {name: _values(cells, column, name, options) for name, column in where.items()}
+            if {*_pose.PLACE[:2]} <= set(values):
+                _pose.refuse_whole_degrees([cells.names[where[name]] for name in _pose.PLACE[:2]], values)
             about = _lifted(part, cells, values, where)
             odd = np.any([_odd(cells, where[name]) for name in _VALUE[kind]], axis=0)
             words = "_".join(word for word in (options.channel or kind, label, device) if word)
+            if (
+                kind == "rss"
+                and (level := cells.meanings[where["rss_db"]]) is not None
+                and level.quantity.can_be[0] < 0
+            ):
+                about = {"quantity": level.quantity.name, **about}
             streams.append(_stream(part, kind, words, values, odd, options.unit or unit, about))
         if kind == "rss":
             streams.append(_track(of_device, table, where, device))
     rows.warnings += sheet.unread()
     return rows.result(streams)
+
+
+def _refuse_empty(sheet: _sheet.Sheet, columns: list[int]) -> None:
+    """Refuse a table whose rows all end before a column that the user named."""
+    for column in columns:
+        if len(sheet) and not any(sheet.texts(column)):
+            raise InputError(
+                f"column {sheet.names[column]!r} is empty in every row", expected="values", cause=_sheet.BESIDE
+            )
 
 
 def _divided(rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind) -> list[tuple[str, _rows.Rows, _sheet.Sheet]]:

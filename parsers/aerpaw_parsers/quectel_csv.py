@@ -69,7 +69,7 @@ _LTE = re.compile(
 )  # fmt: skip
 _SA = re.compile(
     _SERVING + _token(b"QENG", b"NR5G-SA") + rb"," + _skip(4) + _V + rb"," + _skip(1) + _V + rb"," + _skip(2)
-    + rb",".join([_V] * 3) + rb"," + _C + rb"," + _C + _END,
+    + rb",".join([_V] * 3) + rb"(?:," + _C + rb"){0,3}" + _END,  # firmwares differ behind the SINR
     re.MULTILINE,
 )  # fmt: skip
 _NSA = re.compile(

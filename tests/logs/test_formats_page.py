@@ -33,6 +33,7 @@ EXAMPLES = {
     "velocity_down_mps": ("VD", "vz", "zSpeed(mph)"),
     "fix": ("fix_type", "GPSFix"),
     "satellites": ("NumberOfSatellites", "satellites_used"),
+    "battery_v": ("Volt", "batteryVolts"),
     "device": ("device_id", "IMEI", "sysid", "receiver_channel"),
     "network": ("operator", "MCC", "MNC", "SIM slot"),
     "technology": ("NetworkTech", "net_type", "RAT"),

@@ -415,17 +415,6 @@ OAI_UE = (
     b"1740927600.250000 [NR_PHY] I RSRP = -80 dBm, RI = 2 i1 = 0.0.0, i2 = 1, SINR = 20 dB, CQI = 15\n"
     b"1740927601.250000 [NR_PHY] I RI = 1 i1 = 0.0.0, i2 = 1, SINR = 19 dB, CQI = 15\n"
 )
-AMARISOFT = (
-    b"[2025-03-02 10:00:00.000001]          ------DL------------------------ ------UL------\n"
-    b"[2025-03-02 10:00:00.000002] UE_ID  CL RNTI C cqi  ri  mcs retx txok brate  snr puc1\n"
-    b"[2025-03-02 10:00:00.000003]     1 000 0046 1  15 2.0 27.5    0  138  1.2M 25.5    -\n"
-    b"[2025-03-02 10:00:01.000003]     1 000 0046 1  15 1.5 27.5    0  138  1.2M 25.5    -\n"
-    b"[2025-03-02 10:00:02.000003]     1 000 00\n"
-)
-AMARISOFT_JSON = (
-    b'{"message": "ue_get", "utc": 1740927600.25, "ue_list": [{"enb_ue_id": 1, "rnti": 70, "cells": [{"cqi": 15, "ri": 2.0, "dl_mcs": 27.5}]}]}\n'
-    b'{"message": "ue_get", "utc": 1740927601.25, "ue_list": [{"enb_ue_id": 1, "rnti": 70, "cells": [{"cqi": 15, "ri": 1.25}]}]}\n'
-)
 SIGMF = (
     b'{"global": {"core:datatype": "cf32_le", "core:version": "1.0.0", "core:sample_rate": 2000000},\n'
     b' "captures": [{"core:sample_start": 0,\n'
@@ -540,8 +529,6 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
         "frames": (OAI_GNB_FRAMES, 2, 0),
         "ue": (OAI_UE, 2, 0),
     },
-    "amarisoft": {"monitor": (AMARISOFT, 2, 1)},
-    "amarisoft_json": {"answers": (AMARISOFT_JSON, 2, 0)},
     "sigmf": {"dataset12": (SIGMF, 2, 1)},
     "iq_burst": {"two_channels": (iq_mat(), 1, 0)},
     "own_csv": {"rss": (RSS_EXPORT, 3, 0), "rank": (RANK_EXPORT, 2, 0), "tap": (TAP_EXPORT, 2, 0)},
@@ -556,7 +543,7 @@ CASES = [(reader, name) for reader, samples in SAMPLES.items() for name in sampl
 
 # Readers and samples whose clock is UTC or relative.
 WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
-    "nemo_csv", "nemo_kml", "tap_jsonl", "pawprints", "srsran_json", "amarisoft_json", "own_csv",
+    "nemo_csv", "nemo_kml", "tap_jsonl", "pawprints", "srsran_json", "own_csv",
     "ardupilot_bin", "mavlink_tlog", "px4_ulog",
     ("vehicle_out", "utc_offset"), ("flight_mat", "lte"), ("flight_mat", "processed"), ("gpx", "track"),
     ("drive_test", "srsue_metrics"), ("pose_csv", "airdata"), ("srsran_gnb", "log"), ("oai_log", "frames"), ("oai_log", "ue"),

@@ -29,8 +29,6 @@ def read(reader: str, data: bytes, options: ReadOptions = PLAIN) -> ReadResult:
         ("srsran_gnb", samples.SRSRAN_GNB_OLD, [1.0], [1.0]),
         ("srsran_gnb", samples.SRSRAN_LOG, [2.0], [2.0]),
         ("srsran_json", samples.SRSRAN_JSON, [2.0, None], [2.0, 1.5]),
-        ("amarisoft", samples.AMARISOFT, [2.0, None], [2.0, 1.5]),
-        ("amarisoft_json", samples.AMARISOFT_JSON, [2.0, None], [2.0, 1.25]),
     ],
 )
 def test_a_mean_of_ranks_is_no_rank(
@@ -44,15 +42,6 @@ def test_a_mean_of_ranks_is_no_rank(
     assert stream.frame["time"][0].floor("s") == pd.Timestamp("2025-03-02T15:00:00")
 
 
-@pytest.mark.parametrize("utc", [b'"UTC"', b'"time"'])
-def test_an_answer_without_the_time_of_the_others_is_the_one_that_is_rejected(utc: bytes) -> None:
-    line = samples.AMARISOFT_JSON.splitlines(keepends=True)[0]
-    data = line * 3 + line.replace(b'"utc"', utc) * 5
-    result = read("amarisoft_json", data)
-    assert (result.lines, result.accepted, [line_.number for line_ in result.rejected]) == (8, 3, [4, 5, 6, 7, 8])
-    assert read("amarisoft_json", line.replace(b'"utc"', b'"time"') * 2).accepted == 2, "seconds of the program"
-
-
 def test_the_form_of_most_times_of_reports_is_that_of_all() -> None:
     line = samples.SRSRAN_JSON.splitlines(keepends=True)[0]
     (epoch,) = re.findall(rb'"timestamp": ?([0-9.]+)', line)
@@ -62,8 +51,8 @@ def test_the_form_of_most_times_of_reports_is_that_of_all() -> None:
 
 @pytest.mark.parametrize("rnti", [b"70.5", b"-1", b"1e300", b'"x"'])
 def test_a_number_that_is_no_rnti_is_no_identity(rnti: bytes) -> None:
-    data = samples.AMARISOFT_JSON.replace(b'"rnti": 70', b'"rnti": ' + rnti, 1)
-    result = read("amarisoft_json", data)
+    data = re.sub(rb'"rnti": ?\d+', b'"rnti": ' + rnti, samples.SRSRAN_JSON, count=1)
+    result = read("srsran_json", data)
     assert sum(len(stream.frame) for stream in result.streams) == 2
 
 

@@ -290,7 +290,7 @@ COUSINS: dict[str, tuple[str, Right]] = {
         table("GPSWeek,GPSTime_ms,pci,rsrp", "2370,22401{i}000,11,{l}"), Right(LEVELS, start="2025-06-10T14:13:12", said="GPS weeks")),
     "angles under --map that look like radians": (
         table("t,lat,lon,h,a,b,c", f"{EPOCH},{PLACE},3,0.1,0.1,1.5"),
-        Right({"telemetry": {"yaw_deg": [1.5] * 4}}, said="look like radians",
+        Right({"telemetry": {"yaw_deg": [1.5] * 4}}, said="no value is beyond 2 pi",
               maps=("t=time", "lat=latitude_deg", "lon=longitude_deg", "h=altitude_m", "a=roll_deg", "b=pitch_deg", "c=yaw_deg"))),
     "two vehicles that nothing tells apart": (
         "time,lat,lon,alt_rel\n" + "".join(f"{1749564000 + i},{35.7 + i % 2 / 50},-78.7,3\n" for i in range(8)),
@@ -365,6 +365,29 @@ COUSINS: dict[str, tuple[str, Right]] = {
     "cell search with asctime": (
         table("", "Found CELL MHz, 3500.0,  EARFCN, 7399, PHYID, 11, PRB, 50,  ports, 1, PSS power dBm, {l}.0,  PSR, 2.3, Tue Jun 10 10:00:0{i} 2025"),
         Right({"lte_pci11": {"rss_db": down(-90, 4)}}, options=NEW_YORK)),
+    "latitude and longitude exchanged": (
+        table("time,lat,lon,pci,rsrp", EPOCH + ",-78.696,35.728,11,{l}"), Right(LEVELS, said="are latitude and longitude exchanged?")),
+    "RSRQ called RSRP": (table("time,pci,rsrp", EPOCH + ",11,-1{i}.5"), Right({"pci11": {"rss_db": [NAN] * 4}}, said="an RSRQ")),
+    "RSRQ called RSRP under --map": mapped("time,rsrp", EPOCH + ",-1{i}.5", "time=time", "rsrp=rss_db", levels=[NAN] * 4, said="an RSRQ"),
+    "an index of RSRQ": radio("rsrq", "1{i}", LEVELS, said="most values cannot be"),
+    "yaw alone in radians or degrees": height("alt_rel,yaw", "3,1.{i}", [3] * 4, said="unit of yaw"),
+    "no height has a number": height("alt", "nan", [NAN] * 4, said="heights are unknown"),
+    "no fix before the first height": (
+        "time,lat,lon,alt\n" + "".join(f"{1749564000 + i},35.728,-78.696,{[0, 0, 110, 110, 110, 110, 110, 113, 118][i]}\n" for i in range(9)),
+        Right({"vehicle": {"altitude_m": [NAN, NAN, 0, 0, 0, 0, 0, 3, 8]}}, said="at rest on the ground")),
+    "an offset in a header without brackets": mapped("Time UTC-4,p", "2025-06-10 10:00:0{i},{l}", "Time UTC-4=time", "p=rss_db", timezone="Asia/Tokyo"),
+    "a narrow space before AM": phone("Time", "2025-06-10 10:00:0{i}\u202fAM", **NEW_YORK),
+    "seconds of a GPS week under --map": (
+        table("gps_week,gps_tow,p", "2370,22401{i},{l}"),
+        Right({"rss": {"rss_db": down(-90, 4)}}, start="2025-06-10T14:13:12", maps=("gps_tow=time", "p=rss_db"), options={"unit": "dBm"})),
+    "integers of MAVLink under --map": (
+        table("t,a,b,h", EPOCH + ",357280001,-786960001,3"),
+        Right({"telemetry": {"latitude_deg": [35.7280001] * 4}}, said="1e-7 deg",
+              maps=("t=time", "a=latitude_deg", "b=longitude_deg", "h=altitude_m"))),
+    "German names": (
+        table("Zeit (MESZ);Breite;L\u00e4nge;H\u00f6he;pci;rsrp", "2025-06-10 16:00:0{i};35,728;-78,696;3;11;{l}"),
+        Right({**LEVELS, "phone": {"altitude_m": [3] * 4}}, options={"timezone": "Asia/Tokyo"})),
+    "another cell": radio("other_pci,other_rsrp", "20,-12{i}", N1),
     "PawPrints positions of 2023": (
         table("", "GPS_LOG_START,174956400{i}000,2.0,1.1,35.728,-78.696,75.{i},11.4,GPS_LOG_STOP"),
         Right({"phone": {"altitude_m": [0, 0.1, 0.2, 0.3]}})),
@@ -421,6 +444,8 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "answers of another modem": (
         table("", '[2025-06-10 10:00:0{i}] #RFSTS: "310 26",1795,-101,-67,-15,2242'), InputError, "AT answers of a modem"),
     "NMEA through ts": (table("", "[2025-06-10 10:00:0{i}] $GNGGA,140000.00,3543.68,N,07841.76,W,1"), InputError, "NMEA"),
+    "an index in front of AERPAW's positions": (
+        table("time,lat,lon,alt,rsrp", EPOCH + ",1.{i},35.728,-78.696,{l}"), InputError, "latitudes of a site of AERPAW stand in 'lon'"),
     "a web page": ("<!DOCTYPE html><html><body>Log in</body></html>\n", InputError, "a web page"),
     "a table of nobody": (
         table("index,when_utc,Breite,rx_power_dbm,temperature", "{i},2025-06-10 10:00:0{i},35,{l},20"), InputError,

@@ -18,7 +18,7 @@ from benchmarks import fuzz_inputs
 from tests.parsers.samples import BINARY, CASES, NO_LOGS, OPTIONS, SAMPLES
 
 SNIFFED = [case for case in CASES if case[0] != "generic_csv"]
-_CONSOLES = ("quectel_console", "cell_search", "srsran_gnb", "oai_log", "amarisoft")
+_CONSOLES = ("quectel_console", "cell_search", "srsran_gnb", "oai_log")
 TALK = ("controller_log", "srsenb_log", "srsue_log", "nemo_kml", "gnettrack_kml", "gpx", "vehicle_log", *_CONSOLES)
 TEXT_CASES = [case for case in CASES if case[0] not in BINARY]
 

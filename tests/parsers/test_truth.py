@@ -763,13 +763,6 @@ FORMS = {
     "srsran_json": Form(
         "", '{{"timestamp": {s}, "ue_list": [{{"pci": 1, "rnti": 5, "dl_ri": {v}}}]}}\n', "gnb", RANKS, utc=True
     ),
-    "amarisoft": Form(
-        "[2025-01-01 00:00:00.000000] UE_ID  CL RNTI C cqi  ri  mcs retx\n", "[{t}] 1 000 0046 1 15.0 {v} 27.5 0\n", "gnb", RANKS
-    ),
-    "amarisoft_json": Form(
-        "", '{{"message": "ue_get", "utc": {s}, "ue_list": [{{"rnti": 5, "cells": [{{"cqi": 9, "ri": {v}}}]}}]}}\n',
-        "gnb", RANKS, utc=True,
-    ),
     "oai_log": Form("", "[{t}] [NR_MAC] UE 1f4d: CQI 15, RI {v}, PMI (14,1)\n", "oai", RANKS),
     "pawprints": Form(
         "", '{{"abs_time": 1, "companion_abs_time": {ms}, "cells": [{{"technology": "4G_LTE", "rsrp": -{v}, "pci": 7}}]}}\n',

@@ -65,6 +65,8 @@ def test_a_part_of_a_building_by_levels(tmp_path: Path) -> None:
         {"location": "underground", "layer": "-1", "height": "5"},
         {"building:levels": "0", "building:levels:underground": "3"},
         {"amenity": "parking", "parking": "underground"},
+        {"layer": "-1", "height": "5"},
+        {"tunnel": "yes"},
     ],
 )
 def test_what_lies_below_the_ground_is_not_drawn(tmp_path: Path, tags: dict[str, str]) -> None:

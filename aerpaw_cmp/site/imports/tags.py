@@ -63,6 +63,9 @@ def below_ground(tags: Mapping[str, str]) -> bool:
     """
     if "underground" in (tags.get("location", "").lower(), tags.get("parking", "").lower()):
         return True
+    layer = _number(tags.get("layer", ""))
+    if tags.get("tunnel", "no").lower() not in _NOT or (layer is not None and layer < 0):
+        return True
     levels, cellars = (_number(tags.get(f"building:levels{what}", "")) for what in ("", ":underground"))
     return levels is not None and levels <= 0 and bool(cellars) and not tags.get("height")
 

@@ -14,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import permutations, product
+from itertools import product
 
 import numpy as np
 
@@ -639,22 +639,29 @@ def _refuse_site_elsewhere(columns: Sequence[tuple[str, dictionary.Quantity, Flo
 
     Angles that are exchanged lie in their columns: the limits of all readers say so.
     """
-    middle = [np.nanmedian(values) if np.isfinite(values).any() else np.nan for *_, values in columns]
-    places = {("latitude_deg", "longitude_deg"), ("longitude_deg", "latitude_deg")}
-    pairs = [
-        (first[:2], second[:2])
-        for (first, north), (second, east) in permutations(zip(columns, middle, strict=True), 2)
-        if any(abs(north - lat) < NEAR_DEG and abs(east - lon) < NEAR_DEG for lat, lon in SITES_DEG)
-    ]
-    named = {quantity.name for _, quantity, _ in columns} >= {"latitude_deg", "longitude_deg"}
-    if named and pairs and not any((first[1].name, second[1].name) in places for first, second in pairs):
-        latitude, longitude = (name for name, _ in pairs[0])
+    if not {"latitude_deg", "longitude_deg"} <= {quantity.name for _, quantity, _ in columns}:
+        return
+    middle = [
+        (name, quantity.name, float(np.nanmedian(values)))
+        for name, quantity, values in columns if _is_angle(values)
+    ]  # fmt: skip
+    for place in SITES_DEG:
+        north, east = ([item for item in middle if abs(item[2] - angle) < NEAR_DEG] for angle in place)
+        if not north or not east or {"latitude_deg", "longitude_deg"} <= {what for _, what, _ in (*north, *east)}:
+            continue
+        latitude, longitude = north[0][0], east[0][0]
         raise InputError(
             f"the rows do not fit the header: latitudes of a site of AERPAW stand in {latitude!r}, longitudes in "
             f"{longitude!r}",
             expected="values beside their names",
             cause=BESIDE,
         )
+
+
+def _is_angle(values: FloatArray) -> bool:
+    """Check whether numbers are written as positions of one flight: of four decimals and more, and near each other."""
+    known = values[np.isfinite(values)]
+    return bool(len(known) and np.ptp(known) < NEAR_DEG and (np.abs(known * 1e3 % 1 - 0.5) < 0.499999).mean() > 0.5)
 
 
 BESIDE = "a column is missing in the header or in the rows, and all values stand beside their names"

@@ -230,7 +230,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     east, north = site.frame.to_local(latitude, longitude)
     centre = site.frame.to_local(np.array([middle[0]]), np.array([middle[1]]))
     reach_m = float(np.hypot(east - centre[0], north - centre[1]).max())
-    up = np.maximum(frame["altitude_m"].to_numpy(np.float64) + site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
+    up = np.maximum(frame["altitude_m"].to_numpy(np.float64) + site.takeoff_ground_m, MINIMUM_HEIGHT_M)
     height = float(np.nanmedian(up)) if logged and np.isfinite(up).any() else float("nan")
     if logged and not np.isfinite(height):
         raise InputError(
@@ -246,7 +246,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
         frame if logged else frame.assign(altitude_m=0.0),
         site.frame,
         maximum_gap_s=settings.rt.advanced.maximum_gap_s,
-        ground_m=site.datum.takeoff_ground_m,
+        ground_m=site.takeoff_ground_m,
         ground=site.ground_under_m,
     )
     if not len(track):
@@ -458,7 +458,7 @@ def _channel_of(log: LogSettings, stream: Stream) -> str:
 
 def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximum_gap_s: float) -> Track:
     frame, _ = scored_rows(stream, path)
-    takeoff_m, ground = site.datum.takeoff_ground_m, site.ground_under_m
+    takeoff_m, ground = site.takeoff_ground_m, site.ground_under_m
     track = Track(frame, site.frame, maximum_gap_s=maximum_gap_s, ground_m=takeoff_m, ground=ground)
     if not len(track) and lacks_height(stream):
         raise InputError(
@@ -605,7 +605,7 @@ def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | N
     position = None
     if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
         east, north = site.frame.to_local(frame["latitude_deg"], frame["longitude_deg"])
-        takeoff_m = site.datum.takeoff_ground_m  # as of the track: altitude_m counts from there
+        takeoff_m = site.takeoff_ground_m  # as of the track: altitude_m counts from there
         up = frame["altitude_m"].to_numpy(np.float64) + takeoff_m
         up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)
         position = np.stack([east, north, np.where(buried | np.isnan(frame["altitude_m"]), np.nan, up)], axis=-1)

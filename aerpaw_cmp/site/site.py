@@ -17,7 +17,6 @@ from ..common.htmltable import html_table
 from ..common.units import FloatArray
 from .mesh_scenes.mitsuba import TriangleScene
 from .relief.dem import Dem
-from .relief.heights import VerticalDatum
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +165,8 @@ class Site:
         Sizes on the map that nobody measured.
     notes : tuple of str
         For the report.
-    datum : VerticalDatum
-        What up = 0 is in other height references, and how high the take-off point lies.
+    takeoff_ground_m : float
+        Up of the take-off point, from which ``altitude_m`` of logs counts.
     dem : Dem or None
         Ground heights; blocks lines of sight.
     scene : TriangleScene or None
@@ -189,7 +188,7 @@ class Site:
     credit: str = ""
     assumed: str = ""
     notes: tuple[str, ...] = ()
-    datum: VerticalDatum = field(default_factory=VerticalDatum)
+    takeoff_ground_m: float = 0.0
     dem: Dem | None = None
     scene: TriangleScene | None = None
     merge_m: float = 1e-3
@@ -209,7 +208,7 @@ class Site:
 
         A plane above up = 0 ends at its tower: who flies lower beside it flies over lower ground between them.
         """
-        ground = np.full(len(east_m), self.datum.takeoff_ground_m if self.scene is not None else 0.0)
+        ground = np.full(len(east_m), self.takeoff_ground_m if self.scene is not None else 0.0)
         if self.scene is None and self.towers:
             towers = list(self.towers.values())
             apart = [np.hypot(east_m - tower.east_m, north_m - tower.north_m) for tower in towers]

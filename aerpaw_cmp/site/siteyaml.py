@@ -27,7 +27,6 @@ from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines
 from .materials import material
 from .mesh_scenes.mitsuba import TriangleScene
 from .relief.dem import Dem, read_dem
-from .relief.heights import Height, HeightReference, VerticalDatum
 from .relief.surface import Surface, surface_through
 from .scenes import placed_scene, without_traps
 from .site import Building, Forest, Geofence, Site, Tower, Trees
@@ -96,21 +95,14 @@ def _problem(shape: Polygon) -> str | None:
     return None
 
 
+_Datum = Literal["orthometric", "ellipsoidal"]
+
+
 class HeightModel(StrictModel):
-    """A height with its reference."""
+    """A height above the geoid or the ellipsoid."""
 
     height_m: float
-    reference: HeightReference
-
-    def height(self) -> Height:
-        """As a value that refuses to mix."""
-        return Height(self.height_m, self.reference)
-
-
-class AbsoluteHeightModel(HeightModel):
-    """A height that does not count from the site itself."""
-
-    reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL]
+    reference: _Datum
 
 
 class OriginModel(StrictModel):
@@ -118,7 +110,7 @@ class OriginModel(StrictModel):
 
     latitude_deg: Latitude
     longitude_deg: Longitude
-    ground: AbsoluteHeightModel | None = None
+    ground: HeightModel | None = None
     takeoff_ground_m: float = 0.0
 
 
@@ -139,19 +131,13 @@ class TowerModel(StrictModel):
     source: str = ""
     positions: dict[str, PositionModel] = Field(default_factory=dict)
     antenna_height_m: _Structure | None = None
-    antenna: HeightModel | None = None
     ground_offset_m: float | None = None
-    ground: HeightModel | None = None
 
     @model_validator(mode="after")
     def _one_way(self) -> TowerModel:
         ways = (self.latitude_deg is not None) + (self.longitude_deg is not None)
         if ways == 1 or (ways == 2) == bool(self.positions):
             raise ValueError("give latitude_deg and longitude_deg, or positions, not both")
-        if self.antenna is not None and self.antenna_height_m is not None:
-            raise ValueError("give antenna_height_m (above ground) or antenna, not both")
-        if self.ground is not None and self.ground_offset_m is not None:
-            raise ValueError("give ground_offset_m (above the ground at the origin) or ground, not both")
         return self
 
 
@@ -247,7 +233,7 @@ class DemModel(StrictModel):
 
     path: str
     crs: str | None = None
-    reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL] = HeightReference.ORTHOMETRIC
+    reference: _Datum = "orthometric"
 
 
 class SceneModel(StrictModel):
@@ -346,7 +332,7 @@ def _at(*location: Any) -> Iterator[None]:
 def known_grounds(name_or_path: str | Path) -> tuple[Ground, ...]:
     """Values of ``tower_ground`` that a site has the data for."""
     model = site_model(name_or_path)
-    offsets = any(tower.ground_offset_m or tower.ground for tower in model.towers.values())
+    offsets = any(tower.ground_offset_m for tower in model.towers.values())
     has_data = {"flat": True, "offsets": offsets, "surface": bool(model.ground_points), "dem": model.dem is not None}
     return tuple(kind for kind in get_args(Ground) if has_data[kind])
 
@@ -386,7 +372,6 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     notes = list(model.notes)
     if model.tower_ground == "surface":
         notes.append(_about_surface(ground_surface(model, frame)))
-    datum = VerticalDatum(_origin_ground(model, dem), model.origin.takeoff_ground_m)
     if model.credit or model.assumed:
         notes.insert(0, f"Map: {'; '.join(text for text in (model.credit, model.assumed) if text)}.")
     with _at("scene"):
@@ -395,9 +380,9 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     towers = {}
     for name, tower in model.towers.items():
         with _at("towers", name):
-            towers[name] = _tower(name=name, model=tower, site=model, frame=frame, datum=datum, dem=dem, notes=notes)
+            towers[name] = _tower(name=name, model=tower, site=model, frame=frame, dem=dem, notes=notes)
             _check_tower(towers[name], model.area_m, frame)
-    notes += _disagreements(model, towers, datum, dem)
+    notes += _disagreements(model, towers, dem)
     with _at("area_m"):
         area = _area(model.area_m, towers)
     woods: tuple[Forest, ...] = ()
@@ -429,7 +414,7 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         geofences=tuple(Geofence(item.name, area) for item, area in _outlines(model.geofences, "geofences", frame)),
         area_m=area,
         notes=tuple(notes),
-        datum=datum,
+        takeoff_ground_m=model.origin.takeoff_ground_m,
         dem=dem,
         scene=scene,
         merge_m=1e-3 if model.scene is None else model.scene.merge_m,
@@ -440,19 +425,16 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
 _HEIGHTS_AGREE_M = 5.0
 
 
-def _disagreements(model: SiteModel, towers: Mapping[str, Tower], datum: VerticalDatum, dem: Dem | None) -> list[str]:
+def _disagreements(model: SiteModel, towers: Mapping[str, Tower], dem: Dem | None) -> list[str]:
     """Sentences on grounds that the file states and its elevation model contradicts."""
     if dem is None or model.dem is None:
         return []
     pairs = []
-    if (ground := model.origin.ground) is not None and ground.reference is model.dem.reference:
-        pairs.append(("origin.ground", ground.height().value_m, float(dem.absolute_m(0.0, 0.0))))
+    if (ground := model.origin.ground) is not None and ground.reference == model.dem.reference:
+        pairs.append(("origin.ground", ground.height_m, float(dem.absolute_m(0.0, 0.0))))
     for name, tower in model.towers.items():
-        stated = tower.ground_offset_m
-        if tower.ground is not None:
-            stated = datum.up_m(tower.ground.height(), name)
-        if stated is not None:
-            pairs.append((f"the ground of tower {name}", stated, float(towers[name].ground_m)))
+        if tower.ground_offset_m is not None:
+            pairs.append((f"the ground of tower {name}", tower.ground_offset_m, float(towers[name].ground_m)))
     return [
         f"{what} is stated as {stated:.1f} m, the elevation model has {modelled:.1f} m: is one of another datum?"
         for what, stated, modelled in pairs
@@ -538,14 +520,6 @@ def _about_surface(surface: Surface) -> str:
     )
 
 
-def _origin_ground(model: SiteModel, dem: Dem | None) -> Height | None:
-    if model.origin.ground is not None:
-        return model.origin.ground.height()
-    if dem is not None and model.dem is not None and model.tower_ground != "surface":
-        return Height(float(dem.absolute_m(0.0, 0.0)), model.dem.reference)
-    return None
-
-
 def _on_ground(trees: Trees, dem: Dem | None) -> Trees:
     if dem is None or not len(trees):
         return trees
@@ -623,36 +597,24 @@ def _tower(
     model: TowerModel,
     site: SiteModel,
     frame: SiteFrame,
-    datum: VerticalDatum,
     dem: Dem | None,
     notes: list[str],
 ) -> Tower:
     chosen = _chosen_position(name, model, site.coordinates, frame, notes)
-    what = f"tower '{name}'"
     east, north = frame.to_local(chosen.latitude_deg, chosen.longitude_deg)
     ground = 0.0
     if dem is not None:
         ground = float(dem.ground_m(east, north))
         if math.isnan(ground):
-            raise UsageError(f"{what} is not on the elevation model", cause="the grid is too small for the site")
-    stated = model.ground_offset_m or 0.0
-    if model.ground is not None and (site.tower_ground == "offsets" or datum.origin_ground is not None):
-        stated = datum.up_m(model.ground.height(), f"{what}, ground")  # also where unused: mixing is refused
+            raise UsageError(f"tower '{name}' is not on the elevation model", cause="a grid too small for the site")
     if site.tower_ground == "offsets":
-        ground = stated
-    height = model.antenna_height_m or chosen.antenna_height_m or 10.0
-    if model.antenna is not None:
-        height = datum.up_m(model.antenna.height(), f"{what}, antenna", ground_m=ground) - ground
-    if not height > 0:
-        raise UsageError(
-            f"{what}: the antenna lies {-height:g} m below the ground", cause="a height of another reference"
-        )
+        ground = model.ground_offset_m or 0.0
     return Tower(
         name=name,
         **named(chosen, "latitude_deg longitude_deg source"),
         east_m=float(east),
         north_m=float(north),
-        antenna_height_m=height,
+        antenna_height_m=model.antenna_height_m or chosen.antenna_height_m or 10.0,
         ground_m=ground,
     )
 

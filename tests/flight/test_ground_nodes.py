@@ -73,7 +73,7 @@ def test_heights_are_the_ground_s_or_the_log_s(tmp_path):
     low, _ = ground_nodes(site, flight(track="rover.csv", antenna_height_m=2.0), tmp_path)
     assert low.towers["ROVER"].position_m[2] == pytest.approx(2.0)
     high, nodes = ground_nodes(site, flight(track={"path": "rover.csv"}, height="logged"), tmp_path)
-    up = 25.0 + site.datum.takeoff_ground_m
+    up = 25.0 + site.takeoff_ground_m
     assert high.towers["ROVER"].position_m[2] == pytest.approx(up)
     assert nodes["ROVER"].pose_at(np.array(["2023-12-13T17:00:10"], "datetime64[ns]")).position_m[0, 2] == up
     for wrong in ({"latitude_deg": 35.0, "longitude_deg": -78.0}, {"track": "rover.csv", "antenna_height_m": 2.0}):

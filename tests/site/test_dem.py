@@ -111,11 +111,6 @@ def test_site_stands_on_its_ground(tmp_path: Path) -> None:
     assert site.trees.ground_m[0] == pytest.approx(-6 - 1, abs=1e-6)
     assert site.dem is not None
     assert load_site(tmp_path / "site.yaml", tower_ground="flat").towers["T"].ground_m == 0
-    (tmp_path / "site.yaml").write_text(
-        SITE.replace("-78.696}\ndem", "-78.696, antenna: {height_m: 90, reference: ellipsoidal}}\ndem")
-    )
-    with pytest.raises(UsageError, match="ellipsoidal height 90 m cannot be compared with orthometric height 80 m"):
-        load_site(tmp_path / "site.yaml")
 
 
 @pytest.mark.parametrize(
@@ -127,12 +122,10 @@ def test_grounds_that_the_elevation_model_contradicts_are_told(
 ) -> None:
     """The plane is 80 m at the origin and 78 m at the tower."""
     asc(tmp_path / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10)
-
-    def ground(height_m: float) -> str:
-        return f", ground: {{height_m: {height_m}, reference: orthometric}}}}\n"
-
-    text = SITE.replace("longitude_deg: -78.696}\ntowers", f"longitude_deg: -78.696{ground(origin_m)}towers")
-    (tmp_path / "site.yaml").write_text(text.replace("-78.696}\ndem", f"-78.696{ground(tower_m)}dem"))
+    origin = f", ground: {{height_m: {origin_m}, reference: orthometric}}}}\n"
+    text = SITE.replace("longitude_deg: -78.696}\ntowers", f"longitude_deg: -78.696{origin}towers")
+    offset = f", ground_offset_m: {tower_m - origin_m}}}\n"
+    (tmp_path / "site.yaml").write_text(text.replace("-78.696}\ndem", f"-78.696{offset}dem"))
     notes = [note for note in load_site(tmp_path / "site.yaml").notes if "the elevation model has" in note]
     assert [note.split(" is stated")[0] for note in notes] == contradicted
 

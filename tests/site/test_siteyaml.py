@@ -11,7 +11,6 @@ from shapely.geometry import Point
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.site.relief.heights import Height, HeightReference, VerticalDatum
 from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, SceneModel, SiteModel, build_site, load_site
 
 MINIMAL = """\
@@ -129,60 +128,6 @@ def test_no_such_site(tmp_path: Path) -> None:
         load_site(tmp_path / "absent.yaml")
 
 
-# ---------------------------------------------------------------- heights
-
-
-def heights(tmp_path: Path, origin_ground: str, tower: str, ground: str = "offsets") -> tuple[float, float]:
-    text = MINIMAL.replace("-78.696}\ntowers", f"-78.696, takeoff_ground_m: 1.5{origin_ground}}}\ntowers")
-    text = text.replace("-78.696}\n", f"-78.696, {tower}}}\n") + f"tower_ground: {ground}\n"
-    tower_ = load_site(site_file(tmp_path, text)).towers["T"]
-    return float(tower_.position_m[2]), tower_.ground_m
-
-
-def test_each_reference_gives_the_same_antenna(tmp_path: Path) -> None:
-    # ground at the origin 112 m above the ellipsoid and 79 m above the geoid; the antenna 12 m above a 3 m knoll
-    hae, msl = ", ground: {height_m: 112, reference: ellipsoidal}", ", ground: {height_m: 79, reference: orthometric}"
-    assert heights(tmp_path, "", "antenna_height_m: 12, ground_offset_m: 3") == (15, 3)
-    assert heights(tmp_path, hae, "antenna: {height_m: 127, reference: ellipsoidal}, ground_offset_m: 3") == (15, 3)
-    assert heights(
-        tmp_path, msl, "antenna: {height_m: 94, reference: orthometric}, ground: {height_m: 82, reference: orthometric}"
-    ) == (15, 3)
-    assert heights(tmp_path, "", "antenna: {height_m: 13.5, reference: above_takeoff}, ground_offset_m: 3") == (15, 3)
-    assert heights(tmp_path, "", "antenna: {height_m: 12, reference: above_ground}, ground_offset_m: 3") == (15, 3)
-
-
-def test_mixing_is_refused(tmp_path: Path) -> None:
-    msl = ", ground: {height_m: 79, reference: orthometric}"
-    with pytest.raises(
-        UsageError, match=r"tower 'T', antenna: ellipsoidal height 127 m .* orthometric height 79 m.*geoid"
-    ):
-        heights(tmp_path, msl, "antenna: {height_m: 127, reference: ellipsoidal}")
-    with pytest.raises(UsageError, match="does not say how high its origin is"):
-        heights(tmp_path, "", "antenna: {height_m: 127, reference: ellipsoidal}")
-    with pytest.raises(UsageError, match="not both"):
-        heights(tmp_path, msl, "ground_offset_m: 3, ground: {height_m: 80, reference: orthometric}")
-    with pytest.raises(UsageError, match="the antenna lies 64 m below the ground"):
-        heights(tmp_path, msl, "antenna: {height_m: 15, reference: orthometric}")
-    with pytest.raises(UsageError, match="reference: found 'sea_level'"):
-        heights(tmp_path, msl, "antenna: {height_m: 15, reference: sea_level}")
-
-
-@pytest.mark.parametrize("reference", list(HeightReference))
-@pytest.mark.parametrize("second", list(HeightReference))
-def test_only_like_heights_subtract(reference: HeightReference, second: HeightReference) -> None:
-    if reference is second:
-        assert Height(5, reference).minus(Height(2, second), "x") == 3
-    else:
-        with pytest.raises(UsageError, match=f"{reference.value} height 5 m cannot be compared with {second.value}"):
-            Height(5, reference).minus(Height(2, second), "x")
-
-
-def test_altitude_above_takeoff_of_a_flight() -> None:
-    datum = VerticalDatum(takeoff_ground_m=-2.0)
-    assert datum.up_m(Height(30, HeightReference.ABOVE_TAKEOFF), "UAV") == 28
-    assert datum.up_m(Height(30, HeightReference.ABOVE_GROUND), "UAV", ground_m=4) == 34
-
-
 def test_the_documented_site_is_valid() -> None:
     text = (Path(__file__).parents[2] / "docs" / "site.md").read_text(encoding="utf-8")
     model = parse_yaml(text.split("```yaml\n")[1].split("```")[0], SiteModel)
@@ -231,8 +176,6 @@ SQUARE = "[[0, 0], [10, 0], [10, 10], [0, 10]]"
         ("  U: {latitude_deg: 35.7275, longitude_deg: 78.696}", 5, "west is negative"),
         ("  U: {latitude_deg: 35.9, longitude_deg: -78.696}", 5, "a digit is wrong"),
         ("  U: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna_height_m: 3300}", 5, "feet or centimetres"),
-        ("  U: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna: {height_m: 90, reference: orthometric}}", 5, "cannot be compared"),
-        ("  U: {latitude_deg: 35.7275, longitude_deg: -78.696, ground: {height_m: 90, reference: orthometric}}", 5, "cannot be compared"),
         ("area_m: [10, -10, 0, 5]", 5, "east_min, east_max"),
         ("tower_ground: dem", 5, "the key 'dem'"),
         ("trees: {height_m: -3}", 5, "trees.height_m: found -3; expected greater than 0"),
@@ -249,7 +192,6 @@ SQUARE = "[[0, 0], [10, 0], [10, 10], [0, 10]]"
         ("  U: {latitude_deg: 36.7275, longitude_deg: -78.696}", 5, "tower 'U' .* lies 111.0 km from its site"),
         ("  U: {latitude_deg: 135.7, longitude_deg: -78.696}", 5, "latitude_deg: found 135.7"),
         ("  U: {latitude_deg: 35.7275}", 5, "give latitude_deg and longitude_deg, or positions"),
-        ("  U: {latitude_deg: 35.7, longitude_deg: -78.6, antenna_height_m: 3, antenna: {height_m: 3, reference: ellipsoidal}}", 5, "not both"),
     ],
 )  # fmt: skip
 def test_every_message_names_its_line(tmp_path: Path, more: str, line: int, words: str) -> None:

@@ -117,7 +117,7 @@ class Placer:
 
     def __post_init__(self) -> None:
         frame = self.telemetry.frame[~unscored(self.telemetry.frame)]
-        takeoff_m, ground = self.site.datum.takeoff_ground_m, self.site.ground_under_m
+        takeoff_m, ground = self.site.takeoff_ground_m, self.site.ground_under_m
         self.track = Track(frame, self.site.frame, ground_m=takeoff_m, ground=ground)
 
     @property

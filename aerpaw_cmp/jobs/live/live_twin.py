@@ -89,7 +89,7 @@ class LiveTwin:
         plan = self.settings.flight.plan
         if plan is None:
             return None
-        _, place, yaw = planned_poses(plan, self.site.datum.takeoff_ground_m, _ROUTE_STEP_S)
+        _, place, yaw = planned_poses(plan, self.site.takeoff_ground_m, _ROUTE_STEP_S)
         rotation = np.broadcast_to(np.eye(3), (len(place), 3, 3))
         if self.settings.rt.attitude != "ignored":
             rotation = rotation_from_aircraft(0.0 * yaw, 0.0 * yaw, yaw)
@@ -158,7 +158,7 @@ class LiveTwin:
     def _pose(self, sample: TelemetrySample) -> tuple[FloatArray, FloatArray]:
         east, north = self.site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
         ground = float(self.site.ground_under_m(np.array([east]), np.array([north]))[0])
-        up = max(sample.altitude_m + self.site.datum.takeoff_ground_m, ground + MINIMUM_HEIGHT_M)
+        up = max(sample.altitude_m + self.site.takeoff_ground_m, ground + MINIMUM_HEIGHT_M)
         place, attitude = np.array([float(east), float(north), up]), self.settings.rt.attitude
         if attitude == "ignored" or not np.isfinite(sample.yaw_deg):
             return place, np.eye(3)

@@ -288,7 +288,7 @@ def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
         place, yaw = targets.position_m[targets.known], targets.yaw_deg[targets.known]
         steps = np.diff(place, axis=0)
         yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))  # else the nose goes ahead
-        ground = site.datum.takeoff_ground_m
+        ground = site.takeoff_ground_m
         points = [
             Waypoint(east_m=float(p[0]), north_m=float(p[1]), height_m=float(p[2]) - ground, yaw_deg=float(y))
             for p, y in zip(place, yaw, strict=True)
@@ -315,7 +315,7 @@ def _corners(points: Sequence[Waypoint]) -> list[Waypoint]:
 
 def _raised(route: Route, site: Site) -> Route:
     """Heights above take-off to heights of the site."""
-    return replace(route, position_m=route.position_m + np.array([0.0, 0.0, site.datum.takeoff_ground_m]))
+    return replace(route, position_m=route.position_m + np.array([0.0, 0.0, site.takeoff_ground_m]))
 
 
 def _leaves_area(route: Route, area: Any) -> bool:

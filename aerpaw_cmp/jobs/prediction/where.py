@@ -208,7 +208,7 @@ def _grid(site: Site, options: TargetOptions) -> Targets:
 
 def _planned(flight: FlightFile, site: Site) -> Targets:
     assert flight.flight.plan is not None
-    time, position, yaw = planned_poses(flight.flight.plan, site.datum.takeoff_ground_m, 1.0)
+    time, position, yaw = planned_poses(flight.flight.plan, site.takeoff_ground_m, 1.0)
     return Targets(kind="route", name=flight.flight.name, position_m=position, yaw_deg=yaw % 360.0, time_s=time)
 
 
@@ -264,7 +264,7 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
             cause="latitude and longitude are exchanged" if exchanged else "a route of another place",
             path=where,
         )
-    takeoff_m = site.datum.takeoff_ground_m
+    takeoff_m = site.takeoff_ground_m
     up = table["altitude_m"].to_numpy(np.float64) + takeoff_m
     up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)
     if buried.any():

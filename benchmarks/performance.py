@@ -204,18 +204,15 @@ def town(history: list[dict[str, Any]]) -> list[str]:
         return []
     out = [
         f"Munich of Sionna RT ({number(rows[0]['faces'])} faces, {rows[0]['receivers']} receivers, one tower; {when}); "
-        "PathSolver's time holds what its kernel cache lacks. The estimate is of the wall on idle cores, all of them: "
-        "processor seconds by their number:", "",
-        "| search | depth | processor s | estimated wall s | times ours | paths that it lacks |",
-        "| --- | ---: | ---: | ---: | ---: | ---: |",
+        "PathSolver's time holds what its kernel cache lacks:", "",
+        "| search | depth | processor s | times ours | paths that it lacks |", "| --- | ---: | ---: | ---: | ---: |",
     ]  # fmt: skip
     for row in rows:
         cpu = row["search_s"][1]
         name = "image engine" if row["kind"] == "image" else f"PathSolver, {number(row['samples'])} rays"
         ratio = "1" if row["kind"] == "image" else number(cpu / ours[row["depth"]])
         lacks = "none known" if row["kind"] == "image" else f"{row['extra']} of {sum(row['exact'])}"
-        guess = number(row["estimated_s"]) if "estimated_s" in row else "-"
-        out.append(f"| {name} | {row['depth']} | {number(cpu)} | {guess} | {ratio} | {lacks} |")
+        out.append(f"| {name} | {row['depth']} | {number(cpu)} | {ratio} | {lacks} |")
     return [*out, ""]
 
 

@@ -32,7 +32,6 @@ import numpy as np
 from shapely.geometry import box
 
 from aerpaw_cmp.propagation.geometry.paths import Links
-from aerpaw_cmp.propagation.options import Run
 from aerpaw_cmp.propagation.search.beams import grow_paths
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene, read_scene
@@ -115,9 +114,8 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
     sources, targets = ends(task["scene"], task["receivers"])
     surfaces = merged(scene)
     setup = clock.since()
-    clock, estimates = Clock(), []
-    run = Run(on_estimate=estimates.append)
-    paths = grow_paths(surfaces, Links(sources, targets), run, max_depth=task["depth"])
+    clock = Clock()
+    paths = grow_paths(surfaces, Links(sources, targets), max_depth=task["depth"])
     search = clock.since()
     row = {
         **task,
@@ -127,7 +125,6 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
         "compile_s": compile_s,
         "setup_s": setup,
         "search_s": search,
-        "estimated_s": estimates[0].seconds,
         "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
         "paths": np.bincount(paths.depth, minlength=task["depth"] + 1).tolist(),
         "duplicates": len(paths) - len(plane_keys(paths, surfaces.plane)),

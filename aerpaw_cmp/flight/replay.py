@@ -17,7 +17,7 @@ from ..propagation.drivers.parts import replay_in_parts
 from ..propagation.edges import diffracted
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.geometry.paths import RowsT
-from ..propagation.options import Engine, Estimate, Field, Run, Search
+from ..propagation.options import Engine, Field, Run, Search
 from ..propagation.replay import PER_LINK, Replay, replay
 from ..site.site import Site
 from .data import FlightData, RssSeries, Times, rank_positions
@@ -429,7 +429,6 @@ def replay_poses(
         cache_dir=None if rt.advanced.cache else "",
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" or long or towers_m is not None else None,
-        on_estimate=lambda estimate: _tell(progress, name, estimate),
     )
     field = Field(path_loss(site, rt, link.carrier_hz))
     if towers_m is not None:
@@ -437,9 +436,3 @@ def replay_poses(
     if long:
         return replay_in_parts(site, link, poses, search, field, run, size=BLOCK)
     return replay(site, link, poses, search, field, run)
-
-
-def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
-    """Say what a search will take, where it is more than a moment."""
-    if estimate.seconds > 1.0:
-        progress(f"path search {name}: {estimate}")

@@ -18,9 +18,7 @@ from ..common.stages import Stages
 from ..common.units import spread_out
 from ..flight.data import FlightData
 from ..flight.settings import FlightFile, RtSettings
-from ..propagation.engine.engines import estimate_search
 from ..propagation.geometry.arrays import Link, Poses
-from ..propagation.options import Search
 from ..site.site import Site
 from ..site.siteyaml import load_site
 
@@ -164,10 +162,6 @@ def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> P
     work, n = f"{len(poses)} poses, engine {rt.engine}", len(poses)
     if rt.engine != "image" or n == 0:
         return PlannedStage(name, work, None if n else 0.0)
-    search = Search(max_depth=rt.max_depth)
-    if (searched := _searched(site, link, poses, search)) is not None:
-        setup, estimate = searched
-        return PlannedStage(name, f"{work}; path search {estimate}", setup + estimate.seconds)
 
     def tried(count: int) -> float:
         few = np.unique(np.linspace(0, n - 1, min(n, count)).astype(int))
@@ -180,33 +174,6 @@ def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> P
     small, large = tried(few), tried(more)
     per_pose = max(large - small, 0.2 * large) / (more - few)  # a hiccup in the small one does not make poses free
     return PlannedStage(name, work, large + per_pose * (n - more))
-
-
-def _searched(site: Site, link: Link, poses: Poses, search: Search) -> tuple[float, Any] | None:
-    """CPU seconds to prepare a search among thousands of faces, which are spent once, and its estimate; None among few.
-
-    The estimate is extrapolated from the first faces.
-    """
-    start = time.process_time()
-    estimate = estimate_search(site, link, poses, search, threads=1)
-    return None if estimate is None else (time.process_time() - start, estimate)
-
-
-def _map_searched(site: Site, settings: Any, heights: int) -> PlannedStage | None:
-    """The path search of a map among thousands of faces, from that of one piece of it; None among few."""
-    from ..maps.grid import Grid
-    from ..maps.job import CHUNK
-    from .mapping.coverage_map import SiteChannels
-
-    spots = Grid.over_area(site.area_m, settings.spacing_m).positions_m(max(settings.rss_altitudes_m))
-    piece = spots[:: max(1, len(spots) // CHUNK)][:CHUNK]
-    poses = Poses(piece, np.tile(np.eye(3), (len(piece), 1, 1)))
-    searched = _searched(site, SiteChannels(site, settings).siso, poses, Search(max_depth=settings.max_depth))
-    if searched is None:
-        return None
-    pieces = heights * -(-len(spots) // CHUNK)
-    work = f"path search in {pieces} pieces, each {searched[1]}"
-    return PlannedStage("path search", work, searched[0] + pieces * searched[1].seconds)
 
 
 def _tiles(site: Site, settings: Any, tiling: Any) -> PlannedStage:
@@ -247,14 +214,10 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
     heights = len(set(settings.rss_altitudes_m) | set(settings.rank_altitudes_m))
     links = positions * heights * len(place.towers)
     stages = [_tiles(place, settings, Tiling(grid, cells))] if cells else []
-    searched = _map_searched(place, settings, heights) if settings.engine == "image" and not cells else None
     for mode in () if cells else settings.foliage:
         work = f"{links} links: {positions} positions, {heights} heights, {len(place.towers)} towers"
         seconds: float | None = None
-        if searched is not None:  # the modes share the paths
-            seconds = searched.seconds if mode == settings.foliage[0] else 0.0
-            work += f"; {searched.work}"
-        elif settings.engine == "image":
+        if settings.engine == "image":
             coarse = dataclasses.replace(
                 settings, foliage=(mode,), spacing_m=settings.spacing_m * max(1.0, (positions / 80) ** 0.5)
             )

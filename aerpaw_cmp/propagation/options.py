@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
@@ -111,39 +111,6 @@ class Job:
         return cls(np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known, links, pairs)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Estimate:
-    """Estimated cost of a search.
-
-    Parameters
-    ----------
-    seconds : float
-        Of an idle machine, all sources.
-    sources, first_faces, sequences : int
-        ``first_faces`` of one source, ``sequences`` of all.
-    memory_mib : float
-        Geometry and trees; sequences are streamed.
-    """
-
-    seconds: float
-    sources: int
-    first_faces: int
-    sequences: int
-    memory_mib: float
-
-    def times(self, sources: int) -> Estimate:
-        """The estimate of so many sources like this one."""
-        return replace(self, seconds=self.seconds * sources, sources=sources, sequences=self.sequences * sources)
-
-    def __str__(self) -> str:
-        many = "1 tower" if self.sources == 1 else f"{self.sources} towers"
-        seconds = f"{self.seconds:.2g}" if self.seconds < 100 else f"{self.seconds:.0f}"
-        return (
-            f"about {seconds} s for {many}: {self.first_faces} first faces, some {self.sequences} sequences, "
-            f"streamed in {max(1, round(self.memory_mib))} MiB"
-        )
-
-
 Progress = Callable[[float], None]
 
 
@@ -162,13 +129,9 @@ class Run:
         Of compiled code (default: the cores this process may use).
     progress : callable, optional
         Called with the share done.
-    on_estimate : callable, optional
-        Called before a search among thousands of faces with what it will take; without one, a long search is a
-        warning.
     """
 
     cache_dir: str | Path | None = None
     job: Job | None = None
     threads: int | None = None
     progress: Progress | None = None
-    on_estimate: Callable[[Estimate], None] | None = None

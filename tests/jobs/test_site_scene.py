@@ -1,7 +1,6 @@
 """A scene to a site.yaml, through replay, and back."""
 
 import json
-import re
 from pathlib import Path
 
 import numpy as np
@@ -126,30 +125,14 @@ def flown(room: Path, tmp_path: Path) -> Path:
     return tmp_path / "flight.yaml"
 
 
-def test_the_plan_of_a_flight_in_a_scene_has_the_estimate(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    capsys.readouterr()
-    assert main(["report", str(flown), "--dry-run", "--json", "--quiet"]) == 0
-    (stage,) = (s for s in json.loads(capsys.readouterr().out)["stages"] if s["name"].startswith("replay RSS"))
-    assert re.search(r"path search about \S+ s for 1 tower: \d+ first faces, some \d+ sequences, .* MiB", stage["work"])
-    assert stage["seconds"] >= 0.0
-
-
-def test_the_plan_of_a_map_of_a_scene_searches_one_piece_of_it(
-    flown: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    from aerpaw_cmp.jobs.mapping import coverage_map
-
-    def never(*_: object) -> None:
-        raise AssertionError("a map was made for the plan")
-
-    monkeypatch.setattr(coverage_map, "make_maps", never)
-    capsys.readouterr()
-    site = flown.with_name("site.yaml")
-    assert main(["map", str(site), "--spacing", "20", "--dry-run", "--json", "--quiet"]) == 0
-    stages = [s for s in json.loads(capsys.readouterr().out)["stages"] if s["name"].startswith("maps, foliage")]
-    assert all(re.search(r"path search in \d+ pieces, each about \S+ s for 1 tower", stage["work"]) for stage in stages)
-    assert all(stage["seconds"] == 0.0 for stage in stages[1:])  # paths are shared
-    assert stages[0]["seconds"] > 0.0
+def test_a_flight_and_a_map_of_a_scene_are_planned_by_a_trial(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for command in (["report", str(flown)], ["map", str(flown.with_name("site.yaml")), "--spacing", "20"]):
+        capsys.readouterr()
+        assert main([*command, "--dry-run", "--json", "--quiet"]) == 0
+        stages = json.loads(capsys.readouterr().out)["stages"]
+        tried = [s for s in stages if s["name"].startswith(("replay RSS", "maps, foliage"))]
+        assert tried
+        assert all(stage["seconds"] > 0.0 for stage in tried)
 
 
 @pytest.mark.sionna

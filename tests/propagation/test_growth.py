@@ -10,14 +10,13 @@ pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.check.explain import why_not
-from aerpaw_cmp.propagation.engine.engines import estimate_search
 from aerpaw_cmp.propagation.geometry.paths import Links
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import beams, prisms
 from aerpaw_cmp.propagation.search import mirror as image
-from aerpaw_cmp.propagation.search.beams import estimate, grow_paths, reflection_points
+from aerpaw_cmp.propagation.search.beams import grow_paths, reflection_points
 from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
@@ -75,12 +74,7 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     rng = np.random.default_rng(2)
     targets = np.column_stack([rng.uniform(-150, 150, (40, 2)), rng.uniform(1.5, 60, 40)])
     source = np.array([[0.0, 0.0, 30.0]])
-    words: list[str] = []
-    run = Run(on_estimate=lambda said: words.append(str(said)))
-    paths = [grow_paths(surfaces, Links(source, targets), run, max_depth=2, shadows=on) for on in (True, False)]
-    assert len(words) == 2
-    assert "first faces" in words[0]
-    assert "MiB" in words[0]
+    paths = [grow_paths(surfaces, Links(source, targets), max_depth=2, shadows=on) for on in (True, False)]
     assert len(paths[0]) == len(paths[1]) > 50
     for column in ("pose", "faces"):
         assert np.array_equal(getattr(paths[0], column), getattr(paths[1], column))
@@ -108,14 +102,15 @@ def test_only_a_convex_face_leaves_out_what_its_outline_covers(name):
     scene = enumerate_.scene_of([*occluder, *mirror], shapes=[0] * len(occluder) + [1, 1])
     surfaces, ends = merged(scene), (np.array([[0.0, 0, 0]]), np.array([[0.0, 0.5, 0.5]]))
     assert len(surfaces) == 2
-    paths, before = grow_paths(surfaces, Links(*ends), max_depth=1), estimate(surfaces, Links(*ends), max_depth=1)
+    paths = grow_paths(surfaces, Links(*ends), max_depth=1)
+    ((_, _, search),) = beams._searches(surfaces, Links(*ends), beams._rules(surfaces, 1, solids=False))
     everything = grow_paths(surfaces, Links(*ends), max_depth=1, shadows=False)
     wrong = grow_paths(replace(surfaces, convex=np.ones(len(surfaces), np.bool_)), Links(*ends), max_depth=1)
     if name == "a square":  # itself a mirror, at (5, 1/4, 1/4); the one behind it is not followed
-        assert before.first_faces == 1  # the other one lies in its shadow
+        assert len(search.first_faces()) == 1  # the other one lies in its shadow
         assert [p[0].round(9).tolist() for p in paths.vertices_m[1:]] == [[5.0, 0.25, 0.25]]
     else:
-        assert before.first_faces == 2
+        assert len(search.first_faces()) == 2
         assert [p[0].round(9).tolist() for p in paths.vertices_m[1:]] == [[10.0, 0.25, 0.25]]
         assert len(wrong) == 1  # this scene does tell the two apart
     np.testing.assert_array_equal(paths.faces, everything.faces)
@@ -175,40 +170,6 @@ def test_flipped_and_degenerate_triangles_change_nothing():
 def town(rng, count, half_m):
     spot = rng.uniform(-half_m, half_m, (count, 2))
     return [Building(f"b{k}", box(e, n, e + 14, n + 11), float(rng.uniform(5, 15))) for k, (e, n) in enumerate(spot)]
-
-
-def test_the_estimate_of_a_search_comes_without_the_search(scenes):
-    rng = np.random.default_rng(12)
-    buildings = town(rng, 400, 900)
-    site = scenes.site(buildings, ((0.0, 0.0, 30.0), (50.0, 0.0, 30.0)))
-    poses = scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3)))
-    estimates = []
-    replay(site, scenes.link(site), poses, run=Run(on_estimate=estimates.append))
-    before = estimate_search(site, scenes.link(site), poses)
-    assert [forecast.first_faces for forecast in estimates] == [before.first_faces]
-    assert before.first_faces > 500
-    assert before.sequences == estimates[0].sequences > 2 * before.first_faces
-    assert str(before).startswith("about ")
-    assert "2 towers" in str(before)
-    assert "MiB" in str(before)
-    assert estimate_search(scenes.site(buildings[:5]), scenes.link(scenes.site()), poses) is None
-
-
-def test_the_estimate_holds_whichever_faces_are_tried():
-    """Few first faces lead to most of three reflections: 64 plain draws are off by 0.6 to 1.6 here."""
-    scene, source = read_scene(enumerate_.shipped("munich")), np.array([[8.5, 21.0, 27.0]])
-    away = np.linalg.norm(scene.vertices_m[scene.triangles].mean(axis=1)[:, :2] - source[0, :2], axis=1)
-    near = np.argsort(away)[:2500]
-    surfaces = merged(replace(scene, triangles=scene.triangles[near], shape=scene.shape[near]))
-    rng = np.random.default_rng(1)
-    targets = np.column_stack([source[0, :2] + rng.uniform(-140, 140, (20, 2)), rng.uniform(1.5, 60, 20)])
-    rules = beams._rules(surfaces, 3, solids=False)
-    ((_, _, search),) = beams._searches(surfaces, Links(source, targets), rules)
-    first = search.first_faces()
-    every = search.follow(first)[3]
-    for seed in range(12):
-        forecast = search.estimate(np.random.default_rng(seed).permutation(first), threads=1)
-        assert 1 / 1.3 < forecast.sequences / every < 1.3, seed
 
 
 def test_paths_can_be_recomputed_from_their_faces():

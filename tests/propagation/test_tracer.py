@@ -13,7 +13,7 @@ from aerpaw_cmp.propagation.engine import engines
 from aerpaw_cmp.propagation.engine.engines import PathCache
 from aerpaw_cmp.propagation.geometry.arrays import Link, single_element
 from aerpaw_cmp.propagation.native.compiled import State
-from aerpaw_cmp.propagation.options import Estimate, Run, Search
+from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene, within_reach
 from aerpaw_cmp.propagation.trace import trace
@@ -136,17 +136,6 @@ def test_beams_serve_many_faces_two_deep_and_jobs_that_are_worth_them(
     assert engines.by_beams(few, Search(**search), 7) is expected
     assert engines.by_beams(few, Search(**search)) is (expected and faces > 400)
     assert engines.by_beams(replace(few, surfaces=object()), Search(**search)) is (search.get("engine") != "sionna")
-
-
-def test_a_long_search_is_a_warning(recwarn):
-    made = {"sources": 1, "first_faces": 3, "sequences": 9, "memory_mib": 0.4}
-    engines._long_search(Estimate(seconds=60.0, **made))
-    assert not recwarn.list
-    with pytest.warns(RuntimeWarning, match=r"takes about 60 s for 1 tower: 3 first faces, some 9 sequences, .* 1 MiB"):
-        engines._long_search(Estimate(seconds=60.1, **made))
-    three = Estimate(seconds=50.0, **made).times(3)
-    assert str(three).startswith("about 150 s for 3 towers: 3 first faces, some 27 sequences")
-    assert str(Estimate(seconds=0.123, **made)).startswith("about 0.12 s")
 
 
 def test_a_trace_of_plain_positions_is_that_of_level_poses(case):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import time
-import warnings
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,17 +20,13 @@ from ...common.content import content_digest
 from ...common.files import cache_folder, read_sealed, write_sealed
 from ...common.units import AnyArray, FloatArray
 from ...common.versions import version
-from ...site.site import Site
 from ..geometry.arrays import Link, Poses
 from ..geometry.paths import PathSet
 from ..native.compiled import beams, beams_for, switch, warn_once
-from ..options import Estimate, Run, Search
-from ..scene import Scene, within_reach
+from ..options import Run, Search
+from ..scene import Scene
 from ..search import mirror
 from ..search.samples import Choice, enough_samples, spread
-
-# A search that will take longer is a warning where nobody asked to be told.
-_LONG_SEARCH_S = 60.0
 
 # Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same.
 MANY_FACES = 400
@@ -125,7 +120,6 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
         from ..search import beams as search_beams
         from ..search import prisms  # compiled: loaded where there are many faces
 
-        run = replace(run, on_estimate=run.on_estimate or _long_search)
         if scene.surfaces is not None:
             return search_beams.grow_paths(scene.surfaces, links, run, max_depth=depth)
         return prisms.find_paths(scene.faces, links, run, max_depth=depth, extent_m=extent)
@@ -160,43 +154,6 @@ def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
 def _links(scene: Scene, run: Run) -> int:
     """Links of the whole job."""
     return scene.excluded.size if run.job is None else run.job.links
-
-
-def _long_search(estimate: Estimate) -> None:
-    if estimate.seconds > _LONG_SEARCH_S:
-        warnings.warn(f"the path search takes {estimate}", RuntimeWarning, stacklevel=2)
-
-
-def estimate_search(
-    site: Site, link: Link, poses: Poses, search: Search | None = None, *, threads: int | None = None
-) -> Estimate | None:
-    """Estimate the cost of the path search of the image engine, from its first faces.
-
-    Parameters
-    ----------
-    site, link, poses, search
-        As for :func:`aerpaw_cmp.propagation.replay.replay`.
-    threads : int, optional
-
-    Returns
-    -------
-    Estimate or None
-        None where there are few faces: a replay of some poses tells it.
-    """
-    poses, _ = within_reach(site, poses)
-    scene, search = Scene.of(site, link, poses), replace(search or Search(), engine="image")
-    if not by_beams(scene, search):
-        return None
-    from ..search import beams as search_beams
-    from ..search import prisms  # compiled: loaded where there are many faces
-
-    return search_beams.estimate(
-        scene.surfaces or prisms.solid_surfaces(scene.faces, scene.sources_m, poses.position_m),
-        scene.links_to(poses),
-        max_depth=search.max_depth,
-        threads=threads,
-        solids=scene.surfaces is None,
-    )
 
 
 # ------------------------------------------------------------------------------------------------------- the cache

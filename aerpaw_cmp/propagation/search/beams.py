@@ -11,7 +11,6 @@ Pairs are streamed: memory does not grow with their number.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
@@ -23,7 +22,7 @@ from ...common.units import BoolArray, FloatArray, IntArray
 from ..geometry.paths import BoxTree, Links, PathSet, Surfaces
 from ..native.compiled import in_threads, thread_count
 from ..native.numba_options import kernel, part
-from ..options import Estimate, Progress, Run
+from ..options import Progress, Run
 from .boxtree import DEEPEST, box_missed, box_outside, box_tree, next_leaf, within_planes
 from .merging import WINDOW
 from .mirror import merge, searched_links
@@ -42,9 +41,6 @@ EDGE_M = 1e-6
 
 # Share of a triangle's height by which a segment must meet it to cut it beyond doubt.
 _SOLID_MARGIN = 1e-6
-
-# First faces that an estimate draws from, the fewest that it tries, and the standard error at which it stops.
-_POOL, _FEWEST_TRIED, _CERTAIN = 1024, 24, 0.12
 
 
 class _Mirrors(NamedTuple):
@@ -100,7 +96,7 @@ def grow_paths(
     surfaces : Surfaces
     links : Links
     run : Run
-        Threads, progress, and whom to tell before the first source is searched what it will take.
+        Threads and progress.
     max_depth : int
         0 to 3.
     beams : bool
@@ -118,48 +114,23 @@ def grow_paths(
     """
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
-    towers, threads, on_estimate = len(links.sources_m), thread_count(run.threads), run.on_estimate
+    towers, threads = len(links.sources_m), thread_count(run.threads)
     pieces: list[PathSet] = []
     rules = _rules(surfaces, max_depth, solids=solids, beams=beams, shadows=shadows)
     for tower, poses, search in _searches(surfaces, links, rules):
         levels = [search.direct()]
         if max_depth:
-            first = search.first_faces()
-            if on_estimate:
-                on_estimate(search.estimate(first, threads).times(towers - tower))
-                on_estimate = None
 
             def share(fraction: float, tower: int = tower) -> None:
                 if run.progress:
                     run.progress((tower + fraction) / towers)
 
-            levels += search.run(first, threads, share)
+            levels += search.run(search.first_faces(), threads, share)
         pieces += [PathSet.from_tower(tower, poses[pose], faces, at, max_depth) for pose, faces, at in levels]
         if run.progress:
             run.progress((tower + 1) / towers)
     paths = merge(pieces, max_depth, None)
     return paths if solids else without_coincident(paths, surfaces)
-
-
-def estimate(
-    surfaces: Surfaces, links: Links, *, max_depth: int = 2, threads: int | None = None, solids: bool = False
-) -> Estimate | None:
-    """Estimate the cost of :func:`grow_paths` from some faces of the first source; None where nothing is searched.
-
-    Parameters
-    ----------
-    surfaces, links, max_depth, threads, solids
-        As for :func:`grow_paths`.
-
-    Returns
-    -------
-    Estimate or None
-    """
-    if not max_depth:
-        return None
-    for tower, _, search in _searches(surfaces, links, _rules(surfaces, max_depth, solids=solids)):
-        return search.estimate(search.first_faces(), thread_count(threads)).times(len(links.sources_m) - tower)
-    return None
 
 
 def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = True, shadows: bool = True) -> Rules:
@@ -225,62 +196,16 @@ class _Search:
         good = _first_faces(self.mirrors, self.solids.face_tree, self.source, self.rules)
         return np.random.default_rng(0).permutation(np.flatnonzero(good))
 
-    def follow(self, some: IntArray) -> tuple[IntArray, IntArray, FloatArray, int]:
-        """Paths whose first face is one of some, and how many sequences there were."""
-        return self._follow(some, self.rules.depth)
-
-    def _follow(self, some: IntArray, depth: int) -> tuple[IntArray, IntArray, FloatArray, int]:
-        rules = self.rules._replace(depth=depth)
-        return _follow(self.mirrors, self.solids, self.targets, self.source, some, rules)  # type: ignore[no-any-return]
-
-    def estimate(self, first: IntArray, threads: int) -> Estimate:
-        """Estimate the cost of following the faces ``first``; some of them are tried.
-
-        Notes
-        -----
-        A tenth of the first faces leads to most sequences. Of three reflections, faces are drawn in proportion to
-        their sequences of two, and weigh less in that measure (M. H. Hansen, W. N. Hurwitz, Ann. Math. Stat. 14
-        (1943) 333, doi:10.1214/aoms/1177731356): 24 of them tell munich to 13 %, where plain draws take 500.
-        """
-        pool = first[:_POOL]
-        size = np.ones(len(pool))
-        if self.rules.depth > 2:
-            size = np.array([max(1, self._tried(face, self.rules.depth - 1)[0]) for face in pool], dtype=np.float64)
-        tried: list[tuple[float, float]] = []
-        for at in np.random.default_rng(0).choice(len(pool), len(pool), p=size / size.sum()) if len(pool) else ():
-            sequences, seconds = self._tried(pool[at], self.rules.depth)
-            tried.append((sequences / size[at], seconds / size[at]))
-            known = np.array(tried)[:, 0]
-            if len(known) >= _FEWEST_TRIED and known.std() < _CERTAIN * known.mean() * np.sqrt(len(known)):
-                break
-        share = size.sum() * len(first) / max(1, len(pool))
-        sequences, seconds = share * np.mean(tried or [(0.0, 0.0)], axis=0)
-        (face_tree, corners, tree), (targets, target_tree) = self.solids, self.targets
-        arrays = (corners, targets, *tree, *face_tree, *target_tree, *self.mirrors)
-        return Estimate(
-            seconds=float(seconds) / max(1, threads),
-            sources=1,
-            first_faces=len(first),
-            sequences=round(float(sequences)),
-            memory_mib=sum(array.nbytes for array in arrays) / 2**20,
-        )
-
-    def _tried(self, face: int, depth: int) -> tuple[int, float]:
-        """Sequences of at most ``depth`` that begin with a face, and the CPU seconds that they take."""
-        some = np.array([face])
-        self._follow(some[:0], depth)  # the first call compiles, or loads what was compiled
-        begun = time.thread_time()  # what others do on this machine is not told beforehand
-        self._follow(some[:0], depth)
-        called = time.thread_time()
-        sequences = self._follow(some, depth)[3]
-        return sequences, max(0.0, time.thread_time() - called - (called - begun))
+    def follow(self, some: IntArray) -> _Level:
+        """Paths whose first face is one of some."""
+        return _follow(self.mirrors, self.solids, self.targets, self.source, some, self.rules)  # type: ignore[no-any-return]
 
     def run(self, first: IntArray, threads: int, share: Progress) -> list[_Level]:
         """Follow all sequences that begin with the faces ``first``."""
         levels: list[_Level] = []
         followed = 0
         for some, size in _chunks(first, threads):
-            levels += [(pose, faces, points) for pose, faces, points, _ in in_threads(self.follow, some, threads)]
+            levels += in_threads(self.follow, some, threads)
             followed += size
             share(followed / len(first))
         return levels
@@ -774,7 +699,7 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
     face_tree = solids.face_tree
     depth, side, beams = rules.depth, rules.side, rules.beams
     pose, faces, points = np.empty(256, np.int64), np.full((256, depth), -1, np.int64), np.zeros((256, depth, 3))
-    total = followed = 0
+    total = 0
     next_faces = np.empty((depth + 1, max(len(normal), len(firsts))), np.int64)
     waiting, turn = np.zeros(depth + 2, np.int64), np.zeros(depth + 2, np.int64)
     chain, signs, images = np.full(depth, -1, np.int64), np.zeros(depth + 1), np.zeros((depth + 1, 3))
@@ -808,7 +733,6 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
             last = signs[level - 1]
             if worthwhile and _wholly_hidden(mirrors, face_tree, place, f, before, last, rules, stack):
                 continue
-        followed += 1
         chain[level], signs[level] = f, sign
         n0, n1, n2 = normal[f, 0], normal[f, 1], normal[f, 2]
         image = images[level + 1]
@@ -857,7 +781,7 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
             level += 1
             waiting[level] = within_planes(face_tree, mine, many[level - 1], stack, next_faces[level])
             turn[level] = 0
-    return pose[:total].copy(), faces[:total].copy(), points[:total].copy(), followed
+    return pose[:total].copy(), faces[:total].copy(), points[:total].copy()
 
 
 def obstacle(surfaces: Surfaces, points_m: FloatArray, sequence: IntArray) -> int | None:
@@ -890,7 +814,6 @@ def try_out() -> None:
 
 __all__ = [
     "Rules",
-    "estimate",
     "grow_paths",
     "in_face",
     "obstacle",

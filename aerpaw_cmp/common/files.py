@@ -104,15 +104,13 @@ def locked(folder: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def atomic_path(target: Path, *, durable: bool = False) -> Iterator[Path]:
+def atomic_path(target: Path) -> Iterator[Path]:
     """A place to write to, which takes the name ``target`` when the block ends without an error.
 
     Parameters
     ----------
     target : Path
         In a folder that exists. A reader sees the old file or the new one, never a part.
-    durable : bool
-        Bring content and name to the disk first, so that a power cut does not undo them.
 
     Yields
     ------
@@ -132,12 +130,7 @@ def atomic_path(target: Path, *, durable: bool = False) -> Iterator[Path]:
     try:
         yield part
         part.chmod(plain_mode())  # mkstemp makes files private; these are ordinary ones
-        if durable:
-            sync(part)
         part.replace(target)
-        if durable:
-            with contextlib.suppress(OSError):  # not every system lets folders be synced
-                sync(target.parent)
     finally:
         part.unlink(missing_ok=True)
 

@@ -271,7 +271,10 @@ class OrdinaryKriging:
         return chosen
 
     def _semivariance(self, offset_m: FloatArray) -> FloatArray:
-        """1 - Phi of offsets (dims, ...) between different places."""
+        """1 - Phi of offsets (dims, ...) between different places.
+
+        Source: arXiv 2502.10324 eq. 17; ``v^2`` scales the variance afterwards.
+        """
         square = offset_m[0] ** 2 + offset_m[1] ** 2
         for more in offset_m[2:]:
             square += more**2

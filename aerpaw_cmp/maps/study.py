@@ -82,7 +82,7 @@ def interpolation_study(
         The correlation and its fit, scores of every interpolator.
     """
     points = grid.points_m
-    correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m, missing="pairwise")
+    correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m)
     fit = _curve(correlation)
     models: dict[str, evaluate.Predictor] = {
         "Kriging": OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed),

@@ -21,7 +21,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -90,7 +89,6 @@ def vector_correlation(
     *,
     width_m: float = _PAPER_WIDTH_M,
     maximum_m: float = _PAPER_MAXIMUM_M,
-    missing: Literal["drop", "pairwise"] = "drop",
 ) -> BinnedCorrelation:
     """Pearson correlation of the positions' vectors, binned by horizontal distance (the paper's Steps 1 to 4).
 
@@ -101,11 +99,9 @@ def vector_correlation(
     points_m : (n, 2+)
         East, north [m].
     vectors : (n, ...)
-        Rank or RSS over altitudes and K, flattened per position.
+        Rank or RSS over altitudes and K, flattened per position; of NaN a pair uses the components that both have.
     width_m, maximum_m : float
         Bin width (the paper's d_rx) and the largest distance [m].
-    missing : {"drop", "pairwise"}
-        What NaN does: the position is left out, or each pair uses the components that both positions have.
 
     Returns
     -------
@@ -113,10 +109,10 @@ def vector_correlation(
     """
     points, data = _points_and_vectors(points_m, vectors)
     present = np.isfinite(data)
-    lacking = ~present.all(axis=1) if missing == "drop" else present.sum(axis=1) < _MINIMUM_COMMON
+    lacking = present.sum(axis=1) < _MINIMUM_COMMON
     constant = ~lacking & _is_constant(data, present)
     varying = ~(lacking | constant)
-    if missing == "drop" or present[varying].all():
+    if present[varying].all():
         unit = data[varying] - data[varying].mean(axis=1, keepdims=True)
         unit /= np.sqrt((unit**2).sum(axis=1, keepdims=True))
         bins = _bin_pairs(
@@ -257,13 +253,6 @@ class Variogram:
     def __call__(self, distance_m: ArrayLike) -> FloatArray:
         """Fitted correlation at distances [m]."""
         return self.model_(distance_m)
-
-    def semivariance(self, distance_m: ArrayLike, sill: float = 1.0) -> FloatArray:
-        """``sill * (1 - Phi(d))`` at distances [m], in the unit of the sill.
-
-        Source: arXiv 2502.10324 eq. 17.
-        """
-        return np.asarray(sill * (1.0 - self.model_(distance_m)))
 
 
 class _PairwisePearson:

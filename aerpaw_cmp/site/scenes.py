@@ -127,28 +127,13 @@ def bounds(scene: TriangleScene) -> tuple[np.ndarray, np.ndarray]:
 
 
 def ground_share(scene: TriangleScene) -> float:
-    """Share of a 40 x 40 grid over the plan that has a level surface somewhere above or below it."""
+    """Share of the plan that has a level surface somewhere above or below it."""
     corners = scene.vertices_m[scene.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(across, axis=1)
     level = corners[np.abs(across[:, 2]) > LEVEL * np.maximum(size, 1e-300)]
     low, high = bounds(scene)
-    side = 40
-    at = (np.arange(side) + 0.5) / side
-    covered = np.zeros((side, side), dtype=np.bool_)
-    east, north = low[0] + at * (high[0] - low[0]), low[1] + at * (high[1] - low[1])
-    for triangle in level[:, :, :2]:
-        columns = slice(*np.searchsorted(east, [triangle[:, 0].min(), triangle[:, 0].max()]))
-        rows = slice(*np.searchsorted(north, [triangle[:, 1].min(), triangle[:, 1].max()]))
-        if columns.start == columns.stop or rows.start == rows.stop:
-            continue
-        x, y = east[columns][:, None], north[rows][None, :]
-        signs = []
-        for k in range(3):
-            (a, b), (c, d) = triangle[k], triangle[(k + 1) % 3]
-            signs.append((c - a) * (y - b) - (d - b) * (x - a))
-        covered[columns, rows] |= ((np.stack(signs) >= 0).all(axis=0)) | ((np.stack(signs) <= 0).all(axis=0))
-    return float(covered.mean())
+    return float(shapely.union_all(shapely.polygons(level[:, :, :2])).area / (high - low)[:2].prod())
 
 
 # A mesh this narrow in plan whose box comes this near to an antenna is its mast, bracket or housing.

@@ -12,11 +12,10 @@ from aerpaw_cmp.common.files import atomic_path, inside, read_bounded
 from aerpaw_cmp.common.geodesy import SiteFrame
 
 
-@pytest.mark.parametrize("durable", [False, True])
-def test_the_new_content_takes_the_name(tmp_path: Path, durable: bool) -> None:
+def test_the_new_content_takes_the_name(tmp_path: Path) -> None:
     target = tmp_path / "a.txt"
     target.write_text("old")
-    with atomic_path(target, durable=durable) as part:
+    with atomic_path(target) as part:
         part.write_text("new")
         assert target.read_text() == "old"
     assert target.read_text() == "new"

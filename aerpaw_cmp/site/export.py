@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -11,6 +11,7 @@ import numpy as np
 
 from ..common.outputs import explained_os_errors
 from .materials import CONSTANT, material
+from .mesh_scenes.mitsuba import TriangleScene
 from .meshes import Mesh, site_meshes
 from .site import Site
 
@@ -54,12 +55,15 @@ def export_scene(site: Site, folder: str | Path) -> list[Path]:
 
 def _parts(site: Site) -> list[tuple[str, str, Mesh]]:
     """Title, material and mesh of each part: those of a scene shape by shape, all else by material."""
-    parts, scene = [], site.scene
-    for number in () if scene is None else np.unique(scene.shape):  # none of vegetation, which is a medium
+    parts = [(f"all_{_plain(name)}", name, mesh) for name, mesh in site_meshes(site).items()]
+    return parts if site.scene is None else [*_parts_of_scene(site.scene), *parts]
+
+
+def _parts_of_scene(scene: TriangleScene) -> Iterator[tuple[str, str, Mesh]]:
+    for number in np.unique(scene.shape):  # none of vegetation, which is a medium
         used, place = np.unique(scene.triangles[scene.shape == number], return_inverse=True)
         title = f"{number}_{_plain(scene.shapes[number].removeprefix('mesh-'))[:60]}"
-        parts.append((title, scene.materials[number], (scene.vertices_m[used], place.reshape(-1, 3))))
-    return parts + [(f"all_{_plain(name)}", name, mesh) for name, mesh in site_meshes(site).items()]
+        yield title, scene.materials[number], (scene.vertices_m[used], place.reshape(-1, 3))
 
 
 def _plain(name: str) -> str:

@@ -22,6 +22,7 @@ from ..flight.settings import FlightFile, LinkSettings
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.path_table import check_band, subcarriers_hz, velocities_mps
 from ..report.exports.channel import FORMATS, Channel
+from ..report.exports.formats import chosen_formats
 from ..site.antenna.learned import BAND
 from .options import DEFAULT, JobOutcome, RunOptions
 from .prediction.sources import memory_of
@@ -240,6 +241,8 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
     """
     if unknown := [name for name in chosen.formats if name not in FORMATS]:
         raise UsageError(f"--format {unknown[0]!r}", expected="one of " + ", ".join(FORMATS))
+    if "netcdf" in chosen.formats:
+        chosen_formats("netcdf")  # told before the replay where its libraries are missing
     settings, stages = load_with_learned(flight), Stages(options.progress)
     root = options.logs_root or flight.parent
     if chosen.route is None and settings.flight.plan and not all((root / log.path).exists() for log in settings.logs):

@@ -24,6 +24,8 @@ from ..flight.gains.learned_gain import sphere_angles
 from ..flight.gains.memory import load_with_learned
 from ..flight.marks import mark_of
 from ..flight.rows.lock import LOCK_FLOOR_DB, is_sounder_power
+from ..flight.settings import FlightFile
+from ..logs.ingest import IngestedFile
 from ..logs.records import Stream
 from ..report.pages.locate import LocatePage, locate_metrics, write_locate
 from ..site.antenna.antennas import MeasuredPattern
@@ -62,30 +64,13 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
     folder = options.out or Path("reports") / f"locate-{settings.flight.name}"
     with OutputFolder(folder, job="locate", inputs=inputs, force=options.force) as output:
         with stages("read"):
-            files = read_logs(settings, flight.parent, options.logs_root)
             site = choose_site(settings.site, flight.parent)
-            streams = [(file, stream) for file in files for stream in file.result.streams]
-            vehicles = [s for _, s in streams if s.kind == "telemetry"]
-            levels = [(f, s) for f, s in streams if s.kind == "rss" and not is_ratio(s)]
-            names = [_name(s) for _, s in levels]
-            if not vehicles or not levels:
-                missing = "telemetry" if levels else "levels"
-                raise InputError(f"no log has {missing}", expected="telemetry and levels of one flight", path=flight)
-            if channel is not None and channel not in names:
-                raise UsageError(f"no channel {channel!r}", expected="one of " + ", ".join(names))
-            file, level = levels[names.index(channel) if channel else 0]
-            link = settings.link.channels.get(_name(level), settings.link.rss)
-            known = link.build([_NODE], options.logs_root or flight.parent)
-            node, uav = (a.patterns[0] for a in (known.tower_arrays[_NODE], known.uav_array))
-            if not isinstance(uav, MeasuredPattern):
-                mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
-                series, log = (_name(level), file.result.reader), (file.sha256, mark)
-                node, uav = _remembered(site_place(settings.site.file, flight.parent), site, series, log)
+            vehicle, file, level = _streams(settings, flight, options.logs_root, channel)
+            node, uav = _antennas(settings, flight, options.logs_root, site, (file, level))
         with stages("locate"):
             floor = LOCK_FLOOR_DB if is_sounder_power(level) else receiver_floor_db([level])
             floor = -np.inf if floor is None else floor
-            placer = Placer(site, max(vehicles, key=lambda s: len(s.frame)))
-            track = placer.levels(level, floor, uav if isinstance(uav, MeasuredPattern) else None)
+            track = Placer(site, vehicle).levels(level, floor, uav)
             if len(track.level_db) < FEWEST:
                 raise InputError(
                     f"{len(track.level_db)} bins of 4 s have a level and a position above 5 m",
@@ -97,7 +82,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
             if track.airframe_db is not None and isinstance(node, SpherePattern):
                 model, assumed = _model_of(node), f"{node.name}, learned on other flights"
                 track = replace(track, airframe_db=_both_ends(track.airframe_db, node))
-            airframe = uav.name if track.airframe_db is not None else "unknown"
+            airframe = "unknown" if uav is None else uav.name
             estimate = locate(track, model=model)
         ends = f"Antenna of the UAV: {airframe}. Antenna of the node: {assumed}."
         page = _page(settings.flight.name, level, site, track, estimate, ends)
@@ -106,10 +91,38 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
         return JobOutcome(folder=folder, metrics=locate_metrics(page), files=output.placed(written))
 
 
-def _remembered(place: str | Path, site: Site, series: tuple[str, str], log: tuple[str, str]) -> tuple[Any, Any]:
-    """Antennas of a node that flights placed themselves and of their airframe; None where none fits."""
-    both = next((t for name, t in taught(place, series, log).items() if name not in site.towers), None)
-    return (both.tower, both.uav) if both else (None, searching_airframe(place, site.towers, series, log))
+def _streams(
+    settings: FlightFile, flight: Path, logs_root: Path | None, channel: str | None
+) -> tuple[Stream, IngestedFile, Stream]:
+    """Telemetry with most rows; the chosen levels and their file."""
+    streams = [(f, stream) for f in read_logs(settings, flight.parent, logs_root) for stream in f.result.streams]
+    vehicles = [s for _, s in streams if s.kind == "telemetry"]
+    levels = {_name(s): (f, s) for f, s in reversed(streams) if s.kind == "rss" and not is_ratio(s)}
+    if not vehicles or not levels:
+        missing = "telemetry" if levels else "levels"
+        raise InputError(f"no log has {missing}", expected="telemetry and levels of one flight", path=flight)
+    if channel is not None and channel not in levels:
+        raise UsageError(f"no channel {channel!r}", expected="one of " + ", ".join(reversed(levels)))
+    return max(vehicles, key=lambda s: len(s.frame)), *levels[channel or list(levels)[-1]]
+
+
+def _antennas(
+    settings: FlightFile, flight: Path, logs_root: Path | None, site: Site, log: tuple[IngestedFile, Stream]
+) -> tuple[Any, MeasuredPattern | None]:
+    """Antennas of node and airframe that the flight file or else the site knows; none that this very log taught."""
+    file, level = log
+    link = settings.link.channels.get(_name(level), settings.link.rss)
+    known = link.build([_NODE], logs_root or flight.parent)
+    node, uav = (array.patterns[0] for array in (known.tower_arrays[_NODE], known.uav_array))
+    if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
+        return node, uav
+    mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
+    place, series = site_place(settings.site.file, flight.parent), (_name(level), file.result.reader)
+    every = taught(place, series, (file.sha256, mark)).items()
+    both = next((antennas for name, antennas in every if name not in site.towers), None)
+    if both is not None:
+        return both.tower, both.uav
+    return None, searching_airframe(place, site.towers, series, (file.sha256, mark))
 
 
 def _model_of(node: SpherePattern) -> LevelModel:
@@ -143,7 +156,7 @@ def _page(flight: str, level: Stream, site: Site, track: LevelTrack, estimate: N
         modes.append({name: float(x) for name, x in place.items()} | named(mode, "share radius_m"))
     low, high = estimate.height_m
     floor = "none shows" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB, below it only that is known"
-    edge = "The likeliest place lies at the edge of the search: the node may stand farther away."
+    edge = "The region reaches the edge of the search, 400 m beyond the flight: the node may stand farther away."
     return LocatePage(
         flight=flight,
         channel=_name(level),

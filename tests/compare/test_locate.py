@@ -177,7 +177,7 @@ def test_the_grid_reaches_400_m_beyond_the_flight_and_the_region_a_tenth_of_the_
         ((0, 501.0), 1),
         ((0, -261), 1),
     ):
-        assert locating._on_edge(np.array([*place, 1.5]), grid) == bool(edge)
+        assert locating._on_edge(np.array([[*place, 1.5]]), grid).tolist() == [bool(edge)]
     certain, far = np.array([1.0]), np.array([0.0, 500.0])
     assert locating._radius(np.array([0.0]), certain) == pytest.approx(20.0 * np.sqrt(-2.0 * np.log(0.1)), abs=0.1)
     # five percent far away: of the rest 18 in 19 are within; twenty percent: half of those far away
@@ -242,3 +242,9 @@ def test_regions_of_one_place_are_the_disks_of_a_normal_distribution() -> None:
         assert mode.share == pytest.approx(part, abs=0.01)
         area_m2 = regions.holding(part).sum() * np.diff(regions.east_m)[0] * np.diff(regions.north_m)[0]
         assert area_m2 == pytest.approx(np.pi * radius_m**2, rel=0.03)
+
+
+def test_a_part_that_holds_almost_nothing_is_no_place_of_its_own() -> None:
+    places = np.array([[0.0, 0.0], [500.0, 0.0], [-400.0, 300.0]])
+    regions = locating.Regions.of(places, np.array([0.6, 0.38, 0.02]))
+    assert [mode.place_m.round(-1).tolist() for mode in regions.modes(0.995)] == [[0.0, 0.0], [500.0, 0.0]]

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -176,6 +177,15 @@ def test_what_cannot_be_is_refused_in_one_line(folder, options, expected, capsys
     said = capsys.readouterr().err
     assert "Traceback" not in said
     assert expected in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_missing_library_is_told_before_the_replay(folder, capsys, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "netCDF4", None)
+    assert main(["channel", str(folder / "plan.yaml"), "-o", str(tmp_path / "out")]) == 2
+    said = capsys.readouterr().err
+    assert "aerpaw-cmp[geo]" in said
+    assert "replay" not in said
     assert not (tmp_path / "out").exists()
 
 

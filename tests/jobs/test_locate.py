@@ -1,5 +1,6 @@
 """An unknown node of a simulated flight, from its logs to the page."""
 
+import hashlib
 import json
 
 import numpy as np
@@ -103,3 +104,16 @@ def test_a_growing_log_is_followed_until_it_is_interrupted(flight, capsys, tmp_p
     )
     assert first != second
     assert (tmp_path / "out" / "locate.html").exists()
+
+
+@pytest.mark.parametrize("own", [True, False])
+def test_antennas_that_this_very_log_taught_are_not_used(flight, own, capsys, tmp_path):
+    digest = hashlib.sha256(flight.with_name("power.txt").read_bytes()).hexdigest() if own else "ab" * 32
+    rows = [f"{a},{e},0,1" for a in range(0, 360, 90) for e in (90, 0, -90)]
+    head = [f"# trained_on: {digest}", "azimuth_deg,elevation_deg,gain_dbi,gain_sd_db"]
+    (flight.parent / "frame.csv").write_text("\n".join([*head, *rows]) + "\n")
+    link = "link: {rss: {carrier_hz: 3.3e9, uav: {antenna: {model: sphere, file: frame.csv}}}}\n"
+    (flight.parent / "taught.yaml").write_text(flight.read_text() + link)
+    assert main(["locate", str(flight.parent / "taught.yaml"), "-o", str(tmp_path / "out"), "--json"]) == 0
+    assumed = json.loads(capsys.readouterr().out)["assumed"][1]
+    assert assumed.startswith("Antenna of the UAV: unknown." if own else "Antenna of the UAV: frame.")

@@ -252,8 +252,8 @@ def _likelihood(track: LevelTrack, latent: FloatArray, noise: float) -> tuple[Fl
     return value.sum(axis=1), gradient, weight
 
 
-# Cells of the regions [m].
-_CELL_M = 5.0
+# Cells of the regions [m]; parts of a region that hold less are none.
+_CELL_M, _LEAST_SHARE = 5.0, 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -321,7 +321,7 @@ class Regions:
             share = self.share[tuple(cells.T)]
             best = at[share.argmax()]
             out.append(Mode(place_m=best, share=float(share.sum()), radius_m=_within(at - best, share, 0.9)))
-        return tuple(sorted(out, key=lambda mode: -mode.share))
+        return tuple(sorted((mode for mode in out if mode.share >= _LEAST_SHARE), key=lambda mode: -mode.share))
 
     def radius_m(self, place_m: FloatArray, part: float) -> float:
         """Radius of the circle about a place that holds a part of the posterior."""
@@ -362,7 +362,7 @@ class NodeEstimate:
     anywhere : float
         Log evidence of any place within reach.
     at_edge : bool
-        The likeliest place lies at the edge of the search: the node may stand farther away.
+        More than a few percent lie at the edge of the search: the node may stand farther away.
     regions : Regions
     """
 
@@ -431,7 +431,7 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = 
         slope_sd=float(fits.slope_sd[best]),
         log_odds=log_odds,
         anywhere=anywhere,
-        at_edge=_on_edge(places[best], grid),
+        at_edge=bool(share[_on_edge(places, grid)].sum() > _LEAST_SHARE),
         regions=Regions.of(places, share),
     )
 
@@ -448,8 +448,9 @@ def _grid(track: LevelTrack) -> FloatArray:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def _on_edge(place: FloatArray, grid: FloatArray) -> bool:
-    return bool((place[:2] < grid.min(axis=0) + _SPACING_M).any() or (place[:2] > grid.max(axis=0) - _SPACING_M).any())
+def _on_edge(places: FloatArray, grid: FloatArray) -> BoolArray:
+    low, high = grid.min(axis=0) + _SPACING_M, grid.max(axis=0) - _SPACING_M
+    return np.asarray(((places[:, :2] < low) | (places[:, :2] > high)).any(axis=1))
 
 
 def _refined(places: FloatArray) -> FloatArray:

@@ -408,9 +408,22 @@ def gather(
     )
     _check_place(data, [(path, stream) for path, stream in telemetry[:1]])
     _check_overlap(data)
-    asked = () if track is None else doubts(track, telemetry[0][1], _times_on_track(data))
+    asked = (
+        () if track is None else doubts(track, telemetry[0][1], _times_on_track(data), _undated(data, telemetry[0][0]))
+    )
     data = dataclasses.replace(data, doubts=asked, warnings=(*data.warnings, *(f"{text}." for text in asked)))
     return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
+
+
+def _undated(data: FlightData, track: str) -> list[str]:
+    """Logs with positions of their own that only 'time_origin' dates, beside a track that has a clock."""
+    dated = {log.path for log in data.settings.logs if log.time_origin is not None}
+    return [
+        log.path
+        for log, file in zip(data.settings.logs, data.files, strict=True)
+        if log.path in dated and track not in dated
+        and any(s.kind != "telemetry" and "latitude_deg" in s.frame for s in file.result.streams)
+    ]  # fmt: skip
 
 
 def _times_on_track(data: FlightData) -> list[tuple[str, Times]]:

@@ -7,6 +7,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import yaml
 
@@ -349,6 +350,18 @@ def rank_with_positions(folder: Path, origin: str = ORIGIN) -> Path:
     content["logs"][1]["columns"] |= POSITIONS
     content["logs"][1]["time_origin"] = origin
     return write_yaml(path, content)
+
+
+def test_a_rank_log_without_a_clock_may_be_of_another_flight(tmp_path: Path) -> None:
+    path = rank_with_positions(tmp_path)
+    assert not gathered(path).doubts, "nor has the track a clock"
+    content = yaml.safe_load(path.read_text())
+    del content["logs"][0]["time_origin"]
+    track = pd.read_csv(tmp_path / "track.csv")
+    track["t"] += pd.Timestamp(ORIGIN).timestamp()
+    track.to_csv(tmp_path / "track.csv", index=False)
+    (doubt,) = gathered(write_yaml(path, content)).doubts
+    assert doubt == "ri.csv has no clock: by its positions it may be of another flight on this route"
 
 
 def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> None:

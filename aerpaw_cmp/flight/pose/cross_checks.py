@@ -77,7 +77,9 @@ _TOGETHER_S = 90.0
 _MANY_WITHOUT_POSE = 0.1
 
 
-def doubts(track: Track, telemetry: Stream, series: Sequence[tuple[str, AnyArray]]) -> tuple[str, ...]:
+def doubts(
+    track: Track, telemetry: Stream, series: Sequence[tuple[str, AnyArray]], undated: Sequence[str] = ()
+) -> tuple[str, ...]:
     """Clauses on clocks and heights that the first words of a report repeat.
 
     Parameters
@@ -87,6 +89,12 @@ def doubts(track: Track, telemetry: Stream, series: Sequence[tuple[str, AnyArray
         That it was made from.
     series : sequence of (str, (n,) datetime64)
         Names and times of what is compared on the track.
+    undated : sequence of str
+        Logs with positions whose times the flight file dates, beside telemetry with a clock.
+
+    Returns
+    -------
+    tuple of str
     """
     apart: dict[int, list[str]] = {}
     poseless: dict[str, float] = {}
@@ -103,6 +111,8 @@ def doubts(track: Track, telemetry: Stream, series: Sequence[tuple[str, AnyArray
     ]
     if poseless:
         texts.append(f"{max(poseless.values()):.0%} of the samples of {_listed(list(poseless))} have no position")
+    if undated:
+        texts.append(f"{_listed(undated)} has no clock: by its positions it may be of another flight on this route")
     low_m, assumed = _lowest_m(telemetry), telemetry.attributes.get("height_from") == "assumed"
     if low_m is not None and (low_m > _TOO_HIGH_M or (assumed and abs(low_m) > _GROUND_M)):
         texts.append(f"the lowest height above take-off is {low_m:.0f} m, as of another datum")

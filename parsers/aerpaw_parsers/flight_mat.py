@@ -47,6 +47,7 @@ _NAMES = {*_TELEMETRY, *_LEVELS, *_TEXTS, *_EPOCHS, "mSpeed"}
 _SURE = {*_LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
 # Raw positions of the LTE flights, which stand in front of their levels; the interpolated ones are read.
 _GPS = re.compile(r"GPS[xyz]")
+_TEXT = re.compile(_time.TIME)
 _COMPRESSED, _MATRIX = 15, 14
 
 
@@ -115,7 +116,7 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
         if name in _TEXTS:
             text = np.array([str(cell).strip() for cell in table[name]], dtype=np.str_)
             column = np.char.encode(text, "ascii", "replace")
-            right = np.array([re.fullmatch(_time.TIME, cell) is not None for cell in column.tolist()], dtype=bool)
+            right = np.array([_TEXT.fullmatch(cell) is not None for cell in column.tolist()], dtype=bool)
             wall, valid, _, _ = _time.parse_texts(column)
             valid = valid & right
         else:

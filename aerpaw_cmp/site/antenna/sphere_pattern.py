@@ -6,6 +6,7 @@ import csv
 import io
 from collections.abc import Sequence
 from contextlib import suppress
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -118,7 +119,12 @@ def read_sphere_csv(path: str | Path) -> SpherePattern:
         Missing columns or directions, values that are no gains; with the line.
     """
     path = Path(path)
-    text = read_table(path, "an antenna file").decode("utf-8-sig")
+    return _pattern_of(read_table(path, "an antenna file").decode("utf-8-sig"), path)
+
+
+@lru_cache(maxsize=64)
+def _pattern_of(text: str, path: Path) -> SpherePattern:
+    """The antenna of a file's text; kept, for each draft of a folder reads all of a site's memory."""
     numbered = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if line.strip() and line[0] != "#"]
     header = [cell.strip() for cell in numbered[0][1].split(",")] if numbered else []
     if header[:3] != list(COLUMNS[:3]):

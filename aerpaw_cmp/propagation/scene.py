@@ -86,11 +86,11 @@ def surfaces_of(site: Site) -> Surfaces | None:
     scene = site.scene
     for building in site.buildings:
         scene = added(scene, *building_mesh(building), building.name, material(building.material).name)
-    return _merged(scene, site.merge_m)
+    return _merged(scene)
 
 
 @lru_cache(maxsize=2)
-def _merged(scene: TriangleScene, merge_m: float) -> Surfaces:
+def _merged(scene: TriangleScene) -> Surfaces:
     """Faces of a scene; the same scene is merged once."""
     if compiled.beams().kernels is None:
         raise UsageError(
@@ -100,7 +100,7 @@ def _merged(scene: TriangleScene, merge_m: float) -> Surfaces:
         )
     from .search.merging import merged  # compiled: loaded where there is a scene
 
-    return merged(scene, merge_m)
+    return merged(scene)
 
 
 # Poses further than this from every tower [m] are no poses of the site.

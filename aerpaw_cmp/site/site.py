@@ -171,8 +171,6 @@ class Site:
         Ground heights; blocks lines of sight.
     scene : TriangleScene or None
         Open surfaces in the site frame, which stand in for the ground plane. Buildings stand beside them.
-    merge_m : float
-        How far from one plane the corners of a face of the scene may lie [m].
     """
 
     name: str
@@ -191,7 +189,6 @@ class Site:
     takeoff_ground_m: float = 0.0
     dem: Dem | None = None
     scene: TriangleScene | None = None
-    merge_m: float = 1e-3
 
     @property
     def wooded(self) -> bool:

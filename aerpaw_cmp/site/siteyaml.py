@@ -148,14 +148,13 @@ class PolygonModel(StrictModel):
     polygon_m: Ring | None = None
     polygon_deg: Ring | None = None
     holes_m: list[Ring] = Field(default_factory=list)
-    holes_deg: list[Ring] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _one_way(self) -> PolygonModel:
         if (self.polygon_m is None) == (self.polygon_deg is None):
             raise ValueError("give polygon_m (east, north) or polygon_deg (latitude, longitude)")
-        if (self.holes_m and self.polygon_m is None) or (self.holes_deg and self.polygon_deg is None):
-            raise ValueError("holes and outline must both be in metres or both in degrees")
+        if self.holes_m and self.polygon_m is None:
+            raise ValueError("holes are in metres: give polygon_m, too")
         if self.polygon_m is not None and (problem := _problem(Polygon(self.polygon_m, self.holes_m))):
             raise ValueError(f"the polygon of '{self.name}' {problem}")
         return self
@@ -166,9 +165,7 @@ class PolygonModel(StrictModel):
             _check_near(self.polygon_m, self.name)
             shape = Polygon(self.polygon_m, self.holes_m)
         else:
-            rings = [self.polygon_deg or [], *self.holes_deg]
-            local = [_ring_from_degrees(ring, frame, self.name) for ring in rings]
-            shape = Polygon(local[0], local[1:])
+            shape = Polygon(_ring_from_degrees(self.polygon_deg or [], frame, self.name))
         if problem := _problem(shape):
             raise UsageError(f"the polygon of '{self.name}' {problem}")
         return shapely.normalize(shape)
@@ -200,17 +197,10 @@ OutlineT = TypeVar("OutlineT", bound=PolygonModel)
 class SingleTreeModel(StrictModel):
     """A tree with sizes of its own; what is absent is as of all trees."""
 
-    at_m: tuple[float, float] | None = None
-    at_deg: tuple[float, float] | None = None
+    at_m: tuple[float, float]
     height_m: Positive | None = None
     crown_diameter_m: Positive | None = None
     trunk_diameter_m: Positive | None = None
-
-    @model_validator(mode="after")
-    def _one_way(self) -> SingleTreeModel:
-        if (self.at_m is None) == (self.at_deg is None):
-            raise ValueError("give at_m (east, north) or at_deg (latitude, longitude)")
-        return self
 
 
 class TreesModel(StrictModel):
@@ -244,7 +234,6 @@ class SceneModel(StrictModel):
     offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     turn_deg: float = 0.0
     materials: dict[str, _MaterialName] = Field(default_factory=dict)
-    merge_m: Annotated[float, Field(gt=0, le=0.1)] = 1e-3
     ground_plane: bool = False
 
 
@@ -402,7 +391,7 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     forests += woods
     notes += _unmapped(towers, [item.footprint for item in buildings] + [item.area for item in forests])
     with _at("trees"):
-        trees, of_stands = _trees(model.trees, forests, buildings, towers, frame, notes)
+        trees, of_stands = _trees(model.trees, forests, buildings, towers, notes)
     return Site(
         **named(model, "name ground_material credit assumed"),
         frame=frame,
@@ -417,7 +406,6 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         takeoff_ground_m=model.origin.takeoff_ground_m,
         dem=dem,
         scene=scene,
-        merge_m=1e-3 if model.scene is None else model.scene.merge_m,
     )
 
 
@@ -649,7 +637,6 @@ def _trees(
     forests: tuple[Forest, ...],
     buildings: tuple[Building, ...],
     towers: Mapping[str, Tower],
-    frame: SiteFrame,
     notes: list[str],
 ) -> tuple[Trees, Trees]:
     """Trees that stand for themselves, and those of stands, which only opaque foliage sees."""
@@ -672,19 +659,16 @@ def _trees(
             )
         (parts if forest.height_m is None else of_stands).append(placed)
     if model.single:
-        parts.append(_single(model.single, sizes, frame))
+        parts.append(_single(model.single, sizes))
     return join_trees(parts), join_trees(of_stands)
 
 
-def _single(models: list[SingleTreeModel], sizes: TreeSizes, frame: SiteFrame) -> Trees:
+def _single(models: list[SingleTreeModel], sizes: TreeSizes) -> Trees:
     """Trees with sizes of their own; crowns begin at the same share of the height as everywhere."""
-    points = []
     for index, model in enumerate(models):
         with _at("trees", "single", index):
-            if model.at_m is not None:
-                _check_near([model.at_m], "trees.single")
-            points.append(model.at_m or _ring_from_degrees([model.at_deg or (0.0, 0.0)], frame, "trees.single")[0])
-    east, north = np.array(points, dtype=np.float64).T
+            _check_near([model.at_m], "trees.single")
+    east, north = np.array([model.at_m for model in models], dtype=np.float64).T
     drawn = trees_at(east, north, sizes)
 
     def own(name: str) -> FloatArray:

@@ -180,8 +180,6 @@ SQUARE = "[[0, 0], [10, 0], [10, 10], [0, 10]]"
         ("tower_ground: dem", 5, "the key 'dem'"),
         ("trees: {height_m: -3}", 5, "trees.height_m: found -3; expected greater than 0"),
         ("trees:\n  single: [{at_m: [1e9, 0]}]", 6, "map coordinates"),
-        ("trees:\n  single:\n    - {at_m: [1, 2]}\n    - {at_deg: [-78.696, 35.7275]}", 8, "swapped"),
-        ("trees:\n  single:\n    - {at_m: [1, 2], at_deg: [35, -78]}", 7, "give at_m"),
         ("sead: 1", 5, "unknown key 'sead'"),
         ("trees: {sead: 1}", 5, "unknown key 'trees.sead'. Likely cause: did you mean 'seed'"),
         ("name: again", 5, r"the key 'name' stands twice \(first on line 1\)"),

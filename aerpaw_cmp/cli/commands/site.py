@@ -42,7 +42,6 @@ def site_import(
         list[str] | None, Option(help="Scene: id=concrete, for a material without radio properties; repeatable.")
     ] = None,
     turn: Annotated[float, Option(help="Scene: angle of the x axis, counter-clockwise from east [deg].")] = 0.0,
-    merge_m: Annotated[float, Option(help="Scene: largest distance of a face's corners from its plane [m].")] = 1e-3,
     untagged: Annotated[
         Literal["building", "forest", "geofence"] | None, Option(help="Kind of the areas without a tag.")
     ] = None,
@@ -62,7 +61,7 @@ def site_import(
         raise UsageError(f"{option} with {kinds[0]}", expected=f"{kinds[1]}, or no {option}")
     if scene:
         facts = site_scene.SceneOptions(
-            origin=origin, base=base, towers=tower or (), materials=material or (), turn_deg=turn, merge_m=merge_m
+            origin=origin, base=base, towers=tower or (), materials=material or (), turn_deg=turn
         )
         actions = site_scene.run_scene_import(files[0], out, facts, force=force)
     else:

@@ -48,8 +48,6 @@ class SceneOptions:
         ``id=material`` for materials of the scene that say nothing about radio.
     turn_deg : float
         How far the scene is turned counter-clockwise from above: 0 where x is east and y north.
-    merge_m : float
-        How far from one plane the corners of a face may lie [m].
     """
 
     origin: str | None = None
@@ -57,7 +55,6 @@ class SceneOptions:
     towers: Sequence[str] = ()
     materials: Sequence[str] = ()
     turn_deg: float = 0.0
-    merge_m: float = 1e-3
 
 
 def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool = False) -> list[str]:
@@ -107,7 +104,6 @@ def run_scene_import(path: Path, out: Path, facts: SceneOptions, *, force: bool 
             sha256=scene.sha256,
             turn_deg=facts.turn_deg,
             materials=named,
-            merge_m=facts.merge_m,
             ground_plane=ground_plane,
         ).model_dump(mode="json", exclude_defaults=True)
         if base is None or facts.towers:

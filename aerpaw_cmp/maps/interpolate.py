@@ -274,16 +274,6 @@ class IndexInterpolation(_Local):
         return curve(index, near.values, at)
 
 
-class Nearest(_Local):
-    """The value of the nearest sample; ties by the rule of :mod:`~aerpaw_cmp.maps.neighbours`."""
-
-    def __init__(self, radius_m: float = 150.0) -> None:
-        super().__init__(1, radius_m)
-
-    def _combine(self, near: _Near) -> FloatArray:
-        return near.values[:, 0]
-
-
 class InverseDistance(_Local):
     """Mean weighted by the inverse square of distance (Shepard 1968, doi:10.1145/800186.810616); exact at samples."""
 

@@ -11,7 +11,7 @@ import numpy as np
 from ..common.units import FloatArray
 from . import evaluate, variogram
 from .grid import Grid, without_coverage_as_nan
-from .interpolate import IndexInterpolation, InverseDistance, Nearest, ServingTowerMean
+from .interpolate import IndexInterpolation, InverseDistance, ServingTowerMean
 from .job import MapResult
 from .kriging import OrdinaryKriging
 
@@ -88,7 +88,7 @@ def interpolation_study(
         "Kriging": OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed),
         "makima": IndexInterpolation("makima", grid, neighbours, radius_m, selection=selection, seed=seed),
         "spline": IndexInterpolation("spline", grid, neighbours, radius_m, selection=selection, seed=seed),
-        "nearest": Nearest(radius_m),
+        "nearest": InverseDistance(1, radius_m),
         "inverse distance": InverseDistance(neighbours, radius_m),
         "serving-tower mean": ServingTowerMean(towers_m),
     }

@@ -53,12 +53,6 @@ class Search:
         """Options that Sionna's search takes."""
         return {name: getattr(self, name) for name in ("max_depth", "samples", "batch")}
 
-    @property
-    def deciding(self) -> dict[str, object]:
-        """Options that an entry of the path cache depends on."""
-        names = ("engine", "max_depth", "samples", "batch")
-        return {name: getattr(self, name) for name in names}
-
     def check(self) -> None:
         """Refuse what no engine knows.
 

@@ -6,7 +6,7 @@ from scipy.interpolate import Akima1DInterpolator, CubicSpline
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.interpolate import IndexInterpolation, InverseDistance, Nearest, ServingTowerMean, makima, spline
+from aerpaw_cmp.maps.interpolate import IndexInterpolation, InverseDistance, ServingTowerMean, makima, spline
 
 RNG = np.random.default_rng(5)
 
@@ -95,7 +95,7 @@ def test_leave_one_out_on_a_grid_equals_a_plain_loop(kind):
 
 
 def test_nearest_follows_the_tie_rule():
-    model = Nearest().fit([[30.0, 0.0], [-30.0, 0.0], [0.0, 30.0], [0.0, -30.0]], [1.0, 2.0, 3.0, 4.0])
+    model = InverseDistance(1).fit([[30.0, 0.0], [-30.0, 0.0], [0.0, 30.0], [0.0, -30.0]], [1.0, 2.0, 3.0, 4.0])
     assert model.predict([[0.0, 0.0]])[0].tolist() == [4.0]  # the southern one
     assert np.isnan(model.predict([[0.0, 500.0]])[0]).all()
 

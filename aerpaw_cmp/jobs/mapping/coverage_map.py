@@ -32,7 +32,7 @@ from ...maps.evaluate import (
     blocked,
 )
 from ...maps.grid import Grid
-from ...maps.interpolate import InverseDistance, Nearest, ServingTowerMean
+from ...maps.interpolate import InverseDistance, ServingTowerMean
 from ...maps.kriging import OrdinaryKriging
 from ...maps.netcdf import write_netcdf
 from ...maps.store import TileStore
@@ -533,7 +533,7 @@ def _far_reaching(outcome: MapOutcome) -> dict[str, Predictor]:
     neighbours = outcome.settings.neighbours
     return {
         "Kriging": OrdinaryKriging(outcome.studies["missing"].fit, neighbours, outside="nearest"),
-        "nearest": Nearest(np.inf),
+        "nearest": InverseDistance(1, np.inf),
         "inverse distance": InverseDistance(neighbours, np.inf),
         "serving-tower mean": ServingTowerMean(outcome.shown.towers_m),
     }

@@ -211,7 +211,7 @@ class PathCache:
             SHA-256, in hexadecimal.
         """
         faces, surfaces = scene.faces, scene.surfaces
-        decides: list[object] = [__version__, LAYOUT, sorted(search.deciding.items())]
+        decides: list[object] = [__version__, LAYOUT, sorted({"engine": search.engine, **search.rays}.items())]
         if search.engine == "sionna":
             decides += [[version(name) for name in ("sionna-rt", "mitsuba", "drjit")], carrier_hz, faces.material]
         columns = (faces.normal, faces.offset_m, faces.along, faces.lower, faces.upper, faces.solid)

@@ -80,6 +80,7 @@ SMALLEST: dict[str, list[str]] = {
     "report": ["--quick"],
     "scaling": ["--axes", "poses"],
     "scenes": ["--scenes", "canyon", "--depths", "1", "--receivers", "10"],
+    "simulated_modem": [],
     "tap_common": [],
     "tap_replug": ["--quick"],
     "tap_sigkill": ["--quick"],

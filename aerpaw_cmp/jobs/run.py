@@ -520,8 +520,8 @@ def run_campaign(
         campaign.yaml.
     options : RunOptions
     keep : Path, optional
-        Folder of the outcomes of single tasks, in place of what campaign.yaml says: a rerun, or one after an
-        interruption, computes only what is missing.
+        Folder of the outcomes of single tasks, in place of the user's cache: a rerun, or one after an interruption,
+        computes only what is missing.
     fresh : bool
         Keep nothing and take nothing.
 
@@ -545,7 +545,7 @@ def run_campaign(
     campaign = load_campaign(path)
     inputs = [path, *inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)]
     folder = options.out or Path("reports") / campaign.campaign
-    store = None if fresh else _campaign_keep(campaign, path, keep)
+    store = None if fresh else _outcomes_in(keep)
     note = f"finished tasks are kept in {store}, and the same command computes the rest" if store else "nothing is kept"
     with OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output, noting_interrupts(note):
         data = run_all(campaign, path.parent, options, keep=store, stages=stages)
@@ -560,13 +560,11 @@ def run_campaign(
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=tuple(failed))
 
 
-def _campaign_keep(campaign: Any, path: Path, keep: Path | None = None) -> Path:
-    """Folder of outcomes: as asked, else as campaign.yaml says, else in the user's cache."""
-    if keep is None:
-        keep = cache_folder("outcomes") if campaign.keep is None else path.parent / Path(campaign.keep).expanduser()
-    if ":/" in str(keep):  # a path has one slash there
-        raise UsageError(f"outcomes in {keep}", expected="a folder", cause="object stores are not written any more")
-    return keep
+def _outcomes_in(keep: Path | None) -> Path:
+    """Folder of outcomes: as asked, else in the user's cache."""
+    if keep is not None and ":/" in str(keep):  # of an address; a path has one slash there
+        raise UsageError(f"--keep {keep}", expected="a folder")
+    return keep or cache_folder("outcomes")
 
 
 def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
@@ -603,7 +601,7 @@ def campaign_status(path: Path, options: RunOptions = DEFAULT, *, keep: Path | N
 
     campaign = load_campaign(path)
     tasks, _, failures = campaign_tasks(campaign, path.parent, options.logs_root)
-    store = None if fresh else outcome_store(_campaign_keep(campaign, path, keep))
+    store = None if fresh else outcome_store(_outcomes_in(keep))
     return campaign_plan.campaign_status(campaign.campaign, tasks, failures, store, workers=options.workers)
 
 

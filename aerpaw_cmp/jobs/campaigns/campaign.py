@@ -39,8 +39,6 @@ class CampaignFile(StrictModel):
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
     calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
     repeatability: RepeatSettings = RepeatSettings()
-    keep: str | None = None
-    """Folder of outcomes, against this file's."""
 
 
 def load_campaign(path: Path) -> CampaignFile:

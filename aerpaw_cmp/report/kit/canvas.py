@@ -503,7 +503,7 @@ def draw_credit(ax: Axes, site: Site) -> None:
         )  # fmt: skip
 
 
-def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None) -> None:
+def draw_site(ax: Axes, site: Site) -> None:
     """Forests, trees, buildings, geofences and towers on a plan (east, north) [m].
 
     Parameters
@@ -541,8 +541,7 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None) -> N
             fence.area, facecolor="none", edgecolor="#333333", linestyle=(0, (4, 3)), linewidth=0.9, zorder=0.6,
             label="geofence" if number == 0 else None,
         )  # fmt: skip
-    chosen = [t for name, t in site.towers.items() if towers is None or name in towers]
-    for number, tower in enumerate(chosen):
+    for number, tower in enumerate(site.towers.values()):
         ax.plot(
             tower.east_m, tower.north_m, marker="^", markersize=9, color=TOWER, markeredgecolor="black",
             linestyle="none", zorder=5, label="tower" if number == 0 else None,

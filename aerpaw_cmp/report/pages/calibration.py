@@ -84,39 +84,12 @@ def draw_antenna(antenna: AntennaMap) -> Figure:
     return fig
 
 
-def draw_curve(data: CalibrationData) -> Figure:
-    """Error on flights left out against the number of flights learned from, and what one more would bring."""
-    fig, ax = canvas.subplots((7.0, 3.8))
-    flights = [p["flights"] for p in data.curve]
-    for key, label, colour in (
-        ("rmse_db", "as logged", canvas.SIMULATED),
-        ("rmse_4s_db", "4 s means", canvas.MEASURED),
-    ):
-        ax.plot(flights, [p[key] for p in data.curve], "o-", color=colour, label=label)
-    ax.plot(
-        [flights[-1], flights[-1] + 1], [data.curve[-1]["rmse_db"], data.one_more_rmse_db], "o--", fillstyle="none",
-        color=canvas.SIMULATED, label="one flight more (extrapolated)",
-    )  # fmt: skip
-    ax.set_xticks([*flights, flights[-1] + 1])
-    ax.set(xlabel="flights learned from", ylabel="RMSE on a flight left out [dB]")
-    ax.legend()
-    return fig
-
-
 def _mean(rows: Sequence[Mapping[str, Any]], key: str = "rmse_db") -> float:
     return float(np.mean([r[key] for r in rows])) if rows else float("nan")
 
 
 def figure_specs(data: CalibrationData) -> Iterator[FigureSpec]:
     """All figures."""
-    if len(data.curve) > 1:
-        yield FigureSpec(
-            "learning_curve", "scores", "Expected gain of one flight more",
-            f"Mean RMSE over {data.curve[0]['series']} series, each predicted by subsets of the other flights. The "
-            "last point is extrapolated: the squared error as a constant and a part that falls with the number of "
-            "flights.",
-            partial(draw_curve, data),
-        )  # fmt: skip
     for a in data.antennas:
         yield FigureSpec(
             f"antenna_{safe_name(a.name)}", "antennas", a.name,

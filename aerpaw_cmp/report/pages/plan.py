@@ -75,13 +75,6 @@ def _figures(data: PlanPage) -> Iterator[FigureSpec]:
         "where a route may run.",
         partial(_draw_map, data),
     )  # fmt: skip
-    if len(data.curve) > 1:
-        yield FigureSpec(
-            "length", "length", "What a longer flight buys",
-            "The best of three candidates, flown for a part of the battery or beyond it; a longer flight may hold the "
-            "shorter one. Dashed: no further flight.",
-            partial(_draw_curve, data),
-        )  # fmt: skip
 
 
 def _draw_map(data: PlanPage) -> Figure:
@@ -105,13 +98,4 @@ def _draw_map(data: PlanPage) -> Figure:
     extent = np.concatenate([data.place_m[:, :2], data.outline_m, data.track_m[:, :2]])
     canvas.frame_around(axes[0], *extent.T, shape=canvas.plan_shape(*extent.T))
     axes[1].plot(data.track_m[:, 0], data.track_m[:, 1], color=canvas.MEASURED, linewidth=1.0)
-    return fig
-
-
-def _draw_curve(data: PlanPage) -> Figure:
-    fig, ax = canvas.subplots((7.0, 3.6))
-    ax.plot([p["minutes"] for p in data.curve], [p["sd_db"] for p in data.curve], "o-", color=canvas.SIMULATED)
-    ax.axhline(float(np.sqrt(np.mean(data.before_db**2))), linestyle="--", color="0.5")
-    ax.set(xlabel="flight time [min]", ylabel="standard deviation over the target [dB]")
-    ax.set_ylim(bottom=0.0)
     return fig

@@ -26,15 +26,16 @@ def flight(samples: int):
     rng = np.random.default_rng(1)
     s = np.linspace(0, 1, samples)
     names = ("measured_db", "calibrated_db", "simulated_dbm", "residual_db", "free_space_dbm", "two_ray_dbm")
-    link = {
-        "time": np.datetime64("2024-07-15T17:02:11", "ns") + np.round(s * samples * 1e8).astype("timedelta64[ns]"),
-        **{"flight": "long", "tower": "LW1", "channel": "USRP1", "unit": "dBm"},
+    time_utc = np.datetime64("2024-07-15T17:02:11", "ns") + np.round(s * samples * 1e8).astype("timedelta64[ns]")
+    columns = {
+        **{"tower": "LW1", "channel": "USRP1", "unit": "dBm"},
         **{"east_m": 500 * np.cos(50 * s), "north_m": 900 * np.sin(41 * s), "up_m": 40 + 30 * s},
         **{name: rng.normal(-80, 8, samples) for name in names},
     }
     site = load_site("lake_wheeler")
-    rss = points_table("rss", [link], site.frame)
-    return Export(name="long", title="A long flight", site=site, sets=rss, lines=(), clock=True)
+    rss = tuple(points_table("rss", "long", [(time_utc, columns)], site.frame))
+    about = {"flight": "long", "title": "A long flight", "synthetic": True, "attributes": {}}
+    return Export(site=site, sets=rss, track=None, clock=True, **about)
 
 
 def write_one(name: str, samples: int) -> None:

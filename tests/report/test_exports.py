@@ -241,8 +241,7 @@ def shift_time(monkeypatch, data):
     del monkeypatch
     one_hour = np.timedelta64(3600, "s")
     export = changed(points.of_report(data), lambda table: table.assign(time=table["time"] + one_hour))
-    lines = tuple(dataclasses.replace(line, time=line.time + one_hour) for line in export.lines)
-    return dataclasses.replace(export, lines=lines)
+    return dataclasses.replace(export, track=dataclasses.replace(export.track, time=export.track.time + one_hour))
 
 
 def wrong_unit(monkeypatch, data):

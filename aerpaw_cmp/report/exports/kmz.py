@@ -45,7 +45,7 @@ def write_kmz(export: Export, folder: Path) -> list[Path]:
     shown = list(_shown(export))
     scales = {item.scale.key: item.scale for item in shown}
     budget = POINTS // max(1, len(shown))
-    body = [_towers(export), *_flown(export)]
+    body = [_towers(export), _flown(export)]
     for number, link in enumerate(shown):
         lines = "".join(_lines(link, budget, clock=export.clock, visible=number == 0))
         body.append(kml.folder(link.name, _legend_name(link.scale), lines, visible=number == 0))
@@ -64,13 +64,11 @@ def _shown(export: Export) -> Iterator[_Shown]:
     for kind, scales in _scales_of(export).items():
         points = next(item for item in export.sets if item.kind == kind)
         columns = {c.name: c for c in points.columns}
-        for (flight, tower, channel, rows), (name, scale) in itertools.product(points.links(), scales.items()):
+        for (_, tower, channel, rows), (name, scale) in itertools.product(points.links(), scales.items()):
             if name.startswith("simulated_rank") and rows[name].isna().all():  # a K of other links
                 continue
-            link = f"{tower} {channel}".strip()
-            whose = f"{flight}: {link}" if len(export.lines) > 1 else link
-            what = _LEVELS.get(name, columns[name].meaning)
-            yield _Shown(name=f"{whose}, {what}", column=columns[name], scale=scale, rows=rows)
+            shown = f"{tower} {channel}".strip() + f", {_LEVELS.get(name, columns[name].meaning)}"
+            yield _Shown(name=shown, column=columns[name], scale=scale, rows=rows)
 
 
 def _styles(scale: Scale) -> str:
@@ -90,24 +88,24 @@ def _towers(export: Export) -> str:
     return f"<Folder><name>Towers</name>{''.join(marks)}</Folder>"
 
 
-def _flown(export: Export) -> Iterator[str]:
-    """The flown lines: with a clock as tracks that the time slider moves along."""
-    for line in export.lines:
-        known = np.flatnonzero(line.known & ~np.isnat(line.time))
-        pick = known[keep_extremes([line.up_m[known]], TRACK_POINTS)] if len(known) else known
-        if len(pick) < 2:
-            continue
-        latitude, longitude = latitude_longitude(export.site.frame, line.east_m[pick], line.north_m[pick])
-        at = kml.coordinates(longitude, latitude, line.up_m[pick])
-        if export.clock:
-            times = "".join(f"<when>{time}</when>" for time in iso_time(line.time[pick]))
-            places = "".join(f"<gx:coord>{item.replace(',', ' ')}</gx:coord>" for item in at)
-            shape = f"<gx:Track>{_AIR}{times}{places}</gx:Track>"
-        else:
-            shape = f"<LineString>{_AIR}<coordinates>{' '.join(at)}</coordinates></LineString>"
-        yield (
-            f"<Placemark><name>Flown: {xml_text(line.flight)}</name>{kml.line_style('99ffffff', 2)}{shape}</Placemark>"
-        )
+def _flown(export: Export) -> str:
+    """The flown line: with a clock as a track that the time slider moves along; nothing of less than two places."""
+    if (line := export.track) is None:
+        return ""
+    known = np.flatnonzero(np.isfinite(line.east_m) & np.isfinite(line.north_m) & ~np.isnat(line.time))
+    if len(known) < 2:
+        return ""
+    pick = known[keep_extremes([line.up_m[known]], TRACK_POINTS)]
+    latitude, longitude = latitude_longitude(export.site.frame, line.east_m[pick], line.north_m[pick])
+    at = kml.coordinates(longitude, latitude, line.up_m[pick])
+    if export.clock:
+        times = "".join(f"<when>{time}</when>" for time in iso_time(line.time[pick]))
+        places = "".join(f"<gx:coord>{item.replace(',', ' ')}</gx:coord>" for item in at)
+        shape = f"<gx:Track>{_AIR}{times}{places}</gx:Track>"
+    else:
+        shape = f"<LineString>{_AIR}<coordinates>{' '.join(at)}</coordinates></LineString>"
+    name, style = xml_text(export.flight), kml.line_style("99ffffff", 2)
+    return f"<Placemark><name>Flown: {name}</name>{style}{shape}</Placemark>"
 
 
 def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Tables of points: samples of links with the unit and the meaning of every column, towers, flown lines.
+"""Tables of points: samples of links with the unit and the meaning of every column, towers, the flown line.
 
 The values are those of ``rss.csv`` and ``rank.csv``, rounded as there, with latitude and longitude beside them. A
 missing number is NaN; a rank of 0 is a code, "no path".
@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from ...common.cf import DB, DBM
 from ...common.geodesy import SiteFrame
-from ...common.jsonable import fields_of, named
-from ...common.units import AnyArray, FloatArray
+from ...common.jsonable import named
+from ...common.units import FloatArray
 from ...logs.records import has_wall_clock
 from ...site.site import Site
 from ..content.flight import ReportData, Track
@@ -106,28 +106,16 @@ class Points:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Line(Track):
-    """The track of a flight."""
-
-    flight: str
-
-    @property
-    def known(self) -> AnyArray:
-        """Mask (n,): True where the position is known."""
-        return np.isfinite(self.east_m) & np.isfinite(self.north_m)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class Export:
-    """Everything that is exported.
+    """Everything that is exported of a flight.
 
     Parameters
     ----------
-    name, title : str
+    flight, title : str
     site : Site
         Frame, towers, height of the origin.
     sets : tuple of Points
-    lines : tuple of Line
+    track : Track, optional
     clock : bool
         Instants are UTC; else they count from 1970-01-01, because the logs have relative times and no origin.
     synthetic : bool
@@ -135,14 +123,14 @@ class Export:
         What made it: generated, version.
     """
 
-    name: str
+    flight: str
     title: str
     site: Site
     sets: tuple[Points, ...]
-    lines: tuple[Line, ...]
+    track: Track | None
     clock: bool
-    synthetic: bool = False
-    attributes: Mapping[str, str] = field(default_factory=dict)
+    synthetic: bool
+    attributes: Mapping[str, str]
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -183,30 +171,30 @@ def column(name: str, unit: str | None = None) -> Column:
     return Column(name=name, unit=udunits, shown_unit=shown, meaning=meaning)
 
 
-def points_table(kind: str, links: Iterable[Mapping[str, Any]], frame: SiteFrame) -> tuple[Points, ...]:
-    """The points of links one below the other; none without links.
+def points_table(
+    kind: str, flight: str, links: Iterable[tuple[Any, dict[str, Any]]], frame: SiteFrame
+) -> Iterator[Points]:
+    """The points of the links of a flight one below the other; nothing without links.
 
     Parameters
     ----------
     kind : str
         Name of files and layers.
-    links : iterable of mapping
-        Columns of each link, arrays (n,) or one value for all rows: ``time``, :data:`LABELS` (``channel`` and ``unit``
-        may be missing), ``east_m``, ``north_m``, ``up_m``, then values with their unit at the end of the name.
+    flight : str
+    links : iterable of (times, dict)
+        Instants (n,) of a link and its further columns: arrays (n,), or one value for all rows.
     frame : SiteFrame
 
-    Returns
-    -------
-    tuple of Points
-        One, or none.
+    Yields
+    ------
+    Points
     """
     import pandas as pd
 
-    parts = [
-        pd.DataFrame({"channel": "", "unit": "1", **link}, index=range(len(np.asarray(link["time"])))) for link in links
-    ]
+    link = {"channel": "", "unit": "1", "flight": flight}
+    parts = [pd.DataFrame({**link, "time": time, **columns}, index=range(len(time))) for time, columns in links]
     if not parts:
-        return ()
+        return
     table = pd.concat(parts, ignore_index=True)
     table["time"] = table["time"].to_numpy("datetime64[ns]")
     units = table["unit"].unique()
@@ -219,7 +207,7 @@ def points_table(kind: str, links: Iterable[Mapping[str, Any]], frame: SiteFrame
     )
     table = table.astype(dict.fromkeys(LABELS, "category"))[["time", *LABELS, *PLACES, *names]]
     shared = str(units[0]) if len(units) == 1 else "dB, reference by link"
-    return (Points(kind=kind, table=table, columns=tuple(column(name, shared) for name in names)),)
+    yield Points(kind=kind, table=table, columns=tuple(column(name, shared) for name in names))
 
 
 def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[FloatArray, FloatArray]:
@@ -238,30 +226,12 @@ def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[Flo
 def of_report(data: ReportData) -> Export:
     """The samples of a flight."""
     tables = {"rss": rss_tables(data.rss), "rank": rank_tables(data.rank)}
-    sets = [
-        points
-        for kind, links in tables.items()
-        for points in points_table(
-            kind, ({"time": time, "flight": data.flight, **columns} for time, columns in links), data.site.frame
-        )
-    ]
-    lines = [] if data.track is None else [Line(flight=data.flight, **fields_of(data.track))]
+    sets = tuple(p for kind, links in tables.items() for p in points_table(kind, data.flight, links, data.site.frame))
+    times = [points.table["time"].to_numpy() for points in sets] + ([] if data.track is None else [data.track.time])
+    known = [time.min() for time in (time[~np.isnat(time)] for time in times) if len(time)]
     return Export(
-        name=data.flight,
-        **named(data, "title site synthetic"),
-        sets=tuple(sets),
-        lines=tuple(lines),
-        clock=_clock([*(points.table["time"].to_numpy() for points in sets), *(line.time for line in lines)]),
-        attributes=_made(data.generated, data.versions),
+        **named(data, "flight title site track synthetic"),
+        sets=sets,
+        clock=bool(known) and has_wall_clock(min(known)),
+        attributes={"generated": data.generated, "version": data.versions.get("aerpaw-cmp", "")},
     )
-
-
-def _made(generated: str, versions: Mapping[str, str]) -> dict[str, str]:
-    return {"generated": generated, "version": versions.get("aerpaw-cmp", "")}
-
-
-def _clock(times: Iterable[AnyArray]) -> bool:
-    """Check whether the first known instant is a time of day."""
-    known = [time[~np.isnat(time)] for time in times]
-    first = [time.min() for time in known if len(time)]
-    return bool(first) and has_wall_clock(min(first))

@@ -587,11 +587,8 @@ class Tap:
             self._status_ns = now
             self._check_alarm(now)
             self._show("")
-        if self._settings.duration_s is not None and now - self._start_ns > self._settings.duration_s * 1e9:
-            self._settings_end()
-
-    def _settings_end(self) -> None:
-        if not self._stop.count:
+        duration_s = self._settings.duration_s
+        if duration_s is not None and now - self._start_ns > duration_s * 1e9 and not self._stop.count:
             self._stop("duration")
 
     def _check_alarm(self, now: int) -> None:

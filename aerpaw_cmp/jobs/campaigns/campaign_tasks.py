@@ -17,7 +17,7 @@ import numpy as np
 
 from ...common.errors import AerpawCmpError
 from ...common.jsonable import named
-from ...common.units import AnyArray, FloatArray
+from ...common.units import AnyArray
 from ...common.versions import versions
 from ...compare import offset
 from ...compare.result import FlightResult, RankResult, RssResult
@@ -251,15 +251,12 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
 
 def _flown(task: Task, result: FlightResult) -> FlownTrack:
     first = result.rss[0] if result.rss else result.rank[0]
-    return FlownTrack(flight=task.flight, time_s=_elapsed_s(first.time), position_m=first.position_m)
+    seconds = np.asarray((first.time - first.time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
+    return FlownTrack(flight=task.flight, time_s=seconds, position_m=first.position_m)
 
 
 def _start_ns(time: AnyArray) -> int:
     return int(time[0].astype("datetime64[ns]").astype(np.int64)) if len(time) else 0
-
-
-def _elapsed_s(time: AnyArray) -> FloatArray:
-    return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
 
 
 def _identity(data: FlightData, series: RssSeries | RankSeries) -> dict[str, Any]:

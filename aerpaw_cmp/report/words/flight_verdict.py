@@ -74,13 +74,11 @@ def _training(data: ReportData) -> str:
 
 def _baseline_sentence(panels: Sequence[RssResult]) -> str:
     """Sentence on what a model without anything learned leaves on the panels of a training flight."""
-    best = _best_baseline([panel for panel in panels if panel.training])
-    return "" if best is None else f"For comparison, {words.with_article(best[0])}: RMSE {best[1]:.1f} dB."
-
-
-def _best_baseline(panels: Sequence[RssResult]) -> tuple[str, float] | None:
-    """Name and pooled RMSE [dB] of the baseline with the smallest error; None without one that all have."""
-    return min(baseline_errors(panels).items(), key=lambda item: item[1], default=None)
+    errors = baseline_errors([panel for panel in panels if panel.training])
+    if not errors:
+        return ""
+    best = min(errors, key=errors.__getitem__)
+    return f"For comparison, {words.with_article(best)}: RMSE {errors[best]:.1f} dB."
 
 
 def _pooled(panels: Sequence[RssResult]) -> float:

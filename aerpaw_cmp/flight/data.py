@@ -320,10 +320,9 @@ def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettin
 
     An estimator reports ratios below 0 dB too (it knows the signal): its own noise cuts nothing off.
     """
-    if not is_ratio(stream, (SNR,)) or (link.noise_floor_dbm is None and link.bandwidth_hz is None):
+    if not is_ratio(stream, (SNR,)) or link.bandwidth_hz is None:
         return None, link
-    free = {"noise_floor_dbm": None, "bandwidth_hz": None, "noise_figure_db": None}
-    return link.floor_dbm, link.model_copy(update=free)
+    return link.floor_dbm, link.model_copy(update={"bandwidth_hz": None, "noise_figure_db": None})
 
 
 def gather(
@@ -379,10 +378,9 @@ def gather(
                 f"{log.path}: nothing is skipped by {', '.join(unknown)}: its streams are {', '.join(names)}"
             )
         warnings += _of_ratios(settings.link, log, file.result.streams)
-    if rank and settings.link.rank.noise_floor_dbm is None and settings.link.rank.bandwidth_hz is None:
+    if rank and settings.link.rank.bandwidth_hz is None:
         warnings.append(
-            "link.rank: no bandwidth_hz and no noise_floor_dbm: ranks count as in coverage down to the thermal noise "
-            "of 1 Hz (-174 dBm)"
+            "link.rank: no bandwidth_hz: ranks count as in coverage down to the thermal noise of 1 Hz (-174 dBm)"
         )
     if idle := set(settings.link.channels) - {series.channel for _, series in rss}:
         warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")

@@ -138,9 +138,8 @@ class LinkSettings(StrictModel):
     carrier_hz: Positive
     transmit_power_dbm: float = 40.0
     uav_transmits: bool = True
-    noise_floor_dbm: float | None = None
-    """Below it a link is out of coverage; by default from ``bandwidth_hz`` and ``noise_figure_db``."""
     bandwidth_hz: Positive | None = None
+    """Below the noise of this bandwidth a link is out of coverage."""
     noise_figure_db: float | None = None
     tower: ArraySettings = ArraySettings()
     towers: dict[str, ArraySettings] = {}
@@ -148,17 +147,13 @@ class LinkSettings(StrictModel):
 
     @model_validator(mode="after")
     def _one_floor(self) -> LinkSettings:
-        if self.noise_floor_dbm is not None and (self.bandwidth_hz is not None or self.noise_figure_db is not None):
-            raise ValueError("noise_floor_dbm or bandwidth_hz with noise_figure_db, not both")
         if self.noise_figure_db is not None and self.bandwidth_hz is None:
             raise ValueError("noise_figure_db needs bandwidth_hz")
         return self
 
     @property
     def floor_dbm(self) -> float:
-        """Noise floor of the receiver [dBm]: given, of its bandwidth, or that of 1 Hz."""
-        if self.noise_floor_dbm is not None:
-            return self.noise_floor_dbm
+        """Noise floor of the receiver [dBm]: of its bandwidth, or that of 1 Hz."""
         return noise_floor_dbm(self.bandwidth_hz or 1.0, self.noise_figure_db or 0.0)
 
     def build(self, tower_names: list[str], folder: Path) -> Link:

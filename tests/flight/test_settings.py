@@ -89,10 +89,8 @@ def test_what_a_flight_file_does_not_say() -> None:
     line = ArraySettings(layout="linear", elements=3).positions(0.1)
     assert sorted(line.ravel().tolist()) == pytest.approx([-0.05, 0, 0, 0, 0, 0, 0, 0, 0.05])
     assert ArraySettings().positions(0.1).tolist() == [[0.0, 0.0, 0.0]]
-    floor, figure = {"noise_floor_dbm": -90.0}, {"noise_figure_db": 3.0}
-    for both in (floor | {"bandwidth_hz": 1.0}, figure, floor | figure):
-        with pytest.raises(ValidationError):
-            FlightFile.model_validate(flight("link.rss", {"carrier_hz": 3e9, **both}))
+    with pytest.raises(ValidationError):
+        FlightFile.model_validate(flight("link.rss", {"carrier_hz": 3e9, "noise_figure_db": 3.0}))
 
 
 @pytest.mark.parametrize("name", ["../secret.csv", "/etc/passwd", "link.csv"])

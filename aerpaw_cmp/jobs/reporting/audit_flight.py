@@ -224,15 +224,10 @@ def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -
         **named(settings, "carrier_hz transmit_power_dbm uav_transmits"),
         towers={name: expected_array(settings.towers.get(name, settings.tower), wavelength, folder) for name in towers},
         uav=expected_array(settings.uav, wavelength, folder),
-        noise_floor_dbm=_floor_dbm(settings),
+        # k T B at 290 K
+        noise_floor_dbm=10 * math.log10(1.380649e-23 * 290 * (settings.bandwidth_hz or 1.0) * 1e3)
+        + (settings.noise_figure_db or 0.0),
     )
-
-
-def _floor_dbm(settings: LinkSettings) -> float:
-    """Given, or kTB at 290 K with the noise figure."""
-    if settings.noise_floor_dbm is not None:
-        return settings.noise_floor_dbm
-    return 10 * math.log10(1.380649e-23 * 290 * (settings.bandwidth_hz or 1.0) * 1e3) + (settings.noise_figure_db or 0)
 
 
 def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> reference.ExpectedArray:

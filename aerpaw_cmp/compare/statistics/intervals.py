@@ -258,28 +258,6 @@ def bootstrap_means(
     return result
 
 
-def block_variance(values: FloatArray, block_length: int) -> float:
-    """Variance of the mean over circular block resamples, in closed form (see :func:`bootstrap_means`).
-
-    Parameters
-    ----------
-    values : (n,)
-        In time order.
-    block_length : int
-        Samples per block, 1 .. n.
-
-    Notes
-    -----
-    A resample is a sum of independent blocks: b of the length L and one of the length l that is left, so the variance
-    is (b Var(S_L) + Var(S_l)) / n^2 with S the sums of a block from every start.
-    """
-    n = len(values)
-    blocks = -(-n // block_length)
-    column = values[:, None]
-    full_sums, last_sums = _block_sums(column, block_length), _block_sums(column, n - (blocks - 1) * block_length)
-    return float(((blocks - 1) * full_sums.var() + last_sums.var()) / n**2)
-
-
 def _block_sums(columns: FloatArray, length: int) -> FloatArray:
     """Sum of ``length`` rows from every start (n, m), on a circle."""
     running = np.zeros((len(columns) + length, columns.shape[1]))

@@ -196,7 +196,6 @@ FULL = Path("/dev/full")
         ("formats", ">/dev/full", 3, "standard output does not take the results (No space left on device)"),
         ("formats --json", ">&-", 3, "standard output does not take the results (Bad file descriptor)"),
         ("formats", "<&-", 0, ""),
-        ("reprot", "2>/dev/full", 2, ""),
         ("reprot", "2>&- >&-", 2, ""),
         ("reprot", "2>/dev/full >/dev/full", 2, ""),
         ("formats", ">/dev/full 2>/dev/full", 3, ""),

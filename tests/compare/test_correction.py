@@ -248,3 +248,7 @@ def test_gains_of_many_directions_are_asked_once_a_degree() -> None:
     np.testing.assert_allclose(coarse(turned)[0], predictor(turned)[0], atol=0.25)
     few = many.part(np.arange(5000))
     np.testing.assert_array_equal(coarse(few), predictor(few))
+    azimuth = generator.uniform(-np.pi, np.pi, 5040)
+    around = np.column_stack([np.cos(azimuth), np.sin(azimuth), np.full(5040, 0.2)]) / np.hypot(1.0, 0.2)
+    every = dataclasses.replace(many, at_uav=-around, at_tower=around)  # half a degree at most from what is asked
+    np.testing.assert_allclose(coarse(every)[0], predictor(every)[0], atol=0.2)

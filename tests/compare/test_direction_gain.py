@@ -296,9 +296,8 @@ def test_the_evidence_is_that_of_the_dense_covariance_at_any_noise():
     assert abs(dense[1] - dense[0]) > 20.0
 
 
-@pytest.mark.parametrize("terms", [(TERMS[1],), (TERMS[1], PLACE_TERM)])
-def test_antennas_without_a_shared_term_are_fits_of_their_own(terms):
-    model = dataclasses.replace(MODEL, terms=terms)
+def test_antennas_without_a_shared_term_are_fits_of_their_own():
+    model = dataclasses.replace(MODEL, terms=(TERMS[1], PLACE_TERM))
     both = fit_gain(TRAIN, model)
     alone = [fit_gain([s for s in TRAIN if s.channel == channel], model) for channel in "AB"]
     assert both.log_evidence == pytest.approx(sum(fit.log_evidence for fit in alone), rel=1e-9)

@@ -177,23 +177,6 @@ def test_sounder_channel_names_the_stream() -> None:
     assert any("one layout" in text for text in power.warnings)
 
 
-@pytest.mark.parametrize(
-    ("file_name", "stream_name", "warned"),
-    [
-        ("2025-03-02_10_00_00_quality_log.txt", "quality", False),
-        ("SNR_log.txt", "snr", False),
-        ("x_power_log.txt", "power", False),
-        ("x.txt", "power", True),
-    ],
-)
-def test_sounder_file_name_tells_what_the_layout_does_not(file_name: str, stream_name: str, warned: bool) -> None:
-    result = read("sounder_log", samples.SOUNDER, replace(OPTIONS, unit=None, file_name=file_name))
-    assert result.streams[0].name == stream_name
-    assert any("one layout" in text for text in result.warnings) == warned
-    named = read("sounder_log", samples.SOUNDER, replace(OPTIONS, channel="USRP1", file_name=file_name))
-    assert named.streams[0].name == "USRP1"
-
-
 def test_mat_epoch_of_local_time() -> None:
     """Without the text the epoch is wall clock stored as UTC, unless the user knows better."""
     data = samples.mat_flight(timestamp_power_for_csv=None)

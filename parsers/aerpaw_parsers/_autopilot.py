@@ -17,12 +17,10 @@ from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 
-from . import _pose
+from . import _pose, _stamps
 
 # An attitude farther in time than this from a position is not that of the position.
 _NEAR_S = 0.5
-# GPS week 0 as UTC seconds of 1970, leap seconds since 2017 taken off.
-_GPS_EPOCH_S = 315_964_800 - 18
 
 
 @dataclass
@@ -52,7 +50,7 @@ NONE = Series(np.zeros(0), np.zeros(0, dtype=np.int64))
 
 def gps_utc_s(week: FloatArray, milliseconds: FloatArray) -> FloatArray:
     """GPS week and milliseconds of the week as seconds of UTC."""
-    return np.asarray(_GPS_EPOCH_S + week * 604_800.0 + milliseconds / 1e3)
+    return np.asarray(_stamps.GPS_S - _stamps.LEAP_S + week * 604_800.0 + milliseconds / 1e3)
 
 
 def offset_s(utc_s: FloatArray, time_s: FloatArray) -> float | None:

@@ -6,12 +6,11 @@ _TS = "program: ts on the node, local wall time"
 _GPS = "written: UTC of the GPS"
 _TAKEOFF = "program: DroneKit relative frame, above take-off"
 
-# ``written``, or ``program`` or ``assumed`` with what that is. A text with an offset, or an epoch, is written.
+# ``written``, or ``program`` or ``assumed`` with what that is; of the others the reader's own word, which is assumed.
+# A text with an offset, or an epoch, is written.
 CLOCKS = {
     "vehicle_out": "program: aerpawlib datetime.now(), local wall time",
     "vehicle_log": _TS,
-    "pose_csv": "assumed: local wall time",
-    "gpx": "assumed: local wall time",
     "ardupilot_bin": _GPS,
     "mavlink_tlog": "written: UTC of the ground station",
     "px4_ulog": _GPS,
@@ -25,8 +24,6 @@ CLOCKS = {
     "pawprints": "written: epoch of the companion computer",
     "nemo_csv": "program: milliseconds from time_origin",
     "nemo_kml": "program: milliseconds from time_origin",
-    "drive_test": "assumed: local wall time",
-    "gnettrack_kml": "assumed: local wall time",
     "aadm_snr": "program: AADM controller datetime.now(), local wall time",
     "controller_log": _TS,
     "srsenb_log": _TS,
@@ -49,8 +46,6 @@ HEIGHTS = {
     "flight_mat": _TAKEOFF,
     "sigmf": _TAKEOFF,
     "quectel_ri": "program: joined with vehicleOut, above take-off",
-    "nemo_csv": "assumed: above take-off",
-    "nemo_kml": "assumed: above take-off",
     "gpx": "program: GPX elevations are above sea level; above the first point",
     "pawprints": "program: Android altitudes are above the ellipsoid; above the first position",
     "own_csv": "written",

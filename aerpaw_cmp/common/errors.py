@@ -28,12 +28,14 @@ _T = TypeVar("_T")
 def one_line(text: str) -> str:
     r"""Text for one line of a message: line breaks, control characters and bytes that are no UTF-8 as escapes.
 
+    The narrow space within numbers (6 550) stays: Python calls it unprintable.
+
     Examples
     --------
     >>> print(one_line("two\nlines"))
     two\nlines
     """
-    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+    return "".join(c if c.isprintable() or c == "\u202f" else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
 def printable(text: str) -> str:

@@ -219,12 +219,6 @@ def _bisector_segment(
     return np.stack([middle + low * along, middle + high * along])
 
 
-def without_coverage_as_nan(rank: ArrayLike) -> FloatArray:
-    """Ranks as floats with 0 (no path, "Z") as NaN, so that no average takes it for a number."""
-    array = unmasked(rank)
-    return np.where(array > 0, array, np.nan)
-
-
 def class_shares(rank: ArrayLike, highest: int = 4) -> FloatArray:
     """Shares of the classes Z (0), 1, ..., ``highest`` among ranks; shape (highest + 1,), sum 1; NaN does not count."""
     values = unmasked(rank)

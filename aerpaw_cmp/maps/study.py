@@ -10,7 +10,7 @@ import numpy as np
 
 from ..common.units import FloatArray
 from . import evaluate, variogram
-from .grid import Grid, without_coverage_as_nan
+from .grid import Grid
 from .interpolate import IndexInterpolation, InverseDistance, ServingTowerMean
 from .job import MapResult
 from .kriging import OrdinaryKriging
@@ -50,7 +50,7 @@ def rank_fields(
     rows = [i for i, height in enumerate(result.rank_altitudes_m) if height >= LOWEST_M]
     rank = np.moveaxis(result.ranks()[rows], -1, 0).astype(np.float64)
     heights = tuple(result.rank_altitudes_m[i] for i in rows)
-    return heights, without_coverage_as_nan(rank) if out_of_coverage == "missing" else rank
+    return heights, np.where(rank > 0, rank, np.nan) if out_of_coverage == "missing" else rank
 
 
 def interpolation_study(

@@ -9,7 +9,7 @@ Three correlations, all averaged over pairs of positions in bins of distance:
 - :func:`vertical_correlation`: vertical only. Pearson correlation over the positions of two altitudes' maps.
 
 All three serve RSS as well as rank. NaN is out of coverage; whether a rank of 0 is a number or NaN is the caller's
-choice (:func:`aerpaw_cmp.maps.grid.without_coverage_as_nan`).
+choice.
 
 The curve through it, :func:`fit_biexponential`, lives in :mod:`~aerpaw_cmp.maps.biexponential`.
 

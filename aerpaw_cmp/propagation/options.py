@@ -9,7 +9,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
 from .geometry.paths import PathSet
 
@@ -52,17 +51,6 @@ class Search:
     def rays(self) -> dict[str, Any]:
         """Options that Sionna's search takes."""
         return {name: getattr(self, name) for name in ("max_depth", "samples", "batch")}
-
-    def check(self) -> None:
-        """Refuse what no engine knows.
-
-        Raises
-        ------
-        UsageError
-            An unknown engine.
-        """
-        if self.engine not in ("image", "sionna"):
-            raise UsageError(f"unknown engine {self.engine!r}", expected="'image' or 'sionna'")
 
 
 @dataclass(frozen=True, slots=True)

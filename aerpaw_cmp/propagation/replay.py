@@ -211,7 +211,8 @@ def replay(
         Unknown tower or engine, a scene too large for ``image``.
     """
     started = time.perf_counter()
-    search.check()
+    if search.engine not in ("image", "sionna"):
+        raise UsageError(f"unknown engine {search.engine!r}", expected="'image' or 'sionna'")
     poses, notes = within_reach(site, poses)
     scene = Scene.of(site, link, poses)
     if search.links is not None:

@@ -6,7 +6,7 @@ docs/site.md shows every key. Polygons are ``polygon_m`` (east, north) or ``poly
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
@@ -373,7 +373,8 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
             _check_tower(towers[name], model.area_m, frame)
     notes += _disagreements(model, towers, dem)
     with _at("area_m"):
-        area = _area(model.area_m, towers)
+        places = towers.values()
+        area = _checked_area(model.area_m, [t.east_m for t in places], [t.north_m for t in places])
     woods: tuple[Forest, ...] = ()
     if scene is not None:
         scene, woods, scene_notes = without_traps(scene, {name: tower.position_m for name, tower in towers.items()})
@@ -685,11 +686,7 @@ def _single(models: list[SingleTreeModel], sizes: TreeSizes) -> Trees:
     )
 
 
-def _area(area: Area | None, towers: Mapping[str, Tower]) -> Area:
-    return _checked_area(area, [t.east_m for t in towers.values()], [t.north_m for t in towers.values()])
-
-
-def _checked_area(area: Area | None, east: list[float], north: list[float]) -> Area:
+def _checked_area(area: Area | None, east: Sequence[float], north: Sequence[float]) -> Area:
     if area is None:
         return (min(east) - 500.0, max(east) + 500.0, min(north) - 500.0, max(north) + 500.0)
     if not (area[0] < area[1] and area[2] < area[3]):

@@ -1,8 +1,9 @@
 import numpy as np
 import pytest
 
+from aerpaw_cmp.common.units import spread_out
 from aerpaw_cmp.propagation.geometry.paths import Faces, PathSet
-from aerpaw_cmp.propagation.search.samples import FIRST, MOST, enough_samples, spread
+from aerpaw_cmp.propagation.search.samples import FIRST, MOST, enough_samples
 
 FACES = Faces(np.eye(3), np.zeros(3), ("concrete",) * 3, ("a", "b", "c"))
 
@@ -51,7 +52,7 @@ def test_pilots_that_never_agree_end_and_say_so():
 @pytest.mark.parametrize("count", [1, 7, 100])
 def test_spread_takes_both_ends(count):
     known = np.arange(40) * 3
-    some = spread(known, count)
+    some = known[spread_out(len(known), count)]
     assert len(some) == min(count, 40)
     assert some[0] == 0
     assert count == 1 or some[-1] == 117

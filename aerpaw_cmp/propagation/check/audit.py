@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.units import IntArray
+from ...common.units import IntArray, spread_out
 from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
 from ..geometry.arrays import Link, Poses
@@ -17,7 +17,6 @@ from ..options import Engine, Field, Run, Search
 from ..replay import Replay
 from ..replay import replay as run_replay
 from ..search.mirror import plane_keys, planes_of
-from ..search.samples import spread
 from .field_audit import (
     REFERENCE_LINKS,
     Expected,
@@ -179,7 +178,7 @@ def audit(
 def _spread(poses: Poses, count: int | None) -> IntArray:
     """Indices of poses with a position, evenly spread."""
     good = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
-    return good if count is None else spread(good, count)
+    return good if count is None else np.asarray(good[spread_out(len(good), count)])
 
 
 def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[float] = RANK_K) -> Difference:

@@ -18,7 +18,7 @@ import numpy as np
 from ... import __version__
 from ...common.content import content_digest
 from ...common.files import cache_folder, read_sealed, write_sealed
-from ...common.units import AnyArray, FloatArray
+from ...common.units import AnyArray, FloatArray, spread_out
 from ...common.versions import version
 from ..geometry.arrays import Link, Poses
 from ..geometry.paths import PathSet
@@ -26,7 +26,7 @@ from ..native.compiled import beams, beams_for, switch, warn_once
 from ..options import Run, Search
 from ..scene import Scene
 from ..search import mirror
-from ..search.samples import Choice, enough_samples, spread
+from ..search.samples import Choice, enough_samples
 
 # Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same.
 MANY_FACES = 400
@@ -58,7 +58,8 @@ def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache
     """
     if search.engine != "sionna" or search.samples != "auto":
         return None
-    some = spread(np.flatnonzero(np.isfinite(poses.position_m).all(axis=1)), search.batch)
+    known = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
+    some = known[spread_out(len(known), search.batch)]
     part = replace(scene, excluded=scene.excluded[:, some])
     few = Poses(poses.position_m[some], poses.rotation[some])
 

@@ -11,9 +11,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-import numpy as np
-
-from ...common.units import IntArray, spread_out
 from ..geometry.paths import Faces, PathSet
 from .mirror import plane_keys, planes_of
 
@@ -69,8 +66,3 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
         before = paths
     words = f"{samples:,} rays a tower still found other paths than {samples // _FACTOR:,} at {poses} poses"
     return Choice(samples, words.replace(",", " "), before)
-
-
-def spread(known: IntArray, count: int) -> IntArray:
-    """At most ``count`` of some poses, evenly spread."""
-    return np.asarray(known[spread_out(len(known), count)])

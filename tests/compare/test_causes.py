@@ -112,6 +112,17 @@ def test_a_loss_that_rests_on_undetected_samples_is_none() -> None:
     assert _named(silent) == "no detection"
 
 
+@pytest.mark.parametrize("spread_db", [0.0, 0.4])
+def test_a_flat_level_is_neither_floor_nor_saturation(spread_db: float) -> None:
+    """All levels equal, or the noise of a flight inside the floor: nothing says on which side of it the level lies."""
+    sound = _sound()
+    level = -90.0 + np.random.default_rng(2).normal(0.0, spread_db, len(sound.time_s))
+    cause = flight_cause([replace(sound, measured_db=level)])
+    assert cause is not None
+    assert cause.name == "flat"
+    assert "stays at \N{MINUS SIGN}90 dB" in cause.sentence
+
+
 def test_two_channels_are_one_flight_and_a_second_trouble_hides_none() -> None:
     sound, planted = _sound(), _planted()
     both = flight_cause(
@@ -188,25 +199,30 @@ def test_a_simulators_log_is_known_by_receiver_and_battery(
     assert is_simulated(stream) == simulated
 
 
+@pytest.mark.parametrize(
+    ("memories", "tolerance"), [((3, 0, 7), 1e-4), ((0, 3, 0), 1e-4), ((4, 2, 3), 2.0), ((2, 0, 5), 2.0)]
+)
 @pytest.mark.parametrize("columns", [False, True])
-def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memory(columns: bool) -> None:
-    """Dense covariances phi^|i - j|, offset and coefficients by generalised least squares, the variance its own mean."""
-    generator, n = np.random.default_rng(4), 80
-    residual, extra = np.cumsum(generator.normal(size=n)) + 3.0, generator.normal(size=(n, 2))
-    design = np.column_stack([np.ones(n), extra]) if columns else np.ones((n, 1))
-    best = (-np.inf, residual)
-    for phi in (0.0, 0.3, 0.5, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.985, 0.995):
-        cover = phi ** np.abs(np.subtract.outer(np.arange(n), np.arange(n))) / (1.0 - phi**2)
-        inverse = np.linalg.inv(cover)
-        coefficients = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ residual)
-        left = residual - design @ coefficients
-        variance = left @ inverse @ left / n
-        best = max(
-            best, (multivariate_normal.logpdf(left, None, variance * cover), left), key=lambda candidate: candidate[0]
-        )
-    fit = causes._autoregressive(residual, design)
-    assert fit.log_likelihood == pytest.approx(best[0] + 0.5 * n * (np.log(2.0 * np.pi) + 1.0), abs=1e-6)
-    np.testing.assert_allclose(fit.residual_db, best[1] - best[1].mean(), atol=1e-6)
+def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
+    columns: bool, memories: tuple[int, int, int], tolerance: float
+) -> None:
+    """Dense covariances, offset and coefficients by generalised least squares; of two memories but for their start."""
+    generator, n = np.random.default_rng(4), 200
+    design = np.column_stack([np.ones(n), generator.normal(size=(n, 2))]) if columns else np.ones((n, 1))
+    known, apart = causes._Memories(*memories), np.abs(np.subtract.outer(np.arange(n), np.arange(n)))
+    slow, fast, share = causes._SLOW[known.slow], causes._FAST[known.fast], causes._SLOW_SHARE[known.share]
+    cover = share * slow**apart + (1.0 - share) * fast**apart
+    residual = 3.0 + np.linalg.cholesky(cover) @ generator.normal(size=n)
+    inverse = np.linalg.inv(cover)
+    coefficients = np.linalg.solve(design.T @ inverse @ design, design.T @ inverse @ residual)
+    left = residual - design @ coefficients
+    exact = multivariate_normal.logpdf(left, None, left @ inverse @ left / n * cover)
+    fit = causes._remembering(residual, design, known)
+    assert fit.log_likelihood == pytest.approx(exact + 0.5 * n * (np.log(2.0 * np.pi) + 1.0), abs=tolerance)
+    np.testing.assert_allclose(fit.residual_db, left, atol=max(0.2 * tolerance, 1e-4))
+    best = causes._remembering(residual, design, None)
+    assert best.log_likelihood >= max(causes._remembering(residual, design, near).log_likelihood
+                                      for near in best.memories.near)  # fmt: skip
 
 
 @pytest.mark.parametrize("phi", [0.0, 0.8])

@@ -309,6 +309,14 @@ def test_a_difference_of_reports_says_what_its_interval_does(word):
     assert "+0.31 dB" in said
 
 
+def test_two_channels_of_the_same_levels_are_told(report_data):
+    panel = report_data.rss[0]
+    twice = dataclasses.replace(report_data, rss=(panel, dataclasses.replace(panel, channel="copy")))
+    said = f"{panel.name} and {panel.tower} copy hold the same levels: they are one measurement."
+    assert said in cautions(twice)
+    assert not any("same levels" in text for text in cautions(report_data))
+
+
 def test_a_receiver_that_lost_its_lock_has_one_error_that_with_the_floor(report_data):
     """Levels: ray tracing 3 dB, the line 5 dB off where detected; both sides at the floor elsewhere."""
     panel, rng = report_data.rss[0], np.random.default_rng(7)

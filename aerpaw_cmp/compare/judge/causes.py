@@ -1,24 +1,27 @@
 """Likely cause of a level error: the one trouble of a log, its settings or its site that explains it, by likelihood.
 
 Each trouble changes the predicted level in its own way: by decibels that are known, by columns with free coefficients,
-or by samples that the receiver clipped, whose level is their own mean. The offset is fitted beside it, and the residual
-counts as first-order autoregressive noise, so that slow fading is no trouble. Explanations are single troubles and two
-at a time; each has the log likelihood that it gains over all channels beyond the cost of its numbers (Schwarz). The
-best explanation names its trouble where all that explain the flight without it are less likely by :data:`_MARGIN`
-(chance: fewer than one in a hundred), and where it takes a tenth off the RMSE. The paired test of two models would ask
-for a flight much longer than a trouble lasts: a trouble of a minute has one sign in each of few stretches.
+or by samples that the receiver clipped, whose level is their own mean and which fade less. The offset is fitted beside
+it, and the residual counts as noise of two memories: slow fading is no trouble. Explanations are single troubles
+and two at a time, the second judged by what the first leaves; each has the log likelihood that it gains over all
+channels beyond the cost of its numbers (Schwarz). The best explanation names its trouble where all that explain the
+flight without it are less likely by :data:`_MARGIN` (one in a hundred), and where a tenth of the RMSE goes with it.
+The paired test of two models would ask for a flight much longer than a trouble lasts: a trouble of a minute has one
+sign in each of few stretches.
 
 A new trouble is a function that yields its :class:`Trial`, and an entry of :data:`CANDIDATES`.
 
-Reference: Schwarz, Annals of Statistics 6 (1978) 461, doi 10.1214/aos/1176344136.
+References: Schwarz, Annals of Statistics 6 (1978) 461, doi 10.1214/aos/1176344136; Granger and Morris, J. R. Stat.
+Soc. A 139 (1976) 246, doi 10.2307/2345178, on sums of autoregressive sequences.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
+from functools import cache
 from itertools import combinations
 from typing import Protocol
 
@@ -29,19 +32,19 @@ from ..statistics.intervals import Interval
 
 # Samples are averaged over so long [s], over longer where a flight has more than so many seconds.
 BIN_S, _MOST_BINS = 1.0, 2000
-_FEWEST_BINS = 60
-# Log likelihood that a trouble must gain beyond its cost.
-_MARGIN = 4.0
+_FEWEST_BINS = 40
+# Log likelihood that a trouble must gain beyond its cost and all rivals.
+_MARGIN = math.log(100.0)
 # Of sentence and next step of a cause: a page begins with sixty in all.
 MOST_CAUSE_WORDS = 28
-# A trouble that takes less than this share off the RMSE is not the cause of the error.
-_LEAST_SHARE = 0.1
+# A trouble that takes less than this share off the RMSE is no cause of the error, unless it gains so much a channel:
+# a floor where the flight fades leaves the error of all that is above it.
+_LEAST_SHARE, _CERTAIN = 0.1, 30.0
 # Half of the 95 % point of chi-squared with one degree of freedom.
 _NEAR = 1.92
 _EPOCH = np.datetime64(0, "s")
 _Estimate = tuple[float, float, float]
 _NOTHING: _Estimate = (math.nan, math.nan, math.nan)
-_PHI = np.array([0.0, 0.3, 0.5, 0.7, 0.8, 0.87, 0.92, 0.95, 0.97, 0.985, 0.995])
 
 
 class JudgedClock(Protocol):
@@ -115,8 +118,7 @@ class LevelEvidence:
     serving: FloatArray | None = None
     clock: JudgedClock | None = None
     least: BoolArray | None = None
-    greatest: BoolArray | None = None
-    """Samples at the least and at the greatest level of the log, where it has that again and again."""
+    """Samples at the least level of the log, where it has that again and again."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -156,7 +158,7 @@ class Trial:
     """A trouble with its numbers: what it changes, how many free numbers that takes, and what is said of it.
 
     ``change_db`` (n,) is added to the predicted level, ``columns`` (n, k) have free coefficients, ``clipped`` (n,) are
-    samples whose level is not that of the link.
+    samples whose level is not that of the link; ``fading`` (n,) is the share of the link's fading that is shown.
     """
 
     name: str
@@ -166,15 +168,40 @@ class Trial:
     change_db: FloatArray | None = None
     columns: FloatArray | None = None
     clipped: BoolArray | None = None
+    fading: FloatArray | None = None
     estimate: _Estimate = _NOTHING
 
 
 @dataclass(frozen=True, slots=True)
+class _Memories:
+    """Noise of two memories: of :data:`_SLOW`, :data:`_FAST` and :data:`_SLOW_SHARE` the numbers of a row each."""
+
+    slow: int
+    fast: int
+    share: int
+
+    @property
+    def near(self) -> list[_Memories]:
+        """Itself, and the neighbours of each of its numbers."""
+        places, sizes = (self.slow, self.fast, self.share), (len(_SLOW), len(_FAST), len(_SLOW_SHARE))
+        steps = [(0, 0), *((i, step) for i in range(3) for step in (-1, 1))]
+        moved = [tuple(p + step * (k == i) for k, p in enumerate(places)) for i, step in steps]
+        return [_Memories(*m) for m in moved if all(0 <= p < size for p, size in zip(m, sizes, strict=True))]
+
+
+_SLOW = (0.8, 0.87, 0.92, 0.95, 0.97, 0.985, 0.995)
+_FAST = (0.0, 0.3, 0.5, 0.7, 0.8)
+_SLOW_SHARE = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
+_START = _Memories(4, 2, 3)
+
+
+@dataclass(frozen=True, slots=True)
 class _Fit:
-    """Log likelihood and residual of a prediction with its best offset."""
+    """Log likelihood and residual of a prediction with its best offset, and the noise under which it is so."""
 
     log_likelihood: float
     residual_db: FloatArray
+    memories: _Memories
 
 
 @dataclass(frozen=True, slots=True)
@@ -208,20 +235,26 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     gains = {frozenset(some): sum(_best(table, some).gain for table in tables) for some in sets}
     best = max(gains, key=lambda some: gains[some])
     without = {name: max(gain for some, gain in gains.items() if name not in some) for name in best}
-    name = min(without, key=lambda trouble: without[trouble], default=None)
-    if name is None or gains[best] - without[name] < _MARGIN + math.log(len(channels)):
+    least = _MARGIN + math.log(max(len(channels), 1))
+    named = {}
+    for name in (trouble for trouble in best if gains[best] - without[trouble] >= least):
+        shown = [table for table in tables if name in _names(_best(table, best))]
+        shown.sort(key=lambda table: -_best(table, {name}).gain)
+        # also alone it must bring levels and prediction together, not only their changes from second to second
+        alone = _share_of_error(shown, _SOUND, {name})
+        share = min(alone, _share_of_error(shown, best - {name}, best))
+        certain = gains[best] - without[name] >= _CERTAIN * len(channels)
+        if alone <= 1.0 and (share <= 1.0 - _LEAST_SHARE or certain):
+            named[name] = shown
+    if not named:
         return None
-    shown = [table for table in tables if name in _names(_best(table, best))]
-    shown.sort(key=lambda table: -table[frozenset([name])].gain)
-    # also alone it must bring levels and prediction together, not only their changes from second to second
-    alone = _share_of_error(shown, _SOUND, {name})
-    if alone > 1.0 or min(alone, _share_of_error(shown, best - {name}, best)) > 1.0 - _LEAST_SHARE:
-        return None
-    return _named(name, shown, gains[best] - without[name])
+    # a gain over directions takes the place of much else: it is named where nothing else can be
+    name = min(named, key=lambda name: (name == _CATCH_ALL, without[name]))
+    return _named(name, named[name], gains[best] - without[name])
 
 
-def _names(model: _Model) -> set[str]:
-    return {trial.name for trial in model.trials}
+def _names(model: _Model) -> frozenset[str]:
+    return frozenset(trial.name for trial in model.trials)
 
 
 def _best(table: _Models, troubles: Set[str]) -> _Model:
@@ -229,36 +262,62 @@ def _best(table: _Models, troubles: Set[str]) -> _Model:
     return max((model for names, model in table.items() if names <= troubles), key=lambda model: model.gain)
 
 
-# Troubles of a channel that are tried two at a time.
-_MOST_TRIED = 6
+# Troubles of a channel that are tried two at a time, and of those the ones without which all are looked for again.
+_MOST_TRIED, _MOST_FIRST = 6, 2
 
 
 def _models(e: LevelEvidence) -> _Models:
-    """The likeliest numbers of each trouble, and each two of the best of them."""
+    """The likeliest numbers of each trouble, and each two of the best of them: the second judged without the first."""
     sound = _fitted(e)
 
-    def model(*trials: Trial) -> _Model:
-        fit = _fitted(e, *trials)
+    def model(*trials: Trial, at: _Memories | None = None) -> _Model:
+        fit = _fitted(e, *trials, at=at)
         cost = 0.5 * sum(trial.cost for trial in trials) * math.log(len(e.time_s))
         return _Model(e, trials, fit.residual_db, fit.log_likelihood - sound.log_likelihood - cost)
 
-    best: dict[str, _Model] = {}
-    for trial in (trial for candidate in CANDIDATES for trial in candidate(e)):
-        alone = model(trial)
-        if trial.name not in best or alone.gain > best[trial.name].gain:
-            best[trial.name] = alone
-    likely = sorted(best, key=lambda name: -best[name].gain)[:_MOST_TRIED]
-    pairs = {frozenset(two): model(*(best[name].trials[0] for name in two)) for two in combinations(likely, 2)}
-    return {_SOUND: model(), **{frozenset([name]): best[name] for name in likely}, **pairs}
+    def best_of(sets: Iterable[tuple[Trial, ...]], at: _Memories) -> list[_Model]:
+        """The likeliest of each set of names under some noise, the best of them under their own."""
+        best: dict[frozenset[str], _Model] = {}
+        for trials in sets:
+            tried = model(*trials, at=at)
+            names = _names(tried)
+            if len(names) == len(trials) and (names not in best or tried.gain > best[names].gain):
+                best[names] = tried
+        likely = sorted(best.values(), key=lambda m: -m.gain)[:_MOST_TRIED]
+        return [model(*m.trials) for m in likely]
+
+    alone = best_of(((trial,) for trial in _candidates(e)), sound.memories)
+    alone.sort(key=lambda m: -m.gain)
+    models, likely = [model(), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
+    models += [model(*(m.trials[0] for m in two)) for two in combinations(alone, 2) if two[0].gain > 0.0]
+    for first in likely:
+        rest = _without(e, first)
+        at = _fitted(rest).memories
+        pairs = best_of(((first.trials[0], second) for second in _candidates(rest)), at)
+        models += [*pairs, *(model(m.trials[1], at=sound.memories) for m in pairs)]
+    return {_names(m): m for m in sorted(models, key=lambda m: m.gain)}
+
+
+def _candidates(e: LevelEvidence) -> Iterator[Trial]:
+    return (trial for candidate in CANDIDATES for trial in candidate(e))
+
+
+def _without(e: LevelEvidence, first: _Model) -> LevelEvidence:
+    """Evidence whose prediction knows a trouble already."""
+    predicted = e.measured_db - first.residual_db
+    moved = predicted - e.predicted_db
+    others = {name: level + moved for name, level in e.other_towers_db.items()}
+    return dataclasses.replace(e, predicted_db=predicted, other_towers_db=others)
 
 
 def _share_of_error(shown: Sequence[_Models], before: Set[str], after: Set[str]) -> float:
     """RMSE with further troubles over that before."""
-    return _rmse_db([_best(table, after) for table in shown]) / _rmse_db([_best(table, before) for table in shown])
+    rmse, known = (_rmse_db([_best(table, troubles) for table in shown]) for troubles in (after, before))
+    return rmse / known if known else 1.0
 
 
 def _rmse_db(models: Sequence[_Model]) -> float:
-    return float(np.sqrt(np.mean(np.concatenate([model.residual_db for model in models]) ** 2)))
+    return float(np.concatenate([model.residual_db - model.residual_db.mean() for model in models]).std())
 
 
 def _named(name: str, shown: Sequence[_Models], gain: float) -> Cause:
@@ -311,10 +370,9 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
         return np.degrees(np.angle(mean(turn.real) + 1j * mean(turn.imag)))
 
     changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
-    for name, end in (("least", level.min()), ("greatest", level.max())):
-        at = level == end
-        often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level))
-        changed[name] = np.bincount(place, at) > 0.5 * count if often else None
+    at = level == level.min()
+    often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level))
+    changed["least"] = np.bincount(place, at) > 0.5 * count if often else None
     return LevelEvidence(**changed)  # type: ignore[arg-type]
 
 
@@ -322,42 +380,76 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
 _AT_END, _SHARE_AT_END = 10, 0.01
 
 
-def _fitted(e: LevelEvidence, *trials: Trial) -> _Fit:
-    """Best offset and coefficients with some troubles, under first-order autoregressive noise, its memory searched."""
+def _fitted(e: LevelEvidence, *trials: Trial, at: _Memories | None = None) -> _Fit:
+    """Best offset and coefficients with some troubles, under noise of two memories: those given, else the likeliest."""
     target = e.measured_db - e.predicted_db
     clipped = np.zeros(len(target), dtype=np.bool_)
-    columns = []
+    columns, shown = [], np.ones(len(target))
     for trial in trials:
         target = target if trial.change_db is None else target - trial.change_db
         clipped = clipped if trial.clipped is None else clipped | trial.clipped
         columns += [] if trial.columns is None else [trial.columns]
+        shown = shown if trial.fading is None else shown * trial.fading
     design = np.column_stack([np.ones(len(target)), *columns])
-    if not clipped.any():
-        return _autoregressive(target, design)
-    inside = np.where(clipped, e.measured_db, target)
-    design = np.column_stack([np.where(clipped[:, None], 0.0, design), clipped])
-    rough = inside - design @ np.linalg.lstsq(design, inside, rcond=None)[0]
-    spread = np.where(clipped, rough[clipped].std(), rough[~clipped].std() if (~clipped).any() else 1.0)
-    spread = spread.clip(_LEAST_SPREAD_DB)
-    fit = _autoregressive(inside / spread, design / spread[:, None])
-    return _Fit(fit.log_likelihood - float(np.log(spread).sum()), fit.residual_db * spread)
+    if clipped.all():
+        return _Fit(-math.inf, target - target.mean(), _START)
+    link = ~clipped
+    scale = shown[link]
+    fit = _remembering(target[link] / scale, design[link] / scale[:, None], at)
+    likelihood, residual = fit.log_likelihood - float(np.log(scale).sum()), np.zeros(len(target))
+    residual[link] = fit.residual_db * scale
+    if clipped.any():  # what a receiver writes beyond its limit remembers nothing of the link
+        residual[clipped] = e.measured_db[clipped] - e.measured_db[clipped].mean()
+        likelihood -= float(clipped.sum()) * math.log(max(float(residual[clipped].std()), _LEAST_SPREAD_DB))
+    return _Fit(likelihood, residual, fit.memories)
 
 
 _LEAST_SPREAD_DB = 0.2
 
 
-def _autoregressive(residual: FloatArray, design: FloatArray) -> _Fit:
-    n, best = len(residual), _Fit(-math.inf, residual)
-    for phi in _PHI.tolist():
-        root = math.sqrt(1.0 - phi**2)
-        white_y = np.concatenate(([root * residual[0]], residual[1:] - phi * residual[:-1]))
-        white_x = np.concatenate((root * design[:1], design[1:] - phi * design[:-1]))
-        coefficients = np.linalg.lstsq(white_x, white_y, rcond=None)[0]
-        variance = float(np.mean((white_y - white_x @ coefficients) ** 2))
-        likelihood = -0.5 * n * math.log(max(variance, 1e-12)) + math.log(root)
-        if likelihood > best.log_likelihood:
-            best = _Fit(likelihood, residual - design @ coefficients)
-    return _Fit(best.log_likelihood, best.residual_db - best.residual_db.mean())
+@cache
+def _whitening(memories: _Memories) -> tuple[FloatArray, FloatArray, FloatArray, float]:
+    """Numerator, denominator and start of the filter, and the innovation's share of the standard deviation.
+
+    The sum of two first-order autoregressive sequences is an ARMA(2, 1) sequence (Granger and Morris).
+    """
+    from scipy.signal import lfilter_zi  # it would load with every command
+
+    slow, fast, share = _SLOW[memories.slow], _FAST[memories.fast], _SLOW_SHARE[memories.share]
+    shocks = share * (1.0 - slow**2), (1.0 - share) * (1.0 - fast**2)
+    power = shocks[0] * (1.0 + fast**2) + shocks[1] * (1.0 + slow**2)
+    neighbour = shocks[0] * fast + shocks[1] * slow
+    half = 0.5 * power / neighbour if neighbour > 1e-12 else math.inf
+    theta = half - math.sqrt(half**2 - 1.0) if math.isfinite(half) else 0.0
+    innovation = neighbour / theta if theta else power
+    ahead, back = np.array([1.0, -slow - fast, slow * fast]), np.array([1.0, -theta, 0.0])
+    return ahead, back, lfilter_zi(ahead, back), math.sqrt(innovation)
+
+
+def _remembering(residual: FloatArray, design: FloatArray, given: _Memories | None) -> _Fit:
+    """Fit under noise of two memories; those that are not given are climbed to by steps to the likeliest neighbour."""
+    from scipy.signal import lfilter
+
+    n, columns = len(residual), np.column_stack([residual, design])
+
+    def fit(memories: _Memories) -> tuple[float, FloatArray]:
+        ahead, back, start, root = _whitening(memories)
+        white = lfilter(ahead, back, columns, axis=0, zi=start[:, None] * columns[:1])[0]
+        white[0] = root * columns[0]
+        gram = white.T @ white
+        ridge = 1e-10 * np.trace(gram[1:, 1:]) * np.eye(len(gram) - 1)  # columns may say the same
+        coefficients = np.linalg.solve(gram[1:, 1:] + ridge, gram[1:, 0])
+        variance = float(gram[0, 0] - gram[0, 1:] @ coefficients) / n
+        return -0.5 * n * math.log(max(variance, 1e-12)) + math.log(root), coefficients
+
+    best = given or _START
+    tried, at = {best: fit(best)}, given
+    while best != at:
+        at = best
+        tried |= {memories: fit(memories) for memories in at.near if memories not in tried}
+        best = max(tried, key=lambda memories: tried[memories][0])
+    likelihood, coefficients = tried[best]
+    return _Fit(likelihood, residual - design @ coefficients, best)
 
 
 # --- the troubles --------------------------------------------------------------------------------------------------
@@ -374,14 +466,35 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
         )  # fmt: skip
 
 
-def _profiled(e: LevelEvidence, trials: Mapping[float, Trial]) -> Trial:
+def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: _Memories = _START) -> Trial:
     """The best of some values, and the range of those that are nearly as likely, half way to the next that are not."""
-    likelihood = {value: _fitted(e, trial).log_likelihood for value, trial in trials.items()}
+    likelihood = {value: _fitted(e, trial, at=at).log_likelihood for value, trial in trials.items()}
     best, tried = max(likelihood, key=lambda value: likelihood[value]), sorted(trials)
     near = [i for i, value in enumerate(tried) if likelihood[value] >= likelihood[best] - _NEAR]
     low, high = max(near[0] - 1, 0), min(near[-1] + 1, len(tried) - 1)
     ends = 0.5 * (tried[near[0]] + tried[low]), 0.5 * (tried[near[-1]] + tried[high])
     return dataclasses.replace(trials[best], estimate=(best, *ends))
+
+
+# Values between two that were given.
+_BETWEEN = np.linspace(-0.8, 0.8, 9)
+
+
+def _tuned(
+    e: LevelEvidence, changes_db: Mapping[float, FloatArray], trial: Callable[[float, FloatArray], Trial]
+) -> Trial:
+    """The best of some values and of those about it, whose changes of the level are interpolated; at 0 is none."""
+    from scipy.interpolate import CubicSpline
+
+    values = sorted({0.0, *changes_db})
+    likely = _profiled(e, {value: trial(value, change) for value, change in changes_db.items()})
+    best = likely.estimate[0]
+    table = np.stack([changes_db.get(value, np.zeros(len(e.time_s))) for value in values])
+    at = values.index(best)
+    between = np.interp(at + _BETWEEN, np.arange(len(values)), values)
+    curve = CubicSpline(values, table)
+    finer = {value: trial(value, curve(value)) for value in between[between != 0.0].tolist()}
+    return _profiled(e, finer, _fitted(e, likely).memories)
 
 
 # An angle, and that it is looked for all around.
@@ -392,15 +505,15 @@ def _heading(e: LevelEvidence) -> Iterator[Trial]:
     """An antenna turned about the vertical."""
     if not e.turned_db:
         return
-    turns = {
-        angle: Trial(
+
+    def turned(angle: float, change: FloatArray) -> Trial:
+        return Trial(
             name="heading", cost=_HEADING_COST, change_db=change,
             next_step="check the antenna's mount and the logged yaw",
             sentence=f"the UAV antenna is turned clockwise by {angle:.0f} degrees",
-        )
-        for angle, change in e.turned_db.items()
-    }  # fmt: skip
-    best = _profiled(e, turns)
+        )  # fmt: skip
+
+    best = _tuned(e, e.turned_db, turned)
     yield best
     # a turned antenna leaves nothing that depends on the direction: what does is another antenna
     yield dataclasses.replace(_pattern_trial(e), cost=_HEADING_COST + _PATTERN_COST, change_db=best.change_db)
@@ -421,16 +534,16 @@ def _attitude(e: LevelEvidence) -> Iterator[Trial]:
 
 def _height(e: LevelEvidence) -> Iterator[Trial]:
     """Heights of another datum."""
+
+    def raised(rise: float, change: FloatArray) -> Trial:
+        return Trial(
+            name="height", cost=1.0, change_db=change,
+            sentence=f"the UAV flew about {abs(rise):.0f} m {'higher' if rise > 0 else 'lower'} than the log says",
+            next_step="check the telemetry's height datum",
+        )  # fmt: skip
+
     if e.raised_db:
-        trials = {
-            rise: Trial(
-                name="height", cost=1.0, change_db=change,
-                sentence=f"the UAV flew about {abs(rise):.0f} m {'higher' if rise > 0 else 'lower'} than the log says",
-                next_step="check the telemetry's height datum",
-            )
-            for rise, change in e.raised_db.items()
-        }  # fmt: skip
-        yield _profiled(e, trials)
+        yield _tuned(e, e.raised_db, raised)
 
 
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
@@ -442,7 +555,7 @@ def _tower(e: LevelEvidence) -> Iterator[Trial]:
         )  # fmt: skip
 
 
-_PATTERN_COST = 6.0
+_CATCH_ALL, _PATTERN_COST = "pattern", 6.0
 
 _PATTERN = {
     "isotropic": (
@@ -462,7 +575,7 @@ _PATTERN = {
 
 def _pattern_trial(e: LevelEvidence) -> Trial:
     sentence, step = _PATTERN[e.antenna]
-    return Trial(name="pattern", cost=_PATTERN_COST, sentence=sentence, next_step=step, columns=_harmonics(e))
+    return Trial(name=_CATCH_ALL, cost=_PATTERN_COST, sentence=sentence, next_step=step, columns=_harmonics(e))
 
 
 def _pattern(e: LevelEvidence) -> Iterator[Trial]:
@@ -489,6 +602,24 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
 # --- troubles of the receiver ----------------------------------------------------------------------------------------
 
 
+def _flat(e: LevelEvidence) -> Iterator[Trial]:
+    """One level alone where the model predicts many: a dead input, or a flight below the floor or above the ceiling."""
+    if _is_flat(e):
+        yield Trial(
+            name="flat", cost=1.0, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
+            sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} all along",
+        )  # fmt: skip
+
+
+# The middle 80 % of a flat level span less than this share of the predicted ones, as for the clock.
+_FLAT = 0.2
+
+
+def _is_flat(e: LevelEvidence) -> bool:
+    measured, predicted = (np.ptp(np.percentile(level, (10, 90))) for level in (e.measured_db, e.predicted_db))
+    return bool(measured < _FLAT * predicted)
+
+
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Noise that the receiver writes without its lock, by the quality in the log."""
     if e.locked is not None and (lost := e.locked < 0.5).any():
@@ -512,28 +643,48 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 def _floor(e: LevelEvidence) -> Iterator[Trial]:
     """A receiver that shows no level below its floor; what it shows there spreads less."""
-    if e.least is None:  # else the log itself says where nothing was detected
+    if e.least is None and not _is_flat(e):  # else the log itself says where nothing was detected
         yield from _clipping(e, 1.0)
 
 
 def _saturation(e: LevelEvidence) -> Iterator[Trial]:
     """A receiver that shows no level above its ceiling."""
-    yield from _clipping(e, -1.0)
+    if not _is_flat(e):
+        yield from _clipping(e, -1.0)
 
 
-# Of clipped samples: so many lie further beyond the limit [dB], and they spread by at most so much of the others.
-_BEYOND_DB, _MOST_BEYOND, _MOST_SPREAD = 2.0, 0.02, 0.6
+# Of samples beyond a limit: so many lie further [dB].
+_BEYOND_DB, _MOST_BEYOND = 2.0, 0.02
 _FAR_DB, _LEAST_FAR = 3.0, 0.1
 _LEAST_BINS = 5
 
 
 def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
-    """Limits below (``side`` 1) or above (-1) which a receiver shows no level: hard ones, and soft ones."""
+    """Limits below (``side`` 1) or above (-1) which a receiver shows no level: where it fades no more, and soft."""
+    pile = _pile(e, side)
+    if pile is not None:
+        limit = float(e.measured_db[pile].mean())
+        if (trial := _limited(e, limit, side)) is not None:
+            yield dataclasses.replace(trial, clipped=pile, estimate=(limit, limit, limit))
     limits = np.quantile(e.measured_db, np.linspace(0.02, 0.7, 18) if side > 0 else np.linspace(0.98, 0.3, 18))
-    for limit_of in (_clipped, _bent):
-        trials = {limit: trial for limit in limits.tolist() if (trial := limit_of(e, limit, side)) is not None}
-        if trials:
-            yield _profiled(e, trials)
+    trials = {limit: trial for limit in limits.tolist() if (trial := _bent(e, limit, side)) is not None}
+    if trials:
+        yield _profiled(e, trials)
+
+
+# At a limit of the receiver: so near to the last levels [dB], so large a share of the samples, which fade so much less.
+_PILE_DB, _LEAST_PILE, _MOST_FADING = 1.2, 0.1, 0.35
+
+
+def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
+    """Samples at the receiver's limit; None where those near the least or greatest level fade as all others do."""
+    end = float(np.quantile(e.measured_db, 0.01 if side > 0 else 0.99))
+    pile = side * (e.measured_db - end) < _PILE_DB
+    step = np.abs(np.diff(e.measured_db))
+    inside, outside = pile[1:] & pile[:-1], ~(pile[1:] | pile[:-1])
+    if inside.sum() < max(_LEAST_BINS, _LEAST_PILE * len(pile)) or outside.sum() < _LEAST_BINS:
+        return None
+    return pile if np.median(step[inside]) < _MOST_FADING * np.median(step[outside]) else None
 
 
 def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
@@ -543,21 +694,6 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     name, words, step = _LIMITS[side]
     sentence, next_step = words.format(level=f"{Printed(limit):.0f} {e.unit}"), step.format(typed=f"{limit:.0f}")
     return Trial(name=name, cost=2.0, sentence=sentence, next_step=next_step)
-
-
-def _clipped(e: LevelEvidence, limit: float, side: float) -> Trial | None:
-    """Samples beyond a limit, which spread less there."""
-    gap = e.measured_db - e.predicted_db
-    offset = float(np.median(gap))
-    for _ in range(4):
-        free = side * (e.predicted_db + offset - limit) > 0.0
-        if min(free.sum(), (~free).sum()) < _LEAST_BINS:
-            return None
-        offset = float(np.mean(gap[free]))
-    if float(e.measured_db[~free].std()) > _MOST_SPREAD * gap[free].std():
-        return None
-    trial = _limited(e, limit, side)
-    return None if trial is None else dataclasses.replace(trial, clipped=~free)
 
 
 def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
@@ -571,7 +707,11 @@ def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     # a prediction that fades too deep here and there meets no limit of the receiver
     if trial is None or (side * (limit - level) > _FAR_DB).mean() < _LEAST_FAR:
         return None
-    return dataclasses.replace(trial, change_db=shown - level)
+    fading = 1.0 / (1.0 + 10.0 ** (side * (limit - level) / 10.0))
+    return dataclasses.replace(trial, change_db=shown - level, fading=fading.clip(_LEAST_FADING))
+
+
+_LEAST_FADING = 0.1
 
 
 _LIMITS = {
@@ -660,5 +800,5 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
 
 CANDIDATES: tuple[Callable[[LevelEvidence], Iterator[Trial]], ...] = (
     _clock, _heading, _attitude, _height, _tower, _pattern, _cell,
-    _lock, _no_detection, _floor, _saturation, _blocked, _gain_step,
+    _lock, _no_detection, _flat, _floor, _saturation, _blocked, _gain_step,
 )  # fmt: skip

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 
@@ -411,6 +412,11 @@ def cautions(data: ReportData) -> list[str]:
     texts += [f"{text}." for text in data.doubts]
     for panel in data.rss:
         texts += _rss_cautions(panel)
+    texts += [
+        f"{panel.name} and {copy.name} hold the same levels: they are one measurement."
+        for panel, copy in combinations(data.rss, 2)
+        if panel.score.n and np.array_equal(panel.measured_db, copy.measured_db, equal_nan=True)
+    ]
     if data.engine is not None and audit is None:
         why = data.engine.not_audited
         texts.append(
@@ -434,7 +440,7 @@ def _rss_cautions(panel: RssResult) -> list[str]:
             f"{floor} in the first sentence."
         )
     if 0 < score.n < FEW_SAMPLES:
-        texts.append(f"{panel.name}: only {score.n} samples were scored, too few for a verdict.")
+        texts.append(f"{panel.name}: only {counted(score.n, 'sample')} scored, too few for a verdict.")
     if score.n_out_of_coverage > 0.2 * len(panel.time):
         share = 100 * score.n_out_of_coverage / len(panel.time)
         texts.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not part of the RMSE.")

@@ -12,6 +12,7 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.geodesy import bearing_deg
 from ..common.outputs import OutputFolder
+from ..common.provenance import KEY, union
 from ..common.stages import Stages
 from ..common.units import FloatArray
 from ..flight.data import FlightData, choose_site, load_data, site_place
@@ -19,6 +20,7 @@ from ..flight.gains.memory import load_with_learned
 from ..flight.pose.track import interpolated
 from ..flight.replay import replay_poses, valid_poses
 from ..flight.settings import FlightFile, LinkSettings
+from ..flight.training import flight_logs
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.path_table import check_band, subcarriers_hz, velocities_mps
 from ..report.exports.channel import FORMATS, Channel
@@ -106,11 +108,12 @@ def flight_channel(
         replayed = replay_poses(data.site, settings.rt, link, along.poses, **run)
     with stages("paths"):
         table = replayed.path_table()
-    velocity = velocities_mps(along.time_s, along.poses.position_m)
+    spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # steps of many seconds are no gaps
+    velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
     moves = bool(np.isfinite(velocity).any())
     if not moves:
         remarks.append("No Doppler shift: the points have no times, so the UAV has no velocity.")
-    level, sd, unit = _levels(data, link, name, along.poses, remarks)
+    level, sd, unit, trained_on = _levels(data, link, name, along.poses, remarks)
     return Channel(
         name=along.name,
         link=name,
@@ -119,11 +122,12 @@ def flight_channel(
         time_s=along.time_s,
         start=along.start,
         velocity_mps=velocity if moves else None,
-        tower_mps=0.0 if along.towers_m is None else velocities_mps(along.time_s, along.towers_m),
+        tower_mps=0.0 if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans),
         summed=settings.rss.field,
         level_db=level,
         level_sd_db=sd,
         level_unit=unit,
+        trained_on=trained_on,
         offsets_hz=None if chosen.bandwidth_hz is None else subcarriers_hz(chosen.bandwidth_hz, chosen.subcarriers),
         remarks=(*remarks, *along.remarks, *replayed.left_out),
     )
@@ -196,16 +200,17 @@ def _planned(data: FlightData, route: Path, step_s: float) -> _Along:
 
 def _levels(
     data: FlightData, link: Link, name: str, poses: Poses, remarks: list[str]
-) -> tuple[FloatArray | None, FloatArray | None, str]:
-    """Level and standard deviation (poses, towers) by the antennas that the site remembers, and the log's unit."""
+) -> tuple[FloatArray | None, FloatArray | None, str, tuple[str, ...]]:
+    """Level and standard deviation (poses, towers) by remembered antennas, the log's unit, logs that taught them."""
     towers = tuple(link.tower_arrays)
     try:
         memory = memory_of(site_place(data.settings.site.file, data.folder), data.site)
     except UsageError:
         remarks.append("No calibrated level: no flight taught the site its antennas (aerpaw-cmp calibrate).")
-        return None, None, ""
+        return None, None, "", ()
     level, sd = np.full((2, len(poses), len(towers)), np.nan)
     heading, units, guesses = bearing_deg(poses.rotation[:, :, 0]), dict[str, str](), 0
+    trained_on: tuple[str, ...] = ()
     for source in sorted(memory.sources().values(), key=lambda s: s.channel != name):
         near = abs(source.link.carrier_hz / link.carrier_hz - 1.0) <= BAND
         if source.tower not in towers or source.tower in units or not near or source.tower in data.nodes:
@@ -216,12 +221,15 @@ def _levels(
         level[:, column] = gain + source.free_space_db(poses.position_m)
         sd[:, column] = memory.fading(source.antenna).total_db(slow)
         guesses += int(guess.sum())
+        trained_on = union(trained_on, memory.known[source.antenna].entry.trained_on)
     if not units:
         remarks.append("No calibrated level: the site remembers no antenna of these towers near this carrier.")
-        return None, None, ""
+        return None, None, "", ()
     if guesses:
         remarks.append(f"{guesses} levels lie where no flight taught the antennas: their standard deviation says so.")
-    return level, sd, ", ".join(dict.fromkeys(units.values()))
+    if set(trained_on) & set(flight_logs(data)):
+        remarks.append("The calibrated level was learned from this flight's own logs, too: it is no prediction of it.")
+    return level, sd, ", ".join(dict.fromkeys(units.values())), trained_on
 
 
 def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFAULT) -> JobOutcome:
@@ -271,6 +279,7 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
             "paths": len(channel.table.pose),
             "has_doppler": channel.velocity_mps is not None,
             "has_level": channel.level_db is not None,
+            KEY: list(channel.trained_on),
             "files": [str(path) for path in output.placed(written)],
             "warnings": [*data.warnings, *channel.remarks],
             "stages": stages.seconds,

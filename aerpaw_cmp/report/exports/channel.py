@@ -49,6 +49,8 @@ class Channel:
     level_db, level_sd_db : (poses, towers), optional
         Calibrated level and its standard deviation, in the unit of the log.
     level_unit : str
+    trained_on : tuple of str
+        SHA-256 of the logs that taught the level.
     offsets_hz : (subcarriers,), optional
         Of the frequency response.
     remarks : tuple of str
@@ -66,6 +68,7 @@ class Channel:
     level_db: FloatArray | None = None
     level_sd_db: FloatArray | None = None
     level_unit: str = ""
+    trained_on: tuple[str, ...] = ()
     offsets_hz: FloatArray | None = None
     remarks: tuple[str, ...] = ()
 
@@ -194,6 +197,7 @@ def _file(channel: Channel) -> dict[str, Any]:
         "carrier_hz": link.carrier_hz,
         "transmit_power_dbm": link.transmit_power_dbm,
         "transmitter": "UAV" if link.uav_transmits else "tower",
+        "trained_on": " ".join(channel.trained_on),
     }
 
 

@@ -14,7 +14,7 @@ COMMANDS: dict[str, str] = {
     "modem-sim": "A pseudo-terminal that behaves like the modem, to try the tap without hardware.",
     "predict": "Level and rank with error bars on a route, a grid or points, before a flight.",
     "plan": "Which flight next: candidate routes by the standard deviation they would leave.",
-    "locate": "Where an unknown transmitter or receiver on the ground stands, by the levels of a flight.",
+    "locate": "Where an unknown transmitter or receiver on the ground stands, by levels of a flight.",
     "channel": "The channel along a flight or a route as files: paths, H, Doppler, levels.",
     "map": "Coverage and rank maps of a site, Kriging of rank and its baselines.",
     "simulate": "Write the logs of a planned flight in the real formats, with their truth.",

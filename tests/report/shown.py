@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from aerpaw_cmp.compare.judge.ladder import LadderRow
 from aerpaw_cmp.compare.judge.report_difference import Overlap, level_difference, pooled_difference
 from aerpaw_cmp.compare.learning.calibration import Score
 from aerpaw_cmp.report.content.calibration import CalibrationData
@@ -40,7 +41,13 @@ def _written(write: Callable[[Any, Path], Any], data: Any, name: str) -> str:
 
 
 def report(fixture: Fixture) -> str:
-    return html.page(fixture("report_data"), ["metrics.json"])
+    """With ten channels on the ladder: the key of its chart is longer than a page is wide."""
+    ladder = tuple(
+        LadderRow(model="free space", tower=f"LW{i // 2 + 1}", channel=f"USRP{i % 2 + 1}", rmse_heldout_db=5.0 + i,
+                  difference_to_best_db=0.0, difference_to_best_ci95_db=(0.0, 0.0), n=100, seconds=1.0, recommended=True)
+        for i in range(10)
+    )  # fmt: skip
+    return html.page(dataclasses.replace(fixture("report_data"), ladder=ladder), ["metrics.json"])
 
 
 def site_map(fixture: Fixture) -> str:

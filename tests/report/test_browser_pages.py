@@ -1,12 +1,15 @@
-"""Pages in a real browser: the first words of each above the fold; a model that is chosen marked in every task."""
+"""Pages in a real browser: the first words of each above the fold; never wider than the window; dark where asked."""
 
+import io
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import matplotlib.image
+import numpy as np
 import pytest
 
-from tests.report.browsing import needs_browser, start
+from tests.report.browsing import needs_browser, open_page, set_scheme, set_width, start
 from tests.report.shown import PAGES
 
 pytestmark = needs_browser
@@ -36,5 +39,29 @@ def test_the_first_words_need_no_scrolling(
         assert bottom < 0.75 * height  # the first picture or table begins above the fold, too
         assert wide <= width
         assert any(unit in text for unit in (" dB", " %"))
-        assert "Next: " in text or page == "report"  # a flight has one next step or none
+        assert "Next: " in text or page in ("report", "diff")  # one next step or none
         assert "`" not in text
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_no_page_is_wider_than_its_window_or_light_in_the_dark(
+    page: str, driver: Any, tmp_path: Path, request: pytest.FixtureRequest
+) -> None:
+    """Every fold open: what is wide scrolls in its own box, and a drawn figure is dark on a dark page."""
+    path = tmp_path / f"{page}.html"
+    path.write_text(PAGES[page](request.getfixturevalue), encoding="utf-8")
+    if page == "report":  # the charts of its folds are drawn by a script
+        open_page(driver, path, "window.explorer")
+    else:
+        driver.get(path.as_uri())
+    driver.execute_script("document.querySelectorAll('details').forEach(d => { d.open = true; })")
+    for scheme in ("light", "dark"):
+        set_scheme(driver, scheme)
+        for width in (390, 1024, 1440):
+            set_width(driver, width)
+            assert driver.execute_script("return document.documentElement.scrollWidth") <= width
+        figures = driver.find_elements("css selector", "figure img")[:2]
+        for shown in [driver.find_element("css selector", ".kicker"), *figures]:
+            pixels = matplotlib.image.imread(io.BytesIO(shown.screenshot_as_png))[..., :3]
+            assert (np.median(pixels) < 0.2) == (scheme == "dark")
+    set_scheme(driver)

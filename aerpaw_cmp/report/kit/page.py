@@ -92,25 +92,32 @@ def duration(seconds: float | None) -> str:
 def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
     """Nested settings as dotted names and plain text, without those that are not set; a bound as ``≥ low``.
 
+    What is listed, as the logs of a flight, has a numbered row each.
+
     Examples
     --------
     >>> list(flat({"a": {"b_ci95_db": (5.5, None), "c": None}, "d": [1, 2], "e_ci95": (None, None)}))
     [('a.b_ci95_db', '≥ 5.5'), ('d', '1, 2')]
+    >>> list(flat({"logs": [{"path": "a.txt", "node": "LW1", "kind": None, "skip": []}, {"path": "b.txt"}]}))
+    [('logs.1', 'path: a.txt, node: LW1'), ('logs.2', 'path: b.txt')]
     """
     for key, value in settings.items():
         name = f"{above}.{key}" if above else str(key)
         if isinstance(value, Mapping):
             yield from flat(value, name)
+        elif isinstance(value, (list, tuple)) and any(isinstance(part, Mapping) for part in value):
+            for number, part in enumerate(value, 1):
+                yield f"{name}.{number}", ", ".join(": ".join(row) for row in flat(part))
         elif (text := _plain(name, value)) is not None:
             yield name, text
 
 
 def _plain(name: str, value: Any) -> str | None:
-    """Text of one setting or number; None where it is not set."""
+    """Text of one setting or number; None where it is not set or empty."""
     if "ci95" in name and isinstance(value, (list, tuple)) and None in value:
         return None if value[0] is None else f"≥ {short(value[0])}"
     if isinstance(value, (list, tuple)):
-        return ", ".join(map(short, value))
+        return ", ".join(map(short, value)) or None
     return None if value is None else short(value)
 
 

@@ -71,7 +71,7 @@ def draw_antenna(antenna: AntennaMap) -> Figure:
         (axes[1], closed(antenna.sd_db), "standard deviation [dB]", (0.0, float(antenna.sd_db.max()))),
     ):
         mesh = ax.pcolormesh(azimuth, elevation, values, shading="gouraud", vmin=limits[0], vmax=limits[1],
-                             cmap="viridis" if ax is axes[0] else "magma", rasterized=True)  # fmt: skip
+                             cmap="viridis" if ax is axes[0] else "plasma", rasterized=True)  # fmt: skip
         fig.colorbar(mesh, ax=ax, label=label, pad=0.01)
         ax.set_ylabel("elevation [deg]")
         ax.set_yticks([-90, -45, 0, 45, 90])

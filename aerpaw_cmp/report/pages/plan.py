@@ -87,7 +87,7 @@ def _draw_map(data: PlanPage) -> Figure:
         for ring in (data.outline_m, *data.holes_m):
             ax.plot(ring[:, 0], ring[:, 1], color="0.75", linewidth=0.8)
         place = data.place_m[first]
-        shown = ax.scatter(place[:, 0], place[:, 1], c=values, s=9, vmin=low, vmax=high, cmap="magma", rasterized=True)
+        shown = ax.scatter(place[:, 0], place[:, 1], c=values, s=9, vmin=low, vmax=high, cmap="plasma", rasterized=True)
         fig.colorbar(shown, ax=ax, label="standard deviation [dB]", pad=0.02, shrink=0.85)
         for name, at in data.towers.items():
             ax.plot(at[0], at[1], "^", color="black", markersize=5)

@@ -181,7 +181,7 @@ def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
     east, north = part["east_m"].to_numpy(), part["north_m"].to_numpy()
     for ax, column, label, colours in (
         (axes[0], "level_db", "level [dB]", "viridis"),
-        (axes[1], "sd_db", "standard deviation [dB]", "magma"),
+        (axes[1], "sd_db", "standard deviation [dB]", "plasma"),
     ):
         values = part[column].to_numpy()
         for line in data.flown.values():

@@ -11,6 +11,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+from ..common.counting import counted
 from ..common.errors import one_line, printable
 
 _EVERY_S = 30.0
@@ -122,7 +123,7 @@ def print_plan(plan: Any, as_json: bool = False) -> None:
     rows.append(["all", "", f"{plan.seconds:.0f} and what has a dash"])
     table(["stage", "work", "s"], rows, f"{plan.job}, not run")
     show(plan.as_dict()["measured"])
-    show(f"reads {len(plan.inputs)} files; would write {plan.output}")
+    show(f"reads {counted(len(plan.inputs), 'file')}; would write {plan.output}")
 
 
 def print_files(paths: Sequence[Path], as_json: bool = False) -> None:

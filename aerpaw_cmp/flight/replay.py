@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from ..common.counting import counted
 from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
@@ -129,7 +130,7 @@ def replay_rss(
         poses = [valid_poses(track, rt.attitude) for track in tracks]
         joined = poses[0] if len(poses) == 1 else _joined_poses(poses)
         channels = ", ".join(data.rss[i].channel for i in members)
-        progress(f"replay RSS {tower} {channels}: {len(joined)} poses")
+        progress(f"replay RSS {tower} {channels}: {counted(len(joined), 'pose')}")
         towers_m = None if tower not in data.nodes else np.concatenate(places)
         replayed = replay_poses(data.site, rt, link, joined, towers_m=towers_m, progress=progress)
         fixed_m, start = data.site.towers[tower].position_m[None, :], 0
@@ -354,7 +355,7 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
         if track is not None:
             rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
         poses = Poses(position[valid], rotation)
-        progress(f"replay rank {series.tower}: {len(poses)} poses")
+        progress(f"replay rank {series.tower}: {counted(len(poses), 'pose')}")
         # H holds reflections alone, so nothing else is searched
         replayed = replay_poses(data.site, data.settings.rt, link, poses, towers_m=towers_m, progress=progress)
         out.append(Replayed(link=link, poses=poses, valid=valid, replay=replayed, track=track, tower_m=towers_m))

@@ -14,6 +14,7 @@ import numpy as np
 from shapely import affinity
 from shapely.geometry import Point, box
 
+from ..common.counting import counted
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import named
 from ..common.stages import Progress, begin_peak, peak_mib, silent
@@ -149,10 +150,10 @@ def speed_against_error(
         rows.append(case.replayed(Search(max_depth=depth)))
     for count in samples:
         for kind in ("synthetic", "explicit"):
-            progress(f"sionna, {count} samples, its own {kind} arrays")
+            progress(f"sionna, {counted(count, 'sample')}, its own {kind} arrays")
             chosen = spread_out(len(poses), len(poses) if kind == "synthetic" else explicit_poses)
             rows.append(case.own_arrays(count, kind, chosen))
-        progress(f"sionna, {count} samples")
+        progress(f"sionna, {counted(count, 'sample')}")
         rows.append(case.replayed(Search("sionna", max_depth=_DEPTH, samples=count, batch=BATCH)))
     return rows
 

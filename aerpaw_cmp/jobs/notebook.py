@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ..common.counting import counted
 from ..common.errors import UsageError
 from ..common.htmltable import html_table
 from ..common.jsonable import named
@@ -274,7 +275,7 @@ class Flight:
         return html_table(("tower", "channel", "quantity", "samples"), rows, self.settings.flight.name)
 
     def _span(self) -> str:
-        return "no track" if self.data.track is None else f"{len(self.track)} poses"
+        return "no track" if self.data.track is None else f"{counted(len(self.track), 'pose')}"
 
 
 class ReplayedFlight:

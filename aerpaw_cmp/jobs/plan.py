@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.counting import counted
 from ..common.stages import Stages
 from ..common.units import spread_out
 from ..flight.data import FlightData
@@ -118,17 +119,19 @@ def report_plan(
     rss, rank = _tried_replays(data)
     rt = settings.rt
     stages = [
-        PlannedStage("read", f"{len(inputs)} files", reading),
+        PlannedStage("read", counted(len(inputs), "file"), reading),
     ]
     if n_rss and settings.rss.lag in ("estimate", "apply"):
         stages.append(PlannedStage("clocks", f"{len({series.tower for series in data.rss})} receivers"))
     stages += [*rss, *rank, PlannedStage("compare", f"{n_rss} RSS and {n_rank} rank samples")]
     if rt.audit_links > 0:
-        stages.append(PlannedStage("audit", f"{min(rt.audit_links, n_rss + n_rank)} links by the other engine"))
+        stages.append(
+            PlannedStage("audit", f"{counted(min(rt.audit_links, n_rss + n_rank), 'link')} by the other engine")
+        )
     if n_rss and rt.engine == "image":
         stages.append(PlannedStage("ladder", "simpler and richer models"))
     drawn = 0 if figures == "none" else len(data.rss) + len(data.rank)
-    stages.append(PlannedStage("report", f"page, figures of {drawn} channels"))
+    stages.append(PlannedStage("report", f"page, figures of {counted(drawn, 'channel')}"))
     return Plan(job="report", inputs=tuple(inputs), output=out, stages=tuple(stages))
 
 
@@ -159,7 +162,7 @@ def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> P
     """The stage of one replay; a Sionna replay is not tried, since it compiles first."""
     from ..flight.replay import replay_poses
 
-    work, n = f"{len(poses)} poses, engine {rt.engine}", len(poses)
+    work, n = f"{counted(len(poses), 'pose')}, engine {rt.engine}", len(poses)
     if rt.engine != "image" or n == 0:
         return PlannedStage(name, work, None if n else 0.0)
 
@@ -215,7 +218,8 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
     links = positions * heights * len(place.towers)
     stages = [_tiles(place, settings, Tiling(grid, cells))] if cells else []
     for mode in () if cells else settings.foliage:
-        work = f"{links} links: {positions} positions, {heights} heights, {len(place.towers)} towers"
+        sides = (positions, "position"), (heights, "height"), (len(place.towers), "tower")
+        work = f"{counted(links, 'link')}: {', '.join(counted(*side) for side in sides)}"
         seconds: float | None = None
         if settings.engine == "image":
             coarse = dataclasses.replace(

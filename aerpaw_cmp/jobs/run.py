@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from ..common.counting import counted
 from ..common.errors import UsageError, noting_interrupts
 from ..common.files import cache_folder
 from ..common.inputs import input_files
@@ -327,7 +328,9 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
     if why := (metrics.get("rt") or {}).get("not_audited"):
         failed.append(f"audit: {why}")
     if audit.get("missing_paths"):
-        failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")
+        failed.append(
+            f"audit: the engine misses {counted(audit['missing_paths'], 'path')} that {audit['reference']} finds"
+        )
     failed += [f"audit of the field: {text}" for text in (audit.get("field") or {}).get("failures", ())]
     return tuple(failed)
 

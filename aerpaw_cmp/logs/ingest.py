@@ -13,6 +13,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..common.counting import counted
 from ..common.errors import InputError, UsageError, one_line, parsing
 from .files import archives, chunks, packed
 from .files.pieces import join
@@ -469,7 +470,7 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     if not result.accepted:
         first = f": {result.rejected[0].reason}" if result.rejected else ""
         raise InputError(
-            f"reader {reader.name!r} found no record in {result.lines} lines{first}",
+            f"reader {reader.name!r} found no record in {counted(result.lines, 'line')}{first}",
             expected=f"lines such as {reader.sample!r}",
             cause="a log of another kind, or an aborted run",
             path=path,
@@ -543,11 +544,16 @@ def _span(frame: pd.DataFrame) -> dict[str, Any]:
 # Columns of :func:`account_rows`.
 ACCOUNT = ("file", "reader", "streams (rows)", "lines", "accepted", "rejected", "blank", "rate Hz", "start UTC", "s")
 
+MOST_NAMED = 6
 
-def account_rows(account: Mapping[str, Any]) -> tuple[str, list[list[str]]]:
-    """A summary for people: the folder that all paths share, and a row of :data:`ACCOUNT` per file."""
+
+def account_rows(account: Mapping[str, Any], every_stream: bool = False) -> tuple[str, list[list[str]]]:
+    """A summary for people: the folder that all paths share, and a row of :data:`ACCOUNT` per file.
+
+    Of more than :data:`MOST_NAMED` streams of a kind, as in a wide table, only the number unless all are wanted.
+    """
     folder = _common_folder([Path(file["path"]) for file in account["files"]])
-    return folder, [_account_row(file, folder) for file in account["files"]]
+    return folder, [_account_row(file, folder, every_stream) for file in account["files"]]
 
 
 def _common_folder(paths: Sequence[Path]) -> str:
@@ -557,7 +563,7 @@ def _common_folder(paths: Sequence[Path]) -> str:
     return os.path.commonpath([path.parent for path in paths])
 
 
-def _account_row(file: Mapping[str, Any], folder: str) -> list[str]:
+def _account_row(file: Mapping[str, Any], folder: str, every_stream: bool) -> list[str]:
     streams = file["streams"]
     kinds: dict[str, list[str]] = {}
     for stream in streams:
@@ -567,7 +573,11 @@ def _account_row(file: Mapping[str, Any], folder: str) -> list[str]:
     return [
         one_line(str(Path(file["path"]).relative_to(folder) if folder else file["path"])),
         file["reader"],
-        "; ".join(f"{kind}: {', '.join(names)}" for kind, names in kinds.items()) or "-",
+        "; ".join(
+            f"{kind}: {', '.join(names) if every_stream or len(names) <= MOST_NAMED else f'{len(names)} (--all)'}"
+            for kind, names in kinds.items()
+        )
+        or "-",
         *(str(file[key]) for key in ("lines", "accepted", "rejected", "blank")),
         ", ".join(sorted(rates)) or "-",
         start,

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..common.counting import counted
 from ..common.errors import UsageError
 from ..common.units import BoolArray, ComplexArray, FloatArray, db_from_power, wavelength_m
 from ..site.site import Site
@@ -103,8 +104,8 @@ class Replay:
     def __repr__(self) -> str:
         """One line: the arrays are too large to be shown."""
         return (
-            f"Replay({len(self.has_path)} poses, towers {', '.join(self.towers)}, engine {self.engine!r}, "
-            f"{len(self.paths)} paths, coverage {100 * self.has_path.mean():.0f} %, {self.seconds:.2f} s)"
+            f"Replay({counted(len(self.has_path), 'pose')}, towers {', '.join(self.towers)}, engine {self.engine!r}, "
+            f"{counted(len(self.paths), 'path')}, coverage {100 * self.has_path.mean():.0f} %, {self.seconds:.2f} s)"
         )
 
     def path_table(self) -> PathTable:

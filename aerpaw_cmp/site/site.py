@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from shapely.geometry import Polygon
 
+from ..common.counting import counted
 from ..common.geodesy import SiteFrame
 from ..common.htmltable import html_table
 from ..common.units import FloatArray
@@ -225,5 +226,5 @@ class Site:
     def _repr_html_(self) -> str:
         """Towers and their places, for notebooks."""
         rows = [(name, *(f"{metres:.1f}" for metres in tower.position_m)) for name, tower in self.towers.items()]
-        caption = f"{self.name}: {len(self.buildings)} buildings, {len(self.trees)} trees"
+        caption = f"{self.name}: {counted(len(self.buildings), 'building')}, {counted(len(self.trees), 'tree')}"
         return html_table(("tower", "east [m]", "north [m]", "up [m]"), rows, caption)

@@ -90,7 +90,7 @@ def test_a_planned_map_counts_its_links(tmp_path: Path, capsys: pytest.CaptureFi
     quick = ["map", "--quick", "--foliage", "none", "-o", tmp_path / "m"]
     plan = planned(capsys, *quick)
     maps, study, last = plan["stages"]
-    assert maps["work"] == "2295 links: 153 positions, 3 heights, 5 towers"
+    assert maps["work"] == "2\N{NARROW NO-BREAK SPACE}295 links: 153 positions, 3 heights, 5 towers"
     assert study["name"] == "study"
     assert last["seconds"] is None
     assert maps["seconds"] > 0

@@ -91,6 +91,16 @@ def test_the_account_for_people_names_lines_and_files(tmp_path: Path) -> None:
     assert account_rows(summary(Ingested())) == ("", [])
 
 
+def test_a_wide_table_takes_one_line_unless_all_is_wanted(tmp_path: Path) -> None:
+    (tmp_path / "wide.csv").write_text(
+        "time," + ",".join(f"rssi_ch{i}_dbm" for i in range(47)) + "\n"
+        + "".join(f"2025-06-01T10:00:{k:02d}Z" + ",-70" * 47 + "\n" for k in range(9))
+    )  # fmt: skip
+    account = summary(ingest(tmp_path))
+    assert account_rows(account)[1][0][2] == "rss: 47 (--all)"
+    assert account_rows(account, every_stream=True)[1][0][2].count(" 9") == 47
+
+
 @pytest.mark.parametrize(
     ("paths", "folder", "names"),
     [

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 from typer.core import TyperCommand
 
+from ...common.counting import counted
 from ...common.errors import UsageError, one_line
 from ..app import Json, command, output
 from ..shown import print_files, print_json, say, show
@@ -80,8 +81,15 @@ def tap(
     summaries = tap_modems(settings, port or [None], shown, on_status=line)
     for summary in summaries:
         rates = ", ".join(f"{name} {rate:.2f} Hz" for name, rate in summary.rates_hz.items())
-        lost = f", {summary.lost_records} records lost (the disk did not take them)" if summary.lost_records else ""
-        say(f"{line.end}ended: {summary.reason}; {summary.records} records{lost}, {summary.gaps} gaps; {rates}")
+        lost = (
+            f", {counted(summary.lost_records, 'record')} lost (the disk did not take them)"
+            if summary.lost_records
+            else ""
+        )
+        say(
+            f"{line.end}ended: {summary.reason}; {counted(summary.records, 'record')}{lost}, "
+            f"{counted(summary.gaps, 'gap')}; {rates}"
+        )
     if as_json:
         print_json(json_safe(summaries[0] if len(summaries) == 1 else {"modems": summaries}))
     else:

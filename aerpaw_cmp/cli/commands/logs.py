@@ -39,6 +39,7 @@ def ingest(
         Option("--map", metavar="COLUMN=QUANTITY", help="Content of a CSV column: time, rss_db, rank, ..."),
     ] = None,
     unit: Annotated[str | None, Option(help="Unit of levels, if the file does not state it.")] = None,
+    every_stream: Annotated[bool, Option("--all", help="Name every stream of a wide table.")] = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -54,7 +55,7 @@ def ingest(
     if as_json:
         print_json(summary)
         return
-    folder, rows = account_rows(summary)
+    folder, rows = account_rows(summary, every_stream)
     table(list(ACCOUNT), rows, f"files below {folder}" if folder else None)
     for note in account_notes(summary):
         say(note)

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from ...common import files as cached
+from ...common.counting import counted
 from ..app import Json, command
 from ..shown import print_json, records, say, show
 
@@ -51,7 +52,8 @@ def bench(
 def _conditions(at: Mapping[str, Any]) -> str:
     """Conditions of a benchmark in words."""
     towers = ", ".join(at["towers"])
-    return f"{at['poses']} positions, towers {towers}, {at['buildings']} buildings, {at['cpus']} CPUs"
+    buildings = counted(at["buildings"], "building")
+    return f"{counted(at['poses'], 'position')}, towers {towers}, {buildings}, {at['cpus']} CPUs"
 
 
 @command(
@@ -69,7 +71,7 @@ def doctor(
     """Check this machine."""
     if clear_cache:
         files, size = cached.clear_cache()
-        say(f"cache: {files} files removed, {size / 1e6:.1f} MB")
+        say(f"cache: {counted(files, 'file')} removed, {size / 1e6:.1f} MB")
     from ...machine import doctor as doctor_room
 
     checks = doctor_room.checks()

@@ -8,6 +8,7 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
+from ...common.counting import counted
 from ...jobs.options import RunOptions
 from ..app import Flights, Force, Json, LogsRoot, command, output
 from ..shown import print_json, records, say, show, warn_all
@@ -194,7 +195,10 @@ def channel(
         print_json(outcome.metrics)
         return
     m = outcome.metrics
-    show(f"{m['paths']} paths, {m['poses']} poses, towers {', '.join(m['towers'])}, link {m['link']}")
+    show(
+        f"{counted(m['paths'], 'path')}, {counted(m['poses'], 'pose')}, towers {', '.join(m['towers'])}, "
+        f"link {m['link']}"
+    )
     warn_all(m["warnings"])
     for file in outcome.files:
         show(file)

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError, one_line
 from ...common.yamlfile import parse_yaml
 from ...logs.ingest import IngestedFile, name_inside, read_log
@@ -159,7 +160,7 @@ def draft(
     checks = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
     proved = [f"no sample of this draft can be compared: {proof.reason}"]
     if not proof.reason:
-        proved = [f"{proof.samples} samples can be compared", *proof.lost]
+        proved = [f"{counted(proof.samples, 'sample')} can be compared", *proof.lost]
     return text, proved + checks + [f"left out: {remark}" for remark in entries.out]
 
 

@@ -152,7 +152,9 @@ def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str
     records, gaps = sum(s.records for s in summaries), sum(s.gaps for s in summaries)
     lost = sum(s.lost_records for s in summaries)
     at = time.strftime("%H:%M:%S", time.gmtime())
-    counts = f"{records} records, {counted(gaps, 'gap')}" + (f", {lost} records lost" if lost else "")
+    counts = f"{counted(records, 'record')}, {counted(gaps, 'gap')}" + (
+        f", {counted(lost, 'record')} lost" if lost else ""
+    )
     text = f"The tap ended at {at} UTC ({summaries[0].reason}): {counts}. The log is in {folder}."
     return {"text": text, "commands": _report_commands(folder, twin)}
 

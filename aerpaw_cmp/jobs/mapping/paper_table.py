@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import yaml
 
+from ...common.counting import counted
 from ...common.units import finite_mean, power_from_db
 from ...maps.job import Antennas
 from ...maps.study import rank_fields
@@ -64,7 +65,7 @@ def _setup(outcome: MapOutcome) -> dict[str, str]:
         "interval": f"{s.spacing_m:g} m",
         "locations": f"{columns} x {rows} = {columns * rows}",
         "materials": f"{', '.join(buildings)}, {site.ground_material} (ITU-R P.2040)",
-        "trees": f"{_spans(tree.height_m)} and {_spans(tree.crown_diameter_m)}, {len(tree)} trees",
+        "trees": f"{_spans(tree.height_m)} and {_spans(tree.crown_diameter_m)}, {counted(len(tree), 'tree')}",
     }
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from ...common.counting import counted
 from ...common.errors import UsageError
 from ...common.geodesy import SiteFrame
 from ...common.outputs import OutputFile, OutputFolder, is_sealed, sealed
@@ -125,7 +126,7 @@ def _summary(scene: TriangleScene) -> str:
     low, high = bounds(scene)
     size = " x ".join(f"{v:.0f}" for v in high - low)
     used = sorted({scene.materials[s] for s in set(scene.shape.tolist())})
-    return f"{len(scene.shapes)} shapes, {len(scene)} triangles, {size} m, of {', '.join(used)}"
+    return f"{counted(len(scene.shapes), 'shape')}, {counted(len(scene), 'triangle')}, {size} m, of {', '.join(used)}"
 
 
 def _pair(text: str, option: str, example: str) -> tuple[str, str]:

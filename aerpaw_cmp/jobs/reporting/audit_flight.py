@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.jsonable import named
 from ...common.stages import Progress, silent
 from ...common.units import AnyArray, FloatArray, spread_out
@@ -121,7 +122,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         count = len(replayed.poses)
         links = min(count, max(math.ceil(data.settings.rt.audit_links * count / max(total, 1)), 1))
         if links:
-            progress(f"audit {replayed.replay.towers[0]}: {links} links")
+            progress(f"audit {replayed.replay.towers[0]}: {counted(links, 'link')}")
             second = Second(links=links, expected=expected, ks=ks, reference_links=few, known=known)
             parts.append(_of_series(data.settings.rt, site, replayed, second))
     if not parts:

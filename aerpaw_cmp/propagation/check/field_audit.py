@@ -18,6 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ...common.content import content_digest
+from ...common.counting import counted
 from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray
 from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
@@ -188,7 +189,7 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
         sequence = link.sequence(int(row))
         if sequence is None or reference.verdict(sequence, link.target) is False:
             count += 1
-    failures = (f"{count} paths that cannot exist",) if count else ()
+    failures = (f"{counted(count, 'path')} that cannot exist",) if count else ()
     return FieldAudit(phantom_paths=count, failures=failures)
 
 
@@ -248,7 +249,7 @@ class _OneLink:
             phantom += verdict is False
             doubtful += verdict is None
         if phantom:
-            failures.append(f"{self.name}: {phantom} paths that cannot exist")
+            failures.append(f"{self.name}: {counted(phantom, 'path')} that cannot exist")
         if complete and not nowhere:
             for sequence in self.reference.sequences(self.target, max_depth) or ():
                 if self.reference.verdict(sequence, self.target) and (key := _key(sequence)) not in keys:

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
+from ...common.counting import counted
 from ...compare.judge.report_difference import LevelDifference, Overlap, RankDifference
 from ...compare.statistics.intervals import PairedDifference
 
@@ -106,7 +107,7 @@ def _level_clauses(level: LevelDifference) -> Iterator[str]:
 def _alone(samples: Overlap) -> str:
     """Number of samples that are in one report alone, in words."""
     sides = ((samples.only_first, "first"), (samples.only_second, "second"))
-    return ", ".join(f"{n} samples only in the {name}" for n, name in sides if n)
+    return ", ".join(f"{counted(n, 'sample')} only in the {name}" for n, name in sides if n)
 
 
 def _rank_clauses(rank: RankDifference) -> Iterator[str]:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.units import FloatArray, IntArray
 from ...site.site import Site
 from ..content.campaign import CampaignData, RssRow, place_means
@@ -209,7 +210,7 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
         if cell_mean:
             residual = np.array([mean for mean, _ in cell_mean.values()])
             mesh = _cells(ax, data, np.array(list(cell_mean)), residual, reach, [row.tower])
-        ax.set_title(f"{row.flight} ({count(row.n)} samples)")
+        ax.set_title(f"{row.flight} ({counted(row.n, 'sample')})")
         ax.label_outer()
     _frame(axes[0][0], data, cells, [rows[0].tower], shape)
     if mesh is not None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.units import FloatArray
 from ...compare.level.rss import PART_DB
 from ...compare.rank import RankFit
@@ -312,7 +313,7 @@ def rank_histograms(panel: RankResult) -> Figure:
     fig, ax = subplots((9.2, 3.4))
     reported = int(np.isfinite(panel.measured).sum())
     score = panel.score
-    series = [(f"measured ({count(reported)} samples)", score.histogram, score.histogram_ci95)]
+    series = [(f"measured ({counted(reported, 'sample')})", score.histogram, score.histogram_ci95)]
     series += [(_at_label(k, fit), fit.histogram, fit.histogram_ci95) for k, fit in score.simulated.items()]
     width = 0.8 / len(series)
     from matplotlib import colormaps

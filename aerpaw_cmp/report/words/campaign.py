@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ...common.counting import counted
 from ...compare.flight_verdict import pooled_db
 from ...compare.judge.verdicts import Verdict, campaign_verdict
 from ...compare.level.rss import LEARNED_HERE
@@ -97,7 +98,7 @@ def _ranked_words(data: CampaignData) -> list[str]:
         return []
     first = (
         f"With the offset of the other flights, {ranking[0].setting} has the smallest error "
-        f"({ranking[0].mean_db:.2f} dB over {ranking[0].n_flights} flights). "
+        f"({ranking[0].mean_db:.2f} dB over {counted(ranking[0].n_flights, 'flight')}). "
     )
     return [first + ranking_sentence({entry.setting: entry.verdict for entry in ranking[1:]}, _FEW_SETTINGS)]
 

@@ -74,10 +74,10 @@ def headline(data: ReportData) -> str:
         towers = list(dict.fromkeys(panel.tower for panel in data.rss))
         samples = sum(len(panel.time) for panel in data.rss)
         panels = "1 channel" if len(data.rss) == 1 else f"{len(data.rss)} tower channels"
-        parts.append(f"received signal strength at {_listed(towers)} ({panels}, {count(samples)} samples)")
+        parts.append(f"received signal strength at {_listed(towers)} ({panels}, {counted(samples, 'sample')})")
     if data.rank:
         samples = sum(len(panel.time) for panel in data.rank)
-        parts.append(f"channel rank at {_listed([panel.tower for panel in data.rank])} ({count(samples)} samples)")
+        parts.append(f"channel rank at {_listed([panel.tower for panel in data.rank])} ({counted(samples, 'sample')})")
     if not parts:
         return "This flight holds no radio measurement that could be compared; only its track and inputs are shown."
     engine = "" if data.engine is None else f" by the {data.engine.engine} engine"
@@ -218,10 +218,10 @@ def audit_summary(audit: AuditResult) -> str:
     str
     """
     fields = audit.fields
-    texts = [f"Audit, {count(audit.links)} links against {audit.reference}: {audit_paths(audit)}."]
+    texts = [f"Audit, {counted(audit.links, 'link')} against {audit.reference}: {audit_paths(audit)}."]
     if fields is not None:
         texts.append(
-            f"Field: {count(fields.paths)} paths against {audit.reference}'s own coefficients, worst "
+            f"Field: {counted(fields.paths, 'path')} against {audit.reference}'s own coefficients, worst "
             f"{fields.power_max_db:.2g} dB and {fields.phase_max_rad:.2g} rad."
         )
         texts.append(f"Checks failed: {count(len(fields.failures))}.")
@@ -233,7 +233,7 @@ def audit_summary(audit: AuditResult) -> str:
 
 def audit_paths(audit: AuditResult) -> str:
     """Paths that one engine alone has, and the level that they make: half a sentence of the card and of the summary."""
-    parts = [f"{count(audit.missing_paths)} paths missing"]
+    parts = [f"{counted(audit.missing_paths, 'path')} missing"]
     if audit.extra_paths:
         tested = audit.fields is not None and not audit.fields.phantom_paths
         parts.append(
@@ -324,8 +324,9 @@ def _detection_words(panel: RssResult) -> str:
         return ""
     floor = f"{Printed(score.floor_db):.0f}"
     return (
-        f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of {score.n} samples: the "
-        f"Brier score is {score.brier:.2f} by the predicted level ({learned_on(score)}), {score.constant_brier:.2f} by "
+        f" The receiver detected the signal in {100 * score.n_detected / score.n:.0f} % of "
+        f"{counted(score.n, 'sample')}: the Brier score is {score.brier:.2f} by the predicted level "
+        f"({learned_on(score)}), {score.constant_brier:.2f} by "
         f"that share alone. With lower levels counted as {floor}: RMSE {score.rmse_db:.1f} dB (free space: "
         f"{score.free_space_rmse_db:.1f} dB)."
     )

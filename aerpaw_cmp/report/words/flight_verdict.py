@@ -196,9 +196,9 @@ def headlines(data: ReportData) -> list[Headline]:
 def _audit(audit: AuditResult) -> Headline:
     """Failed checks of the audit; paths that the other engine did not sample are no fault of ours."""
     fields = audit.fields
-    extent = f"{words.count(audit.links)} links against {audit.reference}"
+    extent = f"{counted(audit.links, 'link')} against {audit.reference}"
     if fields is None:
-        value = f"{words.count(audit.missing_paths)} paths missing"
+        value = f"{counted(audit.missing_paths, 'path')} missing"
     else:
         value = f"{words.count(len(fields.failures))} failed"
     return Headline(label="Audit", value=value, interval=words.audit_paths(audit), reference=extent)

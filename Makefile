@@ -51,8 +51,9 @@ report: $(READY) $(LLVM)
 # the order of files is that of tests/conftest.py: the dearest first
 WORKERS := -q -n auto --dist loadfile --no-loadscope-reorder
 
-# mypy uses one core, so it runs beside pytest; what it says comes last
+# mypy uses one core, so it runs beside pytest; what it says comes after, and last which tests were skipped and why
 test: setup
+	@command -v chromedriver >/dev/null || $(BIN)/python tools/setup_browser.py
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
@@ -60,6 +61,7 @@ test: setup
 	echo "$(BIN)/python -m pytest $(WORKERS)"; \
 	$(BIN)/python -m pytest $(WORKERS); tested=$$?; \
 	echo "$(BIN)/mypy"; wait $$types; typed=$$?; cat "$$said"; rm -f "$$said"; \
+	cat .pytest_cache/d/skipped/said; rm -f .pytest_cache/d/skipped/said; \
 	[ $$tested -eq 0 ] && [ $$typed -eq 0 ]
 
 $(READY_DOCS): $(READY) requirements/docs.txt

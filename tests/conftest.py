@@ -8,7 +8,8 @@ import random
 import shutil
 import signal
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import pytest
 from _pytest.doctest import DoctestModule
 from hypothesis import settings
 
+from aerpaw_cmp.common.counting import counted
 from tests.real_logs import REAL
 
 # In CI the same examples run every time, so that a red run can be repeated; elsewhere every run looks further.
@@ -66,6 +68,20 @@ DEAREST = (
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--shuffle SEED``: no test may need another to have run before it."""
     parser.addoption("--shuffle", type=int, default=None, metavar="SEED", help="files, and tests in them, in any order")
+
+
+def skips(reasons: Iterable[str]) -> str:
+    """How many tests were skipped and why, as the last line of ``make test``."""
+    counts = Counter(reason.removeprefix("Skipped: ") for reason in reasons)
+    return (
+        "; ".join(f"skipped: {counted(n, 'test')}, {reason}" for reason, n in counts.most_common()) or "skipped: none"
+    )
+
+
+def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+    if (cache := getattr(config, "cache", None)) is not None:
+        reasons = (str(report.longrepr[2]) for report in terminalreporter.stats.get("skipped", ()))
+        (cache.mkdir("skipped") / "said").write_text(skips(reasons) + "\n")
 
 
 def pytest_unconfigure() -> None:

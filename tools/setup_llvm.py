@@ -36,6 +36,24 @@ def root_prefix() -> list[str] | None:
     return [sudo] if sys.stdin is not None and sys.stdin.isatty() else None
 
 
+def apt(say: Callable[[str], None]) -> Callable[..., bool] | None:
+    """apt-get of this machine, which tells ``say`` each command and answers whether it did it; None where it cannot."""
+    prefix = root_prefix()
+    if prefix is None or not llvm.os_families() & {"debian", "ubuntu"} or shutil.which("apt-get") is None:
+        return None
+
+    def apt_get(*arguments: str) -> bool:
+        command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", *arguments]
+        say(" ".join(command))
+        # a person may have to answer sudo; apt itself asks nothing
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+        if done.returncode:
+            say(done.stdout.strip()[-1000:])
+        return done.returncode == 0
+
+    return apt_get
+
+
 def install(
     say: Callable[[str], None], attempt: Callable[[llvm.Library], llvm.Trial] | None = None
 ) -> llvm.Trial | None:
@@ -53,18 +71,9 @@ def install(
     Trial or None
         The trial of what was installed; None if nothing could be (not Debian or Ubuntu, no root, no package).
     """
-    prefix = root_prefix()
-    if prefix is None or not llvm.os_families() & {"debian", "ubuntu"} or shutil.which("apt-get") is None:
+    apt_get = apt(say)
+    if apt_get is None:
         return None
-
-    def apt_get(*arguments: str) -> bool:
-        command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", *arguments]
-        say(" ".join(command))
-        # a person may have to answer sudo; apt itself asks nothing
-        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
-        if done.returncode:
-            say(done.stdout.strip()[-1000:])
-        return done.returncode == 0
 
     def apt_install(*packages: str) -> llvm.Trial | None:
         if not apt_get("install", "-y", "-qq", "--no-install-recommends", *packages):

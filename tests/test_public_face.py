@@ -161,7 +161,7 @@ def test_trace_takes_plain_positions_and_equals_free_space_where_nothing_reflect
     data = traced.to_xarray()
     assert data.rss_dbm.sel(tower="LW1").item() == traced.rss_dbm[0, 0]
     assert (data.h_real + 1j * data.h_imag).values.tobytes() == traced.h.tobytes()
-    assert "1 poses, towers LW1" in repr(traced)
+    assert "1 pose, towers LW1" in repr(traced)
     with pytest.raises(Exception, match="positions"):
         ac.trace(site, link, [[1.0, 2.0]])
 

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import logging
+import re
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -23,8 +26,20 @@ class Progress(Protocol):
     def __call__(self, text: str, fraction: float | None = None, /) -> object: ...  # noqa: D102
 
 
-def silent(_text: str, _fraction: float | None = None, /) -> None:
-    """No progress."""
+# a package prints nothing of its own accord: who wants its log gives this logger a handler, or calls basicConfig
+logging.getLogger("aerpaw_cmp").addHandler(logging.NullHandler())
+
+
+def logged(text: str, fraction: float | None = None, /) -> None:
+    """Progress of what Python calls: INFO, shares DEBUG, on the logger of its room, such as ``aerpaw_cmp.flight``."""
+    frame = sys._getframe(1)
+    while frame.f_back is not None and not re.match(r"aerpaw_cmp\.(?!common)", frame.f_globals["__name__"]):
+        frame = frame.f_back
+    room = ".".join(frame.f_globals["__name__"].split(".")[:2])
+    if fraction is None:
+        logging.getLogger(room).info(text)
+    else:
+        logging.getLogger(room).debug("%s %.0f %%", text, 100 * fraction)
 
 
 def duration(seconds: float) -> str:
@@ -69,7 +84,7 @@ class Stages:
     ['read']
     """
 
-    progress: Progress = silent
+    progress: Progress = logged
     seconds: dict[str, float] = field(default_factory=dict)
 
     @contextmanager

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..common.counting import counted
-from ..common.stages import Progress, Stages, share_of, silent
+from ..common.stages import Progress, Stages, logged, share_of
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.drivers.moving import replay_moving
@@ -114,7 +114,7 @@ def replay_flight(data: FlightData, stages: Stages | None = None) -> FlightRepla
 
 
 def replay_rss(
-    data: FlightData, progress: Progress = silent, clocks: Sequence[Clock | None] | None = None
+    data: FlightData, progress: Progress = logged, clocks: Sequence[Clock | None] | None = None
 ) -> list[Replayed]:
     """Replay every RSS series; series of one tower with equal links are replayed together."""
     groups: dict[tuple[str, str], list[int]] = {}
@@ -175,7 +175,7 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
     return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
 
 
-def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock | None]:
+def estimate_clocks(data: FlightData, progress: Progress = logged) -> list[Clock | None]:
     """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; series of one computer share it.
 
     Predictions are the image engine's RSS along the track with at most one reflection.
@@ -337,7 +337,7 @@ def part_of(replayed: Replay, start: int, stop: int) -> Replay:
     )
 
 
-def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]:
+def replay_rank(data: FlightData, progress: Progress = logged) -> list[Replayed]:
     """Replay every rank series with the arrays of ``link.rank``.
 
     Position and attitude come each from what has them: positions from the log where it holds its own, else from the
@@ -386,7 +386,7 @@ def replay_poses(
     *,
     towers_m: FloatArray | None = None,
     engine: Engine | None = None,
-    progress: Progress = silent,
+    progress: Progress = logged,
 ) -> Replay:
     """Replay poses as the flight's ``rt`` asks, foliage included; ``engine`` in place of ``rt.engine``.
 

@@ -21,7 +21,7 @@ from ..common.errors import UsageError
 from ..common.files import inside
 from ..common.geodesy import SiteFrame, bearing_deg
 from ..common.outputs import SUMS, OutputFolder
-from ..common.stages import Progress, silent
+from ..common.stages import Progress, logged
 from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
 from ..common.yamlfile import dump_yaml
 from ..compare.rank import channel_rank
@@ -249,7 +249,7 @@ class FlightSimulator:
         self.folder = folder
 
     def run(
-        self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, progress: Progress = silent
+        self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, progress: Progress = logged
     ) -> list[Path]:
         """Write a folder with every log of the flight file, the file itself and truth.json; gives the paths written.
 

@@ -17,7 +17,7 @@ from shapely.geometry import Point, box
 from ..common.counting import counted
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import named
-from ..common.stages import Progress, begin_peak, peak_mib, silent
+from ..common.stages import Progress, begin_peak, logged, peak_mib
 from ..common.units import ComplexArray, FloatArray, IntArray, spread_out, wavelength_m
 from ..compare.rank import channel_rank
 from ..propagation.check.audit import RANK_K, Difference, compare
@@ -56,7 +56,7 @@ def run_bench(
     poses: int = 200,
     samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
     ratios: bool = True,
-    progress: Progress = silent,
+    progress: Progress = logged,
 ) -> dict[str, Any]:
     """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
 
@@ -115,7 +115,7 @@ def speed_against_error(
     samples: Sequence[int] = (1_000, 10_000, 100_000, 1_000_000),
     depths: Sequence[int] = (0, 1, 2, 3),
     explicit_poses: int = 50,
-    progress: Progress = silent,
+    progress: Progress = logged,
 ) -> list[Row]:
     """Rows of speed against error: ways to replay the same poses, each held against the image engine at depth 2.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -79,6 +80,8 @@ def open_flight(
         raise UsageError("flight=NAME beside a flight.yaml", expected="a flight file of several flights", path=file)
     settings = _drafted(file, flight) if drafted else load_with_learned(file)
     data = load_data(overridden(settings, overrides or {}), file.parent, root)
+    for warning in data.warnings:
+        logging.getLogger("aerpaw_cmp.flight").warning(warning)
     changed = ("the draft of its flight file",) if drafted else ()
     return Flight(file, data, root, changed=(*changed, *(overrides or ())))
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..common.stages import Progress, silent
+from ..common.stages import Progress, logged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,7 +34,7 @@ class RunOptions:
     force: bool = False
     workers: int = 1
     scheduler: str | None = None
-    progress: Progress = silent
+    progress: Progress = logged
 
 
 DEFAULT = RunOptions()

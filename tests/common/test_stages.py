@@ -24,6 +24,17 @@ def test_stages_keep_their_order_and_add_up() -> None:
     assert calls == [("read", None), ("replay", None), ("fails", None), ("maps", 0.5)]
 
 
+def test_what_python_calls_is_logged_by_its_room(
+    caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
+) -> None:
+    program = "with stages('replay'):\n    share_of(stages.progress, 'replay LW1')(0.5)"
+    with caplog.at_level("DEBUG", logger="aerpaw_cmp"):
+        exec(program, {"__name__": "aerpaw_cmp.flight.replay", "stages": Stages(), "share_of": share_of})
+    lines = [(record.name, record.levelname, record.getMessage()) for record in caplog.records]
+    assert lines == [("aerpaw_cmp.flight", "INFO", "replay"), ("aerpaw_cmp.flight", "DEBUG", "replay LW1 50 %")]
+    assert capfd.readouterr() == ("", "")
+
+
 def test_a_share_is_a_line_per_quarter_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     progress = shown.ProgressLines()
     for i in range(101):

@@ -15,7 +15,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.files import seal
-from aerpaw_cmp.common.stages import silent
+from aerpaw_cmp.common.stages import logged
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import sample
@@ -37,8 +37,8 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def run_tasks(tasks: list[Task], workers: Workers, keep: Path | None = None) -> list[Outcome]:
     """All tasks in order, as a campaign runs them."""
     store = None if keep is None else outcome_store(keep)
-    outcomes, orders = kept_outcomes(tasks, store, silent)
-    compute(orders, workers, outcomes, store, silent)
+    outcomes, orders = kept_outcomes(tasks, store, logged)
+    compute(orders, workers, outcomes, store, logged)
     return [outcomes[number] for number in range(len(tasks))]
 
 

@@ -81,7 +81,7 @@ def test_paths_that_the_other_engine_lacks_are_invented_only_where_none_can_be()
     )[0]
     planted = dataclasses.replace(replayed, contributions=(dataclasses.replace(replayed.paths, faces=faces),))
     audit = impossible(SITE, POSES, planted, every, Expected.of(LINK))
-    assert (audit.phantom_paths, audit.failures) == (1, ("1 paths that cannot exist",))
+    assert (audit.phantom_paths, audit.failures) == (1, ("1 path that cannot exist",))
     assert impossible(SITE, POSES, planted, np.setdiff1d(every, row), Expected.of(LINK)).phantom_paths == 0
 
 

@@ -17,7 +17,7 @@ import numpy as np
 
 from ...common.counting import counted
 from ...common.jsonable import named
-from ...common.stages import Progress, silent
+from ...common.stages import Progress, logged
 from ...common.units import AnyArray, FloatArray, spread_out
 from ...compare.level.field_difference import FieldAudit
 from ...compare.result import AuditResult, EngineResult
@@ -57,7 +57,7 @@ _NOT_COVERED = (
 
 
 def audit_replays(
-    data: FlightData, replays: Sequence[Replayed], progress: Progress = silent, *, anew: bool = True
+    data: FlightData, replays: Sequence[Replayed], progress: Progress = logged, *, anew: bool = True
 ) -> EngineResult:
     """The engine record, with the audit where ``rt.audit_links`` asks for one.
 

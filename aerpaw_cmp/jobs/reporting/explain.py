@@ -14,7 +14,7 @@ import numpy as np
 
 from ...common.errors import UsageError
 from ...common.jsonable import fields_of, json_object
-from ...common.stages import Progress, silent
+from ...common.stages import Progress, logged
 from ...common.units import FloatArray
 from ...flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
 from ...flight.gains.losses import path_loss, roughness_loss
@@ -81,7 +81,7 @@ def run_explain(
     channel: str | None = None,
     engine: Engine | None = None,
     logs_root: Path | None = None,
-    progress: Progress = silent,
+    progress: Progress = logged,
 ) -> Explanation:
     """Explain the link to a tower at the sample nearest to an instant.
 

@@ -29,7 +29,7 @@ from typing import Any, Protocol
 
 from ...common.counting import counted
 from ...common.errors import InputError, UsageError
-from ...common.stages import Progress, silent
+from ...common.stages import Progress, logged
 from .outcomes import code_digest
 
 # What is done with an item; it can be pickled.
@@ -200,7 +200,7 @@ class Cluster:
         Told when no worker is there.
     """
 
-    def __init__(self, client: Any, progress: Progress = silent) -> None:
+    def __init__(self, client: Any, progress: Progress = logged) -> None:
         self._client, self._progress = client, progress
         self._counted_s = self._staffed_s = time.monotonic()
 
@@ -271,7 +271,7 @@ def open_workers(
     scheduler: str | None = None,
     *,
     paths: Sequence[Path] = (),
-    progress: Progress = silent,
+    progress: Progress = logged,
 ) -> Iterator[Workers]:
     """Workers for the tasks of a job.
 

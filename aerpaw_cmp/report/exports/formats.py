@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ...common.errors import UsageError
-from ...common.stages import Progress, silent
+from ...common.stages import Progress, logged
 
 if TYPE_CHECKING:
     from .points import Export
@@ -60,7 +60,7 @@ def _installed(module: str) -> bool:
         return False
 
 
-def write_exports(export: Export, folder: Path, formats: Iterable[str], progress: Progress = silent) -> list[Path]:
+def write_exports(export: Export, folder: Path, formats: Iterable[str], progress: Progress = logged) -> list[Path]:
     """Write the files of some formats into ``folder / "exports"``.
 
     Parameters

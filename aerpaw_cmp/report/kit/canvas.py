@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...common.stages import Progress, silent
+from ...common.stages import Progress, logged
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray, spread_out
 from ...logs.records import has_wall_clock
 from ...site.scenes import drawn_buildings
@@ -195,7 +195,7 @@ def write_figures(
     folder: Path,
     formats: Sequence[str] = ("svg", "png"),
     kind: str = "screen",
-    progress: Progress = silent,
+    progress: Progress = logged,
 ) -> tuple[list[Picture], list[Path]]:
     """Draw figures and write each in its formats; gives the pictures and the files.
 

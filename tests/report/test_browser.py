@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -278,3 +279,28 @@ def test_no_error_of_a_model_is_shown_on_the_flight_it_was_learned_from(small_re
         assert "RMSE with" in browser.execute_script("return document.getElementById('span').textContent")
     finally:
         browser.quit()
+
+
+def test_every_chart_is_saved_as_it_is_shown(driver):
+    """Buttons of a chart: the same marks and words as SVG, the picture, and a row for each of its points."""
+    driver.execute_script(
+        "window.files = {}; URL.createObjectURL = blob => { window.last = blob; return 'blob:'; };"
+        "HTMLAnchorElement.prototype.click = function () { window.last.text().then(t => { files[this.download] = t; }); };"
+        "document.querySelectorAll('details').forEach(d => { d.open = true; });"
+    )
+    frame(driver)
+    driver.execute_script("document.querySelectorAll('.key button').forEach(b => b.click())")
+    names = "new Set([...document.querySelectorAll('.key button')].map(b => b.title + b.textContent))"
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    ready = f"return Object.keys(files).length === {names}.size"
+    WebDriverWait(driver, 20).until(lambda d: d.execute_script(ready))
+    files = driver.execute_script("return files")
+    assert files["Residuals.svg"].count("<rect") == 31  # the paper and the bars
+    assert "Samples</text>" in files["Residuals.svg"]
+    ElementTree.fromstring(files["Residuals.svg"])
+    rows = files["Residuals.csv"].splitlines()
+    assert sum(int(row.split(",")[1]) for row in rows[1:]) == driver.execute_script("return explorer.statistics().n")
+    shown = driver.execute_script("return explorer.series(explorer.data.rss[0].time).length")
+    assert len(files["Residual [dB].csv"].splitlines()) == shown + 1
+    assert all(text for text in files.values())

@@ -174,12 +174,35 @@ const common = (() => {
     jobs.forEach(job => waiting.add(job));
   }
 
-  // a button that saves a canvas as a picture
-  function download(canvas) {
-    const button = document.createElement("button");
-    button.type = "button"; button.textContent = "PNG";
-    button.addEventListener("click", () => canvas.toBlob(blob => { const a = document.createElement("a"); a.href = URL.createObjectURL(blob); a.download = `${canvas.getAttribute("aria-label")}.png`; a.click(); URL.revokeObjectURL(a.href); }));
-    return button;
+  // what a canvas is drawn with, taken down as SVG while it is drawn anew
+  function drawnAsSvg(canvas, draw) {
+    const pen = canvas.getContext("2d"), out = [], text = v => String(v).replace(/[&<]/g, c => `&#${c.charCodeAt(0)};`);
+    let path = "";
+    const mark = (tag, rest, filled) => {
+      const m = pen.getTransform(), line = `fill="none" stroke="${pen.strokeStyle}" stroke-width="${pen.lineWidth}" stroke-dasharray="${pen.getLineDash()}"`;
+      out.push(`<${tag} transform="matrix(${[m.a, m.b, m.c, m.d, m.e, m.f]})" opacity="${pen.globalAlpha}" ${filled ? `fill="${pen.fillStyle}"` : line} ${rest}`);
+    };
+    const taken = {
+      beginPath: () => { path = ""; }, closePath: () => { path += "Z"; }, moveTo: (x, y) => { path += `M${x} ${y}`; },
+      lineTo: (x, y) => { path += `${path ? "L" : "M"}${x} ${y}`; }, stroke: () => mark("path", `d="${path}"/>`), fill: () => mark("path", `d="${path}"/>`, true),
+      fillRect: (x, y, w, h) => mark("rect", `x="${x}" y="${y}" width="${w}" height="${h}"/>`, true),
+      fillText: (t, x, y) => mark("text", `x="${x}" y="${y}" font-family="sans-serif" font-size="${parseFloat(pen.font.match(/[\d.]+px/))}" text-anchor="${{ center: "middle", right: "end" }[pen.textAlign] || "start"}">${text(t)}</text>`, true),
+    };
+    for (const name in taken) pen[name] = (...values) => { taken[name](...values); CanvasRenderingContext2D.prototype[name].apply(pen, values); };
+    try { draw(); } finally { for (const name in taken) delete pen[name]; }
+    return `<svg xmlns="http://www.w3.org/2000/svg" width="${canvas.clientWidth}" viewBox="0 0 ${canvas.width} ${canvas.height}">${out.join("")}</svg>`;
+  }
+
+  // buttons that save a chart: drawn anew as SVG where ``draw`` does that, as a picture, and the rows of its numbers
+  function downloads(canvas, name, rows, draw) {
+    const save = (kind, blob) => { const a = document.createElement("a"); a.href = URL.createObjectURL(blob); a.download = `${name}.${kind}`; a.click(); URL.revokeObjectURL(a.href); };
+    const cell = v => v === null || Number.isNaN(v) ? "" : /[",\n]/.test(v) ? `"${String(v).replaceAll('"', '""')}"` : v;
+    const kinds = { svg: () => save("svg", new Blob([drawnAsSvg(canvas, draw)])), png: () => canvas.toBlob(blob => save("png", blob)), csv: () => save("csv", new Blob([rows().map(row => row.map(cell).join(",")).join("\n") + "\n"])) };
+    return Object.keys(kinds).filter(kind => draw || kind !== "svg").map(kind => {
+      const button = document.createElement("button");
+      button.type = "button"; button.textContent = kind.toUpperCase(); button.title = `Save: ${name}`; button.addEventListener("click", kinds[kind]);
+      return button;
+    });
   }
 
   function whenResized(element, job) {
@@ -188,5 +211,5 @@ const common = (() => {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => later(job));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, credit, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, download, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar };
+  return { at, css, number, unpack, values, cells, fill, frame, credit, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, downloads, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar };
 })();

@@ -181,6 +181,10 @@
     };
     const made = new uPlot(options, columns, host);
     made.parted = extra.parted;
+    const saves = document.createElement("p");
+    saves.className = "key saves";
+    saves.append(...common.downloads(made.ctx.canvas, label, () => [["time", ...series.map(one => one.label || "band")], ...Array.from(columns[0], (t, i) => columns.map(list => list[i]))]));
+    host.append(saves);
     made.over.addEventListener("dblclick", () => { span(null); zoomTo(null); });
     charts.push({ chart: made, host, height });
   }
@@ -399,6 +403,7 @@
 
   // --- residual against a quantity, and histograms ----------------------------------------------------------------------
 
+  const saved = (id, name, rows, draw) => at(id).parentElement.querySelector(".saves").replaceChildren(...common.downloads(at(id), name, () => rows, draw));
   function drawScatter() {
     const s = rss();
     at("scatter-figure").hidden = !s || !s.geometry.length;
@@ -416,6 +421,7 @@
     for (const [a, b] of chosen) p.fillRect(X(a) - 1.2, Y(b) - 1.2, 2.4, 2.4);
     p.globalAlpha = 1;
     chosen.sort((a, b) => a[0] - b[0]);
+    saved("scatter", "Residual", [[kind.name, "Residual [dB]"], ...chosen], drawScatter);
     const bins = Math.min(20, Math.floor(chosen.length / 8));
     if (bins > 1) {
       p.strokeStyle = css("--ink"); p.lineWidth = 2; p.beginPath();
@@ -435,11 +441,13 @@
       const found = statistics(), rest = residuals(), counts = new Array(30).fill(0);
       for (const i of found.used || []) counts[Math.min(29, Math.max(0, Math.floor(rest[i] + 15)))]++;
       const g = axes(p, w, h, { low: -15, high: 15, label: "Residual [dB] (outer bins include outliers)" }, { low: 0, high: Math.max(1, ...counts), label: "Samples" });
+      saved("histogram", "Residuals", [["Residual from [dB]", "Samples"], ...counts.map((c, i) => [i - 15, c])], drawHistogram);
       counts.forEach((c, i) => bar(g, i - 15, i - 14, c, "--measured"));
     } else if (r) {
       const found = rankStatistics(), share = list => { const t = list.reduce((a, b) => a + b, 0) || 1; return list.map(v => 100 * v / t); };
       const m = share(found.shares.measured), q = share(found.shares.simulated);
       const g = axes(p, w, h, { low: -0.5, high: 4.5, label: "Rank: measured (light), simulated (dark)", marks: [0, 1, 2, 3, 4], words: v => v ? String(v) : "none" }, { low: 0, high: Math.max(1, ...m, ...q), label: "Share [%]" });
+      saved("histogram", "Ranks", [["Rank", "Measured [%]", "Simulated [%]"], ...m.map((v, i) => [i, v, q[i]])], drawHistogram);
       m.forEach((v, i) => { bar(g, i - 0.4, i, v, "--measured"); bar(g, i, i + 0.4, q[i], "--ink"); });
     }
   }
@@ -539,7 +547,8 @@
       }
       p.globalAlpha = 1;
     }
-    place.parentElement.querySelector(".key").replaceChildren(...marks.map(m => { const s = document.createElement("span"), i = document.createElement("i"); i.textContent = "■ "; i.style.color = m.hue; s.append(i, m.name); return s; }), common.download(place));
+    place.parentElement.querySelector(".key").replaceChildren(...marks.map(m => { const s = document.createElement("span"), i = document.createElement("i"); i.textContent = "■ "; i.style.color = m.hue; s.append(i, m.name); return s; }), ...common.downloads(place, place.getAttribute("aria-label"), () => [["series", spec.x.label, n ? "row" : spec.y.label, "low", "high"],
+      ...marks.flatMap(m => Array.from(m.x, (x, i) => [m.name, x, ...[m.y, m.low, m.high].map(list => list ? list[i] : null)]))], () => drawPlot(place)));
   }
   for (const place of document.querySelectorAll("canvas[data-plot]")) common.whenResized(place, () => drawPlot(place));
 

@@ -548,7 +548,7 @@
       p.globalAlpha = 1;
     }
     place.parentElement.querySelector(".key").replaceChildren(...marks.map(m => { const s = document.createElement("span"), i = document.createElement("i"); i.textContent = "■ "; i.style.color = m.hue; s.append(i, m.name); return s; }), ...common.downloads(place, place.getAttribute("aria-label"), () => [["series", spec.x.label, n ? "row" : spec.y.label, "low", "high"],
-      ...marks.flatMap(m => Array.from(m.x, (x, i) => [m.name, x, ...[m.y, m.low, m.high].map(list => list ? list[i] : null)]))], () => drawPlot(place)));
+      ...marks.flatMap(m => Array.from(m.x, (x, i) => [m.name, x, n ? spec.rows[Math.round(m.y[i])] : m.y ? m.y[i] : null, ...[m.low, m.high].map(list => list ? list[i] : null)]))], () => drawPlot(place)));
   }
   for (const place of document.querySelectorAll("canvas[data-plot]")) common.whenResized(place, () => drawPlot(place));
 

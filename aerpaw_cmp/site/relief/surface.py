@@ -68,13 +68,16 @@ class Surface:
         west, east, south, north = self.reach_m
         cell = max(_CELL_M, float(np.sqrt((east - west) * (north - south) / _MOST_CELLS)))
         columns, rows = (int(np.ceil(span / cell)) + 1 for span in (east - west, north - south))
-        at = np.stack(np.meshgrid(west + cell * np.arange(columns), south + cell * np.arange(rows)), axis=-1)
-        place = at.reshape(-1, 2)
+        across, along = (
+            west + cell * np.arange(columns, dtype=np.float64),
+            south + cell * np.arange(rows, dtype=np.float64),
+        )
+        place = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
         off = self.height_m - self.level_m
         prior = np.zeros(len(place))
         if drawn is not None:  # what was drawn, corrected by what the points say of it
             waves = self._waves(drawn)
-            prior = waves(place)
+            prior = waves.on_grid(across, along).ravel()
             off = off + drawn.normal(0.0, self.error_m) - waves(self.place_m)
         height = self.level_m + prior + self._between(place) @ self._factor().solve(off)
         return Dem(
@@ -111,6 +114,11 @@ class _Waves:
 
     def __call__(self, place_m: FloatArray) -> FloatArray:
         return np.asarray(self.height_m * np.cos(place_m @ self.vector + self.phase).sum(axis=1))
+
+    def on_grid(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
+        """The same (north, east) where lines of a grid cross: cosines of the lines alone, by cos(a + b)."""
+        east, north = east_m[:, None] * self.vector[0], north_m[:, None] * self.vector[1] + self.phase
+        return np.asarray(self.height_m * (np.cos(north) @ np.cos(east).T - np.sin(north) @ np.sin(east).T))
 
 
 def _matern(distance_m: FloatArray, length_m: float) -> FloatArray:

@@ -217,14 +217,16 @@ def _kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
 
 def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
     """Covariance (n, m) of the gains between samples of some series and of others [dB^2]."""
-    names = [[s.antenna for s in series for _ in range(len(s))] for series in (first, second)]
-    codes = np.unique(names[0] + names[1], return_inverse=True)[1]
-    same = codes[: len(names[0]), None] == codes[None, len(names[0]) :]
-    out = np.zeros(same.shape)
+    mine, theirs = (np.repeat([s.antenna for s in series], [len(s) for s in series]) for series in (first, second))
+    out = np.zeros((len(mine), len(theirs)))
     for term in terms:
         at, to = (np.concatenate([argument_of(s, term.frame) for s in series]) for series in (first, second))
-        kernel = _kernel(term, at, to)
-        out += kernel * same if term.per == "antenna" else kernel
+        if term.per != "antenna":
+            out += _kernel(term, at, to)
+            continue
+        for name in dict.fromkeys(s.antenna for s in first):  # gains of two antennas share nothing
+            rows, columns = mine == name, theirs == name
+            out[np.ix_(rows, columns)] += _kernel(term, at[rows], to[columns])
     return out
 
 

@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
 from ..common.geodesy import azimuth_rad, elevation_rad
-from ..common.units import SPEED_OF_LIGHT_MPS, AnyArray, ComplexArray, FloatArray, IntArray
+from ..common.units import SPEED_OF_LIGHT_MPS, AnyArray, ComplexArray, FloatArray, IntArray, unmasked
 from .field.sum import channel_matrices
 from .geometry.arrays import Link, Poses
 from .geometry.paths import Faces, PathSet, path_lengths
@@ -140,7 +140,7 @@ class PathTable:
         -------
         (paths,)
         """
-        tower = np.broadcast_to(np.asarray(tower_mps, dtype=np.float64), velocity_mps.shape)
+        tower = np.broadcast_to(unmasked(tower_mps), velocity_mps.shape)
         closing = np.einsum("ni,ni->n", velocity_mps[self.pose], self.at_uav)
         closing += np.einsum("ni,ni->n", tower[self.pose], self.at_tower)
         return np.asarray(carrier_hz / SPEED_OF_LIGHT_MPS * closing)
@@ -262,7 +262,7 @@ def impulse_responses(
     shape = len(ends.poses), len(ends.link.tower_arrays)
     turned = table.gain[..., None]
     if velocity_mps is not None:
-        cycles = table.doppler_hz(ends.link.carrier_hz, velocity_mps)[:, None] * np.asarray(times_s)
+        cycles = table.doppler_hz(ends.link.carrier_hz, velocity_mps)[:, None] * unmasked(times_s)
         turned = turned * np.exp(2j * np.pi * cycles)[:, None, None, :]
     a = np.zeros((*shape, most, *turned.shape[1:]), dtype=np.complex128)
     tau = np.zeros((*shape, most))
@@ -298,7 +298,7 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
     -----
     ``H(f0 + f) = sum_p a_p exp(-j 2 pi f tau_p)`` with gains of the carrier and delays of the array centres.
     """
-    offsets = np.asarray(offsets_hz, dtype=np.float64)
+    offsets = unmasked(offsets_hz)
     check_band(float(np.ptp(offsets)) if len(offsets) else 0.0, ends.link.carrier_hz)
     links = len(ends.poses), len(ends.link.tower_arrays)
     h = np.zeros((*links, *table.gain.shape[1:], len(offsets)), dtype=np.complex128)

@@ -141,8 +141,8 @@ def test_recorded_answers_decode():
         for answer in path.read_text(encoding="latin-1").split("OK\n"):
             lines = [line.strip() for line in answer.splitlines()]
             csi = [line for line in lines if line.startswith('+QNWCFG: "nr5g_csi",') and "(" not in line]
+            ranks += [decode("nr5g_csi", [line]).values["rank"] for line in csi]
             cell = [line for line in lines if line.startswith("+QENG")]
-            ranks += [decode("nr5g_csi", csi).values["rank"]] if csi else []
             cells += [decode("servingcell", cell)] if cell else []
     assert ranks == [2, 2]
     assert len(cells) >= 7

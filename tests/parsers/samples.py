@@ -585,6 +585,10 @@ NO_LOGS: dict[str, bytes] = {
         b"Found 1 cells\nFound CELL 930.0 MHz, EARFCN=3500, PHYID=2, 50 PRB, 1 ports, PSS power=-21.3 dBm\n\nBye\n"
     ),
     "flight_plan": b'{\n    "fileType": "Plan",\n    "geoFence": {},\n    "mission": {"items": []}\n}\n',
+    "kml_track": (
+        b"<?xml version='1.0'?>\n<kml xmlns:gx='x'><Document><Placemark><gx:Track><when>2025-03-02T10:00:00Z</when>"
+        b"<gx:coord>-78.7 35.7 100</gx:coord></gx:Track></Placemark></Document></kml>\n"
+    ),
     "map": b"<?xml version='1.0'?>\n<osm version='0.6'>\n",
     "site_yaml": b"name: f\norigin: {latitude_deg: 35.7}\ntowers:\n  T: {}\n",
     "flight_yaml": b"flight:\n  name: f\nsite: lake_wheeler\nlogs:\n  - {path: a.txt}\n",

@@ -12,6 +12,7 @@ from typing import Any
 
 import pytest
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.jobs.tasks import workers
 from aerpaw_cmp.jobs.tasks.workers import open_workers
 from tests.jobs.worker_tasks import collected, dies
@@ -195,3 +196,16 @@ def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatc
     assert results == {0: 2, 1: 3}
     assert len(messages) == 2
     assert "the scheduler has had no worker" in messages[0]
+
+
+def test_a_scheduler_that_goes_away_as_it_is_asked_is_one_message() -> None:
+    """Dask's own error of a closed line ended a map with exit code 70."""
+
+    class Gone:
+        status = "running"
+
+        def nthreads(self) -> dict[str, int]:
+            raise OSError("Stream is closed")
+
+    with pytest.raises(InputError, match="went away"):
+        _ = workers.Cluster(Gone()).count

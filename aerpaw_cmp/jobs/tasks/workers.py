@@ -207,7 +207,14 @@ class Cluster:
     @property
     def count(self) -> int:
         """Threads of all workers that are there now."""
-        return max(1, int(sum(self._client.nthreads().values())))
+        return max(1, sum(self._threads().values()))
+
+    def _threads(self) -> dict[str, int]:
+        """Threads of each worker; InputError where the scheduler goes away as it is asked."""
+        try:
+            return dict(self._client.nthreads())
+        except OSError:
+            raise self._gone() from None
 
     def run(self, function: Task, items: Sequence[Any], on_result: _OnResult) -> None:  # noqa: D102
         killed = self._through(function, items, range(len(items)), on_result)
@@ -252,7 +259,7 @@ class Cluster:
         if now - self._counted_s < COUNT_EVERY_S:
             return
         self._counted_s = now
-        if self._client.nthreads():
+        if self._threads():
             self._staffed_s = now
         elif now - self._staffed_s > NO_WORKER_S:
             self._progress(f"the scheduler has had no worker for {NO_WORKER_S:.0f} s; finished tasks are kept")

@@ -132,7 +132,7 @@ def site_show(
     ],
 )
 def antenna_export(
-    file: Annotated[Path, Argument(help="Pattern: AERPAW text or .mat, MSI, NSMA, a sphere .csv, an azimuth cut .csv")],
+    file: Annotated[Path, Argument(help="Pattern: AERPAW text or .mat, MSI, a sphere .csv, an azimuth cut .csv")],
     out: Annotated[Path, output("File to write: .py, .msi or .csv.", "FILE")],
     elevation: Annotated[
         Path | None, Option(metavar="CSV", help="Elevation cut, where FILE is an azimuth cut.")

@@ -87,6 +87,11 @@ def elevation_rad(vectors: FloatArray) -> FloatArray:
     return np.asarray(np.arctan2(vectors[..., 2], np.hypot(vectors[..., 0], vectors[..., 1])))
 
 
+def unit_vectors(vectors: FloatArray) -> FloatArray:
+    """Vectors (n, 3) of length one; those without a length stay zero."""
+    return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300))
+
+
 def in_shape(transform: Callable[[Any, Any], Any], x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
     """Coordinates transformed by pyproj, in their common shape; up to 3.7.1 it takes an array of one for a number.
 

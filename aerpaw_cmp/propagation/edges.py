@@ -21,6 +21,7 @@ from typing import ClassVar, NamedTuple
 import numpy as np
 
 from ..common.errors import UsageError
+from ..common.geodesy import unit_vectors
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, wavelength_m
 from .field import dyads
 from .field.fresnel import FaceMaterials, coefficients
@@ -436,7 +437,7 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     bb, bp, pp = wedge(phi_in, phi_out, cosine, exterior, distance, *materials)
     # lambda / (4 pi) = 1 / 2k; the legs are near / sine and far / sine long, both bases lack a factor 1 / sine
     spread = (1.0 / (2.0 * wave_number * sine * np.sqrt(wave_number * near * far)))[:, None]
-    ways = _unit(point - ends[0].centre_m), _unit(ends[1].centre_m - point)
+    ways = unit_vectors(point - ends[0].centre_m), unit_vectors(ends[1].centre_m - point)
     towers = tuple(link.tower_arrays.values())
     (b_in, p_in), (b_out, p_out) = (
         _round_edge(ends[side], ways[side], 1.0 - 2.0 * side, along, cosine, _patterns(arrays, paths, ends[side], way))
@@ -450,10 +451,6 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     cycles = length / wavelength
     carrier = np.exp(-2j * np.pi * (cycles - np.round(cycles))) / np.sqrt(length)
     return np.asarray((b_out[:, :, None] * b_mid[:, None, :] + p_out[:, :, None] * p_mid[:, None, :]) * carrier)
-
-
-def _unit(vector: FloatArray) -> FloatArray:
-    return np.asarray(vector / np.linalg.norm(vector, axis=1, keepdims=True))
 
 
 def _ends(

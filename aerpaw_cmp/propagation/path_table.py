@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
-from ..common.geodesy import azimuth_rad, elevation_rad
+from ..common.geodesy import azimuth_rad, elevation_rad, unit_vectors
 from ..common.units import SPEED_OF_LIGHT_MPS, AnyArray, ComplexArray, FloatArray, IntArray, unmasked
 from .field.sum import channel_matrices
 from .geometry.arrays import Link, Poses
@@ -119,6 +119,11 @@ class PathTable:
     names: tuple[str, ...]
 
     @property
+    def most(self) -> int:
+        """Paths of the link that has most."""
+        return int(self.number.max(initial=-1)) + 1
+
+    @property
     def delay_s(self) -> FloatArray:
         """Delay (paths,) between the centres of the arrays."""
         return np.asarray(self.length_m / SPEED_OF_LIGHT_MPS)
@@ -199,8 +204,8 @@ def path_table(contributions: tuple[Any, ...], faces: Faces, ends: Ends, counts:
                 "via": codes[via.ravel()],
                 "gain": _gains(item, faces, ends, loss_db),
                 "length_m": path_lengths(replace(lines, pose=own, tower=own), sources, targets),
-                "at_tower": _unit(np.where(bent, first, targets) - sources),
-                "at_uav": _unit(np.where(bent, last, sources) - targets),
+                "at_tower": unit_vectors(np.where(bent, first, targets) - sources),
+                "at_uav": unit_vectors(np.where(bent, last, sources) - targets),
                 "turns": item.turns,
                 "vertices_m": np.pad(
                     lines.vertices_m, ((0, 0), (0, most - lines.vertices_m.shape[1]), (0, 0)), constant_values=np.nan
@@ -234,10 +239,6 @@ def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> C
     return gain
 
 
-def _unit(vector: FloatArray) -> FloatArray:
-    return np.asarray(vector / np.maximum(np.linalg.norm(vector, axis=1, keepdims=True), 1e-300))
-
-
 def impulse_responses(
     table: PathTable, ends: Ends, velocity_mps: FloatArray | None = None, times_s: ArrayLike = (0.0,)
 ) -> tuple[ComplexArray, FloatArray]:
@@ -258,14 +259,13 @@ def impulse_responses(
     tau : (rx, tx, paths)
         Delay [s]; zero where there is no path.
     """
-    most = int(table.number.max(initial=-1)) + 1
     shape = len(ends.poses), len(ends.link.tower_arrays)
     turned = table.gain[..., None]
     if velocity_mps is not None:
         cycles = table.doppler_hz(ends.link.carrier_hz, velocity_mps)[:, None] * unmasked(times_s)
         turned = turned * np.exp(2j * np.pi * cycles)[:, None, None, :]
-    a = np.zeros((*shape, most, *turned.shape[1:]), dtype=np.complex128)
-    tau = np.zeros((*shape, most))
+    a = np.zeros((*shape, table.most, *turned.shape[1:]), dtype=np.complex128)
+    tau = np.zeros((*shape, table.most))
     at = table.pose, table.tower, table.number
     a[at], tau[at] = turned, table.delay_s
     # a is (pose, tower, path, rx_ant, tx_ant, time)
@@ -302,7 +302,7 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
     check_band(float(np.ptp(offsets)) if len(offsets) else 0.0, ends.link.carrier_hz)
     links = len(ends.poses), len(ends.link.tower_arrays)
     h = np.zeros((*links, *table.gain.shape[1:], len(offsets)), dtype=np.complex128)
-    for number in range(int(table.number.max(initial=-1)) + 1):  # one path a link: no row is added to twice
+    for number in range(table.most):  # one path a link: no row is added to twice
         rows = np.flatnonzero(table.number == number)
         phase = np.exp(-2j * np.pi * table.delay_s[rows][:, None] * offsets)
         h[table.pose[rows], table.tower[rows]] += table.gain[rows][..., None] * phase[:, None, None, :]

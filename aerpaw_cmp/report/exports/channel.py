@@ -93,9 +93,7 @@ class Channel:
     def by_link(self, values: AnyArray, fill: Any) -> AnyArray:
         """Values per path (paths, ...) as (most paths of a link, poses, towers, ...)."""
         table = self.table
-        out = np.full(
-            (int(table.number.max(initial=-1)) + 1, *self.gain_db.shape, *values.shape[1:]), fill, values.dtype
-        )
+        out = np.full((table.most, *self.gain_db.shape, *values.shape[1:]), fill, values.dtype)
         out[table.number, table.pose, table.tower] = values
         return out
 
@@ -109,12 +107,11 @@ def channel_dataset(channel: Channel) -> Any:
         xarray is not installed; more numbers than fit in memory.
     """
     table, replay = channel.table, channel.replay
-    most = int(table.number.max(initial=-1)) + 1
     subcarriers = 0 if channel.offsets_hz is None else len(channel.offsets_hz)
-    size = 16 * replay.h.size * (most + subcarriers)
+    size = 16 * replay.h.size * (table.most + subcarriers)
     if size > _MOST_BYTES:
         raise UsageError(
-            f"{size / 2**30:.0f} GiB of gains: {len(replay.h)} poses, {len(replay.towers)} towers, {most} paths, "
+            f"{size / 2**30:.0f} GiB of gains: {len(replay.h)} poses, {len(replay.towers)} towers, {table.most} paths, "
             f"{subcarriers} subcarriers",
             expected=f"at most {_MOST_BYTES >> 30} GiB",
             cause="too short a --step, or too many --subcarriers",

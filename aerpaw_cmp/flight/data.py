@@ -464,7 +464,7 @@ def _link_of(links: LinksSettings, log: LogSettings, stream: Stream) -> LinkSett
 
 
 def _channel_of(log: LogSettings, stream: Stream) -> str:
-    return log.channel or _text(stream, "channel") or stream.name
+    return log.channel or stream.channel
 
 
 def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximum_gap_s: float) -> Track:

@@ -97,7 +97,7 @@ def _streams(
     """Telemetry with most rows; the chosen levels and their file."""
     streams = [(f, stream) for f in read_logs(settings, flight.parent, logs_root) for stream in f.result.streams]
     vehicles = [s for _, s in streams if s.kind == "telemetry"]
-    levels = {_name(s): (f, s) for f, s in reversed(streams) if s.kind == "rss" and not is_ratio(s)}
+    levels = {s.channel: (f, s) for f, s in reversed(streams) if s.kind == "rss" and not is_ratio(s)}
     if not vehicles or not levels:
         missing = "telemetry" if levels else "levels"
         raise InputError(f"no log has {missing}", expected="telemetry and levels of one flight", path=flight)
@@ -111,13 +111,13 @@ def _antennas(
 ) -> tuple[Any, MeasuredPattern | None]:
     """Antennas of node and airframe that the flight file or else the site knows; none that this very log taught."""
     file, level = log
-    link = settings.link.channels.get(_name(level), settings.link.rss)
+    link = settings.link.channels.get(level.channel, settings.link.rss)
     known = link.build([_NODE], logs_root or flight.parent)
     node, uav = (array.patterns[0] for array in (known.tower_arrays[_NODE], known.uav_array))
     if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
         return node, uav
     mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
-    place, series = site_place(settings.site.file, flight.parent), (_name(level), file.result.reader)
+    place, series = site_place(settings.site.file, flight.parent), (level.channel, file.result.reader)
     every = taught(place, series, (file.sha256, mark)).items()
     both = next((antennas for name, antennas in every if name not in site.towers), None)
     if both is not None:
@@ -138,32 +138,24 @@ def _both_ends(
     return lambda towards: airframe_db(towards) + node.gain_dbi(*sphere_angles(-towards))
 
 
-def _name(stream: Stream) -> str:
-    return str(stream.attributes.get("channel") or stream.name)
-
-
 def _page(flight: str, level: Stream, site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -> LocatePage:
     regions, modes = estimate.regions, list[dict[str, float]]()
-    for mode in regions.modes():
+    parts = regions.modes()
+    for mode in parts:
         (latitude,), (longitude,) = site.frame.to_geographic(mode.place_m[:1], mode.place_m[1:])
-        place = dict(
-            zip(
-                ("latitude_deg", "longitude_deg", "east_m", "north_m"),
-                (latitude, longitude, *mode.place_m),
-                strict=True,
-            )
-        )
-        modes.append({name: float(x) for name, x in place.items()} | named(mode, "share radius_m"))
+        (east, north), angles = mode.place_m, {"latitude_deg": float(latitude), "longitude_deg": float(longitude)}
+        modes.append(angles | {"east_m": float(east), "north_m": float(north)} | named(mode, "share radius_m"))
+    region50_m, region90_m = (regions.radius_m(parts[0].place_m, part) for part in (0.5, 0.9))
     low, high = estimate.height_m
     floor = "none shows" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB, below it only that is known"
     edge = "The region reaches the edge of the search, 400 m beyond the flight: the node may stand farther away."
     return LocatePage(
         flight=flight,
-        channel=_name(level),
-        sentence=_sentence(modes, regions.radius_m(regions.modes()[0].place_m, 0.9)),
+        channel=level.channel,
+        sentence=_sentence(modes, region90_m),
         position={key: modes[0][key] for key in ("latitude_deg", "longitude_deg")},
-        region50_m=regions.radius_m(regions.modes()[0].place_m, 0.5),
-        region90_m=regions.radius_m(regions.modes()[0].place_m, 0.9),
+        region50_m=region50_m,
+        region90_m=region90_m,
         modes=modes,
         assumed=(
             f"Path-loss exponent {estimate.slope:.1f} +- {2.0 * estimate.slope_sd:.1f} (fitted, 95 %).",

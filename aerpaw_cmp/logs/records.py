@@ -93,6 +93,11 @@ class Stream:
         if missing:
             raise ValueError(f"stream {self.name!r} of kind {self.kind!r} lacks columns {missing}")
 
+    @property
+    def channel(self) -> str:
+        """Channel of the receiver where the log says one, else the name."""
+        return str(self.attributes.get("channel") or self.name)
+
 
 @dataclass(frozen=True, slots=True)
 class RejectedLine:

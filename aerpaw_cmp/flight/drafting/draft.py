@@ -753,7 +753,7 @@ def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, ...]:
     tower = str(entry.get("node") or stream.attributes.get("node"))
     if stream.kind == "rank":
         return tower, "rank"
-    return tower, str(entry.get("channel") or stream.attributes.get("channel") or stream.name)
+    return tower, str(entry.get("channel") or stream.channel)
 
 
 def _top_m(stream: Stream) -> float:

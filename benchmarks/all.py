@@ -86,6 +86,7 @@ SMALLEST: dict[str, list[str]] = {
     "tap_sigkill": ["--quick"],
     "tap_web_soak": ["--quick"],
     "tr36777": ["--ues", "50"],
+    "wheels": ["--pythons", sys.executable],
 }
 
 ON_FIELD_DATA = ("learned_map", "left_out_reports", "real_ground")

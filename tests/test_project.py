@@ -14,7 +14,9 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
+import aerpaw_cmp
 from aerpaw_cmp.common.commands import COMMANDS
 
 if sys.version_info >= (3, 11):
@@ -85,6 +87,21 @@ def test_every_dependency_has_a_lowest_version() -> None:
     lowest = runpy.run_path(str(ROOT / "tools/lowest_versions.py"))["lowest"](PROJECT["dependencies"])
     assert len(lowest) == len(PROJECT["dependencies"])
     assert [line for line in lowest if not re.fullmatch(r"[\w.-]+==\d[\w.]*", line)] == []
+
+
+def test_the_conda_recipe_asks_for_what_the_package_asks_for() -> None:
+    """But for Sionna RT, which has no conda package; names that conda spells otherwise are mapped."""
+    recipe = yaml.safe_load((ROOT / "packaging/conda-forge/recipe.yaml").read_text())
+    assert recipe["context"]["version"] == aerpaw_cmp.__version__
+    assert PROJECT["requires-python"] == f">={recipe['context']['python_min']}"
+    spelled = {"matplotlib": "matplotlib-base", "PyYAML": "pyyaml"}
+    wanted = {re.sub(r"^[\w-]+", lambda name: spelled.get(name[0], name[0]), line) for line in PROJECT["dependencies"]}
+    lines = {line.replace(" ", "") for line in recipe["requirements"]["run"][1:]}
+    assert wanted - lines == {line for line in wanted if line.startswith("sionna-rt")}
+    assert lines <= wanted
+    (script,) = recipe["build"]["python"]["entry_points"]
+    name, target = script.split(" = ")
+    assert PROJECT["scripts"] == {name: target}
 
 
 def test_the_readme_names_every_command() -> None:

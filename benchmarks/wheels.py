@@ -1,0 +1,96 @@
+"""Wheel and sdist on every Python at hand: installed anew, the sample reported with Sionna RT and without it.
+
+    python benchmarks/wheels.py [--pythons python3.10 /opt/py/bin/python3.13] [--keep FOLDER]
+
+Both archives are built from this tree. Each Python (those of --pythons, else every python3.10 to python3.14 on the path
+and under ~/.pyenv/versions) makes a new environment for each archive, installs it from the package index, copies the
+sample and reports it. Sionna RT, Mitsuba and Dr.Jit are then removed, and the same report must give the same levels and
+ranks. Prints one line each and exits with 1 when one fails. A minute or two each, the first time with downloads.
+"""
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+MINORS = range(10, 15)
+RAYS = ("sionna-rt", "mitsuba", "drjit")
+
+
+def at_hand() -> list[str]:
+    """The interpreters 3.10 to 3.14 of this machine, one for each minor version."""
+    pythons = []
+    for minor in MINORS:
+        kept = sorted(Path.home().glob(f".pyenv/versions/3.{minor}.*/bin/python"))
+        path = str(kept[-1]) if kept else shutil.which(f"python3.{minor}")
+        if path:
+            pythons.append(path)
+    return pythons
+
+
+def run(*command: str | Path, cwd: Path) -> str:
+    """Run a command in a folder that is none of this tree's; its output, or what it said as it failed."""
+    kept = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    done = subprocess.run(
+        [str(part) for part in command], cwd=cwd, env=kept, capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        raise RuntimeError(
+            f"{' '.join(map(str, command[:4]))}: exit {done.returncode}\n{(done.stdout + done.stderr)[-2000:]}"
+        )
+    return done.stdout
+
+
+def tried(python: str, archive: Path, folder: Path) -> str:
+    """Install an archive, report the sample with Sionna RT and without it; what came of both."""
+    folder.mkdir()
+    run(python, "-m", "venv", "env", cwd=folder)
+    own = folder / "env" / "bin"
+    run(own / "python", "-m", "pip", "install", "--quiet", archive, cwd=folder)
+    version = run(own / "aerpaw-cmp", "--version", cwd=folder).split()[1]
+    run(own / "aerpaw-cmp", "sample", "-o", "x", cwd=folder)
+    for name in ("audited", "bare"):
+        run(own / "aerpaw-cmp", "report", "x/flight.yaml", "-o", name, cwd=folder)
+        if name == "audited":
+            run(own / "python", "-m", "pip", "uninstall", "--quiet", "--yes", *RAYS, cwd=folder)
+    said = (folder / "bare" / "report.html").read_text(encoding="utf-8")
+    if "Not audited against Sionna RT" not in said:
+        raise RuntimeError("the page without Sionna RT does not say that nothing was audited")
+    for name in ("rss.csv", "rank.csv"):
+        if (folder / "audited" / name).read_bytes() != (folder / "bare" / name).read_bytes():
+            raise RuntimeError(f"{name} differs without Sionna RT")
+    return f"{version}: installed, reported, the same levels and ranks without Sionna RT"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--pythons", nargs="+", default=None)
+    parser.add_argument("--keep", type=Path, help="leave archives, environments and reports in this new folder")
+    args = parser.parse_args()
+    folder = args.keep or Path(tempfile.mkdtemp())
+    folder.mkdir(exist_ok=True, parents=True)
+    run(sys.executable, "-m", "hatchling", "build", "-d", folder / "dist", cwd=ROOT)
+    failed = False
+    for python in args.pythons or at_hand():
+        for archive in sorted((folder / "dist").iterdir()):
+            name = f"{Path(python).parent.parent.name}-{archive.suffix[1:]}"
+            start = time.perf_counter()
+            try:
+                outcome = tried(python, archive, (folder / name).resolve())
+            except (RuntimeError, OSError) as error:
+                failed, outcome = True, f"FAILED {error}"
+            print(f"{python} {archive.name}: {outcome} ({time.perf_counter() - start:.0f} s)", flush=True)
+            if not args.keep:
+                shutil.rmtree(folder / name, ignore_errors=True)
+    if not args.keep:
+        shutil.rmtree(folder)
+    raise SystemExit(int(failed))
+
+
+if __name__ == "__main__":
+    main()

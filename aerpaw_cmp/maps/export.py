@@ -47,6 +47,9 @@ class MapLayers:
         Positions of the towers, east, north, up.
     borders : sequence of Border
         Lines between the areas that two towers serve.
+    credit : str
+        Of the map that the site was made of, "" for none: its licence asks for it in what is made of it. A CSV table
+        has no place for it.
     """
 
     grid: Grid
@@ -54,6 +57,7 @@ class MapLayers:
     layers: Sequence[Layer]
     towers_m: Mapping[str, Sequence[float]] = field(default_factory=dict)
     borders: Sequence[Border] = ()
+    credit: str = ""
 
     def __post_init__(self) -> None:
         n, names = len(self.grid), [layer.name for layer in self.layers]
@@ -132,6 +136,8 @@ def write_geotiff(path: str | Path, maps: MapLayers) -> Path:
                 file.set_band_description(band, layer.name)
                 file.set_band_unit(band, layer.unit)
                 file.update_tags(band, title=layer.title, unit=layer.unit, classes=" ".join(layer.classes))
+            if maps.credit:
+                file.update_tags(TIFFTAG_COPYRIGHT=maps.credit)
         with memory.open() as file:
             copy(file, ordered.name, driver="COG", compress="deflate", overview_resampling="nearest")
         target.write_bytes(ordered.read())
@@ -164,7 +170,7 @@ def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and r
         low, high = _range(layer)
         pictures[f"maps/{layer.name}.png"] = _picture(maps.grid, layer, low, high)
         pictures[f"legends/{layer.name}.png"] = _legend(layer, low, high)
-    return kml.write_archive(Path(path), title, "", "".join(parts), pictures)
+    return kml.write_archive(Path(path), title, maps.credit, "".join(parts), pictures)
 
 
 def _bounding_box(maps: MapLayers) -> tuple[float, float, float, float]:

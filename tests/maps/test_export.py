@@ -3,6 +3,7 @@
 import io
 import sys
 import zipfile
+from dataclasses import replace
 from xml.etree import ElementTree
 
 import numpy as np
@@ -147,6 +148,16 @@ def test_geotiff_has_the_layout_of_a_cloud_optimised_one(tmp_path):
         ) as plain:
             plain.write(file.read())
     assert not cogeo.cog_validate(tmp_path / "plain.tif", strict=True)[0]
+
+
+def test_what_is_made_of_a_map_credits_it(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    credit = "© OpenStreetMap contributors, ODbL"
+    credited = replace(BARE, credit=credit)
+    with rasterio.open(export.write_geotiff(tmp_path / "m.tif", credited)) as file:
+        assert file.tags()["TIFFTAG_COPYRIGHT"] == credit
+    with zipfile.ZipFile(export.write_kmz(tmp_path / "m.kmz", credited)) as archive:
+        assert f"<description>{credit}</description>" in archive.read("doc.kml").decode()
 
 
 def test_missing_extra_is_named(tmp_path, monkeypatch):

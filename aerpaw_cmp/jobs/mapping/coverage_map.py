@@ -463,7 +463,7 @@ def _write_tiles(
 ) -> None:
     """Compute the tiles that a store lacks, write each as it comes, and read some positions of all for the page."""
     empty, tiling = channels.empty(store.tiling.grid_of(0)), store.tiling
-    missing = store.begin(empty, outcome.site.frame, _about_maps(outcome.site.name))
+    missing = store.begin(empty, outcome.site.frame, _about_maps(outcome.site))
     if store.damaged:
         progress(f"{store.damaged} finished tiles have chunks that are missing or were changed: computed again")
     if len(missing) < len(tiling):
@@ -791,7 +791,7 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
     shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
     named = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
     every_layer = export.MapLayers(
-        grid=grid, frame=site.frame, layers=every, towers_m=named, borders=outcome.shown.borders
+        grid=grid, frame=site.frame, layers=every, towers_m=named, borders=outcome.shown.borders, credit=site.credit
     )
     all_joint, levels_and_ranks = replace(every_layer, layers=joint), replace(every_layer, layers=shown)
     written = [
@@ -800,7 +800,7 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
     ]
     maps = dict(outcome.ordered())
     writers: tuple[Callable[[], Path], ...] = (
-        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, _about_maps(site.name), flown),
+        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, _about_maps(site), flown),
         lambda: export.write_geotiff(folder / "maps.tif", all_joint),
     )
     for write in writers:
@@ -815,14 +815,15 @@ def _provenance() -> dict[str, str]:
     return {"generated": utc_now(), "version": versions()["aerpaw-cmp"]}
 
 
-def _about_maps(title: str) -> dict[str, str]:
+def _about_maps(site: Site) -> dict[str, str]:
     """Attributes of maps.nc and of a store of tiles."""
-    return file_attributes(
-        title=title,
+    about = file_attributes(
+        title=site.name,
         source="ray tracing",
         **_provenance(),
         comment="A missing level has no path. A rank of 0 is a code: no path.",
     )
+    return about | ({"acknowledgement": site.credit} if site.credit else {})
 
 
 def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:

@@ -16,7 +16,7 @@ from aerpaw_cmp.compare.level.rss import compare_rss, error_spans
 from aerpaw_cmp.compare.rank import channel_rank, commonest_rank, compare_rank, singular_values
 from aerpaw_cmp.compare.result import ModelLevel, RankFurther, RankResult, RssFurther, RssResult
 from aerpaw_cmp.jobs.campaigns.season import with_season
-from aerpaw_cmp.report.content.campaign import CampaignData, Failure, FlownTrack, RssRow
+from aerpaw_cmp.report.content.campaign import CampaignData, Failure, RssRow
 from aerpaw_cmp.report.content.flight import ReportData, Track
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -40,7 +40,7 @@ def season(flights: int = 200, settings: int = 20, towers: int = 5, channels: in
     site = load_site("lake_wheeler")
     names, labels = [f"flight_{i:03d}" for i in range(flights)], [f"setting {i:02d}" for i in range(settings)]
     rows: list[RssRow] = []
-    failures, tracks = [], []
+    failures = []
     some = flights // 10 + 1
     broken = set(zip(rng.integers(0, flights, some).tolist(), rng.integers(0, settings, some).tolist(), strict=True))
     for f, name in enumerate(names):
@@ -49,7 +49,6 @@ def season(flights: int = 200, settings: int = 20, towers: int = 5, channels: in
         reach = 250 + 150 * rng.random()
         position = np.column_stack([100 + reach * np.cos(turn), 150 + reach * np.sin(turn), np.full(SAMPLES, 40.0)])
         hill = HILL_DB * np.exp(-((position[:, 0] - 200) ** 2 + (position[:, 1] - 300) ** 2) / 2 / 120**2)
-        tracks.append(FlownTrack(flight=name, time_s=np.arange(SAMPLES) * 5.0, position_m=position))
         drift = -20 + DRIFT_DB_PER_30_DAYS * f / 30
         links = {
             (tower, f"USRP{channel + 1}"): drift + 2 * channel + rng.normal(0, 0.5)
@@ -69,7 +68,7 @@ def season(flights: int = 200, settings: int = 20, towers: int = 5, channels: in
         name="season", title=f"A season that was never flown: {flights} flights, {settings} settings",
         generated="2026-11-21T00:00:00+00:00", versions={"numpy": np.__version__}, calibration="channel",
         flights=tuple(names), settings={label: {"rt.max_depth": i % 4} for i, label in enumerate(labels)},
-        rss=tuple(rows), failures=tuple(failures), tracks=tuple(tracks), site=site, synthetic=(),
+        rss=tuple(rows), failures=tuple(failures), site=site, synthetic=(),
     )  # fmt: skip
     return with_season(data, {name: f"../{name}/report.html" for name in names[:3]})
 
@@ -81,7 +80,6 @@ def _row(
     mean = float((simulated - measured).mean())
     offset = round(mean, 1)
     residual = measured + offset - simulated
-    empty: Any = np.zeros(0)
     return RssRow(
         flight=flight, setting=setting, tower=tower, channel=channel, unit="dBm", offset_db=offset,
         rmse_db=float(np.sqrt((residual**2).mean())), correlation=float(np.corrcoef(measured, simulated)[0, 1]),
@@ -90,7 +88,6 @@ def _row(
         baselines={"free_space": 7.0}, span_db=(-50.0, 50.0),
         measured_db=measured, simulated_dbm=simulated,
         position_m=position if reference else np.zeros((0, 3)),
-        distance_m=np.hypot(*position[:, :2].T) if reference else empty,
         start_ns=start,
     )  # fmt: skip
 

@@ -16,7 +16,8 @@ from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, run
 from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.jobs.options import RunOptions
-from aerpaw_cmp.report.content.campaign import RankRow, RssRow, place_means
+from aerpaw_cmp.report.content.campaign import RankRow
+from tests.jobs.campaign_rows import rss_row
 from tests.json_page import unlisted
 from tests.simulated import planned, simulate, write_yaml
 
@@ -138,10 +139,7 @@ def test_broken_flights_are_rows_with_their_message(summary: dict[str, Any], fol
 
 def test_every_figure_is_there(summary: dict[str, Any], folder: Path) -> None:
     figures = folder / "whole_out" / "figures"
-    expected = {
-        "tracks", "distance_LW1_USRP1", "distance_LW1_USRP2", "places_LW1_USRP1", "places_LW1_USRP2",
-        "season_drift", "season_places",
-    }  # fmt: skip
+    expected = {"season_drift", "season_places"}
     assert {p.stem for p in figures.glob("*.svg")} == {p.stem for p in figures.glob("*.png")} == expected
 
 
@@ -228,31 +226,12 @@ def test_a_channel_of_its_own_starts_as_a_copy(folder: Path) -> None:
         overridden(flight, {"wings": 2})
 
 
-def row(flight: str, channel: str, measured: Any, simulated: Any, **keys: Any) -> RssRow:
-    """A row with levels and places; numbers that the functions under test do not read are NaN."""
-    measured, simulated = np.asarray(measured, float), np.asarray(simulated, float)
-    n = len(measured)
-    nan = float("nan")
-    given: dict[str, Any] = {
-        "unit": "dBm", "offset_db": float(np.nanmean(simulated - measured)), "rmse_db": nan, "correlation": nan, "n": n,
-        "n_out_of_coverage": 0, "at_search_edge": False, "rmse_ci95_db": None, "offset_ci95_db": None,
-        "correlation_ci95": None, "n_effective": nan, "lag_s": nan, "lag_verdict": "", "fitted": (), "baselines": {},
-        "span_db": (-50.0, 50.0),
-        "distance_m": np.arange(n) * 3.0,
-        "position_m": np.stack([np.arange(n) * 3.0, np.zeros(n), np.full(n, 40.0)], axis=-1),
-    }  # fmt: skip
-    return RssRow(
-        flight=flight, setting="s", tower="LW1", channel=channel, measured_db=measured, simulated_dbm=simulated,
-        **{**given, **keys},
-    )  # fmt: skip
-
-
 def test_shared_offsets_have_their_closed_form() -> None:
     """The least squares of everything in a group is the mean difference over its samples, not over its flights."""
     rows = [
-        row("a", "USRP1", [0.0, 0.0, 0.0], [3.0, 3.0, 3.0]),
-        row("b", "USRP1", [0.0, np.nan], [7.0, 100.0], unit="dB re full scale"),
-        row("b", "USRP2", [1.0, 1.0], [0.0, 0.0]),
+        rss_row("a", "USRP1", [0.0, 0.0, 0.0], [3.0, 3.0, 3.0]),
+        rss_row("b", "USRP1", [0.0, np.nan], [7.0, 100.0], unit="dB re full scale"),
+        rss_row("b", "USRP2", [1.0, 1.0], [0.0, 0.0]),
     ]
     done, groups = pool_offsets(rows, "channel")
     assert [g.group for g in groups] == ["USRP1", "USRP2"]
@@ -275,8 +254,8 @@ def test_repeatability_is_the_noise_of_both_flights_after_one_constant() -> None
     rng = np.random.default_rng(5)
     n = 4000
     level = -60 + 10 * np.sin(np.arange(n) / 40)
-    first = row("a", "USRP1", level + rng.normal(0, 2.0, n), level)
-    second = row("b", "USRP1", level + 6.0 + rng.normal(0, 1.5, n), level)
+    first = rss_row("a", "USRP1", level + rng.normal(0, 2.0, n), level)
+    second = rss_row("b", "USRP1", level + 6.0 + rng.normal(0, 1.5, n), level)
     (pair,) = repeats([first, second], RepeatSettings(heading_within_deg=None))
     assert pair.n == n
     assert pair.share == 1.0
@@ -286,7 +265,7 @@ def test_repeatability_is_the_noise_of_both_flights_after_one_constant() -> None
     assert abs(pair.place_correlation) < 0.2  # nothing but noise comes back
     wrong = np.where(np.arange(n) % 400 < 200, 5.0, -5.0)
     (pair,) = repeats(
-        [row("a", "USRP1", level + wrong, level), row("b", "USRP1", level + wrong, level)], RepeatSettings()
+        [rss_row("a", "USRP1", level + wrong, level), rss_row("b", "USRP1", level + wrong, level)], RepeatSettings()
     )
     assert pair.rmse_db == pytest.approx(0.0, abs=1e-9)
     assert pair.place_correlation == pytest.approx(1.0)
@@ -315,20 +294,14 @@ def test_k_is_chosen_on_the_other_flights() -> None:
 
 
 def test_flights_that_never_meet_have_no_floor() -> None:
-    low, high = row("a", "USRP1", np.zeros(50), np.zeros(50)), row("b", "USRP1", np.zeros(50), np.zeros(50))
+    low, high = rss_row("a", "USRP1", np.zeros(50), np.zeros(50)), rss_row("b", "USRP1", np.zeros(50), np.zeros(50))
     up = high.position_m + np.array([0.0, 0.0, 30.0])
-    high = row("b", "USRP1", np.zeros(50), np.zeros(50), position_m=up)
+    high = rss_row("b", "USRP1", np.zeros(50), np.zeros(50), position_m=up)
     (pair,) = repeats([low, high], RepeatSettings())
     assert pair.n == 0
     assert np.isnan(pair.rmse_db)
     assert pair.height_difference_m == 30.0
-    assert repeats([low, row("b", "USRP2", np.zeros(50), np.zeros(50))], RepeatSettings()) == []
-
-
-def test_places_are_square_cells_with_mean_residuals() -> None:
-    cells = place_means(row("a", "c", [1.0, 3.0, np.nan, 9.0], [0.0] * 4, offset_db=0.0, position_m=np.array(
-        [[1.0, 1.0, 10.0], [19.0, 19.0, 30.0], [5.0, 5.0, 5.0], [-1.0, 1.0, 7.0]])), 20.0)  # fmt: skip
-    assert cells == {(0, 0): (2.0, 20.0), (-1, 0): (9.0, 7.0)}
+    assert repeats([low, rss_row("b", "USRP2", np.zeros(50), np.zeros(50))], RepeatSettings()) == []
 
 
 def test_flights_without_a_sample_that_counts_give_no_number_and_end_nothing(folder: Path) -> None:
@@ -341,7 +314,7 @@ def test_flights_without_a_sample_that_counts_give_no_number_and_end_nothing(fol
 
 
 def test_a_campaign_of_rank_flights(folder: Path) -> None:
-    """Rank alone: no RSS tables, but rank rows, their transfer of K and the tracks."""
+    """Rank alone: no RSS tables, but rank rows, their transfer of K and no figure."""
     for seed, name in enumerate(OFFSETS_DB, start=1):
         settings = flight_settings(name, seed, YAW_DEG)
         settings["flight"]["name"] = f"rank_{name}"
@@ -360,7 +333,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
     for transfer in campaign["rank_transfers"]:
         assert transfer["k"] == 10  # the simulated modem's
         assert transfer["total_variation"] < 0.05
-    assert {p.stem for p in (folder / "ranks_out" / "figures").glob("*.svg")} == {"tracks"}
+    assert not list((folder / "ranks_out").glob("figures/*"))
     page = (folder / "ranks_out" / "campaign.html").read_text(encoding="utf-8")
     assert "Mean RMSE over towers" not in page
     assert "K chosen on the other flights" in page

@@ -24,7 +24,8 @@ from aerpaw_cmp.jobs.campaigns.campaign_plan import campaign_status, compute, ke
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Done, Order, Outcome, Task, carry_out, digest_of, outcome_store
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
 from aerpaw_cmp.jobs.tasks.workers import InProcess, Processes, Workers
-from aerpaw_cmp.report.content.campaign import Failure, FlownTrack
+from aerpaw_cmp.report.content.campaign import Failure
+from tests.jobs.campaign_rows import rss_row
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -42,22 +43,21 @@ def run_tasks(tasks: list[Task], workers: Workers, keep: Path | None = None) -> 
     return [outcomes[number] for number in range(len(tasks))]
 
 
-def track(number: float) -> Outcome:
-    return Outcome(track=FlownTrack(flight=f"f{number:g}", time_s=np.arange(3.0), position_m=np.full((3, 3), number)))
+def outcome_of(number: float) -> Outcome:
+    return Outcome(rss=(rss_row(f"f{number:g}", "USRP1", np.full(3, number), np.zeros(3)),))
 
 
 def equal(left: Outcome, right: Outcome) -> bool:
-    assert left.track is not None
-    assert right.track is not None
-    return left.track.flight == right.track.flight and np.array_equal(left.track.position_m, right.track.position_m)
+    (mine,), (theirs,) = left.rss, right.rss
+    return mine.flight == theirs.flight and np.array_equal(mine.measured_db, theirs.measured_db)
 
 
 def test_an_outcome_comes_back_as_it_was(tmp_path: Path) -> None:
     store = OutcomeStore(tmp_path, Outcome)
-    store.save("a", track(2.5))
+    store.save("a", outcome_of(2.5))
     loaded = store.load("a")
-    assert equal(loaded, track(2.5))
-    assert loaded.rss == ()
+    assert equal(loaded, outcome_of(2.5))
+    assert loaded.rank == ()
     assert store.load("b") is None
 
 
@@ -74,18 +74,19 @@ def test_an_outcome_comes_back_as_it_was(tmp_path: Path) -> None:
 )
 def test_arrays_of_every_kind_come_back(tmp_path: Path, array: np.ndarray) -> None:
     store = OutcomeStore(tmp_path, Outcome)
-    store.save("a", Outcome(track=FlownTrack(flight="f", time_s=array, position_m=np.zeros((0, 3)))))
-    loaded = store.load("a").track
-    assert loaded.time_s.dtype == array.dtype
-    assert loaded.time_s.shape == array.shape
-    assert loaded.time_s.tobytes() == np.ascontiguousarray(array).tobytes()
+    row = rss_row("f", "USRP1", [0.0], [1.0], heading_deg=array, position_m=np.zeros((0, 3)))
+    store.save("a", Outcome(rss=(row,)))
+    (loaded,) = store.load("a").rss
+    assert loaded.heading_deg.dtype == array.dtype
+    assert loaded.heading_deg.shape == array.shape
+    assert loaded.heading_deg.tobytes() == np.ascontiguousarray(array).tobytes()
     assert loaded.position_m.shape == (0, 3)
 
 
 @pytest.mark.parametrize("place", [0, 100, -1])
 def test_a_damaged_entry_is_told_and_not_used(tmp_path: Path, place: int) -> None:
     store = OutcomeStore(tmp_path, Outcome)
-    store.save("a", track(1.0))
+    store.save("a", outcome_of(1.0))
     file = tmp_path / "a.npz"
     content = bytearray(file.read_bytes())
     content[place] ^= 0xFF
@@ -106,10 +107,10 @@ PICKLED = np.array([{}], dtype=object)
         {"content": b"["},
         {"content": b"3"},
         {"content": b'{"rss": 3}'},
-        {"content": b'{"track": {"flight": 3, "time_s": 1, "position_m": 2}}'},
-        {"content": b'{"track": {"nothing": 3}}'},
-        {"content": b'{"track": {"flight": "f", "time_s": {"array of the entry": "a7"}}}', "a0": b"12"},
-        {"content": b'{"track": {"flight": "f", "time_s": {"array of the entry": ["a0"]}}}', "a0": b"12345678"},
+        {"content": b'{"rss": [{"flight": 3, "measured_db": 1}]}'},
+        {"content": b'{"rss": [{"nothing": 3}]}'},
+        {"content": b'{"rss": [{"flight": "f", "measured_db": {"array of the entry": "a7"}}]}', "a0": b"12"},
+        {"content": b'{"rss": [{"flight": "f", "measured_db": {"array of the entry": ["a0"]}}]}', "a0": b"12345678"},
         {"content": b'{"failure": {"flight": "f"}}'},
         {"content": b"{}", "a0": b""},
         {"content": b"[" * 100_000 + b"]" * 100_000},
@@ -139,11 +140,11 @@ def test_a_place_that_takes_nothing_is_a_usage_error(tmp_path: Path, place: str)
 def test_equal_arrays_are_kept_and_held_once(tmp_path: Path) -> None:
     """Channels of a tower share times and places: half of all that a campaign keeps."""
     store, place = OutcomeStore(tmp_path, Outcome), np.arange(3000.0).reshape(-1, 3)
-    track = FlownTrack(flight="f", time_s=place, position_m=place.copy())
-    store.save("a", Outcome(track=track))
+    row = rss_row("f", "USRP1", [0.0], [1.0], heading_deg=place, position_m=place.copy())
+    store.save("a", Outcome(rss=(row,)))
     assert (tmp_path / "a.npz").stat().st_size < 1.5 * place.nbytes
-    loaded = store.load("a").track
-    assert loaded.time_s is loaded.position_m
+    (loaded,) = store.load("a").rss
+    assert loaded.heading_deg is loaded.position_m
 
 
 def key_of(settings: FlightFile, flight: Path) -> str:
@@ -193,7 +194,7 @@ def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkey
         asked.append(task.flight)
         if task.flight == "f3" and len(asked) < 6:
             return Outcome(failure=Failure(flight="f3", setting="as written", message="no luck", traceback="line 1"))
-        return track(float(task.flight[1:]))
+        return outcome_of(float(task.flight[1:]))
 
     monkeypatch.setattr(campaign_tasks, "run_task", compute_but_f3)
     tasks = tasks_of(flight)
@@ -217,12 +218,12 @@ def test_a_new_name_or_place_in_the_list_computes_nothing(
 ) -> None:
     """A setting put before the first, a label that is another: the outcomes are those that were kept, renamed."""
     asked: list[str] = []
-    monkeypatch.setattr(campaign_tasks, "run_task", lambda task: asked.append(task.setting) or track(1.0))
+    monkeypatch.setattr(campaign_tasks, "run_task", lambda task: asked.append(task.setting) or outcome_of(1.0))
     run_tasks([Task(flight, "f", "a", {}, None, True)], InProcess(), keep=tmp_path)
     first = Task(flight, "g", "first", {"rss.advanced.lag_window_s": 3}, None, True)
     outcomes = run_tasks([first, Task(flight, "g", "b", {}, None, False)], InProcess(), keep=tmp_path)
     assert asked == ["a", "first"]
-    assert [outcome.track.flight for outcome in outcomes if outcome.track is not None] == ["g", "g"]
+    assert [row.flight for outcome in outcomes for row in outcome.rss] == ["g", "g"]
 
 
 def test_a_worker_that_sees_other_files_fails_the_task(flight: Path) -> None:
@@ -251,16 +252,12 @@ from pathlib import Path
 from aerpaw_cmp.jobs.campaigns import campaign_tasks
 from aerpaw_cmp.jobs.campaigns.campaign_plan import compute, kept_outcomes
 from aerpaw_cmp.jobs.tasks.workers import InProcess
-from aerpaw_cmp.report.content.campaign import FlownTrack
-import numpy as np
+from tests.jobs.campaign_rows import rss_row
 
 def compute_but_f2(task):
     if task.flight == "f2":
         os.kill(os.getpid(), signal.SIGKILL)
-    number = float(task.flight[1:])
-    return campaign_tasks.Outcome(
-        track=FlownTrack(flight=task.flight, time_s=np.arange(3.0), position_m=np.full((3, 3), number))
-    )
+    return campaign_tasks.Outcome(rss=(rss_row(task.flight, "USRP1", [float(task.flight[1:])] * 3, [0.0] * 3),))
 
 campaign_tasks.run_task = compute_but_f2
 flight = Path(sys.argv[1])
@@ -278,11 +275,11 @@ def test_after_sigkill_only_what_is_missing_is_computed(
     assert done.returncode == -signal.SIGKILL
     asked: list[str] = []
     monkeypatch.setattr(
-        campaign_tasks, "run_task", lambda task: asked.append(task.flight) or track(float(task.flight[1:]))
+        campaign_tasks, "run_task", lambda task: asked.append(task.flight) or outcome_of(float(task.flight[1:]))
     )
     outcomes = run_tasks(tasks_of(flight), InProcess(), keep=tmp_path)
     assert asked == ["f2", "f3"]
-    assert all(equal(outcome, track(float(i))) for i, outcome in enumerate(outcomes))
+    assert all(equal(outcome, outcome_of(float(i))) for i, outcome in enumerate(outcomes))
 
 
 def lethal(order: Order) -> Done:
@@ -290,7 +287,7 @@ def lethal(order: Order) -> Done:
     task = order.task
     if task.flight == "poison" or (task.flight == "f1" and not _happened(task)):
         os.kill(os.getpid(), signal.SIGKILL)
-    return Done(outcome=track(float(task.flight[1:])))
+    return Done(outcome=outcome_of(float(task.flight[1:])))
 
 
 def _happened(task: Task) -> bool:
@@ -313,9 +310,7 @@ def test_a_lost_worker_costs_its_own_task_one_more_try(
     assert [outcome.failure is None for outcome in outcomes] == [True] * 6 + [False]
     assert outcomes[-1].failure is not None
     assert "worker process ended" in outcomes[-1].failure.message
-    assert [outcome.track.flight for outcome in outcomes[:6] if outcome.track is not None] == [
-        f"f{i}" for i in range(6)
-    ]
+    assert [row.flight for outcome in outcomes for row in outcome.rss] == [f"f{i}" for i in range(6)]
 
 
 def test_a_fault_in_the_rows_of_a_flight_is_a_failure_of_that_flight(

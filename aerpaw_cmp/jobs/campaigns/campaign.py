@@ -108,7 +108,6 @@ def run(
         rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
         repeated = repeats([r for r in rows if r.setting == next(iter(settings))], campaign.repeatability)
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
-    tracks = {o.track.flight: o.track for o in reversed(results) if o.track is not None}
     return CampaignData(
         name=campaign.campaign,
         title=campaign.title or campaign.campaign,
@@ -118,7 +117,6 @@ def run(
         rss=tuple(rows),
         rank=rank,
         rank_transfers=tuple(transfer_ranks(rank)),
-        tracks=tuple(tracks[name] for name in files if name in tracks),
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(repeated),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from ...common.errors import AerpawCmpError
 from ...common.jsonable import named
 from ...common.stages import Progress
-from ...report.content.campaign import Failure, FlownTrack
+from ...report.content.campaign import Failure
 from ..tasks.outcomes import OutcomeStore
 from ..tasks.workers import Lost, Workers
 from .campaign_tasks import Done, Order, Outcome, Task, carry_out, digest_of, fitted_to
@@ -119,41 +119,12 @@ def _state(task: Task, store: OutcomeStore) -> TaskState:
     return TaskState(task=task, stored=store.has(key), seconds=store.seconds(key))
 
 
-class Outcomes(dict[int, Outcome]):
-    """Outcomes of a campaign's tasks by number, each held without what its setting is not asked for.
-
-    Series of samples stay for the first setting; of the others a row holds numbers, and the flown line of a flight is
-    held once: the memory of 4000 tasks is that of the flights.
-
-    Parameters
-    ----------
-    tasks : sequence of Task
-    """
-
-    def __init__(self, tasks: Sequence[Task]) -> None:
-        super().__init__()
-        self._tasks = tasks
-        self._tracks: dict[str, FlownTrack] = {}
-
-    def put(self, number: int, outcome: Outcome) -> None:
-        """Take one more, under the names of this campaign."""
-        task = self._tasks[number]
-        fitted = fitted_to(task, outcome)
-        if fitted.track is not None:
-            known = self._tracks.setdefault(task.flight, fitted.track)
-            same = all(
-                np.array_equal(getattr(known, name), getattr(fitted.track, name), equal_nan=True)
-                for name in ("time_s", "position_m")
-            )
-            fitted = replace(fitted, track=known if same else fitted.track)
-        self[number] = fitted
-
-
 def kept_outcomes(
     tasks: Sequence[Task], store: OutcomeStore | None, progress: Progress
-) -> tuple[Outcomes, dict[int, Order]]:
+) -> tuple[dict[int, Outcome], dict[int, Order]]:
     """Outcomes that are there, and what is to be computed, by number."""
-    outcomes, orders = Outcomes(tasks), {number: Order(task=task) for number, task in enumerate(tasks)}
+    outcomes: dict[int, Outcome] = {}
+    orders = {number: Order(task=task) for number, task in enumerate(tasks)}
     if store is None:
         return outcomes, orders
     for number, task in enumerate(tasks):
@@ -161,7 +132,7 @@ def kept_outcomes(
             key = digest_of(task)
             orders[number] = Order(task=task, key=key)
             if isinstance(outcome := store.load(key), Outcome):
-                outcomes.put(number, outcome)
+                outcomes[number] = fitted_to(task, outcome)
                 del orders[number]
     for text in store.warnings:
         progress(text)
@@ -171,7 +142,11 @@ def kept_outcomes(
 
 
 def compute(
-    orders: Mapping[int, Order], workers: Workers, outcomes: Outcomes, store: OutcomeStore | None, progress: Progress
+    orders: Mapping[int, Order],
+    workers: Workers,
+    outcomes: dict[int, Outcome],
+    store: OutcomeStore | None,
+    progress: Progress,
 ) -> None:
     """Let the workers do what is to do; each outcome is put into ``outcomes`` and kept as soon as it comes.
 
@@ -180,7 +155,7 @@ def compute(
     orders : mapping of int to Order
         What is to do, by the number of its task.
     workers : Workers
-    outcomes : Outcomes
+    outcomes : dict of int to Outcome
         Gets the new ones.
     store : OutcomeStore, optional
         Keeps the new ones.
@@ -199,7 +174,7 @@ def compute(
         failure = result.outcome.failure
         if store is not None and order.key is not None and failure is None:
             store.save(order.key, result.outcome, result.seconds)
-        outcomes.put(numbers[place], result.outcome)
+        outcomes[numbers[place]] = fitted_to(order.task, result.outcome)
         failed += failure is not None
         progress(f"flights\t{len(outcomes)} of {total} done, {failed} failed", len(outcomes) / total)
 

@@ -27,7 +27,7 @@ from ...flight.marks import among
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import logs_of, series_mark
-from ...report.content.campaign import Failure, FlownTrack, RankRow, RssRow
+from ...report.content.campaign import Failure, RankRow, RssRow
 from ..reporting.flight_run import run_flight
 from ..tasks.outcomes import OutcomeStore, task_inputs, task_key
 
@@ -42,7 +42,7 @@ class Task:
     overrides: Overrides
     logs_root: Path | None
     reference: bool = True
-    """Overlays are drawn for this setting: places and times are kept."""
+    """Pairs of flights and the season are of this setting: places are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,7 +52,6 @@ class Outcome:
     rss: tuple[RssRow, ...] = ()
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
-    track: FlownTrack | None = None
 
 
 def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -145,7 +144,6 @@ def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
             for compared, series in zip(result.rank, data.rank, strict=True)
             for row in _rank_rows(task, compared, _identity(data, series))
         ),
-        track=_flown(task, result),
     )
 
 
@@ -220,7 +218,10 @@ def outcome_store(keep: Path) -> OutcomeStore:
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
-    """A kept outcome under the names of this campaign, without what only the first setting's figures need."""
+    """An outcome under the names of this campaign; series of samples stay for the first setting alone.
+
+    Of the others a row holds numbers: the memory of 4000 tasks is that of the flights.
+    """
 
     def row(kept_row: RssRow) -> RssRow:
         named = dataclasses.replace(kept_row, flight=task.flight, setting=task.setting)
@@ -232,7 +233,6 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
             difference=kept_row.moments,
             measured_db=none,
             simulated_dbm=none,
-            distance_m=none,
             position_m=np.zeros((0, 3)),
             heading_deg=None,
         )
@@ -242,17 +242,10 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
         rss=tuple(map(row, outcome.rss)),
         rank=tuple(dataclasses.replace(item, flight=task.flight, setting=task.setting) for item in outcome.rank),
         failure=failure,
-        track=outcome.track and dataclasses.replace(outcome.track, flight=task.flight),
     )
 
 
 # --- rows -----------------------------------------------------------------------------------------------------------
-
-
-def _flown(task: Task, result: FlightResult) -> FlownTrack:
-    first = result.rss[0] if result.rss else result.rank[0]
-    seconds = np.asarray((first.time - first.time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
-    return FlownTrack(flight=task.flight, time_s=seconds, position_m=first.position_m)
 
 
 def _start_ns(time: AnyArray) -> int:
@@ -288,7 +281,6 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mappin
         span_db=rules.span_db,
         measured_db=measured_db,
         start_ns=_start_ns(result.time),
-        distance_m=result.geometry["distance_m"],
         heading_deg=result.geometry.get("heading_deg"),
         difference=offset.difference_moments(measured_db, result.simulated_dbm),
         **identity,

@@ -16,8 +16,9 @@ from ...common.errors import InputError, parsing
 from ...common.files import LARGEST_TABLE, read_bounded
 from ...common.units import FloatArray
 from ...compare.judge import season
+from ...compare.statistics.passes import cell_means
 from ...logs.records import has_wall_clock
-from ...report.content.campaign import CampaignData, Drift, PlaceMap, RssRow, Season, SettingRank, place_means
+from ...report.content.campaign import CampaignData, Drift, PlaceMap, RssRow, Season, SettingRank
 
 _DAY_NS = 86_400e9
 _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
@@ -191,8 +192,10 @@ def _place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
     """Mean residual of each cell of the plan over flights, towers and channels; None without a cell."""
     residuals: dict[tuple[int, int], list[float]] = {}
     for row in rows:
-        for cell, (residual, _) in place_means(row, cell_m).items():
-            residuals.setdefault(cell, []).append(residual)
+        scored = np.isfinite(row.residual_db) & np.isfinite(row.position_m).all(axis=1)
+        cells, means, _ = cell_means(row.position_m, row.residual_db, scored, cell_m)
+        for (east, north), residual in zip(cells.tolist(), means, strict=True):
+            residuals.setdefault((east, north), []).append(residual)
     if not residuals:
         return None
     return PlaceMap(cells=np.array(list(residuals)), mean_db=np.array([np.mean(v) for v in residuals.values()]))

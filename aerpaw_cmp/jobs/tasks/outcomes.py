@@ -26,7 +26,7 @@ from ...flight.settings import FlightFile
 from .manifest import digest_of, other_inputs
 
 # Raised whenever the form of an entry changes.
-LAYOUT = 6
+LAYOUT = 7
 
 _SEAL = b"aerpaw-cmp outcome"
 

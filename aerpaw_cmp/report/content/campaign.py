@@ -6,12 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-import numpy as np
-
 from ...common.units import FloatArray, IntArray
 from ...compare.offset import Moments, difference_moments
 from ...compare.statistics.intervals import Interval
-from ...compare.statistics.passes import cell_means
 from ...site.site import Site
 from .made import Made
 
@@ -51,7 +48,6 @@ class RssRow:
     measured_db: FloatArray = field(repr=False)
     simulated_dbm: FloatArray = field(repr=False)
     position_m: FloatArray = field(repr=False)
-    distance_m: FloatArray = field(repr=False)
     heading_deg: FloatArray | None = field(repr=False, default=None)
     start_ns: int = 0
     """First instant, nanoseconds after 1970-01-01."""
@@ -85,13 +81,6 @@ class RssRow:
     def residual_db(self) -> FloatArray:
         """Measurement after this row's own offset, minus simulation (n,)."""
         return self.measured_db + self.offset_db - self.simulated_dbm
-
-
-def place_means(row: RssRow, cell_m: float) -> dict[tuple[int, int], tuple[float, float]]:
-    """Mean residual [dB] and mean height [m] of each square cell of the plan that has a scored sample."""
-    good = np.isfinite(row.residual_db) & np.isfinite(row.position_m).all(axis=1)
-    cells, residual, height = cell_means(row.position_m, row.residual_db, good, cell_m)
-    return {(int(e), int(n)): (float(r), float(h)) for (e, n), r, h in zip(cells, residual, height, strict=True)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -210,15 +199,6 @@ class RankTransfer:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FlownTrack:
-    """Samples of one flight's track: ``time_s`` (n,) after its first sample, ``position_m`` (n, 3)."""
-
-    flight: str
-    time_s: FloatArray
-    position_m: FloatArray
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class SettingRank:
     """One setting against the one of least mean error, over flights.
 
@@ -328,7 +308,6 @@ class CampaignData(Made):
     pooled: tuple[PooledOffset, ...] = ()
     repeats: tuple[Repeat, ...] = ()
     rank_transfers: tuple[RankTransfer, ...] = ()
-    tracks: tuple[FlownTrack, ...] = ()
     radius_m: float = 3.0
     heading_within_deg: float | None = 20.0
     cell_m: float = 20.0
@@ -339,7 +318,7 @@ class CampaignData(Made):
 
     @property
     def reference(self) -> str:
-        """The setting that overlays and repeatability are drawn for: the first."""
+        """The setting that repeatability and the season are drawn for: the first."""
         return next(iter(self.settings), "")
 
     @property

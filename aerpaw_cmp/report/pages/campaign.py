@@ -35,7 +35,7 @@ ROWS_SHOWN = 300
 _COMPACT_ROWS = 2000
 
 # Fields of a row that are samples, not numbers of a table.
-ARRAYS = ("measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
+ARRAYS = ("measured_db", "simulated_dbm", "position_m", "heading_deg")
 
 
 def _entries(items: Iterable[Any], without: Sequence[str]) -> list[dict[str, Any]]:
@@ -155,7 +155,7 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
             write_file(folder / f"{_PAIR_TABLE}.csv", guarded(pairs).to_csv(index=False, lineterminator="\n"))
         )
     tables = [path.name for path in written]
-    drawn, pictures = canvas.write_figures(campaign_figures.figure_specs(data), folder / "figures")
+    drawn, pictures = canvas.write_figures(list(campaign_figures.figure_specs(data)), folder / "figures")
     written += pictures
     page = write_file(folder / "campaign.html", campaign_page(data, drawn, tables))
     return [page, *written]

@@ -416,23 +416,6 @@ class OutputFolder:
             _clear(place.part)
 
 
-@contextlib.contextmanager
-def new_folder(target: Path) -> Iterator[Path]:
-    """An empty folder that takes a free name when the block ends without an error; errors as :class:`OutputFolder`."""
-    with explained_os_errors(target):
-        place = _Place(target, target, folder=True)
-        try:
-            (place.part / _UNFINISHED).touch()
-            yield place.part
-            _sync_tree(place.part)
-            place.refuse_gone()
-            raise_interrupt()
-            with held():
-                place.take_name()
-        finally:
-            place.leave()
-
-
 def foreign_entries(folder: Path, own: Iterable[str]) -> Iterator[str]:
     """Entries of a folder besides files that are this tool's: files, links, folders, other file systems.
 

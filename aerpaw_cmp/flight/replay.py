@@ -21,7 +21,7 @@ from ..propagation.geometry.paths import RowsT
 from ..propagation.options import Engine, Field, Run, Search
 from ..propagation.replay import PER_LINK, Replay, replay
 from ..site.site import Site
-from .data import FlightData, RssSeries, Times, rank_positions
+from .data import FlightData, RankSeries, RssSeries, Times, rank_positions
 from .gains.learned_gain import LearnedGain, learned_gain
 from .gains.losses import path_loss
 from .pose.clock import Along, ClockChannel, ClockEstimate, judge_clock
@@ -338,28 +338,32 @@ def part_of(replayed: Replay, start: int, stop: int) -> Replay:
 
 
 def replay_rank(data: FlightData, progress: Progress = logged) -> list[Replayed]:
-    """Replay every rank series with the arrays of ``link.rank``.
-
-    Position and attitude come each from what has them: positions from the log where it holds its own, else from the
-    track; attitude from the track, whoever gave the position. Where the track has none, the UAV array stays as mounted.
-    """
+    """Replay every rank series with the arrays of ``link.rank``."""
     out = []
     for series in data.rank:
         link = data.link_of(series)
-        position, valid = rank_positions(series, data.track)
-        place, known = data.tower_at(series.tower, series.time)
-        valid = valid & known
-        towers_m = place[valid] if series.tower in data.nodes else None
-        track = None if data.track is None else data.poses_at(series.time).pick(valid)
-        rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
-        if track is not None:
-            rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
-        poses = Poses(position[valid], rotation)
+        poses, valid, track = rank_poses(data, series)
+        towers_m = data.tower_at(series.tower, series.time)[0][valid] if series.tower in data.nodes else None
         progress(f"replay rank {series.tower}: {counted(len(poses), 'pose')}")
         # H holds reflections alone, so nothing else is searched
         replayed = replay_poses(data.site, data.settings.rt, link, poses, towers_m=towers_m, progress=progress)
         out.append(Replayed(link=link, poses=poses, valid=valid, replay=replayed, track=track, tower_m=towers_m))
     return out
+
+
+def rank_poses(data: FlightData, series: RankSeries) -> tuple[Poses, BoolArray, TrackPoses | None]:
+    """Poses of the reports at which the UAV and the tower are known, which those are (n,), and the track at them.
+
+    Position and attitude come each from what has them: positions from the log where it holds its own, else from the
+    track; attitude from the track, whoever gave the position. Where the track has none, the UAV array stays as mounted.
+    """
+    position, valid = rank_positions(series, data.track)
+    valid = valid & data.tower_at(series.tower, series.time)[1]
+    track = None if data.track is None else data.poses_at(series.time).pick(valid)
+    rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
+    if track is not None:
+        rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
+    return Poses(position[valid], rotation), valid, track
 
 
 def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:

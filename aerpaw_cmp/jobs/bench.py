@@ -40,8 +40,8 @@ _DEPTH = 2
 # Poses per PathSolver call.
 BATCH = 50
 
-# The same with explicit arrays, which multiply sources and targets.
-_EXPLICIT_BATCH = 10
+# The same with explicit arrays, which multiply sources and targets, and how many poses of them are replayed.
+_EXPLICIT_BATCH, _EXPLICIT_POSES = 10, 50
 
 # Lines of a real channel-sounder flight.
 LINES = 20_523
@@ -114,7 +114,6 @@ def speed_against_error(
     *,
     samples: Sequence[int] = (1_000, 10_000, 100_000, 1_000_000),
     depths: Sequence[int] = (0, 1, 2, 3),
-    explicit_poses: int = 50,
     progress: Progress = logged,
 ) -> list[Row]:
     """Rows of speed against error: ways to replay the same poses, each held against the image engine at depth 2.
@@ -127,8 +126,6 @@ def speed_against_error(
         Rays of the Sionna rows; empty for none.
     depths : sequence of int
         Rows of the image engine.
-    explicit_poses : int
-        Explicit arrays multiply the work by the element pairs: their rows take this many poses, evenly spread.
     progress : callable
         Told what runs.
 
@@ -151,7 +148,7 @@ def speed_against_error(
     for count in samples:
         for kind in ("synthetic", "explicit"):
             progress(f"sionna, {counted(count, 'sample')}, its own {kind} arrays")
-            chosen = spread_out(len(poses), len(poses) if kind == "synthetic" else explicit_poses)
+            chosen = spread_out(len(poses), len(poses) if kind == "synthetic" else _EXPLICIT_POSES)
             rows.append(case.own_arrays(count, kind, chosen))
         progress(f"sionna, {counted(count, 'sample')}")
         rows.append(case.replayed(Search("sionna", max_depth=_DEPTH, samples=count, batch=BATCH)))
@@ -331,7 +328,7 @@ def path_search_ratios(
     return {"at": {f"{n:.0e}": measured for n, measured in sorted(at.items())}, "equal_error": at[enough]}
 
 
-def kriging_shared_weights(fields: int = 27, neighbours: int = 20) -> dict[str, Any] | None:
+def kriging_shared_weights(fields: int = 27) -> dict[str, Any] | None:
     """Prediction at 2556 targets with one set of weights for all fields on our side and PyKrige's compiled back end.
 
     Both have the same neighbours and the same exponential variogram. PyKrige has no several fields: one run is timed,
@@ -344,7 +341,7 @@ def kriging_shared_weights(fields: int = 27, neighbours: int = 20) -> dict[str, 
     from ..maps.grid import Grid
     from ..maps.kriging import OrdinaryKriging
 
-    generator = np.random.default_rng(2)
+    generator, neighbours = np.random.default_rng(2), 20
     grid = Grid.over_area((-540.0, 540.0, -1065.0, 1065.0))
     points = grid.points_m + generator.uniform(-5, 5, (len(grid), 2))
     targets = points + generator.uniform(5, 10, points.shape)

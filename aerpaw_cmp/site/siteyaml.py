@@ -203,19 +203,11 @@ class SingleTreeModel(StrictModel):
     trunk_diameter_m: Positive | None = None
 
 
-class TreesModel(StrictModel):
+class TreesModel(TreeSizes):
     """Sizes of all trees, the seed of the placement, and single trees."""
 
     seed: Annotated[int, Field(ge=0)] = 0
-    height_m: Positive = 20.0
-    crown_diameter_m: Positive = 10.0
-    trunk_diameter_m: Positive = 0.4
-    crown_base_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.25
     single: list[SingleTreeModel] = Field(default_factory=list)
-
-    def sizes(self) -> TreeSizes:
-        """For the placement."""
-        return TreeSizes(**named(self, "height_m crown_diameter_m trunk_diameter_m crown_base_fraction"))
 
 
 class DemModel(StrictModel):
@@ -645,14 +637,13 @@ def _trees(
         [building.footprint for building in buildings]
         + [Point(tower.east_m, tower.north_m).buffer(MAST_CLEARANCE_M) for tower in towers.values()]
     )
-    sizes = model.sizes()
     parts: list[Trees] = []
     of_stands: list[Trees] = []
     for index, forest in enumerate(forests):
         if forest.height_m is not None and not forest.trees:
             continue
         with _at("forests", index):
-            placed = place_trees(forest, sizes, seed=model.seed, keep_clear=clear)
+            placed = place_trees(forest, model, seed=model.seed, keep_clear=clear)
         wanted = wanted_trees(forest, clear)
         if len(placed) < wanted:
             notes.append(
@@ -660,7 +651,7 @@ def _trees(
             )
         (parts if forest.height_m is None else of_stands).append(placed)
     if model.single:
-        parts.append(_single(model.single, sizes))
+        parts.append(_single(model.single, model))
     return join_trees(parts), join_trees(of_stands)
 
 

@@ -9,15 +9,18 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import fields
+from typing import Annotated
 
 import numpy as np
 import shapely
+from pydantic import Field
 from scipy.spatial import cKDTree
 from shapely.geometry.base import BaseGeometry
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
+from ..common.yamlfile import StrictModel
 from .site import Forest, Trees
 
 # Of one forest.
@@ -26,25 +29,16 @@ _MAXIMUM_TREES = 2_000_000
 _STALLED_ROUNDS = 12  # batches of darts in a row that add less than a thousandth: the forest is full
 
 
-@dataclass(frozen=True, slots=True)
-class TreeSizes:
-    """Sizes of trees.
+class TreeSizes(StrictModel):
+    """Sizes of trees; the crown's base lies at a share of the height."""
 
-    Parameters
-    ----------
-    height_m, crown_diameter_m, trunk_diameter_m : float
-    crown_base_fraction : float
-        Height of the crown's base as a share of the tree's height, 0 to below 1.
-    """
+    height_m: Annotated[float, Field(gt=0)] = 20.0
+    crown_diameter_m: Annotated[float, Field(gt=0)] = 10.0
+    trunk_diameter_m: Annotated[float, Field(gt=0)] = 0.4
+    crown_base_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.25
 
-    height_m: float = 20.0
-    crown_diameter_m: float = 10.0
-    trunk_diameter_m: float = 0.4
-    crown_base_fraction: float = 0.25
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.crown_base_fraction < 1:
-            raise UsageError(f"crown_base_fraction is {self.crown_base_fraction}", expected="0 to below 1")
+PAPER_SIZES = TreeSizes()
 
 
 def trees_at(east_m: FloatArray, north_m: FloatArray, sizes: TreeSizes) -> Trees:
@@ -82,7 +76,7 @@ def join_trees(parts: Sequence[Trees]) -> Trees:
 
 def place_trees(
     forest: Forest,
-    sizes: TreeSizes = TreeSizes(),
+    sizes: TreeSizes = PAPER_SIZES,
     *,
     seed: int = 0,
     keep_clear: BaseGeometry | None = None,

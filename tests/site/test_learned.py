@@ -3,7 +3,6 @@
 import errno
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -19,6 +18,7 @@ from aerpaw_cmp.flight.drafting.remembered import Nodes, propose, searching_airf
 from aerpaw_cmp.flight.gains.memory import load_with_learned
 from aerpaw_cmp.flight.marks import mark_of
 from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.site.antenna import learned as memory
 from aerpaw_cmp.site.antenna.learned import (
     Entry,
     Learned,
@@ -243,18 +243,18 @@ def test_a_copied_memory_is_whole_or_not_there_and_holds_its_own_files_alone(
     own, copy = folder_of(folder / "mine.yaml"), folder / "new.yaml"
     (own / "diary.txt").symlink_to("/etc/hostname")
     (own / "thesis.tex").write_text("years of work")
-    plain = shutil.copyfile
+    plain = memory.write_whole
 
-    def full(source: Path, target: Path) -> None:
-        if source.name != "A.t.csv.gz":
-            plain(source, target)
-        raise OSError(errno.ENOSPC, "No space left on device")
+    def full(place: Path, content: bytes) -> None:
+        if place.name == "A.u.csv.gz":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        plain(place, content)
 
     with monkeypatch.context() as patch:
-        patch.setattr(shutil, "copyfile", full)
+        patch.setattr(memory, "write_whole", full)
         with pytest.raises(OutputError, match="the disk is full"):
             carry_memory(folder / "mine.yaml", copy)
-    assert sorted(place.name for place in folder.iterdir()) == ["mine.learned"]
+    assert read_learned(copy).entries == {}
     assert carry_memory(folder / "mine.yaml", copy)
     names = {"learned.yaml", "A.t.csv.gz", "A.u.csv.gz"}
     assert {place.name: place.read_bytes() for place in folder_of(copy).iterdir()} == {

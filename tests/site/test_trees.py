@@ -79,6 +79,6 @@ def test_the_papers_tree_is_the_default() -> None:
 def test_impossible_wishes() -> None:
     with pytest.raises(UsageError, match="asks for 100000000 trees"):
         place_trees(Forest("w", box(0, 0, 1e5, 1e5), 100, 4))
-    with pytest.raises(UsageError, match="crown_base_fraction"):
+    with pytest.raises(ValueError, match="crown_base_fraction"):
         TreeSizes(crown_base_fraction=1.0)
     assert len(place_trees(Forest("w", box(0, 0, 10, 10), 0, 4))) == 0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.units import FloatArray
 from ...compare.gains.direction_gain import link_directions
-from ...propagation.geometry.arrays import Array, Link, Poses
+from ...propagation.geometry.arrays import Array, Link, Pattern, Poses
 from ...site.antenna.sphere_pattern import SpherePattern
 
 
@@ -78,6 +78,13 @@ def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tupl
 def sphere_angles(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Zenith angle and azimuth (...,) [rad] of directions (..., 3)."""
     return 0.5 * np.pi - elevation_rad(direction), azimuth_rad(direction)
+
+
+def mean_gain_db(patterns: Sequence[Pattern], theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
+    """Mean gain (n,) of the elements of an array towards directions of its frame [dBi]; no lower than -60."""
+    fields = [pattern.field(theta_rad, phi_rad) for pattern in patterns]
+    power = sum(np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2 for e_theta, e_phi in fields)
+    return np.asarray(10.0 * np.log10(np.maximum(power / len(patterns), 1e-6)))
 
 
 def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | float:

@@ -24,7 +24,7 @@ from ...compare.learning.calibration import Learned, Observed, Recipe, Score
 from ...compare.learning.correction import BIN_S
 from ...compare.learning.learning_curve import CurvePoint, learning_curve
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
-from ...flight.gains.learned_gain import sphere_angles
+from ...flight.gains.learned_gain import mean_gain_db, sphere_angles
 from ...flight.gains.memory import load_with_learned
 from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...flight.settings import AntennaSettings, load_pattern
@@ -393,13 +393,7 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
 def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
     """Gain [dBi] of a pattern towards unit vectors (n, 3) of its device frame."""
     pattern = load_pattern(settings, folder)
-
-    def gain(direction: FloatArray) -> FloatArray:
-        e_theta, e_phi = pattern.field(*sphere_angles(direction))
-        power = np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2
-        return np.asarray(10.0 * np.log10(np.maximum(power, 1e-6)))
-
-    return gain
+    return lambda direction: mean_gain_db([pattern], *sphere_angles(direction))
 
 
 def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:

@@ -25,9 +25,9 @@ from ...common.yamlfile import StrictModel
 from ...compare.level.rss import seconds
 from ...compare.ranks import receiver
 from ...compare.ranks.forecast import ForecastScore, constant_forecast, score_forecast
-from ...flight.data import FlightData, RankSeries, rank_positions
+from ...flight.data import FlightData, RankSeries
 from ...flight.marks import among
-from ...flight.replay import attitude_rotation
+from ...flight.replay import rank_poses
 from ...flight.training import logs_of, series_mark
 from ...propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
 from ...propagation.geometry.arrays import Link, Poses
@@ -203,15 +203,10 @@ def _geometry(values: Mapping[str, Any]) -> Geometry:
 
 def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
     """Reports above ``rank.minimum_height_m`` at known positions."""
-    position, valid = rank_positions(series, data.track)
-    rotation = np.tile(np.eye(3), (len(position), 1, 1))
-    if data.track is not None:
-        track = data.track.pose_at(series.time)
-        rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
+    poses, known, _ = rank_poses(data, series)
     low = data.settings.rank.minimum_height_m
-    with np.errstate(invalid="ignore"):
-        keep = valid if low is None else valid & (position[:, 2] >= low)
-    link = data.link_of(series)
+    high = np.full(len(poses), True) if low is None else poses.position_m[:, 2] >= low
+    keep, link = np.flatnonzero(known)[high], data.link_of(series)
     ports = {len(link.uav_array), len(link.tower_arrays[series.tower])}
     if series.tower in data.nodes:
         raise UsageError(
@@ -227,7 +222,7 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
         flight=data.settings.flight.name,
         tower=series.tower,
         tower_m=np.asarray(data.site.towers[series.tower].position_m),
-        poses=Poses(position[keep], np.ascontiguousarray(rotation[keep])),
+        poses=Poses(poses.position_m[high], np.ascontiguousarray(poses.rotation[high])),
         rank=series.rank[keep],
         link=link,
         time_s=seconds(series.time[keep]),

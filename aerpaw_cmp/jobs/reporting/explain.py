@@ -16,10 +16,10 @@ from ...common.errors import UsageError
 from ...common.jsonable import fields_of, json_object
 from ...common.stages import Progress, logged
 from ...common.units import FloatArray
-from ...flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
+from ...flight.data import FlightData, RankSeries, RssSeries, Times, load_data
 from ...flight.gains.losses import path_loss, roughness_loss
 from ...flight.gains.memory import load_with_learned
-from ...flight.replay import attitude_rotation, estimate_clocks, replay_poses, telemetry_time, valid_poses
+from ...flight.replay import estimate_clocks, rank_poses, replay_poses, telemetry_time, valid_poses
 from ...flight.settings import RtSettings
 from ...propagation.check.explain import (
     ExplainedPath,
@@ -223,14 +223,11 @@ def _pose(
         _check_pose(track.valid, series, at)
         return data.link_of(series), valid_poses(track, rt.attitude), notes, time[at : at + 1]
     link = data.link_of(series)
-    position, valid = rank_positions(series, data.track)
+    poses, valid, _ = rank_poses(data, series)
     _check_pose(valid[at : at + 1], series, at)
-    rotation: FloatArray = np.eye(3)[None]
-    if data.track is not None:
-        track = data.poses_at(series.time[at : at + 1])
-        if track.valid[0]:
-            rotation = np.asarray(attitude_rotation(track, rt.attitude))
-    return link, Poses(position[at : at + 1], np.ascontiguousarray(rotation)), notes, series.time[at : at + 1]
+    row = int(valid[:at].sum())
+    pose = Poses(poses.position_m[row : row + 1], np.ascontiguousarray(poses.rotation[row : row + 1]))
+    return link, pose, notes, series.time[at : at + 1]
 
 
 def _check_pose(valid: Any, series: RssSeries | RankSeries, at: int) -> None:

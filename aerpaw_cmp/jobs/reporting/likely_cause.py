@@ -14,6 +14,7 @@ from ...compare.judge.causes import Cause, LevelEvidence, flight_cause
 from ...compare.level import rss
 from ...compare.result import RssResult
 from ...flight.data import FlightData, RssSeries
+from ...flight.gains.learned_gain import mean_gain_db
 from ...flight.replay import FlightReplay, Replayed, attitude_rotation
 from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
@@ -188,11 +189,7 @@ class _Direct:
         """Free space and the mean gain of the UAV's elements towards the tower [dB]."""
         link, at = self.replayed.link, self.directions(place_m, position_m, rotation)
         theta, phi = np.radians(90.0 - at["uav_elevation_deg"]), np.radians(at["uav_azimuth_deg"])
-        power = np.zeros(len(theta))
-        for pattern in link.uav_array.patterns:
-            e_theta, e_phi = pattern.field(theta, phi)
-            power += np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2
-        gain = 10.0 * np.log10(np.maximum(power / len(link.uav_array.patterns), 1e-6))
+        gain = mean_gain_db(link.uav_array.patterns, theta, phi)
         return np.asarray(free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0] + gain)
 
 

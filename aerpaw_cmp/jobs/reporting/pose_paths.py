@@ -18,12 +18,12 @@ POSES = 300
 SHORTEST = 8
 
 
-def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> tuple[PosePaths, ...]:
-    """Paths of each tower's first series at about ``limit`` of its poses, spread over the flight."""
+def pose_paths(data: FlightData, replays: FlightReplay) -> tuple[PosePaths, ...]:
+    """Paths of each tower's first series at about :data:`POSES` of its poses, spread over the flight."""
     by_tower: dict[str, PosePaths] = {}
     for (_, series), replayed in zip(data.series, replays.all, strict=True):
         if series.tower not in by_tower and replayed.valid.any():
-            poses = np.unique(np.linspace(0, len(replayed.poses) - 1, limit).astype(np.int64))
+            poses = np.unique(np.linspace(0, len(replayed.poses) - 1, POSES).astype(np.int64))
             time = series.time[replayed.valid][poses]
             tower_m = np.broadcast_to(replayed.source_m(data.site), replayed.poses.position_m.shape)
             lines = tuple(tuple(_lines(replayed, pose, tower_m[pose])) for pose in poses)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-import shutil
 from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
@@ -20,7 +19,7 @@ from pydantic import Field
 from ...common.counting import counted
 from ...common.errors import InputError, UsageError, parsing
 from ...common.files import LARGEST_TABLE, inside, locked, read_bounded, write_whole
-from ...common.outputs import explained_os_errors, file_digest, new_folder
+from ...common.outputs import explained_os_errors, file_digest
 from ...common.yamlfile import StrictModel, dump_yaml, load_yaml
 
 _INDEX = "learned.yaml"
@@ -235,13 +234,15 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
 def carry_memory(base: str | Path, site: Path) -> list[str]:
     """Copy the memory of a base beside a site made of it, which has none yet; a line that says so."""
     origin, folder = folder_of(base), folder_of(site)
-    if not origin.is_dir() or folder.exists():
+    if not origin.is_dir() or (folder / _INDEX).exists():
         return []
     entries = read_learned(base).entries
-    with new_folder(folder) as copy:
-        for name in sorted({_INDEX}.union(*map(files_of, entries.values()))):
-            if (place := inside(origin, name, origin / _INDEX, plain=True)).is_file():
-                shutil.copyfile(place, copy / name)
+    with explained_os_errors(folder):
+        folder.mkdir(exist_ok=True)
+        for name in [*sorted(set().union(*map(files_of, entries.values()))), _INDEX]:  # without it there is no memory
+            place = inside(origin, name, origin / _INDEX, plain=True)
+            if place.is_file() and not (folder / name).exists():
+                write_whole(folder / name, place.read_bytes())
     return [f"learned antennas and receivers of the base were copied to {folder.name}: {', '.join(entries)}"]
 
 

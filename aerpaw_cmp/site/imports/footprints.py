@@ -123,10 +123,7 @@ def import_footprints(
     frame: SiteFrame,
     *,
     untagged: Kind | None = None,
-    default_height_m: float = _DEFAULT_HEIGHT_M,
     trees: bool = False,
-    trees_per_hectare: float = 100.0,
-    minimum_spacing_m: float = 4.0,
     area_m: tuple[float, float, float, float] | None = None,
 ) -> Footprints:
     """Outlines of map files as records of the site.
@@ -139,12 +136,8 @@ def import_footprints(
         Of the site that they belong to.
     untagged : {"building", "forest", "geofence"}, optional
         What areas without a known tag are. By default a KML area is a geofence and others are left out.
-    default_height_m : float
-        Of buildings without height and levels.
     trees : bool
         Forests are single trees at random places; by default media with a height.
-    trees_per_hectare, minimum_spacing_m : float
-        Of all forests found.
     area_m : (east_min, east_max, north_min, north_max), optional
         Of the site; forests are cut off :data:`_FOREST_MARGIN_M` outside.
 
@@ -169,15 +162,7 @@ def import_footprints(
         result.actions += content.notes
         if content.credit and content.credit not in result.credits:
             result.credits.append(content.credit)
-        _sort(
-            content=content,
-            path=Path(path),
-            frame=frame,
-            untagged=untagged,
-            default_height_m=default_height_m,
-            shapes=shapes,
-            actions=result.actions,
-        )
+        _sort(content, Path(path), frame, untagged, shapes, result.actions)
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
     _inherit(shapes["building"], result.actions)
@@ -185,7 +170,7 @@ def import_footprints(
     near = None if area_m is None else box(area_m[0], area_m[2], area_m[1], area_m[3]).buffer(_FOREST_MARGIN_M)
     shapes["forest"] = _cut_off(shapes["forest"], near, result.actions)
     canopy_m = None if trees else _DEFAULT_CANOPY_M
-    _fill(result, shapes, canopy_m, trees_per_hectare, minimum_spacing_m)
+    _fill(result, shapes, canopy_m)
     if not (result.buildings or result.forests or result.geofences or result.trees):
         raise InputError(
             "no building, forest, geofence or tree found in " + ", ".join(Path(f).name for f in files),
@@ -199,7 +184,6 @@ def _sort(
     path: Path,
     frame: SiteFrame,
     untagged: Kind | None,
-    default_height_m: float,
     shapes: dict[Kind, list[_Shape]],
     actions: list[str],
 ) -> None:
@@ -214,7 +198,7 @@ def _sort(
         shape = _project(outline, frame, actions)
         if shape is not None:
             if kind == "building":
-                _describe(shape, outline, default_height_m, path, actions)
+                _describe(shape, outline, path, actions)
             elif kind == "forest":
                 _describe_wood(shape, outline.tags, actions)
             shapes[kind].append(shape)
@@ -270,13 +254,7 @@ def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> 
     return near_shapes
 
 
-def _fill(
-    result: Footprints,
-    shapes: dict[Kind, list[_Shape]],
-    canopy_m: float | None,
-    trees_per_hectare: float,
-    minimum_spacing_m: float,
-) -> None:
+def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float | None) -> None:
     actions = result.actions
     buildings = _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions)
     woods = _first_keeps(_without_duplicates(shapes["forest"], actions), actions)
@@ -285,15 +263,16 @@ def _fill(
             Building(name, area, round(shape.height_m, 2), material=shape.material, source=shape.source)
         )
     for name, shape, area in _parts(woods, actions):
-        wood = Forest(name, area, trees_per_hectare, minimum_spacing_m, shape.source, evergreen_share=shape.evergreen)
+        wood = Forest(name, area, source=shape.source, evergreen_share=shape.evergreen)
         result.forests.append(
             wood if canopy_m is None else replace(wood, height_m=round(shape.height_m, 2) or canopy_m)
         )
     for name, _, area in _parts(shapes["geofence"], actions):
         result.geofences.append(Geofence(name, area))
     guesses = [_assumed_heights(buildings)]
-    if canopy_m is None and woods:
-        guesses.append(f"trees assumed: {trees_per_hectare:g} per hectare at random places in {len(woods)} woods")
+    if canopy_m is None and result.forests:
+        density = result.forests[0].trees_per_hectare
+        guesses.append(f"trees assumed: {density:g} per hectare at random places in {len(woods)} woods")
     elif low := [shape for shape in woods if not shape.height_m]:
         guesses.append(f"height assumed: {len(low)} of {len(woods)} woods have none in the map, {canopy_m:g} m each")
     result.assumed = "; ".join(filter(None, guesses))
@@ -418,14 +397,14 @@ def _areas_only(shape: BaseGeometry) -> BaseGeometry:
 # ---------------------------------------------------------------- heights and materials
 
 
-def _describe(shape: _Shape, outline: Outline, default_m: float, path: Path, actions: list[str]) -> None:
+def _describe(shape: _Shape, outline: Outline, path: Path, actions: list[str]) -> None:
     tags = {key.lower(): value for key, value in outline.tags.items()}
     notes: list[str] = []
     height = height_of(tags, notes)
     levels = levels_of(tags, notes)
     shape.stated, shape.assumed = height is not None, height is None and not levels
     if height is None:
-        height = levels * _LEVEL_M if levels else default_m
+        height = levels * _LEVEL_M if levels else _DEFAULT_HEIGHT_M
         notes = [f"{note}; it is drawn {height:g} m high" for note in notes]
     lowest = tags.get("min_height", tags.get("building:min_level", tags.get("min_level", "0")))
     if (metres(lowest) or 0.0) > 0:

@@ -79,7 +79,8 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s| us)?$",
         r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| local| epoch)?$",
         r"^time ?millisecond$",
-        r"^(rel|relative|elapsed) ?time( ms| s)?$", r"^time boot ms$", r"^(epoch|unix)( ms| s)?$", r"^utc$", r"^t$",
+        r"^(rel|relative|elapsed) ?time( ms| s)?$", r"^elapsed$", r"^time boot ms$", r"^(epoch|unix)( ms| s)?$",
+        r"^utc$", r"^t$",
         r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
     )),
     Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$", r"^(datum|fecha)$")),
@@ -90,11 +91,12 @@ QUANTITIES: tuple[Quantity, ...] = (
     ), "s"),
     # where
     Quantity("latitude_deg", "position", (
-        r"^(osd |gps )?(lat|latitude)( deg| degrees| int)?( ?1?e ?[67])?$", r" (lat|latitude)( deg)?$",
+        r"^(osd |gps )?(lat|latitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67])?$", r" (lat|latitude)( deg)?$",
         r"^(breite|breitengrad|latitud)( deg)?$",
     ), "deg", can_be=(-90.0, 90.0)),
     Quantity("longitude_deg", "position", (
-        r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int)?( ?1?e ?[67])?$", r" (lon|lng|longitude)( deg)?$",
+        r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67])?$",
+        r" (lon|lng|longitude)( deg)?$",
         r"^(l nge|laenge|l ngengrad|laengengrad|longitud)( deg)?$",
     ), "deg", can_be=(-180.0, 180.0)),
     # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's

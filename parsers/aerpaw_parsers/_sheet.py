@@ -556,7 +556,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     if day is not None and day != column:
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
         texts = [f"{date} {time}".strip() for date, time in pairs]
-    name, unit = dictionary.plain(sheet.names[column]), sheet.unit(column)
+    name, unit = dictionary.plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", sheet.names[column])), sheet.unit(column)
     count = next((short for short, form in _COUNTS.items() if form.search(unit) or form.search(name)), None)
     # the sign for micro is no letter of a plain name: 'Time [\u00b5s]' is 'time s' there
     if unit in ("\u00b5s", "\u03bcs") or (unit and count is None):
@@ -571,8 +571,10 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     return _stamps.read(texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps)
 
 
-_COUNTS = {"us": re.compile(r"\b(us|usec|micros\w*)\b"), "ms": re.compile(r"\bms\b|^m?sec$|millisecond"),
-           "s": re.compile(r" s$|^s$|\bsec(ond)?s\b")}  # fmt: skip
+_COUNTS = {"ns": re.compile(r"\bn(s|sec|anos\w*)\b"), "us": re.compile(r"(\b|time|stamp)(us|usec|micros\w*)\b"),
+           "ms": re.compile(r"(\b|time|stamp)ms\b|^m?sec$|millisecond"),
+           "s": re.compile(r" s$|^s$|\bsec(ond)?s\b"), "min": re.compile(r"\bmin(ute)?s?\b"),
+           "h": re.compile(r" h$|^h$|\bh(ou)?rs?\b")}  # fmt: skip
 
 
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:

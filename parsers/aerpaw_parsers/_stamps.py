@@ -311,7 +311,7 @@ def read(
     ----------
     texts : sequence of str
     options : ReadOptions
-    unit : {"s", "ms", "us"}, optional
+    unit : {"ns", "us", "ms", "s", "min", "h"}, optional
         Of numbers, where the head of the column says so and they count from no known origin.
     european : bool
         Has the table decimal commas? Where they stand, the day comes before the month.
@@ -331,6 +331,11 @@ def read(
     texts = [text.replace("\u202f", " ").replace("\xa0", " ") for text in texts]  # in front of AM, as browsers write it
     shown = [text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else text.strip() for text in texts]
     filled = [text for text in shown if text]
+    if 2 * sum((match := _COMPACT.fullmatch(text)) is not None and bool(match[1] or zone) for text in filled) > len(
+        filled
+    ):
+        shown = [_COMPACT.sub(_with_marks, text) for text in shown]
+        filled = [text for text in shown if text]
     refuse_spreadsheets(filled)
     counts = sum(_NUMBER.fullmatch(text) is not None for text in filled)
     if counts * 2 > len(filled) and not any(_DIGITS.fullmatch(text) for text in filled[:3]):
@@ -349,6 +354,16 @@ def read(
         else _written(text, order, zones) for text in shown
     ]  # fmt: skip
     return "wall", _lines.cells(cells), warnings
+
+
+# The date and the time of day of a GPS receiver, six digits each: ddmmyy or yymmdd, hhmmss.
+_COMPACT = re.compile(r"((\d\d)(\d\d)(\d\d)[ T])?([01]\d|2[0-3])([0-5]\d)([0-5]\d(?:\.\d{1,9})?)")
+
+
+def _with_marks(match: re.Match[str]) -> str:
+    """Points in the date, where the day comes before the month, and colons in the time."""
+    date = ".".join(match.group(2, 3, 4)) + " " if match[1] else ""
+    return date + ":".join(match.group(5, 6, 7))
 
 
 def refuse_spreadsheets(texts: Sequence[str]) -> None:
@@ -404,7 +419,7 @@ def _numbers(
 GPS_S, LEAP_S = 315_964_800, 18
 _GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were taken off"
 # An epoch in a unit that the head of the column says; 1e9 microseconds are a quarter of an hour of PX4's own clock.
-_LEAST_EPOCH = {"s": 1e9, "ms": 1e12, "us": 1e15}
+_LEAST_EPOCH = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18, "min": np.inf, "h": np.inf}
 # Date of number zero, and the numbers of the years 2000 to 2099.
 _DAY_NUMBERS = (
     ("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"),

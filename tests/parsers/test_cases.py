@@ -388,6 +388,19 @@ COUSINS: dict[str, tuple[str, Right]] = {
         table("Zeit (MESZ);Breite;L\u00e4nge;H\u00f6he;pci;rsrp", "2025-06-10 16:00:0{i};35,728;-78,696;3;11;{l}"),
         Right({**LEVELS, "phone": {"altitude_m": [3] * 4}}, options={"timezone": "Asia/Tokyo"})),
     "another cell": radio("other_pci,other_rsrp", "20,-12{i}", N1),
+    **{f"times in {unit}": (
+        table(f"{name},pci,rsrp", f"{value},11,{{l}}"), Right(LEVELS, start=f"{START[:-2]}36", options={"time_origin": f"{START}Z"}))
+       for unit, name, value in (
+           ("milliseconds of Java", "timestampMs", "3600{i}"), ("minutes", "time [min]", "0.60{i}"), ("hours", "time (h)", "0.010{i}"),
+           ("microseconds of ArduPilot", "TimeUS", "3600000{i}"), ("nanoseconds", "elapsed (ns)", "3600000000{i}"))},
+    **{f"six digits, {order}": (
+        table("date,utc,pci,rsrp", f"{date},14000{{i}}.00,11,{{l}}"), Right(LEVELS, said=f"the {said} number was taken"))
+       for order, date, said in (("the day first", "100625", "last"), ("the year first", "250610", "first"))},
+    "six digits without a date": (
+        table("utc,pci,rsrp", "14000{i}.00,11,{l}"), Right(LEVELS, said="no date", options={"time_origin": f"{START}Z"})),
+    "degrees and minutes by name": (
+        table("time,lat_ddmm,lon_dddmm,pci,rsrp", EPOCH + ",3543.680006,-7841.760006,11,{l}"),
+        Right({"phone": {"latitude_deg": [35.7280001] * 4}}, said="ddmm.mmmm")),
     "PawPrints positions of 2023": (
         table("", "GPS_LOG_START,174956400{i}000,2.0,1.1,35.728,-78.696,75.{i},11.4,GPS_LOG_STOP"),
         Right({"phone": {"altitude_m": [0, 0.1, 0.2, 0.3]}})),

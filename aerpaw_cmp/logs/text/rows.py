@@ -340,7 +340,7 @@ def _untimed(lines: _lines.Lines, rows: IntArray, cells: AnyArray, valid: BoolAr
 
 
 RELATIVE = "the times are relative and no time_origin is given: they count from 1970-01-01T00:00"
-_SCALE_NS = {"s": 1e9, "ms": 1e6, "us": 1e3}
+_SCALE_NS = {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9, "min": 6e10, "h": 3.6e12}
 _MOST_S = 9.2e9
 # Relative times beyond about 285 years would leave the range of datetime64[ns].
 _FLIGHT_S = 9.0e9
@@ -355,7 +355,7 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
     options : ReadOptions
     clock : str
         ``wall`` (text, local unless it carries an offset), ``epoch_s``, ``epoch_ms``, ``epoch_us`` (UTC),
-        ``relative_s``, ``relative_ms`` or ``relative_us`` (from ``time_origin``, else from 1970-01-01).
+        ``relative_ns`` .. ``relative_h`` (from ``time_origin``, else from 1970-01-01).
     reader : str
         Its name, for messages.
 

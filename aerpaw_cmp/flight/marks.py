@@ -1,9 +1,9 @@
 """Marks of a log: what its readings did from moment to moment, whatever their unit, rate, clock and file are.
 
 A mark is the change of a level or a rank every half second: its mean over one second less its mean over ten, in steps
-of 0.4 robust standard deviations, a digit each. Two marks are of one log where they correlate at some lag: so do those
-of a part and of a thinned, resampled, rounded, shifted or scaled copy. Flights of one route share what is slower; where
-they share all, as in a simulation without noise, their clocks tell them apart: a mark begins with that of its log.
+of 0.4 robust standard deviations, a digit each; a power in watts counts by its logarithm. Two marks are of one log
+where they correlate at some lag: so do those of a part and of a thinned, resampled, rounded, shifted or scaled copy.
+Flights of one route share what is slower. A mark begins with the clock of its log: where the clocks differ, more is asked.
 """
 
 from __future__ import annotations
@@ -29,7 +29,10 @@ _SLACK, _HOUR = 120, 7200
 
 # Half seconds that two marks share; correlation, and Fisher's z over its standard deviation, from which they are of one
 # log. Largest z of two logs of the field: 7.3, the next 5.7; of a changed copy of most of a log the least is 8.6.
-_FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
+_FEWEST, _LEAST_R, _LEAST_Z, _LEAST_Z_APART = 80, 0.5, 7.5, 9.0
+
+# Readings that are all positive, and below one or over so many decades, are powers.
+_POWER_RATIO = 1e3
 
 # Standard deviation of the changes below which a mark tells of the route alone; of real logs the least is 0.26.
 _LEAST_SD = 0.2
@@ -41,8 +44,10 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
     known = known[np.argsort(time[known], kind="stable")]
     if not len(known):
         return ""
-    seconds = (time[known] - time[known[0]]) / np.timedelta64(1, "s")
-    total = np.concatenate([[0.0], np.cumsum(readings[known] - readings[known].mean())])
+    seconds, values = (time[known] - time[known[0]]) / np.timedelta64(1, "s"), readings[known]
+    if 0.0 < values.min() and (values.max() < 1.0 or values.max() > _POWER_RATIO * values.min()):
+        values = 10.0 * np.log10(values)
+    total = np.concatenate([[0.0], np.cumsum(values - values.mean())])
     at = np.arange(0.0, min(float(seconds[-1]), _LONGEST_S), _STEP_S)
 
     def mean(width_s: float) -> tuple[FloatArray, AnyArray]:
@@ -60,7 +65,7 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
     text = np.full(len(at), _GAP)
     text[told] = np.array(list(_DIGITS))[digits]
     digits, apart = "".join(text), int(_TREND_S / _STEP_S)
-    if _alike(digits, digits)[apart:-apart].any():
+    if (_evidence(digits, digits) >= _LEAST_Z)[apart:-apart].any():
         return ""
     first = time[known[0]]
     start = round((first - np.datetime64(0, "ns")) / np.timedelta64(500, "ms")) if has_wall_clock(first) else ""
@@ -78,11 +83,12 @@ def _same(first: str, second: str) -> bool:
     other, digits = _parts(second)
     if min(len(own), len(digits)) < _FEWEST:
         return False
-    lags = np.flatnonzero(alike := _alike(own, digits))
-    if begin is None or other is None:
-        return bool(len(lags))
-    apart = np.abs(np.where(lags < len(digits), lags, lags - len(alike)) + other - begin) + _SLACK
-    return bool(((apart % _HOUR <= 2 * _SLACK) & (apart <= 14 * _HOUR + 2 * _SLACK)).any())
+    z, near = _evidence(own, digits), np.True_
+    if begin is not None and other is not None:
+        lags = np.arange(len(z))
+        apart = np.abs(np.where(lags < len(digits), lags, lags - len(z)) + other - begin) + _SLACK
+        near = (apart % _HOUR <= 2 * _SLACK) & (apart <= 14 * _HOUR + 2 * _SLACK)
+    return bool((z >= np.where(near, _LEAST_Z, _LEAST_Z_APART)).any())
 
 
 def _parts(mark: str) -> tuple[int | None, str]:
@@ -91,8 +97,8 @@ def _parts(mark: str) -> tuple[int | None, str]:
     return int(begin) if begin.isdecimal() and len(begin) < 12 else None, digits
 
 
-def _alike(first: str, second: str) -> AnyArray:
-    """Lags, circular, at which two marks are of one log; of a level and of a path loss the signs differ."""
+def _evidence(first: str, second: str) -> FloatArray:
+    """Fisher's z over its spread at each circular lag, 0 of few or loose pairs; of level and path loss signs differ."""
     size = 1 << (len(first) + len(second) - 1).bit_length()
     left, right = _spectra(first, size), _spectra(second, size)
 
@@ -105,7 +111,7 @@ def _alike(first: str, second: str) -> AnyArray:
     covariance = np.abs(at_lags(1, 1) - ours * theirs / count)
     r = np.minimum(covariance / np.sqrt(np.maximum(variances, (0.01 * count) ** 2)), 0.9999)
     z = np.arctanh(r) * np.sqrt(np.maximum(count / _memory(left[1], right[1], size) - 3.0, 0.0))
-    return np.asarray((count >= _FEWEST) & (r >= _LEAST_R) & (z >= _LEAST_Z))
+    return np.where((count >= _FEWEST) & (r >= _LEAST_R), z, 0.0)
 
 
 def _memory(left: AnyArray, right: AnyArray, size: int) -> float:

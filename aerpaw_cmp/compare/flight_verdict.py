@@ -29,8 +29,11 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Channels with enough samples for a sentence about their error."""
-    return [panel for panel in panels if panel.score.n >= FEWEST and math.isfinite(panel.score.rmse_db)]
+    """Channels with enough samples for a sentence about their error; of some with the same levels the first."""
+    enough = [panel for panel in panels if panel.score.n >= FEWEST and math.isfinite(panel.score.rmse_db)]
+    levels = [panel.measured_db for panel in enough]
+    copied = [any(np.array_equal(of, earlier, equal_nan=True) for earlier in levels[:i]) for i, of in enumerate(levels)]
+    return [panel for panel, copy in zip(enough, copied, strict=True) if not copy]
 
 
 def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:

@@ -78,7 +78,7 @@ def test_the_first_sentence_follows_from_the_interval_over_all_channels(report_d
     won = paragraph(judged_as(report_data, -4.9, -6.0, -3.9, 3.0))
     assert won.startswith(f"Ray tracing (RMSE 3.0 dB) is 4.90 dB better than {best} [3.90, 6.00] over")
     few = paragraph(judged_as(report_data, 0.5, np.nan, np.nan))
-    assert f"{best}: 7.9 dB. Too few samples for an interval of the difference." in few
+    assert f"{best}: 7.9 dB. The flight is too short for an interval of the difference." in few
     none = paragraph(dataclasses.replace(lost, verdict=None))
     assert none.startswith("Ray tracing: RMSE 8.4 dB. No baseline could be scored.")
 
@@ -315,6 +315,9 @@ def test_two_channels_of_the_same_levels_are_told(report_data):
     said = f"{panel.name} and {panel.tower} copy hold the same levels: they are one measurement."
     assert said in cautions(twice)
     assert not any("same levels" in text for text in cautions(report_data))
+    pooled = flight_verdict(twice.rss)
+    assert pooled is not None
+    assert (pooled.channels, pooled.ci95_db) == (1, flight_verdict([panel]).ci95_db)
 
 
 def test_a_receiver_that_lost_its_lock_has_one_error_that_with_the_floor(report_data):

@@ -38,7 +38,7 @@ _FEWEST_INDEPENDENT = 10.0
 # on simulated flights).
 _UNSURE = 3.0
 
-# Width of an interval over its value from which its lower end alone is given.
+# Width of an interval over its value from which its lower end alone is given; of a difference, over both errors.
 _BOUND = 2.0
 
 # Stretches of a flight; the share of each comes from the others.
@@ -405,7 +405,8 @@ class PairedDifference:
     difference_db : float
         ``rmse_db - other_rmse_db`` [dB]: negative where the first model is better.
     difference_ci95_db : (low, high)
-        95 % interval of it [dB]; NaN where none can be given.
+        95 % interval of it [dB]; NaN where none can be given, and where one that holds 0 is wider than
+        :data:`_BOUND` times the two errors together: the flight is too short for its memory.
     standard_error_db : float
         Of ``difference_db`` [dB]: half of its central 68 % interval; NaN where none can be given.
     mean_square_difference_db2, mean_square_ci95_db2 : float, (low, high)
@@ -434,7 +435,7 @@ class PairedDifference:
         size = f"{abs(self.difference_db):.1f} dB"
         if self.verdict == "no interval":
             more = "more" if self.difference_db > 0 else "less"
-            return f"{size} {more} error than {other_model}, too few samples for an interval"
+            return f"{size} {more} error than {other_model}, too short a flight for an interval"
         difference, low, high = map(Printed, (self.difference_db, *self.difference_ci95_db))
         if self.verdict == "not significant":
             return f"no significant difference from {other_model} ({difference:+.1f} dB [{low:+.1f}, {high:+.1f}])"
@@ -491,6 +492,8 @@ def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_of
         squares = _ends(drawn)
         scale = max(rmse + other_rmse, 1e-300)
         bounds = squares[0] / scale, squares[1] / scale
+        if bounds[0] <= 0.0 <= bounds[1] and bounds[1] - bounds[0] > _BOUND * scale:
+            bounds = NO_INTERVAL
         spread = float(0.5 * np.diff(np.quantile(drawn, [0.1587, 0.8413]))[0]) / scale
         chance = 2.0 * min(float(np.mean(drawn <= 0.0)), float(np.mean(drawn >= 0.0)), 0.5)
     return PairedDifference(

@@ -47,12 +47,12 @@ def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
 
 
 def interval(value: tuple[float | None, float | None] | None, decimals: int = 1) -> str:
-    """An interval as ``[low, high]``, a bound as ``≥ low``, or nothing; "n/a" where there is neither."""
+    """An interval as ``[low, high]``, a bound as ``≥ low``, or nothing; "cannot tell" where there is neither."""
     if value is None:
         return ""
     low, high = (math.nan if end is None else end for end in value)
     if not math.isfinite(low):
-        return "n/a"
+        return "cannot tell"
     return (
         f"[{number(low, decimals)}, {number(high, decimals)}]" if math.isfinite(high) else f"≥ {number(low, decimals)}"
     )

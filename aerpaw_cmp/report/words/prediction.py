@@ -40,7 +40,7 @@ AGAINST_FREE_SPACE = {
         "On {over} left out the difference from free space [{low:+.1f}, {high:+.1f}] is not significant (95 %).",
         "",
     ),
-    "no interval": ("Too few samples for an interval of the difference from free space.", ""),
+    "no interval": ("The flight is too short for an interval of the difference from free space.", ""),
 }
 
 # The residual field, by the interval of the difference of the CRPS; ``off`` where it holds zero.

@@ -3,7 +3,7 @@
 A mark is the change of a level or a rank every half second: its mean over one second less its mean over ten, in steps
 of 0.4 robust standard deviations, a digit each; a power in watts counts by its logarithm. Two marks are of one log
 where they correlate at some lag: so do those of a part and of a thinned, resampled, rounded, shifted or scaled copy.
-Flights of one route share what is slower. A mark begins with the clock of its log: where the clocks differ, more is asked.
+Flights of one route share what is slower. A mark begins with the clock of its log: of other clocks more is asked.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
     if not len(known):
         return ""
     seconds, values = (time[known] - time[known[0]]) / np.timedelta64(1, "s"), readings[known]
-    if 0.0 < values.min() and (values.max() < 1.0 or values.max() > _POWER_RATIO * values.min()):
+    if values.min() > 0.0 and (values.max() < 1.0 or values.max() > _POWER_RATIO * values.min()):
         values = 10.0 * np.log10(values)
     total = np.concatenate([[0.0], np.cumsum(values - values.mean())])
     at = np.arange(0.0, min(float(seconds[-1]), _LONGEST_S), _STEP_S)

@@ -160,7 +160,9 @@ _DECIDED = {
     "not significant": (
         "Ray tracing: RMSE {ray}; {name}: {other}. The difference {ends}{over} is not significant (95 %)."
     ),
-    "no interval": "Ray tracing: RMSE {ray}; {name}: {other}. The flight is too short for an interval of the difference.",
+    "no interval": (
+        "Ray tracing: RMSE {ray}; {name}: {other}. The flight is too short for an interval of the difference."
+    ),
 }
 
 

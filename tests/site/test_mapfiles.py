@@ -255,6 +255,8 @@ def test_parts_of_a_building_have_their_own_heights(tmp_path: Path) -> None:
         ({"height": "12,5 m"}, 12.5, ""),
         ({"height": "350 cm"}, 3.5, ""),
         ({"building:levels": "2;3"}, 9, "the largest holds"),
+        ({"NumFloors": "3"}, 9, ""),
+        ({"no_of_storeys": "3"}, 9, ""),
         ({"building:levels": "-1"}, 6, "no positive number"),
         ({"building:levels": "three"}, 6, "no positive number"),
     ],

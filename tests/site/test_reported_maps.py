@@ -102,6 +102,16 @@ def test_an_extruded_polygon_is_as_high_as_it_is_drawn(tmp_path: Path) -> None:
     assert heights(kml(tmp_path / "a.kml", "clampToGround", "{},{},0")) == [6.0]
 
 
+def test_a_solid_without_a_tag_is_said_to_be_no_building(tmp_path: Path) -> None:
+    kml(tmp_path / "a.kml", "relativeToGround", "{},{},9.5")
+    bare = (tmp_path / "a.kml").read_text().replace("building", "colour")
+    (tmp_path / "a.kml").write_text(bare)
+    content = import_footprints([tmp_path / "a.kml"], FRAME)
+    assert len(content.geofences) == 1
+    assert any("9.5 m high without a tag: taken as a geofence" in text for text in content.actions)
+    assert heights(import_footprints([tmp_path / "a.kml"], FRAME, untagged="building")) == [9.5]
+
+
 def test_heights_above_sea_level_are_not_taken_for_heights_of_buildings(tmp_path: Path) -> None:
     content = kml(tmp_path / "a.kml", "absolute", "{},{},112")
     assert heights(content) == [6.0]

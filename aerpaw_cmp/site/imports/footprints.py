@@ -195,6 +195,9 @@ def _sort(
             skipped[main_tag(outline.tags) if kind is None else "building below the ground"] += 1
             continue
         actions += [f"{outline.source}: {problem}" for problem in dict.fromkeys(outline.broken)]
+        if kind == "geofence" and "height" in outline.tags and kind_of(outline.tags) is None and untagged is None:
+            text = f"an area {outline.tags['height']} m high without a tag: taken as a geofence"
+            actions.append(f"{outline.source}: {text}; '--untagged building' makes it a building")
         shape = _project(outline, frame, actions)
         if shape is not None:
             if kind == "building":

@@ -139,7 +139,7 @@ _UNIT_AT_END = re.compile(
     r"(?:[^a-z]|(?<=height)|(?<=hgt)|(?<=hght)|(?<=ht))(ft|feet|foot|cm|m|met(?:er|re)s?)[^a-z]*$"
 )
 _FEET = re.compile(r"feet|foot|[^a-z]ft([^a-z]|$)")
-_STOREYS = ("building:levels", "levels", "num_floors", "floors", "stories", "storeys", "num_stories", "no_floors")
+_STOREYS = re.compile(r"(building)?levels|(n|num|no|noof|numberof)?(floors|stor(ey|ie|y)s)|(floor|stor(ey|y))(count|s)")
 
 
 def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
@@ -166,8 +166,8 @@ def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
 
 def levels_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
     """Number of levels; of several (``2;3``) the largest."""
-    plain = {name.lower(): value for name, value in tags.items()}
-    written = next((plain[name].strip() for name in _STOREYS if plain.get(name, "").strip()), "")
+    named = (value.strip() for name, value in tags.items() if _STOREYS.fullmatch(re.sub(r"[^a-z]", "", name.lower())))
+    written = next(filter(None, named), "")
     if not written:
         return None
     parts = [_number(part) for part in written.split(";")]

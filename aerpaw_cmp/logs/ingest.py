@@ -95,10 +95,7 @@ def _raw(place: Path, limit: int | None = None) -> bytes:
 
 
 def ingest(
-    paths: Sequence[str | Path] | str | Path,
-    *,
-    options: _OptionsFor | None = None,
-    reader: str | None = None,
+    paths: Sequence[str | Path] | str | Path, *, options: _OptionsFor | None = None, reader: str | None = None
 ) -> Ingested:
     """Read files and folders.
 
@@ -236,10 +233,7 @@ def read_log(
     path = root / name
     if not exists(path):
         raise InputError(
-            "there is no such log",
-            expected=f"a log below '{root}'",
-            cause="a wrong path, or --logs-root",
-            path=path,
+            "there is no such log", expected=f"a log below '{root}'", cause="a wrong path, or --logs-root", path=path
         )
     if reader is not None:
         _refuse_other_kind(path, by_name(reader))

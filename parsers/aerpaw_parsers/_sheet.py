@@ -630,9 +630,7 @@ def refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]
     row = int(np.argmax(alone[0] if alone else count > 1))
     shown = "; ".join(f"{name!r} is {values[row]:g}" for name, values, mask in wrong if mask[row])
     raise InputError(
-        f"the rows do not fit the header: {shown}",
-        expected="values that their columns can have",
-        cause=BESIDE,
+        f"the rows do not fit the header: {shown}", expected="values that their columns can have", cause=BESIDE
     )
 
 

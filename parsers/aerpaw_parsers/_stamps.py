@@ -421,10 +421,7 @@ _GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were taken o
 # An epoch in a unit that the head of the column says; 1e9 microseconds are a quarter of an hour of PX4's own clock.
 _LEAST_EPOCH = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18, "min": np.inf, "h": np.inf}
 # Date of number zero, and the numbers of the years 2000 to 2099.
-_DAY_NUMBERS = (
-    ("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"),
-    ("-001-12-31", 730_486.0, 767_011.0, "MATLAB"),
-)
+_DAY_NUMBERS = (("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"), ("-001-12-31", 730_486.0, 767_011.0, "MATLAB"))
 
 
 def _are_days(value: FloatArray, low: float, high: float) -> bool:

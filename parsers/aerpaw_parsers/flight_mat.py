@@ -131,9 +131,7 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
             count = np.arange(len(table[name]))
             return np.round(count * step_s * 1e9).astype(np.int64), count >= 0, _COUNTED
     raise InputError(
-        "the MATLAB file has no clock",
-        expected=f"a variable {', '.join((*_TEXTS, *_EPOCHS))}",
-        cause="not a flight",
+        "the MATLAB file has no clock", expected=f"a variable {', '.join((*_TEXTS, *_EPOCHS))}", cause="not a flight"
     )
 
 

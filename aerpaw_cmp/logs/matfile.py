@@ -12,7 +12,9 @@ import math
 import struct
 import zlib
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
@@ -93,6 +95,18 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
     return arrays
 
 
+def names_of(head: bytes) -> list[str]:
+    """Names of the variables of a level-5 file that begin in its first bytes."""
+    order, names = "<" if head[126:128] == b"IM" else ">", []
+    with suppress(InputError, struct.error, zlib.error):
+        for element in islice(_elements(head, 128, order, padded=False, cut=True), 64):
+            body = element.body
+            if element.kind == _COMPRESSED:
+                body = zlib.decompressobj().decompress(body, 256)[8:]
+            names.append(_head_of(_elements(body, 0, order, padded=True, cut=True))[2])
+    return names
+
+
 def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArray]:
     """The wanted variables of a version 7.3 file, read in a process of its own."""
     from ..common.native import read
@@ -111,8 +125,11 @@ def _letters(codes: AnyArray) -> AnyArray:
     return np.array(["".join(map(chr, row)).rstrip() for row in rows] or [""], dtype=np.str_)[: len(codes)]
 
 
-def _elements(data: bytes, at: int, order: str, *, padded: bool) -> Iterator[_Element]:
-    """Elements one after the other; inside a variable they are padded to eight bytes and may be small."""
+def _elements(data: bytes, at: int, order: str, *, padded: bool, cut: bool = False) -> Iterator[_Element]:
+    """Elements one after the other; inside a variable they are padded to eight bytes and may be small.
+
+    Of data that are ``cut`` the last may be cut, too.
+    """
     while at < len(data):
         if len(data) - at < 8:
             if data[at:].strip(b"\0"):
@@ -126,7 +143,7 @@ def _elements(data: bytes, at: int, order: str, *, padded: bool) -> Iterator[_El
             yield _Element(kind, data[at + 4 : at + 4 + size])
             at += 8
             continue
-        if size > len(data) - at - 8:
+        if size > len(data) - at - 8 and not cut:
             raise _damaged(f"{size} bytes announced, {len(data) - at - 8} left")
         yield _Element(kind, data[at + 8 : at + 8 + size])
         at += 8 + (-(-size // 8) * 8 if padded else size)
@@ -157,18 +174,11 @@ def _inflated(element: _Element, order: str, most: int) -> _Element:
 def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[str, AnyArray | None]:
     """Name and array of a variable; None for one that is not wanted or of another class."""
     parts = _elements(body, 0, order, padded=True)
-    flags, dimensions, name = (next(parts, None) for _ in range(3))
-    if flags is None or dimensions is None or name is None:
-        raise _damaged("a variable without flags, dimensions or name")
-    if flags.kind != _UINT32 or len(flags.body) != 8 or dimensions.kind != _INT32 or name.kind != _INT8:
-        raise _damaged("a variable whose head is of another type")
-    if len(dimensions.body) < 8 or len(dimensions.body) % 4:
-        raise _damaged("dimensions that are no numbers")
-    shape = struct.unpack(f"{order}{len(dimensions.body) // 4}i", dimensions.body)
+    flags, dimensions, title = _head_of(parts)
+    shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
     if min(shape) < 0:
         raise _damaged("a negative dimension")
-    title = name.body.decode("ascii", errors="replace")
-    word = struct.unpack(order + "II", flags.body)[0]
+    word = struct.unpack(order + "II", flags)[0]
     family, is_complex = word & 0xFF, bool(word & 0x0800)
     unwanted = wanted is not None and title not in wanted
     if unwanted or (family not in _CLASSES and family != _CHARACTERS):
@@ -188,6 +198,17 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
         array = real.astype(np.complex128)
         array.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would be no number
     return title, array
+
+
+def _head_of(parts: Iterator[_Element]) -> tuple[bytes, bytes, str]:
+    """Flags, dimensions and name of a variable: its first three elements."""
+    head = [*islice(parts, 3)]
+    if [element.kind for element in head] != [_UINT32, _INT32, _INT8]:
+        raise _damaged("a variable without flags, dimensions or name")
+    flags, dimensions, name = (element.body for element in head)
+    if len(flags) != 8 or len(dimensions) < 8 or len(dimensions) % 4:
+        raise _damaged("dimensions that are no numbers")
+    return flags, dimensions, name.decode("ascii", errors="replace")
 
 
 def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) -> AnyArray:

@@ -162,14 +162,13 @@ def claims(data: bytes) -> list[Reader]:
     """Readers whose sniffers accept the beginning of a file, blank lines in front of it aside.
 
     A console or a KML may hold what tells it apart behind much talk or many styles: where no log reader accepts the
-    first ``HEAD_BYTES``, theirs and then those of files that are no logs see ``DEEP_BYTES``.
+    first ``HEAD_BYTES``, theirs see ``DEEP_BYTES``. Those of files that are no logs are asked last.
     """
     data = _BLANK_LINES.sub(b"", data[:DEEP_BYTES])
-    known = [reader for reader in catalogue() if reader.sniff(data[:HEAD_BYTES])]
-    if len(data) > HEAD_BYTES and not any(reader.kinds for reader in known):
-        deep = [reader for reader in catalogue() if reader.kinds and reader.sniff(data)]
-        known = deep or [reader for reader in catalogue() if not reader.kinds and reader.sniff(data)] or known
-    return known
+    heads = (data[:HEAD_BYTES], data) if len(data) > HEAD_BYTES else (data,)
+    tried = [(head, True) for head in heads] + [(head, False) for head in reversed(heads)]
+    accepting = ([r for r in catalogue() if bool(r.kinds) is of_logs and r.sniff(head)] for head, of_logs in tried)
+    return next((readers for readers in accepting if readers), [])
 
 
 def identify(data: bytes, *, path: str | None = None) -> Reader:
@@ -191,13 +190,12 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
             path=path,
         )
     known = claims(data)
-    candidates = [reader for reader in known if reader.kinds]
-    if len(candidates) == 1:
-        return candidates[0]
-    if known and not candidates:
+    if known and not known[0].kinds:
         raise InputError(f"no log: {known[0].title}", expected="one of the formats of 'aerpaw-cmp formats'", path=path)
-    if candidates:
-        names = ", ".join(reader.name for reader in candidates)
+    if len(known) == 1:
+        return known[0]
+    if known:
+        names = ", ".join(reader.name for reader in known)
         raise InputError(
             f"several readers accept this content: {names}",
             expected="exactly one",

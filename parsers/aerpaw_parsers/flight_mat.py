@@ -14,16 +14,13 @@ read as the older ones are. The lines of the account are rows.
 from __future__ import annotations
 
 import re
-import struct
-import zlib
 from collections.abc import Iterator
 
 import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs.matfile import MAGIC as _MAGIC
-from aerpaw_cmp.logs.matfile import MAGIC_73, read_arrays
+from aerpaw_cmp.logs.matfile import MAGIC, MAGIC_73, names_of, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.logs.text import clocks as _time
@@ -48,43 +45,6 @@ _SURE = {*_LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
 # Raw positions of the LTE flights, which stand in front of their levels; the interpolated ones are read.
 _GPS = re.compile(r"GPS[xyz]")
 _TEXT = re.compile(_time.TIME)
-_COMPRESSED, _MATRIX = 15, 14
-
-
-def names_of(head: bytes) -> list[str]:
-    """Variable names of a level-5 file that lie inside ``head`` (MAT-File Format, MathWorks, chapter 1)."""
-    names: list[str] = []
-    order = "<" if head[126:128] == b"IM" else ">"
-    at = 128
-    while at + 8 <= len(head) and len(names) < 64:
-        kind, size = struct.unpack_from(order + "II", head, at)
-        body = head[at + 8 : at + 8 + size]
-        if kind == _COMPRESSED:
-            try:
-                inner = zlib.decompressobj().decompress(body, 256)
-            except zlib.error:
-                break
-            body, kind = inner[8:], struct.unpack_from(order + "I", inner)[0] if len(inner) >= 8 else 0
-        if kind != _MATRIX:
-            break
-        name = _name(body, order)
-        if name:
-            names.append(name)
-        at += 8 + size
-    return names
-
-
-def _name(body: bytes, order: str) -> str | None:
-    """Name of an array element: flags (16 bytes), dimensions, then the name."""
-    try:
-        _, dimensions = struct.unpack_from(order + "II", body, 16)
-        at = 24 + -(-dimensions // 8) * 8
-        kind, size = struct.unpack_from(order + "II", body, at)
-        if kind >> 16:  # small element: size and type share a word, the name follows
-            return body[at + 4 : at + 4 + (kind >> 16)].decode("ascii")
-        return body[at + 8 : at + 8 + min(size, 64)].decode("ascii")
-    except (struct.error, UnicodeDecodeError):
-        return None
 
 
 def sniff(head: bytes) -> bool:
@@ -94,7 +54,7 @@ def sniff(head: bytes) -> bool:
     """
     if head.startswith(MAGIC_73):
         return any(re.search(rb"\b%s\b" % name.encode(), head) for name in _SURE)
-    return head.startswith(_MAGIC) and any(name in _NAMES or _GPS.fullmatch(name) for name in names_of(head))
+    return head.startswith(MAGIC) and any(name in _NAMES or _GPS.fullmatch(name) for name in names_of(head))
 
 
 def _load(data: bytes) -> dict[str, AnyArray]:

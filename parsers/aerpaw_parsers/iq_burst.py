@@ -12,21 +12,19 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs.matfile import MAGIC, read_arrays
+from aerpaw_cmp.logs.matfile import MAGIC, names_of, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, ReadResult
 from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 
-from . import flight_mat
-
 _NAME = re.compile(r"(\d{6,12})(?:\.0)?_(\d{4,10})(?:\.0)?_(\d{4})_(\d\d)_(\d\d)_(\d\d)_(\d\d)_(\d\d)_?(\d{3,6})?")
 
 
 def sniff(head: bytes) -> bool:
     """Check whether its first variables are samples and device times."""
-    return head.startswith(MAGIC) and "IQ" in flight_mat.names_of(head)
+    return head.startswith(MAGIC) and "IQ" in names_of(head)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError
 from aerpaw_cmp.logs import limits
-from aerpaw_cmp.logs.readers import ReadOptions, by_name, catalogue, identify
+from aerpaw_cmp.logs.readers import ReadOptions, by_name, catalogue, claims, identify
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import drive_test
 from benchmarks import fuzz_inputs
@@ -46,7 +46,7 @@ def test_sample_is_accounted_for(reader: str, sample: str) -> None:
 @pytest.mark.parametrize(("reader", "sample"), SNIFFED)
 def test_only_its_own_sniffer_accepts_a_sample(reader: str, sample: str) -> None:
     data = SAMPLES[reader][sample][0]
-    assert [other.name for other in catalogue() if other.sniff(data)] == [reader]
+    assert [other.name for other in claims(data)] == [reader]
     assert identify(data).name == reader
 
 
@@ -70,7 +70,7 @@ def test_every_reader_has_a_sample() -> None:
 
 @pytest.mark.parametrize("kind", NO_LOGS)
 def test_what_is_no_log_is_named_and_taken_by_no_reader(kind: str) -> None:
-    assert [reader.name for reader in catalogue() if reader.sniff(NO_LOGS[kind])] == [kind]
+    assert [reader.name for reader in claims(NO_LOGS[kind])] == [kind]
     with pytest.raises(InputError, match="no log: "):
         identify(NO_LOGS[kind])
     with pytest.raises(InputError, match="no log: "):

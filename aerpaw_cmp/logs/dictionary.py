@@ -8,10 +8,10 @@ do not: units and datums that a program is known to write. A new name is a row h
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
@@ -465,19 +465,14 @@ class Program:
 
     name: str
     signs: tuple[frozenset[str], ...]
-    words: MappingProxyType[str, str] = field(default_factory=lambda: MappingProxyType({}))
-    units: MappingProxyType[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    words: Mapping[str, str] = field(default_factory=dict)
+    units: Mapping[str, str] = field(default_factory=dict)
     datum: str = ""
     angles: str = ""
 
 
-def _program(
-    name: str, *signs: str, words: dict[str, str] | None = None, units: dict[str, str] | None = None, datum: str = "",
-    angles: str = "",
-) -> Program:  # fmt: skip
-    sets = tuple(frozenset(part.split(",")) for part in signs)
-    words_of, units_of = MappingProxyType(words or {}), MappingProxyType(units or {})
-    return Program(name=name, signs=sets, words=words_of, units=units_of, datum=datum, angles=angles)
+def _program(name: str, *signs: str, **about: Any) -> Program:
+    return Program(name, tuple(frozenset(part.split(",")) for part in signs), **about)
 
 
 _MAVLINK_UNITS = {
@@ -531,25 +526,35 @@ def program(names: Collection[str]) -> Program | None:
     return next((item for item in PROGRAMS if any(sign <= present for sign in item.signs)), None)
 
 
-def in_common_words(names: list[str]) -> list[str]:
-    """Plain names, those that only one program uses in the words of all."""
-    known = program(names)
-    words = dict(known.words) if known else {}
-    if "rank" in names and not words and any(_is_level(name) for name in names):
+def described(
+    names: Iterable[str], *, known: Program | None = None, of: Collection[str] = ()
+) -> tuple[Program | None, list[tuple[Meaning | None, str, str]]]:
+    """Program of a table, and of each name the meaning, the unit as written or as the program writes it, common words.
+
+    Parameters
+    ----------
+    names : iterable of str
+        As written.
+    known : Program, optional
+        Where the names do not tell it.
+    of : collection of str
+        Further names that tell it.
+    """
+    own = [(name, plain(name)) for name in names]  # a table may have a name twice
+    present = [bare for _, bare in own]
+    known = known or program([*present, *map(plain, of)])
+    words, columns = dict(known.words) if known else {}, []
+    if "rank" in present and not words and any((m := meaning(name)) and m.quantity.role == "rss" for name in present):
         words = {"rank": "rank indicator"}  # by itself the word may be that of any list
-    for pattern, word in words.items():
-        names = [re.sub(f"^(?:{pattern})$", word, name) for name in names]
-    return names
-
-
-def by_program(known: Program | None, name: str) -> tuple[Meaning | None, str, str]:
-    """Meaning of a name in a program, its unit as written or as the program writes it, and its common words."""
-    own = plain(name)
-    words = next((word for form, word in known.words.items() if re.fullmatch(form, own)), own) if known else own
-    what = meaning(name, None if words == own else words)
-    if what is None or what.unit or known is None:
-        return what, what.unit if what else "", words
-    return what, known.units.get(own, known.angles if what.quantity.role == "angle" else ""), words
+    for name, bare in own:
+        forms = (re.sub(form, word, bare) for form, word in words.items() if re.fullmatch(form, bare))
+        common = next(forms, bare)
+        what = meaning(name, None if common == bare else common)
+        unit = what.unit if what else in_brackets(name)[0]
+        if known and not unit:
+            unit = known.units.get(bare, known.angles if what and what.quantity.role == "angle" else "")
+        columns.append((what, unit, common))
+    return known, columns
 
 
 def record_columns(
@@ -570,11 +575,8 @@ def record_columns(
     dict of str to float array, shape (n,)
         Of several fields of one column the preferred; heights above take-off as ``above_home_m``.
     """
-    names = [plain(name) for name in fields]
-    known = program([*names, *map(plain, of)])
     columns: dict[str, tuple[tuple[int, int], FloatArray]] = {}
-    for name in fields:
-        what, unit, words = by_program(known, name)
+    for name, (what, unit, words) in zip(fields, described(fields, of=of)[1], strict=True):
         if what is None or what.quantity.role not in ("position", "height", "angle", "velocity", "count"):
             continue
         row = what.quantity
@@ -589,8 +591,3 @@ def record_columns(
         if column not in columns or place < columns[column][0]:
             columns[column] = place, converted(values, unit)
     return {column: values for column, (_, values) in columns.items()}
-
-
-def _is_level(name: str) -> bool:
-    known = meaning(name)
-    return known is not None and known.quantity.role == "rss"

@@ -10,14 +10,15 @@ overflow, a sentinel), not what is unusual.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pandas as pd
 
-from ..common.units import AnyArray, BoolArray, IntArray
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .jumps import FLAG, PLACE, jumps_of
-from .records import ReadResult, Stream
+from .records import COLUMNS, ReadResult, Stream
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,21 +42,9 @@ class Limit:
 
 # Quantities that mean the same in every stream. Levels (by unit) and times have their own rules below.
 LIMITS: tuple[Limit, ...] = (
-    Limit(
-        ("latitude_deg", "longitude_deg", "altitude_m"),
-        ((-90.0, 90.0), (-180.0, 180.0), (-1000.0, 20_000.0)),
-        "position_out_of_range",
-    ),
-    Limit(
-        ("roll_deg", "pitch_deg", "yaw_deg"),
-        ((-180.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)),
-        "attitude_out_of_range",
-    ),
-    Limit(
-        ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps"),
-        ((-200.0, 200.0),) * 3,
-        "velocity_out_of_range",
-    ),
+    Limit(PLACE, ((-90.0, 90.0), (-180.0, 180.0), (-1000.0, 20_000.0)), "position_out_of_range"),
+    Limit(COLUMNS["telemetry"][3:6], ((-180.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)), "attitude_out_of_range"),
+    Limit(COLUMNS["telemetry"][6:9], ((-200.0, 200.0),) * 3, "velocity_out_of_range"),
     Limit(("rsrp_dbm",), ((-200.0, 50.0),), "rsrp_out_of_range"),
     Limit(("sinr_db",), ((-100.0, 100.0),), "sinr_out_of_range"),
 )
@@ -95,174 +84,152 @@ def check(result: ReadResult) -> ReadResult:
     ReadResult
         Streams with flags and NaN, and one more warning per stream and flag.
     """
-    warnings: list[str] = []
-    streams = tuple(_checked(stream, warnings) for stream in result.streams)
-    return replace(result, streams=streams, warnings=(*result.warnings, *warnings)) if warnings else result
-
-
-def _checked(stream: Stream, warnings: list[str]) -> Stream:
-    frame, present = stream.frame, set(stream.frame.columns)
-    if stream.kind == "rss" and stream.attributes.get("unit") == "dBm":
-        frame = _no_index(stream, frame, warnings)
-    for limit in _limits_of(stream):
-        if not present.isdisjoint(limit.columns):
-            frame = _apply(stream, frame, limit, warnings)
-    if stream.kind == "rank":
-        frame = _within_ports(stream, frame, warnings)
-    frame = _near_in_time(stream, frame, warnings)
-    if stream.kind == "rss":
-        _two_levels(stream, frame, warnings)
-    _at_a_site_if_exchanged(stream, frame, warnings)
-    bad, sentence = jumps_of(stream if frame is stream.frame else replace(stream, frame=frame))
-    if bad.any():
-        frame = _marked(frame, bad, FLAG, [name for name in PLACE if name in frame.columns])
-    warnings += [sentence] if sentence else []
-    return stream if frame is stream.frame else replace(stream, frame=frame)
-
-
-def _limits_of(stream: Stream) -> tuple[Limit, ...]:
-    if stream.kind != "rss":
-        return LIMITS
-    bounds = LEVEL_DB.get(str(stream.attributes.get("unit")), _LEVEL_OTHER_DB)
-    return (*LIMITS, Limit(("rss_db",), (bounds,), "level_out_of_range"))
-
-
-def _apply(stream: Stream, frame: pd.DataFrame, limit: Limit, warnings: list[str]) -> pd.DataFrame:
-    names = [name for name in limit.columns if name in frame.columns]
-    first: tuple[int, str, tuple[float, float]] | None = None
-    bad = np.zeros(len(frame), dtype=np.bool_)
-    for name, (low, high) in zip(limit.columns, limit.ranges, strict=True):
-        if name not in names:
-            continue
-        value = frame[name].to_numpy(dtype=np.float64)
-        least = np.fmin.reduce(value) if len(value) else np.nan
-        if np.isnan(least) or (low <= least and np.fmax.reduce(value) <= high):
-            continue
-        beyond = (value < low) | (value > high)
-        if beyond.any() and (first is None or int(np.argmax(beyond)) < first[0]):
-            first = int(np.argmax(beyond)), name, (low, high)
-        bad |= beyond
-    if first is None:
-        return frame
-    row, name, (low, high) = first
-    shown = (
-        f"{name} {frame[name].iloc[row]:.6g} in line {int(frame['line'].iloc[row])}, where {low:g} .. {high:g} can be"
+    checks = [_Check(stream) for stream in result.streams]
+    warnings = [text for check in checks for text in check.run()]
+    streams = tuple(
+        check.stream if check.frame is check.stream.frame else replace(check.stream, frame=check.frame)
+        for check in checks
     )
-    scored = "; not scored" if limit.flag in UNSCORED else "; read as missing"
-    swap = _exchanged(frame, bad) if "latitude_deg" in names else ""
-    warnings.append(_sentence(stream, int(bad.sum()), limit.flag, f"the first: {shown}{swap}{scored}"))
-    return _marked(frame, bad, limit.flag, names)
-
-
-def _exchanged(frame: pd.DataFrame, bad: BoolArray) -> str:
-    """A hint where every impossible position would be possible with its angles exchanged."""
-    latitude = np.abs(frame["latitude_deg"].to_numpy(dtype=np.float64)[bad])
-    longitude = np.abs(frame["longitude_deg"].to_numpy(dtype=np.float64)[bad])
-    fits = (latitude > 90.0) & (latitude <= 180.0) & (longitude <= 90.0)
-    return "; are latitude and longitude exchanged?" if fits.all() else ""
+    return replace(result, streams=streams, warnings=(*result.warnings, *warnings)) if warnings else result
 
 
 # AERPAW's sites, Lake Wheeler and Centennial Campus: latitude, longitude, and how far from them positions are theirs.
 SITES_DEG, NEAR_DEG = ((35.727, -78.696), (35.773, -78.677)), 0.3
-
-
-def _at_a_site_if_exchanged(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> None:
-    """Say where positions that can be would lie at a site of AERPAW with their angles exchanged."""
-    if not {"latitude_deg", "longitude_deg"} <= set(frame.columns):
-        return
-    place = frame[["latitude_deg", "longitude_deg"]].median().to_numpy(dtype=np.float64)
-    if (np.abs(np.array(SITES_DEG) - place[::-1]) < NEAR_DEG).all(axis=1).any():
-        warnings.append(
-            f"{stream.kind} {stream.name!r}: the positions lie at latitude {place[0]:.3f}, longitude {place[1]:.3f}; "
-            "exchanged they lie at a site of AERPAW: are latitude and longitude exchanged?"
-        )
-
-
-def _within_ports(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:
-    """No rank is above the number of ports that the log itself tells."""
-    ports = stream.attributes.get("ports")
-    if not isinstance(ports, (int, float)) or isinstance(ports, bool):
-        return frame
-    rank = frame["rank"].to_numpy(dtype=np.float64)
-    bad = rank > float(ports)
-    if not bad.any():
-        return frame
-    row = int(np.argmax(bad))
-    text = (
-        f"the first: rank {rank[row]:g} in line {int(frame['line'].iloc[row])}, on at most {ports:g} ports by the log "
-        "itself; a wrong base of the indicator, or another cell; not scored"
-    )
-    warnings.append(_sentence(stream, int(bad.sum()), "rank_above_ports", text))
-    return _marked(frame, bad, "rank_above_ports", ["rank"])
-
-
 # No receiver in flight meets such levels: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
 # SINR do not.
 _MOST_DBM = {"RSRP": -20.0}
-
-
-def _no_index(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:
-    """Flag levels that mostly cannot be received: an index of the standard (0 .. 127), another unit, or a ratio."""
-    level = frame["rss_db"].to_numpy(dtype=np.float64)
-    quantity = str(stream.attributes.get("quantity"))
-    bad = level >= _MOST_DBM.get(quantity, 0.0)
-    if 2 * bad.sum() <= np.isfinite(level).sum() or not bad.any():
-        return frame
-    row = int(np.argmax(bad))
-    known = "another unit, an RSRQ, or an index?" if quantity in _MOST_DBM else "another unit, or an index?"
-    text = (
-        f"the first: {level[row]:g} dBm in line {int(frame['line'].iloc[row])}, which is received nowhere "
-        f"({known}); not scored"
-    )
-    warnings.append(_sentence(stream, int(bad.sum()), "level_out_of_range", text))
-    return _marked(frame, bad, "level_out_of_range", ["rss_db"])
-
-
 # Levels that alternate from record to record: further apart than fading, and back with the next.
 _APART_DB, _BACK_SHARE, _FEW_ALTERNATE = 10.0, 0.2, 6
 
 
-def _two_levels(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> None:
-    """Say where the levels of a series alternate between two: of two devices, SIMs or networks."""
-    level = frame["rss_db"].to_numpy(dtype=np.float64)[:10_000]
-    level = level[np.isfinite(level)]
-    if len(level) < _FEW_ALTERNATE:
-        return
-    step, back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in (1, 2))
-    if step > _APART_DB and back < _BACK_SHARE * step:
-        warnings.append(
-            f"rss {stream.name!r}: its levels alternate, {step:.0f} dB apart from record to record: two devices, SIMs "
-            "or networks in one series, which no column known as a name tells apart"
-        )
+class _Check:
+    """A stream, its records as they are marked, and what is said of them."""
 
+    def __init__(self, stream: Stream) -> None:
+        self.stream, self.frame, self._said = stream, stream.frame, list[str]()
+        self._about, self._what = stream.attributes, f"{stream.kind} {stream.name!r}"
 
-def _near_in_time(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:
-    """Flag a few stamps that lie days from all the others."""
-    stamp: IntArray = frame["time"].to_numpy("datetime64[ns]").view(np.int64)
-    if len(stamp) < 2 or _one_run(stamp):
-        return frame
-    timed = ~np.isnat(frame["time"].to_numpy("datetime64[ns]"))
-    if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= _APART_S * 1e9:
-        return frame
-    order = np.argsort(np.where(timed, stamp, np.iinfo(np.int64).max), kind="stable")[: int(timed.sum())]
-    group = np.concatenate(([0], np.cumsum(np.diff(stamp[order].astype(np.float64)) > _APART_S * 1e9)))
-    size = np.bincount(group)
-    few = size <= max(_FEW_ROWS, _FEW_SHARE * len(order))
-    few[int(np.argmax(size))] = False
-    few &= 2 * size.max() > len(order)  # without a main part: two flights in one file, not a few bad stamps
-    last = stamp[order][np.append(np.flatnonzero(np.diff(group)), len(order) - 1)]
-    unset = last < _CLOCK_SET_NS  # rows before the clock was set, however many
-    few |= unset & ~unset.all()
-    bad = np.zeros(len(frame), dtype=np.bool_)
-    bad[order[few[group]]] = True
-    if not bad.any():
-        return frame
-    row = int(np.argmax(bad))
-    shown = f"the first: {np.datetime_as_string(frame['time'].to_numpy('datetime64[ns]')[row], unit='s')}"
-    why = "written before the clock was set" if stamp[row] < _CLOCK_SET_NS else "days from all others"
-    text = f"{shown} in line {int(frame['line'].iloc[row])}, {why}; not scored"
-    warnings.append(_sentence(stream, int(bad.sum()), "time_out_of_range", text))
-    return _marked(frame, bad, "time_out_of_range", [])
+    def run(self) -> list[str]:
+        """Check everything; sentences."""
+        kind, limits = self.stream.kind, LIMITS
+        if kind == "rss":
+            if self._about.get("unit") == "dBm":
+                self._no_index()
+            bounds = LEVEL_DB.get(str(self._about.get("unit")), _LEVEL_OTHER_DB)
+            limits = (*LIMITS, Limit(("rss_db",), (bounds,), "level_out_of_range"))
+        for limit in limits:
+            self._within(limit)
+        if kind == "rank":
+            self._within_ports()
+        self._near_in_time()
+        if kind == "rss":
+            self._two_levels()
+        self._at_a_site_if_exchanged()
+        bad, sentence = jumps_of(replace(self.stream, frame=self.frame))
+        if bad.any():
+            self.frame = _marked(self.frame, bad, FLAG, [name for name in PLACE if name in self.frame.columns])
+        return [*self._said, *([sentence] if sentence else [])]
+
+    def _values(self, name: str) -> FloatArray:
+        return self.frame[name].to_numpy(dtype=np.float64)
+
+    def _flag(self, bad: BoolArray, flag: str, first: str, why: str, void: Sequence[str] = ()) -> None:
+        """Flag rows, void some of their columns, and say how many there are, what the first is, and why."""
+        rows = "1 row is" if bad.sum() == 1 else f"{bad.sum()} rows are"
+        line = int(self.frame["line"].iloc[int(np.argmax(bad))])
+        end = "not scored" if flag in UNSCORED else "read as missing"
+        self._said.append(f"{self._what}: {rows} flagged {flag}; the first: {first} in line {line}, {why}; {end}")
+        self.frame = _marked(self.frame, bad, flag, void)
+
+    def _within(self, limit: Limit) -> None:
+        names = [name for name in limit.columns if name in self.frame.columns]
+        ranges = dict(zip(limit.columns, limit.ranges, strict=True))
+        beyond: dict[str, BoolArray] = {}
+        for name in names:
+            value, (low, high) = self._values(name), ranges[name]
+            least = np.fmin.reduce(value) if len(value) else np.nan
+            if not np.isnan(least) and not (low <= least and np.fmax.reduce(value) <= high):
+                beyond[name] = (value < low) | (value > high)
+        if not beyond:
+            return
+        name = min(beyond, key=lambda name: int(np.argmax(beyond[name])))
+        bad, (low, high) = np.any([*beyond.values()], axis=0), ranges[name]
+        first = f"{name} {self._values(name)[int(np.argmax(bad))]:.6g}"
+        swap = self._exchanged(bad) if "latitude_deg" in names else ""
+        self._flag(bad, limit.flag, first, f"where {low:g} .. {high:g} can be{swap}", names)
+
+    def _exchanged(self, bad: BoolArray) -> str:
+        """A hint where every impossible position would be possible with its angles exchanged."""
+        latitude, longitude = (np.abs(self._values(name)[bad]) for name in PLACE[:2])
+        fits = (latitude > 90.0) & (latitude <= 180.0) & (longitude <= 90.0)
+        return "; are latitude and longitude exchanged?" if fits.all() else ""
+
+    def _at_a_site_if_exchanged(self) -> None:
+        """Say where positions that can be would lie at a site of AERPAW with their angles exchanged."""
+        if not {*PLACE[:2]} <= set(self.frame.columns):
+            return
+        place = self.frame[[*PLACE[:2]]].median().to_numpy(dtype=np.float64)
+        if (np.abs(np.array(SITES_DEG) - place[::-1]) < NEAR_DEG).all(axis=1).any():
+            self._said.append(
+                f"{self._what}: the positions lie at latitude {place[0]:.3f}, longitude {place[1]:.3f}; "
+                "exchanged they lie at a site of AERPAW: are latitude and longitude exchanged?"
+            )
+
+    def _within_ports(self) -> None:
+        """No rank is above the number of ports that the log itself tells."""
+        ports, rank = self._about.get("ports"), self._values("rank")
+        if not isinstance(ports, (int, float)) or isinstance(ports, bool) or not (bad := rank > float(ports)).any():
+            return
+        why = f"on at most {ports:g} ports by the log itself; a wrong base of the indicator, or another cell"
+        self._flag(bad, "rank_above_ports", f"rank {rank[int(np.argmax(bad))]:g}", why, ["rank"])
+
+    def _no_index(self) -> None:
+        """Flag levels that mostly cannot be received: an index of the standard (0 .. 127), another unit, or a ratio."""
+        level, quantity = self._values("rss_db"), str(self._about.get("quantity"))
+        bad = level >= _MOST_DBM.get(quantity, 0.0)
+        if 2 * bad.sum() <= np.isfinite(level).sum() or not bad.any():
+            return
+        known = "another unit, an RSRQ, or an index?" if quantity in _MOST_DBM else "another unit, or an index?"
+        first = f"{level[int(np.argmax(bad))]:g} dBm"
+        self._flag(bad, "level_out_of_range", first, f"which is received nowhere ({known})", ["rss_db"])
+
+    def _two_levels(self) -> None:
+        """Say where the levels of a series alternate between two: of two devices, SIMs or networks."""
+        level = self._values("rss_db")[:10_000]
+        level = level[np.isfinite(level)]
+        if len(level) < _FEW_ALTERNATE:
+            return
+        step, back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in (1, 2))
+        if step > _APART_DB and back < _BACK_SHARE * step:
+            self._said.append(
+                f"{self._what}: its levels alternate, {step:.0f} dB apart from record to record: two devices, SIMs "
+                "or networks in one series, which no column known as a name tells apart"
+            )
+
+    def _near_in_time(self) -> None:
+        """Flag a few stamps that lie days from all the others."""
+        time = self.frame["time"].to_numpy("datetime64[ns]")
+        stamp: IntArray = time.view(np.int64)
+        if len(stamp) < 2 or _one_run(stamp):
+            return
+        timed = ~np.isnat(time)
+        if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= _APART_S * 1e9:
+            return
+        order = np.argsort(np.where(timed, stamp, np.iinfo(np.int64).max), kind="stable")[: int(timed.sum())]
+        group = np.concatenate(([0], np.cumsum(np.diff(stamp[order].astype(np.float64)) > _APART_S * 1e9)))
+        size = np.bincount(group)
+        few = size <= max(_FEW_ROWS, _FEW_SHARE * len(order))
+        few[int(np.argmax(size))] = False
+        few &= 2 * size.max() > len(order)  # without a main part: two flights in one file, not a few bad stamps
+        last = stamp[order][np.append(np.flatnonzero(np.diff(group)), len(order) - 1)]
+        unset = last < _CLOCK_SET_NS  # rows before the clock was set, however many
+        few |= unset & ~unset.all()
+        bad = np.zeros(len(stamp), dtype=np.bool_)
+        bad[order[few[group]]] = True
+        if bad.any():
+            row = int(np.argmax(bad))
+            why = "written before the clock was set" if stamp[row] < _CLOCK_SET_NS else "days from all others"
+            self._flag(bad, "time_out_of_range", np.datetime_as_string(time[row], unit="s"), why)
 
 
 def _one_run(stamp: IntArray) -> bool:
@@ -273,19 +240,11 @@ def _one_run(stamp: IntArray) -> bool:
     if high - low <= _APART_S * 1e9:
         return True
     step = 1 << 20
-    for first in range(0, len(stamp) - 1, step):
-        part = np.diff(stamp[first : first + step + 1].astype(np.float64))
-        if np.abs(part).max() > _APART_S * 1e9:
-            return False
-    return True
+    parts = (np.diff(stamp[first : first + step + 1].astype(np.float64)) for first in range(0, len(stamp) - 1, step))
+    return all(np.abs(part).max() <= _APART_S * 1e9 for part in parts)
 
 
-def _sentence(stream: Stream, count: int, flag: str, text: str) -> str:
-    rows = "1 row is" if count == 1 else f"{count} rows are"
-    return f"{stream.kind} {stream.name!r}: {rows} flagged {flag}; {text}"
-
-
-def _marked(frame: pd.DataFrame, bad: BoolArray, flag: str, void: list[str]) -> pd.DataFrame:
+def _marked(frame: pd.DataFrame, bad: BoolArray, flag: str, void: Sequence[str]) -> pd.DataFrame:
     column: AnyArray = frame["flag"].to_numpy(dtype=object).copy()
     for i in np.flatnonzero(bad):
         words = str(column[i]).split(";") if column[i] else []

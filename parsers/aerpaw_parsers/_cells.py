@@ -3,42 +3,38 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.records import Attribute, Stream
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
-# Radio accesses; the first where a log does not say.
-RATS = ("", "lte", "nr")
-QUALITIES = ("rsrq_db", "rssi_dbm", "sinr_db", "pathloss_db")
 # RSRP beyond these is a sentinel (2147483647, 0) or a mistake.
 _RANGE_DBM = (-170.0, -1.0)
 
 
-@dataclass(frozen=True)
-class Reading:
-    """Levels of one cell in one row.
+class Reading(NamedTuple):
+    """Levels of one cell in one row: a row of the table that :func:`streams` takes.
 
     Parameters
     ----------
     row : int
         Index into the rows.
     rat : str
-        One of :data:`RATS`.
-    pci : float
-        Physical cell identity, NaN where unknown.
-    arfcn : float
+        ``lte``, ``nr``, or empty where the log does not say.
+    pci, arfcn : float
+        Physical cell identity and carrier, NaN where unknown.
     rsrp_dbm : float
-    serving : bool or None
+    serving : bool
         Does the log call it the serving cell?
-    qualities : tuple of float
-        Values of :data:`QUALITIES`.
+    rsrq_db, rssi_dbm, sinr_db, pathloss_db : float
     """
 
     row: int
@@ -46,8 +42,14 @@ class Reading:
     pci: float
     arfcn: float
     rsrp_dbm: float
-    serving: bool | None
-    qualities: tuple[float, ...] = (np.nan,) * len(QUALITIES)
+    serving: bool = False
+    rsrq_db: float = np.nan
+    rssi_dbm: float = np.nan
+    sinr_db: float = np.nan
+    pathloss_db: float = np.nan
+
+
+QUALITIES = Reading._fields[6:]
 
 
 def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -> Reading:
@@ -58,67 +60,14 @@ def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -
         if what is not None and np.isfinite(value) and not name.startswith("csi"):  # SS-RSRP is the cell's level
             known.setdefault(what.quantity.name, value)
     pci, arfcn, level, *qualities = (known.get(name, np.nan) for name in _QUANTITIES)
-    return Reading(
-        row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level, serving=serving, qualities=tuple(qualities)
-    )  # fmt: skip
+    return Reading(row, rat, pci, arfcn, level, serving, *qualities)
 
 
 _QUANTITIES = ("PCI", "ARFCN", "RSRP", "RSRQ", "RSSI", "SINR", "path loss")
 
 
-@dataclass(frozen=True)
-class Table:
-    """Readings as columns; meanings as of :class:`Reading`.
-
-    Parameters
-    ----------
-    row : int array, shape (n,)
-    rat : int array, shape (n,)
-        Index into :data:`RATS`.
-    pci, arfcn, rsrp_dbm : float array, shape (n,)
-    serving : bool array, shape (n,)
-    qualities : float array, shape (4, n)
-    """
-
-    row: IntArray
-    rat: AnyArray
-    pci: FloatArray
-    arfcn: FloatArray
-    rsrp_dbm: FloatArray
-    serving: BoolArray
-    qualities: FloatArray
-
-
-def table(readings: Iterable[Reading]) -> Table:
-    """Readings, one by one, as columns."""
-    listed = list(readings)
-    pci, arfcn, rsrp = (np.array([getattr(item, name) for item in listed], dtype=np.float64) for name in _NUMBERS)
-    return Table(
-        row=np.array([item.row for item in listed], dtype=np.int64),
-        rat=np.array([RATS.index(item.rat) for item in listed], dtype=np.int8),
-        pci=pci,
-        arfcn=arfcn,
-        rsrp_dbm=rsrp,
-        serving=np.array([bool(item.serving) for item in listed], dtype=bool),
-        qualities=np.array([item.qualities for item in listed], dtype=np.float64)
-        .reshape(len(listed), len(QUALITIES))
-        .T,
-    )
-
-
-_NUMBERS = ("pci", "arfcn", "rsrp_dbm")
-
-
-def joined(tables: Sequence[Table]) -> Table:
-    """Several tables, one behind the other."""
-    if not tables:
-        return table(())
-    columns = {part.name: [getattr(item, part.name) for item in tables] for part in fields(Table)}
-    return Table(**{name: np.concatenate(column, axis=-1) for name, column in columns.items()})
-
-
 def streams(
-    rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: str, quantity: str = "RSRP"
+    rows: _rows.Rows, readings: pd.DataFrame | Iterable[Reading], *, source: str, quantity: str = "RSRP"
 ) -> list[Stream]:
     """A stream per cell: radio access, PCI and carrier. Every reading with a level is a record.
 
@@ -129,30 +78,25 @@ def streams(
     Parameters
     ----------
     rows : Rows
-    readings : Table or iterable of Reading
+    readings : pandas.DataFrame or iterable of Reading
+        A table has the fields of :class:`Reading` as columns.
     source : str
     quantity : str
         The level that they hold.
     """
-    columns = readings if isinstance(readings, Table) else table(readings)
-    order = np.argsort(columns.row, kind="stable")
-    order = order[np.isfinite(columns.rsrp_dbm[order])]
-    rats, pci, arfcn = columns.rat[order], columns.pci[order], columns.arfcn[order]
-    served = _serving(columns, order)
-    pci = np.where(np.isfinite(pci) & (pci >= 0), pci, -1.0)
+    is_table = isinstance(readings, pd.DataFrame)
+    table: pd.DataFrame = readings if is_table else pd.DataFrame([*readings], columns=list(Reading._fields))
+    table = table[np.isfinite(table["rsrp_dbm"].to_numpy(np.float64))].sort_values("row", kind="stable")
+    table = table.assign(served=_serving(table), pci=table["pci"].where(table["pci"] >= 0, -1.0))
     per_cell: list[Stream] = []
-    for rat in np.unique(rats).tolist():
-        for identity in np.unique(pci[rats == rat]).tolist():
-            of_pci = np.flatnonzero((rats == rat) & (pci == identity))
-            carriers = np.unique(arfcn[of_pci][np.isfinite(arfcn[of_pci])])
-            if len(carriers) < 2:
-                parts = [(of_pci, float(carriers[0]) if len(carriers) else np.nan)]
-            else:
-                parts = [(of_pci[arfcn[of_pci] == carrier], carrier) for carrier in carriers.tolist()]
-                parts.append((of_pci[np.isnan(arfcn[of_pci])], np.nan))
-            for pick, carrier in parts:
-                cell = Cell(RATS[rat], identity, carrier, several=len(carriers) > 1, quantity=quantity)
-                per_cell += [_stream(rows, columns, order[pick], served[pick], cell, source)] if len(pick) else []
+    for (rat, identity), cell_rows in table.groupby(["rat", "pci"]):
+        carriers = np.unique(cell_rows["arfcn"].dropna()).tolist()
+        several = len(carriers) > 1
+        for carrier in [*carriers, np.nan] if several else [*carriers, np.nan][:1]:
+            mine = cell_rows["arfcn"].eq(carrier) | (cell_rows["arfcn"].isna() & np.isnan(carrier))
+            part = cell_rows[mine] if several else cell_rows
+            cell = Cell(rat, identity, carrier, several=several, quantity=quantity)
+            per_cell += [_stream(rows, part, cell, source)] if len(part) else []
     return per_cell
 
 
@@ -175,25 +119,24 @@ class Cell:
         return "_".join(part for part in parts if part)
 
 
-def _serving(columns: Table, order: IntArray) -> FloatArray:
+def _serving(table: pd.DataFrame) -> FloatArray:
     """1 where the reading is of the cell that serves, 0 where another does, NaN where nothing is known."""
-    row, rats, serving = (column[order] for column in (columns.row, columns.rat, columns.serving))
-    cell = np.stack([columns.pci[order], np.nan_to_num(columns.arfcn[order], nan=-1.0)])
-    served = np.full(len(order), np.nan)
-    for rat in np.unique(rats[serving]).tolist():
+    row, rats, serving = (table[name].to_numpy() for name in ("row", "rat", "serving"))
+    cell = np.stack([table["pci"], table["arfcn"].fillna(-1.0)])
+    served = np.full(len(table), np.nan)
+    for rat in np.unique(rats[serving.astype(bool)]).tolist():
         of_rat = np.flatnonzero(rats == rat)
-        named = of_rat[serving[of_rat]]
+        named = of_rat[serving[of_rat].astype(bool)]
         # all readings of a row at once: the serving one may stand behind its neighbours
         last = np.searchsorted(row[named], row[of_rat], side="right") - 1
-        named_before = last >= 0
-        of_rat = of_rat[named_before]
-        served[of_rat] = serving[of_rat] | (cell[:, of_rat] == cell[:, named[last[named_before]]]).all(axis=0)
+        of_rat, last = of_rat[last >= 0], last[last >= 0]
+        served[of_rat] = serving[of_rat] | (cell[:, of_rat] == cell[:, named[last]]).all(axis=0)
     return served
 
 
-def _stream(rows: _rows.Rows, columns: Table, pick: IntArray, served: FloatArray, cell: Cell, source: str) -> Stream:
+def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: Cell, source: str) -> Stream:
     """Readings of one cell, in the order of the log."""
-    row, level = columns.row[pick], columns.rsrp_dbm[pick]
+    row, level = table["row"].to_numpy(), table["rsrp_dbm"].to_numpy(np.float64, copy=True)
     flag = rows.flag[row]
     outside = ~((level >= _RANGE_DBM[0]) & (level <= _RANGE_DBM[1]))
     if 2 * outside.sum() > len(level):
@@ -202,15 +145,14 @@ def _stream(rows: _rows.Rows, columns: Table, pick: IntArray, served: FloatArray
             f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
             "read as out of coverage"
         )
-    rssi = columns.qualities[QUALITIES.index("rssi_dbm"), pick]
-    if cell.quantity == "RSRP" and (rssi < level).sum() > max(2, len(level) // 2):
+    if cell.quantity == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell.name}: RSSI lies below RSRP, which cannot be: are the columns exchanged?")
     _lines.add_flag(flag, outside, "out_of_coverage")
     _lines.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
     level[outside] = np.nan
-    values: dict[str, FloatArray] = {"rss_db": level, "serving": served}
-    for name, column in zip(QUALITIES, columns.qualities, strict=True):
-        quality = column[pick]
+    values: dict[str, AnyArray] = {"rss_db": level, "serving": table["served"].to_numpy()}
+    for name in QUALITIES:
+        quality = table[name].to_numpy(np.float64)
         finite = np.isfinite(quality)  # a ratio or loss written as 'inf' is none
         if finite.any():
             values[name] = np.where(finite, quality, np.nan)

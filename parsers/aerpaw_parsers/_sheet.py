@@ -154,29 +154,29 @@ class Sheet:
         """Count the rows."""
         return len(self.row)
 
-    @cached_property
+    @property
     def _own(self) -> list[str]:
         return [dictionary.plain(name) for name in self.names]
 
     @cached_property
+    def _described(self) -> tuple[dictionary.Program | None, list[tuple[dictionary.Meaning | None, str, str]]]:
+        return dictionary.described(self.names)
+
+    @property
     def plain(self) -> list[str]:
         """Names in plain form, in common words."""
-        return dictionary.in_common_words(self._own)
+        return [words for *_, words in self._described[1]]
 
-    @cached_property
+    @property
     def program(self) -> dictionary.Program | None:
         """The program that is known to write such columns."""
-        return dictionary.program(self._own)
+        return self._described[0]
 
     @cached_property
     def meanings(self) -> list[dictionary.Meaning | None]:
         """Meaning of each column."""
-        known = [
-            dictionary.meaning(name) if written == words else dictionary.meaning(name, words)
-            for name, written, words in zip(self.names, self._own, self.plain, strict=True)
-        ]
         said = {i: dictionary.Meaning(row, dictionary.in_brackets(self.names[i])[0]) for i, row in self.said.items()}
-        return [said.get(i) if what is None else what for i, what in enumerate(known)]
+        return [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
 
     def find(self, *quantities: str) -> int | None:
         """The column that surest holds one of the quantities."""
@@ -193,13 +193,7 @@ class Sheet:
 
     def unit(self, column: int) -> str:
         """Unit that the name of a column writes, or that its program is known to write, or an empty text."""
-        meaning = self.meanings[column]
-        written = meaning.unit if meaning is not None else dictionary.in_brackets(self.names[column])[0]
-        if written or self.program is None:
-            return written
-        unit = self.program.units.get(self._own[column], "")
-        if meaning is not None and meaning.quantity.role == "angle":
-            unit = unit or self.program.angles
+        unit = self._described[1][column][1]
         return unit if unit not in dictionary.OF_INTEGERS or self._in_integers else ""
 
     def unit_read(self, column: int) -> str:
@@ -227,7 +221,7 @@ class Sheet:
         """A column more."""
         self.names.append(name)
         self.cells = [[*cells, text] for cells, text in zip(self.cells, texts, strict=True)]
-        for cached in ("_own", "plain", "program", "meanings"):
+        for cached in ("_described", "meanings"):
             self.__dict__.pop(cached, None)
 
     def part(self, where: BoolArray) -> Sheet:

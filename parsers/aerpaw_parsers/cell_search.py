@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import re
 
-import numpy as np
-
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_cmp.logs.text import lines as _lines
@@ -47,12 +45,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows.warnings += warnings
     cells = [groups[i] for i in rows.at.tolist()]
     readings = [
-        _cells.Reading(
-            row=i, rat="lte", pci=float(cell[4]), arfcn=float(cell[3]), rsrp_dbm=float(cell[5]), serving=None,
-            qualities=(np.nan,) * len(_cells.QUALITIES),
-        )
+        _cells.Reading(i, "lte", pci=float(cell[4]), arfcn=float(cell[3]), rsrp_dbm=float(cell[5]))
         for i, cell in enumerate(cells)
-    ]  # fmt: skip
+    ]
     return rows.result(_cells.streams(rows, readings, source="cell search", quantity="PSS power"))
 
 

@@ -13,6 +13,7 @@ import re
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+import pandas as pd
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
@@ -136,30 +137,27 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
     return list(cells.values())
 
 
-def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
-    tables = []
+def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> pd.DataFrame:
     technology = sheet.find("technology")
-    of_row = None if technology is None else np.array([_rat(text) for text in sheet.texts(technology)], dtype=np.int8)
-    idle = _idle(sheet)
+    of_row = np.array([] if technology is None else [_rat(text) for text in sheet.texts(technology)], dtype=object)
+    idle, tables = _idle(sheet), []
     for cell in cells:
         assert cell.rsrp is not None
         level = sheet.numbers(cell.rsrp)
-        pci, arfcn = (_or_nan(sheet, place, len(level)) for place in (cell.pci, cell.arfcn))
-        none = _is_none(sheet, cell.rsrp) & ~(pci > 0) if cell.rat == "nr" or not cell.serving else False
-        row = np.flatnonzero(np.isfinite(level) & ~none)  # a leg or a neighbour that is not there is no reading
-        pci, arfcn = pci[row], arfcn[row]
-        qualities = np.stack([_or_nan(sheet, cell.qualities.get(name), len(level))[row] for name in _cells.QUALITIES])
-        pci = np.where(pci == np.round(pci), pci, np.nan)  # a fraction is no identity of a cell
-        rat = np.full(len(row), _cells.RATS.index(cell.rat), dtype=np.int8)
-        if of_row is not None and not cell.rat:
-            rat = of_row[row]
-        serving = np.full(len(row), cell.serving) & ~idle[row]
-        tables.append(
-            _cells.Table(
-                row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level[row], serving=serving, qualities=qualities
-            )
-        )
-    return _cells.joined(tables)
+        columns = {
+            "pci": cell.pci,
+            "arfcn": cell.arfcn,
+            **{name: cell.qualities.get(name) for name in _cells.QUALITIES},
+        }
+        values = {name: _or_nan(sheet, column, len(level)) for name, column in columns.items()}
+        none = _is_none(sheet, cell.rsrp) & ~(values["pci"] > 0) if cell.rat == "nr" or not cell.serving else False
+        pci = np.where(values["pci"] == np.round(values["pci"]), values["pci"], np.nan)  # a fraction is no identity
+        rat = of_row if technology is not None and not cell.rat else cell.rat
+        about = {"row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle}
+        # a leg or a neighbour that is not there is no reading
+        tables.append(pd.DataFrame({**values, **about, "pci": pci})[np.isfinite(level) & ~np.asarray(none)])
+    joined: pd.DataFrame = pd.concat(tables) if tables else pd.DataFrame(columns=list(_cells.Reading._fields))
+    return joined
 
 
 def _idle(sheet: _sheet.Sheet) -> BoolArray:
@@ -171,10 +169,10 @@ def _idle(sheet: _sheet.Sheet) -> BoolArray:
     return idle
 
 
-def _rat(technology: str) -> int:
-    """Index into ``RATS`` of what a program calls a technology."""
+def _rat(technology: str) -> str:
+    """Radio access of what a program calls a technology."""
     word = technology.strip().lower()
-    return _cells.RATS.index("nr" if re.search(r"5g|nr", word) else "lte" if re.search(r"4g|lte", word) else "")
+    return "nr" if re.search(r"5g|nr", word) else "lte" if re.search(r"4g|lte", word) else ""
 
 
 def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:

@@ -191,7 +191,7 @@ def _measured(rows: _rows.Rows, table: dict[str, AnyArray]) -> Iterator[Stream |
         if name not in table:
             continue
         values = _numeric(table[name], name)
-        what, unit, _ = dictionary.by_program(dictionary.AERPAW_MAT, name)
+        ((what, unit, _),) = dictionary.described([name], known=dictionary.AERPAW_MAT)[1]
         assert what is not None
         row, unit = what.quantity, unit or what.quantity.unit
         if row.role == "kpi":

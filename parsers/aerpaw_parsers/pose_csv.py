@@ -26,11 +26,9 @@ def is_header(names: list[str]) -> bool:
 
 def has_radio(names: list[str]) -> bool:
     """Check whether names hold a level, a ratio or a rank of the channel."""
-    plain = [dictionary.plain(name) for name in names]
-    words = zip(names, dictionary.in_common_words(plain), plain, strict=True)
-    known = [dictionary.meaning(name, None if word == own else word) for name, word, own in words]
     return any(
-        m is not None and (m.quantity.role in ("rss", "rank") or m.quantity.name in ("SINR", "RSRQ")) for m in known
+        what is not None and (what.quantity.role in ("rss", "rank") or what.quantity.name in ("SINR", "RSRQ"))
+        for what, *_ in dictionary.described(names)[1]
     )
 
 

@@ -32,20 +32,12 @@ _ROW = re.compile(
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     rsrp, loss, snr, cfo, pci = (rows.si(name) for name in ("rsrp", "pl", "snr", "cfo", "pci"))
     rats = ["nr" if cc == "nr" else "lte" for cc in rows.text("cc")]
-    carrier = np.array([int(cc) if cc.isdigit() else 0 for cc in rows.text("cc")])
+    carrier = [int(cc) if cc.isdigit() else 0 for cc in rows.text("cc")]
     readings = [
-        _cells.Reading(
-            row=i,
-            rat=rats[i],
-            pci=pci[i],
-            arfcn=np.nan,
-            rsrp_dbm=rsrp[i],
-            serving=True,
-            qualities=(np.nan, np.nan, snr[i], loss[i]),
-        )
+        _cells.Reading(i, rats[i], pci[i], np.nan, rsrp[i], serving=True, sinr_db=snr[i], pathloss_db=loss[i])
         for i in range(len(rows))
     ]
-    for cc in np.unique(carrier).tolist():  # two carriers may share a PCI, and the console prints no ARFCN
+    for cc in sorted(set(carrier)):  # two carriers may share a PCI, and the console prints no ARFCN
         of_carrier = [reading for reading in readings if carrier[reading.row] == cc]
         for stream in _cells.streams(rows, of_carrier, source="srsUE"):
             name = f"{stream.name}_cc{cc}" if cc else stream.name

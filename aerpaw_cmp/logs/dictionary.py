@@ -157,7 +157,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     )),
     Quantity("network", "identity", (
         r"^(network )?(operator|carrier|provider|plmn|sim|slot|sub|subscription)( ?(id|name|code|slot|no|index))?$",
-        r"^network name$",
+        r"^network name$", r"^query$",
         r"^mcc$", r"^mnc$", r"^mcc ?mnc$", r"^(receiver|rx|cent(er|re)|carrier) freq(uency)?( hz| mhz| ghz)?$",
     )),
     Quantity("technology", "cell", (
@@ -515,6 +515,7 @@ PROGRAMS: tuple[Program, ...] = (
         r"signal": "rsrp", r"psc or pci": "pci", r"type": "network type"}),
     _program("phone", "cellname", datum="sea level"),
     _program("MAVLink, positions alone", "lat,lon,relative alt", "lat,lon,alt,hdg", units=_MAVLINK_UNITS),
+    _program("aerpaw-cmp tap", "query,ri raw", words={r"ri raw": "raw", r"rank": "rank indicator"}),
     _program("AERPAW monitoring", "transmitter,receiver,log type", words={
         r"power": "link power", r"quality": "link quality", r"snr": "link snr"}),
 )  # fmt: skip

@@ -33,7 +33,6 @@ CLOCKS = {
     "srsran_json": "program: srsRAN Project writes UTC",
     "oai_log": _TS,
     "tap_jsonl": "written: UTC",
-    "own_csv": "written: UTC",
     "generic_csv": "written",
 }
 
@@ -48,6 +47,5 @@ HEIGHTS = {
     "quectel_ri": "program: joined with vehicleOut, above take-off",
     "gpx": "program: GPX elevations are above sea level; above the first point",
     "pawprints": "program: Android altitudes are above the ellipsoid; above the first position",
-    "own_csv": "written",
     "generic_csv": "written",
 }

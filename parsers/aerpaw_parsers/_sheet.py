@@ -193,8 +193,9 @@ class Sheet:
 
     def unit(self, column: int) -> str:
         """Unit that the name of a column writes, or that its program is known to write, or an empty text."""
-        unit = self._described[1][column][1]
-        return unit if unit not in dictionary.OF_INTEGERS or self._in_integers else ""
+        what, unit, _ = self._described[1][column]
+        written = what is not None and what.unit
+        return unit if written or unit not in dictionary.OF_INTEGERS or self._in_integers else ""
 
     def unit_read(self, column: int) -> str:
         """Unit of :meth:`numbers`; empty where the brackets hold something else, such as ``(LTE scell0)``."""

@@ -60,17 +60,9 @@ _IN_NAME = (
 )
 # Hours east of UTC of the abbreviations that say it, and the zone whose clock they are a part of.
 _HOURS = {
-    "Z": 0.0, "UT": 0.0, "UTC": 0.0, "GMT": 0.0, "EDT": -4.0, "CDT": -5.0, "MDT": -6.0, "PDT": -7.0, "MST": -7.0,
+    "Z": 0.0, "UT": 0.0, "UTC": 0.0, "GMT": 0.0, "EDT": -4.0, "CDT": -5.0, "MDT": -6.0, "PDT": -7.0,
     "HST": -10.0, "CEST": 2.0, "MESZ": 2.0, "EEST": 3.0, "BST": 1.0, "JST": 9.0, "KST": 9.0, "AKDT": -8.0, "AEDT": 11.0,
     "WEST": 1.0, "MSK": 3.0, "SGT": 8.0, "HKT": 8.0, "NZDT": 13.0,
-}  # fmt: skip
-# Those of winter that people also write in summer, and those of several countries.
-_STANDARD = {
-    "EST": ((-5.0, "America/New_York"),), "CST": ((-6.0, "America/Chicago"),), "PST": ((-8.0, "America/Los_Angeles"),),
-    "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),), "MEZ": ((1.0, "Europe/Berlin"),),
-    "EET": ((2.0, "Europe/Athens"),),
-    "WET": ((0.0, "Europe/Lisbon"),), "AEST": ((10.0, "Australia/Sydney"),), "NZST": ((12.0, "Pacific/Auckland"),),
-    "IST": ((5.5, "Asia/Kolkata"), (1.0, "Europe/Dublin"), (2.0, "Asia/Jerusalem")),
 }  # fmt: skip
 # Names of a zone with its summer time.
 _WITH_SUMMER = {
@@ -222,32 +214,26 @@ class _Zones:
         if word in _WITH_SUMMER or "/" in word:
             here = _at(_WITH_SUMMER.get(word, word), moment)
             return "" if here is None else _shown(here[0])
-        if word not in _STANDARD:
+        if word not in _time.WINTER:
             raise UsageError(
                 f"the times are of a zone that is not known: {word}",
                 expected="UTC, an offset such as -04:00, or an abbreviation such as EDT",
                 cause="mend the name in the file, or its offset",
             )
-        candidates = _STANDARD[word]
+        candidates = _time.WINTER[word]
         hours, zone = candidates[0]
         here = _at(zone, moment)
         if len(candidates) == 1 and (here is None or here[0] == hours):
             return _shown(hours)
-        raise UsageError(_in_doubt(word, date, here), expected=_candidates(word, candidates, here))
-
-
-def _in_doubt(word: str, date: str, here: tuple[float, str] | None) -> str:
-    if here is None or len(_STANDARD[word]) > 1:
-        return f"the times say {word}, which is the zone of several countries"
-    return f"the times say {word}, but on {date[:10]} the clocks of that zone show {here[1]}"
-
-
-def _candidates(word: str, known: tuple[tuple[float, str], ...], here: tuple[float, str] | None) -> str:
-    """The offsets that may be meant, and how each is chosen."""
-    ways = [f"{_shown(hours)} ({zone})" for hours, zone in known]
-    if len(known) == 1:
-        ways = [f"{_shown(known[0][0])} as written"] + ([f"{_shown(here[0])} ({here[1]})"] if here else [])
-    return f"{' or '.join(ways)}: put the offset in place of {word} in the file"
+        doubt, ways = (
+            "which is the zone of several countries",
+            [f"{_shown(east)} ({name})" for east, name in candidates],
+        )
+        if len(candidates) == 1 and here is not None:
+            doubt = f"but on {date[:10]} the clocks of that zone show {here[1]}"
+            ways = [f"{_shown(hours)} as written", f"{_shown(here[0])} ({here[1]})"]
+        expected = f"{' or '.join(ways)}: put the offset in place of {word} in the file"
+        raise UsageError(f"the times say {word}, {doubt}", expected=expected)
 
 
 def _shown(hours: float) -> str:
@@ -282,7 +268,7 @@ def header_zone(name: str, brackets: str) -> str:
     if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu"}:
         return "UTC"
     last = words[-1].upper() if len(words[-1]) > 2 else ""  # 'time_edt'
-    return next((word for word in (*words, last) if word in {*_HOURS, *_STANDARD, *_WITH_SUMMER}), "")
+    return next((word for word in (*words, last) if word in {*_HOURS, *_time.WINTER, *_WITH_SUMMER}), "")
 
 
 def beside(text: str) -> str:

@@ -19,7 +19,7 @@ from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
-from . import _pose, _stamps
+from . import _json, _pose, _stamps
 
 _N = rb"(" + _lines.NUMBER + rb")"
 _POINT = re.compile(rb"<(?:trkpt|wpt|rtept)\b([^<>]{0,200})>(.{0,2000}?)(?:</(?:trkpt|wpt|rtept)>)", re.DOTALL)
@@ -53,8 +53,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     placed = [values for _, values in points]
     clock, time, warnings = _stamps.read([values[b"time"].decode("ascii", "replace") for values in placed], options)
     column = {
-        name.decode(): _lines.cells([values.get(name, b"") for values in placed])
-        for name in (b"lat", b"lon", b"ele", b"course")
+        name.decode(): _lines.cells([values.get(name, b"") for values in placed]) for name in (b"lat", b"lon", b"ele")
     }
     rows = _rows.built(
         lines, row, {"time": time, **column}, options, reader="gpx", reason=lambda _line: None, clock=clock,
@@ -75,7 +74,9 @@ def _overlap(rows: _rows.Rows, track: IntArray) -> bool:
 
 
 def _stream(rows: _rows.Rows, name: str) -> Stream | None:
-    values = dictionary.record_columns({key: rows.decimal(key) for key in ("lat", "lon", "ele")})
+    names = ("lat", "lon", "ele")
+    texts = {key: rows.columns[key].tolist() for key in names}
+    values = dictionary.record_columns({key: np.array([_json.number(cell) for cell in texts[key]]) for key in names})
     lost = _pose.clean(rows, values)
     rows.height_from = "program"
     values["altitude_m"], about = _pose.above_takeoff(rows, values, "sea level", lost)

@@ -112,6 +112,8 @@ _KINDS: tuple[tuple[str, str, tuple[_Test, ...]], ...] = (
     ("flight_yaml", "a flight file of settings: give it to 'report'",
      (rb"(?m)\A[^\0]{0,4096}?^flight:", rb"(?m)^logs:")),
     ("site_yaml", "a site: name it under 'site:' in flight.yaml", (rb"(?m)^origin:[^\0]*^towers:",)),
+    ("own_export", "samples of a report of aerpaw-cmp: give the logs that it was made of (or '--map' its columns)",
+     (rb"\A(?:\xef\xbb\xbf)?time_utc,time_s,tower,",)),
     ("map", "a map: 'aerpaw-cmp site import' reads it",
      (rb'\A\s*(?:(?:<\?xml[^>]*>\s*)?<osm\b|\{[^\[]*"type"\s*:\s*"FeatureCollection"|\{[^\[]*"osm3s")',)),
 )  # fmt: skip

@@ -61,8 +61,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     own_stamp = begun is not None and not begun[0].startswith(b"[")  # not that of ts
     if own_stamp and options.clock is None:
         options = replace(options, clock="utc")  # the program's log and metrics are in UTC
-    torn = _rows.torn(_TORN, "an incomplete line of the table (torn line?)")
-    rows = _rows.matched(data, pattern, options, reader="srsran_gnb", reason=torn)
+    rows = _rows.matched(
+        data, pattern, options, reader="srsran_gnb",
+        reason=lambda line: "an incomplete line of the table (torn line?)" if _TORN.match(line) else None,
+    )  # fmt: skip
     rnti = np.array([int(text, 16) if text else np.nan for text in rows.text("rnti")], dtype=np.float64)
     columns = {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti, "pci": rows.number("pci")}
     rows.clock_from = rows.clock_from or ("program" if own_stamp else None)

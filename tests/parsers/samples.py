@@ -428,7 +428,6 @@ RSS_EXPORT = (
     b"2025-03-02T15:00:01.250Z,1,LW1,USRP1,dBm,1,2,3,,\n"
     b"2025-03-02T15:00:00.250Z,0,LW2,USRP1,dBm,1,2,3,-91.5,-80\n"
 )
-RANK_EXPORT = b"time_utc,time_s,tower,east_m,north_m,up_m,measured_rank\n,0,LW1,1,2,3,2\n,1.5,LW1,1,2,3,\n"
 TAP_EXPORT = (
     b"time_utc,uncertainty_s,n,query,status,rank,ri_raw,mcs,cqi,rsrp_dbm,sinr_db\n"
     b"2025-03-02T15:00:00.250Z,0.02,1,nr5g_csi,ok,2,2,11,9,,\n"
@@ -531,7 +530,6 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     },
     "sigmf": {"dataset12": (SIGMF, 2, 1)},
     "iq_burst": {"two_channels": (iq_mat(), 1, 0)},
-    "own_csv": {"rss": (RSS_EXPORT, 3, 0), "rank": (RANK_EXPORT, 2, 0), "tap": (TAP_EXPORT, 2, 0)},
     "ardupilot_bin": {"flight": (autopilots.dataflash(), 5, 0)},
     "mavlink_tlog": {"version_2": (autopilots.tlog(2), 5, 0), "version_1": (autopilots.tlog(1), 5, 0)},
     "px4_ulog": {"flight": (autopilots.ulog(), 5, 0)},
@@ -543,7 +541,7 @@ CASES = [(reader, name) for reader, samples in SAMPLES.items() for name in sampl
 
 # Readers and samples whose clock is UTC or relative.
 WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
-    "nemo_csv", "nemo_kml", "tap_jsonl", "pawprints", "srsran_json", "own_csv",
+    "nemo_csv", "nemo_kml", "tap_jsonl", "pawprints", "srsran_json",
     "ardupilot_bin", "mavlink_tlog", "px4_ulog",
     ("vehicle_out", "utc_offset"), ("flight_mat", "lte"), ("flight_mat", "processed"), ("gpx", "track"),
     ("drive_test", "srsue_metrics"), ("pose_csv", "airdata"), ("srsran_gnb", "log"), ("oai_log", "frames"), ("oai_log", "ue"),

@@ -109,20 +109,14 @@ def test_a_burst_says_its_frequency_and_needs_its_name() -> None:
         read("iq_burst", samples.iq_mat(), replace(PLAIN, file_name="burst.mat"))
 
 
-def test_our_own_exports_are_read_back() -> None:
-    rank = read("own_csv", samples.RANK_EXPORT).streams[0]
-    assert rank.attributes["clock"] == "relative"
-    assert rank.frame["rank"].tolist()[0] == 2.0
-    tap = read("own_csv", samples.TAP_EXPORT)
-    assert [(stream.kind, stream.name) for stream in tap.streams] == [("rank", "nr5g"), ("rss", "nr5g_rsrp")]
-
-
-@pytest.mark.parametrize("rank", ["-1", "0", "9", "1.5", "1e30"])
-def test_a_rank_that_is_none_in_a_tap_export_is_missing_and_flagged(rank: str) -> None:
-    data = samples.TAP_EXPORT.replace(b",ok,2,2,", f",ok,{rank},2,".encode(), 1)
-    (frame,) = (s.frame for s in read("own_csv", data).streams if s.kind == "rank")
-    assert np.isnan(frame["rank"].to_numpy()).all()
-    assert list(frame["flag"]) == ["ri_out_of_range"]
+def test_an_export_of_the_tap_keeps_its_queries_apart() -> None:
+    lte = b"2025-03-02T15:00:00.300Z,0.02,3,lte_csi,ok,4,4,11,9,,\n"
+    streams = {stream.name: stream for stream in read("drive_test", samples.TAP_EXPORT + lte).streams}
+    ranks = {name: stream.frame["rank"].tolist() for name, stream in streams.items() if stream.kind == "rank"}
+    assert sorted(ranks.values()) == [[2.0], [4.0]]
+    (level,) = (stream for stream in streams.values() if stream.kind == "rss")
+    assert level.frame["rss_db"].tolist() == [-80.0]
+    assert str(level.frame["time"][0]) == "2025-03-02 15:00:00.350000"
 
 
 def test_objects_over_several_lines_are_read_behind_any_number_of_damaged_ones():

@@ -144,27 +144,6 @@ def test_a_cell_serves_until_another_does() -> None:
     assert {name: frame["serving"].tolist() for name, frame in streams.items()} == {"pci5": [1, 1], "pci20": [0, 0]}
 
 
-def test_exports_read_back_keep_the_order_of_the_table() -> None:
-    head = b"time_utc,time_s,tower,channel,unit,measured_db\n"
-    rows = [f"2025-03-02T15:00:{i:02d}Z,{i},LW{3 - i % 3},USRP1,{'dB' if i else 'dBm'},{-50 - i}\n" for i in range(7)]
-    result = read("own_csv", head + "".join(rows).encode())
-    assert [stream.name for stream in result.streams] == ["LW3_USRP1", "LW2_USRP1", "LW1_USRP1"]
-    assert [stream.attributes["unit"] for stream in result.streams] == ["dBm", "dB", "dB"]
-
-
-@pytest.mark.parametrize("kind", ["rss", "rank"])
-def test_a_name_that_ends_in_nul_loses_no_row(kind: str) -> None:
-    """NumPy takes the last NULs off a text that it compares with: a table of levels ended in an IndexError."""
-    head, cells = {
-        "rss": (b"time_utc,time_s,tower,channel,unit,measured_db", b"LW\0,USRP1\0,dBm,-81.5"),
-        "rank": (b"time_utc,time_s,tower,measured_rank", b"LW\0,2"),
-    }[kind]
-    data = head + b"\n2025-03-02T15:00:00Z,0," + cells + b"\n2025-03-02T15:00:01Z,1," + cells + b"\n"
-    result = by_name("own_csv").read(data, OPTIONS)
-    assert result.accepted == 2
-    assert [len(stream.frame) for stream in result.streams] == [2]
-
-
 # --- tables that a person or a program wrote anew ---------------------------------------------------------------------
 
 SIX_COLUMNS = "Time,Latitude,Longitude,Altitude (m),RSRP (dBm)\n"

@@ -651,8 +651,6 @@ SAMPLES = [
         "vehicle": {"longitude_deg": [-78.7, -78.71]}, "USRP1": {"time": [0.25, 0.55], "rss_db": [-40.5, -41.5]},
         "USRP2": {"flag": ["", "out_of_coverage"]},
     }, "sigmf"),
-    Case("our RSS table", samples.RSS_EXPORT, {"LW1_USRP1": {"flag": ["", "out_of_coverage"]}}, "own_csv",
-         about={f"{node}_USRP1": {"node": node, "channel": "USRP1"} for node in ("LW1", "LW2")}),
     Case("MATLAB, two channels: units and silence", samples.mat_flight(), {"USRP1": {"flag": ["", "", "out_of_coverage", "", ""]}},
          "flight_mat", about={"USRP1": {"unit": "dB re full scale"}}),
     Case("MATLAB, LTE: unit and silence", samples.lte_flight(),
@@ -770,9 +768,6 @@ FORMS = {
     ),
     "drive_test, two carriers": Form(
         "Timestamp,PCI,EARFCN,RSRP (dBm),N1 PCI,N1 EARFCN,N1 RSRP\n", "{t},7,1300,-{v},7,2850,-99\n", "pci7_arfcn1300", "-level"
-    ),
-    "own_csv": Form(
-        "time_utc,time_s,tower,channel,unit,measured_db\n", "{t}Z,0,LW1,USRP1,dB,{v}.5\n", "LW1_USRP1", "level", utc=True
     ),
 }  # fmt: skip
 NEW_YORK = ZoneInfo("America/New_York")

@@ -25,8 +25,15 @@ TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
 # Optional offset behind :data:`TIME`.
 ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 
-# Zones of the database without daylight time whose names people use all year: where the clock is turned, and where not.
-_WINTER = {"EST": ("America/New_York", "Etc/GMT+5"), "MST": ("America/Denver", "America/Phoenix")}
+# Abbreviations of winter that people also write in summer, and those of several countries: hours east of UTC, and the
+# zone whose clock is turned.
+WINTER = {
+    "EST": ((-5.0, "America/New_York"),), "CST": ((-6.0, "America/Chicago"),), "MST": ((-7.0, "America/Denver"),),
+    "PST": ((-8.0, "America/Los_Angeles"),), "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),),
+    "MEZ": ((1.0, "Europe/Berlin"),), "EET": ((2.0, "Europe/Athens"),), "WET": ((0.0, "Europe/Lisbon"),),
+    "AEST": ((10.0, "Australia/Sydney"),), "NZST": ((12.0, "Pacific/Auckland"),),
+    "IST": ((5.5, "Asia/Kolkata"), (1.0, "Europe/Dublin"), (2.0, "Asia/Jerusalem")),
+}  # fmt: skip
 _BUCKET_S = 900  # no zone in use changes its offset within a quarter of an hour of wall clock
 _MONTH_DAYS = np.array([0, 31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
 
@@ -116,11 +123,11 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     where = zone(name, needed_by=needed_by)
     starts, buckets, index = _runs(wall_ns)
     first, second = (_offsets_s(buckets, where, fold) for fold in (0, 1))
-    if name in _WINTER and (first != _offsets_s(buckets, zone(_WINTER[name][0], needed_by=needed_by), 0)).any():
-        turned, never = _WINTER[name]
+    hours, turned = WINTER.get(name or "", ((0.0, ""),))[0]
+    if turned and (first != _offsets_s(buckets, zone(turned, needed_by=needed_by), 0)).any():
         raise UsageError(
             f"{name} is a winter time, and times of {needed_by} lie in summer",
-            expected=f"timezone: {turned} (clocks are turned) or {never} (they are not)",
+            expected=f"timezone: {turned} (clocks are turned) or Etc/GMT{-hours:+.0f} (they are not)",
         )
     length = np.diff(np.append(starts, len(wall_ns)))
     if np.array_equal(first, second):
@@ -306,43 +313,16 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
         Times that are none are False, and 1970-01-01 in ``instants``.
     """
     wall, valid, offset, zoned = parse_texts(column)
-    return _parsed_to_utc(wall, valid, offset, zoned, options, needed_by=needed_by), valid
-
-
-def _parsed_to_utc(
-    wall: IntArray, valid: BoolArray, offset_s: IntArray, zoned: BoolArray, options: ReadOptions, *, needed_by: str
-) -> Instants:
-    """Convert the result of :func:`parse_texts` to UTC.
-
-    Parameters
-    ----------
-    wall : (n,)
-        Wall clock [ns since 1970].
-    valid : (n,) bool
-    offset_s : (n,)
-        East of UTC, where the text has a zone [s].
-    zoned : (n,) bool
-        Whether it has one.
-    options : ReadOptions
-        Zone of the others.
-    needed_by : str
-        What the message names if there is no zone.
-
-    Returns
-    -------
-    Instants
-        The time of what is none is 1970-01-01.
-    """
     naive = valid & ~zoned
     if len(wall) and naive.all():
-        return wall_to_utc(wall, options, needed_by=needed_by)
-    utc = (wall - offset_s * 1_000_000_000).astype("datetime64[ns]")
-    ambiguous, nonexistent = np.zeros(len(wall), dtype=bool), np.zeros(len(wall), dtype=bool)
+        return wall_to_utc(wall, options, needed_by=needed_by), valid
+    utc = (wall - offset * 1_000_000_000).astype("datetime64[ns]")
+    ambiguous, nonexistent = np.zeros((2, len(wall)), dtype=bool)
     if not naive.any():
-        return Instants(utc, ambiguous, nonexistent, zoned=bool(valid.any()))
+        return Instants(utc, ambiguous, nonexistent, zoned=bool(valid.any())), valid
     local = wall_to_utc(wall[naive], options, needed_by=needed_by)
     utc[naive], ambiguous[naive], nonexistent[naive] = local.time, local.ambiguous, local.nonexistent
-    return Instants(utc, ambiguous, nonexistent, local.warnings)
+    return Instants(utc, ambiguous, nonexistent, local.warnings), valid
 
 
 def origin_ns(options: ReadOptions, *, needed_by: str) -> int | None:

@@ -152,20 +152,11 @@ def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tupl
         One tuple per line.
     """
     if b"\r\r" in lines.data:  # the pattern has room for one carriage return, a line's own is left out
-        return _each(lines, pattern, range(len(lines)))
-    positions: list[int] = []
-    groups: list[tuple[bytes, ...]] = []
-    for hit in pattern.finditer(lines.data):
-        positions.append(hit.start())
-        groups.append(hit.groups(b""))
-    return np.searchsorted(lines.starts, np.array(positions, dtype=np.int64)), groups
-
-
-def _each(lines: Lines, pattern: re.Pattern[bytes], numbers: Iterable[int]) -> tuple[IntArray, list[tuple[bytes, ...]]]:
-    """Of some lines those that the pattern describes, one by one, and its groups."""
-    tried = [(i, pattern.match(lines.raw(i))) for i in numbers]
-    hits = [(i, hit.groups(b"")) for i, hit in tried if hit is not None]
-    return np.array([i for i, _ in hits], dtype=np.int64), [groups for _, groups in hits]
+        tried = ((i, pattern.match(lines.raw(i))) for i in range(len(lines)))
+        hits = [(int(lines.starts[i]), hit.groups(b"")) for i, hit in tried if hit is not None]
+    else:
+        hits = [(hit.start(), hit.groups(b"")) for hit in pattern.finditer(lines.data)]
+    return np.searchsorted(lines.starts, np.array([at for at, _ in hits], dtype=np.int64)), [row for _, row in hits]
 
 
 class Rejects:
@@ -244,9 +235,7 @@ def remainder(
 
 def columns(groups: list[tuple[bytes, ...]], count: int) -> list[AnyArray]:
     """Groups by column, as fixed-width byte arrays."""
-    if not groups:
-        return [np.empty(0, dtype="S1") for _ in range(count)]
-    return [np.array(column, dtype=np.bytes_) for column in zip(*groups, strict=True)]
+    return [cells([group[i] for group in groups]) for i in range(count)]
 
 
 def cells(texts: Sequence[bytes]) -> AnyArray:

@@ -24,7 +24,6 @@ from . import make_frames as _frames
 _NO_DATE = "the time stamp is no date of the calendar"
 _UNREAD = "the time is empty or of a form that is not read"
 NO_TIME = "the time is beyond any flight"
-_DECIMAL = re.compile(_lines.NUMBER)
 _SI = {b"k": 1e3, b"M": 1e6, b"G": 1e9, b"m": 1e-3, b"u": 1e-6, b"n": 1e-9}
 Reason = Callable[[bytes], "str | None"]
 
@@ -93,20 +92,13 @@ class Rows:
             cells = np.where(cells == word, b"", cells)
         return np.asarray(_lines.numbers(cells), dtype=np.float64)
 
-    def decimal(self, name: str) -> FloatArray:
-        """A column as numbers, what is none NaN."""
-        values = [float(cell) if _DECIMAL.fullmatch(cell) else np.nan for cell in self.columns[name].tolist()]
-        return np.array(values, dtype=np.float64)
-
     def si(self, name: str) -> FloatArray:
         """A column of numbers with SI suffix: ``-4.3k`` is -4300."""
         cells = [cell.strip() for cell in self.columns[name].tolist()]
         scaled = [cell[-1:] in _SI and cell[-2:-1].isdigit() for cell in cells]  # 'nan' is no nano
         scale = np.array([_SI[cell[-1:]] if mark else 1.0 for cell, mark in zip(cells, scaled, strict=True)])
         plain = _lines.cells([cell[:-1] if mark else cell for cell, mark in zip(cells, scaled, strict=True)])
-        for word in (b"n/a", b"-"):
-            plain = np.where(plain == word, b"", plain)
-        return np.asarray(_lines.numbers(plain) * scale, dtype=np.float64)
+        return np.asarray(replace(self, columns={name: plain}).number(name) * scale, dtype=np.float64)
 
     def text(self, name: str) -> list[str]:
         """A column as text."""
@@ -241,15 +233,10 @@ def matched(
         If a zone-less clock has no zone.
     """
     lines = _lines.split(data)
-    names = list(pattern.groupindex)
     rows, groups = _lines.match(lines, pattern)
-    column = dict(zip(names, _picked(groups, pattern), strict=True))
+    texts = _lines.columns(groups, pattern.groups)
+    column = {name: texts[i - 1] for name, i in pattern.groupindex.items()}
     return built(lines, rows, column, options, reader=reader, reason=reason, skip=skip, clock=clock)
-
-
-def _picked(groups: list[tuple[bytes, ...]], pattern: re.Pattern[bytes]) -> list[AnyArray]:
-    column = _lines.columns(groups, pattern.groups)
-    return [column[i - 1] for i in pattern.groupindex.values()]
 
 
 def built(
@@ -382,11 +369,6 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
         return False, _time.local_to_utc(ns, options.timezone, needed_by=reader), valid
     none = np.zeros(len(ns), dtype=bool)
     return origin is None, _time.Instants(ns.astype("datetime64[ns]"), none, none.copy()), valid
-
-
-def torn(pattern: re.Pattern[bytes], text: str) -> Reason:
-    """A reason for consoles: lines that begin as a row does are rejected, all others are talk."""
-    return lambda line: text if pattern.match(line) else None
 
 
 def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = None) -> Stream | None:

@@ -312,15 +312,9 @@ def _read_file(items: Mapping[str, AnyArray], group: str) -> IngestedFile:
     reasons = () if account is None else tuple(RejectedReason(*entry) for entry in _read_json(account))
     streams = tuple(_read_stream(items, name) for name in _numbered(items, f"{group}streams/"))
     result = ReadResult(
-        reader=meta["reader"],
-        streams=streams,
-        lines=meta["lines"],
-        accepted=meta["accepted"],
-        blank=meta["blank"],
-        rejected=rejected,
-        reasons=reasons,
-        warnings=tuple(meta["warnings"]),
-    )
+        reader=meta["reader"], streams=streams, lines=meta["lines"], accepted=meta["accepted"], blank=meta["blank"],
+        rejected=rejected, reasons=reasons, warnings=tuple(meta["warnings"]),
+    )  # fmt: skip
     return IngestedFile(meta["path"], meta["sha256"], result)
 
 

@@ -165,11 +165,8 @@ def as_utf8(data: bytes) -> bytes:
     return data.removeprefix(b"\xef\xbb\xbf")
 
 
-def _present(path: Path) -> bool:
-    try:
-        return path.exists()
-    except (OSError, ValueError):
-        return False  # an impossible path: read_bytes says so
+# Path's own raise for a name that is too long: read_bytes says so.
+_present, _is_folder = os.path.exists, os.path.isdir
 
 
 def exists(path: Path) -> bool:
@@ -177,11 +174,15 @@ def exists(path: Path) -> bool:
     return _present(path) or archives.inside(path) is not None
 
 
+def _part_of(path: Path) -> tuple[Path, str] | None:
+    return None if _present(path) else archives.inside(path)
+
+
 def sniffers_of(path: Path) -> list[str]:
     """Names of the readers whose sniffers accept a log; none for a folder of pieces or a log in a flight file."""
     if path.is_dir():
         return []
-    if (part := None if _present(path) else archives.inside(path)) is None:
+    if (part := _part_of(path)) is None:
         return [reader.name for reader in claims(_beginning(path)) if reader.kinds]
     if _in_flight_file(path) is not None:
         return []  # a flight file knows the reader of each log
@@ -340,17 +341,10 @@ def _samples_of(name: str, names: Collection[str]) -> str | None:
     return None
 
 
-def _is_folder(place: Path) -> bool:
-    try:
-        return place.is_dir()
-    except (OSError, ValueError):
-        return False  # an impossible path: read_bytes says so
-
-
 def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: Reader | None = None) -> IngestedFile:
     """Read one file, or one member of an archive; see :func:`ingest`."""
     place = Path(path)
-    if (part := None if _present(place) else archives.inside(place)) is not None:
+    if (part := _part_of(place)) is not None:
         archive, name = part
         if _in_flight_file(place) is not None:
             return _of_kind(_source(archive, name), reader, archive)
@@ -391,7 +385,7 @@ def _of_kind(file: IngestedFile, chosen: Reader | None, flight_file: Path) -> In
 
 def _in_flight_file(path: Path) -> tuple[Path, str] | None:
     """The flight file that a path leads into, and the name of the log in it."""
-    part = None if _present(path) else archives.inside(path)
+    part = _part_of(path)
     return part if part is not None and _head(part[0]).startswith(_HDF5) else None
 
 

@@ -253,12 +253,9 @@ def _way_out(head: bytes) -> str:
 
 # Words that a column of a quantity may have in its name, where the dictionary does not know it.
 _LIKE = {
-    "time": r"time|date|clock|stamp|epoch|utc",
-    "rss_db": r"power|level|signal|strength|rss|dbm|rsrp",
-    "latitude_deg": r"\blat",
-    "longitude_deg": r"\b(lon|lng)",
-    "altitude_m": r"\b(alt|height|elev)",
-}
+    "time": r"time|date|clock|stamp|epoch|utc", "rss_db": r"power|level|signal|strength|rss|dbm|rsrp",
+    "latitude_deg": r"\blat", "longitude_deg": r"\b(lon|lng)", "altitude_m": r"\b(alt|height|elev)",
+}  # fmt: skip
 
 
 def _looks_like(name: str, words: str) -> bool:

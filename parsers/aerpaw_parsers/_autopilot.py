@@ -122,17 +122,11 @@ def result(
     rejected = [*damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in np.sort(number[~timed]))]
     lines = messages + len(damaged)
     rows = _rows.Rows(
-        reader=reader,
-        options=options,
-        lines=lines,
-        row=number[timed],
-        at=np.arange(int(timed.sum())),
+        reader=reader, options=options, lines=lines, row=number[timed], at=np.arange(int(timed.sum())),
         time=(np.round(time_s[timed] * 1e6).astype(np.int64) * 1000 + (zero_ns or 0)).astype("datetime64[ns]"),
-        flag=_lines.flags(int(timed.sum())),
-        blank=lines - int(timed.sum()) - len(rejected),
-        rejected=rejected,
+        flag=_lines.flags(int(timed.sum())), blank=lines - int(timed.sum()) - len(rejected), rejected=rejected,
         relative=zero_ns is None,
-    )
+    )  # fmt: skip
     if not len(rows):
         return rows.result([])
     rows.warnings += ["no message carries UTC: " + _rows.RELATIVE] if rows.relative else []

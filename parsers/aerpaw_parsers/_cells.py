@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import pandas as pd
@@ -84,12 +84,13 @@ def streams(
     quantity : str
         The level that they hold.
     """
-    is_table = isinstance(readings, pd.DataFrame)
-    table: pd.DataFrame = readings if is_table else pd.DataFrame([*readings], columns=list(Reading._fields))
+    rows_or_table = readings if isinstance(readings, pd.DataFrame) else [*readings]
+    table = pd.DataFrame(rows_or_table, columns=list(Reading._fields))
     table = table[np.isfinite(table["rsrp_dbm"].to_numpy(np.float64))].sort_values("row", kind="stable")
     table = table.assign(served=_serving(table), pci=table["pci"].where(table["pci"] >= 0, -1.0))
     per_cell: list[Stream] = []
-    for (rat, identity), cell_rows in table.groupby(["rat", "pci"]):
+    for key, cell_rows in table.groupby(["rat", "pci"]):
+        rat, identity = cast("tuple[str, float]", key)
         carriers = np.unique(cell_rows["arfcn"].dropna()).tolist()
         several = len(carriers) > 1
         for carrier in [*carriers, np.nan] if several else [*carriers, np.nan][:1]:

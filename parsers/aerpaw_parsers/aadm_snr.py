@@ -34,12 +34,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
 
 
 READER = _text.reader(
-    "aadm_snr",
-    "SNR of several towers, CSV (AADM)",
-    kinds=("rss",),
-    sample="time,snr_lw1,snr_lw2",
-    header=_HEADER,
-    row=_row,
-    streams=_streams,
+    "aadm_snr", "SNR of several towers, CSV (AADM)", kinds=("rss",), sample="time,snr_lw1,snr_lw2", header=_HEADER,
+    row=_row, streams=_streams,
     otherwise="the number of fields, the time or a number does not fit the header (torn line?)",
-)
+)  # fmt: skip

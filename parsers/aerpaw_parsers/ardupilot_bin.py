@@ -160,14 +160,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         home = _autopilot.of_both(position, "above_home_m")
     filters = next((series[name] for name in ("XKF1", "NKF1", "EKF1") if len(series[name].time_s)), _autopilot.NONE)
     flight = _autopilot.Flight(
-        position=position,
-        attitude=_named(series["ATT"]),
-        velocity=_named(filters),
-        fix=_named(gps),
-        utc_minus_clock_s=_offset(gps),
-        home=home,
-        source="ArduPilot dataflash log",
-    )
+        position=position, attitude=_named(series["ATT"]), velocity=_named(filters), fix=_named(gps),
+        utc_minus_clock_s=_offset(gps), home=home, source="ArduPilot dataflash log",
+    )  # fmt: skip
     return _autopilot.result("ardupilot_bin", options, [flight], count, damaged)
 
 
@@ -187,10 +182,6 @@ def _offset(gps: _autopilot.Series) -> float | None:
 
 
 READER = Reader(
-    name="ardupilot_bin",
-    title="ArduPilot dataflash log (.bin, or .log in text)",
-    kinds=("telemetry",),
-    sample="binary: POS, GPS, ATT, XKF1",
-    sniff=sniff,
-    read=read,
-)
+    name="ardupilot_bin", title="ArduPilot dataflash log (.bin, or .log in text)", kinds=("telemetry",),
+    sample="binary: POS, GPS, ATT, XKF1", sniff=sniff, read=read,
+)  # fmt: skip

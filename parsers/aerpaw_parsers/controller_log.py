@@ -37,13 +37,8 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
 
 
 READER = _text.reader(
-    "controller_log",
-    "AADM controller console: SNR of each tower",
-    kinds=("rss",),
+    "controller_log", "AADM controller console: SNR of each tower", kinds=("rss",),
     sample="[2025-01-01 12:00:07.000002] 1:-1.250000",
-    mark=re.compile(rb"^\[[^\n]{0,80}\[(?:Controller-->UAV|UAV-->Controller)\]", re.MULTILINE),
-    row=_VALUE,
-    torn=re.compile(_STAMP + rb"\d{1,2}:"),
-    skip=_no_level,
-    streams=_streams,
-)
+    mark=re.compile(rb"^\[[^\n]{0,80}\[(?:Controller-->UAV|UAV-->Controller)\]", re.MULTILINE), row=_VALUE,
+    torn=re.compile(_STAMP + rb"\d{1,2}:"), skip=_no_level, streams=_streams,
+)  # fmt: skip

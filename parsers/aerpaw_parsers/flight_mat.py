@@ -142,16 +142,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     timed = {name: column[keep] for name, column in table.items()}
     instants, warnings = _instants(timed, wall[keep], clock, options)
     rows = _rows.Rows(
-        reader="flight_mat",
-        options=options,
-        lines=count,
-        row=keep,
-        time=instants.time,
-        flag=_lines.flags(len(keep)),
+        reader="flight_mat", options=options, lines=count, row=keep, time=instants.time, flag=_lines.flags(len(keep)),
         rejected=[RejectedLine(int(i) + 1, "the row has no time", "") for i in np.flatnonzero(~valid)],
-        warnings=[*warnings, *instants.warnings],
-        relative=clock == _COUNTED and options.time_origin is None,
-    )
+        warnings=[*warnings, *instants.warnings], relative=clock == _COUNTED and options.time_origin is None,
+    )  # fmt: skip
     instants.flag(rows.flag)
     return rows.result([_track(rows, timed, clock), *_measured(rows, timed)])
 

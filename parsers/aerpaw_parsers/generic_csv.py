@@ -271,10 +271,6 @@ def _track(rows: _rows.Rows, sheet: _sheet.Sheet, where: dict[str, int], device:
 
 
 READER = Reader(
-    name="generic_csv",
-    title="any CSV with a header, columns mapped in flight.yaml",
-    kinds=("telemetry", "rss", "rank"),
-    sample="Time,Power,...",
-    sniff=sniff,
-    read=read,
-)
+    name="generic_csv", title="any CSV with a header, columns mapped in flight.yaml",
+    kinds=("telemetry", "rss", "rank"), sample="Time,Power,...", sniff=sniff, read=read,
+)  # fmt: skip

@@ -90,10 +90,7 @@ def _torn(lines: _lines.Lines, data: bytes, row: object) -> list[RejectedLine]:
 
 
 READER = Reader(
-    name="gpx",
-    title="GPX track (Nemo, phones, loggers)",
-    kinds=("telemetry",),
+    name="gpx", title="GPX track (Nemo, phones, loggers)", kinds=("telemetry",),
     sample='<trkpt lat="35.7280002" lon="-78.6960001"><ele>76.0</ele><time>2025-01-01T12:00:07Z</time></trkpt>',
-    sniff=sniff,
-    read=read,
-)
+    sniff=sniff, read=read,
+)  # fmt: skip

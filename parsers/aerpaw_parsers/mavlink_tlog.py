@@ -153,10 +153,6 @@ _NO_AUTOPILOT = {*range(100, 106), 154, *range(171, 176)}
 
 
 READER = Reader(
-    name="mavlink_tlog",
-    title="MAVLink telemetry log of a ground station (.tlog)",
-    kinds=("telemetry",),
-    sample="binary: GLOBAL_POSITION_INT, ATTITUDE, GPS_RAW_INT",
-    sniff=sniff,
-    read=read,
-)
+    name="mavlink_tlog", title="MAVLink telemetry log of a ground station (.tlog)", kinds=("telemetry",),
+    sample="binary: GLOBAL_POSITION_INT, ATTITUDE, GPS_RAW_INT", sniff=sniff, read=read,
+)  # fmt: skip

@@ -103,10 +103,6 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 READER = Reader(
-    name="oai_log",
-    title="OpenAirInterface gNB statistics or UE log: rank indicator, RSRP",
-    kinds=("rank", "rss"),
-    sample="[2025-01-01 12:00:07.000000] UE 1f4d: CQI 15, RI 2, PMI (14,1)",
-    sniff=sniff,
-    read=read,
-)
+    name="oai_log", title="OpenAirInterface gNB statistics or UE log: rank indicator, RSRP", kinds=("rank", "rss"),
+    sample="[2025-01-01 12:00:07.000000] UE 1f4d: CQI 15, RI 2, PMI (14,1)", sniff=sniff, read=read,
+)  # fmt: skip

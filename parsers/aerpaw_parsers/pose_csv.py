@@ -64,8 +64,5 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 READER = Reader(
     name="pose_csv",
     title="positions and attitude, CSV with named columns (converted vehicleOut, ArduPilot export, DJI, AirData)",
-    kinds=("telemetry",),
-    sample="timestamp,Lat,Lng,Alt,Roll,Pitch,Yaw",
-    sniff=sniff,
-    read=read,
-)
+    kinds=("telemetry",), sample="timestamp,Lat,Lng,Alt,Roll,Pitch,Yaw", sniff=sniff, read=read,
+)  # fmt: skip

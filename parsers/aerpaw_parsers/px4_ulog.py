@@ -25,27 +25,13 @@ from . import _autopilot
 
 _MAGIC = b"ULog\x01\x12\x35"
 _TYPES = {
-    "int8_t": "i1",
-    "uint8_t": "u1",
-    "bool": "u1",
-    "char": "S1",
-    "int16_t": "<i2",
-    "uint16_t": "<u2",
-    "int32_t": "<i4",
-    "uint32_t": "<u4",
-    "int64_t": "<i8",
-    "uint64_t": "<u8",
-    "float": "<f4",
-    "double": "<f8",
-}
+    "int8_t": "i1", "uint8_t": "u1", "bool": "u1", "char": "S1", "int16_t": "<i2", "uint16_t": "<u2", "int32_t": "<i4",
+    "uint32_t": "<u4", "int64_t": "<i8", "uint64_t": "<u8", "float": "<f4", "double": "<f8",
+}  # fmt: skip
 _WANTED = (
-    "vehicle_global_position",
-    "vehicle_attitude",
-    "vehicle_local_position",
-    "vehicle_gps_position",
-    "sensor_gps",
+    "vehicle_global_position", "vehicle_attitude", "vehicle_local_position", "vehicle_gps_position", "sensor_gps",
     "home_position",
-)
+)  # fmt: skip
 _FIELD = re.compile(r"(\w+)(?:\[(\d{1,4})\])? (\w+)")
 # Kinds of message of the format, by their letters.
 _KINDS = frozenset(b"BFIMPQADLCSORT")
@@ -204,10 +190,6 @@ def _angles(table: AnyArray) -> dict[str, FloatArray | None]:
 
 
 READER = Reader(
-    name="px4_ulog",
-    title="PX4 log (.ulg)",
-    kinds=("telemetry",),
-    sample="binary: vehicle_global_position, vehicle_attitude, vehicle_local_position",
-    sniff=sniff,
-    read=read,
-)
+    name="px4_ulog", title="PX4 log (.ulg)", kinds=("telemetry",),
+    sample="binary: vehicle_global_position, vehicle_attitude, vehicle_local_position", sniff=sniff, read=read,
+)  # fmt: skip

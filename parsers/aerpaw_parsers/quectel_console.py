@@ -92,10 +92,6 @@ def _rank(rows: _rows.Rows, name: str, values: list[tuple[str, dict[str, float]]
 
 
 READER = Reader(
-    name="quectel_console",
-    title="console of AERPAW's Quectel logger (drawn tables)",
-    kinds=("rss", "rank"),
-    sample='|  0 | +QNWCFG: "nr5g_csi" |        24 |       2 |       12 |        5 |',
-    sniff=sniff,
-    read=read,
-)
+    name="quectel_console", title="console of AERPAW's Quectel logger (drawn tables)", kinds=("rss", "rank"),
+    sample='|  0 | +QNWCFG: "nr5g_csi" |        24 |       2 |       12 |        5 |', sniff=sniff, read=read,
+)  # fmt: skip

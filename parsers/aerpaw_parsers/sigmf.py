@@ -15,7 +15,6 @@ The lines of the account are those values.
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterator
 from typing import Any
 
@@ -30,7 +29,6 @@ from aerpaw_cmp.logs.text import rows as _rows
 
 from . import _json, _stamps
 
-_MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 _BURST_S = 0.02
 _SAMPLES = {
     "cf64": ("f8", 1.0), "cf32": ("f4", 1.0), "ci32": ("i4", 2.0**31), "ci16": ("i2", 2.0**15), "ci8": ("i1", 2.0**7),
@@ -38,6 +36,7 @@ _SAMPLES = {
     "ru16": ("u2", 2.0**15), "ru32": ("u4", 2.0**31), "ri8": ("i1", 2.0**7), "ri32": ("i4", 2.0**31),
     "rf64": ("f8", 1.0), "rf32": ("f4", 1.0), "ri16": ("i2", 2.0**15),
 }  # fmt: skip
+_TIMES = ("core:datetime", "core:timestamp", "core:time")
 _LEVELS = {"RSS1": "USRP1", "RSS2": "USRP2", "RSS": "USRP1", "rss1": "USRP1", "rss2": "USRP2"}
 _PLACE = (("latitude_deg", ("mY", "y", "latitude", "lat")), ("longitude_deg", ("mX", "x", "longitude", "lon")),
           ("altitude_m", ("mZ", "z", "altitude", "alt")))  # fmt: skip
@@ -71,12 +70,10 @@ def _column(captures: list[dict[str, Any]], field: str, *names: str) -> FloatArr
     return np.array(out, dtype=np.float64)
 
 
-def _times(captures: list[dict[str, Any]], *fields: str) -> list[str]:
-    texts: list[str] = []
-    for capture in captures:
-        value = next((capture[field] for field in fields if field in capture), None)
-        texts += [str(item) for item in _list(value)]
-    return texts
+def _times(captures: list[dict[str, Any]], own: str) -> list[str]:
+    """Times of all captures, of a field of their own or the core's."""
+    stamps = (next((capture[field] for field in (own, *_TIMES) if field in capture), None) for capture in captures)
+    return [str(item) for stamp in stamps for item in _list(stamp)]
 
 
 def _rows_of(texts: list[str], options: ReadOptions) -> _rows.Rows:
@@ -87,16 +84,9 @@ def _rows_of(texts: list[str], options: ReadOptions) -> _rows.Rows:
     flag = _lines.flags(len(texts))
     instants.flag(flag)
     return _rows.Rows(
-        reader="sigmf",
-        options=options,
-        lines=len(texts),
-        row=keep,
-        at=keep,
-        time=instants.time[keep],
-        flag=flag[keep],
-        warnings=[*warnings, *instants.warnings, *([_rows.RELATIVE] if relative else [])],
-        relative=relative,
-    )
+        reader="sigmf", options=options, lines=len(texts), row=keep, at=keep, time=instants.time[keep], flag=flag[keep],
+        warnings=[*warnings, *instants.warnings, *([_rows.RELATIVE] if relative else [])], relative=relative,
+    )  # fmt: skip
 
 
 def _at_frequencies(rows: _rows.Rows, channel: str, values: FloatArray, frequency_hz: FloatArray) -> Iterator[Stream]:
@@ -144,18 +134,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     lost = np.setdiff1d(np.arange(1, count + 1), read_lines)
     warnings = [*(text for rows, _ in tables for text in rows.warnings), *warnings]
     return ReadResult(
-        reader="sigmf",
-        streams=tuple(stream for _, stream in tables),
-        lines=count,
-        accepted=len(read_lines),
-        blank=0,
+        reader="sigmf", streams=tuple(stream for _, stream in tables), lines=count, accepted=len(read_lines), blank=0,
         rejected=tuple(RejectedLine(int(i), "a value without a time", "") for i in lost),
         warnings=tuple(dict.fromkeys(warnings)),
-    )
+    )  # fmt: skip
 
 
 def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[_rows.Rows, Stream]]:
-    texts = _times(captures, "measurement:time_stamp", "core:datetime", "core:timestamp")
+    texts = _times(captures, "measurement:time_stamp")
     for name, channel in _LEVELS.items():
         values = _column(captures, "measurement:values", name)
         if not len(values):
@@ -171,12 +157,9 @@ def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tu
 
 def _track(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[_rows.Rows, Stream]]:
     """Positions: of the measurements, of the GPS, or of the receiver."""
-    for field, times in (
-        ("measurement:values", ("measurement:time_stamp", "core:datetime", "core:timestamp")),
-        ("gps:position", ("gps:time_stamp", "core:datetime", "core:timestamp")),
-        ("core:rx_location", ("core:timestamp", "core:datetime", "core:time")),
-    ):
-        texts = _times(captures, *times)
+    fields = ("measurement:values", "measurement:time_stamp"), ("gps:position", "gps:time_stamp")
+    for field, time in (*fields, ("core:rx_location", "core:timestamp")):
+        texts = _times(captures, time)
         columns = {name: _column(captures, field, *names) for name, names in _PLACE}
         if not texts or len(columns["latitude_deg"]) != len(texts) or len(columns["longitude_deg"]) != len(texts):
             continue
@@ -196,93 +179,63 @@ def _data_name(options: ReadOptions) -> str:
 def _powers(
     meta: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str]
 ) -> Iterator[tuple[_rows.Rows, Stream]]:
-    """Power of each burst of the samples beside the meta file.
-
-    Parameters
-    ----------
-    meta : dict
-        Of the file.
-    captures : list of dict
-        With the global fields that they lack.
-    options : ReadOptions
-    warnings : list of str
-        Gets what the user should know.
-
-    Yields
-    ------
-    tuple of Rows and Stream
-        Of each channel.
-    """
-    samples = _samples(meta, options)
-    rate = _json.number(_json.inside(meta, "global").get("core:sample_rate"))
+    """Power of each burst of the samples beside the meta file, ``captures`` with the global fields that they lack."""
+    common = _json.inside(meta, "global")
+    samples, full_scale = _samples(common, _json.listed(meta, "captures"), options)
+    rate = _json.number(common.get("core:sample_rate"))
     if samples is None or not rate > 0:
         return
-    size = max(1, round(_BURST_S * rate))
-    texts: list[str] = []
+    size, zero = max(1, round(_BURST_S * rate)), _integer(common.get("core:offset"))
+    middle = full_scale - 0.5 if samples.dtype.kind == "u" else 0.0
+    bursts: list[tuple[str, float, float]] = []  # stamp of the capture, seconds behind it, frequency
     powers: list[FloatArray] = []
-    frequencies: list[float] = []
-    middle = _full_scale(meta) - 0.5 if samples.dtype.kind == "u" else 0.0
-    zero = _integer(_json.inside(meta, "global").get("core:offset"), 0)
-    starts = [min(max(_integer(item.get("core:sample_start"), 0) - zero, 0), len(samples)) for item in captures]
+    starts = [min(max(_integer(item.get("core:sample_start")) - zero, 0), len(samples)) for item in captures]
     for capture, start, end in zip(captures, starts, [*starts[1:], len(samples)], strict=True):
-        stamp = next((capture[key] for key in ("core:datetime", "core:timestamp", "core:time") if key in capture), None)
+        stamp = next((capture[key] for key in _TIMES if key in capture), None)
         if stamp is None:
             warnings.append("captures without core:datetime are left out")
             continue
         for at in range(start, end - size // 2, size):
             piece = samples[at : min(at + size, end)].astype(np.float64) - middle
-            texts.append(_later(str(stamp), (at - start) / rate))
-            frequencies.append(_json.number(capture.get("core:frequency")))
+            bursts.append((str(stamp), (at - start) / rate, _json.number(capture.get("core:frequency"))))
             with np.errstate(all="ignore"):  # damaged samples may be any number
                 powers.append((piece**2).sum(axis=2).mean(axis=0))
-    if not texts:
+    if not bursts:
         return
+    stamps, later_s, tuned = zip(*bursts, strict=True)
     with np.errstate(all="ignore"):
-        level = 10 * np.log10(np.array(powers)) - 20 * np.log10(_full_scale(meta))
-    rows = _rows_of(texts, options)
+        level = 10 * np.log10(np.array(powers)) - 20 * np.log10(full_scale)
+    rows = _rows_of(list(stamps), options)
+    rows.time = rows.time + np.round(np.array(later_s)[rows.at] * 1e9).astype("timedelta64[ns]")
     for i in range(level.shape[1]):
-        for stream in _at_frequencies(rows, f"USRP{i + 1}", level[:, i], np.array(frequencies)):
+        for stream in _at_frequencies(rows, f"USRP{i + 1}", level[:, i], np.array(tuned)):
             yield rows, stream
 
 
-def _samples(meta: dict[str, Any], options: ReadOptions) -> AnyArray | None:
-    """The samples beside the meta file as they are stored, shape (n, channels, 1 or 2); None where there are none."""
-    kind = str(_json.inside(meta, "global").get("core:datatype", ""))
+def _samples(
+    common: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions
+) -> tuple[AnyArray | None, float]:
+    """The samples beside the meta file as they are stored, shape (n, channels, 1 or 2), and the largest of their type.
+
+    None where there are none.
+    """
+    kind = str(common.get("core:datatype", ""))
     data = options.neighbour(_data_name(options)) if options.neighbour else None
-    common, captures = _json.inside(meta, "global"), _json.listed(meta, "captures")
-    if data is None or kind.split("_")[0] not in _SAMPLES:
-        return None
-    stored = np.dtype((">" if kind.endswith("_be") else "<") + _SAMPLES[kind.split("_")[0]][0])
-    shape = (min(max(_integer(common.get("core:num_channels"), 1), 1), 64), 2 if kind.startswith("c") else 1)
+    code, full_scale = _SAMPLES.get(kind.split("_")[0], ("", 1.0))
+    if data is None or not code:
+        return None, full_scale
+    stored = np.dtype((">" if kind.endswith("_be") else "<") + code)
+    shape = (min(max(_integer(common.get("core:num_channels")), 1), 64), 2 if kind.startswith("c") else 1)
     frame_bytes = stored.itemsize * shape[0] * shape[1]
-    for capture in sorted(captures, key=lambda item: _integer(item.get("core:sample_start"), 0)):
-        begin = _integer(capture.get("core:sample_start"), 0) * frame_bytes
-        data = data[:begin] + data[begin + max(_integer(capture.get("core:header_bytes"), 0), 0) :]
-    return np.frombuffer(data[: len(data) // frame_bytes * frame_bytes], dtype=stored).reshape(-1, *shape)
+    for capture in sorted(captures, key=lambda item: _integer(item.get("core:sample_start"))):
+        begin = _integer(capture.get("core:sample_start")) * frame_bytes
+        data = data[:begin] + data[begin + max(_integer(capture.get("core:header_bytes")), 0) :]
+    return np.frombuffer(data[: len(data) // frame_bytes * frame_bytes], dtype=stored).reshape(-1, *shape), full_scale
 
 
-def _full_scale(meta: dict[str, Any]) -> float:
-    """Largest sample of the data type, as stored."""
-    return _SAMPLES[str(_json.inside(meta, "global").get("core:datatype", "")).split("_")[0]][1]
-
-
-def _integer(value: Any, default: int) -> int:
+def _integer(value: Any) -> int:
     number = _json.number(value)
-    return int(number) if np.isfinite(number) and abs(number) < 2**53 else default
-
-
-def _later(stamp: str, seconds: float) -> str:
-    """A time so many seconds after another, in the form of the first."""
-    try:
-        return f"{float(stamp) + seconds:.6f}"
-    except ValueError:
-        zone = stamp[-1:] if stamp.endswith("Z") else ""
-        if not _MOMENT.fullmatch(stamp):
-            return "-"
-        moment = np.datetime64(stamp.removesuffix("Z").replace(" ", "T"), "ns") + np.timedelta64(
-            round(seconds * 1e9), "ns"
-        )
-        return str(moment) + zone
+    return int(number) if np.isfinite(number) and abs(number) < 2**53 else 0
 
 
 READER = Reader(

@@ -261,15 +261,9 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     stream = _stream(samples, repeats, before - 1 if unterminated else -1, options, warnings)
     rejected, reasons = rejects.result()
     return ReadResult(
-        reader="sounder_log",
-        streams=(stream,) if stream is not None else (),
-        lines=before,
-        accepted=accepted,
-        blank=blank,
-        rejected=rejected,
-        warnings=tuple(warnings),
-        reasons=reasons,
-    )
+        reader="sounder_log", streams=(stream,) if stream is not None else (), lines=before, accepted=accepted,
+        blank=blank, rejected=rejected, warnings=tuple(warnings), reasons=reasons,
+    )  # fmt: skip
 
 
 def _stream(
@@ -317,21 +311,13 @@ def _stream(
             "with the channel option"
         )
     attributes = _frames.attributes(
-        options,
-        channel=name,
-        unit=options.unit or ("dB" if ratio else "dB re full scale"),
-        quantity="SNR" if name.lower() == "snr" else None,
-        repeated_samples=len(repeats.line),
-    )
+        options, channel=name, unit=options.unit or ("dB" if ratio else "dB re full scale"),
+        quantity="SNR" if name.lower() == "snr" else None, repeated_samples=len(repeats.line),
+    )  # fmt: skip
     return Stream("rss", name, frame, attributes)
 
 
 READER = Reader(
-    name="sounder_log",
-    title="GNU Radio channel sounder power, quality or SNR log (od text)",
-    kinds=("rss",),
-    sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345",
-    sniff=sniff,
-    read=read,
-    read_pieces=read_pieces,
-)
+    name="sounder_log", title="GNU Radio channel sounder power, quality or SNR log (od text)", kinds=("rss",),
+    sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345", sniff=sniff, read=read, read_pieces=read_pieces,
+)  # fmt: skip

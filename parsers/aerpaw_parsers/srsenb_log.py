@@ -48,12 +48,8 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
 
 
 READER = _text.reader(
-    "srsenb_log",
-    "srsENB console: rank indicator (0 = no report)",
-    kinds=("rank",),
+    "srsenb_log", "srsENB console: rank indicator (0 = no report)", kinds=("rank",),
     sample="[2025-01-01 12:00:07.000000] lte   46   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k",
-    mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:rat +(?:pci +)?)?rnti +cqi +ri +mcs", re.MULTILINE),
-    row=_ROW,
-    torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:lte|nr) +[0-9a-fA-F]{1,5} "),
-    streams=_streams,
-)
+    mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:rat +(?:pci +)?)?rnti +cqi +ri +mcs", re.MULTILINE), row=_ROW,
+    torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:lte|nr) +[0-9a-fA-F]{1,5} "), streams=_streams,
+)  # fmt: skip

@@ -100,37 +100,23 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     clock, time, warnings = _stamps.read(texts, options)
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
     rows = _rows.built(
-        lines,
-        row[with_ue],
-        {"time": time},
-        options,
-        reader="srsran_json",
-        reason=_json.bracket,
-        clock=clock,
-        extra=reports.rejected,
-        markup=np.concatenate((mute, reports.more)),
-        closed=reports.closed,
-    )
+        lines, row[with_ue], {"time": time}, options, reader="srsran_json", reason=_json.bracket, clock=clock,
+        extra=reports.rejected, markup=np.concatenate((mute, reports.more)), closed=reports.closed,
+    )  # fmt: skip
     rows.warnings += warnings
     pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(entries[with_ue[at]])]
     return _json.ue_ranks(rows, pairs)
 
 
 READER = Reader(
-    name="srsran_gnb",
-    title="srsRAN Project gNB console (through ts) or log: rank indicator",
-    kinds=("rank",),
+    name="srsran_gnb", title="srsRAN Project gNB console (through ts) or log: rank indicator", kinds=("rank",),
     sample="[2025-01-01 12:00:07.000000]   1 4601 |  15   2   28    17M  908    0   0%    44k |  26.7 -21.2",
-    sniff=sniff,
-    read=read,
-)
+    sniff=sniff, read=read,
+)  # fmt: skip
 JSON_READER = Reader(
-    name="srsran_json",
-    title="srsRAN Project gNB metrics, JSON lines: rank indicator",
-    kinds=("rank",),
+    name="srsran_json", title="srsRAN Project gNB metrics, JSON lines: rank indicator", kinds=("rank",),
     sample='{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "cqi": 15, "dl_ri": 2.0}}]}',
-    sniff=sniff_json,
-    read=read_json,
-)
+    sniff=sniff_json, read=read_json,
+)  # fmt: skip
 
 READERS = (READER, JSON_READER)

@@ -83,35 +83,23 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     for data in pieces:
         log.add(data)
     header = log.header or {}
-    common: dict[str, Attribute] = {"clock": "utc"}
-    for name, value in (("node", options.node), ("frequency_hz", options.frequency_hz)):
-        if value is not None:
-            common[name] = value
+    about = {"clock": "utc", "node": options.node, "frequency_hz": options.frequency_hz}
+    common: dict[str, Attribute] = {name: value for name, value in about.items() if value is not None}
     levels = {leg: _joined("rss", pieces) for leg, pieces in log.levels.items()}
     streams = []
     for query, name in _RANKS:
         frame = _joined("rank", log.rank[query])
-        if frame is None:
-            continue
-        if name == "nr5g" or frame["rank"].notna().any():
-            if name == "nr5g":
-                frame = _with_serving_cell(frame, levels["nr"])
-            ri_base = str(header.get("ri_base", "one"))
-            streams.append(
-                Stream("rank", name, frame, {**common, "ri_base": ri_base, "channel": options.channel or name})
-            )
+        if frame is not None and (name == "nr5g" or frame["rank"].notna().any()):
+            frame = _with_serving_cell(frame, levels["nr"]) if name == "nr5g" else frame
+            of_rank = {**common, "ri_base": str(header.get("ri_base", "one")), "channel": options.channel or name}
+            streams.append(Stream("rank", name, frame, of_rank))
     for leg, frame in levels.items():
         if frame is not None and (leg == "nr" or frame["rss_db"].notna().any()):
             streams += _cells(frame, {**common, "unit": "dBm", "rat": leg}, options)
     return ReadResult(
-        reader="tap_jsonl",
-        streams=tuple(streams),
-        lines=log.lines,
-        accepted=log.exchanges,
-        blank=log.blank,
-        rejected=tuple(log.rejected),
-        warnings=log.warnings(),
-    )
+        reader="tap_jsonl", streams=tuple(streams), lines=log.lines, accepted=log.exchanges, blank=log.blank,
+        rejected=tuple(log.rejected), warnings=log.warnings(),
+    )  # fmt: skip
 
 
 _RANKS = (("nr5g_csi", "nr5g"), ("lte_csi", "lte"))
@@ -291,26 +279,19 @@ def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOption
 
 def _with_serving_cell(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.DataFrame:
     """RSRP and SINR of the last serving-cell answer as columns of the rank frame."""
-    rsrp_dbm, sinr_db = np.full(len(rank), np.nan), np.full(len(rank), np.nan)
-    if rsrp is not None:
-        times = rsrp["time"].to_numpy()
-        order = np.argsort(times, kind="stable")
-        at = np.searchsorted(times[order], rank["time"].to_numpy(), side="right") - 1
-        last = order[np.maximum(at, 0)]
-        age_s = (rank["time"].to_numpy() - times[last]) / np.timedelta64(1, "s")
-        fresh = (at >= 0) & (age_s <= _COMPANION_S)
-        rsrp_dbm = np.where(fresh, rsrp["rss_db"].to_numpy()[last], np.nan)
-        sinr_db = np.where(fresh, rsrp["sinr_db"].to_numpy()[last], np.nan)
-    rank["rsrp_dbm"], rank["sinr_db"] = rsrp_dbm, sinr_db
-    return rank
+    columns = {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"}
+    if rsrp is None:
+        rank[[*columns.values()]] = np.nan
+        return rank
+    cells = rsrp[["time", *columns]].sort_values("time", kind="stable").rename(columns=columns)
+    asked = rank[["time"]].sort_values("time", kind="stable")
+    near = pd.merge_asof(asked, cells, on="time", tolerance=pd.Timedelta(_COMPANION_S, "s"))
+    joined: pd.DataFrame = rank.join(near.set_index(asked.index)[[*columns.values()]])
+    return joined
 
 
 READER = Reader(
-    name="tap_jsonl",
-    title="Log of 'aerpaw-cmp tap': rank indicator and serving cell of a Quectel modem (JSON lines)",
-    kinds=("rank", "rss"),
-    sample='{"kind":"header","schema":"aerpaw-cmp-tap/1", ...',
-    sniff=sniff,
-    read=read,
+    name="tap_jsonl", title="Log of 'aerpaw-cmp tap': rank indicator and serving cell of a Quectel modem (JSON lines)",
+    kinds=("rank", "rss"), sample='{"kind":"header","schema":"aerpaw-cmp-tap/1", ...', sniff=sniff, read=read,
     read_pieces=read_pieces,
-)
+)  # fmt: skip

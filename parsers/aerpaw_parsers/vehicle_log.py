@@ -36,12 +36,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
 
 
 READER = _text.reader(
-    "vehicle_log",
-    "flight script's console: measured positions",
-    kinds=("telemetry", "kpi"),
+    "vehicle_log", "flight script's console: measured positions", kinds=("telemetry", "kpi"),
     sample='[2025-01-01 12:00:07.250000] Current location is {"lat": 35.7280002, "lon": -78.6960001, "alt": 30.1}',
-    mark=_ROW,
-    row=_ROW,
-    torn=re.compile(rb"^\[[^\]\n]{19,40}\] Filtered data \(avg\)"),
-    streams=_streams,
-)
+    mark=_ROW, row=_ROW, torn=re.compile(rb"^\[[^\]\n]{19,40}\] Filtered data \(avg\)"), streams=_streams,
+)  # fmt: skip

@@ -137,10 +137,7 @@ def _values(rows: _rows.Rows, number: dict[str, FloatArray]) -> dict[str, AnyArr
 
 
 READER = Reader(
-    name="vehicle_out",
-    title="AERPAW vehicleOut telemetry (8, 9, 10 or 11 fields)",
-    kinds=("telemetry",),
+    name="vehicle_out", title="AERPAW vehicleOut telemetry (8, 9, 10 or 11 fields)", kinds=("telemetry",),
     sample='7,-78.6960001,35.7280002,30.1,"(0.01,1.57,-0.02)","(0.0,5.0,0.1)",48.1,2025-01-01 12:00:07.000000,4,18',
-    sniff=sniff,
-    read=read,
-)
+    sniff=sniff, read=read,
+)  # fmt: skip

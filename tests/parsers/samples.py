@@ -422,12 +422,6 @@ SIGMF = (
     b'  "measurement:values": {"mX": [-78.7, -78.71, 0], "mY": [35.73, 35.74, 0], "mZ": [0.5, 1.5, 0],\n'
     b'   "RSS1": [-40.5, -41.5, -1], "RSS2": [-50.5, -800, -1]}}], "annotations": []}\n'
 )
-RSS_EXPORT = (
-    b"time_utc,time_s,tower,channel,unit,east_m,north_m,up_m,measured_db,calibrated_db\n"
-    b"2025-03-02T15:00:00.250Z,0,LW1,USRP1,dBm,1,2,3,-81.5,-80\n"
-    b"2025-03-02T15:00:01.250Z,1,LW1,USRP1,dBm,1,2,3,,\n"
-    b"2025-03-02T15:00:00.250Z,0,LW2,USRP1,dBm,1,2,3,-91.5,-80\n"
-)
 TAP_EXPORT = (
     b"time_utc,uncertainty_s,n,query,status,rank,ri_raw,mcs,cqi,rsrp_dbm,sinr_db\n"
     b"2025-03-02T15:00:00.250Z,0.02,1,nr5g_csi,ok,2,2,11,9,,\n"
@@ -560,6 +554,7 @@ NO_LOGS: dict[str, bytes] = {
         b"[2025-03-02 10:00:00.000001] [INFO] [UHD] linux; GNU C++\n[2025-03-02 10:00:01.000001] [INFO] [B200] Detected\n"
     ),
     "radio_console": b"[2025-03-02 10:00:00.000001] ---  Software Radio Systems LTE eNodeB  ---\n[2025-03-02 10:00:01] Reading\n",
+    "own_export": b"time_utc,time_s,tower,channel,unit,measured_db\n2025-03-02T15:00:00.250Z,0,LW1,USRP1,dBm,-81.5\n",
     "positions": b"35.7281, -78.6973\r\n35.7291, -78.6992\r\n",
     "document": b"# A page\n\n## Of text\n\nwords\n",
     "flight_script": b"[2025-03-02 10:00:00.000001] Taking off\n[2025-03-02 10:00:05.000001] Waypoint 0\n",

@@ -14,6 +14,7 @@ import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import partial
+from os.path import isfile
 from pathlib import Path
 
 from ...common.errors import InputError
@@ -34,17 +35,9 @@ _FREE_BYTES = 2**28
 _RATIO = 1200
 # What Python's libraries raise for damaged archives; a ValueError for a directory that begins before the file does.
 _DAMAGE = (
-    zipfile.BadZipFile,
-    zlib.error,
-    lzma.LZMAError,
-    struct.error,
-    EOFError,
-    OSError,
-    ValueError,
-    IndexError,
-    OverflowError,
-    NotImplementedError,
-)
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, ValueError, IndexError,
+    OverflowError, NotImplementedError,
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,13 +66,9 @@ def is_archive(head: bytes) -> bool:
 
 def inside(path: Path) -> tuple[Path, str] | None:
     """The archive and the member that a path names; None where no part of it is a file."""
-    for parent in path.parents:
-        try:
-            if parent.is_file():
-                return parent, path.relative_to(parent).as_posix()
-        except (OSError, ValueError):
-            return None
-    return None
+    # Path's own test raises for a name that is too long
+    file = next((parent for parent in path.parents if isfile(parent)), None)  # noqa: PTH113
+    return None if file is None else (file, path.relative_to(file).as_posix())
 
 
 def members(data: bytes, path: str | Path) -> dict[str, Member]:

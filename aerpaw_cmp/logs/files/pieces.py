@@ -55,15 +55,11 @@ def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
     streams = tuple(_stream(part) for part in parts.values())
     warnings = dict.fromkeys(text for file in group for text in file.result.warnings)
     result = ReadResult(
-        reader=group[0].result.reader,
-        streams=streams,
-        lines=before,
-        accepted=sum(file.result.accepted for file in group),
-        blank=sum(file.result.blank for file in group),
-        rejected=tuple(rejected),
-        reasons=tuple(reasons.values()),
+        reader=group[0].result.reader, streams=streams, lines=before,
+        accepted=sum(file.result.accepted for file in group), blank=sum(file.result.blank for file in group),
+        rejected=tuple(rejected), reasons=tuple(reasons.values()),
         warnings=(f"{len(group)} files of this folder were joined", *warnings),
-    )
+    )  # fmt: skip
     return IngestedFile(folder, digest, result)
 
 

@@ -299,21 +299,10 @@ def built(
         rows, at, time, flag = rows[valid], at[valid], time[valid], flag[valid]
         column = {name: cells[valid] for name, cells in column.items()}
     return Rows(
-        reader=reader,
-        options=options,
-        lines=len(lines),
-        row=rows,
-        time=time,
-        flag=flag,
-        columns=column,
-        blank=blank,
-        rejected=rejected,
-        warnings=warnings,
-        relative=relative,
-        clock_from="written" if clock.startswith("epoch") or instants.zoned else None,
-        at=at,
-        data=lines.data,
-    )
+        reader=reader, options=options, lines=len(lines), row=rows, time=time, flag=flag, columns=column, blank=blank,
+        rejected=rejected, warnings=warnings, relative=relative,
+        clock_from="written" if clock.startswith("epoch") or instants.zoned else None, at=at, data=lines.data,
+    )  # fmt: skip
 
 
 def _untimed(lines: _lines.Lines, rows: IntArray, cells: AnyArray, valid: BoolArray, clock: str) -> list[RejectedLine]:

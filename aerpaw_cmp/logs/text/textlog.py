@@ -94,10 +94,6 @@ def reader(
         return mark is not None and not head.startswith(_lines.MARKUP) and mark.search(head) is not None
 
     return Reader(
-        name=name,
-        title=title,
-        kinds=kinds,
-        sample=sample,
-        sniff=sniff or (known if mark is None else marked),
+        name=name, title=title, kinds=kinds, sample=sample, sniff=sniff or (known if mark is None else marked),
         read=read,
-    )
+    )  # fmt: skip

@@ -43,22 +43,13 @@ Attribute = str | float | int | bool
 # Columns that a frame of each kind must have, besides ``time``, ``line`` and ``flag``.
 COLUMNS: dict[str, tuple[str, ...]] = {
     "telemetry": (
-        "latitude_deg",
-        "longitude_deg",
-        "altitude_m",
-        "roll_deg",
-        "pitch_deg",
-        "yaw_deg",
-        "velocity_north_mps",
-        "velocity_east_mps",
-        "velocity_down_mps",
-        "fix",
-        "satellites",
+        "latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg",
+        "velocity_north_mps", "velocity_east_mps", "velocity_down_mps", "fix", "satellites",
     ),
     "rss": ("rss_db",),
     "rank": ("rank", "ri_raw"),
     "kpi": ("value",),
-}
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)

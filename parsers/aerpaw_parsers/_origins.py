@@ -2,36 +2,36 @@
 
 from __future__ import annotations
 
-_TS = "program: ts on the node, local wall time"
-_GPS = "written: UTC of the GPS"
-_TAKEOFF = "program: DroneKit relative frame, above take-off"
-
-# ``written``, or ``program`` or ``assumed`` with what that is; of the others the reader's own word, which is assumed.
-# A text with an offset, or an epoch, is written.
-CLOCKS = {
-    "vehicle_out": "program: aerpawlib datetime.now(), local wall time", "vehicle_log": _TS, "ardupilot_bin": _GPS,
-    "mavlink_tlog": "written: UTC of the ground station", "px4_ulog": _GPS, "sounder_log": _TS,
-    "flight_mat": "program: AERPAW's post-processing, local wall time",
-    "sigmf": "written: offset or epoch in the meta file",
-    "iq_burst": "program: get_IQ.py names files in America/New_York",
-    "quectel_csv": "program: QuectelLogger datetime.now(), local wall time",
-    "quectel_ri": "program: QuectelLogger datetime.now(), local wall time",
-    "quectel_console": "program: QuectelLogger datetime.now(), local wall time",
-    "pawprints": "written: epoch of the companion computer", "nemo_csv": "program: milliseconds from time_origin",
-    "nemo_kml": "program: milliseconds from time_origin",
-    "aadm_snr": "program: AADM controller datetime.now(), local wall time", "controller_log": _TS, "srsenb_log": _TS,
-    "srsue_log": _TS, "cell_search": "program: cell_search's localtime(), or ts on the node", "srsran_gnb": _TS,
-    "srsran_json": "program: srsRAN Project writes UTC", "oai_log": _TS, "tap_jsonl": "written: UTC",
-    "generic_csv": "written",
+# ``written``, or ``program`` or ``assumed`` with what that is, and the readers that it holds for; of the others the
+# reader's own word, which is assumed. A text with an offset, or an epoch, is written.
+_CLOCKS = {
+    "program: ts on the node, local wall time":
+        "vehicle_log sounder_log controller_log srsenb_log srsue_log srsran_gnb oai_log",
+    "program: aerpawlib datetime.now(), local wall time": "vehicle_out",
+    "program: QuectelLogger datetime.now(), local wall time": "quectel_csv quectel_ri quectel_console",
+    "program: AADM controller datetime.now(), local wall time": "aadm_snr",
+    "program: AERPAW's post-processing, local wall time": "flight_mat",
+    "program: get_IQ.py names files in America/New_York": "iq_burst",
+    "program: cell_search's localtime(), or ts on the node": "cell_search",
+    "program: milliseconds from time_origin": "nemo_csv nemo_kml",
+    "program: srsRAN Project writes UTC": "srsran_json",
+    "written: UTC of the GPS": "ardupilot_bin px4_ulog",
+    "written: UTC of the ground station": "mavlink_tlog",
+    "written: offset or epoch in the meta file": "sigmf",
+    "written: epoch of the companion computer": "pawprints",
+    "written: UTC": "tap_jsonl",
+    "written": "generic_csv",
 }  # fmt: skip
-
-HEIGHTS = {
-    "vehicle_out": _TAKEOFF, "vehicle_log": _TAKEOFF,
-    "ardupilot_bin": "program: RelHomeAlt, else above the first position",
-    "mavlink_tlog": "program: relative_alt of MAVLink",
-    "px4_ulog": "program: above home_position, else above the first position", "flight_mat": _TAKEOFF,
-    "sigmf": _TAKEOFF, "quectel_ri": "program: joined with vehicleOut, above take-off",
-    "gpx": "program: GPX elevations are above sea level; above the first point",
-    "pawprints": "program: Android altitudes are above the ellipsoid; above the first position",
-    "generic_csv": "written",
-}  # fmt: skip
+_HEIGHTS = {
+    "program: DroneKit relative frame, above take-off": "vehicle_out vehicle_log flight_mat sigmf",
+    "program: RelHomeAlt, else above the first position": "ardupilot_bin",
+    "program: relative_alt of MAVLink": "mavlink_tlog",
+    "program: above home_position, else above the first position": "px4_ulog",
+    "program: joined with vehicleOut, above take-off": "quectel_ri",
+    "program: GPX elevations are above sea level; above the first point": "gpx",
+    "program: Android altitudes are above the ellipsoid; above the first position": "pawprints",
+    "written": "generic_csv",
+}
+CLOCKS, HEIGHTS = (
+    {name: origin for origin, names in table.items() for name in names.split()} for table in (_CLOCKS, _HEIGHTS)
+)

@@ -7,7 +7,6 @@ since 1970 in UTC (``clock: local_as_utc`` for wall time stored so).
 
 from __future__ import annotations
 
-import re
 from difflib import get_close_matches
 
 import numpy as np
@@ -26,9 +25,8 @@ _EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", 
 # What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track.
 _COMPANIONS: dict[str, tuple[str, ...]] = {"rank": _EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
 # Columns that a record of a kind is about.
-_VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": ("rss_db",), "rank": ("ri_raw",)}
+_VALUE = {"telemetry": _pose.PLACE, "rss": ("rss_db",), "rank": ("ri_raw",)}
 
-_INK = re.compile(rb"\S")
 # Units of record columns, by the ends of their names.
 _UNITS = {"_deg": "deg", "_m": "m", "_mps": "m/s", "_dbm": "dBm", "_db": "dB"}
 # Quantities of record columns whose values tell their unit, or that rows do not fit their header.
@@ -42,24 +40,6 @@ _KEYS = ("network", "PCI", "ARFCN")
 def sniff(head: bytes) -> bool:  # noqa: ARG001 - the contract of sniffers
     """Never: a CSV says nothing about its units; name this reader in flight.yaml."""
     return False
-
-
-def _separator(header: bytes) -> str:
-    """The sign that the header's names stand between: the most frequent one, a comma where none does."""
-    return max(_sheet.SEPARATORS, key=lambda sign: header.count(sign.encode()))
-
-
-def _header(data: bytes) -> tuple[int, str, list[str]] | None:
-    """Number (from 0), separator and names of the first line that is not blank; None where all are."""
-    begun = _INK.search(data)
-    if begun is None:
-        return None
-    first = data.count(b"\n", 0, begun.start())
-    end = data.find(b"\n", begun.start())
-    line = data[data.rfind(b"\n", 0, begun.start()) + 1 : end if end >= 0 else len(data)].removesuffix(b"\r")
-    line = line.removeprefix(b"\xef\xbb\xbf")
-    separator = _separator(line)
-    return first, separator, [name.strip() for name in _sheet.split_row(line, separator)]
 
 
 def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, int]]:
@@ -150,52 +130,37 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If ``kind``, ``columns``, ``ri_base`` or ``timezone`` is missing or names what is not there.
     """
-    top = _header(data)
-    if top is None:
-        count = len(_lines.split(data))
-        return ReadResult("generic_csv", (), count, 0, count)
-    first, separator, header = top
+    lines = _lines.split(data)
+    if lines.blank.all():
+        return ReadResult("generic_csv", (), len(lines), 0, len(lines))
+    first = int(np.argmin(lines.blank))
+    line = lines.raw(first).removeprefix(b"\xef\xbb\xbf")
+    separator = max(_sheet.SEPARATORS, key=lambda sign: line.count(sign.encode()))
+    header = [name.strip() for name in _sheet.split_row(line, separator)]
     kind, where = _checked(options, header)
-    sheet = _sheet.cut(_lines.split(data), first, separator, header)
+    sheet = _sheet.cut(lines, first, separator, header)
     sheet.said = {where[name]: quantity for name, quantity in _QUANTITIES.items() if name in where}
     rows = _sheet.rows(sheet, options, reader="generic_csv", column=where.pop("time"))
     assert rows is not None
-    _refuse_empty(sheet, [where[name] for name in _VALUE[kind]])
+    for column in (where[name] for name in _VALUE[kind]):
+        if len(sheet) and not any(sheet.texts(column)):
+            found = f"column {sheet.names[column]!r} is empty in every row"
+            raise InputError(found, expected="values", cause=_sheet.BESIDE)
     unit = sheet.unit_read(where["rss_db"]) if kind == "rss" else ""
     if kind == "rss" and options.unit is None and not unit:
         rows.warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
-    streams: list[Stream | None] = []
     angles = {name: sheet.numbers(where[name]) for name in _pose.ANGLES if name in where}
     if not any(sheet.unit(where[name]) for name in angles) and _pose.are_small(angles):
         rows.warnings.append(_pose.small_angles(angles))
+    streams: list[Stream | None] = []
     for device, of_device, table in _sheet.parts(rows, sheet, "device"):
         for label, part, cells in _divided(of_device, table, kind):
-            values = {name: _values(cells, column, name, options) for name, column in where.items()}
-            if {*_pose.PLACE[:2]} <= set(values):
-                _pose.refuse_whole_degrees([cells.names[where[name]] for name in _pose.PLACE[:2]], values)
-            about = _lifted(part, cells, values, where)
-            odd = np.any([_odd(cells, where[name]) for name in _VALUE[kind]], axis=0)
             words = "_".join(word for word in (options.channel or kind, label, device) if word)
-            if (
-                kind == "rss"
-                and (level := cells.meanings[where["rss_db"]]) is not None
-                and level.quantity.can_be[0] < 0
-            ):
-                about = {"quantity": level.quantity.name, **about}
-            streams.append(_stream(part, kind, words, values, odd, options.unit or unit, about))
+            streams.append(_stream(part, cells, kind, where, words, options.unit or unit))
         if kind == "rss":
             streams.append(_track(of_device, table, where, device))
     rows.warnings += sheet.unread()
     return rows.result(streams)
-
-
-def _refuse_empty(sheet: _sheet.Sheet, columns: list[int]) -> None:
-    """Refuse a table whose rows all end before a column that the user named."""
-    for column in columns:
-        if len(sheet) and not any(sheet.texts(column)):
-            raise InputError(
-                f"column {sheet.names[column]!r} is empty in every row", expected="values", cause=_sheet.BESIDE
-            )
 
 
 def _divided(rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind) -> list[tuple[str, _rows.Rows, _sheet.Sheet]]:
@@ -210,23 +175,27 @@ def _divided(rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind) -> list[tuple[st
 
 
 def _stream(
-    rows: _rows.Rows, kind: Kind, name: str, values: dict[str, AnyArray], odd: BoolArray, unit: str,
-    about: _pose.Height,
-) -> Stream | None:  # fmt: skip
+    rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind, where: dict[str, int], name: str, unit: str
+) -> Stream | None:
     """Columns by the rules of the kind, and the attributes that go with them; words in place of numbers are flagged."""
     options, flag = rows.options, rows.flag.copy()
+    values: dict[str, AnyArray] = {key: _values(sheet, column, key, options) for key, column in where.items()}
+    if {*_pose.PLACE[:2]} <= set(values):
+        _pose.refuse_whole_degrees([sheet.names[where[key]] for key in _pose.PLACE[:2]], values)
+    about = _lifted(rows, sheet, values, where)
+    odd = np.any([_odd(sheet, where[key]) for key in _VALUE[kind]], axis=0)
     _lines.add_flag(flag, odd, "no_number")
     if odd.any():
         lines = "1 row is" if odd.sum() == 1 else f"{odd.sum()} rows are"
         first = int(rows.row[odd][0]) + 1
         rows.warnings.append(f"{lines} flagged no_number; the first: line {first}, a word or an infinity; not scored")
-    attributes: dict[str, str | float | None] = {}
     if kind == "rss":
-        level = values["rss_db"]
+        level, meaning = values["rss_db"], sheet.meanings[where["rss_db"]]
         silent = ~(level > options.floor_db) | ((unit == "dBm") & (level == 0))
         _lines.add_flag(flag, silent & ~odd, "out_of_coverage")
         values["rss_db"] = np.where(silent, np.nan, level)
-        attributes = {"unit": unit or "dB re full scale"}
+        quantity = meaning.quantity.name if meaning is not None and meaning.quantity.can_be[0] < 0 else None
+        about = {"unit": unit or "dB re full scale", "quantity": quantity, **about}
     elif kind == "rank":
         base, ri = int(options.ri_base == "one"), values["ri_raw"]
         good = (ri >= base) & (ri <= 7 + base) & (ri == np.round(ri))
@@ -234,16 +203,15 @@ def _stream(
         _lines.add_flag(flag, none & ~odd, "no_csi")
         _lines.add_flag(flag, ~good & ~none, "ri_out_of_range")
         values["rank"] = np.where(good, ri + 1 - base, np.nan)
-        attributes = {"ri_base": options.ri_base}
+        about = {"ri_base": options.ri_base, **about}
     else:
-        place = ("latitude_deg", "longitude_deg", "altitude_m")
-        latitude, longitude, altitude = (values[key] for key in place)
+        latitude, longitude, altitude = (values[key] for key in _pose.PLACE)
         lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
         _lines.add_flag(flag, lost, "no_fix")
-        values |= {key: np.where(lost, np.nan, values[key]) for key in place}
+        values |= {key: np.where(lost, np.nan, values[key]) for key in _pose.PLACE}
         for key in {"fix", "satellites"} & set(values):
             values[key] = np.where(np.isnan(values[key]), -1, values[key]).clip(-1, 255).astype(np.int64)
-    return rows.stream(kind, name, values, flag=flag, about=attributes | about)
+    return rows.stream(kind, name, values, flag=flag, about=about)
 
 
 def _lifted(rows: _rows.Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], where: dict[str, int]) -> _pose.Height:

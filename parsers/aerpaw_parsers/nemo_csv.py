@@ -22,13 +22,10 @@ _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm",
 _LEVELS = (("rsrp_dbm", "nr_rsrp"), ("sinr_db", "nr_sinr"), ("cqi", "wb_cqi"))
 _CELL = r", ?(?P<%s>" + _lines.NUMBER.decode() + "|nan|NaN|)"
 _ROW = re.compile(
-    rb"^\d{1,12}(?:\.0{0,20})?, ?(?P<time>"
-    + _lines.NUMBER
-    + rb")"
-    + "".join(_CELL % name for name in _COLUMNS).encode()
-    + rb"[ \t]*\r?$",
+    rb"^\d{1,12}(?:\.0{0,20})?, ?(?P<time>" + _lines.NUMBER + rb")"
+    + "".join(_CELL % name for name in _COLUMNS).encode() + rb"[ \t]*\r?$",
     re.MULTILINE,
-)
+)  # fmt: skip
 
 
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:

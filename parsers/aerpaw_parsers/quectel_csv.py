@@ -73,19 +73,10 @@ _SA = re.compile(
     re.MULTILINE,
 )  # fmt: skip
 _NSA = re.compile(
-    _T
-    + _token(b"QENG", b"NR5G-NSA")
-    + rb","
-    + _skip(2)
-    + _VALUES
-    + rb"(?:,"
-    + _V
-    + rb"(?:,"
-    + _C
-    + rb"){1,4})?"
+    _T + _token(b"QENG", b"NR5G-NSA") + rb"," + _skip(2) + _VALUES + rb"(?:," + _V + rb"(?:," + _C + rb"){1,4})?"
     + _END,
     re.MULTILINE,
-)
+)  # fmt: skip
 _CSI_ALONE = {
     rat: re.compile(_T + _token(b"QNWCFG", rat + b"_csi") + rb"," + _VALUES + rb"(?:,-?\d{1,7})?" + _END, re.MULTILINE)
     for rat in (b"lte", b"nr5g")
@@ -133,9 +124,8 @@ def _reason(line: bytes) -> str | None:
 
 def _table(lines: _lines.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
     """Lines of all kinds of row, and their columns of text; ``form`` is the kind, an index into ``_FORMS``."""
-    serving = b"servingcell" in lines.data or lines.data.startswith(
-        b"["
-    )  # a search of a whole log of CSI would find nothing, slowly
+    # a search of a whole log of CSI would find nothing, slowly
+    serving = b"servingcell" in lines.data or lines.data.startswith(b"[")
     tables: list[tuple[IntArray, dict[str, AnyArray]]] = []
     for i, (pattern, names) in enumerate(_FORMS if serving else _FORMS[:1]):
         row, groups = _lines.match(lines, pattern)

@@ -29,13 +29,10 @@ _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _STAMP = rb"^\[?(?P<time>" + _time.TIME + _time.ZONE + rb")\]?"
 _ROW = re.compile(
     _STAMP
-    + rb" *(?P<pci>\d{1,4}) +(?P<rnti>(?:0x)?[0-9a-fA-F]{1,6})(?: +\|)?"
-    + _N % b"cqi"
-    + _N % b"ri"
-    + _N % b"mcs"
+    + rb" *(?P<pci>\d{1,4}) +(?P<rnti>(?:0x)?[0-9a-fA-F]{1,6})(?: +\|)?" + _N % b"cqi" + _N % b"ri" + _N % b"mcs"
     + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}%[^\n]{0,200}$",
     re.MULTILINE,
-)
+)  # fmt: skip
 _LOG = re.compile(
     _STAMP + rb" +\[METRICS *\][^\n]{0,200}?\bpci=(?P<pci>\d{1,4})[^\n]{0,80}?\brnti=(?:0x)?(?P<rnti>[0-9a-fA-F]{1,6})"
     rb"[^\n]{0,200}?\bcqi=(?P<cqi>\d{1,4}(?:\.\d{1,4})?|n/a)[^\n]{0,80}? (?:dl_)?ri=(?P<ri>\d{1,4}(?:\.\d{1,4})?|n/a)"

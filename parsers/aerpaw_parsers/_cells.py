@@ -59,11 +59,12 @@ def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -
         what = dictionary.meaning(name)
         if what is not None and np.isfinite(value) and not name.startswith("csi"):  # SS-RSRP is the cell's level
             known.setdefault(what.quantity.name, value)
-    pci, arfcn, level, *qualities = (known.get(name, np.nan) for name in _QUANTITIES)
-    return Reading(row, rat, pci, arfcn, level, serving, *qualities)
+    values = {field: known.get(name, np.nan) for field, name in _QUANTITIES.items()}
+    return Reading(row=row, rat=rat, serving=serving, **values)
 
 
-_QUANTITIES = ("PCI", "ARFCN", "RSRP", "RSRQ", "RSSI", "SINR", "path loss")
+_QUANTITIES = {"pci": "PCI", "arfcn": "ARFCN", "rsrp_dbm": "RSRP", "rsrq_db": "RSRQ", "rssi_dbm": "RSSI",
+               "sinr_db": "SINR", "pathloss_db": "path loss"}  # fmt: skip
 
 
 def streams(

@@ -29,7 +29,7 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray
 from aerpaw_cmp.logs.files.checksums import SCHEMA, decode_record
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import Attribute, Kind, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
 from aerpaw_cmp.logs.text import make_frames
 
 from . import _json
@@ -85,15 +85,16 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     header = log.header or {}
     about = {"clock": "utc", "node": options.node, "frequency_hz": options.frequency_hz}
     common: dict[str, Attribute] = {name: value for name, value in about.items() if value is not None}
-    levels = {leg: _joined("rss", pieces) for leg, pieces in log.levels.items()}
+    frames = {name: _joined(name, pieces) for name, pieces in log.series.items()}
     streams = []
-    for query, name in _RANKS:
-        frame = _joined("rank", log.rank[query])
+    for name in ("nr5g", "lte"):
+        frame = frames[name]
         if frame is not None and (name == "nr5g" or frame["rank"].notna().any()):
-            frame = _with_serving_cell(frame, levels["nr"]) if name == "nr5g" else frame
+            frame = _with_serving_cell(frame, frames["nr_rsrp"]) if name == "nr5g" else frame
             of_rank = {**common, "ri_base": str(header.get("ri_base", "one")), "channel": options.channel or name}
             streams.append(Stream("rank", name, frame, of_rank))
-    for leg, frame in levels.items():
+    for leg in ("nr", "lte"):
+        frame = frames[f"{leg}_rsrp"]
         if frame is not None and (leg == "nr" or frame["rss_db"].notna().any()):
             streams += _cells(frame, {**common, "unit": "dBm", "rat": leg}, options)
     return ReadResult(
@@ -102,7 +103,18 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     )  # fmt: skip
 
 
-_RANKS = (("nr5g_csi", "nr5g"), ("lte_csi", "lte"))
+# Attributes of a cell, and the keys under which they were decoded.
+_IDENTITY = {"pci": "pcid", "arfcn": "arfcn", "band": "band"}
+_OF_RANK = {name: name for name in ("rank", "ri_raw", "mcs", "cqi", "pmi")}
+# Each series: its query, the leg of the serving cell, and its columns with the keys under which they were decoded;
+# LTE's SINR is in steps that the manual leaves open.
+_SERIES: dict[str, tuple[str, str, dict[str, str]]] = {
+    "nr5g": ("nr5g_csi", "", _OF_RANK),
+    "lte": ("lte_csi", "", _OF_RANK),
+    "nr_rsrp": ("servingcell", "nr", {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db", **_IDENTITY}),
+    "lte_rsrp": ("servingcell", "lte",
+                 {"rss_db": "rsrp_dbm", "rsrq_db": "rsrq_db", "rssi_dbm": "rssi_dbm", **_IDENTITY}),
+}  # fmt: skip
 
 
 class _Log:
@@ -110,8 +122,7 @@ class _Log:
 
     def __init__(self) -> None:
         self.header: dict[str, Any] | None = None
-        self.rank: dict[str, list[Columns]] = {query: [] for query, _ in _RANKS}
-        self.levels: dict[str, list[Columns]] = {leg: [] for leg in _LEVELS}
+        self.series: dict[str, list[Columns]] = {name: [] for name in _SERIES}
         self.lines = self.exchanges = self.blank = 0
         self.rejected: list[RejectedLine] = []
         self.events: list[str] = []
@@ -127,10 +138,8 @@ class _Log:
         exchanges = [(number, record) for number, record in records if record["kind"] == "exchange"]
         self.exchanges += len(exchanges)
         self.blank += blank + len(records) - len(exchanges)
-        for query, pieces in self.rank.items():
-            pieces.append(_rank_columns(exchanges, query))
-        for leg, pieces in self.levels.items():
-            pieces.append(_rsrp_columns(exchanges, leg))
+        for name, (query, leg, keys) in _SERIES.items():
+            self.series[name].append(_columns([*_answered(exchanges, query, leg)], keys))
         for _, record in records:
             self._note(record)
 
@@ -172,14 +181,14 @@ class _Log:
         return tuple(texts)
 
 
-def _joined(kind: Kind, pieces: list[Columns]) -> pd.DataFrame | None:
-    """All records of a kind as a frame, None where there are none."""
+def _joined(name: str, pieces: list[Columns]) -> pd.DataFrame | None:
+    """All records of a series as a frame, None where there are none."""
     some = [piece for piece in pieces if len(piece["time"])]
     if not some:
         return None
     values = {name: np.concatenate([piece[name] for piece in some]) for name in some[0]}
     time, line, flag = (values.pop(name) for name in ("time", "line", "flag"))
-    return make_frames.frame(kind, time, line, flag, values, own=True)
+    return make_frames.frame("rss" if _SERIES[name][1] else "rank", time, line, flag, values, own=True)
 
 
 def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:
@@ -233,35 +242,14 @@ def _columns(answers: list[Answer], names: Mapping[str, str]) -> Columns:
     return columns
 
 
-def _rank_columns(exchanges: list[tuple[int, dict[str, Any]]], query: str) -> Columns:
-    """Rank answers; a failed exchange is a row without rank, flagged with its status."""
-    answers = []
+def _answered(exchanges: list[tuple[int, dict[str, Any]]], query: str, leg: str) -> Iterator[Answer]:
+    """Answers to a query; of a rank a failed exchange is one without it, flagged with its status."""
     for number, record in exchanges:
-        if record.get("query") == query:
-            status = [] if record.get("status") == "ok" else [f"status:{record.get('status')}"]
-            answers.append((number, record, _json.inside(record, "decoded"), _flags(record) + status))
-    return _columns(answers, {name: name for name in ("rank", "ri_raw", "mcs", "cqi", "pmi")})
-
-
-# Columns of a leg of the serving cell; LTE's SINR is in steps that the manual leaves open.
-_LEVELS = {
-    "nr": {"rss_db": "rsrp_dbm", "sinr_db": "sinr_db"},
-    "lte": {"rss_db": "rsrp_dbm", "rsrq_db": "rsrq_db", "rssi_dbm": "rssi_dbm"},
-}
-
-
-def _rsrp_columns(exchanges: list[tuple[int, dict[str, Any]]], leg: str) -> Columns:
-    """Levels of the serving cell."""
-    answers = []
-    for number, record in exchanges:
-        values = _json.inside(_json.inside(record, "decoded"), leg)
-        if record.get("query") == "servingcell" and values:
-            answers.append((number, record, values, _flags(record)))
-    return _columns(answers, _LEVELS[leg] | _IDENTITY)
-
-
-# Attributes of a cell, and the keys under which they were decoded.
-_IDENTITY = {"pci": "pcid", "arfcn": "arfcn", "band": "band"}
+        decoded = _json.inside(record, "decoded")
+        values = _json.inside(decoded, leg) if leg else decoded
+        if record.get("query") == query and (values or not leg):
+            status = [] if leg or record.get("status") == "ok" else [f"status:{record.get('status')}"]
+            yield number, record, values, _flags(record) + status
 
 
 def _cells(rsrp: pd.DataFrame, common: dict[str, Attribute], options: ReadOptions) -> Iterator[Stream]:

@@ -3,16 +3,16 @@
 Each trouble changes the predicted level in its own way: by decibels that are known, by columns with free coefficients,
 or by samples that the receiver clipped, whose level is their own mean and which fade less. The offset is fitted beside
 it, and the residual counts as noise of two memories: slow fading is no trouble. Explanations are single troubles
-and two at a time, the second judged by what the first leaves; each has the log likelihood that it gains over all
-channels beyond the cost of its numbers (Schwarz). The best explanation names its trouble where all that explain the
-flight without it are less likely by :data:`_MARGIN` (one in a hundred), and where a tenth of the RMSE goes with it.
-The paired test of two models would ask for a flight much longer than a trouble lasts: a trouble of a minute has one
-sign in each of few stretches.
+and two at a time, the second judged by what the first leaves. Each has the marginal likelihood that it gains over all
+channels: coefficients, angles, heights, places and instants are averaged over what they may be, so that a form with
+many free numbers pays for them. A trouble is named where the explanations with it are so much likelier than all without
+it, and where some of the RMSE goes with it. The paired test of two models would ask for a flight much longer than a
+trouble lasts: a trouble of a minute has one sign in each of few stretches.
 
 A new trouble is a function that yields its :class:`Trial`, and an entry of :data:`CANDIDATES`.
 
-References: Schwarz, Annals of Statistics 6 (1978) 461, doi 10.1214/aos/1176344136; Granger and Morris, J. R. Stat.
-Soc. A 139 (1976) 246, doi 10.2307/2345178, on sums of autoregressive sequences.
+References: MacKay, Neural Computation 4 (1992) 415, doi 10.1162/neco.1992.4.3.415, on marginal likelihoods; Granger and
+Morris, J. R. Stat. Soc. A 139 (1976) 246, doi 10.2307/2345178, on sums of autoregressive sequences.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import cache
-from itertools import combinations
+from itertools import combinations, combinations_with_replacement
 from typing import Protocol
 
 import numpy as np
@@ -32,9 +32,9 @@ from ..statistics.intervals import Interval
 
 # Samples are averaged over so long [s], over longer where a flight has more than so many seconds.
 BIN_S, _MOST_BINS = 1.0, 2000
-_FEWEST_BINS = 40
-# Log likelihood that a trouble must gain beyond its cost and all rivals.
-_MARGIN = math.log(100.0)
+_FEWEST_BINS, _ENOUGH_BINS = 24, 100
+# A trouble is in one flight of ten; named where the odds for it are five to one.
+_SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
 # Of sentence and next step of a cause: a page begins with sixty in all.
 MOST_CAUSE_WORDS = 28
 # A trouble that takes less than this share off the RMSE is no cause of the error, unless it gains so much a channel:
@@ -139,7 +139,7 @@ class Cause:
     rmse_db, rmse_with_db : float
         Of these channels without and with it, as means over a second [dB].
     gain : float
-        Log likelihood that it gains beyond its cost.
+        Log odds of the explanations with it to all without it.
     """
 
     name: str
@@ -155,10 +155,12 @@ class Cause:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trial:
-    """A trouble with its numbers: what it changes, how many free numbers that takes, and what is said of it.
+    """A trouble with its numbers: what it changes, what choosing them costs, and what is said of it.
 
-    ``change_db`` (n,) is added to the predicted level, ``columns`` (n, k) have free coefficients, ``clipped`` (n,) are
-    samples whose level is not that of the link; ``fading`` (n,) is the share of the link's fading that is shown.
+    ``change_db`` (n,) is added to the predicted level; ``columns`` (n, k) have free coefficients, unit normals before
+    the flight; ``clipped`` (n,) are samples whose level is not that of the link; ``fading`` (n,) is the share of the
+    link's fading that is shown. ``cost`` is the log likelihood that goes where the numbers are averaged over all that
+    they may be.
     """
 
     name: str
@@ -212,6 +214,7 @@ class _Model:
     trials: tuple[Trial, ...]
     residual_db: FloatArray
     gain: float
+    memories: _Memories
 
 
 _Models = Mapping[frozenset[str], _Model]
@@ -231,26 +234,30 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     """
     tables = [_models(binned) for evidence in channels if (binned := _binned(evidence)) is not None]
     names = sorted({name for table in tables for names in table for name in names})
-    sets = [_SOUND, *({name} for name in names), *map(set, combinations(names, 2))]
-    gains = {frozenset(some): sum(_best(table, some).gain for table in tables) for some in sets}
-    best = max(gains, key=lambda some: gains[some])
-    without = {name: max(gain for some, gain in gains.items() if name not in some) for name in best}
-    least = _MARGIN + math.log(max(len(channels), 1))
-    named = {}
-    for name in (trouble for trouble in best if gains[best] - without[trouble] >= least):
+    odds: dict[frozenset[str], float] = {}
+    for some in (_SOUND, *({name} for name in names), *map(set, combinations(names, 2))):
+        models = [_best(table, some) for table in tables]
+        used = frozenset().union(*map(_names, models))
+        odds[used] = sum(model.gain for model in models) - _SELDOM * len(used)
+    best, lead = max(odds, key=lambda some: odds[some]), {}
+    for name in best:
+        with_it, without = ([odds[some] for some in odds if (name in some) == side] for side in (True, False))
+        lead[name] = float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without))
+    least, named = _MARGIN + math.log(max(len(channels), 1)), {}
+    for name in (trouble for trouble in best if lead[trouble] >= least):
         shown = [table for table in tables if name in _names(_best(table, best))]
         shown.sort(key=lambda table: -_best(table, {name}).gain)
         # also alone it must bring levels and prediction together, not only their changes from second to second
         alone = _share_of_error(shown, _SOUND, {name})
         share = min(alone, _share_of_error(shown, best - {name}, best))
-        certain = gains[best] - without[name] >= _CERTAIN * len(channels)
+        certain = lead[name] >= _CERTAIN * len(channels)
         if alone <= 1.0 and (share <= 1.0 - _LEAST_SHARE or certain):
             named[name] = shown
     if not named:
         return None
     # a gain over directions takes the place of much else: it is named where nothing else can be
-    name = min(named, key=lambda name: (name == _CATCH_ALL, without[name]))
-    return _named(name, named[name], gains[best] - without[name])
+    name = min(named, key=lambda name: (name == _CATCH_ALL, -sum(_best(table, {name}).gain for table in tables)))
+    return _named(name, named[name], lead[name])
 
 
 def _names(model: _Model) -> frozenset[str]:
@@ -270,31 +277,32 @@ def _models(e: LevelEvidence) -> _Models:
     """The likeliest numbers of each trouble, and each two of the best of them: the second judged without the first."""
     sound = _fitted(e)
 
-    def model(*trials: Trial, at: _Memories | None = None) -> _Model:
-        fit = _fitted(e, *trials, at=at)
-        cost = 0.5 * sum(trial.cost for trial in trials) * math.log(len(e.time_s))
-        return _Model(e, trials, fit.residual_db, fit.log_likelihood - sound.log_likelihood - cost)
+    def model(*trials: Trial, at: _Memories = sound.memories, climb: bool = True) -> _Model:
+        fit = _fitted(e, *trials, at=at, climb=climb)
+        cost = sum(trial.cost for trial in trials)
+        gain = fit.log_likelihood - sound.log_likelihood - cost
+        return _Model(e, trials, fit.residual_db, gain, fit.memories)
 
     def best_of(sets: Iterable[tuple[Trial, ...]], at: _Memories) -> list[_Model]:
         """The likeliest of each set of names under some noise, the best of them under their own."""
         best: dict[frozenset[str], _Model] = {}
         for trials in sets:
-            tried = model(*trials, at=at)
+            tried = model(*trials, at=at, climb=False)
             names = _names(tried)
             if len(names) == len(trials) and (names not in best or tried.gain > best[names].gain):
                 best[names] = tried
         likely = sorted(best.values(), key=lambda m: -m.gain)[:_MOST_TRIED]
-        return [model(*m.trials) for m in likely]
+        return [model(*m.trials, at=at) for m in likely]
 
     alone = best_of(((trial,) for trial in _candidates(e)), sound.memories)
     alone.sort(key=lambda m: -m.gain)
-    models, likely = [model(), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
-    models += [model(*(m.trials[0] for m in two)) for two in combinations(alone, 2) if two[0].gain > 0.0]
+    models, likely = [model(climb=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
+    pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
+    models += [model(first.trials[0], second.trials[0], at=first.memories) for first, second in pairs]
     for first in likely:
         rest = _without(e, first)
-        at = _fitted(rest).memories
-        pairs = best_of(((first.trials[0], second) for second in _candidates(rest)), at)
-        models += [*pairs, *(model(m.trials[1], at=sound.memories) for m in pairs)]
+        further = best_of(((first.trials[0], second) for second in _candidates(rest)), first.memories)
+        models += [*further, *(model(m.trials[1], climb=False) for m in further)]
     return {_names(m): m for m in sorted(models, key=lambda m: m.gain)}
 
 
@@ -349,7 +357,7 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
     if not finite.any():
         return None
     time, level = evidence.time_s[finite], evidence.measured_db[finite]
-    width = max(BIN_S, float(np.ptp(time)) / _MOST_BINS)
+    width = max(min(BIN_S, float(np.ptp(time)) / _ENOUGH_BINS), float(np.ptp(time)) / _MOST_BINS, 1e-3)
     _, place = np.unique(np.floor(time / width), return_inverse=True)
     count = np.bincount(place).astype(np.float64)
     if len(count) < _FEWEST_BINS:
@@ -380,8 +388,8 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
 _AT_END, _SHARE_AT_END = 10, 0.01
 
 
-def _fitted(e: LevelEvidence, *trials: Trial, at: _Memories | None = None) -> _Fit:
-    """Best offset and coefficients with some troubles, under noise of two memories: those given, else the likeliest."""
+def _fitted(e: LevelEvidence, *trials: Trial, at: _Memories = _START, climb: bool = True) -> _Fit:
+    """Offset and coefficients with some troubles, under noise of the given memories, or the likeliest near them."""
     target = e.measured_db - e.predicted_db
     clipped = np.zeros(len(target), dtype=np.bool_)
     columns, shown = [], np.ones(len(target))
@@ -390,21 +398,25 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: _Memories | None = None) -> _F
         clipped = clipped if trial.clipped is None else clipped | trial.clipped
         columns += [] if trial.columns is None else [trial.columns]
         shown = shown if trial.fading is None else shown * trial.fading
-    design = np.column_stack([np.ones(len(target)), *columns])
+    design = np.column_stack([np.full(len(target), _OFFSET_DB), *columns])
     if clipped.all():
         return _Fit(-math.inf, target - target.mean(), _START)
     link = ~clipped
     scale = shown[link]
-    fit = _remembering(target[link] / scale, design[link] / scale[:, None], at)
+    fit = _remembering(target[link] / scale, design[link] / scale[:, None], at, climb)
     likelihood, residual = fit.log_likelihood - float(np.log(scale).sum()), np.zeros(len(target))
     residual[link] = fit.residual_db * scale
     if clipped.any():  # what a receiver writes beyond its limit remembers nothing of the link
         residual[clipped] = e.measured_db[clipped] - e.measured_db[clipped].mean()
-        likelihood -= float(clipped.sum()) * math.log(max(float(residual[clipped].std()), _LEAST_SPREAD_DB))
+        # their mean and spread are two numbers (Schwarz)
+        spread = max(float(residual[clipped].std()), _LEAST_SPREAD_DB)
+        likelihood -= float(clipped.sum()) * (math.log(spread) + 0.5) + math.log(float(clipped.sum()))
     return _Fit(likelihood, residual, fit.memories)
 
 
 _LEAST_SPREAD_DB = 0.2
+# Standard deviation of the offset of a log that nobody knows [dB].
+_OFFSET_DB = 100.0
 
 
 @cache
@@ -426,8 +438,12 @@ def _whitening(memories: _Memories) -> tuple[FloatArray, FloatArray, FloatArray,
     return ahead, back, lfilter_zi(ahead, back), math.sqrt(innovation)
 
 
-def _remembering(residual: FloatArray, design: FloatArray, given: _Memories | None) -> _Fit:
-    """Fit under noise of two memories; those that are not given are climbed to by steps to the likeliest neighbour."""
+def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb: bool) -> _Fit:
+    """Fit under noise of two memories: the given ones, or those climbed to from there, each time the best neighbour.
+
+    Coefficients of the design are unit normals: the likelihood is integrated over them, the residual is about their
+    means. The noise has its likeliest size.
+    """
     from scipy.signal import lfilter
 
     n, columns = len(residual), np.column_stack([residual, design])
@@ -437,19 +453,28 @@ def _remembering(residual: FloatArray, design: FloatArray, given: _Memories | No
         white = lfilter(ahead, back, columns, axis=0, zi=start[:, None] * columns[:1])[0]
         white[0] = root * columns[0]
         gram = white.T @ white
-        ridge = 1e-10 * np.trace(gram[1:, 1:]) * np.eye(len(gram) - 1)  # columns may say the same
-        coefficients = np.linalg.solve(gram[1:, 1:] + ridge, gram[1:, 0])
-        variance = float(gram[0, 0] - gram[0, 1:] @ coefficients) / n
-        return -0.5 * n * math.log(max(variance, 1e-12)) + math.log(root), coefficients
+        power, axes = np.linalg.eigh(gram[1:, 1:])
+        power, along = np.maximum(power, 0.0), axes.T @ gram[1:, 0]
+        fixed = power > 1e-9 * power[-1]
+        left = max(float(gram[0, 0] - (along[fixed] ** 2 / power[fixed]).sum()), n * _LEAST_VARIANCE)
+        # each coefficient that the samples tell takes a degree of freedom
+        variance = left / max(n - float((power / (power + left / n)).sum()), 1.0)
+        mean = along / (power + variance)
+        square = float(gram[0, 0] - along @ mean) / variance
+        size = (n - len(power)) * math.log(variance) + float(np.log(variance + power).sum())
+        return -0.5 * (size + square) + math.log(root), axes @ mean
 
-    best = given or _START
-    tried, at = {best: fit(best)}, given
-    while best != at:
-        at = best
-        tried |= {memories: fit(memories) for memories in at.near if memories not in tried}
+    tried = {at: fit(at)}
+    best, last = at, None if climb else at
+    while best != last:
+        last = best
+        tried |= {memories: fit(memories) for memories in last.near if memories not in tried}
         best = max(tried, key=lambda memories: tried[memories][0])
     likelihood, coefficients = tried[best]
     return _Fit(likelihood, residual - design @ coefficients, best)
+
+
+_LEAST_VARIANCE = 1e-12
 
 
 # --- the troubles --------------------------------------------------------------------------------------------------
@@ -461,19 +486,27 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
         lag = e.clock.radio_minus_telemetry_s
         late = np.interp(e.time_s - lag, e.time_s, e.predicted_db)
         yield Trial(
-            name="clock", cost=1.0, sentence=f"the radio clock is {e.clock.in_words}", next_step="`rss: {lag: apply}`",
+            name="clock", cost=0.0, sentence=f"the radio clock is {e.clock.in_words}", next_step="`rss: {lag: apply}`",
             change_db=late - e.predicted_db, estimate=(lag, *e.clock.ci95_s),
         )  # fmt: skip
 
 
 def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: _Memories = _START) -> Trial:
     """The best of some values, and the range of those that are nearly as likely, half way to the next that are not."""
-    likelihood = {value: _fitted(e, trial, at=at).log_likelihood for value, trial in trials.items()}
+    likelihood = {value: _fitted(e, trial, at=at, climb=False).log_likelihood for value, trial in trials.items()}
     best, tried = max(likelihood, key=lambda value: likelihood[value]), sorted(trials)
+    width = np.gradient(tried) if len(tried) > 1 else np.ones(1)
+    cost = trials[best].cost + _concentration(np.array([likelihood[value] for value in tried]), width)
     near = [i for i, value in enumerate(tried) if likelihood[value] >= likelihood[best] - _NEAR]
     low, high = max(near[0] - 1, 0), min(near[-1] + 1, len(tried) - 1)
     ends = 0.5 * (tried[near[0]] + tried[low]), 0.5 * (tried[near[-1]] + tried[high])
-    return dataclasses.replace(trials[best], estimate=(best, *ends))
+    return dataclasses.replace(trials[best], estimate=(best, *ends), cost=cost)
+
+
+def _concentration(log_likelihood: FloatArray, width: FloatArray) -> float:
+    """Log of the greatest likelihood over its mean, each value with its width."""
+    top = log_likelihood.max()
+    return -math.log(float(np.exp(log_likelihood - top) @ width / width.sum()))
 
 
 # Values between two that were given.
@@ -493,30 +526,22 @@ def _tuned(
     at = values.index(best)
     between = np.interp(at + _BETWEEN, np.arange(len(values)), values)
     curve = CubicSpline(values, table)
-    finer = {value: trial(value, curve(value)) for value in between[between != 0.0].tolist()}
+    finer = {value: trial(value, curve(value)) for value in (*between.tolist(), *changes_db) if value != 0.0}
     return _profiled(e, finer, _fitted(e, likely).memories)
-
-
-# An angle, and that it is looked for all around.
-_HEADING_COST = 2.0
 
 
 def _heading(e: LevelEvidence) -> Iterator[Trial]:
     """An antenna turned about the vertical."""
-    if not e.turned_db:
-        return
 
     def turned(angle: float, change: FloatArray) -> Trial:
         return Trial(
-            name="heading", cost=_HEADING_COST, change_db=change,
+            name="heading", cost=0.0, change_db=change,
             next_step="check the antenna's mount and the logged yaw",
             sentence=f"the UAV antenna is turned clockwise by {angle:.0f} degrees",
         )  # fmt: skip
 
-    best = _tuned(e, e.turned_db, turned)
-    yield best
-    # a turned antenna leaves nothing that depends on the direction: what does is another antenna
-    yield dataclasses.replace(_pattern_trial(e), cost=_HEADING_COST + _PATTERN_COST, change_db=best.change_db)
+    if e.turned_db:
+        yield _tuned(e, e.turned_db, turned)
 
 
 def _attitude(e: LevelEvidence) -> Iterator[Trial]:
@@ -525,7 +550,7 @@ def _attitude(e: LevelEvidence) -> Iterator[Trial]:
         idle = mode != "ignored"  # a log that is not used has no free number
         yield Trial(
             name="attitude",
-            cost=float(not idle),
+            cost=0.0 if idle else _RARE,
             sentence="the UAV's attitude is not used" if idle else "the logged attitude does not fit the level",
             next_step=f"`rt: {{attitude: {mode}}}`",
             change_db=change,
@@ -537,7 +562,7 @@ def _height(e: LevelEvidence) -> Iterator[Trial]:
 
     def raised(rise: float, change: FloatArray) -> Trial:
         return Trial(
-            name="height", cost=1.0, change_db=change,
+            name="height", cost=0.0, change_db=change,
             sentence=f"the UAV flew about {abs(rise):.0f} m {'higher' if rise > 0 else 'lower'} than the log says",
             next_step="check the telemetry's height datum",
         )  # fmt: skip
@@ -550,12 +575,12 @@ def _tower(e: LevelEvidence) -> Iterator[Trial]:
     """The log of another tower."""
     for name, level in e.other_towers_db.items():
         yield Trial(
-            name="tower", cost=1.0, sentence=f"the log is that of {name}", next_step=f"`node: {name}` for this log",
-            change_db=level - e.predicted_db,
+            name="tower", cost=math.log(len(e.other_towers_db)), sentence=f"the log is that of {name}",
+            next_step=f"`node: {name}` for this log", change_db=level - e.predicted_db,
         )  # fmt: skip
 
 
-_CATCH_ALL, _PATTERN_COST = "pattern", 6.0
+_CATCH_ALL = "pattern"
 
 _PATTERN = {
     "isotropic": (
@@ -573,29 +598,32 @@ _PATTERN = {
 }
 
 
-def _pattern_trial(e: LevelEvidence) -> Trial:
-    sentence, step = _PATTERN[e.antenna]
-    return Trial(name=_CATCH_ALL, cost=_PATTERN_COST, sentence=sentence, next_step=step, columns=_harmonics(e))
-
-
 def _pattern(e: LevelEvidence) -> Iterator[Trial]:
-    """A smooth gain over the directions of the UAV's antenna."""
-    yield _pattern_trial(e)
-
-
-def _harmonics(e: LevelEvidence) -> FloatArray:
+    """A smooth gain over the directions of the UAV's antenna, in place of the known one."""
     azimuth, elevation = np.radians(e.uav_azimuth_deg), np.radians(e.uav_elevation_deg)
-    columns = [wave(k * azimuth) for k in (1, 2) for wave in (np.cos, np.sin)]
-    columns += [np.sin(elevation), np.sin(elevation) ** 2]
-    return np.column_stack([column - column.mean() for column in columns])
+    axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+    terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
+    columns = [_GAIN_DB * np.prod(term, axis=0) for term in terms]
+    if e.turned_db:  # no known pattern any more: the mean over all headings
+        columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
+    sentence, step = _PATTERN[e.antenna]
+    yield Trial(
+        name=_CATCH_ALL, cost=0.0, sentence=sentence, next_step=step, columns=np.column_stack(columns),
+    )  # fmt: skip
+
+
+# Standard deviations before the flight: of the terms of an antenna's gain, and of steps and losses [dB].
+_GAIN_DB, _STEP_DB, _LOSS_DB = 3.0, 8.0, 15.0
+# Log odds against what a log or its settings seldom have.
+_RARE = 3.0
 
 
 def _cell(e: LevelEvidence) -> Iterator[Trial]:
     """A level that changes where another cell serves."""
     if e.serving is not None and np.ptp(e.serving) > 0.5:
         yield Trial(
-            name="cell", cost=1.0, sentence="the level steps where the phone changes its cell",
-            next_step="compare the cells apart", columns=e.serving[:, None],
+            name="cell", cost=0.0, sentence="the level steps where the phone changes its cell",
+            next_step="compare the cells apart", columns=_STEP_DB * e.serving[:, None],
         )  # fmt: skip
 
 
@@ -606,7 +634,7 @@ def _flat(e: LevelEvidence) -> Iterator[Trial]:
     """One level alone where the model predicts many: a dead input, or a flight below the floor or above the ceiling."""
     if _is_flat(e):
         yield Trial(
-            name="flat", cost=1.0, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
+            name="flat", cost=_RARE, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
             sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} all along",
         )  # fmt: skip
 
@@ -624,7 +652,7 @@ def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Noise that the receiver writes without its lock, by the quality in the log."""
     if e.locked is not None and (lost := e.locked < 0.5).any():
         yield Trial(
-            name="lock", cost=2.0, clipped=lost,
+            name="lock", cost=0.0, clipped=lost,
             sentence=f"the receiver had lost its lock in {100 * lost.mean():.0f} % of the seconds",
             next_step="trust the error with the floor",
         )  # fmt: skip
@@ -635,7 +663,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
     if e.least is not None and e.least.any() and not e.least.all():
         level, share = float(e.measured_db[e.least].min()), 100 * e.least.mean()
         yield Trial(
-            name="no detection", cost=2.0, clipped=e.least, estimate=(level, level, level),
+            name="no detection", cost=0.0, clipped=e.least, estimate=(level, level, level),
             sentence=f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: nothing was detected",
             next_step=f"`floor_db: {math.ceil(level * 100.0 + 1.0) / 100.0:.2f}` for this log",
         )  # fmt: skip
@@ -693,13 +721,13 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
         return None
     name, words, step = _LIMITS[side]
     sentence, next_step = words.format(level=f"{Printed(limit):.0f} {e.unit}"), step.format(typed=f"{limit:.0f}")
-    return Trial(name=name, cost=2.0, sentence=sentence, next_step=next_step)
+    return Trial(name=name, cost=0.0, sentence=sentence, next_step=next_step)
 
 
 def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     """Levels to which the power of a limit adds, or which come no nearer than that to a ceiling."""
     offset = float(np.median(e.measured_db - e.predicted_db))
-    for _ in range(8):
+    for _ in range(5):
         level = e.predicted_db + offset
         shown = limit + side * 10.0 * np.log10(1.0 + 10.0 ** (side * (level - limit) / 10.0))
         offset += float(np.mean(e.measured_db - shown))
@@ -723,59 +751,57 @@ _LIMITS = {
 # --- troubles of a part of the flight --------------------------------------------------------------------------------
 
 
-def _shift(residual: FloatArray, masks: BoolArray, phi: float) -> tuple[FloatArray, FloatArray]:
-    """Shift inside each mask (m, n), and the squares that it takes off the whitened residual, offset fitted."""
+def _shift(residual: FloatArray, masks: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Shift by each mask (m, n), its standard error, and the log likelihood that it gains; offset fitted."""
     y = residual[1:] - phi * residual[:-1]
-    x = masks[:, 1:].astype(np.float64) - phi * masks[:, :-1]
+    x = masks[:, 1:] - phi * masks[:, :-1]
     y, x = y - y.mean(), x - x.mean(axis=1, keepdims=True)
     power = np.einsum("ij,ij->i", x, x)
     shift = np.divide(x @ y, power, out=np.zeros(len(x)), where=power > 1e-9)
-    return shift, shift**2 * power
+    left = np.maximum(y @ y - shift**2 * power, 1e-12)
+    error = np.sqrt(np.divide(left, len(y) * power, out=np.zeros(len(x)), where=power > 1e-9))
+    return shift, error, -0.5 * len(y) * np.log(left / max(float(y @ y), 1e-12))
 
 
-def _bounded(residual: FloatArray, mask: BoolArray, shift: float, phi: float) -> _Estimate:
-    """A shift inside a mask with its 95 % interval."""
-    y, x = residual[1:] - phi * residual[:-1], mask[1:].astype(np.float64) - phi * mask[:-1]
-    y, x = y - y.mean(), x - x.mean()
-    half = 1.96 * math.sqrt(float(np.mean((y - shift * x) ** 2)) / float(x @ x))
-    return shift, shift - half, shift + half
-
-
-_SEARCHED_PHI = (0.5, 0.8, 0.95)
+_SEARCHED_PHI = (0.6, 0.93)
 _WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
+# Degrees over which the edge of a shadow fades: a Fresnel zone some hundred metres away.
+_EDGE_DEG = 4.0
 _MOST_STARTS = 600
 
 
 def _blocked(e: LevelEvidence) -> Iterator[Trial]:
     """A loss in a sector of directions from the tower: searched by 5 degrees, then by one."""
     residual = e.measured_db - e.predicted_db
-    coarse = [(first, width) for width in _WIDTHS_DEG for first in np.arange(0.0, 360.0, 5.0).tolist()]
+    coarse = [(middle, width) for width in _WIDTHS_DEG for middle in np.arange(0.0, 360.0, 5.0).tolist()]
+    shadows = _shadows(e, coarse)
     for phi in _SEARCHED_PHI:
-        sector = _best_sector(e, residual, coarse, phi)
-        if sector is None:
+        shift, _, gain = _shift(residual, shadows, phi)
+        inside = shadows.sum(axis=1)
+        possible = (inside >= _LEAST_BINS) & (shadows.shape[1] - inside >= _LEAST_BINS) & (shift < 0.0)
+        if not possible.any():
             continue
-        around = [(sector[0] + i, max(sector[1] + j, 2.0)) for i in range(-6, 7) for j in range(-8, 9)]
-        first, width = _best_sector(e, residual, around, phi) or sector
-        mask = (e.tower_azimuth_deg - first) % 360.0 < width
-        shift = float(_shift(residual, mask[None, :], phi)[0][0])
-        value, low, high = _bounded(residual, mask, shift, phi)
+        gain = np.where(possible, gain, -np.inf)
+        cost, (middle, width) = _concentration(gain, np.ones(len(gain))), coarse[int(np.argmax(gain))]
+        around = [(middle + i, max(width + j, 2.0)) for i in range(-6, 7) for j in range(-8, 9)]
+        finer = _shadows(e, around)
+        shift, error, gain = _shift(residual, finer, phi)
+        at = int(np.argmax(np.where(shift < 0.0, gain, -np.inf)))
+        (middle, width), loss, reach = around[at], -float(shift[at]), 1.96 * float(error[at])
+        first = (middle - 0.5 * width) % 360.0
         yield Trial(
-            name="blocked", cost=3.0, columns=mask[:, None].astype(np.float64), estimate=(-value, -high, -low),
-            sentence=f"a loss of {-value:.0f} dB towards {first % 360:.0f} to {(first + width) % 360:.0f} degrees",
+            name="blocked", cost=cost, columns=_LOSS_DB * finer[at][:, None],
+            estimate=(loss, loss - reach, loss + reach),
+            sentence=f"a loss of {loss:.0f} dB towards {first:.0f} to {(first + width) % 360:.0f} degrees",
             next_step="add to the site what stands there",
         )  # fmt: skip
 
 
-def _best_sector(
-    e: LevelEvidence, residual: FloatArray, sectors: Sequence[tuple[float, float]], phi: float
-) -> tuple[float, float] | None:
-    """Start and width [deg] of the sector whose loss takes off most; None where no sector has a loss."""
-    turned = {first: (e.tower_azimuth_deg - first) % 360.0 for first in {first for first, _ in sectors}}
-    masks = np.array([turned[first] < width for first, width in sectors])
-    shift, gain = _shift(residual, masks, phi)
-    inside = masks.sum(axis=1)
-    possible = (inside >= _LEAST_BINS) & (masks.shape[1] - inside >= _LEAST_BINS) & (shift < 0.0)
-    return sectors[int(np.argmax(np.where(possible, gain, -1.0)))] if possible.any() else None
+def _shadows(e: LevelEvidence, sectors: Sequence[tuple[float, float]]) -> FloatArray:
+    """Share (m, n) of the loss of each sector, by middle and width [deg], that each sample has."""
+    middle, width = (np.array(column)[:, None] for column in zip(*sectors, strict=True))
+    off = np.abs((e.tower_azimuth_deg - middle + 180.0) % 360.0 - 180.0)
+    return np.asarray(np.clip(0.5 + (0.5 * width - off) / _EDGE_DEG, 0.0, 1.0))
 
 
 def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
@@ -785,15 +811,16 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     if not len(starts):
         return
     starts = starts[:: 1 + len(starts) // _MOST_STARTS]
-    masks = np.arange(n)[None, :] >= starts[:, None]
+    masks = (np.arange(n)[None, :] >= starts[:, None]).astype(np.float64)
     for phi in _SEARCHED_PHI:
-        shift, gain = _shift(residual, masks, phi)
+        shift, error, gain = _shift(residual, masks, phi)
         at = int(np.argmax(gain))
         instant = (e.start + np.timedelta64(round(float(e.time_s[starts[at]])), "s")).astype("datetime64[s]")
-        step = _bounded(residual, masks[at], float(shift[at]), phi)
+        step, reach = float(shift[at]), 1.96 * float(error[at])
         yield Trial(
-            name="gain step", cost=2.0, columns=masks[at][:, None].astype(np.float64), estimate=step,
-            sentence=f"the level steps by {Printed(step[0]):+.1f} dB at {str(instant)[-8:]} UTC",
+            name="gain step", cost=_concentration(gain, np.ones(len(gain))), columns=_STEP_DB * masks[at][:, None],
+            estimate=(step, step - reach, step + reach),
+            sentence=f"the level steps by {Printed(step):+.1f} dB at {str(instant)[-8:]} UTC",
             next_step="check the receiver's gain; compare both parts apart",
         )  # fmt: skip
 

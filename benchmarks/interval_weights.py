@@ -55,7 +55,7 @@ def power_cell(x: FloatArray, truth: float) -> tuple[FloatArray, FloatArray, Flo
     """Sequences (count, n) under each memory, on their mean square."""
     every = [cosine_terms(row) for row in x]
     slow, fast, freedom = (np.array([getattr(t, k) for t in every]) for k in ("slow", "fast_power", "fast_freedom"))
-    tails = np.array([heavy_tails(row, t) for row, t in zip(x, every, strict=True)])
+    tails = np.array([heavy_tails(row) for row in x])
     known, terms = memories(slow.shape[1]), slow.shape[1]
     likelihood, square = likelihoods(slow)
     third, below = 2.0 / (9.0 * freedom), np.zeros_like(square)

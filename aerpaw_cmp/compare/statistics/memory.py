@@ -114,12 +114,11 @@ def weights(kind: Kind) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Terms:
-    """Cosine terms of a sequence: the slow ones (q,), and power, degrees of freedom of the fast ones and of all."""
+    """Cosine terms of a sequence: the slow ones (q,), and power and degrees of freedom of the fast ones."""
 
     slow: FloatArray
     fast_power: float
     fast_freedom: float
-    freedom: float
 
 
 def cosine_terms(values: FloatArray) -> Terms:
@@ -129,13 +128,9 @@ def cosine_terms(values: FloatArray) -> Terms:
     n = len(values)
     every = dct(values - values.mean(), norm="ortho")[1:] / np.sqrt(n)
     count = int(_FEWER[(n - 1) // 2 >= _FEWER].max())
-    squares = every * every
-    fast = squares[count:]
-
-    def freedom(power: FloatArray) -> float:
-        return float(max(3.0 * power.sum() ** 2 / np.maximum((power * power).sum(), 1e-300), 1.0))
-
-    return Terms(every[:count], float(fast.sum()), freedom(fast), freedom(squares))
+    fast = np.square(every[count:])
+    freedom = max(3.0 * float(fast.sum()) ** 2 / max(float((fast * fast).sum()), 1e-300), 1.0)
+    return Terms(every[:count], float(fast.sum()), freedom)
 
 
 def likelihoods(slow: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -194,12 +189,18 @@ def mean_draws(values: FloatArray, kind: Kind = "mean") -> FloatArray:
     return np.asarray(np.concatenate([centre + reach, centre - reach]))
 
 
-def heavy_tails(values: FloatArray, terms: Terms) -> float:
-    """Standard deviation of the logarithm of the mean square (see :data:`CALM`) for tails heavier than normal."""
-    square = np.square(values - values.mean())
+def heavy_tails(values: FloatArray) -> float:
+    """Standard deviation of the logarithm of the mean square (see :data:`CALM`) for tails heavier than normal.
+
+    The innovations of a first-order autoregression show them where the sequence itself sums over many.
+    """
+    away, n = values - values.mean(), len(values) - 1
+    keep = min(float(away[1:] @ away[:-1]) / float(away @ away), 1.0)
+    both = away[1:] - keep * away[:-1], away[:-1] - keep * away[1:]  # whichever way the time runs
+    square = max((np.square(e) for e in both), key=lambda e: float(e @ e) / max(float(e.mean()) ** 2, 1e-300))
     # a short normal sequence shows heavy tails by chance: only what is beyond half of its spread counts
-    excess = float(np.mean(square * square)) / float(square.mean()) ** 2 - 3.0 - np.sqrt(6.0 / terms.freedom)
-    return float(np.sqrt(max(excess, 0.0) / terms.freedom))
+    excess = float(square @ square) / n / max(float(square.mean()) ** 2, 1e-300) - 3.0 - np.sqrt(6.0 / n)
+    return float(np.sqrt(max(excess, 0.0) / n))
 
 
 def power_draws(values: FloatArray) -> FloatArray:
@@ -220,5 +221,5 @@ def power_draws(values: FloatArray) -> FloatArray:
     third = 2.0 / (9.0 * terms.fast_freedom)
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
-    tails = np.exp(heavy_tails(values, terms) * np.where(normal > 0.0, CALM, 1.0) * normal)
+    tails = np.exp(heavy_tails(values) * np.where(normal > 0.0, CALM, 1.0) * normal)
     return np.tile((scale * memories(len(terms.slow)).power[index] + fast) * tails, 2)

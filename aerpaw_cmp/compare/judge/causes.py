@@ -195,6 +195,8 @@ _SLOW = (0.8, 0.87, 0.92, 0.95, 0.97, 0.985, 0.995)
 _FAST = (0.0, 0.3, 0.5, 0.7, 0.8)
 _SLOW_SHARE = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
 _START = _Memories(4, 2, 3)
+# Where climbs may begin: in the middle, and without any memory.
+_STARTS = (_START, _Memories(0, 0, 0))
 
 
 @dataclass(frozen=True, slots=True)
@@ -439,7 +441,7 @@ def _whitening(memories: _Memories) -> tuple[FloatArray, FloatArray, FloatArray,
 
 
 def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb: bool) -> _Fit:
-    """Fit under noise of two memories: the given ones, or those climbed to from there, each time the best neighbour.
+    """Fit under noise of two memories: the given ones, or those climbed to from there or a start.
 
     Coefficients of the design are unit normals: the likelihood is integrated over them, the residual is about their
     means. The noise has its likeliest size.
@@ -464,8 +466,8 @@ def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb:
         size = (n - len(power)) * math.log(variance) + float(np.log(variance + power).sum())
         return -0.5 * (size + square) + math.log(root), axes @ mean
 
-    tried = {at: fit(at)}
-    best, last = at, None if climb else at
+    tried = {memories: fit(memories) for memories in ({at, *_STARTS} if climb else {at})}
+    best, last = max(tried, key=lambda memories: tried[memories][0]), None if climb else at
     while best != last:
         last = best
         tried |= {memories: fit(memories) for memories in last.near if memories not in tried}

@@ -1,17 +1,22 @@
 """P(lock) of a predicted level: learned on flights, scored on those left out, used for a flight that is unseen."""
 
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from scipy.special import expit
 
+from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term
-from aerpaw_cmp.compare.learning.calibration import Observed, Recipe
+from aerpaw_cmp.compare.learning.calibration import Learned, Observed, Recipe, learn
+from aerpaw_cmp.compare.level.detection import DetectionForecast, learn_detection
 from aerpaw_cmp.flight.data import RssSeries
 from aerpaw_cmp.flight.drafting.remembered import lock_elsewhere
 from aerpaw_cmp.flight.rows.lock import LOCK_FLOOR_DB
 from aerpaw_cmp.flight.settings import LinkSettings
+from aerpaw_cmp.jobs.learning import calibrate_lock as locking
 from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks, lock_words
 from aerpaw_cmp.site.antenna.learned import Entry, LearnedLock, LearnedSeries, read_learned, remember
 
@@ -54,9 +59,35 @@ def test_the_planted_lock_is_recovered_and_beats_the_share_on_flights_left_out()
     assert f"{lock.brier:.3f}" in lock_words(lock)
 
 
+def test_a_forecast_that_is_scored_knows_nothing_of_the_flight(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither its law nor the gains behind the levels of its law saw the flight that it is scored on."""
+    taught: list[set[str]] = []
+    calls: list[list[float]] = []
+
+    def learn_from(series: Sequence[LinkSamples], recipe: Recipe) -> Learned:
+        learned = learn(series, recipe)
+        return replace(learned, mounts={s.flight: None for s in series})  # type: ignore[misc]
+
+    def levels(flights: Sequence[tuple[FloatArray, BoolArray]]) -> DetectionForecast | None:
+        calls.append([float(level.mean()) for level, _ in flights])
+        return learn_detection(flights)
+
+    monkeypatch.setattr(locking, "learn", learn_from)
+    monkeypatch.setattr(locking, "learn_detection", levels)
+    observed = [flight(name, seed) for seed, name in enumerate("abc")]
+    for pair, learned in locking._without_pairs(observed, RECIPE).items():
+        assert set(learned.mounts) == set("abc") - set(pair)
+        taught.append(set(pair))
+    assert len(taught) == 6
+    learned_locks(observed, RECIPE, {})
+    assert [len(each) for each in calls] == [3, 2, 2, 2]
+    assert not set(calls[0]) & {level for each in calls[1:] for level in each}  # of gains that knew one flight less
+
+
 def test_one_flight_or_a_receiver_that_keeps_its_lock_teaches_nothing() -> None:
     assert learned_locks([flight("a", 1)], RECIPE, {}) == {}
-    assert learned_locks([flight("a", 1, losing=False), flight("b", 2, losing=False)], RECIPE, {}) == {}
+    assert learned_locks([flight("a", 1), flight("b", 2)], RECIPE, {}) == {}  # nothing is left for a score
+    assert learned_locks([flight(name, 1, losing=False) for name in "abc"], RECIPE, {}) == {}
 
 
 def test_what_a_site_remembers_of_the_lock_is_used_with_its_airframe_alone(tmp_path: Path) -> None:

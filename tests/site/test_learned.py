@@ -387,6 +387,8 @@ def test_packaged_receiver_beats_a_constant_on_flights_left_out() -> None:
 def test_packaged_lock_beats_a_constant_on_flights_left_out() -> None:
     (lock,) = (s.lock for s in read_learned("lake_wheeler").entries["afar"].series)
     assert lock is not None
-    assert lock.brier < 0.8 * lock.constant_brier
-    assert lock.log_score < 0.8 * lock.constant_log_score
+    # the constant is each flight's own share, which no forecast can know; the mean share of the others, the bound
+    # before, scores .1973 and .5883
+    assert lock.brier < min(0.8 * lock.constant_brier, 0.7 * 0.1973)
+    assert lock.log_score < min(0.82 * lock.constant_log_score, 0.72 * 0.5883)
     assert lock.floor_rmse_db < 8.3

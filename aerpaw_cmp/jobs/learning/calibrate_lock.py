@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import combinations
 
 import numpy as np
 
-from ...compare.learning.calibration import Learned, Observed, Recipe, flight_left_out
+from ...compare.learning.calibration import (
+    Learned,
+    Observed,
+    Recipe,
+    flight_left_out,
+    flights_of,
+    groups_of,
+    learn,
+)
 from ...compare.level.detection import DetectionScore, learn_detection, score_detection
 from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...site.antenna.learned import LearnedLock
@@ -26,19 +35,29 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[st
     Returns
     -------
     dict of str to LearnedLock
-        Nothing for receivers that keep their lock, or whose lock a single flight has lost.
+        Nothing for receivers that keep their lock, or with fewer than three flights: none could be scored.
     """
     able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
-    if len({o.samples.flight for o in able}) < 2:
+    if len(flights_of(able)) < 3:
         return {}
     if not fits:
         fits = {}
         flight_left_out(observed, recipe, fits)
+    pairs = _without_pairs(observed, recipe)
     out = {}
     for antenna in dict.fromkeys(o.samples.antenna for o in able):
-        lock = _learned([_Levels(o, fits[o.samples.flight]) for o in able if o.samples.antenna == antenna])
+        lock = _learned([o for o in able if o.samples.antenna == antenna], fits, pairs)
         if lock is not None:
             out[antenna] = lock
+    return out
+
+
+def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[str, str], Learned]:
+    """Gains learned without two flights: the levels of the one, in a forecast for the other, know of neither."""
+    out: dict[tuple[str, str], Learned] = {}
+    for one, other in combinations(groups_of(flights_of(observed)), 2):
+        learned = learn([o.samples for o in observed if o.samples.flight not in (*one, *other)], recipe)
+        out |= {pair: learned for a in one for b in other for pair in ((a, b), (b, a))}
     return out
 
 
@@ -55,12 +74,17 @@ class _Levels:
         self.detected = o.locked[at] == 1.0
 
 
-def _learned(flights: Sequence[_Levels]) -> LearnedLock | None:
+def _learned(
+    series: Sequence[Observed], fits: Mapping[str, Learned], pairs: Mapping[tuple[str, str], Learned]
+) -> LearnedLock | None:
     """From all flights, scored flight by flight by what the others teach."""
+    flights = [_Levels(o, fits[o.samples.flight]) for o in series]
     every = learn_detection([(f.level_db, f.detected) for f in flights])
     scores: list[DetectionScore] = []
-    for item in flights:
-        from_others = learn_detection([(f.level_db, f.detected) for f in flights if f is not item])
+    for o, item in zip(series, flights, strict=True):
+        known = [(other, pairs.get((o.samples.flight, other.samples.flight))) for other in series]
+        others = [_Levels(other, learned) for other, learned in known if learned is not None]
+        from_others = learn_detection([(f.level_db, f.detected) for f in others])
         score = None if from_others is None else score_detection(
             item.time_s, item.measured_db, item.level_db, item.detected, floor_db=LOCK_FLOOR_DB,
             free_space_db=item.free_db, forecast=from_others,
@@ -113,7 +137,8 @@ def lock_words(lock: LearnedLock) -> str:
     """Sentences on P(lock), and on the level with a floor, from flights left out."""
     return (
         f"The predicted level gives the probability of lock with a Brier score of {lock.brier:.3f} on flights left out "
-        f"(constant: {lock.constant_brier:.3f}), log score {lock.log_score:.3f} ({lock.constant_log_score:.3f}). Where "
-        f"levels below {lock.floor_db:g} dB re full scale count as {lock.floor_db:g}, the RMSE is "
-        f"{lock.floor_rmse_db:.1f} dB; free space: {lock.free_space_floor_rmse_db:.1f} dB."
+        f"(constant share of each flight: {lock.constant_brier:.3f}), log score {lock.log_score:.3f} "
+        f"({lock.constant_log_score:.3f}). Where levels below {lock.floor_db:g} dB re full scale count as "
+        f"{lock.floor_db:g}, the RMSE is {lock.floor_rmse_db:.1f} dB; free space: "
+        f"{lock.free_space_floor_rmse_db:.1f} dB."
     )

@@ -53,7 +53,7 @@ class LearnedLock(StrictModel):
 
     ``locked_sd_db``: of levels about their prediction, in lock. Without, they lie about ``lost_db`` at ``gain_db``,
     ``lost_per_db`` higher for each dB of path gain, with ``lost_sd_db`` [unit of the measurement].
-    The scores are means over flights left out: Brier and log score (nat) beside those of the constant ``share``, and
+    The scores are means over flights left out: Brier and log score (nat) beside those of each flight's own share, and
     the RMSE [dB] of all samples where levels below the floor count as the floor.
     """
 

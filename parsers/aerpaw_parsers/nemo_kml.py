@@ -97,10 +97,16 @@ def _is_rank(name: str) -> bool:
     return meaning is not None and meaning.quantity.role == "rank"
 
 
+# Of the cell that Nemo's CSV calls ``nr``: there RSRP is ``nr_rsrp``.
+_SERVING = " (NR SpCell)"
+
+
 def _measured(rows: _rows.Rows, name: str, where: BoolArray) -> Stream | None:
-    """Level or KPI stream of one quantity."""
+    """Level or KPI stream of one quantity, by the name that it has in Nemo's CSV."""
     unit = next((text for text in rows.text("unit") if text), "")
-    return _cells.named(rows, name, rows.number("value"), unit=unit, where=where)
+    short = f"nr {name.removesuffix(_SERVING)}" if name.endswith(_SERVING) else name
+    about = {"rat": "nr"} if short != name else None
+    return _cells.named(rows, short, rows.number("value"), unit=unit, where=where, about=about)
 
 
 def _markup(lines: _lines.Lines, row: IntArray) -> IntArray:

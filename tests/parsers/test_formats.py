@@ -232,6 +232,16 @@ def test_nemo_relative_times(reader: str, data: bytes) -> None:
     assert any("relative" in text for text in relative.warnings)
 
 
+def test_nemo_calls_one_level_alike_in_both_exports() -> None:
+    """What was learned of the level of one export fits the other: same channel, technology and quantity."""
+    table = next(s for s in read("nemo_csv", samples.NEMO_CSV).streams if s.kind == "rss")
+    placemarks = samples.NEMO_KML.replace(b"PDSCH rank (NR) = 2.0", b"RSRP (NR SpCell) = -80.5 dBm")
+    level = next(s for s in read("nemo_kml", placemarks).streams if s.kind == "rss")
+    for name in ("channel", "rat", "quantity", "unit"):
+        assert level.attributes[name] == table.attributes[name]
+    assert level.frame["rss_db"].dropna().tolist() == [-80.5]
+
+
 def test_nemo_local_origin() -> None:
     local = read("nemo_csv", samples.NEMO_CSV, replace(OPTIONS, time_origin="2025-03-02 10:00:00"))
     zoned = read("nemo_csv", samples.NEMO_CSV)

@@ -329,6 +329,10 @@ def test_a_draft_takes_only_what_fits(folder: Path) -> None:
     elsewhere = propose(known, "mine", [("NODE", "A", "flight_mat")])
     assert elsewhere.antennas == {"uav": "mine/d12_uav"}
     assert elsewhere.antennas_about.startswith("the airframe alone fits")
+    phone = Learned(entries={"nr": entry("nr_rsrp", reader="nemo_csv")})
+    assert propose(phone, "mine", [("LW1", "nr_rsrp", "nemo_kml")]).antennas == {
+        "LW1.nr_rsrp": "mine/nr_LW1.nr_rsrp", "uav": "mine/nr_uav"
+    }  # fmt: skip
     rover = Learned(entries={"r": entry("A", tower="ROVER")})
     for known_place, at_site, fits in (
         (("NODE",), ("LW1",), True),

@@ -120,6 +120,7 @@ def propose(known: learned.Learned, site: str, series: Sequence[_SeriesKey], nod
     Proposal
         Empty where nothing fits.
     """
+    series = [(tower, channel, learned.receiver_of(reader)) for tower, channel, reader in series]
     antennas: dict[str, str] = {}
     about, carrier = "", None
     fits = {name: _fits(entry, series, nodes) for name, entry in known.entries.items()}
@@ -176,7 +177,7 @@ def searching_airframe(
     with suppress(InputError, UsageError):
         unseen = (entry for entry in learned.read_learned(site).entries.values() if log[0] not in entry.trained_on)
         every = (s for entry in unseen for s in entry.series if s.tower not in towers)
-        files = (s.uav_file for s in every if (s.channel, s.reader) == series)
+        files = (s.uav_file for s in every if (s.channel, s.reader) == (series[0], learned.receiver_of(series[1])))
         airframes = (read_sphere_csv(learned.folder_of(site) / file) for file in files)
         return next((airframe for airframe in airframes if not among(log[1], airframe.marks)), None)
     return None
@@ -196,7 +197,7 @@ def taught(site: str | Path, series: tuple[str, str], log: tuple[str, str]) -> d
         fit = [
             known
             for known in remembered(site).values()
-            if (known.series.channel, known.series.reader) == series
+            if (known.series.channel, known.series.reader) == (series[0], learned.receiver_of(series[1]))
             and log[0] not in known.entry.trained_on
             and not among(log[1], known.uav.marks)
         ]

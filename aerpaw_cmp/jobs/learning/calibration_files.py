@@ -27,7 +27,15 @@ from ...report.content.calibration import AntennaMap, CalibrationData
 from ...report.kit.files import write_file
 from ...report.names import safe_name
 from ...report.pages.calibration import calibration_metrics, write_calibration
-from ...site.antenna.learned import Entry, Errors, LearnedLevel, LearnedLock, LearnedReceiver, LearnedSeries
+from ...site.antenna.learned import (
+    Entry,
+    Errors,
+    LearnedLevel,
+    LearnedLock,
+    LearnedReceiver,
+    LearnedSeries,
+    receiver_of,
+)
 from ...site.antenna.pair_gain import PairGain
 from ...site.antenna.sphere_pattern import (
     SpherePattern,
@@ -385,8 +393,8 @@ def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, f
 
 
 def _reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
-    """Reader of the log that holds a series."""
-    return data.files[int(series.log[0]) if len(series.log) else 0].result.reader
+    """Reader of the log that holds a series, or the first of its receiver's."""
+    return receiver_of(data.files[int(series.log[0]) if len(series.log) else 0].result.reader)
 
 
 def _quantity_of(data: FlightData, series: RankSeries) -> str:

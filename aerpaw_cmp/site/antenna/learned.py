@@ -28,6 +28,15 @@ _INDEX = "learned.yaml"
 BAND = 0.02
 
 
+# Readers of exports of one receiver: what the one taught holds for the other.
+_EXPORTS = {"nemo_kml": "nemo_csv"}
+
+
+def receiver_of(reader: str) -> str:
+    """Name of the receiver whose readings a reader reads: that of the first of its readers."""
+    return _EXPORTS.get(reader, reader)
+
+
 class Source(StrictModel):
     """Source of the flights, as calibration.yaml says."""
 

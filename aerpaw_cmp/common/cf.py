@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import importlib
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from .errors import UsageError
 from .geodesy import SiteFrame
+from .interrupts import held
+from .sink import Sink
+from .units import AnyArray
 
 CONVENTIONS = "CF-1.11"
 
@@ -78,11 +84,12 @@ def dataset(variables: Mapping[str, Any], attributes: Mapping[str, Any]) -> Any:
     return _library("xarray").Dataset(dict(variables), attrs=dict(attributes))
 
 
-def netcdf_bytes(data: Any) -> Any:
+def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
     """A NetCDF-4 file of an ``xarray.Dataset``, made in memory: HDF5 ends the process where a disk is full.
 
     Arrays are deflated; text becomes characters in UTF-8, which every reader of CF takes. A variable with NaN has it as
-    ``_FillValue``; another has none, unless its ``encoding`` says so.
+    ``_FillValue``; another has none, unless its ``encoding`` says so. ``grows`` are dimensions without a limit, the
+    first of them that along which :class:`GrowingNetcdf` appends.
 
     Raises
     ------
@@ -93,13 +100,101 @@ def netcdf_bytes(data: Any) -> Any:
     data = data.copy()
     for name, variable in data.variables.items():
         if variable.dtype.kind in "OU":
-            variable.encoding |= {"dtype": "S1", "char_dim_name": f"{name}_length"}
+            width = {"chunksizes": (64,) * (variable.ndim + 1)} if {*variable.dims} & {*grows} else {}
+            variable.encoding |= {"dtype": "S1", "char_dim_name": f"{name}_length", **width}
             continue
         missing = variable.dtype.kind == "f" and bool(variable.isnull().any())
         deflated = {"zlib": True, "complevel": 4, "shuffle": variable.dtype.itemsize > 1} if variable.ndim else {}
         variable.encoding = {"_FillValue": math.nan if missing else None, **deflated, **variable.encoding}
-    data.dump_to_store(_library("xarray.backends").NetCDF4DataStore(book))
+        if {*variable.dims} & {*grows}:
+            variable.encoding["chunksizes"] = _chunk(variable, grows)
+    data.dump_to_store(_library("xarray.backends").NetCDF4DataStore(book), unlimited_dims=grows)
     return book.close()
+
+
+def _chunk(variable: Any, grows: Sequence[str]) -> tuple[int, ...]:
+    """Shape of a chunk: one along a dimension that grows, a power of two of at most a MiB along the first of them."""
+    sizes = {name: 1 if name in grows else size for name, size in variable.sizes.items()}
+    step = max(
+        1, min(variable.sizes.get(grows[0], 1), (1 << 20) // (variable.dtype.itemsize * math.prod(sizes.values())))
+    )
+    return tuple(1 << (step.bit_length() - 1) if name == grows[0] else size for name, size in sizes.items())
+
+
+class GrowingNetcdf:
+    """A NetCDF-4 file of data sets that come one after another, in the memory of one of them; a context.
+
+    Parameters
+    ----------
+    path : Path
+    grows : sequence of str
+        Dimensions without a limit. Data sets follow each other along the first; along the others the file is as long
+        as the longest, and holds ``_FillValue`` where another is shorter. A variable without the first one is written
+        anew with each data set.
+
+    Notes
+    -----
+    A ``_FillValue`` of 0 fills and is then taken out of the attributes: readers take it for a value.
+    """
+
+    def __init__(self, path: Path, grows: Sequence[str]) -> None:
+        self._path, self._grows, self._sizes = path, tuple(grows), dict.fromkeys(grows, 0)
+        self._book: Any = None
+
+    def __enter__(self) -> GrowingNetcdf:
+        self._stream = self._path.open("w+b")
+        self._sink = Sink(self._stream)
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        with held():
+            try:
+                if self._book is not None:
+                    self._book.close()
+                self._sink.raise_spared()
+            finally:
+                self._stream.close()
+
+    def append(self, data: Any) -> None:
+        """Write the next ``xarray.Dataset``: variables and dimensions as the first."""
+        with held():  # an interrupt inside a call of HDF5 would leave it with a half-made file
+            self._append(data)
+
+    def _append(self, data: Any) -> None:
+        if self._book is None:
+            self._sink.write(netcdf_bytes(data, self._grows))
+            self._book = _library("h5py").File(self._sink, "r+")
+            for variable in self._book.values():
+                if "_FillValue" in variable.attrs and variable.attrs["_FillValue"][0] == 0:
+                    del variable.attrs["_FillValue"]
+        parts = {name: _stored(name, variable) for name, variable in data.variables.items()}
+        sizes = {name: size for dims, values in parts.values() for name, size in zip(dims, values.shape, strict=True)}
+        along, start = self._grows[0], self._sizes[self._grows[0]]
+        sizes[along] += start
+        self._sizes = {name: max(size, sizes[name]) for name, size in self._sizes.items()}
+        for name in self._grows:
+            self._book[name].resize((self._sizes[name],))
+        for name, (dims, values) in parts.items():
+            if {*dims} & {*self._grows}:
+                stored = self._book[name]
+                stored.resize(tuple(self._sizes.get(dim, size) for dim, size in zip(dims, stored.shape, strict=True)))
+                shift = [start if dim == along else 0 for dim in dims]
+                stored[tuple(slice(first, first + n) for first, n in zip(shift, values.shape, strict=True))] = values
+        self._sink.raise_spared()
+
+    def describe(self, **attributes: str) -> None:
+        """Write attributes of the file anew."""
+        for name, text in attributes.items():
+            self._book.attrs[name] = text.encode()
+
+
+def _stored(name: str, variable: Any) -> tuple[tuple[str, ...], AnyArray]:
+    """Dimensions and values of a variable as a file has them: text as characters."""
+    values = np.asarray(variable.values)
+    if values.dtype.kind not in "OU":
+        return variable.dims, values
+    text = np.char.encode(values.astype(str), "utf-8")
+    return (*variable.dims, f"{name}_length"), text.view("S1").reshape(*values.shape, -1)
 
 
 def _library(name: str) -> Any:

@@ -18,7 +18,7 @@ from ..propagation.drivers.parts import replay_in_parts
 from ..propagation.edges import diffracted
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.geometry.paths import RowsT
-from ..propagation.options import Engine, Field, Run, Search
+from ..propagation.options import Engine, Field, Job, Run, Search
 from ..propagation.replay import PER_LINK, Replay, replay
 from ..site.site import Site
 from .data import FlightData, RankSeries, RssSeries, Times, rank_positions
@@ -391,6 +391,7 @@ def replay_poses(
     towers_m: FloatArray | None = None,
     engine: Engine | None = None,
     progress: Progress = logged,
+    job: Job | None = None,
 ) -> Replay:
     """Replay poses as the flight's ``rt`` asks, foliage included; ``engine`` in place of ``rt.engine``.
 
@@ -407,6 +408,8 @@ def replay_poses(
     engine : {"image", "sionna"}, optional
     progress : Progress
         Share done; of the sionna engine alone.
+    job : Job, optional
+        What the poses are a part of.
 
     Returns
     -------
@@ -434,6 +437,7 @@ def replay_poses(
         cache_dir=None if rt.advanced.cache else "",
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" or long or towers_m is not None else None,
+        job=job,
     )
     field = Field(path_loss(site, rt, link.carrier_hz))
     if towers_m is not None:

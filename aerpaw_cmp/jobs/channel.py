@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import shutil
+import sys
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..common.errors import UsageError
+from ..common.errors import InputError, UsageError
 from ..common.geodesy import bearing_deg
 from ..common.outputs import OutputFolder
-from ..common.provenance import KEY, union
+from ..common.provenance import union
 from ..common.stages import Stages
 from ..common.units import FloatArray
 from ..flight.data import FlightData, choose_site, load_data, site_place
@@ -22,14 +24,21 @@ from ..flight.replay import replay_poses, valid_poses
 from ..flight.settings import FlightFile, LinkSettings
 from ..flight.training import flight_logs
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
+from ..propagation.options import Job
 from ..propagation.path_table import check_band, subcarriers_hz, velocities_mps
-from ..report.exports.channel import FORMATS, Channel
+from ..report.exports.channel import FORMATS, MOST_BYTES, STREAMED, Channel, refuse_size, write_channel
 from ..report.exports.formats import chosen_formats
 from ..site.antenna.learned import BAND
 from .options import DEFAULT, JobOutcome, RunOptions
-from .prediction.sources import memory_of
+from .prediction.sources import Source, memory_of
 from .prediction.where import TargetOptions, find_targets, target_files
 from .tasks.manifest import inputs_of_flight
+
+# Points of a route further away are none.
+_NEAR_M = 1e6
+
+# Gains and frequency responses that are worked on at once; paths of a link that they are reckoned with.
+_PART_BYTES, _PATHS = 16 << 20, 4
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -74,18 +83,14 @@ class _Along:
     remarks: tuple[str, ...] = ()
 
 
-def flight_channel(
-    data: FlightData, chosen: ChannelOptions = ChannelOptions(), stages: Stages | None = None
-) -> Channel:
-    """The channel along a flight.
+def flight_channel(data: FlightData, chosen: ChannelOptions = ChannelOptions()) -> Channel:
+    """The channel along a flight, in memory.
 
     Parameters
     ----------
     data : FlightData
         With logs read, or of a plan without any.
     chosen : ChannelOptions
-    stages : Stages, optional
-        Times "replay" and "paths".
 
     Returns
     -------
@@ -94,43 +99,87 @@ def flight_channel(
     Raises
     ------
     UsageError, InputError
-        An unknown tower or link, a band wider than the model's, a route that is none.
+        An unknown tower or link, a band wider than the model's, a route that is none, more than fits in memory.
     """
-    stages = stages or Stages()
-    settings, remarks = data.settings, list[str]()
+    (channel,) = channel_parts(data, chosen, in_memory=True)
+    return channel
+
+
+def channel_parts(
+    data: FlightData,
+    chosen: ChannelOptions,
+    stages: Stages | None = None,
+    *,
+    in_memory: bool = False,
+    room: int = sys.maxsize,
+) -> Iterator[Channel]:
+    """The channel along a flight in parts that follow each other; arguments and errors of :func:`flight_channel`.
+
+    Parameters
+    ----------
+    data, chosen
+    stages : Stages, optional
+        Times "replay" and "paths".
+    in_memory : bool
+        One part alone.
+    room : int
+        Bytes that the parts may have together.
+
+    Yields
+    ------
+    Channel
+    """
+    stages, settings, remarks = stages or Stages(), data.settings, list[str]()
     name, link_settings = _chosen_link(settings, chosen)
     towers = _chosen_towers(data, chosen.towers, remarks)
     check_band(chosen.bandwidth_hz or 0.0, link_settings.carrier_hz)
     link = link_settings.build(towers, data.folder)
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
-    with stages("replay"):
-        run: dict[str, Any] = {"towers_m": along.towers_m, "progress": stages.progress}
-        replayed = replay_poses(data.site, settings.rt, link, along.poses, **run)
-    with stages("paths"):
-        table = replayed.path_table()
     spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # steps of many seconds are no gaps
     velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
     moves = bool(np.isfinite(velocity).any())
     if not moves:
         remarks.append("No Doppler shift: the points have no times, so the UAV has no velocity.")
-    level, sd, unit, trained_on = _levels(data, link, name, along.poses, remarks)
-    return Channel(
-        name=along.name,
-        link=name,
-        replay=replayed,
-        table=table,
-        time_s=along.time_s,
-        start=along.start,
-        velocity_mps=velocity if moves else None,
-        tower_mps=0.0 if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans),
-        summed=settings.rss.field,
-        level_db=level,
-        level_sd_db=sd,
-        level_unit=unit,
-        trained_on=trained_on,
-        offsets_hz=None if chosen.bandwidth_hz is None else subcarriers_hz(chosen.bandwidth_hz, chosen.subcarriers),
-        remarks=(*remarks, *along.remarks, *replayed.left_out),
-    )
+    offsets = None if chosen.bandwidth_hz is None else subcarriers_hz(chosen.bandwidth_hz, chosen.subcarriers)
+    levels = _Levels.of(data, link, name, remarks)
+    count, links = len(along.poses), len(along.poses) * len(towers)
+    pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
+    size = 16 * pairs * (_PATHS + (0 if offsets is None else len(offsets)))
+    at_once = 1 << max(0, (_PART_BYTES * count // size).bit_length() - 1)
+    if in_memory or settings.rt.engine != "image":  # Sionna draws its rays for all poses at once
+        at_once, room = count, MOST_BYTES
+    refuse_size(size, f"{count} poses, {len(towers)} towers", room)
+    job = None if at_once >= count else Job.of(along.poses.position_m, links, pairs)
+    names = {"": 0}  # the line of sight
+    for start in range(0, count, at_once):
+        rows = slice(start, start + at_once)
+        poses = Poses(along.poses.position_m[rows], along.poses.rotation[rows])
+        with stages("replay"):
+            run: dict[str, Any] = {"towers_m": None if along.towers_m is None else along.towers_m[rows]}
+            progress = stages.progress if job is None else _silent
+            replayed = replay_poses(data.site, settings.rt, link, poses, **run, progress=progress, job=job)
+        with stages("paths"):
+            table = replayed.path_table(names)
+        if job is not None:
+            stages.progress("channel", min(1.0, rows.stop / count))
+        yield Channel(
+            name=along.name,
+            link=name,
+            replay=replayed,
+            table=table,
+            time_s=along.time_s[rows],
+            start=along.start,
+            velocity_mps=velocity[rows] if moves else None,
+            tower_mps=0.0 if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans)[rows],
+            summed=settings.rss.field,
+            offsets_hz=offsets,
+            remarks=(*remarks, *along.remarks),
+            **levels.at(poses),
+        )
+
+
+def _silent(_text: str, _fraction: float | None = None, /) -> None:
+    """Progress of one part of many."""
 
 
 def _chosen_link(settings: FlightFile, chosen: ChannelOptions) -> tuple[str, LinkSettings]:
@@ -182,12 +231,19 @@ def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> _
 def _planned(data: FlightData, route: Path, step_s: float) -> _Along:
     """Poses of a level aircraft along a route or a plan, nose as the route says, else along the course."""
     targets = find_targets(route, data.site, TargetOptions())
+    if targets.kind == "grid":
+        found = "a site, not a route" if route.exists() else "no such file"
+        raise InputError(found, expected="a .plan, KML, CSV or log, or a flight.yaml with a plan", path=route)
     time, position, yaw, remarks = targets.time_s, targets.position_m, targets.yaw_deg, targets.remarks
     if len(time) > 1 and (np.diff(time) > 0.0).all():
         wanted = np.arange(0.0, time[-1] + 1e-9, step_s)
         yaw = yaw[np.searchsorted(time, wanted, side="right") - 1]
         time, position = wanted, interpolated(wanted, time, position)
-    known = np.isfinite(position).all(axis=1)
+    known = np.asarray((np.abs(position) < _NEAR_M).all(axis=1))
+    if not known.any():
+        raise InputError("no point lies near the site", expected="east, north and height in metres", path=route)
+    if not known.all():
+        remarks = (*remarks, f"{int((~known).sum())} of {len(known)} points have no place near the site: left out.")
     time, position, yaw = time[known], position[known], yaw[known]
     if not np.isfinite(yaw).all():
         course = bearing_deg(np.gradient(position, axis=0)) if len(position) > 1 else np.zeros(1)
@@ -198,38 +254,50 @@ def _planned(data: FlightData, route: Path, step_s: float) -> _Along:
     return _Along(name=targets.name, poses=Poses(position, rotation), time_s=time, remarks=remarks)
 
 
-def _levels(
-    data: FlightData, link: Link, name: str, poses: Poses, remarks: list[str]
-) -> tuple[FloatArray | None, FloatArray | None, str, tuple[str, ...]]:
-    """Level and standard deviation (poses, towers) by remembered antennas, the log's unit, logs that taught them."""
-    towers = tuple(link.tower_arrays)
-    try:
-        memory = memory_of(site_place(data.settings.site.file, data.folder), data.site)
-    except UsageError:
-        remarks.append("No calibrated level: no flight taught the site its antennas (aerpaw-cmp calibrate).")
-        return None, None, "", ()
-    level, sd = np.full((2, len(poses), len(towers)), np.nan)
-    heading, units, guesses = bearing_deg(poses.rotation[:, :, 0]), dict[str, str](), 0
+@dataclass(frozen=True, slots=True)
+class _Levels:
+    """Calibrated levels of towers by remembered antennas: ``sources`` by number of the tower; none without memory."""
+
+    memory: Any
+    sources: Mapping[int, Source]
+    towers: int
     trained_on: tuple[str, ...] = ()
-    for source in sorted(memory.sources().values(), key=lambda s: s.channel != name):
-        near = abs(source.link.carrier_hz / link.carrier_hz - 1.0) <= BAND
-        if source.tower not in towers or source.tower in units or not near or source.tower in data.nodes:
-            continue
-        column, units[source.tower] = towers.index(source.tower), source.unit
-        samples = source.targets(poses.position_m, heading)
-        gain, slow, guess = memory.levels([samples], len(poses))
-        level[:, column] = gain + source.free_space_db(poses.position_m)
-        sd[:, column] = memory.fading(source.antenna).total_db(slow)
-        guesses += int(guess.sum())
-        trained_on = union(trained_on, memory.known[source.antenna].entry.trained_on)
-    if not units:
-        remarks.append("No calibrated level: the site remembers no antenna of these towers near this carrier.")
-        return None, None, "", ()
-    if guesses:
-        remarks.append(f"{guesses} levels lie where no flight taught the antennas: their standard deviation says so.")
-    if set(trained_on) & set(flight_logs(data)):
-        remarks.append("The calibrated level was learned from this flight's own logs, too: it is no prediction of it.")
-    return level, sd, ", ".join(dict.fromkeys(units.values())), trained_on
+
+    @classmethod
+    def of(cls, data: FlightData, link: Link, name: str, remarks: list[str]) -> _Levels:
+        towers = tuple(link.tower_arrays)
+        try:
+            memory = memory_of(site_place(data.settings.site.file, data.folder), data.site)
+        except UsageError:
+            remarks.append("No calibrated level: no flight taught the site its antennas (aerpaw-cmp calibrate).")
+            return cls(None, {}, len(towers))
+        sources: dict[int, Source] = {}
+        for source in sorted(memory.sources().values(), key=lambda s: s.channel != name):
+            near = abs(source.link.carrier_hz / link.carrier_hz - 1.0) <= BAND
+            if source.tower in towers and near and source.tower not in data.nodes:
+                sources.setdefault(towers.index(source.tower), source)
+        if not sources:
+            remarks.append("No calibrated level: the site remembers no antenna of these towers near this carrier.")
+        trained_on = union(*(memory.known[source.antenna].entry.trained_on for source in sources.values()))
+        if set(trained_on) & set(flight_logs(data)):
+            remarks.append("The calibrated level was learned from this flight's own logs, too: no prediction of it.")
+        return cls(memory, sources, len(towers), trained_on)
+
+    def at(self, poses: Poses) -> dict[str, Any]:
+        """Level and standard deviation (poses, towers), and how many are guesses, as :class:`Channel` has them."""
+        if not self.sources:
+            return {}
+        level, sd = np.full((2, len(poses), self.towers), np.nan)
+        heading, guesses = bearing_deg(poses.rotation[:, :, 0]), 0
+        for column, source in self.sources.items():
+            gain, slow, guess = self.memory.levels([source.targets(poses.position_m, heading)], len(poses))
+            level[:, column] = gain + source.free_space_db(poses.position_m)
+            sd[:, column] = self.memory.fading(source.antenna).total_db(slow)
+            guesses += int(guess.sum())
+        units = ", ".join(dict.fromkeys(source.unit for source in self.sources.values()))
+        return {
+            "level_db": level, "level_sd_db": sd, "level_unit": units, "trained_on": self.trained_on, "guesses": guesses
+        }  # fmt: skip
 
 
 def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFAULT) -> JobOutcome:
@@ -267,21 +335,11 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
                 nothing: dict[str, Any] = dict.fromkeys(("files", "rss", "rank", "warnings"), ())
                 site = choose_site(settings.site, flight.parent)
                 data = FlightData(settings=settings, folder=root, site=site, track=None, **nothing)
-        channel = flight_channel(data, chosen, stages)
-        with stages("write"), output.filling() as place:
-            written = [FORMATS[name](channel, place) for name in dict.fromkeys(chosen.formats)]
-        metrics = {
-            "flight": channel.name,
-            "link": channel.link,
-            "carrier_hz": channel.carrier_hz,
-            "towers": list(channel.replay.towers),
-            "poses": len(channel.time_s),
-            "paths": len(channel.table.pose),
-            "has_doppler": channel.velocity_mps is not None,
-            "has_level": channel.level_db is not None,
-            KEY: list(channel.trained_on),
-            "files": [str(path) for path in output.placed(written)],
-            "warnings": [*data.warnings, *channel.remarks],
-            "stages": stages.seconds,
-        }
-        return JobOutcome(folder=folder, metrics=metrics, files=output.placed(written))
+        whole = not STREAMED.issuperset(chosen.formats)
+        with output.filling() as place:
+            parts = channel_parts(data, chosen, stages, in_memory=whole, room=shutil.disk_usage(place).free)
+            written, metrics = write_channel(parts, place, tuple(dict.fromkeys(chosen.formats)), stages)
+        files = output.placed(written)
+        warnings = [*data.warnings, *metrics.pop("warnings")]
+        metrics |= {"files": [*map(str, files)], "warnings": warnings, "stages": stages.seconds}
+        return JobOutcome(folder=folder, metrics=metrics, files=files)

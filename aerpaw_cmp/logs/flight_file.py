@@ -22,7 +22,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -30,6 +30,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..common.errors import InputError, parsed, parsing
 from ..common.outputs import OutputFile
+from ..common.sink import Sink
 from .records import ReadResult, RejectedLine, RejectedReason, Stream
 
 if TYPE_CHECKING:
@@ -89,7 +90,7 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
     """
     import h5py
 
-    sink = _Sink(stream)
+    sink = Sink(stream)
     try:
         with h5py.File(sink, "w") as book:
             book.attrs["format"], book.attrs["version"] = FORMAT, _VERSION
@@ -102,49 +103,6 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
     digest = _digest(stream, size)
     stream.seek(size)
     stream.write(_SEAL + digest)
-
-
-class _Sink:
-    """A stream that never fails towards HDF5, which ends the process where a disk is full.
-
-    The first failure, an interrupt included, is kept for :meth:`look`; what comes after it is lost.
-    """
-
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
-        self._failure: BaseException | None = None
-
-    def raise_spared(self) -> None:
-        """Raise what HDF5 was spared."""
-        if self._failure is not None:
-            raise self._failure
-
-    def _spared(self, action: Callable[..., Any], *given: Any, instead: Any = 0) -> Any:
-        if self._failure is None:
-            try:
-                return action(*given)
-            except BaseException as failure:
-                self._failure = failure
-        return instead
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        return int(self._spared(self._stream.seek, offset, whence))
-
-    def tell(self) -> int:
-        return int(self._spared(self._stream.tell))
-
-    def write(self, block: Any) -> int:
-        return int(self._spared(self._stream.write, block, instead=len(block)))
-
-    def read(self, size: int = -1) -> bytes:
-        block = self._spared(self._stream.read, size, instead=b"")
-        return bytes(block.ljust(max(size, 0), b"\0"))
-
-    def truncate(self, size: int | None = None) -> int:
-        return int(self._spared(self._stream.truncate, size))
-
-    def flush(self) -> None:
-        self._spared(self._stream.flush)
 
 
 def is_flight_file(path: Path) -> bool:
@@ -181,7 +139,7 @@ def _refuse_changed(content: bytes, path: str | Path) -> None:
         )
 
 
-def _write_file(group: Any, file: IngestedFile, sink: _Sink) -> None:
+def _write_file(group: Any, file: IngestedFile, sink: Sink) -> None:
     result = file.result
     _write_json(
         group,
@@ -203,7 +161,7 @@ def _write_file(group: Any, file: IngestedFile, sink: _Sink) -> None:
         _write_stream(shelf.create_group(f"{i:05d}"), stream, sink)
 
 
-def _write_stream(group: Any, stream: Stream, sink: _Sink) -> None:
+def _write_stream(group: Any, stream: Stream, sink: Sink) -> None:
     columns = [{"name": str(name), "type": _type(stream.frame[name])} for name in stream.frame.columns]
     _write_json(
         group,

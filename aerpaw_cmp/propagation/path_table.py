@@ -163,7 +163,9 @@ class PathTable:
         return out
 
 
-def path_table(contributions: tuple[Any, ...], faces: Faces, ends: Ends, counts: AnyArray) -> PathTable:
+def path_table(
+    contributions: tuple[Any, ...], faces: Faces, ends: Ends, counts: AnyArray, names: dict[str, int]
+) -> PathTable:
     """Paths of a replay, each with its own gain.
 
     Parameters
@@ -174,12 +176,14 @@ def path_table(contributions: tuple[Any, ...], faces: Faces, ends: Ends, counts:
     ends : Ends
     counts : (poses, towers) bool
         Links that have a channel; paths of the others are left out.
+    names : dict of str to int
+        Faces of a path by number, those of earlier poses; new ones are added.
 
     Returns
     -------
     PathTable
     """
-    pieces, names = [], dict[str, int]()
+    pieces = []
     most = max(item.lines().vertices_m.shape[1] for item in contributions)
     for item in contributions:
         lines = item.lines()

@@ -108,9 +108,9 @@ class Replay:
             f"{counted(len(self.paths), 'path')}, coverage {100 * self.has_path.mean():.0f} %, {self.seconds:.2f} s)"
         )
 
-    def path_table(self) -> PathTable:
-        """Every path with delay, gain per element pair and directions."""
-        return path_table(self.contributions, self.faces, self.ends, self.has_path)
+    def path_table(self, names: dict[str, int] | None = None) -> PathTable:
+        """Every path with delay, gain per element pair and directions; ``names`` of earlier poses' faces."""
+        return path_table(self.contributions, self.faces, self.ends, self.has_path, {"": 0} if names is None else names)
 
     def paths_frame(self) -> Any:
         """A row per path: ``pose tower kind faces delay_s power_db`` and the angles [deg] of departure and arrival.

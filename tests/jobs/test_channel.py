@@ -1,6 +1,7 @@
 """The channel along a plan and along the sample flight: one set of numbers in every format."""
 
 import json
+import resource
 import shutil
 import sys
 from pathlib import Path
@@ -13,7 +14,9 @@ import xarray
 
 import aerpaw_cmp
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.cf import GrowingNetcdf
 from aerpaw_cmp.common.units import SPEED_OF_LIGHT_MPS
+from aerpaw_cmp.jobs import channel
 from aerpaw_cmp.jobs.channel import ChannelOptions, run_channel
 from aerpaw_cmp.jobs.options import RunOptions
 from tests.json_page import listed
@@ -81,6 +84,70 @@ def test_the_netcdf_file_has_h_as_the_sum_of_its_paths(written, cf_faults):
     assert (book.doppler_hz.to_numpy()[0, :, 0] > 0.0).all()  # it comes nearer all the way
     assert np.diff(book.time) == pytest.approx(2.0)
     assert cf_faults(outcome.files[0]) == []
+
+
+@pytest.fixture
+def short_parts(monkeypatch):
+    monkeypatch.setattr("aerpaw_cmp.jobs.channel._PART_BYTES", 20_000)
+
+
+ALONG = [
+    "--link",
+    "rank",
+    "--step",
+    "2",
+    "--tower",
+    "LW1",
+    "--tower",
+    "LW2",
+    "--bandwidth",
+    "20e6",
+    "--subcarriers",
+    "8",
+]
+
+
+def test_a_file_of_many_parts_is_that_of_one(written, folder, short_parts, monkeypatch, cf_faults):
+    sizes = []
+    replayed = channel.replay_poses
+    monkeypatch.setattr(channel, "replay_poses", lambda *a, **k: (sizes.append(len(a[3])), replayed(*a, **k))[1])
+    out = folder / "parts"
+    assert (
+        main(["channel", str(folder / "plan.yaml"), "-o", str(out), *ALONG, "--format", "netcdf", "--format", "csv"])
+        == 0
+    )
+    assert len(sizes) > 3
+    assert sum(sizes) == 16
+    with xarray.open_dataset(out / "channel.nc") as book:
+        xarray.testing.assert_equal(book, written[1])
+        assert [str(v.attrs) for v in book.values()] == [str(v.attrs) for v in written[1].values()]
+    assert (out / "channel.csv").read_text() == (folder / "out" / "channel.csv").read_text()
+    assert cf_faults(out / "channel.nc") == []
+
+
+def test_links_with_fewer_paths_than_a_later_part_have_no_path_there(tmp_path):
+    """Of a file that grows along both dimensions: what was never written is a gain of 0 and a delay of NaN."""
+    with GrowingNetcdf(tmp_path / "grown.nc", ("pose", "path")) as book:
+        for count in (1, 3):
+            shape = ("path", "pose"), np.full((count, 2), float(count))
+            none = {"_FillValue": np.nan}
+            data = {"gain": (*shape, {}, {"_FillValue": 0.0}), "delay": (*shape, {}, none), "t": ("pose", np.ones(2))}
+            book.append(xarray.Dataset(data))
+    with xarray.open_dataset(tmp_path / "grown.nc") as grown:
+        assert grown.gain.values.tolist() == [[1, 1, 3, 3], [0, 0, 3, 3], [0, 0, 3, 3]]
+        assert np.isnan(grown.delay).sum() == 4
+        assert (grown.t == 1.0).all()
+
+
+def test_a_disk_that_fills_on_the_way_ends_in_one_line(folder, short_parts, capsys, tmp_path):
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (90_000, hard))  # the first parts fit
+    try:
+        assert main(["channel", str(folder / "plan.yaml"), "-o", str(tmp_path / "out"), *ALONG]) == 3
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "cannot be written (File too large)" in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_arrays_for_sionna_and_matlab_hold_the_same(written, folder):
@@ -170,7 +237,11 @@ def test_points_without_times_have_no_doppler_and_a_site_without_memory_no_level
         (["--link", "nope"], "rank"),
         (["--tower", "nope"], "LW1"),
         (["--bandwidth", "5e9"], "tenth of the carrier"),
-        (["--step", "0.1", "--link", "rank", "--bandwidth", "1e6", "--subcarriers", "65536"], "--step"),
+        (
+            ["--step", "0.1", "--bandwidth", "1e6", "--subcarriers", "65536", "--link", "rank", "--format", "npz"],
+            "--step",
+        ),
+        (["--step", "0.001", "--bandwidth", "1e6", "--subcarriers", "65536", "--link", "rank"], "GiB of disk"),
     ],
 )
 def test_what_cannot_be_is_refused_in_one_line(folder, options, expected, capsys, tmp_path):

@@ -231,7 +231,7 @@ def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
 
 
 def _local_points(path: Path) -> Targets | None:
-    """Points of a CSV with east_m, north_m and height_m (and yaw_deg); None for another file."""
+    """Points of a CSV with east_m, north_m and height_m (and yaw_deg, time_s); None for another file."""
     if path.suffix.lower() != ".csv":
         return None
     with parsing(path, "columns east_m, north_m, height_m"):
@@ -239,7 +239,8 @@ def _local_points(path: Path) -> Targets | None:
         if not {"east_m", "north_m", "height_m"} <= set(names):
             return None
         table = pd.read_csv(path, skipinitialspace=True)
-    numbers = table.reindex(columns=["east_m", "north_m", "height_m", "yaw_deg"]).apply(pd.to_numeric, errors="coerce")
+    numbers = table.reindex(columns=["east_m", "north_m", "height_m", "yaw_deg", "time_s"])
+    numbers = numbers.apply(pd.to_numeric, errors="coerce")
     position = numbers[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
     lost = int((~np.isfinite(position).all(axis=1)).sum())
     return Targets(
@@ -247,8 +248,8 @@ def _local_points(path: Path) -> Targets | None:
         name=path.stem,
         position_m=position,
         yaw_deg=numbers["yaw_deg"].to_numpy(np.float64),
-        time_s=np.zeros(len(position)),
-        remarks=(f"{lost} of {len(position)} points have no position: they are flagged no_position.",) if lost else (),
+        time_s=time if np.isfinite(time := numbers["time_s"].to_numpy(np.float64)).all() else np.zeros(len(position)),
+        remarks=(f"{lost} of {len(position)} points have no position.",) if lost else (),
     )
 
 

@@ -70,7 +70,7 @@ def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
         "faces": faces,
         "seconds": sum(part.seconds for part in parts),
         "search_seconds": sum(part.search_seconds for part in parts),
-        "omitted": _added(parts),
+        "omitted": added_up(item for part in parts for item in part.omitted),
         "contributions": tuple(_in_flight(piece, rows) for piece in pieces),
     }
     columns = {name: [getattr(part, name) for part in parts] for name in PER_LINK}
@@ -115,10 +115,10 @@ def _shared(first: Faces, second: Faces) -> int:
     return count if same.all() else int(np.argmin(same))
 
 
-def _added(parts: list[Replay]) -> list[Omission]:
-    """Omissions of the parts, each once, counts added up."""
+def added_up(omissions: Iterable[Omission]) -> list[Omission]:
+    """Omissions of the parts of a replay, each once, counts added up."""
     added: dict[tuple[str, str], Omission] = {}
-    for item in (item for part in parts for item in part.omitted):
+    for item in omissions:
         key = item.tower, item.what
         before = added.get(key)
         counts = item.counts if before is None else tuple(map(sum, zip(before.counts, item.counts, strict=True)))

@@ -4,26 +4,62 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
-from ...common.cf import dataset, file_attributes, netcdf_bytes
+from ...common.cf import GrowingNetcdf, dataset, file_attributes
+from ...common.counting import counted
 from ...common.errors import UsageError
+from ...common.provenance import KEY
+from ...common.stages import Stages
 from ...common.units import AnyArray, FloatArray
 from ...common.versions import tool_version, utc_now
+from ...propagation.drivers.parts import added_up
 from ...propagation.path_table import KINDS, PathTable, frequency_responses, impulse_responses
 from ...propagation.replay import Replay
 
-_PORTS = ("rx", "tx")
-_LINK = ("pose", "tower")
+# Gains and frequency responses that are held in memory at once.
+MOST_BYTES = 2 << 30
 
-# Gains and frequency responses that a file is made of in memory.
-_MOST_BYTES = 2 << 30
+_LINK, _PORTS = ("pose", "tower"), ("rx", "tx")
+_PATH = ("path", *_LINK)
+# Dimensions, unit and meaning of the variables of a file; *_real and *_imag of one name share a row.
+_SITE, _ARRAY = "site frame, azimuth from east, counter-clockwise", "array frame, from the boresight, counter-clockwise"
+_ABOUT: dict[str, tuple[tuple[str, ...], str, str]] = {
+    "gain": ((*_PATH, *_PORTS), "1", "gain of a path at the carrier, its phase included; 0 without a path"),
+    "h": ((*_LINK, *_PORTS), "1", "channel matrix: sum of the gains over the paths"),
+    "cfr": ((*_LINK, *_PORTS, "subcarrier"), "1", "channel matrix at the subcarriers"),
+    "subcarrier_hz": (("subcarrier",), "Hz", "offset of a subcarrier from the carrier"),
+    "delay_s": (_PATH, "s", "delay between the array centres"),
+    "doppler_hz": (_PATH, "Hz", "Doppler shift, positive while the path gets shorter"),
+    "kind": (_PATH, "", "kind of the path"),
+    "faces": (_PATH, "", "row of face_names"),
+    "face_names": (("faces_of_a_path",), "", "faces that a path touches, from tower to UAV"),
+    **{
+        f"{angle}_{end}{frame}_deg": (_PATH, "degree", f"{angle} towards the path at its {end}: {text}")
+        for angle in ("azimuth", "elevation")
+        for end in ("departure", "arrival")
+        for frame, text in (("", _SITE), ("_array", _ARRAY))
+    },
+    "level_db": (_LINK, "1", "level that the receiver would log, of antennas that flights taught"),
+    "level_sd_db": (_LINK, "1", "standard deviation of level_db [dB]"),
+    "tower_name": (("tower",), "", "name of the tower"),
+    "time": (("pose",), "s", "since the start of the route"),
+    **{
+        f"{end}{name}_m": ((dimension,), "m", f"{name} of the site origin, {text}")
+        for end, dimension, text in (("", "pose", "UAV"), ("tower_", "tower", "tower"))
+        for name in ("east", "north", "up")
+    },
+    **{f"velocity_{name}_mps": (("pose",), "m s-1", f"velocity {name}, UAV") for name in ("east", "north", "up")},
+}
+# Dimensions along which the file grows, pose by pose or with the link that has most paths.
+_GROWS = ("pose", "path", "faces_of_a_path", "face_names_length")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,6 +87,8 @@ class Channel:
     level_unit : str
     trained_on : tuple of str
         SHA-256 of the logs that taught the level.
+    guesses : int
+        Levels where no flight taught the antennas.
     offsets_hz : (subcarriers,), optional
         Of the frequency response.
     remarks : tuple of str
@@ -69,6 +107,7 @@ class Channel:
     level_sd_db: FloatArray | None = None
     level_unit: str = ""
     trained_on: tuple[str, ...] = ()
+    guesses: int = 0
     offsets_hz: FloatArray | None = None
     remarks: tuple[str, ...] = ()
 
@@ -90,12 +129,31 @@ class Channel:
         level = self.replay.rss_power_dbm if self.summed == "power" else self.replay.rss_dbm
         return np.asarray(level - self.replay.ends.link.transmit_power_dbm)
 
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences on what the numbers lack."""
+        words = (
+            f"Where no flight taught the antennas: {counted(self.guesses, 'level')}, of a larger standard deviation."
+        )
+        return [*self.remarks, *([words] if self.guesses else []), *self.replay.left_out]
+
     def by_link(self, values: AnyArray, fill: Any) -> AnyArray:
         """Values per path (paths, ...) as (most paths of a link, poses, towers, ...)."""
         table = self.table
         out = np.full((table.most, *self.gain_db.shape, *values.shape[1:]), fill, values.dtype)
         out[table.number, table.pose, table.tower] = values
         return out
+
+
+def refuse_size(size: int, what: str, most: int = MOST_BYTES) -> None:
+    """UsageError for more bytes of gains than there is room for: in memory, else on the disk."""
+    if size > most:
+        further = ", or netcdf and csv alone" if most == MOST_BYTES else " of disk"
+        raise UsageError(
+            f"{size / 2**30:.0f} GiB of gains: {what}",
+            expected=f"at most {most / 2**30:.0f} GiB{further}",
+            cause="too short a --step, or too many --subcarriers",
+        )
 
 
 def channel_dataset(channel: Channel) -> Any:
@@ -106,77 +164,69 @@ def channel_dataset(channel: Channel) -> Any:
     UsageError
         xarray is not installed; more numbers than fit in memory.
     """
-    table, replay = channel.table, channel.replay
-    subcarriers = 0 if channel.offsets_hz is None else len(channel.offsets_hz)
-    size = 16 * replay.h.size * (table.most + subcarriers)
-    if size > _MOST_BYTES:
-        raise UsageError(
-            f"{size / 2**30:.0f} GiB of gains: {len(replay.h)} poses, {len(replay.towers)} towers, {table.most} paths, "
-            f"{subcarriers} subcarriers",
-            expected=f"at most {_MOST_BYTES >> 30} GiB",
-            cause="too short a --step, or too many --subcarriers",
-        )
-    paths, faces = ("path", *_LINK), np.array(table.names, dtype=object)
-    gain = channel.by_link(table.gain, 0.0)
-    flags = {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
-    none = {"_FillValue": np.int8(-1)}
-    variables: dict[str, Any] = {
-        **_parts(
-            "gain", (*paths, *_PORTS), gain, "gain of a path at the carrier, its phase included; 0 without a path"
-        ),
-        "delay_s": (paths, channel.by_link(table.delay_s, np.nan), _about("s", "delay between the array centres")),
-        "kind": (paths, channel.by_link(table.kind.astype(np.int8), -1), _about("", "kind of the path") | flags, none),
-        "faces": (paths, channel.by_link(table.via.astype(np.int32), -1), _about("", "row of face_names")),
-        "face_names": ("faces_of_a_path", faces, _about("", "faces that a path touches, from tower to UAV")),
-        **_parts("h", (*_LINK, *_PORTS), replay.h, "channel matrix: sum of the gains over the paths"),
-        "tower_name": ("tower", np.array(replay.towers, dtype=object), _about("", "name of the tower")),
+    table, replay, offsets = channel.table, channel.replay, channel.offsets_hz
+    poses, towers = replay.has_path.shape
+    size = 16 * replay.h.size * (table.most + (0 if offsets is None else len(offsets)))
+    refuse_size(size, f"{poses} poses, {towers} towers, {table.most} paths")
+    of_paths: dict[str, AnyArray | None] = {
+        "delay_s": table.delay_s, "doppler_hz": channel.doppler_hz, **table.angles_deg(replay.ends)
+    }  # fmt: skip
+    values: dict[str, AnyArray | None] = {
+        "gain": channel.by_link(table.gain, 0.0),
+        "kind": channel.by_link(table.kind.astype(np.int8), -1),
+        "faces": channel.by_link(table.via.astype(np.int32), -1),
+        "face_names": np.array(table.names, dtype=object),
+        "h": replay.h,
+        "tower_name": np.array(replay.towers, dtype=object),
+        **{name: None if rows is None else channel.by_link(rows, np.nan) for name, rows in of_paths.items()},
+        "level_db": channel.level_db,
+        "level_sd_db": channel.level_sd_db,
+        "cfr": None if offsets is None else frequency_responses(table, replay.ends, offsets),
+        "subcarrier_hz": offsets,
+        "time": channel.time_s,
+        **_places(channel),
     }
-    for name, values in table.angles_deg(replay.ends).items():
-        frame = "array frame, from the boresight" if "_array" in name else "site frame, azimuth from east"
-        text = f"{name.split('_')[0]} towards the path at its {name.split('_')[1]}: {frame}, counter-clockwise"
-        variables[name] = paths, channel.by_link(values, np.nan), _about("degree", text)
-    doppler = channel.doppler_hz
-    if doppler is not None:
-        text = "Doppler shift, positive while the path gets shorter"
-        variables["doppler_hz"] = paths, channel.by_link(doppler, np.nan), _about("Hz", text)
+    variables: dict[str, Any] = {}
+    for name, array in values.items():
+        if array is not None:
+            variables |= _variables(name, array, replay.ends.moving)
+    data = dataset(variables, _file(channel))
+    data.kind.attrs |= {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
+    if channel.start is not None:
+        start = str(channel.start).replace("T", " ")
+        data.time.attrs |= {"long_name": f"since {start} UTC", "units": f"seconds since {start[:19]} UTC"}
     if channel.level_db is not None:
-        unit = {"comment": f"unit: {channel.level_unit}"}
-        text = "level that the receiver would log, of antennas that flights taught"
-        variables["level_db"] = _LINK, channel.level_db, _about("1", text) | unit
-        variables["level_sd_db"] = _LINK, channel.level_sd_db, _about("1", "standard deviation of level_db [dB]")
-    if channel.offsets_hz is not None:
-        cfr = frequency_responses(table, replay.ends, channel.offsets_hz)
-        variables |= _parts("cfr", (*_LINK, *_PORTS, "subcarrier"), cfr, "channel matrix at the subcarriers")
-        about = _about("Hz", "offset of a subcarrier from the carrier")
-        variables["subcarrier_hz"] = "subcarrier", channel.offsets_hz, about
-    return dataset(variables | _places(channel), _file(channel))
+        data.level_db.attrs["comment"] = f"unit: {channel.level_unit}"
+    return data
 
 
-def _about(units: str, meaning: str) -> dict[str, Any]:
-    return {"long_name": meaning, **({"units": units} if units else {})}
+def _variables(name: str, values: AnyArray, moving: bool) -> dict[str, Any]:
+    """A variable as ``xarray`` takes it, by name; two of complex numbers."""
+    dimensions, unit, meaning = _ABOUT[name]
+    if moving and dimensions == ("tower",) and unit:
+        dimensions = ("pose",)  # its place
+    about = {"long_name": meaning, **({"units": unit} if unit else {})}
+    if np.iscomplexobj(values):
+        # digits of a phase do not deflate: level 1 takes out the zeros alone
+        encoding = {"complevel": 1, **({"_FillValue": 0.0} if name == "gain" else {})}
+        halves = (("real", values.real), ("imag", values.imag))
+        return {
+            f"{name}_{part}": (dimensions, half, about | {"long_name": f"{meaning} ({part})"}, encoding)
+            for part, half in halves
+        }
+    missing: Any = {"i": values.dtype.type(-1), "f": np.nan}.get(values.dtype.kind)
+    of_links = dimensions[: len(_PATH)] == _PATH or dimensions == _LINK
+    return {name: (dimensions, values, about, {"_FillValue": missing} if of_links else {})}
 
 
-def _parts(name: str, dimensions: tuple[str, ...], values: AnyArray, meaning: str) -> dict[str, Any]:
-    # digits of a phase do not deflate: level 1 takes out the zeros alone
-    return {
-        f"{name}_{part}": (dimensions, np.ascontiguousarray(half), _about("1", f"{meaning} ({part})"), {"complevel": 1})
-        for part, half in (("real", values.real), ("imag", values.imag))
-    }
-
-
-def _places(channel: Channel) -> dict[str, Any]:
-    """Time, places, velocity."""
-    start, ends = channel.start, channel.replay.ends
-    since = "the start of the route" if start is None else f"{str(start).replace('T', ' ')} UTC"
-    time = _about("s" if start is None else f"seconds since {str(start)[:19].replace('T', ' ')} UTC", f"since {since}")
-    out: dict[str, Any] = {"time": ("pose", channel.time_s, time)}
+def _places(channel: Channel) -> dict[str, AnyArray | None]:
+    """Places of both ends, velocity."""
+    ends, velocity = channel.replay.ends, channel.velocity_mps
+    sources = ends.sources_m[:, 0] if ends.moving else ends.sources_m
+    out: dict[str, AnyArray | None] = {}
     for i, name in enumerate(("east", "north", "up")):
-        out[f"{name}_m"] = "pose", ends.poses.position_m[:, i], _about("m", f"{name} of the site origin, UAV")
-        sources = ends.sources_m if not ends.moving else ends.sources_m[:, 0]
-        dimension = "pose" if ends.moving else "tower"
-        out[f"tower_{name}_m"] = dimension, sources[:, i], _about("m", f"{name} of the site origin, tower")
-        if channel.velocity_mps is not None:
-            out[f"velocity_{name}_mps"] = "pose", channel.velocity_mps[:, i], _about("m s-1", f"velocity {name}, UAV")
+        out[f"{name}_m"], out[f"tower_{name}_m"] = ends.poses.position_m[:, i], sources[:, i]
+        out[f"velocity_{name}_mps"] = None if velocity is None else velocity[:, i]
     return out
 
 
@@ -186,7 +236,7 @@ def _file(channel: Channel) -> dict[str, Any]:
         source="ray tracing along a flight",
         generated=utc_now(),
         version=tool_version(),
-        comment=" ".join(channel.remarks),
+        comment=" ".join(channel.warnings),
     )
     link = channel.replay.ends.link
     return {
@@ -201,9 +251,64 @@ def _file(channel: Channel) -> dict[str, Any]:
 # --- files ---------------------------------------------------------------------------------------------------------
 
 
-def _write_netcdf(channel: Channel, folder: Path) -> Path:
-    (folder / "channel.nc").write_bytes(netcdf_bytes(channel_dataset(channel)))
-    return folder / "channel.nc"
+def write_channel(
+    parts: Iterable[Channel], folder: Path, formats: Sequence[str], stages: Stages
+) -> tuple[list[Path], dict[str, Any]]:
+    """Write parts of a channel that follow each other, each as it comes.
+
+    Parameters
+    ----------
+    parts : iterable of Channel
+        One alone where a format is not of :data:`STREAMED`.
+    folder : Path
+    formats : sequence of str
+        Of :data:`FORMATS`.
+    stages : Stages
+        Times "write".
+
+    Returns
+    -------
+    list of Path
+        The file to open of each format.
+    dict
+        What was written, for ``--json``.
+    """
+    poses, paths, guesses = 0, 0, 0
+    omitted: list[Any] = []
+    with ExitStack() as stack:
+        writers = [stack.enter_context(FORMATS[name](folder)) for name in formats]
+        for channel in parts:
+            poses, paths = poses + len(channel.time_s), paths + len(channel.table.pose)
+            guesses, omitted = guesses + channel.guesses, added_up([*omitted, *channel.replay.omitted])
+            whole = replace(channel, guesses=guesses, replay=replace(channel.replay, omitted=omitted))
+            with stages("write"):
+                files = [write(whole) for write in writers]
+    return files, {
+        "flight": whole.name,
+        "link": whole.link,
+        "carrier_hz": whole.carrier_hz,
+        "towers": list(whole.replay.towers),
+        "poses": poses,
+        "paths": paths,
+        "has_doppler": whole.velocity_mps is not None,
+        "has_level": whole.level_db is not None,
+        KEY: list(whole.trained_on),
+        "warnings": whole.warnings,
+    }
+
+
+@contextmanager
+def _netcdf(folder: Path) -> Any:
+    path = folder / "channel.nc"
+    with GrowingNetcdf(path, _GROWS) as book:
+
+        def write(channel: Channel) -> Path:
+            data = channel_dataset(channel)
+            book.append(data)
+            book.describe(comment=data.attrs["comment"])
+            return path
+
+        yield write
 
 
 def _arrays(channel: Channel) -> dict[str, Any]:
@@ -239,6 +344,7 @@ def _write_mat(channel: Channel, folder: Path) -> Path:
 
 def _write_csv(channel: Channel, folder: Path) -> Path:
     """A row per instant and tower: the level of the link, delay and Doppler shift of its strongest path."""
+    path = folder / "channel.csv"
     poses, towers = channel.gain_db.shape
     power = channel.by_link((np.abs(channel.table.gain) ** 2).mean(axis=(1, 2)), 0.0)
     strongest = power.argmax(axis=0)[None] if len(power) else np.zeros((1, poses, towers), dtype=np.int64)
@@ -254,8 +360,8 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
         if values is not None and len(power):
             at = np.take_along_axis(channel.by_link(values, np.nan), strongest, axis=0)[0]
         shown[name] = at.ravel()
-    pd.DataFrame(shown).to_csv(folder / "channel.csv", index=False, float_format="%.9g")
-    return folder / "channel.csv"
+    pd.DataFrame(shown).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
+    return path
 
 
 def _write_deepmimo(channel: Channel, folder: Path) -> Path:
@@ -299,11 +405,18 @@ def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]
     return {"version": "4.0", "rt_params": rays, "scene": {"num_scenes": 1}, "materials": {}, "txrx_sets": sets}
 
 
-# Writers by the name of their format; each gives the file to open.
-FORMATS: dict[str, Callable[[Channel, Path], Path]] = {
-    "netcdf": _write_netcdf,
-    "npz": _write_npz,
-    "deepmimo": _write_deepmimo,
-    "mat": _write_mat,
-    "csv": _write_csv,
+def _each(write: Callable[[Channel, Path], Path]) -> Callable[[Path], Any]:
+    return lambda folder: nullcontext(lambda channel: write(channel, folder))
+
+
+# Writers by the name of their format, as a context of a folder; each gives the file to open.
+FORMATS: dict[str, Callable[[Path], AbstractContextManager[Callable[[Channel], Path]]]] = {
+    "netcdf": _netcdf,
+    "npz": _each(_write_npz),
+    "deepmimo": _each(_write_deepmimo),
+    "mat": _each(_write_mat),
+    "csv": _each(_write_csv),
 }
+
+# Those that take a channel part by part; the others are held in memory.
+STREAMED = {"netcdf", "csv"}

@@ -29,6 +29,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..common.errors import InputError, parsed, parsing
+from ..common.jsonable import named
 from ..common.outputs import OutputFile
 from ..common.sink import Sink
 from .records import ReadResult, RejectedLine, RejectedReason, Stream
@@ -141,19 +142,8 @@ def _refuse_changed(content: bytes, path: str | Path) -> None:
 
 def _write_file(group: Any, file: IngestedFile, sink: Sink) -> None:
     result = file.result
-    _write_json(
-        group,
-        "meta",
-        {
-            "path": file.path,
-            "sha256": file.sha256,
-            "reader": result.reader,
-            "lines": result.lines,
-            "accepted": result.accepted,
-            "blank": result.blank,
-            "warnings": list(result.warnings),
-        },
-    )
+    known = named(result, "reader lines accepted blank warnings")
+    _write_json(group, "meta", {"path": file.path, "sha256": file.sha256, **known})
     _write_json(group, "rejected", [[line.number, line.reason, line.text] for line in result.rejected])
     _write_json(group, "reasons", [[item.reason, item.count, item.first, item.last] for item in result.reasons])
     shelf = group.create_group("streams")

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..common.counting import counted
 from ..common.errors import InputError, UsageError, one_line, parsing
+from ..common.jsonable import named
 from .files import archives, chunks, packed
 from .files.pieces import join
 from .flight_file import IngestedFile, read_flight
@@ -499,9 +500,7 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
     entries = [
         {
             "path": file.path,
-            "reader": file.result.reader,
-            "lines": file.result.lines,
-            "accepted": file.result.accepted,
+            **named(file.result, "reader lines accepted"),
             "rejected": file.result.rejected_count,
             "first_rejected": [asdict(line) for line in file.result.rejected[:_FIRST_REJECTED]],
             "blank": file.result.blank,

@@ -203,38 +203,12 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
             path=path,
         )
     binary = b"\0" in head
-    cause = "another kind of file, or a damaged one" if binary else _way_out(head)
     raise InputError(
         "binary content that no reader knows" if binary else f"no reader knows this content: {_excerpt(head)}",
-        expected="one of the formats of 'aerpaw-cmp formats'" + ("" if binary or "--map" in cause else nearest(head)),
-        cause=cause,
+        expected="one of the formats of 'aerpaw-cmp formats'",
+        cause="another kind of file, or a damaged one" if binary else _way_out(head),
         path=path,
     )
-
-
-def nearest(head: bytes) -> str:
-    """The format whose sample line looks most like the first lines, in words; nothing where none is near.
-
-    Compared are shapes: digits become 0, letters a, so that what counts is how a line is built.
-    """
-    from difflib import SequenceMatcher
-
-    lines = [_shape(line.decode("utf-8", "replace")[:200]) for line in head[:4096].split(b"\n")[:6] if line.strip()]
-    best, name, sample = 0.6, "", ""
-    for reader in catalogue():
-        if not reader.kinds or not reader.sample or reader.sample.startswith("binary"):
-            continue
-        shape = _shape(reader.sample)
-        for line in lines:
-            pair = SequenceMatcher(None, line, shape, autojunk=False)
-            # the first two are upper bounds of the third, which takes most of a folder's time where tried on all
-            if pair.real_quick_ratio() > best and pair.quick_ratio() > best and (score := pair.ratio()) > best:
-                best, name, sample = score, reader.name, reader.sample
-    return f"; the nearest is {name!r}, with lines such as {sample!r}" if name else ""
-
-
-def _shape(text: str) -> str:
-    return re.sub(r"a+", "a", re.sub(r"[A-Za-z]", "a", re.sub(r"\d", "0", text)))
 
 
 def _way_out(head: bytes) -> str:

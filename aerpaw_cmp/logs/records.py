@@ -113,14 +113,14 @@ class RejectedReason:
 KEPT_REJECTED = 1000
 
 
-def _reasons_of(rejected: Iterable[RejectedLine]) -> tuple[RejectedReason, ...]:
-    """Rejected lines counted by reason, in the order of their first lines."""
-    by_reason: dict[str, RejectedReason] = {}
-    for line in rejected:
-        old = by_reason.get(line.reason, RejectedReason(line.reason, 0, line.number, line.number))
-        first, last = min(old.first, line.number), max(old.last, line.number)
-        by_reason[line.reason] = RejectedReason(line.reason, old.count + 1, first, last)
-    return tuple(sorted(by_reason.values(), key=lambda entry: entry.first))
+def by_reason(counted: Iterable[RejectedReason]) -> tuple[RejectedReason, ...]:
+    """Counts of one reason as one, in the order of their first lines."""
+    known: dict[str, RejectedReason] = {}
+    for item in counted:
+        old = known.get(item.reason, RejectedReason(item.reason, 0, item.first, item.last))
+        first, last = min(old.first, item.first), max(old.last, item.last)
+        known[item.reason] = RejectedReason(item.reason, old.count + item.count, first, last)
+    return tuple(sorted(known.values(), key=lambda entry: entry.first))
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +159,8 @@ class ReadResult:
 
     def __post_init__(self) -> None:
         if not self.reasons:
-            object.__setattr__(self, "reasons", _reasons_of(self.rejected))
+            reasons = by_reason(RejectedReason(line.reason, 1, line.number, line.number) for line in self.rejected)
+            object.__setattr__(self, "reasons", reasons)
         if len(self.rejected) > KEPT_REJECTED:
             object.__setattr__(self, "rejected", self.rejected[:KEPT_REJECTED])
         if self.lines != self.accepted + self.rejected_count + self.blank:

@@ -145,21 +145,16 @@ def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     values: dict[str, AnyArray] = {name: column[timed] for name, column in flight.position.columns.items()}
     lost = (np.abs(values["latitude_deg"]) < 1e-6) & (np.abs(values["longitude_deg"]) < 1e-6)
     rows.mark(lost, "no_fix")
-    for name in _PLACE:
+    for name in _pose.PLACE:
         values[name] = np.where(lost, np.nan, values[name])
     values["altitude_m"] = _height(rows, flight, time_s, values)
     heading = values.pop("yaw_deg", np.full(len(rows), np.nan))
-    for name in ("roll_deg", "pitch_deg", "yaw_deg"):
-        values[name] = flight.attitude.near(name, time_s)
+    values |= {name: flight.attitude.near(name, time_s) for name in _pose.ANGLES}
     values["yaw_deg"] = np.where(np.isnan(values["yaw_deg"]), heading, values["yaw_deg"])
-    for name in ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps"):
-        values[name] = flight.velocity.near(name, time_s)
+    values |= {name: flight.velocity.near(name, time_s) for name in _pose.VELOCITIES}
     for name in ("fix", "satellites"):
         values[name] = np.nan_to_num(flight.fix.near(name, time_s), nan=-1).clip(-1, 255).astype(np.int64)
     return rows.stream("telemetry", flight.name, values, source=flight.source, system=flight.system)
-
-
-_PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
 
 
 def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> FloatArray:
@@ -170,7 +165,7 @@ def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[s
         return altitude
     home = np.isfinite(flight.home.columns.get("altitude_m", flight.home.time_s))
     if not home.any():
-        rest = _pose.at_rest(rows.time[known], *(values[name][known] for name in _PLACE))
+        rest = _pose.at_rest(rows.time[known], *(values[name][known] for name in _pose.PLACE))
         return altitude - float(altitude[known[0]] if rest is None else rest)
     home_m = flight.home.columns["altitude_m"][home]
     return _pose.above_home(rows, time_s, altitude, flight.home.time_s[home], home_m)

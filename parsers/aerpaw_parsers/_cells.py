@@ -59,12 +59,13 @@ def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -
         what = dictionary.meaning(name)
         if what is not None and np.isfinite(value) and not name.startswith("csi"):  # SS-RSRP is the cell's level
             known.setdefault(what.quantity.name, value)
-    values = {field: known.get(name, np.nan) for field, name in _QUANTITIES.items()}
+    values = {field: known.get(name, np.nan) for field, name in QUANTITIES.items()}
     return Reading(row=row, rat=rat, serving=serving, **values)
 
 
-_QUANTITIES = {"pci": "PCI", "arfcn": "ARFCN", "rsrp_dbm": "RSRP", "rsrq_db": "RSRQ", "rssi_dbm": "RSSI",
-               "sinr_db": "SINR", "pathloss_db": "path loss"}  # fmt: skip
+# Quantities of the dictionary, by the fields of a reading.
+QUANTITIES = {"pci": "PCI", "arfcn": "ARFCN", "rsrp_dbm": "RSRP", "rsrq_db": "RSRQ", "rssi_dbm": "RSSI",
+              "sinr_db": "SINR", "pathloss_db": "path loss"}  # fmt: skip
 
 
 def streams(

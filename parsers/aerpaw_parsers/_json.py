@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from bisect import bisect_right
 from dataclasses import dataclass
 from typing import Any
 
@@ -54,7 +53,6 @@ def objects(lines: _lines.Lines) -> Objects:
     values: list[dict[str, Any]] = []
     rejected: list[RejectedLine] = []
     more: list[int] = []
-    ends: dict[bytes, list[int]] | None = None
     tried = 0
     for i in np.flatnonzero(~lines.blank).tolist():
         if more and i <= more[-1]:
@@ -64,13 +62,9 @@ def objects(lines: _lines.Lines) -> Objects:
             continue
         value, unclosed = _loaded(text)
         if unclosed and tried < _MOST_TRIED:
-            ends = _ends(lines) if ends is None else ends
-            last = _end_of(lines, i, ends)
-            if last >= 0:
-                several = _bare(lines.data[lines.starts[i] : lines.ends[last]])
-                value, _ = _loaded(several)
-                more += range(i + 1, last + 1) if isinstance(value, dict) else ()
-                tried += 0 if isinstance(value, dict) else len(several)
+            value, last = _several(lines, i)
+            more += range(i + 1, last + 1)
+            tried += 0 if value is not None else int(lines.ends[min(i + _MOST_LINES, len(lines) - 1)] - lines.starts[i])
         listed = value if isinstance(value, list) else [value]  # an array of all of them on a line
         if listed and all(isinstance(item, dict) for item in listed):
             rows += [i] * len(listed)
@@ -95,24 +89,16 @@ def _loaded(text: bytes) -> tuple[Any, bool]:
         return None, False
 
 
-def _indent(line: bytes) -> bytes:
-    return line[: len(line) - len(line.lstrip(b" \t"))]
-
-
-def _ends(lines: _lines.Lines) -> dict[bytes, list[int]]:
-    """Lines that close an object and nothing else, by their indentation."""
-    closing: dict[bytes, list[int]] = {}
-    for i in range(len(lines)):
-        if lines.ends[i] - lines.starts[i] < 200 and lines.raw(i).strip().rstrip(b",") == b"}":
-            closing.setdefault(_indent(lines.raw(i)), []).append(i)
-    return closing
-
-
-def _end_of(lines: _lines.Lines, first: int, ends: dict[bytes, list[int]]) -> int:
-    """The line that closes an object which begins on another; -1 where none does."""
-    same = ends.get(_indent(lines.raw(first).lstrip(b"\xef\xbb\xbf")), [])
-    place = bisect_right(same, first)
-    return same[place] if place < len(same) and same[place] - first <= _MOST_LINES else -1
+def _several(lines: _lines.Lines, first: int) -> tuple[Any, int]:
+    """Object that begins on one line and ends on a later one, and that line; None where there is none."""
+    end = lines.ends[min(first + _MOST_LINES, len(lines) - 1)]
+    text = _bare(lines.data[lines.starts[first] : end]).decode("utf-8", "replace")
+    try:
+        value, length = json.JSONDecoder().raw_decode(text)
+    except (ValueError, RecursionError):
+        return None, first
+    whole = not text[length:].split("\n", 1)[0].strip(" \t\r,]")
+    return (value, first + text.count("\n", 0, length)) if whole else (None, first)
 
 
 def first(head: bytes) -> dict[str, Any] | None:

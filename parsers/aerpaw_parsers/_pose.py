@@ -6,7 +6,6 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.records import Attribute, Stream
 from aerpaw_cmp.logs.text import rows as _rows
@@ -16,7 +15,7 @@ from . import _sheet
 
 PLACE = ("latitude_deg", "longitude_deg", "altitude_m")
 ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
-_VELOCITIES = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
+VELOCITIES = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
 # Attributes of a stream that say how its heights are known.
 Height = dict[str, Attribute | None]
 # No count is so large.
@@ -58,7 +57,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     elif sheet.find("altitude_m") is not None:
         rows.warnings.append("the column of heights holds no number: heights are unknown")
     values |= _attitude(rows, sheet)
-    for key in (*_VELOCITIES, "battery_v"):
+    for key in (*VELOCITIES, "battery_v"):
         if (column := sheet.find(key)) is not None:
             values[key] = sheet.numbers(column)
     for key in ("fix", "satellites"):
@@ -74,11 +73,7 @@ def refuse_whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> N
     known = [angle[np.isfinite(angle)] for angle in (values[key] for key in PLACE[:2])]
     coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
     if coarse[0] != coarse[1]:
-        raise InputError(
-            f"the rows do not fit the header: {names[coarse.index(True)]!r} has whole degrees alone",
-            expected="positions",
-            cause=_sheet.BESIDE,
-        )
+        raise _sheet.shifted(f"{names[coarse.index(True)]!r} has whole degrees alone", "positions")
 
 
 def _signed(sheet: _sheet.Sheet, column: int, letters: str) -> FloatArray:

@@ -20,7 +20,7 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs.limits import NEAR_DEG, SITES_DEG
+from aerpaw_cmp.logs.limits import NEAR_DEG
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
@@ -510,7 +510,8 @@ def rows(
         Of the times; by default the one that the dictionary finds.
     """
     known = {i: m.quantity for i, m in enumerate(sheet.meanings) if m is not None and not m.indirect}
-    refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in known.items() if q.bounded])
+    _refuse_positions_beside(sheet)
+    _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in known.items() if q.bounded])
     mapped = column is not None
     column = _time_column(sheet) if column is None else column
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
@@ -598,7 +599,7 @@ def _counts(sheet: Sheet, column: int) -> bool:
     return bool(np.isfinite(values).any() and np.nanmedian(np.abs(values)) < 0.9e9)
 
 
-def refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
+def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
     """Refuse a table whose rows are shifted against its header, by what the dictionary knows of its columns.
 
     Raises
@@ -606,7 +607,6 @@ def refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]
     InputError
         If some rows have several values that their columns cannot have, or the identities of cells are fractions.
     """
-    _refuse_site_elsewhere(columns)
     wrong = [
         (name, values, dictionary.impossible(quantity, values))
         for name, quantity, values in columns if quantity.role != "height"
@@ -624,39 +624,32 @@ def refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]
         return
     row = int(np.argmax(alone[0] if alone else count > 1))
     shown = "; ".join(f"{name!r} is {values[row]:g}" for name, values, mask in wrong if mask[row])
-    raise InputError(
-        f"the rows do not fit the header: {shown}", expected="values that their columns can have", cause=BESIDE
-    )
+    raise shifted(shown, "values that their columns can have")
 
 
-def _refuse_site_elsewhere(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray]]) -> None:
-    """Refuse a table whose positions, at a site of AERPAW, stand beside the columns of that name.
-
-    Angles that are exchanged lie in their columns: the limits of all readers say so.
-    """
-    if not {"latitude_deg", "longitude_deg"} <= {quantity.name for _, quantity, _ in columns}:
+def _refuse_positions_beside(sheet: Sheet) -> None:
+    """Refuse a table with columns that look like positions and are none, where one that is called so does not."""
+    names = {i: what.quantity.name for i, what in enumerate(sheet.meanings) if what is not None and not what.indirect}
+    place = [i for i, name in names.items() if name in ("latitude_deg", "longitude_deg")]
+    astray = [i for i in place if np.isfinite(sheet.numbers(i)).sum() > 2 and not _is_angle(sheet.numbers(i))]
+    if not astray or len(place) < 2:
         return
-    middle = [
-        (name, quantity.name, float(np.nanmedian(values)))
-        for name, quantity, values in columns if _is_angle(values)
-    ]  # fmt: skip
-    for place in SITES_DEG:
-        north, east = ([item for item in middle if abs(item[2] - angle) < NEAR_DEG] for angle in place)
-        if not north or not east or {"latitude_deg", "longitude_deg"} <= {what for _, what, _ in (*north, *east)}:
-            continue
-        latitude, longitude = north[0][0], east[0][0]
-        raise InputError(
-            f"the rows do not fit the header: latitudes of a site of AERPAW stand in {latitude!r}, longitudes in "
-            f"{longitude!r}",
-            expected="values beside their names",
-            cause=BESIDE,
-        )
+    texts = {i: sheet.texts(i) for i in range(len(sheet.names)) if i not in place}
+    others = [i for i, cells in texts.items() if _is_angle(np.array([_number(cell)[0] for cell in cells]))]
+    if len(others) >= len(astray):
+        beside, empty = sheet.names[others[0]], sheet.names[astray[0]]
+        raise shifted(f"{beside!r} holds values as positions have, {empty!r} does not", "values beside their names")
 
 
 def _is_angle(values: FloatArray) -> bool:
     """Check whether numbers are written as positions of one flight: of four decimals and more, and near each other."""
     known = values[np.isfinite(values)]
     return bool(len(known) and np.ptp(known) < NEAR_DEG and (np.abs(known * 1e3 % 1 - 0.5) < 0.499999).mean() > 0.5)
+
+
+def shifted(found: str, expected: str) -> InputError:
+    """Error of a table whose values stand beside their names."""
+    return InputError(f"the rows do not fit the header: {found}", expected=expected, cause=BESIDE)
 
 
 BESIDE = "a column is missing in the header or in the rows, and all values stand beside their names"

@@ -23,7 +23,6 @@ from aerpaw_cmp.readers import dictionary
 
 from . import _cells, _nemo, _pose, _sheet, aadm_snr, pose_csv, quectel_ri
 
-_QUALITIES = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss": "pathloss_db"}
 _TOWER_SNR = re.compile(r"snr (lw\d)")
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
 _NO, _YES = ("false", "0", "no"), ("true", "1", "yes")
@@ -46,16 +45,19 @@ class _Cell:
 
     rat: str
     place: str
-    rsrp: int | None = None
-    pci: int | None = None
-    arfcn: int | None = None
-    qualities: dict[str, int] = field(default_factory=dict)
+    columns: dict[str, int] = field(default_factory=dict)  # by the fields of a reading
 
     @property
     def serving(self) -> bool:
         return self.place.startswith(("serving", "scell", *_OWNERS))
 
+    @property
+    def measured(self) -> list[int]:
+        """Columns that are no identity."""
+        return [column for name, column in self.columns.items() if name not in _IDENTITY]
 
+
+_IDENTITY = ("pci", "arfcn")
 # Places that are devices or SIMs: cells of each are series of their own.
 _OWNERS = ("sim", "slot", "dev", "modem", "phone", "ue")
 
@@ -67,38 +69,27 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
     for i, meaning in enumerate(sheet.meanings):
         if meaning is None or meaning.quantity.role not in ("rss", "rank", "kpi", "cell"):
             continue
-        name = meaning.quantity.name
-        if meaning.indirect or (meaning.quantity.role in ("rss", "kpi") and name not in ("RSRP", *_QUALITIES)):
+        name, role = _FIELDS.get(meaning.quantity.name), meaning.quantity.role
+        if meaning.indirect or (name is None and role in ("rss", "kpi")):
             others.append(i)
-        elif meaning.quantity.role == "rank":
+        elif role == "rank":
             ranks.append(i)
-        elif meaning.quantity.role != "cell" or name in ("PCI", "ARFCN"):
+        elif name is not None:
             place = (meaning.rat, meaning.place)
-            _put(cells.setdefault(place, _Cell(*place)), i, name, others)
+            columns = cells.setdefault(place, _Cell(*place)).columns
+            others += [i] if name in columns and name not in _IDENTITY else []  # a second one is kept as a KPI
+            columns.setdefault(name, i)
     if sheet.find("neighbouring") is not None and (common := cells.get(("", "serving"))) is not None:
+        of_row = {name: column for name, column in common.columns.items() if name in _IDENTITY}
         for cell in cells.values():  # a cell a row: the identity is that of whichever level the row has
-            cell.pci, cell.arfcn = (
-                own if own is not None else of_row
-                for own, of_row in ((cell.pci, common.pci), (cell.arfcn, common.arfcn))
-            )
+            cell.columns = {**of_row, **cell.columns}
     placed = _completed(cells, others)
     if len(placed) == 1:
         placed[0].place = "serving"  # 'rsrp1' alone
     return placed, others, ranks
 
 
-def _put(cell: _Cell, i: int, quantity: str, others: list[int]) -> None:
-    """Column ``i`` to its place; a second column of one quantity is kept as a KPI."""
-    name = _QUALITIES.get(quantity, "")
-    if quantity in ("PCI", "ARFCN"):
-        part = quantity.lower()
-        setattr(cell, part, i if getattr(cell, part) is None else getattr(cell, part))
-    elif quantity == "RSRP" and cell.rsrp is None:
-        cell.rsrp = i
-    elif name and name not in cell.qualities:
-        cell.qualities[name] = i
-    else:
-        others.append(i)
+_FIELDS = {quantity: name for name, quantity in _cells.QUANTITIES.items()}
 
 
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
@@ -108,31 +99,27 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
     that no column names by a PCI are no levels of a cell: they become KPIs.
     """
     for (rat, role), cell in list(cells.items()):
-        if cell.rsrp is not None:
+        if "rsrp_dbm" in cell.columns:
             continue
-        same = [
-            partner for (access, place), partner in cells.items() if place == role and (not rat or access in ("", rat))
-        ]
-        homes = [partner for partner in same if partner.rsrp is not None]
-        if cell.pci is not None and role == "serving" and not homes:  # a PCI beside 'rsrp1' or 'RSRP[0]' alone
-            homes = [
-                home for home in cells.values()
-                if home.rsrp is not None and not home.place.startswith("n") and (not rat or home.rat in ("", rat))
-            ]  # fmt: skip
+        levels = {key: home for key, home in cells.items() if "rsrp_dbm" in home.columns}
+        homes = [home for key, home in levels.items() if key[1] == role and (not rat or key[0] in ("", rat))]
+        if "pci" in cell.columns and role == "serving" and not homes:  # a PCI beside 'rsrp1' or 'RSRP[0]' alone
+            near = [home for home in levels.values() if not home.place.startswith("n")]
+            homes = [home for home in near if not rat or home.rat in ("", rat)]
         if len(homes) == 1:
-            home = homes[0]
+            (home,) = homes
             home.rat = home.rat or rat
-            home.pci = cell.pci if home.pci is None else home.pci
-            home.arfcn = cell.arfcn if home.arfcn is None else home.arfcn
-            others += [column for key, column in cell.qualities.items() if key in home.qualities]
-            home.qualities = {**cell.qualities, **home.qualities}
+            twice = [name for name in cell.columns if name in home.columns and name not in _IDENTITY]
+            others += [cell.columns[name] for name in twice]
+            home.columns = {**cell.columns, **home.columns}
             del cells[(rat, role)]
     named = {cell.rat for cell in cells.values()} - {""}
     for key, cell in list(cells.items()):
         if len(named) == 1 and not cell.serving:
             cell.rat = cell.rat or next(iter(named))
-        if cell.rsrp is None or (cell.pci is None and cell.place != "serving" and len(cells) > 1):
-            others += [column for column in (cell.rsrp, *cell.qualities.values()) if column is not None]
+        nameless = "pci" not in cell.columns and cell.place != "serving" and len(cells) > 1
+        if "rsrp_dbm" not in cell.columns or nameless:
+            others += cell.measured
             del cells[key]
     return list(cells.values())
 
@@ -142,15 +129,9 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> pd.DataFrame:
     of_row = np.array([] if technology is None else [_rat(text) for text in sheet.texts(technology)], dtype=object)
     idle, tables = _idle(sheet), []
     for cell in cells:
-        assert cell.rsrp is not None
-        level = sheet.numbers(cell.rsrp)
-        columns = {
-            "pci": cell.pci,
-            "arfcn": cell.arfcn,
-            **{name: cell.qualities.get(name) for name in _cells.QUALITIES},
-        }
-        values = {name: _or_nan(sheet, column, len(level)) for name, column in columns.items()}
-        none = _is_none(sheet, cell.rsrp) & ~(values["pci"] > 0) if cell.rat == "nr" or not cell.serving else False
+        level = sheet.numbers(cell.columns["rsrp_dbm"])
+        values = {name: _or_nan(sheet, cell.columns.get(name), len(level)) for name in _FIELDS.values()}
+        none = np.isnan(values["rsrp_dbm"]) & ~(values["pci"] > 0) if cell.rat == "nr" or not cell.serving else False
         pci = np.where(values["pci"] == np.round(values["pci"]), values["pci"], np.nan)  # a fraction is no identity
         rat = of_row if technology is not None and not cell.rat else cell.rat
         about = {"row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle}
@@ -178,13 +159,9 @@ def _rat(technology: str) -> str:
 def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:
     if column is None:
         return np.full(count, np.nan)
-    return np.where(_is_none(sheet, column), np.nan, sheet.numbers(column))
-
-
-def _is_none(sheet: _sheet.Sheet, column: int) -> BoolArray:
-    meaning = sheet.meanings[column]
+    meaning, values = sheet.meanings[column], sheet.numbers(column)
     assert meaning is not None
-    return dictionary.is_none(meaning.quantity, sheet.numbers(column))
+    return np.where(dictionary.is_none(meaning.quantity, values), np.nan, values)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -237,9 +214,9 @@ def _event_columns(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
     """Columns beside a serving level with values in rows of their own, which become streams: Nemo's rows are events."""
     columns = []
     for cell in cells:
-        if cell.rsrp is not None and cell.serving:
-            silent = np.isnan(sheet.numbers(cell.rsrp))
-            columns += [i for i in cell.qualities.values() if np.isfinite(sheet.numbers(i)[silent]).any()]
+        if cell.serving:
+            silent = np.isnan(sheet.numbers(cell.columns["rsrp_dbm"]))
+            columns += [i for i in cell.measured if np.isfinite(sheet.numbers(i)[silent]).any()]
     return columns
 
 
@@ -285,7 +262,5 @@ READER = Reader(
     name="drive_test",
     title="drive-test export, CSV (Nemo, XCAL, TEMS, QualiPoc, G-NetTrack): cells by PCI, rank, KPIs, positions",
     kinds=("rss", "rank", "kpi", "telemetry"),
-    sample="Time,Latitude,Longitude,Physical cell identity (LTE pcell),RSRP (LTE pcell)",
-    sniff=sniff,
-    read=read,
-)
+    sample="Time,Latitude,Longitude,Physical cell identity (LTE pcell),RSRP (LTE pcell)", sniff=sniff, read=read,
+)  # fmt: skip

@@ -204,7 +204,5 @@ READER = Reader(
     name="flight_mat",
     title="merged MATLAB flight (Dataset 12, AFAR, LTE at 3.51 GHz, and what their authors made of them)",
     kinds=("telemetry", "rss", "kpi"),
-    sample="mX mY mZ mRoll mPitch mYaw mpower1 mpower2 timestamp_power timestamp_power_for_csv",
-    sniff=sniff,
-    read=read,
-)
+    sample="mX mY mZ mRoll mPitch mYaw mpower1 mpower2 timestamp_power timestamp_power_for_csv", sniff=sniff, read=read,
+)  # fmt: skip

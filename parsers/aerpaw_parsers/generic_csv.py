@@ -1,8 +1,8 @@
 """Any CSV with a header, its columns mapped by the user: ``columns: {time: Time, rss_db: Power}``, ``kind: rss``.
 
-It is never guessed: flight.yaml names it. Times are texts (``YYYY-mm-dd HH:MM:SS[.f][offset]``, or as tables of other
-programs have them: ``15.07.2024 11:49:27,231``) or numbers: seconds since ``time_origin`` where that is given, else
-since 1970 in UTC (``clock: local_as_utc`` for wall time stored so).
+A CSV says nothing about its units: it is never guessed, flight.yaml names it. Times are texts (``YYYY-mm-dd
+HH:MM:SS[.f][offset]``, or as tables of other programs have them: ``15.07.2024 11:49:27,231``) or numbers: seconds since
+``time_origin`` where that is given, else since 1970 in UTC (``clock: local_as_utc`` for wall time stored so).
 """
 
 from __future__ import annotations
@@ -35,11 +35,6 @@ _QUANTITIES = {row.name: row for row in dictionary.QUANTITIES if row.role in ("p
 _NO_POSE = ("time", "fix", "satellites")
 # Keys that divide a mapped table, besides devices: each part is a series.
 _KEYS = ("network", "PCI", "ARFCN")
-
-
-def sniff(head: bytes) -> bool:  # noqa: ARG001 - the contract of sniffers
-    """Never: a CSV says nothing about its units; name this reader in flight.yaml."""
-    return False
 
 
 def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, int]]:
@@ -240,5 +235,5 @@ def _track(rows: _rows.Rows, sheet: _sheet.Sheet, where: dict[str, int], device:
 
 READER = Reader(
     name="generic_csv", title="any CSV with a header, columns mapped in flight.yaml",
-    kinds=("telemetry", "rss", "rank"), sample="Time,Power,...", sniff=sniff, read=read,
+    kinds=("telemetry", "rss", "rank"), sample="Time,Power,...", sniff=lambda _head: False, read=read,
 )  # fmt: skip

@@ -64,10 +64,8 @@ def _reading(text: bytes) -> dict[str, str]:
 
 
 READER = Reader(
-    name="gnettrack_kml",
-    title="G-NetTrack KML: cells by PCI, KPIs, positions",
+    name="gnettrack_kml", title="G-NetTrack KML: cells by PCI, KPIs, positions",
     kinds=("rss", "rank", "kpi", "telemetry"),
     sample='<Data name="TIME"><value>2025.03.02_10.00.00</value></Data><Data name="RSRP"><value>-81</value></Data>',
-    sniff=sniff,
-    read=read,
-)
+    sniff=sniff, read=read,
+)  # fmt: skip

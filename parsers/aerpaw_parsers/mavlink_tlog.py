@@ -21,10 +21,8 @@ _POSITION, _ATTITUDE, _GPS = 33, 30, 24
 # MAVLink's CRC_EXTRA: a hash of the fields, so that a message of another layout fails the checksum.
 _EXTRA = {_POSITION: 104, _ATTITUDE: 39, _GPS: 24}
 _LAYOUT = {
-    _POSITION: struct.Struct("<IiiiihhhH"),
-    _ATTITUDE: struct.Struct("<Iffffff"),
-    _GPS: struct.Struct("<QiiiHHHHBB"),
-}
+    _POSITION: struct.Struct("<IiiiihhhH"), _ATTITUDE: struct.Struct("<Iffffff"), _GPS: struct.Struct("<QiiiHHHHBB"),
+}  # fmt: skip
 # Names of the fields, as MAVLink's description of common messages has them.
 _FIELDS = {
     _POSITION: ["time_boot_ms", "lat", "lon", "alt", "relative_alt", "vx", "vy", "vz", "hdg"],

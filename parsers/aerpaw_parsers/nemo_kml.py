@@ -71,7 +71,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         rows.height_from, lost = "assumed", np.isnan(position["latitude_deg"])
         position["altitude_m"], about = _pose.above_takeoff(rows, position, "unknown", lost)
     what = np.array(rows.text("what"), dtype=object)
-    if _is_rank(what[0]) if len(what) else False:
+    first = dictionary.meaning(what[0]) if len(what) else None
+    if first is not None and first.quantity.role == "rank":
         return rows.result([pdsch_rank(rows, {"ri_raw": rows.number("value"), **position})])
     streams = [rows.stream("telemetry", "phone", position, source="Nemo placemarks", about=about)]
     streams += [_measured(rows, name, what == name) for name in dict.fromkeys(what.tolist())]
@@ -90,11 +91,6 @@ def _in_seconds(time_ms: FloatArray, latitude: FloatArray, longitude: FloatArray
 
 
 _FEW = 4
-
-
-def _is_rank(name: str) -> bool:
-    meaning = dictionary.meaning(name)
-    return meaning is not None and meaning.quantity.role == "rank"
 
 
 # Of the cell that Nemo's CSV calls ``nr``: there RSRP is ``nr_rsrp``.

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from aerpaw_cmp.logs.text import lines as _lines
@@ -91,30 +92,23 @@ def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result(_cells.streams(rows, readings, source="PawPrints"))
 
 
-_GPS_TEXT = re.compile(
-    rb"^GPS_LOG_START,(?:(\d{13}),)?([\d.]{1,20}),-?[\d.]{1,20},(-?[\d.]{1,20}),(-?[\d.]{1,20}),(-?[\d.]{1,20}),"
-    rb"[^\n]{0,80}?GPS_LOG_STOP[ \t]*\r?$",
-    re.MULTILINE,
+_GPS_TEXT = (
+    rb"^GPS_LOG_START,%s,-?[\d.]{1,20},(?P<latitude>-?[\d.]{1,20}),(?P<longitude>-?[\d.]{1,20}),"
+    rb"(?P<altitude>-?[\d.]{1,20}),[^\n]{0,80}?GPS_LOG_STOP[ \t]*\r?$"
 )
+_GPS_EPOCH = re.compile(_GPS_TEXT % rb"(?P<time>\d{13}),[\d.]{1,20}", re.MULTILINE)
+_GPS_SECONDS = re.compile(_GPS_TEXT % rb"(?:\d{13},)?(?P<time>[\d.]{1,20})", re.MULTILINE)
 
 
 def _read_location(data: bytes, options: ReadOptions) -> ReadResult:
     """Positions of the text of 2023: seconds since the start, or milliseconds of UTC, and the place."""
-    lines = _lines.split(data)
-    row, groups = _lines.match(lines, _GPS_TEXT)
-    epoch, *column = _lines.columns(groups, 5)
-    dated = bool(len(row)) and bool((epoch != b"").all())
-    names = ("time", "latitude", "longitude", "altitude")
-    texts = dict(zip(names, [epoch if dated else column[0], *column[1:]], strict=True))
-    rows = _rows.built(
-        lines, row, texts, options, reader="pawprints",
+    dated = len(_GPS_EPOCH.findall(data)) == len(_GPS_SECONDS.findall(data))
+    rows = _rows.matched(
+        data, _GPS_EPOCH if dated else _GPS_SECONDS, options, reader="pawprints",
         reason=lambda _line: "not a whole 'GPS_LOG_START ... GPS_LOG_STOP' (torn line?)",
         clock="epoch_ms" if dated else "relative_s",
     )  # fmt: skip
-    places = [
-        {key: float(rows.columns[key][i]) for key in ("latitude", "longitude", "altitude")} for i in range(len(rows))
-    ]
-    return rows.result([_track(rows, places)])
+    return rows.result([_placed(rows, *(rows.number(name) for name in ("latitude", "longitude", "altitude")))])
 
 
 def _nr(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
@@ -135,14 +129,16 @@ def _nr(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
 def _track(rows: _rows.Rows, entries: list[dict[str, Any]]) -> Stream | None:
     """Positions, in the object itself or in its ``location``."""
     places = [{**_json.inside(item, "gps"), **_json.inside(item, "location"), **item} for item in entries]
-    values = {
-        "latitude_deg": _json.column(places, "latitude", "lat"),
-        "longitude_deg": _json.column(places, "longitude", "lon", "lng"),
-    }
-    if not np.isfinite(values["latitude_deg"]).any():
+    names = (("latitude", "lat"), ("longitude", "lon", "lng"), ("altitude", "alt"))
+    return _placed(rows, *(_json.column(places, *keys) for keys in names))
+
+
+def _placed(rows: _rows.Rows, latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> Stream | None:
+    if not np.isfinite(latitude).any():
         return None
+    values: dict[str, AnyArray] = {"latitude_deg": latitude, "longitude_deg": longitude}
     lost = _pose.clean(rows, values)
-    values["altitude_m"], rows.height_from = _json.column(places, "altitude", "alt"), "program"
+    values["altitude_m"], rows.height_from = altitude, "program"
     values["altitude_m"], about = _pose.above_takeoff(rows, values, "ellipsoid", lost)
     return rows.stream("telemetry", "phone", values, where=~lost, source="PawPrints location", about=about)
 
@@ -170,10 +166,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 READER = Reader(
-    name="pawprints",
-    title="PawPrints (AERPAW's Android logger), JSON lines: LTE and NR cells",
+    name="pawprints", title="PawPrints (AERPAW's Android logger), JSON lines: LTE and NR cells",
     kinds=("rss", "telemetry"),
     sample='{"abs_time": 1740927600000, "connected_pci": 2, "cells": [{"technology": "4G_LTE", "rsrp": -6, "pci": 2}]}',
-    sniff=sniff,
-    read=read,
-)
+    sniff=sniff, read=read,
+)  # fmt: skip

@@ -37,11 +37,6 @@ _FIELD = re.compile(r"(\w+)(?:\[(\d{1,4})\])? (\w+)")
 _KINDS = frozenset(b"BFIMPQADLCSORT")
 
 
-def sniff(head: bytes) -> bool:
-    """Check whether it begins with ULog's mark."""
-    return head.startswith(_MAGIC)
-
-
 def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
     """Layout of a topic; None where it nests another, which none of the wanted ones does."""
     fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
@@ -190,6 +185,6 @@ def _angles(table: AnyArray) -> dict[str, FloatArray | None]:
 
 
 READER = Reader(
-    name="px4_ulog", title="PX4 log (.ulg)", kinds=("telemetry",),
-    sample="binary: vehicle_global_position, vehicle_attitude, vehicle_local_position", sniff=sniff, read=read,
+    name="px4_ulog", title="PX4 log (.ulg)", kinds=("telemetry",), sniff=lambda head: head.startswith(_MAGIC),
+    sample="binary: vehicle_global_position, vehicle_attitude, vehicle_local_position", read=read,
 )  # fmt: skip

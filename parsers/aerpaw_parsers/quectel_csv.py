@@ -214,10 +214,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 READER = Reader(
-    name="quectel_csv",
-    title="AERPAW Quectel logger CSVs, AT consoles with stamps: rank indicator, serving cell",
+    name="quectel_csv", title="AERPAW Quectel logger CSVs, AT consoles with stamps: rank indicator, serving cell",
     kinds=("rank", "rss"),
-    sample='2025-01-01 12:00:07.250,"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",24,2,12,5',
-    sniff=sniff,
+    sample='2025-01-01 12:00:07.250,"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",24,2,12,5', sniff=sniff,
     read=read,
-)
+)  # fmt: skip

@@ -243,7 +243,5 @@ READER = Reader(
     title="SigMF meta file: levels and positions (dataset 12, sounder), or power of the samples beside it",
     kinds=("rss", "telemetry"),
     sample='{"global": {"core:datatype": "cf32_le"}, "captures": [{"measurement:values": {"mX": [], "RSS1": []}}]}',
-    sniff=sniff,
-    read=read,
-    pieces=True,
-)
+    sniff=sniff, read=read, pieces=True,
+)  # fmt: skip

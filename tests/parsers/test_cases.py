@@ -458,7 +458,11 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
         table("", '[2025-06-10 10:00:0{i}] #RFSTS: "310 26",1795,-101,-67,-15,2242'), InputError, "AT answers of a modem"),
     "NMEA through ts": (table("", "[2025-06-10 10:00:0{i}] $GNGGA,140000.00,3543.68,N,07841.76,W,1"), InputError, "NMEA"),
     "an index in front of AERPAW's positions": (
-        table("time,lat,lon,alt,rsrp", EPOCH + f",1.{{i}},{PLACE},{{l}}"), InputError, "latitudes of a site of AERPAW stand in 'lon'"),
+        table("time,lat,lon,alt,rsrp", EPOCH + f",1.{{i}},{PLACE},{{l}}"), InputError, "holds values as positions have"),
+    "an index in front of positions elsewhere": (
+        table("time,lat,lon,alt,rsrp", EPOCH + ",1.{i},48.13712{i},11.57541{i},{l}"), InputError, "'alt' holds values as"),
+    "a level without its PCI, elsewhere": (
+        table("time,pci,rsrp,lat,lon,alt", EPOCH + ",{l},48.13712{i},11.57541{i},520.3,3"), InputError, SHIFTED),
     "a web page": ("<!DOCTYPE html><html><body>Log in</body></html>\n", InputError, "a web page"),
     "a table of nobody": (
         table("index,when_utc,Breite,rx_power_dbm,temperature", "{i},2025-06-10 10:00:0{i},35,{l},20"), InputError,

@@ -97,7 +97,11 @@ def _zip(data: bytes, path: str | Path) -> Iterator[Member]:
         if not entry.is_dir() and not _hidden(entry.filename):
             size = entry.file_size
             lies = size > MOST_BYTES or size > _RATIO * entry.compress_size + _MARGIN
-            read = partial(_too_large, size, path) if lies else partial(_unzipped, book, entry, path)
+            read = (
+                partial(_refused, f"the member unpacks to {size} bytes", f"at most {MOST_BYTES}", path)
+                if lies
+                else partial(_unzipped, book, entry, path)
+            )
             yield _member(entry.filename, 0 if lies else size, path, read)
 
 
@@ -128,16 +132,12 @@ def _untarred(book: tarfile.TarFile, entry: tarfile.TarInfo, most: int | None) -
 def _member(name: str, size: int, path: str | Path, read: Callable[[int | None], bytes]) -> Member:
     """A member under a relative name: what a flight.yaml names by it lies in the archive and nowhere else."""
     if ".." in name.split("/"):
-        return Member(name, 0, partial(_leads_out, path))
+        return Member(name, 0, partial(_refused, "the member's name leads out of the archive", "a name below it", path))
     return Member(name.lstrip("/"), size, read)
 
 
-def _too_large(size: int, path: str | Path, _most: int | None) -> bytes:
-    raise InputError(f"the member unpacks to {size} bytes", expected=f"at most {MOST_BYTES}", cause="no log", path=path)
-
-
-def _leads_out(path: str | Path, _most: int | None) -> bytes:
-    raise InputError("the member's name leads out of the archive", expected="a name below it", path=path)
+def _refused(found: str, expected: str, path: str | Path, _most: int | None) -> bytes:
+    raise InputError(found, expected=expected, path=path)
 
 
 def most_bytes(size: int) -> int:

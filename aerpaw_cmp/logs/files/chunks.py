@@ -21,7 +21,7 @@ PIECE_BYTES = 4 << 20
 
 def file_pieces(place: Path, digest: Any) -> Iterator[bytes]:
     """Content of a log, unpacked, some MiB of whole lines at a time; ``digest`` takes that content."""
-    chunks = _chunks(place)
+    chunks = packed.chunks(place, PIECE_BYTES)
     first = next(chunks, b"")
     content = chain((first,), chunks)
     yield from whole_lines(_counted(content if packed.form(first) is None else packed.pieces(content, place), digest))
@@ -48,12 +48,6 @@ def whole_lines(chunks: Iterable[bytes]) -> Iterator[bytes]:
     if pending:
         piece = b"".join(pending)
         yield piece if started else piece.removeprefix(b"\xef\xbb\xbf")
-
-
-def _chunks(place: Path) -> Iterator[bytes]:
-    with place.open("rb") as file:
-        while chunk := file.read(PIECE_BYTES):
-            yield chunk
 
 
 def _counted(chunks: Iterable[bytes], digest: Any) -> Iterator[bytes]:

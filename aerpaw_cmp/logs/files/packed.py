@@ -71,12 +71,12 @@ def _machine(name: str, path: str | Path) -> Callable[[], Any]:
         ) from error
 
 
-def pieces(chunks: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
+def pieces(content: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
     """Content of a packed file, some MiB at a time.
 
     Parameters
     ----------
-    chunks : iterable of bytes
+    content : iterable of bytes
         Of the file; the first one shows its form.
     path : str or Path
         What messages name.
@@ -86,15 +86,15 @@ def pieces(chunks: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
     InputError
         If it is damaged or cut, or unpacks to more than a log can.
     """
-    chunks = iter(chunks)
-    unread = next(chunks, b"")
+    content = iter(content)
+    unread = next(content, b"")
     name = form(unread) or "bzip2"
     make, machine = _machine(name, path), None
     bytes_in, bytes_out = len(unread), 0
     while True:
         unread = unread if machine is not None else unread.lstrip(b"\0")  # padding between streams
         if not unread and (machine is None or machine.needs_input):
-            unread = next(chunks, b"")
+            unread = next(content, b"")
             bytes_in += len(unread)
             if not unread:
                 break
@@ -133,7 +133,7 @@ def head_of(place: Path, count: int) -> bytes:
     """The first bytes of what a packed file holds, none where it is damaged: reading it says so."""
     head = b""
     try:
-        for piece in pieces(_chunks(place), place):
+        for piece in pieces(chunks(place, _PIECE), place):
             head += piece
             if len(head) >= count:
                 break
@@ -142,7 +142,8 @@ def head_of(place: Path, count: int) -> bytes:
     return head[:count]
 
 
-def _chunks(place: Path) -> Iterator[bytes]:
+def chunks(place: Path, size: int) -> Iterator[bytes]:
+    """Content of a file, so many bytes at a time."""
     with place.open("rb") as file:
-        while chunk := file.read(_PIECE):
+        while chunk := file.read(size):
             yield chunk

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ..flight_file import IngestedFile
 from ..readers import catalogue
-from ..records import ReadResult, RejectedLine, RejectedReason, Stream
+from ..records import ReadResult, RejectedLine, RejectedReason, Stream, by_reason
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -42,22 +42,20 @@ def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
     before = 0
     parts: dict[tuple[str, str], list[tuple[Stream, pd.DataFrame]]] = {}
     rejected: list[RejectedLine] = []
-    reasons: dict[str, RejectedReason] = {}
+    reasons: list[RejectedReason] = []
     for file in group:
         for stream in file.result.streams:
             frame = stream.frame.assign(line=stream.frame["line"] + before)
             parts.setdefault((stream.kind, stream.name), []).append((stream, frame))
         rejected += [RejectedLine(line.number + before, line.reason, line.text) for line in file.result.rejected]
-        for item in file.result.reasons:
-            old = reasons.get(item.reason, replace(item, count=0, first=item.first + before))
-            reasons[item.reason] = replace(old, count=old.count + item.count, last=item.last + before)
+        reasons += [replace(item, first=item.first + before, last=item.last + before) for item in file.result.reasons]
         before += file.result.lines
     streams = tuple(_stream(part) for part in parts.values())
     warnings = dict.fromkeys(text for file in group for text in file.result.warnings)
     result = ReadResult(
         reader=group[0].result.reader, streams=streams, lines=before,
         accepted=sum(file.result.accepted for file in group), blank=sum(file.result.blank for file in group),
-        rejected=tuple(rejected), reasons=tuple(reasons.values()),
+        rejected=tuple(rejected), reasons=by_reason(reasons),
         warnings=(f"{len(group)} files of this folder were joined", *warnings),
     )  # fmt: skip
     return IngestedFile(folder, digest, result)

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 
 from ...common.units import AnyArray, BoolArray, IntArray
-from ..records import KEPT_REJECTED, RejectedLine, RejectedReason
+from ..records import KEPT_REJECTED, RejectedLine, RejectedReason, by_reason
 
 # Characters of a rejected line that are kept.
 TEXT_LIMIT = 500
@@ -101,16 +101,11 @@ class Lines:
 _SLICE = 1 << 17
 
 
-def places(buffer: AnyArray, byte: int, alternative: int | None = None) -> IntArray:
-    """Places where one of two bytes stands, shape (n,)."""
-    parts = []
-    for first in range(0, len(buffer), _SLICE):
-        piece = buffer[first : first + _SLICE]
-        mask = piece == byte
-        if alternative is not None:
-            mask |= piece == alternative
-        parts.append(np.flatnonzero(mask) + first)
-    return np.concatenate(parts).astype(np.int64, copy=False) if parts else np.zeros(0, dtype=np.int64)
+def _places(buffer: AnyArray, byte: int) -> IntArray:
+    """Places where a byte stands, shape (n,)."""
+    starts = range(0, len(buffer), _SLICE)
+    parts = [np.flatnonzero(buffer[first : first + _SLICE] == byte) + first for first in starts]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
 
 def split(data: bytes) -> Lines:
@@ -122,7 +117,7 @@ def split(data: bytes) -> Lines:
     [b'a', b'', b'b']
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
-    ends = places(buffer, 10)
+    ends = _places(buffer, 10)
     starts = np.empty(len(ends) + 1, dtype=np.int64)
     starts[0] = 0
     np.add(ends, 1, out=starts[1:])
@@ -165,34 +160,29 @@ class Rejects:
     def __init__(self) -> None:
         self.before = 0  # lines of the pieces in front of this one
         self._first_lines: list[RejectedLine] = []
-        self._reasons: dict[str, RejectedReason] = {}
+        self._reasons: list[RejectedReason] = []
 
     def add(self, lines: Lines, numbers: Sequence[int] | IntArray, reason: str) -> None:
         """Lines (0-based) of a piece, for one reason; of each reason and piece the first are kept."""
         if not len(numbers):
             return
         low, high = int(min(numbers)) + self.before + 1, int(max(numbers)) + self.before + 1
-        self._count(reason, len(numbers), low, high)
-        if (
-            len(self._first_lines) < 4 * KEPT_REJECTED
-        ):  # more come in the order of the file, but for the reasons of a piece
+        self._reasons.append(RejectedReason(reason, len(numbers), low, high))
+        # more come in the order of the file, but for the reasons of a piece
+        if len(self._first_lines) < 4 * KEPT_REJECTED:
             for i in sorted(numbers)[:KEPT_REJECTED]:
                 self._first_lines.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
 
     def add_line(self, number: int, reason: str, text: str) -> None:
         """A line by its number from 1."""
-        self._count(reason, 1, number, number)
+        self._reasons.append(RejectedReason(reason, 1, number, number))
         if len(self._first_lines) < 8 * KEPT_REJECTED:
             self._first_lines.append(RejectedLine(number, reason, text))
-
-    def _count(self, reason: str, count: int, low: int, high: int) -> None:
-        old = self._reasons.get(reason, RejectedReason(reason, 0, low, high))
-        self._reasons[reason] = RejectedReason(reason, old.count + count, min(old.first, low), max(old.last, high))
 
     def result(self) -> tuple[tuple[RejectedLine, ...], tuple[RejectedReason, ...]]:
         """The first of them in the order of the file, and the reasons."""
         ordered = sorted(self._first_lines, key=lambda line: line.number)[:KEPT_REJECTED]
-        return tuple(ordered), tuple(sorted(self._reasons.values(), key=lambda item: item.first))
+        return tuple(ordered), by_reason(self._reasons)
 
 
 def remainder(

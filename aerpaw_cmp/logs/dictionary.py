@@ -99,6 +99,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r" (lon|lng|longitude)( deg)?$",
         r"^(l nge|laenge|l ngengrad|laengengrad|longitud)( deg)?$",
     ), "deg", can_be=(-180.0, 180.0)),
+    Quantity("grid", "grid", (r"\b(easting|northing|utm|ecef)\b",)),
     # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
     Quantity("home", "other", (
         r"\b(home|take ?off|launch|terrain|ground|geoid|undulation|delta|target|max|min)\b.*" + _UP + r"(?!.*\babove)",

@@ -20,6 +20,7 @@ EXAMPLES = {
     "gps_seconds": ("GPS seconds", "tow", "GMS"),
     "latitude_deg": ("lat", "OSD.latitude", "GPS Latitude"),
     "longitude_deg": ("lon", "Lng", "OSD.longitude"),
+    "grid": ("easting", "UTM_X"),
     "altitude_m, take-off": ("RelHomeAlt", "relative_alt", "height_above_takeoff(feet)"),
     "altitude_m, ground": ("altitude_agl", "height above ground"),
     "altitude_m, sea level": ("altitude_msl", "Altitude (ft MSL)", "ele"),

@@ -554,6 +554,8 @@ NO_LOGS: dict[str, bytes] = {
         b"[2025-03-02 10:00:00.000001] [INFO] [UHD] linux; GNU C++\n[2025-03-02 10:00:01.000001] [INFO] [B200] Detected\n"
     ),
     "radio_console": b"[2025-03-02 10:00:00.000001] ---  Software Radio Systems LTE eNodeB  ---\n[2025-03-02 10:00:01] Reading\n",
+    "gnss_logger": b"# Fix,Provider,LatitudeDegrees,LongitudeDegrees\nFix,GPS,35.728,-78.696\n",
+    "json_records": b'{"time": 1749564000, "pci": 11, "rsrp": -91}\n',
     "own_export": b"time_utc,time_s,tower,channel,unit,measured_db\n2025-03-02T15:00:00.250Z,0,LW1,USRP1,dBm,-81.5\n",
     "positions": b"35.7281, -78.6973\r\n35.7291, -78.6992\r\n",
     "document": b"# A page\n\n## Of text\n\nwords\n",

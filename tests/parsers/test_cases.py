@@ -396,6 +396,8 @@ COUSINS: dict[str, tuple[str, Right]] = {
     **{f"six digits, {order}": (
         table("date,utc,pci,rsrp", f"{date},14000{{i}}.00,11,{{l}}"), Right(LEVELS, said=f"the {said} number was taken"))
        for order, date, said in (("the day first", "100625", "last"), ("the year first", "250610", "first"))},
+    "positions on a grid": (
+        table("time,easting,northing,pci,rsrp", EPOCH + ",70850{i}.5,395615{i}.2,11,{l}"), Right(LEVELS, said="on a grid")),
     "six digits without a date": (
         table("utc,pci,rsrp", "14000{i}.00,11,{l}"), Right(LEVELS, said="no date", options={"time_origin": f"{START}Z"})),
     "degrees and minutes by name": (
@@ -463,6 +465,11 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
         table("time,lat,lon,alt,rsrp", EPOCH + ",1.{i},48.13712{i},11.57541{i},{l}"), InputError, "'alt' holds values as"),
     "a level without its PCI, elsewhere": (
         table("time,pci,rsrp,lat,lon,alt", EPOCH + ",{l},48.13712{i},11.57541{i},520.3,3"), InputError, SHIFTED),
+    "NMEA of another sentence": (table("", "$GNGNS,14000{i}.00,3543.68,N,07841.76,W,AA,10,0.9,110.1,-33,,*5C"), InputError, "NMEA"),
+    "GnssLogger": (
+        "# Header\n# Fix,Provider,LatitudeDegrees,LongitudeDegrees\n" + "Fix,GPS,35.728,-78.696\n" * 4, InputError, "GnssLogger"),
+    "JSON of a phone": (
+        table("", '{{"time": 174956400{i}, "pci": 11, "rsrp": -9{i}, "lat": 35.728}}')[1:], InputError, "JSON records"),
     "a web page": ("<!DOCTYPE html><html><body>Log in</body></html>\n", InputError, "a web page"),
     "a table of nobody": (
         table("index,when_utc,Breite,rx_power_dbm,temperature", "{i},2025-06-10 10:00:0{i},35,{l},20"), InputError,

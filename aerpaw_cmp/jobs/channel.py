@@ -137,6 +137,7 @@ def channel_parts(
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
     spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # steps of many seconds are no gaps
     velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
+    tower = None if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans)
     moves = bool(np.isfinite(velocity).any())
     if not moves:
         remarks.append("No Doppler shift: the points have no times, so the UAV has no velocity.")
@@ -156,8 +157,8 @@ def channel_parts(
         poses = Poses(along.poses.position_m[rows], along.poses.rotation[rows])
         with stages("replay"):
             run: dict[str, Any] = {"towers_m": None if along.towers_m is None else along.towers_m[rows]}
-            progress = stages.progress if job is None else _silent
-            replayed = replay_poses(data.site, settings.rt, link, poses, **run, progress=progress, job=job)
+            run["progress"] = stages.progress if job is None else lambda *_: None  # one of many parts is silent
+            replayed = replay_poses(data.site, settings.rt, link, poses, **run, job=job)
         with stages("paths"):
             table = replayed.path_table(names)
         if job is not None:
@@ -170,16 +171,12 @@ def channel_parts(
             time_s=along.time_s[rows],
             start=along.start,
             velocity_mps=velocity[rows] if moves else None,
-            tower_mps=0.0 if along.towers_m is None else velocities_mps(along.time_s, along.towers_m, *spans)[rows],
+            tower_mps=0.0 if tower is None else tower[rows],
             summed=settings.rss.field,
             offsets_hz=offsets,
             remarks=(*remarks, *along.remarks),
             **levels.at(poses),
         )
-
-
-def _silent(_text: str, _fraction: float | None = None, /) -> None:
-    """Progress of one part of many."""
 
 
 def _chosen_link(settings: FlightFile, chosen: ChannelOptions) -> tuple[str, LinkSettings]:
@@ -335,9 +332,9 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
                 nothing: dict[str, Any] = dict.fromkeys(("files", "rss", "rank", "warnings"), ())
                 site = choose_site(settings.site, flight.parent)
                 data = FlightData(settings=settings, folder=root, site=site, track=None, **nothing)
-        whole = not STREAMED.issuperset(chosen.formats)
+        in_memory = not STREAMED.issuperset(chosen.formats)
         with output.filling() as place:
-            parts = channel_parts(data, chosen, stages, in_memory=whole, room=shutil.disk_usage(place).free)
+            parts = channel_parts(data, chosen, stages, in_memory=in_memory, room=shutil.disk_usage(place).free)
             written, metrics = write_channel(parts, place, tuple(dict.fromkeys(chosen.formats)), stages)
         files = output.placed(written)
         warnings = [*data.warnings, *metrics.pop("warnings")]

@@ -147,7 +147,7 @@ def _page(flight: str, level: Stream, site: Site, track: LevelTrack, estimate: N
         modes.append(angles | {"east_m": float(east), "north_m": float(north)} | named(mode, "share radius_m"))
     region50_m, region90_m = (regions.radius_m(parts[0].place_m, part) for part in (0.5, 0.9))
     low, high = estimate.height_m
-    floor = "none shows" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB, below it only that is known"
+    floor = "none shows" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB, no level below it is known"
     edge = "The region reaches the edge of the search, 400 m beyond the flight: the node may stand farther away."
     return LocatePage(
         flight=flight,
@@ -158,7 +158,7 @@ def _page(flight: str, level: Stream, site: Site, track: LevelTrack, estimate: N
         region90_m=region90_m,
         modes=modes,
         assumed=(
-            f"Path-loss exponent {estimate.slope:.1f} +- {2.0 * estimate.slope_sd:.1f} (fitted, 95 %).",
+            f"Path-loss exponent {estimate.slope:.1f} ± {2.0 * estimate.slope_sd:.1f} (fitted, 95 %).",
             ends,
             f"Height of the node: {low:g} m" + ("." if low == high else f" or {high:g} m; the levels do not decide."),
             f"Floor of the receiver: {floor}. Shadowing is remembered for 30 s; nothing is ray-traced.",

@@ -137,10 +137,12 @@ class Channel:
         )
         return [*self.remarks, *([words] if self.guesses else []), *self.replay.left_out]
 
-    def by_link(self, values: AnyArray, fill: Any) -> AnyArray:
-        """Values per path (paths, ...) as (most paths of a link, poses, towers, ...)."""
+    def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
+        """Values per path (paths, ...) as (most paths of a link, poses, towers, ...); None of None."""
+        if values is None:
+            return None
         table = self.table
-        out = np.full((table.most, *self.gain_db.shape, *values.shape[1:]), fill, values.dtype)
+        out = np.full((table.most, *self.replay.has_path.shape, *values.shape[1:]), fill, values.dtype)
         out[table.number, table.pose, table.tower] = values
         return out
 
@@ -168,9 +170,6 @@ def channel_dataset(channel: Channel) -> Any:
     poses, towers = replay.has_path.shape
     size = 16 * replay.h.size * (table.most + (0 if offsets is None else len(offsets)))
     refuse_size(size, f"{poses} poses, {towers} towers, {table.most} paths")
-    of_paths: dict[str, AnyArray | None] = {
-        "delay_s": table.delay_s, "doppler_hz": channel.doppler_hz, **table.angles_deg(replay.ends)
-    }  # fmt: skip
     values: dict[str, AnyArray | None] = {
         "gain": channel.by_link(table.gain, 0.0),
         "kind": channel.by_link(table.kind.astype(np.int8), -1),
@@ -178,7 +177,9 @@ def channel_dataset(channel: Channel) -> Any:
         "face_names": np.array(table.names, dtype=object),
         "h": replay.h,
         "tower_name": np.array(replay.towers, dtype=object),
-        **{name: None if rows is None else channel.by_link(rows, np.nan) for name, rows in of_paths.items()},
+        "delay_s": channel.by_link(table.delay_s),
+        "doppler_hz": channel.by_link(channel.doppler_hz),
+        **{name: channel.by_link(angle) for name, angle in table.angles_deg(replay.ends).items()},
         "level_db": channel.level_db,
         "level_sd_db": channel.level_sd_db,
         "cfr": None if offsets is None else frequency_responses(table, replay.ends, offsets),
@@ -280,20 +281,20 @@ def write_channel(
         for channel in parts:
             poses, paths = poses + len(channel.time_s), paths + len(channel.table.pose)
             guesses, omitted = guesses + channel.guesses, added_up([*omitted, *channel.replay.omitted])
-            whole = replace(channel, guesses=guesses, replay=replace(channel.replay, omitted=omitted))
+            latest = replace(channel, guesses=guesses, replay=replace(channel.replay, omitted=omitted))
             with stages("write"):
-                files = [write(whole) for write in writers]
+                files = [write(latest) for write in writers]
     return files, {
-        "flight": whole.name,
-        "link": whole.link,
-        "carrier_hz": whole.carrier_hz,
-        "towers": list(whole.replay.towers),
+        "flight": latest.name,
+        "link": latest.link,
+        "carrier_hz": latest.carrier_hz,
+        "towers": list(latest.replay.towers),
         "poses": poses,
         "paths": paths,
-        "has_doppler": whole.velocity_mps is not None,
-        "has_level": whole.level_db is not None,
-        KEY: list(whole.trained_on),
-        "warnings": whole.warnings,
+        "has_doppler": latest.velocity_mps is not None,
+        "has_level": latest.level_db is not None,
+        KEY: list(latest.trained_on),
+        "warnings": latest.warnings,
     }
 
 
@@ -314,10 +315,7 @@ def _netcdf(folder: Path) -> Any:
 def _arrays(channel: Channel) -> dict[str, Any]:
     """Gains and delays in Sionna's axis order, and what they belong to."""
     a, tau = impulse_responses(channel.table, channel.replay.ends)
-    doppler = channel.doppler_hz
-    moving = {} if doppler is None else {"doppler_hz": channel.by_link(doppler, np.nan)}
-    levels = {} if channel.level_db is None else {"level_db": channel.level_db, "level_sd_db": channel.level_sd_db}
-    return {
+    arrays = {
         "a": a,
         "tau": tau,
         "h": channel.replay.h,
@@ -325,9 +323,11 @@ def _arrays(channel: Channel) -> dict[str, Any]:
         "position_m": channel.replay.ends.poses.position_m,
         "towers": np.array(channel.replay.towers),
         "carrier_hz": channel.carrier_hz,
-        **moving,
-        **levels,
+        "doppler_hz": channel.by_link(channel.doppler_hz),
+        "level_db": channel.level_db,
+        "level_sd_db": channel.level_sd_db,
     }
+    return {name: values for name, values in arrays.items() if values is not None}
 
 
 def _write_npz(channel: Channel, folder: Path) -> Path:
@@ -347,7 +347,6 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
     path = folder / "channel.csv"
     poses, towers = channel.gain_db.shape
     power = channel.by_link((np.abs(channel.table.gain) ** 2).mean(axis=(1, 2)), 0.0)
-    strongest = power.argmax(axis=0)[None] if len(power) else np.zeros((1, poses, towers), dtype=np.int64)
     columns = {"delay_s": channel.table.delay_s, "doppler_hz": channel.doppler_hz}
     time: AnyArray = channel.time_s
     if channel.start is not None:
@@ -358,7 +357,7 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
     for name, values in columns.items():
         at = channel.gain_db * np.nan
         if values is not None and len(power):
-            at = np.take_along_axis(channel.by_link(values, np.nan), strongest, axis=0)[0]
+            at = np.take_along_axis(channel.by_link(values), power.argmax(axis=0)[None], axis=0)[0]
         shown[name] = at.ravel()
     pd.DataFrame(shown).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
     return path
@@ -378,7 +377,7 @@ def _write_deepmimo(channel: Channel, folder: Path) -> Path:
         columns[f"{name}_az"] = angles[f"azimuth_{end}_deg"]
         columns[f"{name}_el"] = 90.0 - angles[f"elevation_{end}_deg"]
     columns |= {"inter": table.turns.astype(np.float64), "inter_pos": table.vertices_m}
-    by_link = {name: channel.by_link(values, np.nan).swapaxes(0, 1) for name, values in columns.items()}
+    by_link = {name: channel.by_link(values).swapaxes(0, 1) for name, values in columns.items()}
     sources = np.nanmedian(ends.sources_m, axis=0) if ends.moving else ends.sources_m
     for number in range(len(channel.replay.towers)):
         arrays = {name: values[:, :, number] for name, values in by_link.items()}

@@ -432,14 +432,9 @@ def unit_of(written: str) -> str:
 def converted(values: FloatArray, written: str) -> FloatArray:
     """Values of a written unit in the unit in which they are read."""
     if written in _DDMM:
-        return from_minutes(values)
+        degrees = np.trunc(values / 100)  # as NMEA writes angles
+        return np.asarray(degrees + (values - 100 * degrees) / 60)
     return UNITS[written][1](values) if written in UNITS else values
-
-
-def from_minutes(values: FloatArray) -> FloatArray:
-    """Angles as NMEA writes them, ddmm.mmmm, in degrees."""
-    degrees = np.trunc(values / 100)
-    return np.asarray(degrees + (values - 100 * degrees) / 60)
 
 
 # --- programs ---------------------------------------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from aerpaw_cmp.logs.records import ReadResult, Stream
 from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
-from . import _cells, _nemo, _pose, _sheet, aadm_snr, pose_csv, quectel_ri
+from . import _cells, _pose, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri
 
 _TOWER_SNR = re.compile(r"snr (lw\d)")
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
@@ -35,7 +35,7 @@ def is_header(names: list[str]) -> bool:
 
 def sniff(head: bytes) -> bool:
     """Check whether a header of such names stands in front, and it is none of the narrower formats."""
-    narrower = (_nemo.sniff, *(r.READER.sniff for r in (quectel_ri, aadm_snr)))
+    narrower = [module.READER.sniff for module in (nemo_csv, quectel_ri, aadm_snr)]
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
 

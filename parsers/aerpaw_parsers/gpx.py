@@ -22,15 +22,16 @@ from aerpaw_cmp.readers import dictionary
 from . import _json, _pose, _stamps
 
 _N = rb"(" + _lines.NUMBER + rb")"
-_POINT = re.compile(rb"<(?:trkpt|wpt|rtept)\b([^<>]{0,200})>(.{0,2000}?)(?:</(?:trkpt|wpt|rtept)>)", re.DOTALL)
+_TAG = rb"(?:\w{1,20}:)?(?:trkpt|wpt|rtept)"  # also of a named space, as programs that use an XML library write it
+_POINT = re.compile(rb"<" + _TAG + rb"\b([^<>]{0,200})>(.{0,2000}?)(?:</" + _TAG + rb">)", re.DOTALL)
 _ATTRIBUTE = re.compile(rb"\b(lat|lon)\s?=\s?[\"']\s?" + _N + rb"\s?[\"']")
-_INSIDE = re.compile(rb"<(ele|time|speed|course)>\s{0,40}([^<>]{1,60}?)\s{0,40}</")
-_START = re.compile(rb"<(?:trkpt|wpt|rtept)\b")
+_INSIDE = re.compile(rb"<(?:\w{1,20}:)?(ele|time)>\s{0,40}([^<>]{1,60}?)\s{0,40}</")
+_START = re.compile(rb"<" + _TAG + rb"\b")
 
 
 def sniff(head: bytes) -> bool:
     """Check whether it is a GPX with points."""
-    return re.search(rb"<gpx\b", head[:4096]) is not None and _START.search(head) is not None
+    return re.search(rb"<(?:\w{1,20}:)?gpx\b", head[:4096]) is not None and _START.search(head) is not None
 
 
 def _points(data: bytes) -> list[tuple[int, dict[bytes, bytes]]]:
@@ -60,7 +61,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         extra=_torn(lines, data, row), closed=True,
     )  # fmt: skip
     rows.warnings += warnings
-    begun = [track.start() for track in re.finditer(rb"<trk\b", data)]
+    begun = [track.start() for track in re.finditer(rb"<(?:\w{1,20}:)?trk\b", data)]
     track = np.searchsorted(begun, np.array([at for at, _ in points], dtype=np.int64))[rows.at]
     if not _overlap(rows, track):
         return rows.result([_stream(rows, "track")])

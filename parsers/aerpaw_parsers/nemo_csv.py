@@ -11,13 +11,16 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.logs.records import Stream
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.logs.text import textlog as _text
 
-from . import _cells, _nemo
+from . import _cells
 
+_NAMES = b"index rel_time_ms lat lon alt_m pdsch_rank nr_rsrp_dbm nr_sinr_db wb_cqi".split()
+_HEADER = re.compile(rb"(?:\xef\xbb\xbf)?" + b", ?".join(_NAMES) + rb"[ \t]*\r?")
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
 _LEVELS = (("rsrp_dbm", "nr_rsrp"), ("sinr_db", "nr_sinr"), ("cqi", "wb_cqi"))
 _CELL = r", ?(?P<%s>" + _lines.NUMBER.decode() + "|nan|NaN|)"
@@ -28,6 +31,20 @@ _ROW = re.compile(
 )  # fmt: skip
 
 
+def pdsch_rank(rows: _rows.Rows, values: dict[str, FloatArray]) -> Stream | None:
+    """Stream of the scheduled rank; ``values`` holds ``ri_raw`` and what stands beside it."""
+    raw = values["ri_raw"]
+    missing = np.isnan(raw)
+    odd = ~missing & ~((raw >= 1) & (raw <= 8) & (raw == np.round(raw)))
+    rows.mark(missing, "no_rank_in_row")
+    rows.mark(odd & (raw != 0), "rank_out_of_range")
+    rows.mark(odd & (raw == 0), "no_csi")
+    values["rank"] = np.where(missing | odd, np.nan, raw)
+    clock = "relative" if rows.relative else "utc"
+    name = rows.options.channel or "pdsch_rank"
+    return rows.stream("rank", name, values, ri_base="one", source="scheduled PDSCH rank", clock=clock)
+
+
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     values = {name: rows.number(name) for name in _COLUMNS}
     levels = [
@@ -36,13 +53,13 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     ]  # before rows without a rank are flagged so
     place = {name: values[name] for name in ("latitude_deg", "longitude_deg", "altitude_m")}
     track = rows.stream("telemetry", "phone", place, where=np.isfinite(place["latitude_deg"]), source="Nemo rows")
-    yield _nemo.pdsch_rank(rows, dict(values))
+    yield pdsch_rank(rows, dict(values))
     yield from levels
     yield track
 
 
 READER = _text.reader(
     "nemo_csv", "Keysight Nemo NR rank and level, CSV with relative times", kinds=("rank", "rss", "kpi", "telemetry"),
-    sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0", header=_nemo.HEADER, sniff=_nemo.sniff,
+    sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0", header=_HEADER,
     row=_ROW, streams=_streams, fields=9, otherwise="a field is no number", clock="relative_ms",
 )  # fmt: skip

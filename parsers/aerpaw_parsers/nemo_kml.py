@@ -20,7 +20,7 @@ from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _cells, _pose
-from ._nemo import pdsch_rank
+from .nemo_csv import pdsch_rank
 
 _N = rb"(" + _lines.NUMBER + rb"|nan)"
 _GAP = rb"[^\n]{0,60}?"

@@ -12,7 +12,7 @@ from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_cmp.readers import dictionary
 
-from . import _nemo, _pose, _sheet, ardupilot_bin, quectel_ri, vehicle_out
+from . import _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, vehicle_out
 
 _LIKE_A_LEVEL = re.compile(
     r"^(?!.*(batt|volt|throttle|gps)).*(\b(rx|received?) ?power|signal|\bdbm\b|\brss\b|strength)"
@@ -40,7 +40,7 @@ def has_time(names: list[str]) -> bool:
 
 def sniff(head: bytes) -> bool:
     """Check whether a header with position and time stands in front, and it is not AERPAW's own layout."""
-    narrower = (vehicle_out.READER.sniff, ardupilot_bin.sniff, _nemo.sniff, quectel_ri.READER.sniff)
+    narrower = [module.READER.sniff for module in (vehicle_out, ardupilot_bin, nemo_csv, quectel_ri)]
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
 

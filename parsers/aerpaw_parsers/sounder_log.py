@@ -223,19 +223,16 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
 _NAMED = re.compile(r"(?<![a-z])(power|quality|snr)(?![a-z])|(?:power|quality|snr)(?=_?log)")
 
 
-def read(data: bytes, options: ReadOptions) -> ReadResult:
+def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     """One stream of levels; power and quality logs look alike, so ``options.channel`` or the file name tells them.
+
+    Of each piece its samples are kept; runs, times and flags are those of all.
 
     Raises
     ------
     UsageError
         If no time zone is given.
     """
-    return read_pieces((data,), options)
-
-
-def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
-    """The same from pieces of whole lines: of each its samples are kept; runs, times and flags are those of all."""
     columns = [Column(np.int64), Column(np.int64), Column(np.int64), Column(np.float64)]
     marks, texts = _Samples.none(), dict[int, str]()
     rejects, before, blank, unterminated = _lines.Rejects(), 0, 0, False
@@ -319,5 +316,6 @@ def _stream(
 
 READER = Reader(
     name="sounder_log", title="GNU Radio channel sounder power, quality or SNR log (od text)", kinds=("rss",),
-    sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345", sniff=sniff, read=read, read_pieces=read_pieces,
+    sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345", sniff=sniff,
+    read=lambda data, options: read_pieces((data,), options), read_pieces=read_pieces,
 )  # fmt: skip

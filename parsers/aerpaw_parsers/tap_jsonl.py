@@ -66,7 +66,7 @@ def decode_line(line: bytes) -> dict[str, Any]:
     return record
 
 
-def read(data: bytes, options: ReadOptions) -> ReadResult:
+def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     """Records of one segment.
 
     Raises
@@ -74,11 +74,6 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     InputError
         If the schema is a later one than we know.
     """
-    return read_pieces((data,), options)
-
-
-def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
-    """The same from pieces of whole lines; only numbers are kept of a piece."""
     log = _Log()
     for data in pieces:
         log.add(data)
@@ -280,6 +275,6 @@ def _with_serving_cell(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.Data
 
 READER = Reader(
     name="tap_jsonl", title="Log of 'aerpaw-cmp tap': rank indicator and serving cell of a Quectel modem (JSON lines)",
-    kinds=("rank", "rss"), sample='{"kind":"header","schema":"aerpaw-cmp-tap/1", ...', sniff=sniff, read=read,
-    read_pieces=read_pieces,
+    kinds=("rank", "rss"), sample='{"kind":"header","schema":"aerpaw-cmp-tap/1", ...', sniff=sniff,
+    read=lambda data, options: read_pieces((data,), options), read_pieces=read_pieces,
 )  # fmt: skip

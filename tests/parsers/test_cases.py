@@ -396,6 +396,9 @@ COUSINS: dict[str, tuple[str, Right]] = {
     **{f"six digits, {order}": (
         table("date,utc,pci,rsrp", f"{date},14000{{i}}.00,11,{{l}}"), Right(LEVELS, said=f"the {said} number was taken"))
        for order, date, said in (("the day first", "100625", "last"), ("the year first", "250610", "first"))},
+    "GPX of a named space": (
+        "<g:gpx>" + table("", '<g:trkpt lat="35.728" lon="-78.696"><g:ele>11{i}</g:ele><g:time>2025-06-10T14:00:0{i}Z</g:time></g:trkpt>'),
+        Right({"track": {"altitude_m": [0, 1, 2, 3]}})),
     "positions on a grid": (
         table("time,easting,northing,pci,rsrp", EPOCH + ",70850{i}.5,395615{i}.2,11,{l}"), Right(LEVELS, said="on a grid")),
     "six digits without a date": (

@@ -26,7 +26,6 @@ def reader(
     sample: str,
     row: Pattern | Callable[[bytes], Pattern],
     streams: Callable[[_rows.Rows], Iterable[Stream | None]],
-    sniff: Callable[[bytes], bool] | None = None,
     header: Pattern | None = None,
     mark: Pattern | None = None,
     torn: Pattern | None = None,
@@ -46,11 +45,9 @@ def reader(
         header, say).
     streams : callable
         ``streams(rows)``: the streams of the rows; its docstring is the reader's.
-    sniff : callable, optional
-        By default a file is known by its first line where there is a ``header``, by ``mark`` where there is one, else
-        by most of its first lines being rows.
     header : re.Pattern, optional
-        The whole line above a table: a comment wherever it stands.
+        The whole line above a table: a comment wherever it stands. A file is known by its first line where there is
+        one, by ``mark`` where there is one, else by most of its first lines being rows.
     mark : re.Pattern, optional
         MULTILINE; a line by which a console is known.
     torn : re.Pattern, optional
@@ -94,6 +91,6 @@ def reader(
         return mark is not None and not head.startswith(_lines.MARKUP) and mark.search(head) is not None
 
     return Reader(
-        name=name, title=title, kinds=kinds, sample=sample, sniff=sniff or (known if mark is None else marked),
+        name=name, title=title, kinds=kinds, sample=sample, sniff=known if mark is None else marked,
         read=read,
     )  # fmt: skip

@@ -51,30 +51,6 @@ def few_titles(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(correction, "fit_field", lambda *given: given[1])
 
 
-def test_flights_are_asked_of_others_and_a_single_one_block_by_block() -> None:
-    three = [
-        flight(name, k, channel) for k, (name, channel) in enumerate([("a", "A"), ("a", "B"), ("b", "A"), ("c", "A")])
-    ]
-    folds = correction._folds(three)
-    assert [[s.flight for s in fold.left_out] for fold in folds] == [["a", "a"], ["b"], ["c"]]
-    for fold in folds:
-        assert {s.flight for s in fold.known} | {s.flight for s in fold.left_out} == {"a", "b", "c"}
-        assert not {s.flight for s in fold.known} & {s.flight for s in fold.left_out}
-    place = np.random.default_rng(1).uniform(0, [900, 900, 1], (400, 3))
-    alone = samples("a", np.arange(400.0), place)
-    folds = correction._folds([alone])
-    counts = [len(fold.left_out[0]) for fold in folds]
-    assert len(folds) == 6  # the fullest of nine blocks
-    assert counts == sorted(counts, reverse=True)
-    for fold in folds:
-        (asked,), (known,) = fold.left_out, fold.known
-        assert len(asked) + len(known) == 400
-        assert sorted([*asked.residual_db, *known.residual_db]) == list(range(400))
-        block = {tuple(row) for row in (asked.position_m[:, :2] // 300.0).tolist()}
-        assert len(block) == 1
-        assert block.isdisjoint(map(tuple, (known.position_m[:, :2] // 300.0).tolist()))
-
-
 def test_blocks_spread_by_their_means() -> None:
     place = np.array([[10.0, 10, 5], [290, 290, 5], [310, 10, 5], [-10, 10, 5], [-20, 10, 5]])
     rows = Rows.of(samples("a", np.zeros(5), place), 0)

@@ -307,39 +307,6 @@ def test_antennas_without_a_shared_term_are_fits_of_their_own():
         np.testing.assert_allclose(both.mean(some), both.predict(some)[0], rtol=0, atol=1e-6)
 
 
-def test_before_anything_is_learned_gains_are_as_strong_and_as_smooth_as_they_were_on_other_flights():
-    """Entries of the covariance of two samples of one antenna and one of another, from the numbers of the model."""
-    rng = np.random.default_rng(6)
-    body, mast = (rng.normal(size=(3, 3)) for _ in range(2))
-    body, mast = (d / np.linalg.norm(d, axis=1, keepdims=True) for d in (body, mast))
-    place = rng.uniform(0, 40, (3, 3))
-    rows = [
-        LinkSamples("a", "LW1", channel, np.zeros(len(k)), place[k], body[k], mast[k], np.zeros(len(k)))
-        for channel, k in (("A", np.array([0, 1])), ("B", np.array([2])))
-    ]
-    covariance = direction_gain._covariance_of_levels(GainModel(), rows)
-    of_body, of_mast = (np.linalg.norm(d[:, None] - d, axis=2) for d in (body, mast))
-    same = np.array([[1, 1, 0], [1, 1, 0], [0, 0, 1.0]])
-    expected = 3.2**2 * np.exp(-of_body / 1.0) + same * (
-        3.4**2 * np.exp(-of_mast / 0.5) + 1.5**2 * np.exp(-(of_body**2 + of_mast**2) / (2 * 0.35**2))
-        + 1.2**2 * np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / 20.0) + (100.0 * 1.5) ** 2
-    ) + 1.5**2 * np.eye(3)  # fmt: skip
-    np.testing.assert_allclose(covariance, expected, rtol=1e-12)
-    at_place = direction_gain._covariance([PLACE_TERM], rows, rows)
-    np.testing.assert_allclose(
-        at_place, same * 4.0 * np.exp(-np.linalg.norm(place[:, None] - place, axis=2) / 60.0), rtol=1e-12
-    )
-    assert GainModel().bin_s == 4.0
-    towards = np.concatenate([body, mast], axis=1)
-    np.testing.assert_array_equal(direction_gain.argument_of(rows[0], "pair"), towards[:2])
-    np.testing.assert_array_equal(direction_gain.argument_of(rows[0], "world"), -mast[:2])
-    lone = direction_gain.directed("LW1.A.b", towards)
-    assert (lone.tower, lone.channel, len(lone)) == ("LW1", "A.b", 3)
-    np.testing.assert_array_equal(np.concatenate([lone.at_uav, lone.at_tower], axis=1), towards)
-    single = direction_gain.directed("LW1.A", body)
-    np.testing.assert_array_equal(single.at_uav, single.at_tower)
-
-
 def test_bins_are_means_from_the_first_sample_on_and_directions_stay_of_length_one():
     time = 7.3 + np.arange(40) * 0.5
     angle = time / 5.0

@@ -265,21 +265,6 @@ def test_long_flights_are_thinned_to_whole_stretches_from_end_to_end():
     assert field_gp._evenly(some, value)[0] is some
 
 
-def test_before_anything_is_learned_a_field_is_two_decibels_over_fifty_metres():
-    """Entries of the covariance of two samples 40 m apart, 9 m in height, 50 degrees of heading and 30 s."""
-    turn = np.radians(50.0)
-    pair = rows_at([[0, 0, 20], [24, 32, 29]], [0.0, 30.0], 0, [[1, 0, 0], [np.cos(turn), np.sin(turn), 0]])
-    chord = 2.0 * np.sin(turn / 2)
-    near = 4.0 * math.exp(-40 / 50 - 9 / 30 - chord**2 / (2 * 0.49))
-    covariance = field_gp.covariance(FieldModel(), pair, pair)
-    assert covariance[0, 1] == pytest.approx(100.0**2 + near + 1.5**2 + 1.5**2 * math.exp(-0.5), abs=1e-9)
-    assert covariance[0, 0] == pytest.approx(100.0**2 + 4.0 + 2 * 1.5**2)
-    assert field_gp.prior_sd_db(FieldModel(), ("place", "drift")) == pytest.approx(2.5)
-    assert field_gp._noisy(FieldModel(), np.zeros((2, 2)))[0].tolist() == [2.25, 0.0]
-    other = rows_at([[0, 0, 20]], [0.0], 1)
-    assert field_gp.covariance(FieldModel(), pair, other)[0, 0] == pytest.approx(100.0**2 + 4.0)
-
-
 def test_scales_are_sought_within_their_limits_from_the_usual_ones_on(monkeypatch):
     """Decibels to 12, lengths of 10 to 300 m, 5 to 100 m of height, memories of 3 s to 10 minutes."""
     limits = {"place_sd_db": (0.05, 12), "length_m": (10, 300), "height_m": (5, 100), "turn": (0.2, 5),

@@ -10,7 +10,6 @@ from scipy.stats import multivariate_normal
 
 from aerpaw_cmp.compare.statistics import memory
 from aerpaw_cmp.compare.statistics.memory import (
-    CALM,
     RATES,
     TERMS,
     WHITE_SHARES,
@@ -114,51 +113,6 @@ def innovations_excess(values: np.ndarray) -> float:
     keep = (away[1:] * away[:-1]).sum() / (away**2).sum()
     innovations = away[1:] - keep * away[:-1], away[:-1] - keep * away[1:]
     return float(max(np.mean(e**4) / np.mean(e**2) ** 2 for e in innovations) - 3.0)
-
-
-@pytest.mark.parametrize("n", [21, 60])
-def test_each_draw_is_one_memory_by_its_weight_its_scale_and_two_normals(
-    n: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Drawn numbers by hand: the first and the last memory, ordinary ones, tails at no, one and minus two deviations."""
-    values = np.cumsum(np.random.default_rng(n).normal(size=n))
-    values[n // 2] += 60.0  # tails beyond chance
-    uniform, chi_squared = np.array([0.0, 0.4, 0.8, 1.0]), np.array([20.0, 12.0, 30.0, 9.0])
-    normal, other = np.array([1.0, 0.0, -2.0, 0.5]), np.array([0.0, 1.0, -1.5, -30.0])
-    monkeypatch.setattr(memory, "_random", lambda _: (uniform, chi_squared, normal, other))
-    terms = cosine_terms(values)
-    slow, known = terms.slow, memories(len(terms.slow))
-    likelihood, square = likelihoods(slow)
-
-    def picked(kind: memory.Kind) -> list[int]:
-        shares = np.cumsum(likelihood * memory.weights(kind))
-        return [next(i for i, total in enumerate(shares / shares[-1]) if total >= u) for u in uniform]
-
-    for kind in ("mean", "ratio"):
-        drawn = mean_draws(values, kind)  # type: ignore[arg-type]
-        for k, i in enumerate(picked(kind)):  # type: ignore[arg-type]
-            reach = normal[k] * np.sqrt(square[i] / chi_squared[k] * known.variance[i])
-            expected = (-known.slope[i] @ slow + reach, -known.slope[i] @ slow - reach)
-            assert (drawn[k], drawn[k + 4]) == pytest.approx(expected)
-    every = np.append(slow, np.sqrt(terms.fast_power))
-    away = values - values.mean()
-    excess = innovations_excess(values) - np.sqrt(6.0 / (len(away) - 1))
-    assert excess > 0.0
-    assert np.square(every).sum() == pytest.approx(values.var())
-    third = 2.0 / (9.0 * terms.fast_freedom)
-    drawn = memory.power_draws(values)
-    for k, i in enumerate(picked("power")):
-        cube_root = max(1.0 - third + np.sqrt(third) * other[k], 0.05)  # Wilson and Hilferty
-        power = square[i] / chi_squared[k] * known.power[i] + terms.fast_power / cube_root**3
-        side = CALM if normal[k] > 0.0 else 1.0
-        expected = power * np.exp(side * np.sqrt(excess / (len(away) - 1)) * normal[k])
-        assert (drawn[k], drawn[k + 4]) == pytest.approx((expected, expected))
-    with_one_term = np.cos(np.pi * 150 * (np.arange(200) + 0.5) / 200)
-    assert cosine_terms(with_one_term).fast_freedom == pytest.approx(3.0)
-    slowest = (
-        0.5 * RATES[0] * memory._exponential(RATES[0], TERMS)[1:, 1:]
-    )  # without white noise, and nothing added to it
-    np.testing.assert_allclose(memories().whiten[0] @ slowest @ memories().whiten[0].T, np.eye(TERMS), atol=1e-6)
 
 
 def test_draws_follow_unit_and_zero_and_do_not_know_the_direction_of_time() -> None:

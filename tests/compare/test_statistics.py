@@ -5,7 +5,6 @@ import dataclasses
 import numpy as np
 import pytest
 from scipy.signal import lfilter
-from scipy.stats import norm
 from scipy.stats import t as student
 
 from aerpaw_cmp.compare.statistics import intervals as statistics
@@ -53,6 +52,16 @@ def test_effective_sample_size_of_a_known_process(n, correlation, noise):
     assert np.median(sizes) == pytest.approx(expected, rel=0.2)
 
 
+def test_blocks_are_those_of_the_law_for_a_known_process():
+    """Patton, Politis and White (2009) of an exponential memory, twice as long; the median over flights."""
+    rng = np.random.default_rng(2)
+    for n, keep in ((1000, 0.5), (3000, 0.9)):
+        blocks = [autocorrelation(shadowing(rng, n, -1.0 / np.log(keep), 1.0)).block_length for _ in range(40)]
+        slope = 2.0 * keep / (1.0 - keep**2)
+        assert np.median(blocks) == pytest.approx(2.0 * (1.5 * slope**2 * n) ** (1 / 3), rel=0.2)
+    assert autocorrelation(np.arange(7.0)) == Autocorrelation(7, 1, 7.0, 1.0)  # too few to tell
+
+
 def test_degenerate_sequences():
     assert autocorrelation([]).n_effective != autocorrelation([]).n_effective  # NaN
     assert autocorrelation([1.0]).block_length == 1
@@ -64,53 +73,6 @@ def test_degenerate_sequences():
     assert constant.offset_db == pytest.approx((-10.0, -10.0))
     assert np.isnan(constant.correlation).all()
     assert constant.rmse_db == (0.0, 0.0)
-
-
-def autocorrelation_by_loops(x):
-    """Block length, effective size and variance factor, with the long-run variance that completes its covariances."""
-    n, away = len(x), np.asarray(x, dtype=float) - np.mean(x)
-    seen = [sum(away[i] * away[i + lag] for i in range(n - lag)) / (n - lag) for lag in range(n // 2 + 1)]
-    counts, long_run = 2.0 * np.sqrt(np.log10(n) / n), 0.0
-    for _ in range(25):
-        c = [value + long_run / n for value in seen]
-        rho = [value / c[0] for value in c]
-        quiet = [all(abs(r) < counts for r in rho[lag + 1 : lag + 6]) for lag in range(len(rho) - 5)]
-        lags = min(2 * max(1, quiet.index(True) if True in quiet else len(rho) - 1), len(rho) - 1)
-        window = [1.0, *(min(1.0, 2.0 * (1.0 - lag / lags)) for lag in range(1, lags + 1))]
-        width = 2.0 * sum(window) - 1.0
-        flat = 2.0 * sum(w * value for w, value in zip(window, c, strict=False)) - c[0] - width * long_run / n
-        flat = flat / (1.0 - width / n) if width < 0.8 * n else np.inf
-        reach, decayed = sum(lag * w * c[lag] for lag, w in enumerate(window)), c[0]
-        if rho[1] >= counts:
-            half = next((lag for lag, r in enumerate(rho) if r <= 0.5), len(rho))
-            pairs = range(1, min(max(2, half), len(rho) - 1))
-            decay = sum(rho[k] * rho[k + 1] for k in pairs) / sum(rho[k] ** 2 for k in pairs)
-            k = np.arange(1, 4000)
-            tail = c[0] * min(1.0, rho[1] / decay) * min(decay, 1.0 - 1.0 / n) ** k
-            decayed, reach = 2.0 * tail.sum() + c[0], max(reach, k @ tail)
-        if max(flat, decayed) >= n * c[0]:
-            return n // 5, 1.0, 2.0
-        long_run = max(flat, decayed) if max(flat, decayed) > 0 else seen[0]
-    slope = 2.0 * max(0.0, reach) / long_run
-    block = min(max(int(np.ceil(2.0 * (1.5 * slope**2 * n) ** (1 / 3))), 1), max(1, n // 5))
-    return block, min(max(n * c[0] / long_run, 1.0), n), 1.0 / (1.0 - min(0.5, slope / block))
-
-
-@pytest.mark.parametrize(("n", "keep", "noise"), [
-    (300, 0.9, 0.0), (300, 0.5, 0.0), (300, 0.0, 0.0), (600, 0.95, 1.0), (80, 0.3, 0.0), (8, 0.0, 0.0), (9, 0.2, 0.0),
-    (40, 0.8, 0.0), (300, -0.6, 0.0), (151, 0.8, 0.0), (16, 0.5, 0.0), (24, 0.6, 0.0), (50, 1.0, 0.0), (60, -0.999, 0.1),
-])  # fmt: skip
-def test_memory_and_blocks_are_those_of_plain_loops(n, keep, noise):
-    rng = np.random.default_rng(n)
-    x = lfilter([1], [1, -keep], rng.normal(size=n)) + noise * rng.normal(size=n)
-    memory = autocorrelation(x)
-    block, effective, factor = autocorrelation_by_loops(x)
-    assert memory.block_length == pytest.approx(block, abs=0.02 * block)
-    assert (memory.n_effective, memory.variance_factor) == pytest.approx((effective, factor), rel=0.02)
-    unit = autocorrelation(1e-4 * x + 3.0)  # whatever the unit
-    assert (unit.block_length, unit.n_effective) == (memory.block_length, pytest.approx(memory.n_effective, rel=1e-6))
-    if n < 10:
-        assert autocorrelation(x[:7]) == Autocorrelation(7, 1, 7.0, 1.0)  # too few to tell
 
 
 @pytest.mark.parametrize(
@@ -242,26 +204,6 @@ def test_interval_of_independent_samples_is_that_of_the_textbook():
     offset, rmse = np.median(ends, axis=0)
     assert offset == pytest.approx(2 * 1.96 * 3 / np.sqrt(n), rel=0.2)
     assert rmse == pytest.approx(2 * 1.96 * 3 / np.sqrt(2 * n), rel=0.2)
-
-
-def test_ends_are_those_of_the_central_95_percent_of_the_draws(monkeypatch):
-    """Of unit-normal draws every interval reaches 1.96 to either side: 90 % would reach 1.64."""
-    normal = norm.ppf((np.arange(20_000) + 0.5) / 20_000)
-    monkeypatch.setattr(statistics, "mean_draws", lambda *_: normal)
-    ramp = np.arange(30.0) - 14.5
-    monkeypatch.setattr(statistics, "power_draws", lambda *_: (ramp.std() + normal) ** 2)
-    white = Autocorrelation(n=10_000, block_length=1, n_effective=10_000.0, variance_factor=1.0)
-    intervals = {
-        "mean": (statistics.mean_interval(ramp), 0.0),
-        "spread": (statistics.spread_interval(ramp), ramp.std()),
-        "pair": (paired_difference(ramp, 2 * ramp).mean_square_ci95_db2, -3.0 * ramp.var()),
-        "resampled": (interval(0.0, normal, white), 0.0),
-    }
-    for name, (ends, middle) in intervals.items():
-        assert ends == pytest.approx((middle - 1.96, middle + 1.96), abs=0.01), name
-    assert paired_difference(ramp, 2 * ramp).standard_error_db == pytest.approx(1.0 / (3.0 * ramp.std()), abs=0.001)
-    low, high = share_interval(0.5, 0.01, white)
-    assert high - low == pytest.approx(2 * 1.96 * 0.01, rel=0.01)
 
 
 def test_an_interval_wider_than_twice_its_value_is_a_bound(monkeypatch):

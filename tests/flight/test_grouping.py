@@ -9,7 +9,6 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, drafts
-from aerpaw_cmp.flight.pose import time_origin
 from aerpaw_cmp.flight.pose.grouping import flights
 from aerpaw_cmp.flight.pose.time_origin import origin_of
 from aerpaw_cmp.flight.settings import load_flight
@@ -168,24 +167,6 @@ def test_no_origin_for_another_track_or_a_hover() -> None:
     assert origin_of(stream_of(hover), stream_of(still)) is None, "every origin fits a hover"
 
 
-@pytest.mark.parametrize("north", [True, False])
-def test_places_are_told_apart_along_either_axis(north: bool) -> None:
-    """Tracks that share time are one flight near by and two apart, whether north or east of each other."""
-    from aerpaw_cmp.flight.pose import grouping
-
-    span = (np.datetime64("2025-03-02T15:00:00"), np.datetime64("2025-03-02T15:05:00"))
-
-    def flight(away: float) -> grouping.Flight:
-        place = (35.73 + away * north, -78.7 + away * (not north))
-        return grouping.Flight(files=[], span=span, place=place)
-
-    apart = grouping.APART_DEG
-    assert grouping._meet(flight(0.0), span, (35.73, -78.7))
-    assert grouping._meet(flight(0.9 * apart), span, (35.73, -78.7))
-    for away in (1.1 * apart, -1.1 * apart):
-        assert not grouping._meet(flight(away), span, (35.73, -78.7))
-
-
 def test_radios_meet_a_flight_up_to_the_slack_before_and_after() -> None:
     from aerpaw_cmp.flight.pose import grouping
 
@@ -241,28 +222,3 @@ def test_a_log_may_lie_twelve_metres_beside_the_track(aside_m: float, agrees: bo
         assert estimate.distance_m == pytest.approx(0.9 * aside_m, abs=0.3)
     assert origin_of(stream_of(log.iloc[:19]), stream_of(flown)) is None
     assert origin_of(stream_of(flown.iloc[40:240]), stream_of(flown)) is None, "its times are times of a day"
-
-
-def test_the_miss_is_the_median_distance_whatever_the_heights_count_from() -> None:
-    time = np.arange(10.0)
-    way = np.column_stack([10.0 * time, 0 * time, 5.0 * time])
-    here = way + np.array([3.0, -4.0, 70.0])
-    misses = time_origin._median_distances(np.array([0.0, -5.0, -5.5]), time, here, time, way)
-    assert misses[0] == pytest.approx(5.0)
-    assert misses[1] == pytest.approx(np.hypot(53.0, 4.0)), "half lies inside"
-    assert np.isnan(misses[2])
-    rng = np.random.default_rng(3)
-    values, counts = rng.normal(size=(50, 9)), rng.uniform(size=(50, 9)) < 0.6
-    counts[0] = False
-    expected = [np.median(row[inside]) if inside.any() else np.nan for row, inside in zip(values, counts, strict=True)]
-    np.testing.assert_array_equal(time_origin._medians(values, counts), expected)
-    frame = pd.DataFrame({"time": pd.to_datetime(np.arange(500.0), unit="s"), "latitude_deg": 35.0 + 1e-5 * np.arange(500.0),
-                          "longitude_deg": -78.0, "altitude_m": np.nan})  # fmt: skip
-    sampled = time_origin._points(frame.sample(frac=1.0, random_state=1), 240)
-    assert sampled is not None
-    assert len(sampled[0]) == 240
-    assert (sampled[0][0], sampled[0][-1]) == (np.datetime64(0, "s"), np.datetime64(499, "s"))
-    metres = time_origin._metres(sampled[1], sampled[1])
-    assert metres[-1] == pytest.approx([0.0, 499 * 1.1132, 0.0])
-    sixty_north = time_origin._metres(np.array([[60.0, 10.001, 7.0]]), np.array([[60.0, 10.0, 0.0]]))
-    assert sixty_north[0] == pytest.approx([55.66, 0.0, 7.0], abs=1e-3)

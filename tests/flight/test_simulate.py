@@ -12,11 +12,8 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight import simulate
-from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.flight.simulate import FlightSimulator, correlated_noise, plan_trajectory, telemetry_frame
-from aerpaw_cmp.site.siteyaml import load_site
 
 POINTS = [(0, 0, 2, 3), (30, 40, 2, 0), (30, 40, 22, 0), (30, 40, 22, 4), (33, 44, 42, 0)]  # east, north, height, hold
 
@@ -147,56 +144,3 @@ logs:
   - {path: a.txt, reader: sounder_log, node: LW1, channel: A}
   - {path: b.csv, reader: quectel_ri, node: LW1}
 """
-
-
-@pytest.mark.parametrize(("field", "attitude"), [("power", "level"), ("coherent", "logged"), ("power", "ignored")])
-def test_a_log_of_a_plan_holds_replayed_levels_less_offset_at_the_times_of_its_clock(
-    field: str, attitude: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    text = FLIGHT.replace("FIELD", field).replace("ATTITUDE", attitude)
-    made = FlightSimulator(parse_yaml(text, FlightFile), load_site("lake_wheeler"), tmp_path)
-    assert made.settings.flight.plan is not None
-    route = plan_trajectory(made.settings.flight.plan)
-    begin = pd.Timestamp("2025-06-01T14:00:00")
-    vars(made).update(plan=made.settings.flight.plan, trajectory=route, start_utc=begin,
-                      truth_={"rss": {}, "rank": {}}, generator=np.random.default_rng(1))  # fmt: skip
-    written: list[Any] = []
-    poses: list[Any] = []
-
-    def replayed(_site: Any, _rt: Any, _link: Any, at: Any) -> Any:
-        poses.append(at)
-        level = -60.0 - np.arange(len(at.position_m), dtype=float)
-        level[3] = -np.inf
-        level[4] = -500.0
-        h = np.zeros((len(level), 1, 4, 4), dtype=complex)
-        h[:, 0, 0, 0] = h[:, 0, 1, 1] = 1.0
-        return SimpleNamespace(rss_power_dbm=level[:, None], rss_dbm=level[:, None] + 0.5, h=h)
-
-    monkeypatch.setattr(simulate, "replay_poses", replayed)
-    monkeypatch.setattr(simulate, "format_power_log", lambda *given: written.append(given) or b"")
-    monkeypatch.setattr(simulate, "format_ri_csv", lambda *given: written.append(given) or b"")
-    for log in made.settings.logs:
-        made._log_bytes(log)
-    (times, level, zone), (records, _) = written
-    own = 0.5 * np.arange(20)  # of 10 s, the end left out
-    assert zone == "America/New_York"
-    assert (times - begin).dt.total_seconds().tolist() == pytest.approx((own + 3.0).tolist())
-    expected = -60.0 - np.arange(20) + 40.0 + 0.5 * (field == "coherent")
-    expected[[3, 4]] = np.nan
-    np.testing.assert_allclose(level, expected)
-    said = made.truth_["rss"]["LW1"]["A"]
-    assert (said["samples"], said["out_of_coverage"]) == (20, 2)
-    assert (said["offset_db"], said["clock_shift_s"]) == (-40.0, 3.0)
-    assert poses[0].position_m[0, 2] == 0.5  # half a metre at least, as in the replay
-    np.testing.assert_allclose(poses[0].position_m[8], [10.0, 0.0, 2.1])
-    nose = {"ignored": [1.0, 0.0, 0.0], "level": [1.0, 0.0, 0.0]}.get(attitude)
-    forward = poses[0].rotation[8] @ [1.0, 0.0, 0.0]
-    if nose is None:  # five metres a second: three degrees down
-        nose = [np.cos(np.radians(3.0)), 0.0, -np.sin(np.radians(3.0))]
-    np.testing.assert_allclose(forward, nose, atol=1e-9)
-    assert records["rank"].tolist() == [2] * 10
-    assert made.truth_["rank"]["LW1"]["histogram"] == {"0": 0, "1": 0, "2": 10, "3": 0, "4": 0}
-    assert records["altitude_m"].tolist() == pytest.approx(poses[1].position_m[:, 2].tolist())
-    for change in ({"node": None}, {"channel": None}, {"node": "LW9"}, {"reader": "generic_csv"}):
-        with pytest.raises(UsageError):
-            made._log_bytes(made.settings.logs[0].model_copy(update=change))

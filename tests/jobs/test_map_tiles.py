@@ -12,8 +12,6 @@ from aerpaw_cmp.jobs.mapping import coverage_map as mapping
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.tiles import PLANES, Budget, Reach, Tiling
 from aerpaw_cmp.propagation.geometry.arrays import Link, single_element
-from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.search.occlusion import Occlusion
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 
@@ -173,21 +171,3 @@ def test_a_tile_without_towers_is_out_of_coverage_at_once(monkeypatch):
     assert (paths, set(counts)) == (0, {0})
     assert np.isnan(maps["none"].rss_siso_dbm).all()
     assert (maps["none"].rank == 0).all()
-
-
-def test_solids_beside_segments_are_all_that_may_cut_them():
-    site = town(40)
-    hiding = Occlusion(Scene.of(site, mapping.SiteChannels(site, settings()).siso, _few()).faces, 1e-9)
-    rng = np.random.default_rng(5)
-    start = np.array([-350.0, -300.0, 9.0]) + rng.uniform(0, 40, (300, 3))
-    end = np.array([200.0, 330.0, 2.0]) + rng.uniform(0, 60, (300, 3))
-    near = hiding._solids_near(start, end)
-    met = hiding._boxes(start, end, np.arange(len(hiding.pieces))).any(axis=0)
-    assert set(np.flatnonzero(met)) <= set(near.tolist())
-    assert len(near) < 0.6 * len(hiding.pieces)
-    start[0] = np.nan  # a segment without a place hides none of the others
-    assert hiding._solids_near(start, end).tolist() == near.tolist()
-
-
-def _few():
-    return mapping.Poses(np.array([[0.0, 0.0, 30.0]]), np.eye(3)[None])

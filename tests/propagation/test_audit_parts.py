@@ -9,8 +9,8 @@ from shapely import Point
 
 from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.propagation.check import audit as audit_module
-from aerpaw_cmp.propagation.check import explain, reference
-from aerpaw_cmp.propagation.check.audit import Second, _spread, compare, extra_rows
+from aerpaw_cmp.propagation.check import reference
+from aerpaw_cmp.propagation.check.audit import Second, _spread
 from aerpaw_cmp.propagation.check.field_audit import (
     Expected,
     _another_rank,
@@ -222,40 +222,6 @@ def test_a_link_s_error_is_that_of_its_sum_where_all_paths_are_near_and_none_fad
     assert _link_error(paths, h, theirs, near, 2, 3) == pytest.approx(expected, rel=1e-12)
 
 
-def test_two_replays_differ_by_what_was_planted() -> None:
-    """Of six poses three are compared: one path is taken away, one put in place of another, two levels are moved."""
-    spots = np.array([[120.0, 60, 40], [40, -90, 25], [-200, 90, 60], [60, 10, 30], [90, 0, 50], [-50, -50, 20]])
-    poses = Poses(spots, np.tile(np.eye(3), (6, 1, 1)))
-    clean, chosen = replay(SITE, LINK, poses, Search("image", max_depth=1)), np.array([4, 0, 3])
-    few = replay(SITE, LINK, Poses(spots[chosen], np.tile(np.eye(3), (3, 1, 1))), Search("image", max_depth=1))
-    same = compare(clean, few, chosen)
-    assert (same.missing_paths, same.extra_paths, same.coverage_differs) == (0, 0, 0)
-    assert (same.rss_max_error_db, set(same.rank_disagreement.values())) == (0.0, {0.0})
-    paths, level, covered = clean.paths, clean.rss_dbm.copy(), clean.has_path.copy()
-    dropped, bent = (int(np.flatnonzero((paths.pose == pose) & (paths.depth == 1))[0]) for pose in (0, 3))
-    faces = paths.faces.copy()
-    plane = clean.faces.normal[faces[bent, 0]], clean.faces.offset_m[faces[bent, 0]]
-    other = (clean.faces.normal != plane[0]).any(axis=1) | (clean.faces.offset_m != plane[1])
-    unused = np.setdiff1d(np.flatnonzero(other), faces[paths.pose == 3])
-    faces[bent, 0] = unused[0]
-    rows = np.setdiff1d(np.arange(len(paths)), dropped)
-    level[[4, 0, 1], 0] += [3.0, -1.0, 50.0]  # the second is not compared
-    level[3, 0], covered[3, 0] = np.nan, False
-    planted = dataclasses.replace(
-        clean, contributions=(dataclasses.replace(paths, faces=faces).select(rows),), rss_dbm=level, has_path=covered,
-        h=clean.h * (np.arange(6) != 3)[:, None, None, None],
-    )  # fmt: skip
-    difference = compare(planted, few, chosen, (10.0, 1000.0))
-    assert (difference.missing_paths, difference.extra_paths, difference.reference_paths) == (2, 1, len(few.paths))
-    assert difference.rss_max_error_db == pytest.approx(3.0)
-    assert difference.rss_rms_error_db == pytest.approx(np.sqrt((9.0 + 1.0) / 2))
-    assert difference.coverage_differs == 1
-    assert difference.rank_disagreement == pytest.approx({10.0: 1 / 3, 1000.0: 1 / 3})
-    assert extra_rows(planted, few, chosen).tolist() == [int(np.flatnonzero(rows == bent)[0])]
-    none = compare(dataclasses.replace(planted, rss_dbm=np.full((6, 1), np.nan)), few, chosen)
-    assert np.isnan([none.rss_max_error_db, none.rss_rms_error_db]).all()
-
-
 @pytest.mark.parametrize(("samples", "rays"), [("auto", 100_000), (5_000, 5_000), (300_000, 100_000)])
 def test_an_audit_adds_up_its_checks(monkeypatch: pytest.MonkeyPatch, samples: object, rays: int) -> None:
     """The image engine by itself, two poses by the second implementation, and what Sionna would be asked."""
@@ -357,14 +323,6 @@ def test_patterns_a_second_time(name: str, pattern: Isotropic) -> None:
     )
     for component in (0, 1):
         np.testing.assert_allclose(np.broadcast_to(ours[component], theta.shape), theirs[..., component], atol=1e-9)
-
-
-@pytest.mark.parametrize(
-    ("length", "text"),
-    [(12.345, "12.35 m"), (0.5, "0.50 m"), (0.01, "0.01 m"), (0.0099, "9.9e-03 m"), (0.0, "0.0e+00 m")],
-)
-def test_lengths_below_a_centimetre_keep_their_digits(length: float, text: str) -> None:
-    assert explain._metres(length) == text
 
 
 def test_faces_are_counted_within_their_shape() -> None:

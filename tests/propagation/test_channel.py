@@ -46,10 +46,6 @@ def crossed_mp(theta, phi):
     )
 
 
-def isotropic_mp(theta, phi):
-    return mp.mpf(1), mp.mpf(0)
-
-
 def reference_h(site, link, poses, result, pose, field=crossed_mp):
     """50-digit H (tower sends) of one pose over the paths that the replay found."""
     tower = next(iter(link.tower_arrays.values()))

@@ -1,6 +1,5 @@
 """Guards of the sionna engine that need no Sionna, and bounds on memory."""
 
-import sys
 import tracemalloc
 from contextlib import nullcontext
 from types import SimpleNamespace
@@ -58,49 +57,6 @@ def test_a_line_of_sight_unlike_friis_or_a_gain_stops_the_run(settings, near_m, 
     unused = raw(gain_of_reflection=9.0)
     unused["valid"][:, :, 1] = False
     sionna._check_gain(unused, SOURCES, TARGETS, 3.4e9)
-
-
-def test_slots_leave_room_and_towers_share_scenes_by_their_ground(scenes):
-    """400 (targets mirrors^2)^2 slots, as a power of two within the limits."""
-    for targets, faces, expected in ((1, [0], 2**20), (100, [5], 2**22), (10, [3, 4, 4], 2**20), (50, [3, 4, 4], 2**24),
-                                     (100, [1, 2], 2**24), (25, [1, 2], 2**22), (100, [], 2**22)):  # fmt: skip
-        built = sionna._Scene(None, {0: np.array(faces[:1], dtype=int), 1: np.array(faces[1:], dtype=int)})
-        assert sionna._slots(built, targets) == expected, (targets, faces)
-    faces = site_faces(scenes.site([Building("b", box(40, -20, 45, 20), 30.0)], ((0, 0, 9), (1, 0, 9, 2), (2, 0, 9))))
-    ground = faces.offset_m[:, None] * (faces.solid < 0)[:, None]
-    usable = ((faces.solid >= 0)[:, None] | (ground == [0.0, 2.0, 0.0])).T
-    usable[2, -1] = False  # a roof that reflects for two towers only still hides from the third
-    groups = {tuple(towers): chosen.tolist() for towers, chosen in sionna._groups(faces, np.zeros((3, 3)), usable)}
-    solid = np.flatnonzero(faces.solid >= 0).tolist()
-    assert groups == {(0,): [0, *solid], (1,): [1, *solid], (2,): [0, *solid]}
-    ((towers, chosen),) = sionna._groups(faces, np.zeros((3, 3)), None)
-    assert (towers.tolist(), len(chosen)) == ([0, 1, 2], len(faces))
-
-
-@pytest.mark.parametrize(
-    ("candidates", "limit", "slots"),
-    [
-        (0, 64, 1024), (32, 64, 1024), (33, 64, 2048), (64, 64, 2048), (65, 128, 4096), (1000, 1024, 32_768),
-        (2**25, 2**25, 2**27), (2**25 + 1, None, None),
-    ],
-)  # fmt: skip
-def test_room_grows_with_the_candidates_of_the_last_batch(monkeypatch, candidates, limit, slots):
-    """A thirty-second of the table, a limit not below the number; two towers share the largest table."""
-    generator = SimpleNamespace(MIN_SPEC_COUNT_SIZE=0)
-    name = "sionna.rt.path_solvers.sb_candidate_generator"
-    monkeypatch.setitem(sys.modules, name, SimpleNamespace(SBCandidateGenerator=generator))
-    finder = object.__new__(sionna._Finder)
-    finder.limit, finder.slots = 64, 1024
-    finder.candidates = SimpleNamespace(numpy=lambda: np.array([0, candidates]))
-    finder.built = SimpleNamespace(scene=SimpleNamespace(transmitters={"a": 1, "b": 2}))
-    if limit is None:
-        with pytest.raises(CheckError, match=f"{candidates} candidates"):
-            finder._more_room()
-        return
-    assert finder._more_room() is ((limit, slots) != (64, 1024))
-    assert (finder.limit, finder.slots) == (limit, slots)
-    assert vars(generator) == {"MIN_SPEC_COUNT_SIZE": 0 if slots == 1024 else slots}
-    assert not finder._more_room()
 
 
 @pytest.mark.parametrize("many", [9, 10])

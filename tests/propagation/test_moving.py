@@ -1,7 +1,6 @@
 """A tower that moves: no approximation, and the limits in which it is a tower that stands."""
 
 import dataclasses
-import itertools
 
 import numpy as np
 import pytest
@@ -55,28 +54,6 @@ def test_every_pose_is_traced_from_its_own_place_whatever_the_blocks(monkeypatch
         np.testing.assert_allclose(replay_moving(SITE, LINK, poses(), rover()).h, replayed.h, rtol=1e-9)
     again = channel_matrices(replayed.paths, replayed.faces, rover()[:, None], poses(), LINK)
     np.testing.assert_allclose(again.h, replayed.h, rtol=1e-12)
-
-
-@pytest.mark.parametrize(("places", "links"), [(64, 16_384), (3, 16_384), (64, 20), (5, 3)])
-def test_blocks_hold_each_pose_once_and_as_many_places_as_fit(monkeypatch, places, links):
-    """Places come in the order in which they are first visited; one place alone may have more poses than fit."""
-    monkeypatch.setattr(moving, "PLACES_AT_ONCE", places)
-    monkeypatch.setattr(moving, "LINKS_AT_ONCE", links)
-    rng = np.random.default_rng(4)
-    visited = rng.permutation(np.repeat(np.arange(12), [9, 1, 1, 2, 1, 1, 5, 1, 1, 1, 1, 1]))
-    sources = rng.normal(size=(12, 3))[visited]
-    blocks = list(moving._blocks(sources))
-    assert sorted(np.concatenate([block.rows for block in blocks]).tolist()) == list(range(25))
-    for block in blocks:
-        assert np.array_equal(block.places_m[block.place], sources[block.rows])
-        assert len(block.places_m) == 1 or len(block.rows) * len(block.places_m) <= links
-        assert len(block.places_m) <= places
-    for block, after in itertools.pairwise(blocks):
-        more = int((after.place == 0).sum())
-        full = len(block.places_m) == places
-        assert full or (len(block.rows) + more) * (len(block.places_m) + 1) > links
-    first = np.concatenate([block.places_m for block in blocks])
-    assert np.array_equal(first, sources[np.sort(np.unique(visited, return_index=True)[1])])
 
 
 def test_reciprocity_the_moving_end_may_be_called_tower_or_uav():

@@ -293,9 +293,8 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     if texts[0] == plain(name):
         # 'Time (+02:00)'; 'heightAboveGround'
         texts += [bare, plain(in_brackets(name)[2]), plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))]
-    row, text = next(
-        ((row, text) for text in dict.fromkeys(texts) for form, row in _COMPILED if form.search(text)), (None, "")
-    )
+    hits = ((row, text) for text in dict.fromkeys(texts) for form, row in _COMPILED if form.search(text))
+    row, text = next(hits, (None, ""))
     if row is None or row.role == "other":
         return None
     rat = "nr" if _NR.search(text) else "lte" if _LTE.search(text) else ""

@@ -153,11 +153,8 @@ def _write_file(group: Any, file: IngestedFile, sink: Sink) -> None:
 
 def _write_stream(group: Any, stream: Stream, sink: Sink) -> None:
     columns = [{"name": str(name), "type": _type(stream.frame[name])} for name in stream.frame.columns]
-    _write_json(
-        group,
-        "meta",
-        {"kind": stream.kind, "name": stream.name, "columns": columns, "attributes": dict(stream.attributes)},
-    )
+    known = {**named(stream, "kind name"), "columns": columns, "attributes": dict(stream.attributes)}
+    _write_json(group, "meta", known)
     for i, column in enumerate(columns):
         _write_column(group, f"C{i:05d}", stream.frame[column["name"]], column["type"])
         sink.raise_spared()
@@ -240,9 +237,8 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
     if form != FORMAT:
         raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
     if version != _VERSION:
-        raise InputError(
-            f"flight file of version {version}", expected=f"version {_VERSION}", cause="a newer tool", path=path
-        )
+        found = f"flight file of version {version}"
+        raise InputError(found, expected=f"version {_VERSION}", cause="a newer tool", path=path)
     with parsing(path, "a flight file of 'aerpaw-cmp ingest -o'", "a cut copy: ingest the logs again", any_shape=True):
         return [_read_file(items, name) for name in _numbered(items, "files/")]
 
@@ -270,10 +266,8 @@ def _read_stream(items: Mapping[str, AnyArray], group: str) -> Stream:
     import pandas as pd
 
     meta = _read_json(items[f"{group}meta"])
-    columns = {
-        column["name"]: _read_column(items, f"{group}C{i:05d}", column["type"])
-        for i, column in enumerate(meta["columns"])
-    }
+    listed = enumerate(meta["columns"])
+    columns = {column["name"]: _read_column(items, f"{group}C{i:05d}", column["type"]) for i, column in listed}
     return Stream(meta["kind"], meta["name"], pd.DataFrame(columns), meta["attributes"])
 
 

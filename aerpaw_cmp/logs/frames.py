@@ -92,9 +92,8 @@ class Logs(dict[str, pd.DataFrame]):
 
     def __repr__(self) -> str:
         """One line per stream."""
-        return "\n".join(
-            [f"Logs of {counted(len(self.files), 'file')}", *("  " + _line(k, v) for k, v in self.items())]
-        )
+        lines = ("  " + _line(name, frame) for name, frame in self.items())
+        return "\n".join([f"Logs of {counted(len(self.files), 'file')}", *lines])
 
     def _repr_html_(self) -> str:
         """A table of streams for notebooks."""

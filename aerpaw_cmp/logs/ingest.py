@@ -234,9 +234,8 @@ def read_log(
     """
     path = root / name
     if not exists(path):
-        raise InputError(
-            "there is no such log", expected=f"a log below '{root}'", cause="a wrong path, or --logs-root", path=path
-        )
+        cause = "a wrong path, or --logs-root"
+        raise InputError("there is no such log", expected=f"a log below '{root}'", cause=cause, path=path)
     if reader is not None:
         _refuse_other_kind(path, by_name(reader))
     if (part := _in_flight_file(path)) is not None:

@@ -112,10 +112,8 @@ def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArra
 
     variables, notes = read("matlab", data)
     chosen = {name: values.T for name, values in variables.items() if wanted is None or name in wanted}
-    text = {
-        name for name, kind in notes["classes"].items() if kind == "char" and name in chosen and chosen[name].ndim == 2
-    }
-    return {name: _letters(values) if name in text else values for name, values in chosen.items()}
+    text = {name for name, kind in notes["classes"].items() if kind == "char"}
+    return {name: _letters(values) if name in text and values.ndim == 2 else values for name, values in chosen.items()}
 
 
 def _letters(codes: AnyArray) -> AnyArray:

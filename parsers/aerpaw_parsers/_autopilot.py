@@ -133,9 +133,8 @@ def result(
     if len(flights) > 1:
         systems = ", ".join(str(flight.system) for flight in flights)
         rows.warnings.append(f"{len(flights)} vehicles (systems {systems}): a track of its own for each")
-    return rows.result(
-        [_track(rows.part(owner[timed] == i), flight, timed[owner == i]) for i, flight in enumerate(flights)]
-    )
+    of = owner[timed]
+    return rows.result([_track(rows.part(of == i), flight, timed[owner == i]) for i, flight in enumerate(flights)])
 
 
 def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:

@@ -199,6 +199,5 @@ def named(
             "rss", short, {"rss_db": level}, where=where, flag=flag, channel=rows.options.channel or short,
             unit=rows.options.unit or unit or quantity.unit, quantity=quantity.name, about=about,
         )  # fmt: skip
-    return rows.stream(
-        "kpi", short, {"value": values}, where=where, unit=unit or quantity.unit, quantity=quantity.name, about=about
-    )
+    about = {"unit": unit or quantity.unit, "quantity": quantity.name, **(about or {})}
+    return rows.stream("kpi", short, {"value": values}, where=where, about=about)

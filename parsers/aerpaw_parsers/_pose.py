@@ -46,10 +46,8 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
             text = "a position on a grid (UTM, ECEF), which is not read: add columns of latitude and longitude"
             rows.warnings.append(f"column {sheet.names[grid]!r}: {text}")
         return None
-    values: dict[str, AnyArray] = {
-        "latitude_deg": _signed(sheet, latitude, "NS"),
-        "longitude_deg": _signed(sheet, longitude, "EW"),
-    }
+    angles = _signed(sheet, latitude, "NS"), _signed(sheet, longitude, "EW")
+    values: dict[str, AnyArray] = dict(zip(PLACE, angles, strict=False))
     lost = clean(rows, values)
     refuse_whole_degrees([sheet.names[latitude], sheet.names[longitude]], values)
     datum, height = _height(rows, sheet)
@@ -94,9 +92,8 @@ def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
     """Put NaN for positions that cannot be (or 0, 0) into a dictionary of columns; their mask."""
     latitude, longitude = values["latitude_deg"], values["longitude_deg"]
     # receivers write 0, 0 before their first fix
-    lost: AnyArray = np.asarray(
-        ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)) | ((latitude == 0) & (longitude == 0))
-    )
+    possible = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
+    lost: AnyArray = np.asarray(~possible | ((latitude == 0) & (longitude == 0)))
     values |= {"latitude_deg": np.where(lost, np.nan, latitude), "longitude_deg": np.where(lost, np.nan, longitude)}
     rows.mark(lost, "no_fix")
     return lost

@@ -237,9 +237,8 @@ class Sheet:
         """A column as text."""
         column_texts = [cells[column].strip() for cells in self.cells]
         if column in self._silent:
-            column_texts = [
-                "" if silent else text for text, silent in zip(column_texts, self._silent[column].tolist(), strict=True)
-            ]
+            both = zip(column_texts, self._silent[column].tolist(), strict=True)
+            column_texts = ["" if silent else text for text, silent in both]
         return column_texts
 
     def numbers(self, column: int) -> FloatArray:
@@ -402,10 +401,8 @@ class _Table:
     def _is_header(self, texts: list[str]) -> bool:
         """Check whether a line is a header, of the same columns or of others; what follows is read under it."""
         bare = [dictionary.without_unit(text) for text in texts]
-        known = [
-            name in self._known or dictionary.meaning(text) is not None
-            for (name, _), text in zip(bare, texts, strict=True)
-        ]
+        both = zip(bare, texts, strict=True)
+        known = [name in self._known or dictionary.meaning(text) is not None for (name, _), text in both]
         if len(texts) < 2 or 2 * sum(known) <= sum(bool(text) for text in texts):
             return False
         spare: dict[str, list[int]] = {}
@@ -490,10 +487,8 @@ def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[i
     longer = [not fields[-1].strip() for _, fields in rows if len(fields) == len(names) + 1]
     filled = longer.count(False)  # a torn row or two may have a field more, too
     if 2 * longer.count(True) > len(rows) and filled <= max(1, len(rows) // 100):
-        rows = [
-            (i, fields[:-1] if len(fields) == len(names) + 1 and not fields[-1].strip() else fields)
-            for i, fields in rows
-        ]
+        more = len(names) + 1
+        rows = [(i, row[:-1] if len(row) == more and not row[-1].strip() else row) for i, row in rows]
     if not names[-1]:
         rows = [(i, [*fields, ""] if len(fields) == len(names) - 1 else fields) for i, fields in rows]
     return rows
@@ -744,6 +739,5 @@ def nothing(data: bytes, reader: str, reason: str) -> ReadResult:
     lines = _lines.split(data)
     filled = np.flatnonzero(~lines.blank)
     rejected = tuple(lines.reject_all(filled, reason))
-    return ReadResult(
-        reader=reader, streams=(), lines=len(lines), accepted=0, blank=len(lines) - len(filled), rejected=rejected
-    )
+    blank = len(lines) - len(filled)
+    return ReadResult(reader=reader, streams=(), lines=len(lines), accepted=0, blank=blank, rejected=rejected)

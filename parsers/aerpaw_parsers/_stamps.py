@@ -159,9 +159,8 @@ def _year(digits: str) -> str:
 
 def _match(text: str) -> re.Match[str] | None:
     matches = (form.fullmatch(text) for form in _FORMS)
-    return next(
-        (match for match in matches if match and (match.groupdict().get("word") is None or _month(match["word"]))), None
-    )
+    known = (match for match in matches if match and (match.groupdict().get("word") is None or _month(match["word"])))
+    return next(known, None)
 
 
 def _written(text: str, order: _Order, zones: _Zones) -> bytes:

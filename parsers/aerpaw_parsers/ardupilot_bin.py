@@ -73,9 +73,8 @@ def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
         if form is None or form.length < 3 or at + form.length > end:
             next_mark = data.find(_MARK, at + 1)
             next_mark = end if next_mark < 0 else next_mark
-            damaged.append(
-                RejectedLine(count + len(damaged) + 1, f"{next_mark - at} bytes at {at} that are no message", "")
-            )
+            reason = f"{next_mark - at} bytes at {at} that are no message"
+            damaged.append(RejectedLine(count + len(damaged) + 1, reason, ""))
             at = next_mark
             continue
         body = data[at + 3 : at + form.length]
@@ -176,9 +175,8 @@ def _offset(gps: _autopilot.Series) -> float | None:
     if "GWk" not in gps.columns or "GMS" not in gps.columns:
         return None
     known = gps.columns["GWk"] > 1000
-    return _autopilot.offset_s(
-        _autopilot.gps_utc_s(gps.columns["GWk"][known], gps.columns["GMS"][known]), gps.time_s[known]
-    )
+    utc_s = _autopilot.gps_utc_s(gps.columns["GWk"][known], gps.columns["GMS"][known])
+    return _autopilot.offset_s(utc_s, gps.time_s[known])
 
 
 READER = Reader(

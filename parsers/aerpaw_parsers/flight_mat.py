@@ -90,9 +90,8 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
         if name in table:
             count = np.arange(len(table[name]))
             return np.round(count * step_s * 1e9).astype(np.int64), count >= 0, _COUNTED
-    raise InputError(
-        "the MATLAB file has no clock", expected=f"a variable {', '.join((*_TEXTS, *_EPOCHS))}", cause="not a flight"
-    )
+    clocks = ", ".join((*_TEXTS, *_EPOCHS))
+    raise InputError("the MATLAB file has no clock", expected=f"a variable {clocks}", cause="not a flight")
 
 
 # Clock of files that have none.
@@ -133,9 +132,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     table = _load(data)
     if not any(name in table for name in (*_LEVELS, *_TELEMETRY)):
-        raise InputError(
-            "the MATLAB file holds no flight", expected=f"variables such as {', '.join(sorted(_NAMES)[:5])}"
-        )
+        raise InputError("the MATLAB file holds no flight", expected=f"variables: {', '.join(sorted(_NAMES)[:5])}")
     count = _common_length(table)
     wall, valid, clock = _wall(table)
     keep = np.flatnonzero(valid)

@@ -52,9 +52,8 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
         )
     lacking = [name for name in ("time", *_VALUE[options.kind]) if name not in options.columns]
     if lacking:
-        raise UsageError(
-            f"'columns:' lacks {', '.join(lacking)}", expected=f"e.g. columns: {{{lacking[0]}: {header[0]!r}}}"
-        )
+        example = f"e.g. columns: {{{lacking[0]}: {header[0]!r}}}"
+        raise UsageError(f"'columns:' lacks {', '.join(lacking)}", expected=example)
     absent = sorted({name for name in options.columns.values() if name not in header})
     if absent:
         near = get_close_matches(absent[0], header, 1)
@@ -64,9 +63,7 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
             cause=f"did you mean {near[0]!r}?" if near else None,
         )
     if options.kind == "rank" and options.ri_base is None:
-        raise UsageError(
-            "generic_csv cannot know whether rank 1 is written as 0 or 1", expected="'ri_base:' zero or one"
-        )
+        raise UsageError("a table does not say whether rank 1 is written as 0 or 1", expected="'ri_base:' zero or one")
     return options.kind, {column: header.index(name) for column, name in options.columns.items()}
 
 
@@ -89,9 +86,7 @@ def _values(sheet: _sheet.Sheet, column: int, name: str, options: ReadOptions) -
     right = unit in ("dBm", "dB") if name == "rss_db" else unit == wanted
     bracketed = "[" in written or unit in {known for known, _ in dictionary.UNITS.values()}
     if unit and wanted and not right and bracketed:
-        raise UsageError(
-            f"column {sheet.names[column]!r} is in {unit} and mapped to {name}", expected=f"a column in {wanted}"
-        )
+        raise UsageError(f"column {written!r} is in {unit} and mapped to {name}", expected=f"a column in {wanted}")
     if name == "rss_db" and unit == "dBm" and options.unit not in (None, "dBm"):
         raise UsageError(f"column {sheet.names[column]!r} says dBm and --unit says {options.unit}", expected="one unit")
     if name == "rss_db" and unit == "dB" and options.unit == "dBm":
@@ -215,9 +210,8 @@ def _lifted(rows: _rows.Rows, sheet: _sheet.Sheet, values: dict[str, AnyArray], 
     if height is None or height.quantity.datum not in ("sea level", "ellipsoid") or "latitude_deg" not in values:
         return {}
     rows.height_from = "written"
-    values["altitude_m"], about = _pose.above_takeoff(
-        rows, values, height.quantity.datum, np.isnan(values["latitude_deg"])
-    )
+    lost = np.isnan(values["latitude_deg"])
+    values["altitude_m"], about = _pose.above_takeoff(rows, values, height.quantity.datum, lost)
     return about
 
 

@@ -53,9 +53,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     row = lines.number_at(at for at, _ in points)
     placed = [values for _, values in points]
     clock, time, warnings = _stamps.read([values[b"time"].decode("ascii", "replace") for values in placed], options)
-    column = {
-        name.decode(): _lines.cells([values.get(name, b"") for values in placed]) for name in (b"lat", b"lon", b"ele")
-    }
+    names = (b"lat", b"lon", b"ele")
+    column = {name.decode(): _lines.cells([values.get(name, b"") for values in placed]) for name in names}
     rows = _rows.built(
         lines, row, {"time": time, **column}, options, reader="gpx", reason=lambda _line: None, clock=clock,
         extra=_torn(lines, data, row), closed=True,

@@ -51,9 +51,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     text = f"{year}-{month}-{day} {hour}:{minute}:{second}.{part or '0'}".encode()
     instants, valid = _time.texts_to_utc(np.array([text]), options, needed_by="iq_burst")
     if not valid[0]:
-        raise InputError(
-            "the date in the name of the burst is none of the calendar", expected="YYYY_mm_dd_HH_MM_SS_mmm"
-        )
+        raise InputError("the date in the burst's name is none of the calendar", expected="YYYY_mm_dd_HH_MM_SS_mmm")
     with np.errstate(all="ignore"):  # damaged samples may be any number
         power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
     rows = _rows.Rows(
@@ -62,10 +60,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     )  # fmt: skip
     instants.flag(rows.flag)
     streams = []
-    about: dict[str, Attribute | None] = {
-        "frequency_hz": options.frequency_hz or float(named[1]),
-        "unit": options.unit or "dB re full scale",
-    }
+    about: dict[str, Attribute | None] = {"frequency_hz": options.frequency_hz or float(named[1])}
+    about["unit"] = options.unit or "dB re full scale"
     for channel, mean_square in enumerate(power.tolist(), start=1):
         level, flag = rows.level(np.array([10 * np.log10(mean_square) if 0 < mean_square < np.inf else np.nan]))
         name = f"USRP{channel}"

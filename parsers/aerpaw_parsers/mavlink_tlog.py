@@ -100,17 +100,15 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             begin = at
             while at < len(data) and _packet(data, at) is None:
                 at = _next_mark(data, at)
-            damaged.append(
-                RejectedLine(count + len(damaged) + 1, f"{at - begin} bytes at {begin} that are no packet", "")
-            )
+            reason = f"{at - begin} bytes at {begin} that are no packet"
+            damaged.append(RejectedLine(count + len(damaged) + 1, reason, ""))
             continue
         length, kind, source, payload = packet
         if kind in _EXTRA:
             layout = _LAYOUT[kind]
             values = layout.unpack(payload[: layout.size].ljust(layout.size, b"\0"))  # trailing zeros are not sent
-            messages[kind].append(
-                (count + len(damaged), source, int.from_bytes(data[at : at + 8], "big") / 1e6, values)
-            )
+            time_s = int.from_bytes(data[at : at + 8], "big") / 1e6
+            messages[kind].append((count + len(damaged), source, time_s, values))
         count += 1
         at += length
     systems = sorted({item[1][0] for item in messages[_POSITION]})

@@ -80,10 +80,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     row, quantities, clock, time = _rows_of(lines)
     rows = _rows.built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)
     timed = [quantities[i] for i in rows.at.tolist()]
-    value = {
-        name: np.array([float(item.get(name, b"nan")) for item in timed])
-        for name in ("ri", "cqi", "sinr", "rsrp", "meas")
-    }
+    names = ("ri", "cqi", "sinr", "rsrp", "meas")
+    value = {name: np.array([float(item.get(name, b"nan")) for item in timed]) for name in names}
     rnti = np.array([float(int(item["rnti"], 16)) if "rnti" in item else np.nan for item in timed])
     reported = np.flatnonzero(~np.isnan(value["ri"]))
     ri = value["ri"][reported]
@@ -97,9 +95,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     level, flag = rows.level(value["rsrp"])
     levels = {"rss_db": level[measured], "serving": np.ones(len(measured)), "rnti": rnti[measured]}
     about = {"channel": options.channel or "nr_rsrp", "unit": "dBm", "quantity": "RSRP", "rat": "nr"}
-    return rows.result(
-        [*ranks, *_rows.of_ues(rows, "rss", "nr_rsrp", levels, pick=measured, flag=flag[measured], about=about)]
-    )
+    of_ues = _rows.of_ues(rows, "rss", "nr_rsrp", levels, pick=measured, flag=flag[measured], about=about)
+    return rows.result([*ranks, *of_ues])
 
 
 READER = Reader(

@@ -38,11 +38,7 @@ def sniff(head: bytes) -> bool:
     if head.startswith((b"CELL_LOG_START,", b"GPS_LOG_START,")):
         return True
     first = head.lstrip(b"\xef\xbb\xbf[ \r\n").split(b"\n", 1)[0]
-    return (
-        head.lstrip(b"\xef\xbb\xbf[ \r\n").startswith(b"{")
-        and b'"abs_time"' in first
-        and any(m in first for m in _MARKS)
-    )
+    return first.startswith(b"{") and b'"abs_time"' in first and any(mark in first for mark in _MARKS)
 
 
 def _reading(row: int, cell: dict[str, Any], connected: float) -> _cells.Reading:
@@ -67,9 +63,7 @@ def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
         place = _OF_TEXT.get(rat)
         if place is None or len(cells) < place["fields"]:
             return None
-        values: dict[str, Any] = {
-            key: cells[at].decode("ascii", "replace") for key, at in place.items() if key != "fields"
-        }
+        values = {key: cells[at].decode("ascii", "replace") for key, at in place.items() if key != "fields"}
         decoded.append({**values, "technology": rat.decode(), "is_connected": values["connected"]})
     return decoded
 
@@ -160,9 +154,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     timed = [entries[i] for i in rows.at.tolist()]
     if any("companion_abs_time" not in item and "cells" in item for item in timed):
         rows.warnings.append("some lines lack companion_abs_time: the phone's own clock was taken there")
-    return rows.result(
-        [_track(rows, timed), *_cells.streams(rows, _readings(timed), source="PawPrints"), _nr(rows, timed)]
-    )
+    cells = _cells.streams(rows, _readings(timed), source="PawPrints")
+    return rows.result([_track(rows, timed), *cells, _nr(rows, timed)])
 
 
 READER = Reader(

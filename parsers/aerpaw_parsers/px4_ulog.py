@@ -65,9 +65,8 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
     while at + 3 <= len(data):
         size, kind = struct.unpack_from("<HB", data, at)
         if kind not in _KINDS or at + 3 + size > len(data):
-            damaged.append(
-                RejectedLine(count + 1, f"{len(data) - at} bytes at {at} that are no message: read no further", "")
-            )
+            reason = f"{len(data) - at} bytes at {at} that are no message: read no further"
+            damaged.append(RejectedLine(count + 1, reason, ""))
             break
         body = data[at + 3 : at + 3 + size]
         if kind == ord("F"):

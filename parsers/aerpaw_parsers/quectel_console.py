@@ -70,9 +70,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     entries, rejected = _tables(lines)
     row = np.array([item[0] for item in entries], dtype=np.int64)
     time = _lines.cells([item[1] for item in entries])
-    rows = _rows.built(
-        lines, row, {"time": time}, options, reader="quectel_console", reason=lambda _line: None, extra=rejected
-    )
+    talk, column = lambda _line: None, {"time": time}
+    rows = _rows.built(lines, row, column, options, reader="quectel_console", reason=talk, extra=rejected)
     timed = [entries[i] for i in rows.at.tolist()]
     readings = [
         _cells.reading(i, value, rat="lte" if title == "LTE" else "nr", serving=True)

@@ -208,9 +208,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows = _rows.built(lines, row, table, options, reader="quectel_csv", reason=_reason)
     form = rows.columns["form"]
     nr = np.isin(form, (2, _NSA_FORM)) | ((form == 1) & (rows.columns["nr_rsrp"] != b""))
-    return rows.result(
-        [_rank(rows, "nr5g"), _rank(rows, "lte"), *_levels(rows, "lte", form == 1), *_levels(rows, "nr", nr)]
-    )
+    levels = (*_levels(rows, "lte", form == 1), *_levels(rows, "nr", nr))
+    return rows.result([_rank(rows, "nr5g"), _rank(rows, "lte"), *levels])
 
 
 READER = Reader(

@@ -117,9 +117,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         meta = json.loads(data.decode("utf-8-sig", "replace"))
         captures = _merged(meta)
     except (ValueError, RecursionError, AttributeError) as error:
-        raise InputError(
-            f"the SigMF meta file is no JSON ({error})", expected="a whole file", cause="a cut download"
-        ) from None
+        found = f"the SigMF meta file is no JSON ({error})"
+        raise InputError(found, expected="a whole file", cause="a cut download") from None
     tables = [*_track(captures, options), *_levels(captures, options)]
     warnings: list[str] = []
     if not any(stream.kind == "rss" for _, stream in tables):

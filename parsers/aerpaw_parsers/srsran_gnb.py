@@ -73,9 +73,7 @@ def sniff_json(head: bytes) -> bool:
     first = _json.first(head)
     if first is None:  # a first line longer than what sniffers see
         return head.lstrip()[:1] == b"{" and b'"ue_list"' in head and re.search(rb'"(dl_)?ri"\s*:', head) is not None
-    return ("timestamp" in first and any(True for _ in _ues(first))) or (
-        "timestamp" in first and '"ue_list"' in str(head)
-    )
+    return "timestamp" in first and (any(True for _ in _ues(first)) or b'"ue_list"' in head)
 
 
 def _ues(report: dict[str, Any]) -> Iterator[dict[str, Any]]:

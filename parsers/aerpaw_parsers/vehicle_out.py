@@ -110,9 +110,7 @@ def _values(rows: _rows.Rows, number: dict[str, FloatArray]) -> dict[str, AnyArr
     """Columns of the record model; positions without a fix, and attitudes that no row has, become NaN."""
     place = {f"{name}_deg": number[name] for name in ("latitude", "longitude")} | {"altitude_m": number["altitude"]}
     latitude, longitude, altitude = place.values()
-    no_fix = (
-        (number["fix"] < 2) | (longitude < _INVALID_POSITION) | (latitude < _INVALID_POSITION) | (altitude < -998.5)
-    )
+    no_fix = (number["fix"] < 2) | (np.fmin(longitude, latitude) < _INVALID_POSITION) | (altitude < -998.5)
     rows.mark(no_fix, "no_fix")
     outside = ~no_fix & ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (np.abs(altitude) < 1e5))
     rows.mark(outside, "position_out_of_range")

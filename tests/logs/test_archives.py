@@ -18,12 +18,10 @@ from aerpaw_cmp.logs.ingest import ingest
 from tests.parsers.samples import IQ_NAME, NEMO_CSV, NO_LOGS, OPTIONS, SOUNDER, VEHICLE_10, iq_mat
 
 CONTENT = {
-    "set/UAV/x_vehicleOut.txt": VEHICLE_10,
-    "set/LW1/x_power_log.txt": SOUNDER,
-    "set/LW1/x_power_log.txt.gz": gzip.compress(SOUNDER),
-    "set/phone.nmfs": NO_LOGS["nemo_binary"],
+    "set/UAV/x_vehicleOut.txt": VEHICLE_10, "set/LW1/x_power_log.txt": SOUNDER,
+    "set/LW1/x_power_log.txt.gz": gzip.compress(SOUNDER), "set/phone.nmfs": NO_LOGS["nemo_binary"],
     "__MACOSX/set/._x": b"junk",
-}
+}  # fmt: skip
 
 
 def zipped(content: dict[str, bytes]) -> bytes:

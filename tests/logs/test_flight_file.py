@@ -62,14 +62,9 @@ def files(draw: st.DrawFn) -> IngestedFile:
     rejected = draw(st.lists(st.builds(RejectedLine, st.integers(1, 2**40), TEXT, TEXT), max_size=4))
     accepted, blank = draw(st.integers(0, 2**40)), draw(st.integers(0, 2**40))
     result = ReadResult(
-        draw(TEXT),
-        tuple(draw(st.lists(streams(), max_size=3))),
-        accepted + blank + len(rejected),
-        accepted,
-        blank,
-        tuple(rejected),
-        tuple(draw(st.lists(TEXT, max_size=3))),
-    )
+        draw(TEXT), tuple(draw(st.lists(streams(), max_size=3))), accepted + blank + len(rejected), accepted, blank,
+        tuple(rejected), tuple(draw(st.lists(TEXT, max_size=3))),
+    )  # fmt: skip
     return IngestedFile(draw(TEXT), draw(TEXT), result)
 
 

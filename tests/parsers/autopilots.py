@@ -102,11 +102,9 @@ def ulog(place: str = "estimator") -> bytes:
     half = [math.radians(angle) / 2 for angle in (1.5, -2.5, 90.0)]
     (cr, cp, cy), (sr, sp, sy) = ([f(angle) for angle in half] for f in (math.cos, math.sin))
     q = (
-        cr * cp * cy + sr * sp * sy,
-        sr * cp * cy - cr * sp * sy,
-        cr * sp * cy + sr * cp * sy,
+        cr * cp * cy + sr * sp * sy, sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy,
         cr * cp * sy - sr * sp * cy,
-    )
+    )  # fmt: skip
     for i in range(COUNT):
         now = 30_000_000 + i * 1_000_000
         if place == "estimator":

@@ -14,13 +14,10 @@ from aerpaw_cmp.logs.readers import ReadOptions
 from tests.parsers import autopilots
 
 OPTIONS = ReadOptions(
-    timezone="America/New_York",
-    time_origin="2025-03-02T15:00:00Z",
-    kind="rss",
-    columns={"time": "Time", "rss_db": "Level"},
-    unit="dBm",
+    timezone="America/New_York", time_origin="2025-03-02T15:00:00Z", kind="rss",
+    columns={"time": "Time", "rss_db": "Level"}, unit="dBm",
     file_name="results_3320000000.0_2000000.0_2025_03_02_10_00_00_250.mat",
-)
+)  # fmt: skip
 
 VEHICLE_10 = (
     b'1,-78.7000001,35.7300002,0.5,"(0.1,1.5,-0.05)","(1.0,2.0,-0.5)",48.1,2025-03-02 10:00:00.250000,3,12\r\n'

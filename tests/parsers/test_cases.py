@@ -568,11 +568,9 @@ def test_the_log_of_the_tap_gives_the_level_of_lte_beside_that_of_nr(tmp_path: P
     header = (CASES / "autopilots" / "tap_handover.jsonl").read_text().splitlines()[0]
     cell = {"pcid": 7, "arfcn": 2300, "band": 4, "rsrp_dbm": -100, "rsrq_db": -12, "rssi_dbm": -70, "sinr_raw": 15}
     asked = {
-        "query": "servingcell",
-        "status": "ok",
-        "sent_utc_ns": 1_749_564_000 * 10**9,
+        "query": "servingcell", "status": "ok", "sent_utc_ns": 1_749_564_000 * 10**9,
         "last_utc_ns": 1_749_564_000 * 10**9,
-    }
+    }  # fmt: skip
     text = json.dumps({"kind": "exchange", "n": 1, **asked, "decoded": {"lte": cell}})[:-1]
     (tmp_path / "x.jsonl").write_text(f'{header}\n{text},"crc":"{zlib.crc32(text.encode()):08x}"}}\n')
     right = {"lte_rsrp": {"rss_db": [-100.0], "rsrq_db": [-12.0], "rssi_dbm": [-70.0]}}

@@ -64,12 +64,10 @@ def test_lines_with_one_sign_changed_are_left_to_the_strict_way(row: int, place:
 
 def test_why_lines_are_rejected() -> None:
     bad = [
-        line(6, "0000001\0 -50.0000"),
-        "2025-03-02 10:00:07.000000 0000014        -50.0000\n",
-        "[2025-03-02 10:00] 0000014        -50.0000\n",
-        line(8, "what the console said"),
+        line(6, "0000001\0 -50.0000"), "2025-03-02 10:00:07.000000 0000014        -50.0000\n",
+        "[2025-03-02 10:00] 0000014        -50.0000\n", line(8, "what the console said"),
         "[2025-02-30 10:00:07.000000] 0000014        -50.0000\n",
-    ]
+    ]  # fmt: skip
     words = ["NUL bytes", "no '[time]' in front", "time stamp is incomplete", "neither 'offset value'", "no date"]
     result = read(*GOOD, *bad)
     assert [word in reject.reason for word, reject in zip(words, result.rejected, strict=True)] == [True] * len(bad)

@@ -48,12 +48,9 @@ def test_round_trip_through_the_zone(seconds: list[int]) -> None:
 def test_the_hour_that_comes_twice() -> None:
     """3 November 2024: 01:30 is first 05:30Z, and after the clock stepped back 06:30Z."""
     texts = (
-        "2024-11-03T00:59:00",
-        "2024-11-03T01:30:00",
-        "2024-11-03T01:59:00",
-        "2024-11-03T01:01:00",
+        "2024-11-03T00:59:00", "2024-11-03T01:30:00", "2024-11-03T01:59:00", "2024-11-03T01:01:00",
         "2024-11-03T02:00:00",
-    )
+    )  # fmt: skip
     assert utc_of(*texts) == [
         "2024-11-03T04:59:00", "2024-11-03T05:30:00", "2024-11-03T05:59:00", "2024-11-03T06:01:00", "2024-11-03T07:00:00",
     ]  # fmt: skip

@@ -60,9 +60,7 @@ CASES |= {
     "milliseconds of the day, a date in the name": Case(
         "2025-03-02_merged.csv",
         ",TIME,SNR,LAT,LON,ALT\n0,36000250,12.5,35.73,-78.7,0.5\n1,36002750,13.5,35.73,-78.7,0.5\n",
-        {"snr": {"time": [0.25, 2.75], "value": [12.5, 13.5]}},
-        "drive_test",
-    ),
+        {"snr": {"time": [0.25, 2.75], "value": [12.5, 13.5]}}, "drive_test"),
     "AirData: whole seconds and a column of milliseconds": Case(
         "airdata.csv",
         "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet)\n"
@@ -91,7 +89,7 @@ CASES |= {
         "nemo_csv",
         replace(LOCAL, time_origin="2025-03-02T15:00:00Z"),
     ),
-}
+}  # fmt: skip
 
 
 LOG2CSV = "Number,Time,Longitude,Latitude,Altitude,Voltage,Battery Level,Fix,Number of Satellites\n"
@@ -108,35 +106,20 @@ MERGED = "2025-03-02 10:00:{s:02d},-78.7,35.73,{rise},{i},4,29\n"
 HEIGHTS = [50.0 + i for i in range(8)]
 CASES |= {
     "converted vehicleOut cut in flight keeps its heights": Case(
-        "cut.csv",
-        table(LOG2CSV, "{i},2025-03-02 10:00:{s:02d},-78.7,{north},{rise},48.1,90,4,29\n"),
-        {"vehicle": {"time": list(range(8)), "altitude_m": HEIGHTS}},
-        "pose_csv",
-    ),
+        "cut.csv", table(LOG2CSV, "{i},2025-03-02 10:00:{s:02d},-78.7,{north},{rise},48.1,90,4,29\n"),
+        {"vehicle": {"time": list(range(8)), "altitude_m": HEIGHTS}}, "pose_csv"),
     "MATLAB merge of vehicleOut that begins in the air": Case(
-        "merged.csv",
-        table("time,Longitude,Latitude,Altitude,BatteryVolts,GPSFix,NumberOfSatellites\n", MERGED),
-        {"vehicle": {"altitude_m": HEIGHTS}},
-        "pose_csv",
-    ),
+        "merged.csv", table("time,Longitude,Latitude,Altitude,BatteryVolts,GPSFix,NumberOfSatellites\n", MERGED),
+        {"vehicle": {"altitude_m": HEIGHTS}}, "pose_csv"),
     "a table of nobody that begins in flight keeps its heights": Case(
-        "x.csv",
-        table("time,lat,lon,alt\n", "2025-03-02 10:00:{s:02d},{north},-78.7,{rise}\n"),
-        {"vehicle": {"altitude_m": HEIGHTS}},
-        "pose_csv",
-    ),
+        "x.csv", table("time,lat,lon,alt\n", "2025-03-02 10:00:{s:02d},{north},-78.7,{rise}\n"),
+        {"vehicle": {"altitude_m": HEIGHTS}}, "pose_csv"),
     "a table of nobody that never leaves its height is not on the ground": Case(
-        "x.csv",
-        table("time,lat,lon,alt\n", "2025-03-02 10:00:{s:02d},35.73,-78.7,{rest}\n"),
-        {"vehicle": {"altitude_m": [134.5] * 8}},
-        "pose_csv",
-    ),
+        "x.csv", table("time,lat,lon,alt\n", "2025-03-02 10:00:{s:02d},35.73,-78.7,{rest}\n"),
+        {"vehicle": {"altitude_m": [134.5] * 8}}, "pose_csv"),
     "altitudes that the header calls above sea level": Case(
-        "x.csv",
-        table("time,lat,lon,altitude_msl\n", "2025-03-02 10:00:{s:02d},{north},-78.7,{rise}\n"),
-        {"vehicle": {"altitude_m": [float(i) for i in range(8)]}},
-        "pose_csv",
-    ),
+        "x.csv", table("time,lat,lon,altitude_msl\n", "2025-03-02 10:00:{s:02d},{north},-78.7,{rise}\n"),
+        {"vehicle": {"altitude_m": [float(i) for i in range(8)]}}, "pose_csv"),
     "Nemo's name is year, month, day; times that are not its name's are UTC, as they say": Case(
         "25Mar02_100000.1.gpx",
         '<gpx><trkpt lat="35.73" lon="-78.7"><ele>90.5</ele><time>T14:00:01.250Z</time></trkpt>\n'
@@ -147,16 +130,12 @@ CASES |= {
     "gnb.log of srsRAN Project is UTC": Case(
         "gnb.log",
         "2025-03-02T15:00:01.250000 [METRICS ] [I] Scheduler UE pci=1 rnti=0x4601 cqi=12 dl_ri=2.0 dl_mcs=27\n",
-        {"gnb": {"time": [1.25], "rank": [2.0], "rnti": [0x4601]}},
-        "srsran_gnb",
-    ),
+        {"gnb": {"time": [1.25], "rank": [2.0], "rnti": [0x4601]}}, "srsran_gnb"),
     "srsRAN Project's JSON with texts is UTC": Case(
         "gnb.json",
         '{"timestamp": "2025-03-02T15:00:02.500", "ue_list": [{"ue_container": {"pci": 1, "rnti": 17921, "dl_ri": 1}}]}\n',
-        {"gnb": {"time": [2.5], "rank": [1.0]}},
-        "srsran_json",
-    ),
-}
+        {"gnb": {"time": [2.5], "rank": [1.0]}}, "srsran_json"),
+}  # fmt: skip
 
 STAMPED = "[2025-03-02 10:00:{s:02d}.000000] {text}\n"
 
@@ -187,18 +166,13 @@ CASES |= {
         "oai_log",
     ),
     "two UEs of srsENB": Case(
-        "x_radio_enb_log.txt",
-        srsenb((1, "46", 2), (1, "47", 1), (2, "46", 2), (2, "47", 1)),
+        "x_radio_enb_log.txt", srsenb((1, "46", 2), (1, "47", 1), (2, "46", 2), (2, "47", 1)),
         {"srsenb_rnti0046": {"time": [1, 2], "rank": [2, 2]}, "srsenb_rnti0047": {"time": [1, 2], "rank": [1, 1]}},
-        "srsenb_log",
-    ),
+        "srsenb_log"),
     "one UE of srsENB that attaches again": Case(
-        "x_radio_enb_log.txt",
-        srsenb((1, "46", 2), (2, "46", 2), (3, "47", 2)),
-        {"srsenb": {"time": [1, 2, 3], "rank": [2, 2, 2], "rnti": [0x46, 0x46, 0x47]}},
-        "srsenb_log",
-    ),
-}
+        "x_radio_enb_log.txt", srsenb((1, "46", 2), (2, "46", 2), (3, "47", 2)),
+        {"srsenb": {"time": [1, 2, 3], "rank": [2, 2, 2], "rnti": [0x46, 0x46, 0x47]}}, "srsenb_log"),
+}  # fmt: skip
 
 
 DJI = "OSD.latitude,OSD.longitude,OSD.height [ft],OSD.yaw"
@@ -234,11 +208,8 @@ CASES |= {
         "pose_csv",
     ),
     "DJI Flight Reader: epochs": Case(
-        "dji.csv",
-        f"CUSTOM.updateTime [epoch],{DJI}\n1740927601.5,35.73,-78.7,10,-9.5\n",
-        {"vehicle": {"time": [1.5], "altitude_m": [3.048]}},
-        "pose_csv",
-    ),
+        "dji.csv", f"CUSTOM.updateTime [epoch],{DJI}\n1740927601.5,35.73,-78.7,10,-9.5\n",
+        {"vehicle": {"time": [1.5], "altitude_m": [3.048]}}, "pose_csv"),
     "QGroundControl's CSV": Case(
         "qgc.csv",
         "Timestamp,roll,pitch,heading,altitudeRelative,altitudeAMSL,gps.lat,gps.lon,gps.courseOverGround,gps.lock,gps.count\n"
@@ -264,10 +235,8 @@ CASES |= {
     "PX4's estimate through ulog2csv counts microseconds": Case(
         "log_vehicle_global_position_0.csv",
         "timestamp,timestamp_sample,lat,lon,alt,eph,epv\n1500000,1490000,35.73,-78.7,120.5,1,1\n2000000,1990000,35.73,-78.7,121.5,1,1\n",
-        {"vehicle": {"time": [1.5, 2.0], "altitude_m": [0, 1]}},
-        "pose_csv",
-        replace(LOCAL, time_origin="2025-03-02T15:00:00Z"),
-    ),
+        {"vehicle": {"time": [1.5, 2.0], "altitude_m": [0, 1]}}, "pose_csv",
+        replace(LOCAL, time_origin="2025-03-02T15:00:00Z")),
     "ArduPilot's log in text": Case(
         "x.log",
         "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n"
@@ -279,7 +248,7 @@ CASES |= {
         {"vehicle": {"time": [0.25, 0.45], "altitude_m": [0, 1], "yaw_deg": [270.5, 270.5], "satellites": [12, 12]}},
         "ardupilot_bin",
     ),
-}
+}  # fmt: skip
 
 GNETTRACK = "Timestamp\tLongitude\tLatitude\tNetworkTech\tLevel\tQual\tARFCN\tPSC\tAltitude\tHeight\n"
 NEMO = "Time,Longitude,Latitude,{c} (LTE pcell),Channel number (LTE pcell),RSRP (LTE pcell)," + (
@@ -336,17 +305,11 @@ CASES |= {
         "drive_test",
     ),
     "TEMS: the file's name says which is the day": Case(
-        "run_2025-03-02.csv",
-        "Time,PCI,EARFCN,RSRP (dBm)\n02/03/2025 10:00:00.250,12,1300,-80.5\n",
-        {"pci12": {"time": [0.25], "rss_db": [-80.5]}},
-        "drive_test",
-    ),
+        "run_2025-03-02.csv", "Time,PCI,EARFCN,RSRP (dBm)\n02/03/2025 10:00:00.250,12,1300,-80.5\n",
+        {"pci12": {"time": [0.25], "rss_db": [-80.5]}}, "drive_test"),
     "TEMS: words for months, tabs": Case(
-        "x.txt",
-        "Time\tServing PCI\tServing EARFCN\tServing RSRP (dBm)\n02-Mar-2025 10:00:00.250\t12\t1300\t-80.5\n",
-        {"pci12": {"time": [0.25], "rss_db": [-80.5]}},
-        "drive_test",
-    ),
+        "x.txt", "Time\tServing PCI\tServing EARFCN\tServing RSRP (dBm)\n02-Mar-2025 10:00:00.250\t12\t1300\t-80.5\n",
+        {"pci12": {"time": [0.25], "rss_db": [-80.5]}}, "drive_test"),
     "XCAL: NR and LTE in one row, a row without fix": Case(
         "x.csv",
         "TIME_STAMP,Lat,Lon,5G KPI PCell RF Serving PCI,5G KPI PCell RF Serving NR-ARFCN,5G KPI PCell RF Serving SS-RSRP [dBm],"
@@ -370,8 +333,7 @@ CASES |= {
         "x.csv",
         "XCAL export\n\nTIMESTAMP,Serving PCI,SS-RSRP [dBm]\n1740927600250,101,-85.5\n1740927601250,102,-86.5\n",
         {"nr_pci101": {"time": [0.25], "rss_db": [-85.5]}, "nr_pci102": {"time": [1.25], "rss_db": [-86.5]}},
-        "drive_test",
-    ),
+        "drive_test"),
     "QualiPoc: date and time apart": Case(
         "x.csv",
         "Date,Time,GPS Latitude,GPS Longitude,LTE Serving Cell PCI,LTE Serving Cell RSRP [dBm],LTE Rank Indicator\n"
@@ -380,17 +342,12 @@ CASES |= {
         "drive_test",
     ),
     "QualiPoc: UTC by the column's name": Case(
-        "x.csv",
-        "Time UTC;LTE Serving Cell PCI;LTE Serving Cell RSRP [dBm]\n2025-03-02 15:00:00.250;7;-80,5\n",
-        {"lte_pci7": {"time": [0.25], "rss_db": [-80.5]}},
-        "drive_test",
-    ),
+        "x.csv", "Time UTC;LTE Serving Cell PCI;LTE Serving Cell RSRP [dBm]\n2025-03-02 15:00:00.250;7;-80,5\n",
+        {"lte_pci7": {"time": [0.25], "rss_db": [-80.5]}}, "drive_test"),
     "QualiPoc: twelve hours, month first": Case(
         "x.csv",
         "Time,LTE Serving Cell PCI,LTE Serving Cell RSRP [dBm]\n03/02/2025 10:00:00.250 AM,7,-80.5\n03/13/2025 10:00:00 AM,7,-80.5\n",
-        {"lte_pci7": {"time": [0.25, 946800.0], "rss_db": [-80.5, -80.5]}},
-        "drive_test",
-    ),
+        {"lte_pci7": {"time": [0.25, 946800.0], "rss_db": [-80.5, -80.5]}}, "drive_test"),
     "a cell a row: the registered one serves": Case(
         "phone.csv",
         "timestamp,latitude,longitude,rat,pci,earfcn,rsrp,is_registered\n"
@@ -407,9 +364,7 @@ CASES |= {
     "CellMapper: signal of a PCI": Case(
         "cm.csv",
         "Latitude,Longitude,MCC,MNC,CID,Signal,Type,ARFCN,PSC or PCI,Timestamp\n35.73,-78.7,310,260,2,-85,LTE,2850,325,1740927600250\n",
-        {"lte_pci325": {"time": [0.25], "rss_db": [-85]}},
-        "drive_test",
-    ),
+        {"lte_pci325": {"time": [0.25], "rss_db": [-85]}}, "drive_test"),
     "one RNTI in two cells of an srsRAN gNB": Case(
         "gnb.json",
         "".join(
@@ -437,7 +392,7 @@ CASES |= {
         {"oai": {"time": [1, 2], "rank": [1, 2], "cqi": [15, 14]}, "nr_rsrp": {"rss_db": [-74, -74]}},
         "oai_log",
     ),
-}
+}  # fmt: skip
 
 
 ENDC = (
@@ -780,11 +735,9 @@ INSTANTS = {
 VALUES = [3, 1, 2, 4]
 # Where a value comes out, its sign, and what the row writes above it.
 COLUMNS = {
-    "level": ("rss_db", 1, 0.5),
-    "-level": ("rss_db", -1, 0.0),
-    "altitude_m": ("altitude_m", 1, 0.5),
+    "level": ("rss_db", 1, 0.5), "-level": ("rss_db", -1, 0.0), "altitude_m": ("altitude_m", 1, 0.5),
     "above the first": ("altitude_m", 1, -3.0),
-}
+}  # fmt: skip
 
 
 def written(form: Form, begin: datetime) -> tuple[str, list[np.datetime64]]:
@@ -826,20 +779,16 @@ def test_every_format_at_every_kind_of_time(name: str, when: str) -> None:
 ORIGINS = {
     "x_vehicleOut.txt": ("vehicle", "program", "program", None),
     "utc_vehicleOut.txt": ("vehicle", "written", "program", None),
-    "x_power_log.txt": ("power", "program", None, "assumed"),
-    "gnb.json": ("gnb", "program", None, "written"),
-    "nobody.csv": ("vehicle", "assumed", "assumed", None),
-    "amsl.csv": ("vehicle", "assumed", "written", None),
-}
+    "x_power_log.txt": ("power", "program", None, "assumed"), "gnb.json": ("gnb", "program", None, "written"),
+    "nobody.csv": ("vehicle", "assumed", "assumed", None), "amsl.csv": ("vehicle", "assumed", "written", None),
+}  # fmt: skip
 ROW = '1,-78.7,35.73,30.5,"(0.1,1.5,0.1)","(0.0,5.0,0.1)",48.1,2025-03-02 10:00:07.000000{zone},4,18\n'
 FILES = {
-    "x_vehicleOut.txt": ROW.format(zone=""),
-    "utc_vehicleOut.txt": ROW.format(zone="+00:00"),
-    "x_power_log.txt": od((1.0, -20.5)),
-    "gnb.json": CASES["srsRAN Project's JSON with texts is UTC"].data,
+    "x_vehicleOut.txt": ROW.format(zone=""), "utc_vehicleOut.txt": ROW.format(zone="+00:00"),
+    "x_power_log.txt": od((1.0, -20.5)), "gnb.json": CASES["srsRAN Project's JSON with texts is UTC"].data,
     "nobody.csv": CASES["a table of nobody that begins in flight keeps its heights"].data,
     "amsl.csv": CASES["altitudes that the header calls above sea level"].data,
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", ORIGINS)

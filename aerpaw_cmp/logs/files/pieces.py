@@ -65,8 +65,7 @@ def _stream(part: Sequence[tuple[Stream, pd.DataFrame]]) -> Stream:
     import pandas as pd
 
     first = part[0][0]
-    common = {
-        key: value for key, value in first.attributes.items() if all(s.attributes.get(key) == value for s, _ in part)
-    }
+    about = [stream.attributes for stream, _ in part]
+    common = {key: value for key, value in about[0].items() if all(other.get(key) == value for other in about)}
     frame = pd.concat([frame for _, frame in part]).sort_values("time", kind="stable").reset_index(drop=True)
     return Stream(first.kind, first.name, frame, common)

@@ -12,8 +12,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import groupby, product
 from typing import Any, Literal
 
 import numpy as np
@@ -217,31 +218,63 @@ def _kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
 
 def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
     """Covariance (n, m) of the gains between samples of some series and of others [dB^2]."""
-    mine, theirs = (np.repeat([s.antenna for s in series], [len(s) for s in series]) for series in (first, second))
-    out = np.zeros((len(mine), len(theirs)))
+    rows, columns = _antennas(first), _antennas(second)
+    out = np.zeros((sum(map(len, first)), sum(map(len, second))))
     for term in terms:
         at, to = (np.concatenate([argument_of(s, term.frame) for s in series]) for series in (first, second))
         if term.per != "antenna":
-            out += _kernel(term, at, to)
+            (at, row), (to, column) = (np.unique(some, axis=0, return_inverse=True) for some in (at, to))
+            out += _kernel(term, at, to)[row][:, column]  # channels of one log have the same directions
             continue
-        for name in dict.fromkeys(s.antenna for s in first):  # gains of two antennas share nothing
-            rows, columns = mine == name, theirs == name
-            out[np.ix_(rows, columns)] += _kernel(term, at[rows], to[columns])
+        blocks: dict[tuple[bytes, bytes], FloatArray] = {}
+        for (name, mine), (other, theirs) in product(rows, columns):
+            if name == other:  # gains of two antennas share nothing; those beside each other see the same
+                key = at[mine].tobytes(), to[theirs].tobytes()
+                blocks[key] = _kernel(term, at[mine], to[theirs]) if key not in blocks else blocks[key]
+                out[mine, theirs] += blocks[key]
     return out
 
 
-def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
-    """Covariance (n, n) of the levels of all rows: gains, and each series' offset, nuisance and noise [dB^2]."""
+def _antennas(series: Sequence[LinkSamples]) -> list[tuple[str, slice]]:
+    """Antennas of series one after another, and where the samples of each begin and end."""
+    out, start = [], 0
+    for name, some in groupby(series, lambda s: s.antenna):
+        stop = start + sum(map(len, some))
+        out.append((name, slice(start, stop)))
+        start = stop
+    return out
+
+
+def _expected(
+    terms: Sequence[Term], samples: LinkSamples, rows: Sequence[LinkSamples], weights: FloatArray
+) -> FloatArray:
+    """Gains (n,) along samples by the weights of the rows [dB]."""
+    gain, own = np.zeros(len(samples)), np.repeat([s.antenna == samples.antenna for s in rows], [len(s) for s in rows])
+    for term in terms:
+        shared = own if term.per == "antenna" else np.ones_like(own)
+        at = np.concatenate([argument_of(s, term.frame) for s in rows])[shared]
+        at, place = np.unique(at, axis=0, return_inverse=True)  # channels of one log have the same directions
+        gain += _kernel(term, argument_of(samples, term.frame), at) @ np.bincount(place, weights[shared])
+    return gain
+
+
+def _own_covariance(model: GainModel, samples: LinkSamples) -> FloatArray:
+    """Covariance (n, n) of a series' offset, nuisance and noise [dB^2]."""
     from scipy.spatial.distance import cdist
 
+    distance = cdist(samples.position_m, samples.position_m)
+    own = model.own_sd_db**2 * np.exp(-distance / model.own_length_m) + (_OFFSET_SD * model.noise_sd_db) ** 2
+    own[np.diag_indices(len(own))] += model.noise_sd_db**2
+    return np.asarray(own)
+
+
+def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
+    """Covariance (n, n) of the levels of all rows: gains, and what each series has of its own [dB^2]."""
     out, start = _covariance(model.terms, rows, rows), 0
     for samples in rows:
         block = slice(start, start + len(samples))
-        distance = cdist(samples.position_m, samples.position_m)
-        out[block, block] += model.own_sd_db**2 * np.exp(-distance / model.own_length_m)
-        out[block, block] += (_OFFSET_SD * model.noise_sd_db) ** 2
+        out[block, block] += _own_covariance(model, samples)
         start = block.stop
-    out[np.diag_indices(len(out))] += model.noise_sd_db**2
     return out
 
 
@@ -267,10 +300,8 @@ class GainFit:
     common_scale: float
     _weights: FloatArray = field(repr=False)
     _factor: Factor = field(repr=False)
-    # mean gain over the rows, by terms and antenna: every flight that is predicted asks for it
-    _zeros: dict[tuple[tuple[Term, ...], str], float] = field(
-        default_factory=dict, init=False, repr=False, compare=False
-    )
+    # mean gain over the rows of each antenna
+    _zero: Mapping[str, float] = field(repr=False)
 
     @property
     def antennas(self) -> tuple[str, ...]:
@@ -317,15 +348,14 @@ class GainFit:
             gain[part], sd[part] = self._moments(terms, samples.part(part), self._rows_of(samples.antenna))
         return gain, sd
 
-    def mean(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> FloatArray:
+    def mean(self, samples: LinkSamples) -> FloatArray:
         """The gain of :meth:`predict` alone (n,) [dB]."""
-        gain = np.full(len(samples), np.nan)
-        terms, known = self._terms(frames), self._known_rows(samples)
-        zero = self._zero(terms, samples.antenna)
+        self._rows_of(samples.antenna)
+        gain, known = np.full(len(samples), np.nan), self._known_rows(samples)
         for start in range(0, len(known), AT_ONCE):
             part = known[start : start + AT_ONCE]
-            gain[part] = _covariance(terms, [samples.part(part)], self.rows) @ self._weights - zero
-        return gain
+            gain[part] = _expected(self.model.terms, samples.part(part), self.rows, self._weights)
+        return gain - self._zero[samples.antenna]
 
     def gain(self, frame: Frame, antenna: str, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gain at one end over directions (n, 3), or of the pair of ends (n, 6): posterior mean and SD (n,) [dB].
@@ -360,13 +390,6 @@ class GainFit:
                 f"tower and channel {antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
             )
         return rows
-
-    def _zero(self, terms: tuple[Term, ...], antenna: str) -> float:
-        """Mean of the gain over the rows of an antenna [dB]."""
-        if (terms, antenna) not in self._zeros:
-            gain = _covariance(terms, self._rows_of(antenna), self.rows) @ self._weights
-            self._zeros[terms, antenna] = float(gain.mean())
-        return self._zeros[terms, antenna]
 
     @staticmethod
     def _known_rows(samples: LinkSamples) -> IntArray:
@@ -431,10 +454,18 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     but for the average over ``bin_s``.
     """
     model, rows = _binned_series(series, model or GainModel())
-    factor = Factor.of(_covariance_of_levels(model, rows))
+    return _solved(model, rows, _covariance_of_levels(model, rows))
+
+
+def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArray) -> GainFit:
+    """The fit of rows with the covariance of their levels, in the place of which it is factored."""
+    factor = Factor.of(covariance)
     target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
     weights = factor.solve(target)
     misfit = float(target @ weights)
+    # what the equations leave to the gains
+    parts = np.split(weights, np.cumsum([len(s) for s in rows])[:-1])
+    gain = target - np.concatenate([_own_covariance(model, s) @ w for s, w in zip(rows, parts, strict=True)])
     return GainFit(
         model=model,
         rows=tuple(rows),
@@ -442,6 +473,7 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
         common_scale=math.sqrt(max(misfit / max(len(target) - len(rows), 1), 1e-6)),
         _weights=weights,
         _factor=factor,
+        _zero={name: float(gain[part].mean()) for name, part in _antennas(rows)},
     )
 
 
@@ -450,14 +482,18 @@ def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) ->
 
     The scale, which changes no mean, makes the standard deviations fit the data: ``s^2 = y' C^-1 y / rows``.
     """
-    model = model or GainModel()
-    mast = [t.frame == "mast" for t in model.terms]
-    fits = [
-        fit_gain(series, dataclasses.replace(model, terms=tuple(
-            dataclasses.replace(t, sd_db=t.sd_db * factor) if t.frame == "mast" else t for t in model.terms
-        ))).scaled()
-        for factor in (_TOWER_FACTORS if any(mast) and not all(mast) else (1.0,))
-    ]  # fmt: skip
+    model, rows = _binned_series(series, model or GainModel())
+    mast = [t for t in model.terms if t.frame == "mast"]
+    if not 0 < len(mast) < len(model.terms):
+        return _solved(model, rows, _covariance_of_levels(model, rows)).scaled()
+    others = dataclasses.replace(model, terms=tuple(t for t in model.terms if t not in mast))
+    of_others, of_towers = _covariance_of_levels(others, rows), _covariance(mast, rows, rows)
+    fits = []
+    for factor in _TOWER_FACTORS:
+        terms = tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) if t in mast else t for t in model.terms)
+        covariance = factor**2 * of_towers
+        covariance += of_others
+        fits.append(_solved(dataclasses.replace(model, terms=terms), rows, covariance).scaled())
     return max(fits, key=lambda fit: fit.log_evidence)
 
 
@@ -471,7 +507,8 @@ def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[Gai
     binned = [s for s in binned if len(s)]
     if not binned:
         raise InputError("no sample has a level and a direction", expected="RSS with positions and attitude")
-    return model, binned
+    antennas = [s.antenna for s in binned]
+    return model, sorted(binned, key=lambda s: antennas.index(s.antenna))
 
 
 def column_forms(
@@ -495,6 +532,8 @@ def column_forms(
         Symmetric, positive semidefinite [squared unit of the columns per dB^2].
     """
     model, rows = _binned_series(series, model)
-    values = np.concatenate([columns(s, model.bin_s) for s in series if len(s.binned(model.bin_s))])
+    names = [s.antenna for s in rows]
+    some = [s for s in series if len(s.binned(model.bin_s))]
+    values = np.concatenate([columns(s, model.bin_s) for s in sorted(some, key=lambda s: names.index(s.antenna))])
     inside = Factor.of(_covariance_of_levels(model, rows)).whiten(values)
     return np.asarray(inside.T @ inside)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import itertools
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -325,17 +325,18 @@ def flight_left_out(
         learned = learn(train, recipe)
         if without is not None:
             without |= dict.fromkeys(group, learned)
-        offsets = _offsets(train, learned)
-        for o in observed:
-            if o.samples.flight in group and o.samples.antenna in offsets:
-                scores.append(_scored_with(o, learned, offsets[o.samples.antenna], spread=without is not None))
+        unseen = [o for o in observed if o.samples.flight in group]
+        if without is None:
+            known = {s.antenna for s in train if np.isfinite(s.residual_db).any()}
+            scores += [score(o, learned.mean(o.samples)) for o in unseen if o.samples.antenna in known]
+        else:
+            scores += _scored_with(unseen, learned, _offsets(train, learned))
     return tuple(s for s in scores if s is not None)
 
 
 def score_with(learned: Learned, unseen: Sequence[Observed], train: Sequence[Observed]) -> tuple[Score, ...]:
     """Scores of flights that were not learned from, at antennas that were."""
-    offsets = _offsets([o.samples for o in train], learned)
-    scored = [_scored_with(o, learned, offsets[o.samples.antenna], spread=True) for o in unseen]
+    scored = _scored_with(unseen, learned, _offsets([o.samples for o in train], learned))
     return tuple(s for s in scored if s is not None)
 
 
@@ -351,20 +352,24 @@ def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]
 _SPREAD_SAMPLES = 400
 
 
-def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: bool) -> Score | None:
-    """Score of a prediction, its own offset and that of the other flights side by side."""
-    gain = learned.mean(o.samples)
-    fitted = score(o, gain)
-    if fitted is None:
-        return None
-    if spread and learned.fit is not None:
-        some = spread_out(len(gain), _SPREAD_SAMPLES)
-        stated = StatedSpread(
-            gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
-        )
-        error = o.samples.residual_db - gain - fitted.offset_db
-        fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
-    return dataclasses.replace(fitted, rmse_shared_offset_db=math.hypot(fitted.rmse_db, fitted.offset_db - offset_db))
+def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[str, float]) -> Iterator[Score | None]:
+    """Scores at antennas that have an offset, with their own and with that of the other flights."""
+    for o in unseen:
+        if o.samples.antenna not in offsets:
+            continue
+        gain = learned.mean(o.samples)
+        fitted = score(o, gain)
+        if fitted is not None and learned.fit is not None:
+            some = spread_out(len(gain), _SPREAD_SAMPLES)
+            stated = StatedSpread(
+                gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
+            )
+            error = o.samples.residual_db - gain - fitted.offset_db
+            fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
+        if fitted is not None:
+            shared = math.hypot(fitted.rmse_db, fitted.offset_db - offsets[o.samples.antenna])
+            fitted = dataclasses.replace(fitted, rmse_shared_offset_db=shared)
+        yield fitted
 
 
 # Of more flights, this many are scored part by part, evenly over their order.

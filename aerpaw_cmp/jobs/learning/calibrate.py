@@ -194,7 +194,7 @@ def calibrate(
     with stages("scores"):
         scores = _score_all(observed, recipe, stages, fits)
         stages.progress("scores: controls")
-        controls = _controls_of(observed, recipe)
+        controls = _controls_of(observed, recipe, scores["flight_left_out"])
         locks = learned_locks(observed, recipe, fits)
     with stages("curve"):
         curve = learning_curve(observed, recipe)
@@ -466,8 +466,10 @@ def _score_all(
     return scores
 
 
-def _controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple[Score, ...]]:
-    """Simpler and wrong models, each flight left out in turn."""
+def _controls_of(
+    observed: Sequence[Observed], recipe: Recipe, scores: tuple[Score, ...]
+) -> dict[str, tuple[Score, ...]]:
+    """Simpler and wrong models, each flight left out in turn; ``scores`` are those of the recipe."""
     if len(calibration.flights_of(observed)) < 2:
         return {}
     left_out, only = calibration.flight_left_out, calibration.only_terms
@@ -475,7 +477,7 @@ def _controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tupl
     scores = {
         "world frame at the UAV": left_out(calibration.world_frame(observed), bare),
         "heading turned the wrong way": left_out(calibration.wrong_way(observed), bare),
-        "body frame, no patterns": left_out(observed, bare),
+        "body frame, no patterns": left_out(observed, bare) if recipe.patterns else scores,
         "UAV end only": left_out(observed, only(bare, direction_gain.UAV_TERMS)),
         "tower end only": left_out(observed, only(bare, direction_gain.TOWER_TERMS)),
         "field over places only": left_out(observed, only(bare, (direction_gain.PLACE_TERM,))),

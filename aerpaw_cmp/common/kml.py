@@ -228,5 +228,5 @@ def _figure(title: str, width: float, height: float) -> Any:
 
 def _png(figure: Any) -> bytes:
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": "aerpaw-cmp"})
+    figure.canvas.print_png(buffer, metadata={"Software": "aerpaw-cmp"})  # savefig draws once more, unseen
     return buffer.getvalue()

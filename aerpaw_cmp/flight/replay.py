@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -16,6 +16,7 @@ from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.drivers.moving import replay_moving
 from ..propagation.drivers.parts import replay_in_parts
 from ..propagation.edges import diffracted
+from ..propagation.field.sum import channel_matrices, mean_pair_power, rss_dbm
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.geometry.paths import RowsT
 from ..propagation.options import Engine, Field, Job, Run, Search
@@ -244,9 +245,13 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
         "datetime64[ns]"
     )
     along: dict[tuple[str, str], Along] = {}
+    alike: dict[tuple[str, float], dict[str, RssSeries]] = {}
     for series in channels:
-        if (series.tower, series.settings_key) not in along:
-            along[series.tower, series.settings_key] = _along(data, series, instants, step)
+        same = alike.setdefault((series.tower, data.link_of(series).carrier_hz), {})
+        same.setdefault(series.settings_key, series)
+    for (tower, _), different in alike.items():
+        every = _along(data, list(different.values()), instants, step)
+        along |= {(tower, key): each for key, each in zip(different, every, strict=True)}
     return [
         ClockChannel(
             name=series.channel if len(towers) == 1 else f"{series.tower} {series.channel}",
@@ -258,39 +263,54 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
     ]
 
 
-def _along(data: FlightData, series: RssSeries, instants: Times, step_s: float) -> Along:
-    """Predictors of the level of a series along the telemetry; the replay has at most one reflection."""
-    link = data.link_of(series)
+def _along(data: FlightData, different: Sequence[RssSeries], instants: Times, step_s: float) -> list[Along]:
+    """Predictors of the levels of series of one tower and carrier; the replay has at most one reflection."""
+    links = [data.link_of(series) for series in different]
     blocks = np.array_split(instants, max(1, -(-len(instants) // BLOCK)))  # of about one size
-    parts = [_levels_along(data, link, series.tower, part) for part in blocks]
-    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    distance, directions = columns.pop("distance_m"), columns.pop("directions")
-    if learned_here(data, series, link):  # antennas that were learned from this very log know its lag
-        columns = {"free space": columns["free space"]}
-    return Along(start_s=0.0, step_s=step_s, predicted_db=columns, distance_m=distance, directions=directions)
+    parts = [_levels_along(data, links, different[0].tower, part) for part in blocks]
+    out = []
+    for series, link, *mine in zip(different, links, *parts, strict=True):
+        columns = {name: np.concatenate([part[name] for part in mine]) for name in mine[0]}
+        distance, directions = columns.pop("distance_m"), columns.pop("directions")
+        if learned_here(data, series, link):  # antennas that were learned from this very log know its lag
+            columns = {"free space": columns["free space"]}
+        out.append(Along(start_s=0.0, step_s=step_s, predicted_db=columns, distance_m=distance, directions=directions))
+    return out
 
 
-def _levels_along(data: FlightData, link: Link, tower: str, instants: Times) -> dict[str, FloatArray]:
-    """Levels of three models, distance and directions at instants (n,)."""
+def _levels_along(
+    data: FlightData, links: Sequence[Link], tower: str, instants: Times
+) -> Iterator[dict[str, FloatArray]]:
+    """Levels of three models, distance and directions at instants (n,), by link; what differs is antennas alone."""
     place, known = data.tower_at(tower, instants)
     track = data.poses_at(instants).where(known)
     poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
-    field = Field(path_loss(data.site, data.settings.rt, link.carrier_hz))
-    if tower in data.nodes:
-        replayed = replay_moving(data.site, link, poses, place[track.valid], Search(max_depth=depth), field)
-    else:
-        replayed = replay(data.site, link, poses, Search("image", max_depth=depth), field)
+    field = Field(path_loss(data.site, data.settings.rt, links[0].carrier_hz))
     line = track.position_m - place
     distance = np.linalg.norm(line, axis=1)
     unit = line / distance[:, None]
     body = -np.einsum("nij,ni->nj", track.rotation, unit)
-    return {
-        "coherent replay": _spread(track.valid, replayed.rss_dbm[:, 0]),
-        "power sum of the replay": _spread(track.valid, replayed.rss_power_dbm[:, 0]),
-        "free space": -20.0 * np.log10(distance),
-        "distance_m": distance,
-        "directions": np.column_stack([unit, body]),
-    }
+    search = Search("image", max_depth=depth)
+    if tower not in data.nodes:
+        traced, sources = replay(data.site, links[0], poses, search), data.site.towers[tower].position_m[None, :]
+        loss_db = field.loss_db(traced.paths, sources, poses.position_m)
+    for link in links:
+        if tower in data.nodes:
+            replayed = replay_moving(data.site, link, poses, place[track.valid], search, field)
+            coherent, power = replayed.rss_dbm, replayed.rss_power_dbm
+        else:
+            fields = channel_matrices(traced.paths, traced.faces, sources, poses, link, loss_db)
+            coherent, power = (
+                rss_dbm(some, link.transmit_power_dbm, link.noise_floor_dbm)
+                for some in (mean_pair_power(fields.h), fields.power)
+            )
+        yield {
+            "coherent replay": _spread(track.valid, coherent[:, 0]),
+            "power sum of the replay": _spread(track.valid, power[:, 0]),
+            "free space": -20.0 * np.log10(distance),
+            "distance_m": distance,
+            "directions": np.column_stack([unit, body]),
+        }
 
 
 def _clock_levels(data: FlightData, series: RssSeries) -> FloatArray:

@@ -408,6 +408,7 @@ def run_map(
     options: RunOptions = DEFAULT,
     *,
     flights: Sequence[Path] = (),
+    figures: str = "png",
 ) -> JobOutcome:
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -419,6 +420,8 @@ def run_map(
     options : RunOptions
     flights : sequence of Path
         Flight files that correct the levels and ranks (:mod:`.predict`).
+    figures : {"png", "svg", "pdf", "all"}
+        Format of the figures.
 
     Returns
     -------
@@ -460,7 +463,7 @@ def run_map(
             record = mapping.maps_record(
                 outcome, name=Path(site).stem, stages_s=stages.seconds, paper=paper_rows(outcome)
             )
-            written = write_maps(record, part)
+            written = write_maps(record, part, figures)
             if record.paper:
                 written.append(part / "paper.md")
                 written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")

@@ -211,9 +211,9 @@ def test_files_agree_with_each_other_and_with_the_page(made):
 def test_the_page_shows_every_figure_of_the_paper_rows(made):
     folder, printed = made
     html = (folder / "map.html").read_text()
-    stems = {path.stem for path in (folder / "figures").glob("*.svg")}
+    stems = {path.stem for path in (folder / "figures").glob("*.png")}
     table = (folder / "paper.md").read_text()
-    named = {part.removeprefix("figures/").removesuffix(".svg") for part in table.split("`") if ".svg" in part}
+    named = {part.removeprefix("figures/").removesuffix(".png") for part in table.split("`") if ".png" in part}
     assert named
     assert named <= stems
     for name in named:

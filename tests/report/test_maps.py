@@ -23,7 +23,8 @@ def few_maps(maps_data):
 
 
 def test_files(few_maps, tmp_path):
-    files = maps_html.write_maps(few_maps, tmp_path)
+    files = maps_html.write_maps(few_maps, tmp_path, "svg")
+    assert {file.suffix for file in files} == {".html", ".json", ".png", ".svg"}
     assert files[0].name == "map.html"
     page = files[0].read_text()
     names = {p.name for p in maps_figures.figure_specs(few_maps)}

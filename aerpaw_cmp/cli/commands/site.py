@@ -189,6 +189,7 @@ def map_(
         float | None,
         Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),
     ] = None,
+    figures: Annotated[Literal["png", "svg", "pdf", "all"], Option(help="Format of the figures.")] = "png",
     workers: Workers = 1,
     scheduler: Scheduler = None,
     dry_run: DryRun = False,
@@ -217,7 +218,7 @@ def map_(
     if dry_run:
         print_plan(run.plan_map(site, settings, options), as_json)
         return
-    outcome = run.run_map(site, settings, options, flights=flights or ())
+    outcome = run.run_map(site, settings, options, flights=flights or (), figures=figures)
     if as_json:
         print_json(outcome.metrics)
         return

@@ -173,6 +173,6 @@ def paper_markdown(rows: Iterable[PaperRow]) -> str:
     """The rows as a Markdown table."""
     lines = ["| where | what | paper | here | figure |", "| --- | --- | --- | --- | --- |"]
     for row in rows:
-        figure = f"`figures/{row.figure}.svg`" if row.figure else ""
+        figure = f"`figures/{row.figure}.png`" if row.figure else ""
         lines.append(f"| {row.where} | {row.what} | {row.paper} | {row.ours} | {figure} |")
     return "\n".join(lines) + "\n"

@@ -196,11 +196,11 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
     -------
     (points,) bool
     """
-    a = np.einsum("ij,ij->i", faces.along[index], points_m)
-    b = np.einsum("ij,ij->i", faces.across[index], points_m)
-    low, high = faces.lower[index] - tolerance_m, faces.upper[index] + tolerance_m
+    a = np.einsum("ij,ij->i", faces.along.take(index, 0), points_m)
+    b = np.einsum("ij,ij->i", faces.across.take(index, 0), points_m)
+    low, high = (faces.lower - tolerance_m).take(index, 0), (faces.upper + tolerance_m).take(index, 0)
     good = (a >= low[:, 0]) & (a <= high[:, 0]) & (b >= low[:, 1]) & (b <= high[:, 1])
-    for face in np.unique(index[good]):
+    for face in np.flatnonzero(np.bincount(index[good])):
         polygon = faces.polygon[face]
         if polygon is None:
             continue

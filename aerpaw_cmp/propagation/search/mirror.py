@@ -332,12 +332,13 @@ def _paths_of_level(
             part = slice(start, start + sequence_step)
             if depth:
                 row, column = _meets_last_face(
-                    faces, level.faces[part, -1], level.images_m[part, -1], targets[some], hiding.tolerance_m
+                    faces, level.faces[part], level.images_m[part, -1], targets[some], hiding.tolerance_m
                 )
             else:
                 row, column = np.zeros(len(some), np.int64), np.arange(len(some))
-            sequence, pose = level.faces[part][row], some[column]
-            vertices, good = trace_back(faces, sequence, level.images_m[part][row], targets[pose], hiding.tolerance_m)
+            # taken: an index in brackets costs four times as much for rows of three
+            sequence, images, pose = level.faces[part].take(row, 0), level.images_m[part].take(row, 0), some[column]
+            vertices, good = trace_back(faces, sequence, images, targets.take(pose, 0), hiding.tolerance_m)
             sequence, pose, vertices = sequence[good], pose[good], vertices[good]
             free = ~hiding.any_segment(np.broadcast_to(source, (len(pose), 3)), vertices, targets[pose])
             pieces.append(PathSet.from_tower(tower, pose[free], sequence[free], vertices[free], max_depth))
@@ -345,7 +346,7 @@ def _paths_of_level(
 
 
 def _meets_last_face(
-    faces: Faces, last: IntArray, image: FloatArray, targets: FloatArray, tolerance_m: float
+    faces: Faces, sequence: IntArray, image: FloatArray, targets: FloatArray, tolerance_m: float
 ) -> tuple[IntArray, IntArray]:
     """(sequence, target) pairs whose line from the last image meets the bounds of the last face.
 
@@ -355,8 +356,7 @@ def _meets_last_face(
     Parameters
     ----------
     faces : Faces
-    last : (s,)
-        Last face of each sequence.
+    sequence : (s, depth)
     image : (s, 3)
         Image of the source in all faces of the sequence [m].
     targets : (n, 3)
@@ -369,6 +369,7 @@ def _meets_last_face(
     sequence, target : (m,)
         Numbers of the pairs that are left.
     """
+    last = sequence[:, -1]
     used, position = np.unique(last, return_inverse=True)
     height = (faces.normal[used] @ targets.T - faces.offset_m[used, None])[position]
     below = np.einsum("ij,ij->i", faces.normal[last], image) - faces.offset_m[last]
@@ -384,8 +385,47 @@ def _meets_last_face(
         point += start
         good &= point >= faces.lower[last, which, None] - tolerance_m
         good &= point <= faces.upper[last, which, None] + tolerance_m
+    if (
+        sequence.shape[1] > 1
+    ):  # the ground as the last face meets every line: tracing each back would take most of a search
+        often = np.flatnonzero(good.sum(axis=1) > _OFTEN * len(targets))
+        good[often] &= _passes_first_faces(faces, sequence[often], image[often], targets)
     row, column = np.nonzero(good)
     return row, column
+
+
+# Share of the targets from which on a sequence's first faces are tested for all of them at once.
+_OFTEN = 0.1
+
+# Heights over a plane that differ by less [m] give no sure place on it.
+_SURE_M = 1e-4
+
+
+def _passes_first_faces(faces: Faces, sequence: IntArray, image: FloatArray, targets: FloatArray) -> BoolArray:
+    """Check whether lines (sequences, targets) from last images may pass all faces but the last, with a margin.
+
+    Each face is mirrored at those after it, so that the path is one straight line.
+    """
+    good = np.ones((len(sequence), len(targets)), dtype=np.bool_)
+    for step in range(sequence.shape[1] - 1):
+        face = sequence[:, step]
+        axes = np.stack([faces.normal[face], faces.along[face], faces.across[face]])
+        shift = np.stack([-faces.offset_m[face], *np.zeros((2, len(face)))])
+        for later in sequence[:, step + 1 :].T:
+            across = np.einsum("ksi,si->ks", axes, faces.normal[later])
+            axes -= 2.0 * across[..., None] * faces.normal[later]
+            shift += 2.0 * across * faces.offset_m[later]
+        height, *ends = axes @ targets.T + shift[..., None]
+        below, *starts = (np.einsum("ksi,si->ks", axes, image) + shift)[..., None]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = below / (below - height)
+            meets = abs(below - height) >= _SURE_M
+            for which, (start, end) in enumerate(zip(starts, ends, strict=True)):
+                place = start + share * (end - start)
+                meets &= place >= faces.lower[face, which, None] - REACH_SLACK_M
+                meets &= place <= faces.upper[face, which, None] + REACH_SLACK_M
+        good &= meets | (abs(below - height) < _SURE_M)
+    return good
 
 
 def trace_back(
@@ -423,7 +463,7 @@ def trace_back(
     point = targets_m
     for step in range(depth - 1, -1, -1):
         face, image = sequence[:, step], images_m[:, step]
-        normal, offset = faces.normal[face], faces.offset_m[face]
+        normal, offset = faces.normal.take(face, 0), faces.offset_m[face]
         ahead = np.einsum("ij,ij->i", normal, point) - offset
         behind = offset - np.einsum("ij,ij->i", normal, image)
         # an end may lie on its face, the other reflection points lie before it

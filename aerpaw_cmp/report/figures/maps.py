@@ -21,8 +21,8 @@ from ..kit.canvas import (
     beyond,
     colour_bar,
     draw_credit,
+    placed,
     rank_colour,
-    subplots,
 )
 from ..names import k_key, safe_name
 from .flight import channel_specs
@@ -140,15 +140,23 @@ def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
     return entries
 
 
-def map_axes(data: MapsData, count: int) -> tuple[Figure, list[Axes]]:
-    """A figure with room for ``count`` maps and a legend, outer axes labelled."""
+def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure, list[Axes]]:
+    """A figure with room for ``count`` maps, a legend and a margin on the right [inch], outer axes labelled."""
     west, east, south, north = extent_m(data)
     columns = min(count, COLUMNS)
     rows = -(-count // columns)
     columns = -(-count // rows)
     width = min((7.4 - 0.15 * columns) / columns, 3.2)  # what a colour bar and the labels leave
     height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
-    fig, grid = subplots((9.2, rows * (height + 0.35) + 1.0), rows, columns, squeeze=False, sharex=True, sharey=True)
+    fig, grid = placed(
+        (9.2, rows * (height + 0.35) + 1.0),
+        rows,
+        columns,
+        gap_in=(0.3, 0.4),
+        right_in=right_in,
+        sharex=True,
+        sharey=True,
+    )
     axes: list[Axes] = list(grid.ravel())
     for ax in axes[count:]:
         ax.set_visible(False)
@@ -166,16 +174,18 @@ def map_axes(data: MapsData, count: int) -> tuple[Figure, list[Axes]]:
 
 def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]) -> Figure:
     """Each tower alone and all jointly, for one antenna choice and height, on one colour scale [dBm]."""
-    fig, axes = map_axes(data, len(maps))
+    fig, axes = map_axes(data, len(maps), 1.0)
     image = None
     for ax, shown in zip(axes, maps, strict=True):
         alone = None if shown.tower == JOINT else shown.tower
         image = draw_map(ax, data, shown.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
         ax.set_title(f"{shown.tower}: {100 * shown.coverage:.0f} %", fontsize=9)
     levels = np.concatenate([entry.rss_dbm.ravel() for entry in maps])
-    colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits))
+    low, high = axes[-1].get_position().y0, axes[0].get_position().y1
+    bar = fig.add_axes((0.91, low + 0.1 * (high - low), 0.016, 0.8 * (high - low)))
+    colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits), bar)
     entries = overlay_legend(data, borders=any(entry.tower == JOINT for entry in maps))
-    fig.legend(handles=entries, loc="outside lower center", ncols=3)
+    fig.legend(handles=entries, loc="lower center", ncols=3)
     return fig
 
 
@@ -191,14 +201,14 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
         draw_map(ax, data, np.where(shown.rank > 0, shown.rank, np.nan), cmap=colours, norm=norm)
         ax.set_title(f"{shown.altitude_m:g} m", fontsize=9)
     entries = [Patch(facecolor=rank_colour(r), edgecolor="black", label=f"rank {r}") for r in RANKS]
-    fig.legend(handles=[*entries, *overlay_legend(data, borders=True)], loc="outside lower center", ncols=5)
+    fig.legend(handles=[*entries, *overlay_legend(data, borders=True)], loc="lower center", ncols=5)
     return fig
 
 
 def cdfs(maps: Sequence[RssMap]) -> Figure:
     """Distribution of RSS per tower and jointly: a panel per height, positions out of coverage counted as below."""
     panels = grouped(maps, lambda m: m.altitude_m)
-    fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, sharex=True, squeeze=False)
+    fig, (axes,) = placed((9.2, 3.4), 1, len(panels), sharey=True, sharex=True)
     for ax, (height, members) in zip(axes, panels.items(), strict=True):
         for number, tower_map in enumerate(members):
             level = np.sort(tower_map.rss_dbm[np.isfinite(tower_map.rss_dbm)])
@@ -213,14 +223,14 @@ def cdfs(maps: Sequence[RssMap]) -> Figure:
             )  # fmt: skip
         ax.set(title=f"{height:g} m", xlabel="RSS [dBm]", ylim=(0, 1.0))
     axes[0].set_ylabel("Share of positions below")
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=6)
     return fig
 
 
 def rank_shares(maps: Sequence[RankMap]) -> Figure:
     """Shares of Z and rank 1 to 4 against height, a panel per K and learned receiver."""
     panels = grouped(maps, lambda entry: entry.source)
-    fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, squeeze=False)
+    fig, (axes,) = placed((9.2, 3.4), 1, len(panels), sharey=True)
     for ax, (source, members) in zip(axes, panels.items(), strict=True):
         at = np.arange(len(members))
         share = 100 * np.array([member.share for member in members])
@@ -238,7 +248,7 @@ def rank_shares(maps: Sequence[RankMap]) -> Figure:
         ax.set(title=source, xlabel="Height [m]")
         ax.grid(visible=False)
     axes[0].set_ylabel("Share of positions [%]")
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=5)
     return fig
 
 
@@ -246,7 +256,7 @@ def correlations(curves: Sequence[Correlation]) -> Figure:
     """Correlation against distance and its model, a panel per kind, at most three in a row."""
     columns = min(len(curves), 3)
     rows = -(-len(curves) // columns)
-    fig, axes = subplots((9.2, 0.2 + 3.0 * rows), rows, columns, squeeze=False)
+    fig, axes = placed((9.2, 0.2 + 3.0 * rows), rows, columns, gap_in=(0.7, 0.8), bottom_in=0.5)
     for ax in axes.flat[len(curves) :]:
         ax.set_visible(False)
     for ax, curve in zip(axes.flat, curves, strict=False):
@@ -264,7 +274,7 @@ def correlations(curves: Sequence[Correlation]) -> Figure:
 def error_curves(errors: Sequence[MapError]) -> Figure:
     """MAE against height for every method, a panel per K."""
     panels = grouped(errors, lambda e: e.k)
-    fig, (axes,) = subplots((9.2, 3.4), 1, len(panels), sharey=True, squeeze=False)
+    fig, (axes,) = placed((9.2, 3.4), 1, len(panels), sharey=True)
     for ax, (k, members) in zip(axes, panels.items(), strict=True):
         for number, (method, rows) in enumerate(grouped(members, lambda e: e.method).items()):
             rows = sorted(rows, key=lambda e: e.altitude_m)
@@ -276,7 +286,7 @@ def error_curves(errors: Sequence[MapError]) -> Figure:
     worst = max((error.mae for error in errors if np.isfinite(error.mae)), default=1.0)
     axes[0].set_ylim(0.0, 1.08 * worst if worst > 0 else 1.0)  # shared by all panels
     axes[0].set_ylabel("Mean absolute error of the rank")
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=4)
     return fig
 
 

@@ -97,6 +97,7 @@ def style(kind: str = "screen") -> Iterator[None]:
         "axes.titlesize": 10.0,
         "axes.titleweight": "bold",
         "axes.titlelocation": "left",
+        "axes.titley": 1.0,  # else every axis is measured for the place of its title
         "axes.spines.top": False,
         "axes.spines.right": False,
         "axes.axisbelow": True,
@@ -142,6 +143,36 @@ def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Fi
     return fig, fig.subplots(*shape, **options)
 
 
+def placed(
+    size: tuple[float, float], rows: int, columns: int, *, gap_in: tuple[float, float] = (0.15, 0.4),
+    right_in: float = 0.15, bottom_in: float = 0.9, **options: Any,
+) -> tuple[Figure, Any]:  # fmt: skip
+    """A figure and its axes (rows, columns), all places in inches: to measure a grid takes as long as to draw it.
+
+    Parameters
+    ----------
+    size : (width, height)
+    rows, columns : int
+    gap_in : (across, up)
+        Between axes.
+    right_in, bottom_in : float
+        Margins, for a colour bar and for a legend.
+    options
+        Of :meth:`matplotlib.figure.Figure.subplots`.
+    """
+    from matplotlib.figure import Figure
+
+    (width, height), left, top = size, 0.7, 0.3
+    wide = (width - left - right_in - (columns - 1) * gap_in[0]) / columns
+    high = (height - top - bottom_in - (rows - 1) * gap_in[1]) / rows
+    fig = Figure(figsize=size)
+    grid = {
+        "left": left / width, "right": 1.0 - right_in / width, "bottom": bottom_in / height,
+        "top": 1.0 - top / height, "wspace": gap_in[0] / wide, "hspace": gap_in[1] / high,
+    }  # fmt: skip
+    return fig, fig.subplots(rows, columns, squeeze=False, gridspec_kw=grid, **options)
+
+
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
     """The figure in some of :data:`FORMATS`; on paper as wide as two columns of an IEEE page.
 
@@ -183,7 +214,7 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
     return {name: file.getvalue() for name, file in images.items()}
 
 
-def render(spec: FigureSpec, formats: Sequence[str] = ("svg", "png"), kind: str = "screen") -> Picture:
+def render(spec: FigureSpec, formats: Sequence[str] = ("png",), kind: str = "screen") -> Picture:
     """Draw a figure and forget it; its pictures stay."""
     with style(kind):
         files = save_as(spec.draw(), (*formats, INLINE) if "png" in formats else formats, kind)
@@ -193,7 +224,7 @@ def render(spec: FigureSpec, formats: Sequence[str] = ("svg", "png"), kind: str 
 def write_figures(
     specs: Sequence[FigureSpec],
     folder: Path,
-    formats: Sequence[str] = ("svg", "png"),
+    formats: Sequence[str] = ("png",),
     kind: str = "screen",
     progress: Progress = logged,
 ) -> tuple[list[Picture], list[Path]]:
@@ -624,7 +655,7 @@ def beyond(values: FloatArray, low: float, high: float) -> str:
     return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((under, over), "neither")
 
 
-def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither") -> Any:
+def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither", cax: Any = None) -> Any:
     """A colour bar that an SVG holds as one picture, without seams; with arrows where values lie beyond.
 
     Parameters
@@ -637,12 +668,14 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
     label : str
     extend : {"neither", "min", "max", "both"}
         Ends beyond which values lie.
+    cax : Axes, optional
+        The bar's own, of a figure that is :func:`placed`.
 
     Returns
     -------
     matplotlib.colorbar.Colorbar
     """
-    bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
+    bar = fig.colorbar(mappable, cax=cax, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
     if bar.solids is not None:
         bar.solids.set_rasterized(True)
         bar.solids.set_edgecolor("face")

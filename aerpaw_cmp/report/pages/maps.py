@@ -91,11 +91,14 @@ def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str])
     )
 
 
-def write_maps(data: MapsData, folder: str | Path) -> list[Path]:
-    """Write ``map.html``, ``metrics.json`` and ``figures/``; returns the files, the page first."""
+def write_maps(data: MapsData, folder: str | Path, drawn: str = "png") -> list[Path]:
+    """Write ``map.html``, ``metrics.json`` and ``figures/``; returns the files, the page first.
+
+    ``drawn`` is a format of the figures beside the page's PNG, or "all".
+    """
     folder = Path(folder)
     written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
-    drawn, pictures = canvas.write_figures(maps_figures.figure_specs(data), folder / "figures")
-    written += pictures
-    page = write_file(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))
-    return [page, *written]
+    formats = canvas.FORMATS if drawn == "all" else tuple(dict.fromkeys(("png", drawn)))
+    pictures, files = canvas.write_figures(maps_figures.figure_specs(data), folder / "figures", formats)
+    page = write_file(folder / "map.html", maps_page(data, pictures, ["metrics.json"]))
+    return [page, *written, *files]

@@ -53,6 +53,7 @@ class Dem:
     crs: str
     frame: SiteFrame
     _to_grid: Any = field(init=False, repr=False, compare=False, default=None)
+    _origin_m: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         if self.crs.lower() != "local":
@@ -71,7 +72,8 @@ class Dem:
                     expected=f"coordinates of {self.crs}",
                     cause="they are metres or feet: another crs",
                 )
-        if np.isnan(self.absolute_m(0.0, 0.0)):
+        object.__setattr__(self, "_origin_m", float(self.absolute_m(0.0, 0.0)))
+        if np.isnan(self._origin_m):
             gap = self._covers_origin()
             raise InputError(
                 "the elevation model has no height at the site's origin",
@@ -112,7 +114,7 @@ class Dem:
 
     def ground_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
         """Up of the ground [m]: 0 at the origin of the site; NaN outside the grid."""
-        return self.absolute_m(east_m, north_m) - self.absolute_m(0.0, 0.0)
+        return self.absolute_m(east_m, north_m) - self._origin_m
 
     def slope(self, east_m: FloatArray, north_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rise of the ground per metre to the east and to the north, from points 1/64 of a cell apart."""

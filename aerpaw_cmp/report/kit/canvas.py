@@ -159,6 +159,10 @@ def placed(
         Margins, for a colour bar and for a legend.
     options
         Of :meth:`matplotlib.figure.Figure.subplots`.
+
+    Returns
+    -------
+    tuple of Figure and array of Axes (rows, columns)
     """
     from matplotlib.figure import Figure
 

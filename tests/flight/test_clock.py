@@ -326,7 +326,7 @@ def test_a_jittering_attitude_makes_no_sharp_optimum():
 
 def test_ratios_do_not_vote_on_the_clock_where_levels_do(monkeypatch):
     """The sounder's quality saturates: pooled with the level, it said +14.8 s for a planted lag of 5 s."""
-    monkeypatch.setattr(flight_replay, "_along", lambda *_: ALONG)
+    monkeypatch.setattr(flight_replay, "_along", lambda *_: [ALONG])
     monkeypatch.setattr(flight_replay, "_clock_levels", lambda _, series: series.measured_db)
     track = SimpleNamespace(start_ns=0, end_ns=10**9)
     time = np.zeros(3, "datetime64[ns]")
@@ -334,7 +334,7 @@ def test_ratios_do_not_vote_on_the_clock_where_levels_do(monkeypatch):
         SimpleNamespace(tower="LW1", channel=c, unit=u, time=time, measured_db=np.zeros(3), settings_key="one")
         for c, u in (("power", "dB re full scale"), ("quality", "dB"))
     ]
-    data = SimpleNamespace(track=track, nodes={})
+    data = SimpleNamespace(track=track, nodes={}, link_of=lambda _: SimpleNamespace(carrier_hz=3.3e9))
     assert [c.name for c in flight_replay.clock_channels(data, series)] == ["power"]
     assert [c.name for c in flight_replay.clock_channels(data, series[1:])] == ["quality"]
 

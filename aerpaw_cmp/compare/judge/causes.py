@@ -422,13 +422,11 @@ _OFFSET_DB = 100.0
 
 
 @cache
-def _whitening(memories: _Memories) -> tuple[FloatArray, FloatArray, FloatArray, float]:
-    """Numerator, denominator and start of the filter, and the innovation's share of the standard deviation.
+def _whitening(memories: _Memories) -> tuple[tuple[float, float, float], float, float]:
+    """Coefficients of the filter, ahead (3,) and back, and the innovation's share of the standard deviation.
 
     The sum of two first-order autoregressive sequences is an ARMA(2, 1) sequence (Granger and Morris).
     """
-    from scipy.signal import lfilter_zi  # it would load with every command
-
     slow, fast, share = _SLOW[memories.slow], _FAST[memories.fast], _SLOW_SHARE[memories.share]
     shocks = share * (1.0 - slow**2), (1.0 - share) * (1.0 - fast**2)
     power = shocks[0] * (1.0 + fast**2) + shocks[1] * (1.0 + slow**2)
@@ -436,8 +434,7 @@ def _whitening(memories: _Memories) -> tuple[FloatArray, FloatArray, FloatArray,
     half = 0.5 * power / neighbour if neighbour > 1e-12 else math.inf
     theta = half - math.sqrt(half**2 - 1.0) if math.isfinite(half) else 0.0
     innovation = neighbour / theta if theta else power
-    ahead, back = np.array([1.0, -slow - fast, slow * fast]), np.array([1.0, -theta, 0.0])
-    return ahead, back, lfilter_zi(ahead, back), math.sqrt(innovation)
+    return (1.0, -slow - fast, slow * fast), theta, math.sqrt(innovation)
 
 
 def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb: bool) -> _Fit:
@@ -446,13 +443,16 @@ def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb:
     Coefficients of the design are unit normals: the likelihood is integrated over them, the residual is about their
     means. The noise has its likeliest size.
     """
-    from scipy.signal import lfilter
+    from scipy.linalg.lapack import dtbtrs  # scipy.signal would load for 0.4 s
 
     n, columns = len(residual), np.column_stack([residual, design])
+    before = columns[[0, 0, *range(n)]]  # as if it had always been what it is at first
 
     def fit(memories: _Memories) -> tuple[float, FloatArray]:
-        ahead, back, start, root = _whitening(memories)
-        white = lfilter(ahead, back, columns, axis=0, zi=start[:, None] * columns[:1])[0]
+        ahead, back, root = _whitening(memories)
+        moved = ahead[0] * before[2:] + ahead[1] * before[1:-1] + ahead[2] * before[:-2]
+        moved[0] /= 1.0 - back
+        white = dtbtrs(np.array([np.ones(n), np.full(n, -back)]), moved, uplo="L")[0]
         white[0] = root * columns[0]
         gram = white.T @ white
         power, axes = np.linalg.eigh(gram[1:, 1:])

@@ -178,11 +178,12 @@ def test_the_grid_reaches_400_m_beyond_the_flight_and_the_region_a_tenth_of_the_
         ((0, -261), 1),
     ):
         assert locating._on_edge(np.array([[*place, 1.5]]), grid).tolist() == [bool(edge)]
-    certain, far = np.array([1.0]), np.array([0.0, 500.0])
-    assert locating._radius(np.array([0.0]), certain) == pytest.approx(20.0 * np.sqrt(-2.0 * np.log(0.1)), abs=0.1)
-    # five percent far away: of the rest 18 in 19 are within; twenty percent: half of those far away
-    assert locating._radius(far, np.array([0.95, 0.05])) == pytest.approx(20 * np.sqrt(-2 * np.log(1 / 19)), abs=0.1)
-    assert locating._radius(far, np.array([0.8, 0.2])) == pytest.approx(500.0, abs=1.0)
+    far = np.array([[0.0, 0.0], [500.0, 0.0]])
+    # all here; five percent far away: of the rest 18 in 19 are within; twenty percent: half of those far away
+    for shares, radius in (((1, 0), 20 * np.sqrt(-2 * np.log(0.1))), ((0.95, 0.05), 20 * np.sqrt(-2 * np.log(1 / 19))),
+                           ((0.8, 0.2), 500.0)):  # fmt: skip
+        regions = locating.Regions.of(far, np.array(shares))
+        assert regions.radius_m(far[0], 0.9) == pytest.approx(radius, abs=1.5)
     moved = locating._refined(np.array([[0.0, 0.0, 1.5], [100.0, 40.0, 10.0]]))
     steps = {(e, n, 1.5) for e in (-1, 0, 1) for n in (-1, 0, 1)}
     assert {tuple(row) for row in np.round(moved[:9] / [40 / 3, 40 / 3, 1], 9).tolist()} == steps

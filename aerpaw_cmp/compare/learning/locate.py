@@ -422,17 +422,18 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = 
     apart = np.hypot(*(places[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1))
     density = np.exp(-0.5 * (apart / SYSTEMATIC_M) ** 2) @ share
     best = int(np.lexsort((-share, -density.round(12)))[0])
+    regions = Regions.of(places, share)
     heights = [h for h in _HEIGHTS_M if share[places[:, 2] == h].sum() > 0.05]
     return NodeEstimate(
         place_m=places[best],
-        radius90_m=_radius(apart[best], share),
+        radius90_m=regions.radius_m(places[best], 0.9),
         height_m=(min(heights), max(heights)),
         slope=float(fits.slope[best]),
         slope_sd=float(fits.slope_sd[best]),
         log_odds=log_odds,
         anywhere=anywhere,
         at_edge=bool(share[_on_edge(places, grid)].sum() > _LEAST_SHARE),
-        regions=Regions.of(places, share),
+        regions=regions,
     )
 
 
@@ -458,18 +459,6 @@ def _refined(places: FloatArray) -> FloatArray:
     third = _SPACING_M / 3.0
     moved = np.array([(e, n, 0.0) for e in (-third, 0.0, third) for n in (-third, 0.0, third)])
     return np.asarray((places[:, None] + moved).reshape(-1, 3))
-
-
-def _radius(apart_m: FloatArray, share: FloatArray) -> float:
-    """Radius that holds 90 % of a posterior whose places are each blurred by :data:`SYSTEMATIC_M`."""
-    from scipy.optimize import brentq
-    from scipy.stats import ncx2
-
-    def held(radius: float) -> float:
-        shares = ncx2.cdf((radius / SYSTEMATIC_M) ** 2, 2, np.maximum((apart_m / SYSTEMATIC_M) ** 2, 1e-12))
-        return float(share @ shares) - 0.9
-
-    return float(brentq(held, 1.0, float(apart_m.max()) + 10.0 * SYSTEMATIC_M, xtol=0.1))
 
 
 def _log_odds(track: LevelTrack, candidates: FloatArray, anywhere: float) -> FloatArray:

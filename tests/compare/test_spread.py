@@ -63,13 +63,20 @@ def test_two_parts_hold_their_share_and_their_score_is_the_integral_over_levels(
     probability, lost_db = random.uniform(0.0, 1.0, N), random.uniform(-25.0, -15.0, N)
     locked = random.random(N) < probability
     error = np.where(locked, random.normal(1.0, 3.0, N), random.normal(lost_db, 6.0))
-    lock = LostLock(probability=probability, locked_db=1.0, lost_db=lost_db, locked_sd_db=3.0, lost_sd_db=6.0)
+    lock = LostLock(probability=probability, locked_db=np.ones(N), lost_db=lost_db, locked_sd_db=3.0, lost_sd_db=6.0)
     stated = StatedSpread(gain_sd_db=np.ones(N), spread=NO_SPREAD, lock=lock)
     for share, held in zip(SHARES, inside_shares(error, stated).values(), strict=True):
         assert held == pytest.approx(share, abs=0.015)
+    for about_db in (0.0, -4.0):
+        assert lock.sd_db(np.full(N, about_db))[:N].mean() == pytest.approx(
+            np.mean(np.sqrt(probability * ((1 - about_db) ** 2 + 9) + (1 - probability) * ((lost_db - about_db) ** 2 + 36)))
+        )  # fmt: skip
+        assert np.mean(lock.sd_db(np.full(N, about_db)) ** 2) == pytest.approx(
+            np.mean((error - about_db) ** 2), rel=0.02
+        )
     grid = np.linspace(-80.0, 60.0, 7001)
     for first in range(3):
-        part = {name: getattr(lock, name)[first : first + 1] for name in ("probability", "lost_db")}
+        part = {name: getattr(lock, name)[first : first + 1] for name in ("probability", "locked_db", "lost_db")}
         alone = StatedSpread(gain_sd_db=np.ones(1), spread=NO_SPREAD, lock=dataclasses.replace(lock, **part))
         below = probability[first] * norm.cdf(grid, 1.0, 3.0) + (1 - probability[first]) * norm.cdf(
             grid, lost_db[first], 6.0

@@ -86,6 +86,15 @@ def test_an_unseen_flight_of_the_sounder_is_told_its_lock_by_other_flights(tmp_p
     assert numbers["P(detected) brier"] < 0.75 * numbers["P(detected) constant_brier"]
     assert numbers["P(detected) log_score"] < 0.75 * numbers["P(detected) constant_log_score"]
     assert numbers["floor"] < min(9.0, numbers["floor, free space"])
+    known = yaml.safe_load((HERE / unseen).read_text(encoding="utf-8")) | {"site": str(site)}
+    (tmp_path / "known.yaml").write_text(yaml.safe_dump(known), encoding="utf-8")
+    before = tmp_path / "before"
+    assert main(["predict", str(tmp_path / "known.yaml"), "--logs-root", str(REAL), "-o", str(before)]) == 0
+    assert "The receiver is in lock for " in json.loads((before / "metrics.json").read_text())["sentence"]
+    flown = ["report", str(tmp_path / "known.yaml"), "--logs-root", str(REAL), "--against", str(before)]
+    assert main([*flown, "--audit", "none", "--figures", "none", "-o", str(tmp_path / "flown")]) == 0
+    (score,) = json.loads((tmp_path / "flown" / "metrics.json").read_text())["against"]["scores"].values()
+    assert 0.85 < score["coverage_90"] < 0.95
     drafted = yaml.safe_load((tmp_path / "flight.yaml").read_text(encoding="utf-8"))["towers"]["NODE"]
     surveyed = yaml.safe_load((HERE / "../calibrations/afar300_loc_2.yaml").read_text(encoding="utf-8"))["towers"][
         "ROVER"

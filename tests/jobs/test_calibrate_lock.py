@@ -52,6 +52,9 @@ def test_the_planted_lock_is_recovered_and_beats_the_share_on_flights_left_out()
     assert lock.per_db == pytest.approx(PER_DB, rel=0.35)
     assert lock.flights == 3
     assert 2.0 < lock.locked_sd_db < 3.0
+    # what locks is no stronger than the rest here: the level in lock follows the path gain, 80 dB above it
+    assert lock.locked_db == pytest.approx(lock.gain_db + REFERENCE_DB, abs=0.5)
+    assert lock.locked_per_db == pytest.approx(1.0, abs=0.1)
     assert (lock.lost_db, lock.lost_per_db, lock.lost_sd_db) == pytest.approx((-28.0, 0.0, 0.5), abs=1e-6)
     assert lock.brier < 0.7 * lock.constant_brier
     assert lock.log_score < 0.7 * lock.constant_log_score
@@ -92,7 +95,7 @@ def test_one_flight_or_a_receiver_that_keeps_its_lock_teaches_nothing() -> None:
 
 def test_what_a_site_remembers_of_the_lock_is_used_with_its_airframe_alone(tmp_path: Path) -> None:
     lock = LearnedLock(
-        gain_db=-95.0, per_db=0.1, share=0.7, locked_sd_db=7.0, lost_db=-27.0, lost_per_db=0.5, lost_sd_db=8.0, flights=3, brier=0.13, constant_brier=0.2, log_score=0.42,
+        gain_db=-95.0, per_db=0.1, share=0.7, locked_db=-15.0, locked_per_db=0.7, locked_sd_db=7.0, lost_db=-27.0, lost_per_db=0.5, lost_sd_db=8.0, flights=3, brier=0.13, constant_brier=0.2, log_score=0.42,
         constant_log_score=0.6, floor_db=-15.0, floor_rmse_db=8.2, free_space_floor_rmse_db=10.3,
     )  # fmt: skip
     series = LearnedSeries(

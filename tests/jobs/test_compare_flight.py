@@ -451,7 +451,14 @@ def test_an_expectation_that_the_flight_refutes_is_withdrawn(
 def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: pytest.MonkeyPatch) -> None:
     """In lock about the prediction and the flight's mean error in lock, else about what other flights wrote without."""
     lock = SimpleNamespace(
-        gain_db=-100.0, per_db=0.1, share=0.7, locked_sd_db=7.0, lost_db=-27.0, lost_per_db=0.5, lost_sd_db=8.0
+        gain_db=-100.0,
+        per_db=0.1,
+        share=0.7,
+        locked_per_db=0.8,
+        locked_sd_db=7.0,
+        lost_db=-27.0,
+        lost_per_db=0.5,
+        lost_sd_db=8.0,
     )
     monkeypatch.setattr(compared, "lock_elsewhere", lambda *_: lock)
     case = SimpleNamespace(
@@ -462,7 +469,8 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
     score = SimpleNamespace(residual_db=np.array([2.0, 4.0, -9.0]), offset_db=-5.0)
     stated = StatedSpread(gain_sd_db=np.ones(3), spread=NO_SPREAD)
     parts = compared._with_lock(case, score, stated).lock
-    assert parts.locked_db == 3.0
+    # path gains 10, 0 and -10 dB from -100: the two in lock lie 5 dB about their middle, a fifth of that counts
+    assert parts.locked_db == pytest.approx([3.0 - 1.0, 3.0 + 1.0, 3.0 + 3.0])
     assert parts.probability == pytest.approx(1.0 / (1.0 + np.exp([-1.0, 0.0, 1.0])))
     assert parts.lost_db == pytest.approx(
         [-27.0 + shift - 5.0 + level for shift, level in ((5, 50), (0, 60), (-5, 70))]

@@ -18,6 +18,7 @@ from aerpaw_cmp.site.antenna.learned import (
     Entry,
     Errors,
     LearnedLevel,
+    LearnedLock,
     LearnedSeries,
     folder_of,
     read_learned,
@@ -50,10 +51,10 @@ def copied(folder: Path) -> Path:
     return place
 
 
-def entry(level: LearnedLevel | None) -> Entry:
+def entry(level: LearnedLevel | None, lock: LearnedLock | None = None) -> Entry:
     series = LearnedSeries(
         tower="LW1", channel="A", reader="sounder_log", carrier_hz=3.3e9, tower_file="t.csv.gz", uav_file="u.csv.gz",
-        sd_db=1.0, level=level,
+        sd_db=1.0, level=level, lock=lock,
     )  # fmt: skip
     errors = Errors(series=2, rmse_db=3.7, rmse_4s_db=3.0, free_space_rmse_db=6.1, inside_90=0.9)
     return Entry(command="c", made="2026-01-02", flights=["a", "b"], flown=["2025-06-01"], trained_on=["a" * 64],
@@ -90,6 +91,46 @@ def test_levels_are_free_space_and_the_remembered_gains(site: Path) -> None:
     assert any("expect an RMSE of 3.7 dB on another flight, free space 6.1 dB" in text for text in said.page.warnings)
     assert said.page.verdict.startswith(f"Expect an RMSE of {np.sqrt(np.mean(said.table['slow_sd_db'] ** 2)):.1f} dB")
     assert said.page.units == {"LW1 A": "dBm"}
+
+
+def test_a_receiver_that_loses_its_lock_is_forecast_in_two_parts(site: Path, tmp_path: Path) -> None:
+    """Drawn sample by sample: in lock or not, then about the line of either part; the offset of the flight is open."""
+    lock = LearnedLock(
+        gain_db=-92.0, per_db=0.4, share=0.7, locked_db=-70.0, locked_per_db=0.8, locked_sd_db=2.0, lost_db=-85.0,
+        lost_per_db=0.3, lost_sd_db=4.0, flights=3, brier=0.1, constant_brier=0.2, log_score=0.4,
+        constant_log_score=0.6, floor_db=-80.0, floor_rmse_db=3.0, free_space_floor_rmse_db=5.0,
+    )  # fmt: skip
+    place = copied(tmp_path)
+    remember(place, "planted", entry(LEVEL, lock), {"t.csv.gz": table(4.0, (1, 1)), "u.csv.gz": table(2.0, (1, 1))})
+    points = site.parent / "p.csv"
+    plain, said = (job.predict(points, [], TargetOptions(site=str(at))) for at in (site, place))
+    levels, before = (x.table[x.table["channel"] == "A"] for x in (said, plain))
+    random, n = np.random.default_rng(3), 200_000
+    assert len(levels) == 4
+    for (_, row), level in zip(levels.iterrows(), before["level_db"], strict=True):
+        above = level + 7.0 - 30.0 + 92.0  # path gain, less that of half the locks
+        p = 1.0 / (1.0 + np.exp(-0.4 * above))
+        in_lock = random.random(n) < p
+        sample = np.where(
+            in_lock,
+            random.normal(-70.0 + 0.8 * above, np.hypot(2.0, LEVEL.sd_db), n),
+            random.normal(-85.0 + 0.3 * above, 4.0, n),
+        )
+        assert row["p_lock"] == pytest.approx(p, abs=1e-3)
+        assert [row["q05_db"], row["level_db"], row["q95_db"]] == pytest.approx(
+            np.quantile(sample, [0.05, 0.5, 0.95]), abs=0.25
+        )
+        assert row["sd_db"] == pytest.approx(np.sqrt(np.mean((sample - row["level_db"]) ** 2)), rel=0.02)
+    assert levels["p_lock"][:3].between(0.1, 0.9).all()  # both parts count
+    assert f"in lock for {100 * levels['p_lock'].mean():.0f} % of them" in said.page.verdict
+    assert "4 s" not in said.page.verdict
+    assert "p_lock" not in plain.table
+    assert main(["predict", str(points), "--site", str(place), "-o", str(tmp_path / "out")]) == 0
+    written = pd.read_csv(tmp_path / "out" / "prediction.csv")
+    np.testing.assert_allclose(written["p_lock"][:4], levels["p_lock"], atol=1e-4)
+    assert "P(lock)" in (tmp_path / "out" / "prediction.html").read_text(encoding="utf-8")
+    numbers = json.loads((tmp_path / "out" / "metrics.json").read_text())["series"]["LW1 A"]
+    assert numbers["mean_p_lock"] == pytest.approx(levels["p_lock"].mean(), abs=1e-3)
 
 
 def test_an_unknown_heading_adds_the_spread_of_the_gain_over_headings(site: Path) -> None:

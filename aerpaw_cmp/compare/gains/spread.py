@@ -100,7 +100,7 @@ class LostLock:
     ----------
     probability : (n,)
         Of lock.
-    locked_db : float
+    locked_db : (n,)
         Mean error in lock.
     lost_db : (n,)
         Mean error without.
@@ -108,10 +108,16 @@ class LostLock:
     """
 
     probability: FloatArray
-    locked_db: float
+    locked_db: FloatArray
     lost_db: FloatArray
     locked_sd_db: float
     lost_sd_db: float
+
+    def sd_db(self, about_db: FloatArray) -> FloatArray:
+        """Root mean square (n,) of the error about a prediction that is this much higher (n,) [dB]."""
+        locked = (self.locked_db - about_db) ** 2 + self.locked_sd_db**2
+        lost = (self.lost_db - about_db) ** 2 + self.lost_sd_db**2
+        return np.asarray(np.sqrt(self.probability * locked + (1.0 - self.probability) * lost))
 
     def quantile_db(self, share: float) -> FloatArray:
         """Error (n,) below which a share of the samples lies, to a hundredth of a dB."""

@@ -118,18 +118,17 @@ _LEAST_SD_DB = 0.5
 
 
 def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
-    """Spread of the level in lock, and the line of its mean over path gain without, with the spread about it."""
-    errors = [(f.measured_db - f.level_db)[f.detected] for f in flights if f.detected.any()]
-    gain, lost = (np.concatenate([getattr(f, k)[~f.detected] for f in flights]) for k in ("level_db", "measured_db"))
-    slope, level = np.polyfit(gain - gain_db, lost, 1)
-    beside = lost - level - slope * (gain - gain_db)
-    spread = float(np.sqrt(np.mean([e.var() for e in errors])))
-    numbers = {
-        "locked_sd_db": spread,
-        "lost_db": level,
-        "lost_per_db": slope,
-        "lost_sd_db": max(beside.std(), _LEAST_SD_DB),
-    }
+    """Lines of the level over path gain in lock and without, and the spread about each."""
+    numbers: dict[str, float] = {}
+    for name, in_lock in (("locked", True), ("lost", False)):
+        parts = [f.detected == in_lock for f in flights]
+        each = [(f.level_db[at] - gain_db, f.measured_db[at]) for f, at in zip(flights, parts, strict=True) if at.any()]
+        gain, level = (np.concatenate(values) for values in zip(*each, strict=True))
+        alike = np.concatenate([np.full(len(g), len(g) ** -0.5) for g, _ in each])  # each flight of the same weight
+        slope, middle = np.polyfit(gain, level, 1, w=alike)
+        about = float(np.mean([np.var(m - slope * g) for g, m in each]))
+        sd = np.sqrt(about) if in_lock else (level - middle - slope * gain).std()
+        numbers |= {f"{name}_db": middle, f"{name}_per_db": slope, f"{name}_sd_db": max(sd, _LEAST_SD_DB)}
     return {name: round(float(value), 3) for name, value in numbers.items()}
 
 

@@ -350,8 +350,8 @@ _OFFSET_SD_DB = 1.5
 def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
     """Mean level of the flights above the antennas as written; its error is that of flights left out."""
     mine = [o for o in calibration.observed if (o.samples.tower, o.samples.channel) == (series.tower, series.channel)]
-    if mine[0].samples.antenna in calibration.locks:
-        return None  # the levels below the floor are not logged
+    if mine[0].samples.antenna in calibration.locks:  # without lock a level says nothing of the path
+        mine = [o.part(o.locked == 1.0) for o in mine if o.locked is not None]
     sent = series.link.transmit_power_dbm
     offsets = [calibration.learned.mean_error(o.samples) + o.sent_dbm - sent for o in mine]
     squares = [

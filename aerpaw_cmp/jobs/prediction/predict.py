@@ -20,7 +20,7 @@ from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...compare.gains.direction_gain import LinkSamples
 from ...compare.gains.spread import BAND
 from ...compare.learning.correction import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
-from ...flight.data import FlightData, choose_site, site_place
+from ...flight.data import FlightData, choose_site, ground_nodes, site_place
 from ...flight.drafting.remembered import remembered
 from ...flight.settings import FlightFile, LinkSettings, LinksSettings
 from ...flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
@@ -56,6 +56,9 @@ HEADINGS = 8
 AT_ONCE = 50_000
 
 RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
+
+# Column of the probability of lock, where a receiver loses it.
+P_LOCK = "p_lock"
 
 _TILE_M = 100.0
 
@@ -127,7 +130,9 @@ def predict(
         site, place = site_of(where, flights, known, options.site)
         memory = None if known else memory_of(place, site)
         if memory is not None:
-            sources = memory.sources()
+            asked = _nodes_of(where)
+            every = memory.sources()
+            sources = {name: s for name, s in every.items() if s.tower in asked} or every
         else:
             observed, warnings = observe(known)
             sources = sources_of(known, observed)
@@ -162,6 +167,7 @@ def _model_fields(
         float(np.sqrt((table["slow_sd_db"] ** 2).mean())),
         float((table["q95_db"] - table["q05_db"]).mean()) / 2.0,
         heading_words(table["yaw_deg"].to_numpy(np.float64)),
+        float(table[P_LOCK].mean()) if P_LOCK in table else None,
     )
     logs, marks = ([getattr(receiver, key) for receiver in receivers] for key in (KEY, MARKS))
     if isinstance(model, Memory):
@@ -241,7 +247,8 @@ def site_of(
     elif known:
         site, place = known[0].site, site_place(flights[0].settings.site.file, flights[0].path.parent)
     elif where is not None and planned is not None:
-        site, place = choose_site(planned.site, where.parent), site_place(planned.site.file, where.parent)
+        site, _ = ground_nodes(choose_site(planned.site, where.parent), planned, where.parent)
+        place = site_place(planned.site.file, where.parent)
     else:
         raise UsageError("the site is not named", expected="--site SITE, or --with a flight")
     for data in known:
@@ -254,11 +261,17 @@ def site_of(
     return site, place
 
 
+def _nodes_of(where: Path) -> set[str]:
+    """Nodes of the logs of a flight file; none of another WHERE."""
+    planned = flight_of(where)
+    return set() if planned is None else {log.node for log in planned.logs if log.node}
+
+
 def _check_shared(where: Path, sources: Mapping[str, Source], site: Site, who: str) -> None:
     """UsageError where the sources share no tower with the site, or none with the planned flight and its band."""
     planned = flight_of(where)
     towers, bands = {s.tower for s in sources.values()}, {s.link.carrier_hz for s in sources.values()}
-    nodes = {log.node for log in planned.logs if log.node} if planned is not None else set(site.towers) | towers
+    nodes = _nodes_of(where) if planned is not None else set(site.towers) | towers
     links = [planned.link.rss, *planned.link.channels.values()] if planned is not None else []
     carriers = {link.carrier_hz for link in links if "carrier_hz" in link.model_fields_set}
     near = not carriers or any(abs(a / b - 1.0) <= CARRIER_BAND for a in carriers for b in bands)
@@ -387,12 +400,8 @@ def _table(
 
     parts, nothing = [], np.full(len(targets), np.nan, dtype=np.float32)
     for k, source in enumerate(sources.values()):
-        fading = model.fading(source.antenna)
-        half, sd = fading.half_width_db(slow[k], BAND), fading.total_db(slow[k])
-        values = {"level_db": level[k], "sd_db": sd, "q05_db": level[k] - half, "q95_db": level[k] + half}
-        values |= {"p_serving": serving[k], "slow_sd_db": slow[k]} | (
-            dict.fromkeys(RANKS, nothing) if receivers else {}
-        )
+        values = _stated(model, source.antenna, level[k], slow[k]) | {"p_serving": serving[k]}
+        values |= dict.fromkeys(RANKS, nothing) if receivers else {}
         flag = np.where(guess[k], _FLAG_CODES["outside_flown"], 0)
         flag[~np.isfinite(level[k])] = _FLAG_CODES["out_of_coverage"]
         flag[~targets.known] = _FLAG_CODES["no_position"]
@@ -402,6 +411,20 @@ def _table(
         parts.append(rows(tower, "rank", np.zeros(len(index), dtype=np.int64), index, values))
     table: pd.DataFrame = pd.concat(parts, ignore_index=True)
     return table
+
+
+def _stated(model: Flown | Memory, antenna: str, level_db: AnyArray, slow_db: AnyArray) -> dict[str, AnyArray]:
+    """Columns (n,) of a level: median, standard deviation, interval, and P(lock) of a receiver that loses its lock."""
+    lock = model.lost_lock(antenna, level_db)
+    if lock is None:
+        fading = model.fading(antenna)
+        half, sd = fading.half_width_db(slow_db, BAND), fading.total_db(slow_db)
+        ends = {"level_db": level_db, "sd_db": sd, "q05_db": level_db - half, "q95_db": level_db + half}
+        return ends | {"slow_sd_db": slow_db}
+    low, middle, high = (lock.quantile_db(share) for share in (0.5 - 0.5 * BAND, 0.5, 0.5 + 0.5 * BAND))
+    sd = lock.sd_db(middle)  # with and without lock differ for longer than 4 s
+    ends = {"level_db": level_db + middle, "sd_db": sd, "q05_db": level_db + low, "q95_db": level_db + high}
+    return ends | {"slow_sd_db": sd, P_LOCK: lock.probability}
 
 
 def _levels(

@@ -14,9 +14,10 @@ from ...common.geodesy import azimuth_rad
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples
-from ...compare.gains.spread import NO_SPREAD, Spread, fading_of
+from ...compare.gains.spread import NO_SPREAD, LostLock, Spread, fading_of
 from ...compare.learning.calibration import Observed
 from ...compare.learning.correction import BIN_S, Correction, Predictor, between_blocks_db, by_degree
+from ...compare.level.detection import DetectionForecast
 from ...flight.data import FlightData, RssSeries, load_data
 from ...flight.drafting.remembered import Remembered, remembered
 from ...flight.gains.learned_gain import pair_db
@@ -192,6 +193,10 @@ class Flown:
         sd_db, kurtosis = fading_of(self.sources[antenna].samples, BIN_S)
         return dataclasses.replace(NO_SPREAD, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
 
+    def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:  # noqa: ARG002
+        """None: of the named flights only the level is learned."""
+        return None
+
     def offset_db(self, antenna: str) -> float:
         """Mean of logged minus replayed levels [dB]."""
         source = self.sources[antenna]
@@ -228,6 +233,21 @@ class Memory:
     def fading(self, antenna: str) -> Spread:
         """As :meth:`Flown.fading`."""
         return dataclasses.replace(self.known[antenna].spread, own_sd_db=0.0, noise_sd_db=0.0)
+
+    def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:
+        """Forecast in two parts about levels in lock (n,) [dB], of a receiver that loses its lock."""
+        memory = self.known[antenna]
+        lock, level = memory.series.lock, memory.level
+        if lock is None:
+            return None
+        above_db = level_db - level.offset_db - level.transmit_power_dbm - lock.gain_db
+        return LostLock(
+            probability=DetectionForecast(level_db=0.0, per_db=lock.per_db, share=lock.share).probability(above_db),
+            locked_db=lock.locked_db + lock.locked_per_db * above_db - level_db,
+            lost_db=lock.lost_db + lock.lost_per_db * above_db - level_db,
+            locked_sd_db=float(np.hypot(lock.locked_sd_db, level.sd_db)),
+            lost_sd_db=lock.lost_sd_db,
+        )
 
     def offset_db(self, antenna: str) -> float:
         """Mean of logged levels minus those of the antennas [dB]."""

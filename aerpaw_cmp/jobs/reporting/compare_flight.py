@@ -182,13 +182,13 @@ def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | Non
     if stated is None or series.locked is None:
         return stated
     lock = lock_elsewhere(case.data.settings.antennas, series, case.data.folder)
-    locked = error_db[(series.locked == 1.0) & np.isfinite(error_db)]
-    if lock is None or not len(locked):
+    locked = (series.locked == 1.0) & np.isfinite(error_db)
+    if lock is None or not locked.any():
         return stated
     above_db = case.levels.simulated_db - series.link.transmit_power_dbm - lock.gain_db
     parts = LostLock(
         probability=_forecast(series, lock).probability(case.levels.simulated_db),
-        locked_db=float(locked.mean()),
+        locked_db=error_db[locked].mean() + (lock.locked_per_db - 1.0) * (above_db - above_db[locked].mean()),
         lost_db=lock.lost_db + lock.lost_per_db * above_db + score.offset_db - case.levels.simulated_db,
         locked_sd_db=lock.locked_sd_db,
         lost_sd_db=lock.lost_sd_db,

@@ -69,6 +69,7 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
             "points": len(part),
             "mean_level_db": part["level_db"].mean(),
             "mean_sd_db": part["sd_db"].mean(),
+            "mean_p_lock": part["p_lock"].mean() if "p_lock" in part else None,
             "share_outside_flown": outside_share(part),
             **{f"share_{flag}": float((part["flag"] == flag).mean()) for flag in FLAGS if flag != "outside_flown"},
         }
@@ -130,7 +131,7 @@ def _dataset(data: PredictionPage) -> Any:
     variables: dict[str, Any] = {"series": ("series", np.array(names), {"long_name": "tower and channel"})}
     for name, unit in (("time_s", "s"), ("east_m", "m"), ("north_m", "m"), ("height_m", "m"), ("yaw_deg", "degree")):
         variables[name] = ("point", first[name].to_numpy(np.float64), {"units": unit})
-    for name in ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db", "p_serving"):
+    for name in ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db", "p_serving", "p_lock"):
         if name in first:
             values = np.stack([part[name].to_numpy(np.float32) for _, part in series])
             variables[name] = (("series", "point"), values, {"units": "dB" if name.endswith("_db") else "1"})
@@ -208,5 +209,9 @@ def _draw_profile(data: PredictionPage, name: str, part: pd.DataFrame) -> Figure
                     label="90 % interval of one sample")  # fmt: skip
     ax.plot(time, part["level_db"], color=canvas.SIMULATED, linewidth=1.2, label="median")
     ax.set(xlabel="time along the route [s]", ylabel=f"level [{data.units.get(name, 'dB')}]")
+    if "p_lock" in part and part["p_lock"].notna().any():
+        share = ax.twinx()
+        share.plot(time, part["p_lock"], color="0.4", linewidth=0.9, linestyle=":")
+        share.set(ylim=(0.0, 1.0), ylabel="probability of lock (dotted)")
     canvas.legend_below(ax, 2)
     return fig

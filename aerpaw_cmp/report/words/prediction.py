@@ -97,9 +97,10 @@ FLOWN: dict[str, tuple[str, str]] = {
 
 
 EXPECTED = (
-    "Expect an RMSE of {error:.1f} dB over 4 s means at these points on a new flight ({heading}); 90 % of the samples "
+    "Expect an RMSE of {error:.1f} dB{over} at these points on a new flight ({heading}); 90 % of the samples "
     "lie within \u00b1{band:.1f} dB."
 )
+LOCK = "The receiver is in lock for {percent:.0f} % of them (P(lock) of each point: `p_lock` in prediction.csv)."
 REMEMBERED = "No flight is named: antennas and levels are those that the site remembers."
 OUTSIDE = {
     "flown": "{percent:.0f} % of the points lie outside the flown places.",
@@ -122,7 +123,12 @@ def heading_words(yaw_deg: FloatArray) -> str:
 
 
 def first_words(
-    correction: Correction | None, outside: float, expected_db: float, band_db: float, heading: str = "heading open"
+    correction: Correction | None,
+    outside: float,
+    expected_db: float,
+    band_db: float,
+    heading: str = "heading open",
+    lock: float | None = None,
 ) -> str:
     """First paragraph of terminal, page and metrics.json: one error with its band, best baseline, one next step.
 
@@ -133,17 +139,22 @@ def first_words(
     outside : float
         Share of points outside the flown places, or in directions that flights hardly saw.
     expected_db : float
-        Stated standard deviation of a mean over 4 s on a new flight, root mean square over the points [dB].
+        Stated standard deviation of a mean over 4 s (of a sample, where a receiver loses its lock) on a new flight,
+        root mean square over the points [dB].
     band_db : float
         Half of the 90 % interval of a sample, mean over the points [dB].
     heading : str
         As :func:`heading_words` has it.
+    lock : float, optional
+        Mean probability of lock, of a receiver that loses it.
 
     Returns
     -------
     str
     """
-    texts = filled([EXPECTED], error=expected_db, band=band_db, heading=heading)
+    over = " over 4 s means" if lock is None else ""
+    texts = filled([EXPECTED], error=expected_db, band=band_db, heading=heading, over=over)
+    texts += [] if lock is None else filled([LOCK], percent=100.0 * lock)
     step = ""
     if correction is None:
         texts.append(REMEMBERED)

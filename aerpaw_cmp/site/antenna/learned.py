@@ -60,8 +60,9 @@ class Errors(StrictModel):
 class LearnedLock(StrictModel):
     """Lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) of the predicted path gain [dB].
 
-    ``locked_sd_db``: of levels about their prediction, in lock. Without, they lie about ``lost_db`` at ``gain_db``,
-    ``lost_per_db`` higher for each dB of path gain, with ``lost_sd_db`` [unit of the measurement].
+    In lock the levels lie about ``locked_db`` at ``gain_db``, ``locked_per_db`` higher for each dB of path gain (less
+    than 1: of weak levels the receiver locks on the strong), with ``locked_sd_db`` in a flight; without lock about
+    ``lost_db`` and so on [unit of the measurement].
     The scores are means over flights left out: Brier and log score (nat) beside those of each flight's own share, and
     the RMSE [dB] of all samples where levels below the floor count as the floor.
     """
@@ -69,6 +70,8 @@ class LearnedLock(StrictModel):
     gain_db: float
     per_db: Annotated[float, Field(gt=0)]
     share: Annotated[float, Field(gt=0, lt=1)]
+    locked_db: float
+    locked_per_db: float
     locked_sd_db: Annotated[float, Field(gt=0)]
     lost_db: float
     lost_per_db: float
@@ -105,7 +108,7 @@ class LearnedSeries(StrictModel):
     """Mean standard deviation of the level over directions that were flown."""
     lock: LearnedLock | None = None
     level: LearnedLevel | None = None
-    """None of receivers that lose their lock."""
+    """Of receivers that lose their lock: of the levels in lock."""
 
 
 class LearnedReceiver(StrictModel):

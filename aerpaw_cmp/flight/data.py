@@ -84,6 +84,8 @@ class FlightData:
     settings: FlightFile
     folder: Path
     """Where logs and antenna files resolve: ``--logs-root``, else the folder of the flight file."""
+    site_place: str | Path
+    """The site's file, which lies by the flight file, or the name of a packaged site."""
     site: Site
     files: tuple[IngestedFile, ...]
     track: Track | None
@@ -396,6 +398,7 @@ def gather(
     data = FlightData(
         settings=settings,
         folder=logs_root or folder,
+        site_place=site_place(settings.site.file, folder),
         site=site,
         files=tuple(files),
         track=track,

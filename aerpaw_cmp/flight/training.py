@@ -18,7 +18,7 @@ from ..propagation.geometry.arrays import Link
 from ..site.antenna.antennas import MeasuredPattern
 from ..site.antenna.learned import folder_of
 from ..site.antenna.sphere_pattern import LEARNED, SpherePattern, read_sphere_csv
-from .data import FlightData, RankSeries, RssSeries, site_place
+from .data import FlightData, RankSeries, RssSeries
 from .marks import among, mark_of
 from .settings import FlightFile
 
@@ -59,7 +59,7 @@ def learned_patterns(link: Link, folder: Path, site: str | Path) -> list[Measure
 def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, ...]:
     """Logs of a series that its antennas, or the settings of its flight file, were learned from; none: it is unseen."""
     logs, settings = logs_of(data, series), data.settings
-    patterns = learned_patterns(link, data.folder, site_place(settings.site.file, data.folder))
+    patterns = learned_patterns(link, data.folder, data.site_place)
     if among(series_mark(series), union(settings.marks, *(p.marks for p in patterns))):
         return logs
     return common(logs, [settings.trained_on, *(p.trained_on for p in patterns)])

@@ -264,7 +264,7 @@ class _Levels:
     def of(cls, data: FlightData, link: Link, name: str, remarks: list[str]) -> _Levels:
         towers = tuple(link.tower_arrays)
         try:
-            memory = memory_of(site_place(data.settings.site.file, data.folder), data.site)
+            memory = memory_of(data.site_place, data.site)
         except UsageError:
             remarks.append("No calibrated level: no flight taught the site its antennas (aerpaw-cmp calibrate).")
             return cls(None, {}, len(towers))
@@ -331,7 +331,8 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
             else:
                 nothing: dict[str, Any] = dict.fromkeys(("files", "rss", "rank", "warnings"), ())
                 site = choose_site(settings.site, flight.parent)
-                data = FlightData(settings=settings, folder=root, site=site, track=None, **nothing)
+                known = site_place(settings.site.file, flight.parent)
+                data = FlightData(settings=settings, folder=root, site_place=known, site=site, track=None, **nothing)
         in_memory = not STREAMED.issuperset(chosen.formats)
         with output.filling() as place:
             parts = channel_parts(data, chosen, stages, in_memory=in_memory, room=shutil.disk_usage(place).free)

@@ -14,11 +14,12 @@ from aerpaw_cmp.flight import data
 from aerpaw_cmp.flight.data import FlightData, choose_site, gather, load_data, read_logs
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.flight.simulate import FlightSimulator
-from aerpaw_cmp.site.siteyaml import load_site
+from aerpaw_cmp.site.siteyaml import load_site, site_model
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
+PACKAGED = Path(__file__).parents[2] / "aerpaw_cmp" / "site" / "data"
 
 
 def _flight(folder: Path, *logs: str) -> FlightData:
@@ -91,6 +92,19 @@ def test_a_ratio_is_known_by_its_channel_and_the_report_warns(
     assert "skip: [LW1, LW2]" in warning
     assert main(["report", str(tmp_path / "flight.yaml"), "--audit", "none", "-o", str(tmp_path / "out")]) == 0
     assert f"warning: {warning}" in capsys.readouterr().err
+
+
+def test_the_site_lies_by_the_flight_file_and_the_logs_elsewhere(tmp_path: Path) -> None:
+    """Its grounds and antennas are read from there again: --logs-root does not move them."""
+    track = next(SAMPLE.glob("UAV/*vehicleOut.txt")).relative_to(SAMPLE)
+    (tmp_path / "flight.yaml").write_text(
+        "flight: f\nsite: site.yaml\ntimezone: America/New_York\nlogs:\n"
+        f"  - {{path: {track}}}\n  - {{path: LW1/USRP1_power_log.txt, node: LW1}}\n"
+    )
+    (tmp_path / "site.yaml").write_bytes((PACKAGED / "lake_wheeler.yaml").read_bytes())
+    flight = load_data(load_flight(tmp_path / "flight.yaml"), tmp_path, SAMPLE)
+    assert flight.folder == SAMPLE
+    assert site_model(flight.site_place) == site_model("lake_wheeler")
 
 
 def test_names_in_the_flight_file_that_fit_nothing_are_told(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from ...compare.learning.locate import LevelModel
 from ...site.antenna import learned
 from ...site.antenna.named import check_logs
 from ...site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
-from ..data import FlightData, RssSeries, site_place
+from ..data import FlightData, RssSeries
 from ..gains.learned_gain import pair_and_sd_db, sphere_angles
 from ..gains.memory import with_learned
 from ..marks import among
@@ -227,7 +227,7 @@ def offered(data: FlightData) -> FlightFile | None:
     series = [(s.tower, s.channel, data.files[int(number)].result.reader)
               for s in data.rss for number in np.unique(s.log)]  # fmt: skip
     try:
-        known = propose(learned.read_learned(site_place(site, data.folder)), str(Path(site).with_suffix("")), series)
+        known = propose(learned.read_learned(data.site_place), str(Path(site).with_suffix("")), series)
     except (InputError, UsageError):
         return None
     if len(known.antennas) < 2:

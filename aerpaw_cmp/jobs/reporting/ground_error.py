@@ -9,7 +9,7 @@ import numpy as np
 
 from ...common.units import FloatArray, IntArray, spread_out
 from ...compare.rank import channel_rank
-from ...flight.data import FlightData, site_place
+from ...flight.data import FlightData
 from ...flight.replay import Replayed, replay_poses
 from ...propagation.geometry.arrays import Poses
 from ...site.relief.dem import Dem
@@ -41,7 +41,7 @@ def agreement_by_ground(
     dict of str to float
         Empty for sites without ``ground_points``, scenes of triangles and towers that move.
     """
-    model = site_model(site_place(data.settings.site.file, data.folder))
+    model = site_model(data.site_place)
     known = np.flatnonzero(np.isfinite(measured))
     if not model.ground_points or data.site.scene is not None or replayed.tower_m is not None or not len(known):
         return {}

@@ -26,7 +26,7 @@ from ...common.yamlfile import parse_yaml
 from ...compare.judge.ladder import Ladder, Rung, climb
 from ...compare.result import BASELINE_TITLE
 from ...compare.statistics.intervals import pooled_difference
-from ...flight.data import FlightData, RssSeries, choose_site, site_place
+from ...flight.data import FlightData, RssSeries, choose_site
 from ...flight.drafting.remembered import errors_elsewhere, offered
 from ...flight.gains.learned_gain import pair_db
 from ...flight.gains.losses import path_loss
@@ -316,11 +316,11 @@ class _Climber:
         data, flat = self._data, self._data.site
         if flat.dem or flat.scene or data.settings.towers or any(t.ground_m for t in flat.towers.values()):
             return {}
-        kinds = known_grounds(site_place(data.settings.site.file, data.folder))
+        kinds = known_grounds(data.site_place)
         chosen: dict[Relief, Site] = {}
         for kind in ("offsets", "surface"):
             if kind in kinds:
-                choice = data.settings.site.model_copy(update={"tower_ground": kind})
+                choice = data.settings.site.model_copy(update={"tower_ground": kind, "file": str(data.site_place)})
                 chosen[kind] = choose_site(choice, data.folder)
         return chosen
 

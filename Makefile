@@ -78,8 +78,7 @@ bench: $(READY_DEV) $(LLVM)
 	$(BIN)/aerpaw-cmp bench
 
 bench-all: $(READY_DEV) $(LLVM)
-	-$(BIN)/python benchmarks/all.py
-	$(BIN)/python benchmarks/performance.py
+	$(BIN)/python benchmarks/performance.py --measure
 
 # every benchmark at its smallest size: does it come to its end?
 bench-check: $(READY_DEV) $(LLVM)

@@ -33,6 +33,7 @@ COMMANDS: dict[str, list[str]] = {
     "scaling": ["benchmarks/scaling.py", "--json", "--axes"],
     "peers": ["benchmarks/peers.py"],
     "report": ["benchmarks/report.py", "--quick", "--json"],
+    "waits": ["benchmarks/waits.py", "--json"],
     "replay": ["benchmarks/replay.py", "--quick", "--no-sionna", "--json"],
     "kriging": ["benchmarks/kriging.py", "--pairs", "60", "--json"],
     "town": ["benchmarks/scenes.py", "--scenes", "munich", "--depths", "2,3", "--sionna", "1e5,1e6", "--json", "-"],
@@ -86,6 +87,7 @@ SMALLEST: dict[str, list[str]] = {
     "tap_sigkill": ["--quick"],
     "tap_web_soak": ["--quick"],
     "tr36777": ["--ues", "50"],
+    "waits": ["--only", "report of the sample"],
     "wheels": ["--pythons", sys.executable],
 }
 

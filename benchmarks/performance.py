@@ -1,6 +1,6 @@
-"""docs/performance.md and its figures from the history of benchmark runs; nothing is measured here.
+"""docs/performance.md and its figures from the history of benchmark runs; ``--measure`` runs them all before.
 
-    python benchmarks/performance.py [--history FILE] [--docs FOLDER]
+    python benchmarks/performance.py [--measure] [--history FILE] [--docs FOLDER]
 
 The last run of the history that measured everything it was asked for is shown; earlier ones make the table of the
 peers' ratios over time. Extrapolations are one line each: the largest measured size, the fitted power, and the size
@@ -11,6 +11,8 @@ import argparse
 import json
 import math
 import statistics
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -317,6 +319,23 @@ def reports(run: dict[str, Any]) -> list[str]:
     ]  # fmt: skip
 
 
+def waits(run: dict[str, Any]) -> list[str]:
+    """Commands that a user waits for: before, asked for, reached."""
+    result = run["benchmarks"].get("waits", {}).get("result")
+    if not result:
+        return []
+    return [
+        "## What is waited for", "",
+        "Whole processes, the next run, processor seconds:", "",
+        "| command | before | asked for | reached | peak MiB |", "| --- | ---: | ---: | ---: | ---: |",
+        *(
+            f"| {row['command']} | {row['before_s']:g} | {row['asked_s']:g} | {row['cpu_s']:.1f} | "
+            f"{row['peak_mib']:.0f} |"
+            for row in result["rows"]
+        ), "",
+    ]  # fmt: skip
+
+
 def page(history: list[dict[str, Any]]) -> str:
     """The text of docs/performance.md."""
     run = last_whole(history)
@@ -333,6 +352,7 @@ def page(history: list[dict[str, Any]]) -> str:
         f"before, {run.get('load_after', '-')} after (the run alone makes 1 to 2), {run['seconds'] / 60:.1f} min in "
         f"all.{' Kernels of replays were compiled before the first row.' * ('load_after' in run)}", "",
         *([f"Not measured: {'; '.join(unmeasured)}.", ""] if unmeasured else []),
+        *waits(run),
         *reports(run),
         "## Cost against size", "",
         f"![Processor time and memory against size](images/{FIGURE})", "",
@@ -377,7 +397,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--history", type=Path, default=HISTORY)
     parser.add_argument("--docs", type=Path, default=ROOT / "docs")
+    parser.add_argument("--measure", action="store_true", help="run benchmarks/all.py first, some nine minutes")
     arguments = parser.parse_args()
+    if arguments.measure:
+        subprocess.run([sys.executable, ROOT / "benchmarks" / "all.py"], check=False)  # a failed one is named
     history = runs(arguments.history)
     text = page(history)
     (arguments.docs / "images").mkdir(parents=True, exist_ok=True)

@@ -1,0 +1,67 @@
+"""Whole commands that a user waits for, as processes: processor seconds and peak memory of the next run.
+
+Each runs once before, so that every cache is warm. Those on real logs need AERPAW_CMP_FIELD_DATA.
+
+    python benchmarks/waits.py [--only NAME] [--json]
+"""
+
+import argparse
+import json
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+from benchmarks.report import ROOT, run
+
+FIELD = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
+SAMPLE = str(ROOT / "sample_logs" / "flight.yaml")
+REAL = ["--logs-root", FIELD]
+# Of each: seconds before the work began, seconds asked for, the command, and whether it needs the field's logs.
+COMMANDS: dict[str, tuple[float, float, list[str], bool]] = {
+    "report of dataset 12": (5.1, 3.2, ["report", str(ROOT / "tests/field/dataset12_40m.yaml"), *REAL], True),
+    "report of the sample": (10.3, 6.0, ["report", SAMPLE], False),
+    "map lake_wheeler": (60.0, 28.0, ["map", "lake_wheeler"], False),
+    "calibrate three flights": (
+        15.0,
+        8.0,
+        ["calibrate", str(ROOT / "tests/field/learned/dataset12.yaml"), *REAL],
+        True,
+    ),
+    "predict a route of 30 minutes": (6.6, 3.5, ["predict", "{folder}/route.csv", "--site", "lake_wheeler"], False),
+}
+
+
+def main() -> None:
+    """Measure them all."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", choices=sorted(COMMANDS))
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        turn = np.linspace(0.0, 20.0 * np.pi, 1800)
+        places = np.column_stack([35.7275 + 0.003 * np.cos(turn / 7), -78.6961 + 0.003 * np.sin(turn), 0.0 * turn + 40])
+        lines = (f"{latitude:.7f},{longitude:.7f},{height:.1f}" for latitude, longitude, height in places)
+        (Path(folder) / "route.csv").write_text("\n".join(["lat,lon,alt", *lines, ""]), encoding="utf-8")
+        for name, (before_s, asked_s, command, real) in COMMANDS.items():
+            if (arguments.only and name != arguments.only) or (real and not FIELD):
+                continue
+            text = [sys.executable, "-m", "aerpaw_cmp", *(part.format(folder=folder) for part in command)]
+            text += ["-o", f"{folder}/out.yaml" if command[0] == "calibrate" else f"{folder}/{command[0]}", "--force"]
+            if command[0] != "map":  # 51 figures: nothing that the first run keeps
+                run(text)
+            rows.append({"command": name, "before_s": before_s, "asked_s": asked_s, **run(text)})
+    if arguments.json:
+        print(json.dumps({"rows": rows}))
+        return
+    for row in rows:
+        print(f"{row['command']}: {row['cpu_s']:.1f} s of processor (asked for {row['asked_s']:g}), "
+              f"{row['peak_mib']:.0f} MiB")  # fmt: skip
+
+
+if __name__ == "__main__":
+    main()

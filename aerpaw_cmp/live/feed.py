@@ -37,6 +37,8 @@ _GPS_LOST_S = 5.0
 _CLOCK_OFF_S = 2.0
 _DISK_LOW_BYTES = 200 * 2**20
 _STEP_SHOWN_S = 30.0
+# A shorter step moves a sample along the flight by less than its position is known; the log and its warnings have it.
+_STEP_S = 0.2
 _POINTS_AHEAD = 40
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
@@ -326,8 +328,10 @@ class Feed:
             modem.rank = modem.rsrp_dbm = modem.sinr_db = None  # what was last measured is not what is now
 
     def _take_clock(self, modem: _Modem, record: Record) -> None:
-        modem.step_s = self._seconds(modem, record["mono_ns"])
-        modem.step_text = f"the wall clock stepped by {record['step_ns'] / 1e9:+.3f} s"
+        step_s = record["step_ns"] / 1e9
+        if abs(step_s) >= max(_STEP_S, modem.period_s / 2):  # a slower tap has its samples farther apart
+            modem.step_s = self._seconds(modem, record["mono_ns"])
+            modem.step_text = f"the wall clock stepped by {step_s:+.3f} s"
 
     def _take_end(self, modem: _Modem, _record: Record) -> None:
         modem.connected, modem.ended, modem.gap_text = False, True, ""

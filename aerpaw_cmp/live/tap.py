@@ -35,6 +35,8 @@ __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_stat
 
 # A jump of the wall clock against the monotonic one beyond this is recorded.
 _CLOCK_STEP_NS = 50_000_000
+# Two clocks that are read farther apart than this tell nothing about each other: the process was paused between them.
+_PAUSE_NS = 5_000_000
 # Gets each record once the log has it, and each status, in the polling thread: it must neither wait nor raise.
 Watch = Callable[["Record | TapStatus"], None]
 
@@ -118,7 +120,7 @@ class Tap:
         now = self._clock.mono_ns()
         self._start_ns = self._last_final_ns = self._last_csi_ns = self._status_ns = self._rest_until_ns = now
         self._noise_ns = now
-        self._offset_ns = self._clock.utc_ns() - now
+        self._offset_ns: int | None = None
 
     # the session ------------------------------------------------------------------------------------------
 
@@ -576,10 +578,7 @@ class Tap:
             for text in self._log.messages():
                 self._say(text)
             self._log_predictions()
-        offset = self._clock.utc_ns() - now
-        if abs(offset - self._offset_ns) > _CLOCK_STEP_NS:
-            self._record({"kind": "clock", "step_ns": offset - self._offset_ns, **self._now()})
-        self._offset_ns = offset
+        self._check_clock()
         if now - self._noise_ns > 1_000_000_000:
             self._noise_ns = now
             self._flush_noise()
@@ -590,6 +589,14 @@ class Tap:
         duration_s = self._settings.duration_s
         if duration_s is not None and now - self._start_ns > duration_s * 1e9 and not self._stop.count:
             self._stop("duration")
+
+    def _check_clock(self) -> None:
+        before, utc, after = self._clock.mono_ns(), self._clock.utc_ns(), self._clock.mono_ns()
+        if after - before > _PAUSE_NS:
+            return
+        step, self._offset_ns = utc - before - (self._offset_ns or utc - before), utc - before
+        if abs(step) > _CLOCK_STEP_NS:
+            self._record({"kind": "clock", "step_ns": step, **self._now()})
 
     def _check_alarm(self, now: int) -> None:
         limit = self._settings.no_csi_alarm_s

@@ -453,6 +453,17 @@ def test_a_wall_clock_that_jumps_leaves_the_rows_in_order():
     assert any("-4998.000 s" in alarm["text"] for alarm in message["alarms"])
 
 
+@pytest.mark.parametrize(
+    ("ri_hz", "step_s", "shown"), [(2, 0.056, 0), (10, 0.056, 0), (2, 0.3, 1), (10, -0.25, 1), (0.1, 1.0, 0)]
+)
+def test_a_step_of_the_clock_is_an_alarm_where_it_moves_a_sample(ri_hz, step_s, shown):
+    hand = Hand()
+    hand.put({"kind": "header", "utc_ns": hand.now_ns, "mono_ns": 0, "port": {}, "settings": {"ri_hz": ri_hz}})
+    hand.answer()
+    hand.put({"kind": "clock", "step_ns": int(step_s * SECOND), "mono_ns": hand.mono_ns})
+    assert hand.open() == ["step"] * shown
+
+
 def test_each_alarm_opens_and_closes():
     hand = Hand()
     hand.answer()

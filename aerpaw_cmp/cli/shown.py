@@ -102,7 +102,7 @@ def warn_all(texts: Sequence[str]) -> None:
     for text in texts[:_WARNINGS]:
         say.warn(f"warning: {one_line(text)}")
     if len(texts) > _WARNINGS:
-        say.warn(f"and {len(texts) - _WARNINGS} more warnings, all on the page")
+        say.warn(f"and {counted(len(texts) - _WARNINGS, 'more warning')}, all on the page")
 
 
 # Version of what ``--json`` prints (docs/reference/json.md): it rises when a key is renamed or removed.

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
 
+from ..common.counting import counted
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..logs.ingest import Held, IngestedFile, ingest, read_log
@@ -373,7 +374,7 @@ def gather(
         ranked = (stream for stream in streams if stream.kind == "rank")
         rank += [(log.path, _rank_series(log, stream, site, tower=tower, number=number)) for stream in ranked]
         if unnamed := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
-            warnings.append(f"{log.path}: {len(unnamed)} cells that 'cells' does not name are left out")
+            warnings.append(f"{log.path}: {counted(len(unnamed), 'cell')} left out that 'cells' does not name")
         names = [s.name for s in file.result.streams]
         if unknown := [name for name in log.skip if name not in names]:
             warnings.append(
@@ -476,14 +477,14 @@ def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximu
     track = Track(frame, site.frame, maximum_gap_s=maximum_gap_s, ground_m=takeoff_m, ground=ground)
     if not len(track) and lacks_height(stream):
         raise InputError(
-            f"none of the {len(stream.frame)} telemetry rows has an altitude",
+            f"no altitude in {counted(len(stream.frame), 'telemetry row')}",
             expected="'height_m: H' beside its path, the height above take-off [m] in all of it, or another track",
             cause="a phone or a drive-test program that writes latitude and longitude alone",
             path=path,
         )
     if not len(track):
         raise InputError(
-            f"none of the {len(stream.frame)} telemetry rows holds a position that can be",
+            f"{counted(len(stream.frame), 'telemetry row')} without a position that can be",
             expected="latitude and longitude in degrees, altitude in metres",
             cause="a receiver without a fix, or columns exchanged",
             path=path,
@@ -561,7 +562,7 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
             messages.append(f"rt.attitude: {mode} has no effect on {kind} of {tower}: {why}.")
         elif pose is not None and kind == "rank" and not pose.valid.all():
             messages.append(
-                f"rt.attitude: {mode} acts on {known} of {len(time)} samples of {kind} of {tower}: "
+                f"rt.attitude: {mode} acts on {known} of {counted(len(time), 'sample')} of {kind} of {tower}: "
                 "the telemetry covers no more."
             )
     return tuple(dict.fromkeys(messages))

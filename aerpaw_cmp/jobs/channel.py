@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.counting import counted
 from ..common.errors import InputError, UsageError
 from ..common.geodesy import bearing_deg
 from ..common.outputs import OutputFolder
@@ -221,7 +222,7 @@ def _flown(data: FlightData, chosen: ChannelOptions, towers: Sequence[str]) -> _
         time_s=((time - time[0]) / np.timedelta64(1, "s"))[track.valid],
         start=time[0],
         towers_m=place[track.valid] if towers[0] in data.nodes else None,
-        remarks=(f"{left} of {len(time)} instants have no pose (telemetry gaps) and are left out.",) if left else (),
+        remarks=(f"{left} of {counted(len(time), 'instant')} left out: no pose (telemetry gaps).",) if left else (),
     )
 
 

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.counting import counted
 from ..common.errors import InputError, UsageError
 from ..common.jsonable import named
 from ..common.outputs import OutputFolder
@@ -73,7 +74,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
             track = Placer(site, vehicle).levels(level, floor, uav)
             if len(track.level_db) < FEWEST:
                 raise InputError(
-                    f"{len(track.level_db)} bins of 4 s have a level and a position above 5 m",
+                    f"{counted(len(track.level_db), 'bin')} of 4 s with a level and a position above 5 m",
                     expected=f"{FEWEST}",
                     cause="a short flight, or logs of two flights",
                     path=flight,
@@ -166,7 +167,7 @@ def _page(flight: str, level: Stream, site: Site, track: LevelTrack, estimate: N
         warnings=(edge,) if estimate.at_edge else (),
         regions=regions,
         track_m=track.position_m,
-        towers={name: tower.position_m for name, tower in site.towers.items()},
+        site=site,
     )
 
 

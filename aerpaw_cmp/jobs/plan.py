@@ -122,8 +122,12 @@ def report_plan(
         PlannedStage("read", counted(len(inputs), "file"), reading),
     ]
     if n_rss and settings.rss.lag in ("estimate", "apply"):
-        stages.append(PlannedStage("clocks", f"{len({series.tower for series in data.rss})} receivers"))
-    stages += [*rss, *rank, PlannedStage("compare", f"{n_rss} RSS and {n_rank} rank samples")]
+        stages.append(PlannedStage("clocks", counted(len({series.tower for series in data.rss}), "receiver")))
+    stages += [
+        *rss,
+        *rank,
+        PlannedStage("compare", f"{counted(n_rss, 'RSS sample')}, {counted(n_rank, 'rank sample')}"),
+    ]
     if rt.audit_links > 0:
         stages.append(
             PlannedStage("audit", f"{counted(min(rt.audit_links, n_rss + n_rank), 'link')} by the other engine")
@@ -187,7 +191,9 @@ def _tiles(site: Site, settings: Any, tiling: Any) -> PlannedStage:
     some = spread_out(len(tiling), _TRIED_TILES).tolist()
     orders = [TileOrder(site="", settings=settings, cells=tiling.cells, number=number) for number in some]
     seconds = _cpu_seconds(lambda: [channels.tile(order) for order in orders]) * len(tiling) / len(some)
-    return PlannedStage("maps in tiles", f"{len(tiling)} tiles of {tiling.cells} x {tiling.cells} positions", seconds)
+    return PlannedStage(
+        "maps in tiles", f"{counted(len(tiling), 'tile')} of {tiling.cells} x {tiling.cells} positions", seconds
+    )
 
 
 def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan:

@@ -142,7 +142,7 @@ def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> t
         return [read_file(place, options=options, reader=chosen)], []
     if not inside:
         known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
-        looked = "1 file" if len(skipped) == 1 else f"{len(skipped)} files"
+        looked = counted(len(skipped), "file")
         first = f"; {one_line(Path(skipped[0].path).name)}: {skipped[0].reason}" if skipped else ""
         raise InputError(
             f"the {'folder' if is_folder else 'archive'} holds no log that {known} ({looked} looked at){first}",

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 import pandas as pd
 
+from ..common.counting import counted
 from ..common.units import BoolArray, FloatArray, IntArray
 from .records import Stream
 
@@ -60,10 +61,9 @@ def jumps_of(stream: Stream) -> tuple[BoolArray, str]:
     out = none.copy()
     out[rows[astray]] = True
     line = int(stream.frame["line"].iloc[rows[at]])
-    counted = "1 row is" if out.sum() == 1 else f"{int(out.sum())} rows are"
     return out, (
-        f"{what}: {counted} flagged {FLAG}; the first: {fast_mps:.0f} m/s to the position in line {line}; read as "
-        "missing"
+        f"{what}: {counted(int(out.sum()), 'row is', 'rows are')} flagged {FLAG}; the first: {fast_mps:.0f} m/s to the "
+        f"position in line {line}; read as missing"
     )
 
 

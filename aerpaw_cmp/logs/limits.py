@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
+from ..common.counting import counted
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .jumps import FLAG, PLACE, jumps_of
 from .records import COLUMNS, ReadResult, Stream
@@ -135,7 +136,7 @@ class _Check:
 
     def _flag(self, bad: BoolArray, flag: str, first: str, why: str, void: Sequence[str] = ()) -> None:
         """Flag rows, void some of their columns, and say how many there are, what the first is, and why."""
-        rows = "1 row is" if bad.sum() == 1 else f"{bad.sum()} rows are"
+        rows = counted(int(bad.sum()), "row is", "rows are")
         line = int(self.frame["line"].iloc[int(np.argmax(bad))])
         end = "not scored" if flag in UNSCORED else "read as missing"
         self._said.append(f"{self._what}: {rows} flagged {flag}; the first: {first} in line {line}, {why}; {end}")

@@ -27,6 +27,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..common import kml
+from ..common.counting import counted
 from ..common.errors import InputError, parsing
 from ..common.xmlfiles import named, outermost, plain, xml_root
 from . import dictionary
@@ -118,7 +119,7 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
     silent = table["altitude_m"].isna()
     if silent.any():
         if height_m is None:
-            place = f"{int(silent.sum())} of {len(table)} points have no height"
+            place = f"{int(silent.sum())} of {counted(len(table), 'point')} without a height"
             raise InputError(place, expected="heights above take-off in the file, or one height for all points")
         table["altitude_m"] = table["altitude_m"].fillna(height_m)
     table["yaw_deg"] = table["yaw_deg"] % 360.0

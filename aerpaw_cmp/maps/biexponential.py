@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..common.counting import counted
 from ..common.errors import UsageError
 from ..common.units import FloatArray, unmasked
 
@@ -110,7 +111,7 @@ def fit_biexponential(
     problem = _Projection.of(distance_m, correlation, weights)
     if len(problem.d) < 4:
         single = problem.single()
-        return problem.result(single, f"{len(problem.d)} points cannot tell four coefficients")
+        return problem.result(single, f"{counted(len(problem.d), 'point')} for four coefficients")
     best = problem.double()
     return problem.judge(best)
 
@@ -135,7 +136,9 @@ class _Projection:
         good = np.isfinite(d) & np.isfinite(y) & (w > 0) & (d >= 0)
         d, y, w = d[good], y[good], w[good]
         if len(d) < 2 or not d.max() > 0:
-            raise UsageError(f"{len(d)} usable points for a curve", expected="at least two, at different distances")
+            raise UsageError(
+                f"{counted(len(d), 'usable point')} for a curve", expected="at least two, at different distances"
+            )
         slow, fast = 1e-6 / d.max(), 10.0 / d[d > 0].min()  # flat over the data; gone at the first bin
         return cls(d, y, np.sqrt(w / w.mean()), (float(np.log(slow)), float(np.log(fast))))
 

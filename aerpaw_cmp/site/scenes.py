@@ -14,6 +14,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 from shapely.geometry import Polygon
 
+from ..common.counting import counted
 from ..common.errors import UsageError
 from ..common.units import FloatArray
 from .materials import CROWN, material
@@ -182,8 +183,8 @@ def without_traps(
     woods = [wood for number in np.flatnonzero(green & ~trunk).tolist() for wood in _media(scene, number)]
     if green.any():
         notes.append(
-            f"{int((green & ~trunk).sum())} meshes of vegetation are media, by the chord, and no mirrors; "
-            f"{int(trunk.sum())} meshes of trunks are left out"
+            f"vegetation is a medium, not a mirror: {counted(int((green & ~trunk).sum()), 'mesh', 'meshes')}; "
+            f"{counted(int(trunk.sum()), 'mesh', 'meshes')} of trunks left out"
         )
     remaining = ~(out | green)[scene.shape]
     return replace(scene, triangles=scene.triangles[remaining], shape=scene.shape[remaining]), tuple(woods), notes

@@ -19,6 +19,7 @@ import shapely
 from pydantic import AfterValidator, Field, model_validator
 from shapely.geometry import Point, Polygon
 
+from ..common.counting import counted
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import named
@@ -545,7 +546,7 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
     if not overlapping:
         return []
     first = " and ".join(f"'{buildings[i].name}'" for i in overlapping[0])
-    more = "" if len(overlapping) == 1 else f" and {len(overlapping) - 1} more pairs"
+    more = "" if len(overlapping) == 1 else f" and {counted(len(overlapping) - 1, 'more pair')}"
     return [f"warning: the buildings {first}{more} overlap; 'aerpaw-cmp site import' makes outlines disjoint"]
 
 
@@ -646,9 +647,8 @@ def _trees(
             placed = place_trees(forest, model, seed=model.seed, keep_clear=clear)
         wanted = wanted_trees(forest, clear)
         if len(placed) < wanted:
-            notes.append(
-                f"{forest.name}: {len(placed)} of {wanted} trees fit at {forest.minimum_spacing_m:g} m spacing"
-            )
+            room = f"room for {len(placed)} of {counted(wanted, 'tree')}"
+            notes.append(f"{forest.name}: {room} at {forest.minimum_spacing_m:g} m spacing")
         (parts if forest.height_m is None else of_stands).append(placed)
     if model.single:
         parts.append(_single(model.single, model))

@@ -10,6 +10,7 @@ from typing import NamedTuple, cast
 import numpy as np
 import pandas as pd
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.records import Attribute, Stream
 from aerpaw_cmp.logs.text import lines as _lines
@@ -144,7 +145,7 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: Cell, source: str) -> S
     outside = ~((level >= _RANGE_DBM[0]) & (level <= _RANGE_DBM[1]))
     if 2 * outside.sum() > len(level):
         rows.warnings.append(
-            f"{cell.name}: {outside.sum()} of {len(level)} levels lie outside {_RANGE_DBM[0]:g} .. "
+            f"{cell.name}: {outside.sum()} of {counted(len(level), 'level')} outside {_RANGE_DBM[0]:g} .. "
             f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
             "read as out of coverage"
         )

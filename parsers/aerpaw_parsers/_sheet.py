@@ -18,6 +18,7 @@ from itertools import product
 
 import numpy as np
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.limits import NEAR_DEG
@@ -273,7 +274,7 @@ class Sheet:
         words = {text: count for text, count in told.items() if math.isnan(parsed[text][0])}
         if 2 * sum(words.values()) > sum(told.values()):
             self.notes[column] = (
-                f"column {self.names[column]!r}: {sum(words.values())} cells are no number (the first: "
+                f"column {self.names[column]!r}: {counted(sum(words.values()), 'cell')} without a number (the first: "
                 f"{next(iter(words))[:30]!r}) and read as missing"
             )
         unit = meaning.unit if meaning is not None and "[" in self.names[column] else ""
@@ -456,7 +457,7 @@ class _Table:
             cells=[[*cells, *[""] * (len(self.names) - len(cells))] for cells in self._cells],
             blank_rows=np.array([*self.comments, *foot], dtype=np.int64),
             rejected=[
-                lines.reject(i, f"{count} fields where the header has {width} (torn line?)")
+                lines.reject(i, f"{counted(count, 'field')} where the header has {width} (torn line?)")
                 for i, count, width in self._odd
                 if i not in foot
             ],

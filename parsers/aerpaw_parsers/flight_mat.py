@@ -18,6 +18,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.matfile import MAGIC, MAGIC_73, names_of, read_arrays
@@ -153,7 +154,9 @@ def _common_length(table: dict[str, AnyArray]) -> int:
     for name, column in table.items():
         lengths.setdefault(len(column), []).append(name)
     if len(lengths) > 1:
-        sizes = "; ".join(f"{count} rows: {', '.join(names[:4])}" for count, names in sorted(lengths.items()))
+        sizes = "; ".join(
+            f"{counted(count, 'row')}: {', '.join(names[:4])}" for count, names in sorted(lengths.items())
+        )
         raise InputError(f"the columns differ in length ({sizes})", expected="one row per sample in each")
     return next(iter(lengths))
 

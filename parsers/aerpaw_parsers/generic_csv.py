@@ -11,6 +11,7 @@ from difflib import get_close_matches
 
 import numpy as np
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
@@ -176,7 +177,7 @@ def _stream(
     odd = np.any([_odd(sheet, where[key]) for key in _VALUE[kind]], axis=0)
     _lines.add_flag(flag, odd, "no_number")
     if odd.any():
-        lines = "1 row is" if odd.sum() == 1 else f"{odd.sum()} rows are"
+        lines = counted(int(odd.sum()), "row is", "rows are")
         first = int(rows.row[odd][0]) + 1
         rows.warnings.append(f"{lines} flagged no_number; the first: line {first}, a word or an infinity; not scored")
     if kind == "rss":

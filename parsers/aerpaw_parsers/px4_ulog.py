@@ -16,6 +16,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
@@ -65,7 +66,7 @@ def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int
     while at + 3 <= len(data):
         size, kind = struct.unpack_from("<HB", data, at)
         if kind not in _KINDS or at + 3 + size > len(data):
-            reason = f"{len(data) - at} bytes at {at} that are no message: read no further"
+            reason = f"{counted(len(data) - at, 'byte')} without a message at {at}: read no further"
             damaged.append(RejectedLine(count + 1, reason, ""))
             break
         body = data[at + 3 : at + 3 + size]

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.files.chunks import Column
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
@@ -273,7 +274,9 @@ def _stream(
     if len(repeats.line):
         samples = samples.join(repeats)
         repeated = np.isin(samples.line, repeats.line)  # lines of '*' hold nothing else
-        warnings.append(f"{len(repeats.line)} samples that od had suppressed as '*' were put back; flagged repeated")
+        warnings.append(
+            f"{counted(len(repeats.line), 'sample')} put back that od had suppressed as '*'; flagged repeated"
+        )
     # what is not needed any more makes room at once: logs may have 1 GB
     jump = samples.offset
     jump[1:] -= jump[:-1]
@@ -291,9 +294,9 @@ def _stream(
     _lines.add_flag(flag, silent, "out_of_coverage")
     _lines.add_flag(flag, lost, "samples_lost_before")
     if lost.any():
-        warnings.append(f"offsets jump at {int(lost.sum())} places: {missing} samples are missing")
+        warnings.append(f"offsets jump at {counted(int(lost.sum()), 'place')}: {counted(missing, 'sample')} missing")
     if back:
-        warnings.append(f"offsets step back at {back} places: several runs in one file?")
+        warnings.append(f"offsets step back at {counted(back, 'place')}: several runs in one file?")
     if torn >= 0:
         _lines.add_flag(flag, samples.line == torn, _lines.UNTERMINATED)
     samples.line += 1

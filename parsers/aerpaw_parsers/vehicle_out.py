@@ -20,6 +20,7 @@ import re
 
 import numpy as np
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
@@ -97,7 +98,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         number[own] = np.fmax(number[own], _numbers(rows, name))
     jumps = int((np.diff(number["index"]) != 1).sum())
     if jumps:
-        rows.warnings.append(f"the row index jumps at {jumps} places: rows are missing or files were joined")
+        rows.warnings.append(f"the row index jumps at {counted(jumps, 'place')}: rows are missing or files were joined")
     values = _values(rows, number)
     return rows.result([rows.stream("telemetry", "vehicle", values, source="vehicleOut")])
 
@@ -120,13 +121,14 @@ def _values(rows: _rows.Rows, number: dict[str, FloatArray]) -> dict[str, AnyArr
     motion |= {f"velocity_{way}_mps": number[way] for way in ("north", "east", "down")}
     warnings = []
     if zero.any():
-        text = f"{zero.sum()} rows have attitude (0,0,0), which AERPAW's converter writes for 'unknown'; flagged"
+        rows_of = counted(int(zero.sum()), "row has", "rows have")
+        text = f"{rows_of} attitude (0,0,0), which AERPAW's converter writes for 'unknown'; flagged"
         if zero.all():  # level flight due north in every row: no aircraft does that
             text += " zero_attitude and read as unknown, because no row has another attitude"
             motion = {name: np.full(len(rows), np.nan) for name in motion}
         warnings.append(text)
     if no_fix.any():
-        warnings.append(f"{no_fix.sum()} rows have no position fix; their positions are NaN, flagged no_fix")
+        warnings.append(f"{counted(int(no_fix.sum()), 'row')} without a position fix: position NaN, flagged no_fix")
     rows.warnings = [*warnings, *rows.warnings]
     if len(rows) > 10 and (number["fix"] == 6).all() and (number["satellites"] == 10).all():
         rows.warnings.append("fix 6 with 10 satellites throughout: a digital-twin run looks like this, not a flight")

@@ -218,7 +218,7 @@ def test_sparse_telemetry_is_named_as_the_reason_why_nothing_is_compared(
     assert main(call) == 0
     message = capsys.readouterr().err
     assert "no sample of this draft can be compared" in message
-    assert " samples lie within the telemetry: it has a fix every 14 s" in message
+    assert " samples within the telemetry: it has a fix every 14 s" in message
     assert "time_origin" not in message
     assert "No sample of this draft can be compared" in target.read_text()
 

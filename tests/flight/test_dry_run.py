@@ -16,10 +16,10 @@ TRACK = SimpleNamespace(pose_at=np.asarray, why_not=lambda _: "most are after te
         ((0, 0, 0), TRACK, "no sample holds a value"),
         ((10, 10, 10), TRACK, ""),
         ((10, 5, 1), TRACK, ""),
-        ((10, 5, 0), TRACK, "all of 5 samples lie below minimum_height_m"),
-        ((10, 4, 4), TRACK, "4 of 10 samples lie within the telemetry: most are after telemetry"),
-        ((10, 4, 0), TRACK, "0 of 10 samples lie within the telemetry: most are after telemetry"),
-        ((10, 0, 0), None, "0 of 10 samples lie within the telemetry: there are no positions"),
+        ((10, 5, 0), TRACK, "all of 5 samples below minimum_height_m"),
+        ((10, 4, 4), TRACK, "4 of 10 samples within the telemetry: most are after telemetry"),
+        ((10, 4, 0), TRACK, "0 of 10 samples within the telemetry: most are after telemetry"),
+        ((10, 0, 0), None, "0 of 10 samples within the telemetry: there are no positions"),
     ],
 )
 def test_a_loss_has_its_first_reason(counts: tuple[int, int, int], track: object, words: str) -> None:

@@ -67,6 +67,6 @@ def test_a_cluster_that_vanishes_costs_the_tiles_in_work(environ: dict[str, str]
         [*command, "--json"], cwd=tmp_path, env=environ, capture_output=True, text=True, check=False, timeout=300
     )
     assert again.returncode == 0, again.stderr
-    assert f"{count} of {TILES} tiles were computed before" in again.stderr
+    assert f"{count} of {TILES} tiles computed before" in again.stderr
     assert json.loads(again.stdout)["tiles"]["tiles"] == TILES
     assert computed(tmp_path / "out.zarr") == TILES

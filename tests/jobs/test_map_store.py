@@ -345,7 +345,7 @@ def test_a_worker_that_is_killed_each_time_costs_one_tile(tmp_path, in_one_piece
     monkeypatch.setenv("TEST_MAP_STORE", str(tmp_path / "tries"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mapping, "map_tile", killed)
-        with pytest.raises(InputError, match="1 of 8 tiles were lost: its worker process ended"):
+        with pytest.raises(InputError, match="1 of 8 tiles lost: its worker process ended"):
             make(tmp_path / "map.zarr", workers=Processes(2))
     assert sorted(map(int, (tmp_path / "tries").read_text().split())) == sorted([*range(TILES), 4, 4])
     crew = Watched()

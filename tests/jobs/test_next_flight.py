@@ -115,7 +115,7 @@ def test_points_without_a_position_are_left_out_and_counted(place: Path) -> None
     table = pd.read_csv(out / "sd_map.csv")
     assert len(table) == 2 * 4  # four headings at each of two points
     assert table.notna().all().all()
-    assert "1 of 3 points have no position" in " ".join(json.loads((out / "metrics.json").read_text())["warnings"])
+    assert "1 of 3 points without a position" in " ".join(json.loads((out / "metrics.json").read_text())["warnings"])
 
 
 def test_without_a_geofence_the_area_is_that_of_the_site() -> None:

@@ -74,7 +74,7 @@ def test_points_without_a_position_and_outside_are_flagged(prediction):
     assert set(rows(prediction, 0)["flag"]) == {""}
     near, far = (rows(prediction, k)["sd_db"].to_numpy() for k in (0, 3))
     assert (far > near).all()
-    assert any("1 of 4 points have no position" in text for text in prediction.page.warnings)
+    assert any("1 of 4 points without a position" in text for text in prediction.page.warnings)
     assert "67 % of the points lie outside" in prediction.page.warnings[0]  # of three with a position
     shares = [series["share_outside_flown"] for series in prediction_metrics(prediction.page)["series"].values()]
     np.testing.assert_allclose(shares, 2 / 3)
@@ -303,7 +303,7 @@ def test_a_heading_that_is_given_counts_then_that_of_the_route_else_all(tmp_path
     ("rows", "message"),
     [
         ("-78.696,35.7275,30\n-78.696,35.7285,40\n", "latitude and longitude are exchanged"),
-        ("35.7275,-78.696,30\n35.7285,-78.696,-40\n", "1 of 2 points lie below the site's ground"),
+        ("35.7275,-78.696,30\n35.7285,-78.696,-40\n", "1 of 2 points below the site's ground"),
     ],
 )
 def test_a_route_that_cannot_be_flown_here_is_a_question(

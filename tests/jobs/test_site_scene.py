@@ -194,7 +194,7 @@ def test_masts_hide_nothing_and_meshes_of_trees_are_media(tmp_path: Path, capsys
     first = capsys.readouterr().err.splitlines()[:3]
     assert first[0] == "the antenna of T stands inside mesh mast, which hides nothing and is no mirror"
     assert first[1] == "the antenna of T stands at mesh sector, which hides nothing and is no mirror"
-    assert first[2].startswith("1 meshes of vegetation are media, by the chord, and no mirrors; 1 meshes of trunks")
+    assert first[2].startswith("vegetation is a medium, not a mirror: 1 mesh; 1 mesh of trunks")
     site = load_site(out)
     assert all(text in site.notes for text in first)
     assert site.scene is not None

@@ -150,7 +150,7 @@ def test_the_track_of_a_log_is_a_route_with_times(tmp_path: Path) -> None:
 def test_points_without_height_ask_for_one(tmp_path: Path) -> None:
     file = tmp_path / "a.kml"
     file.write_bytes(kml("<LineString><coordinates>-78.7,35.7,0 -78.7,35.8,0</coordinates></LineString>"))
-    with pytest.raises(InputError, match="2 of 2 points have no height"):
+    with pytest.raises(InputError, match="2 of 2 points without a height"):
         read_route(file)
     assert read_route(file, height_m=30.0)["altitude_m"].tolist() == [30.0, 30.0]
 

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.logs.readers import ReadOptions, by_name, identify
 from aerpaw_cmp.logs.records import ReadResult, Stream
@@ -40,7 +41,9 @@ def test_a_row_index_that_jumps_is_told_once_per_place(indices: tuple[int, ...],
     rest = samples.VEHICLE_10.splitlines()[0].split(b",", 1)[1].decode()
     rows = [f"{n},{rest.replace('00.250000', f'0{i}.250000')}\n" for i, n in enumerate(indices)]
     warnings = [text for text in read("vehicle_out", "".join(rows).encode()).warnings if "index" in text]
-    expected = [f"the row index jumps at {said} places: rows are missing or files were joined"] if said else []
+    expected = (
+        [f"the row index jumps at {counted(said, 'place')}: rows are missing or files were joined"] if said else []
+    )
     assert warnings == expected
 
 
@@ -89,10 +92,8 @@ def test_limits_of_a_vehicles_position(longitude: str, latitude: str, altitude: 
     (stream,) = result.streams
     assert stream.frame["flag"].tolist() == [flag]
     assert np.isnan(stream.frame["altitude_m"][0]) == bool(flag)
-    notes = [text for text in result.warnings if "no position fix" in text]
-    assert notes == (
-        ["1 rows have no position fix; their positions are NaN, flagged no_fix"] if flag == "no_fix" else []
-    )
+    notes = [text for text in result.warnings if "without a position fix" in text]
+    assert notes == (["1 row without a position fix: position NaN, flagged no_fix"] if flag == "no_fix" else [])
 
 
 @pytest.mark.parametrize(

@@ -158,8 +158,8 @@ def test_offsets_of_two_widths_stay_in_the_order_of_the_file() -> None:
 def test_offsets_that_jump_are_lost_samples() -> None:
     result = read(sample(0, 0), sample(1, 4), sample(2, 16), sample(3, 0))
     assert result.streams[0].frame["flag"].tolist() == ["", "", "samples_lost_before", ""]
-    assert "offsets jump at 1 places: 2 samples are missing" in result.warnings
-    assert any("step back at 1 places" in text for text in result.warnings)
+    assert "offsets jump at 1 place: 2 samples missing" in result.warnings
+    assert any("step back at 1 place" in text for text in result.warnings)
 
 
 def test_samples_of_both_ways_come_in_the_order_of_the_file() -> None:

@@ -29,7 +29,8 @@ SOURCES = {
     "campaign": ("words/campaign.py", "figures/campaign.py", "templates/campaign.html.jinja"),
     "calibration": ("words/calibration.py", "pages/calibration.py", "templates/calibration.html.jinja"),
     "diff": ("pages/diff.py", "content/diff.py", "templates/diff.html.jinja"),
-    "prediction": ("words/prediction.py", "pages/prediction.py", "templates/prediction.html.jinja"),
+    "prediction": ("words/prediction.py", "pages/prediction.py", "templates/prediction.html.jinja",
+                   "templates/places.html.jinja"),
 }  # fmt: skip
 WORD = re.compile(r"[A-Za-z][A-Za-z'-]*")
 INLINE = {"b", "i", "em", "strong", "code", "a", "br", "sup", "sub", "abbr"}

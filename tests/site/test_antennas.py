@@ -242,7 +242,7 @@ SMALL = [
         ([*SMALL[:-1], SMALL[-1][:-1]], 40, "'0.47', has fewer digits than those above it. Likely cause: the line was cut off"),
         ([*SMALL[:-1], SMALL[-1][:-20]], 40, "expected 7 numbers. Likely cause: the line was cut off"),
         ([*SMALL, SMALL[0]], 41, "given twice.*a line was copied"),
-        ([*SMALL[:10], *SMALL[11:]], None, "1 directions are missing.*phi 45.0 deg, theta -135.0 deg.*a line is lost"),
+        ([*SMALL[:10], *SMALL[11:]], None, "1 direction missing.*phi 45.0 deg, theta -135.0 deg.*a line is lost"),
         ([*SMALL[:9], *SMALL[18:]], None, "phi runs from 0.0 to 135.0 deg in 3 values.*angles are missing"),
         ([row.replace(".", ",") for row in SMALL], 5, "decimal commas"),
         ([row.replace("-3.0103\t-6.0206\t-6.0206", "-43.0103\t-46.0206\t-46.0206") for row in SMALL], None,
@@ -268,7 +268,7 @@ ELEVATION, AZIMUTH = np.linspace(90, -90, 7), np.arange(12) * 30.0
 @pytest.mark.parametrize(
     ("elevation", "azimuth", "change", "words"),
     [
-        (ELEVATION, AZIMUTH, "nan", r"1 values that are no numbers, the first at elevation 30 deg, azimuth 90 deg"),
+        (ELEVATION, AZIMUTH, "nan", r"1 value without a number, first at elevation 30 deg, azimuth 90 deg"),
         (ELEVATION, AZIMUTH, "transpose", "'g' has 12 x 7 values.*rows and columns are swapped"),
         (np.where(ELEVATION == 0, np.nan, ELEVATION), AZIMUTH, "", "elevation .* runs from nan"),
         (90 - ELEVATION, AZIMUTH, "", "zenith angles in place of elevation"),

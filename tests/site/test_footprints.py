@@ -111,8 +111,8 @@ def test_round_trip_through_site_yaml(tmp_path: Path) -> None:
     (tmp_path / "site.yaml").write_text(site_yaml(model, header=["imported", *actions]), encoding="utf-8")
     site, again = load_site(tmp_path / "site.yaml"), build_site(model)
     assert site.assumed == (
-        "height assumed: 1 of 3 buildings have none in the map, 6 m each: hut; "
-        "trees assumed: 100 per hectare at random places in 1 woods"
+        "height assumed: none in the map for 1 of 3 buildings, 6 m each: hut; "
+        "trees assumed: 100 per hectare at random places in 1 wood"
     )
     assert site.assumed in actions
     assert any(site.assumed in note for note in site.notes)

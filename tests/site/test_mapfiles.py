@@ -101,7 +101,7 @@ def test_tree_rows_become_trees_along_the_line(tmp_path: Path) -> None:
     assert shapely.LineString([(0, 0), (60, 0), (60, 40)]).distance(shapely.points(east, north)).max() < 0.02
     np.testing.assert_allclose(np.diff(east).sum() + np.diff(north).sum(), 100, atol=0.05)
     assert {(t.height_m, t.crown_diameter_m) for t in footprints.trees} == {(9.0, 5.0)}
-    assert said(footprints, "21 trees were placed along the row, 5 m apart")
+    assert said(footprints, "21 trees placed along the row, 5 m apart")
 
 
 def test_a_tree_row_with_lost_nodes_says_so(tmp_path: Path) -> None:
@@ -109,7 +109,7 @@ def test_a_tree_row_with_lost_nodes_says_so(tmp_path: Path) -> None:
     osm.way(square(0, 0), natural="tree_row")
     footprints = read(tmp_path, osm.xml(drop=(1,)), "a.osm")
     assert footprints.trees
-    assert said(footprints, "way 100: 2 of 5 nodes are not in the file")
+    assert said(footprints, "way 100: 2 of 5 nodes not in the file")
 
 
 def test_a_building_with_a_lost_first_node_or_an_open_line_is_kept(tmp_path: Path) -> None:
@@ -119,7 +119,7 @@ def test_a_building_with_a_lost_first_node_or_an_open_line_is_kept(tmp_path: Pat
     osm.ways[1] = (osm.ways[1][0], osm.ways[1][1][:-1], osm.ways[1][2])
     footprints = read(tmp_path, osm.xml(drop=(1,)), "a.osm")
     assert sorted(round(b.footprint.area) for b in footprints.buildings) == [200, 400]
-    assert said(footprints, "way 100: 2 of 5 nodes are not in the file")
+    assert said(footprints, "way 100: 2 of 5 nodes not in the file")
     assert said(footprints, "way 101: its line is not closed")
 
 
@@ -160,7 +160,7 @@ def test_overpass_center_body_and_remark(tmp_path: Path) -> None:
     broken = {"type": "way", "id": 4, "tags": BARN, "geometry": [{"lat": 1}]}
     footprints = read(tmp_path, overpass(centre, complete, cut, broken, "?", remark="runtime error: Query timed out"))
     assert len(footprints.buildings) == 1
-    for words in ("way 1: left out", "way 3: 1 of 4 points are unknown", "Query timed out"):
+    for words in ("way 1: left out", "way 3: 1 of 4 points unknown", "Query timed out"):
         assert said(footprints, words), words
     text = (tmp_path / "m.json").read_text().splitlines()
     line = text.index('   "id": 4,')  # the brace stands two lines above, and the index counts from 0
@@ -265,7 +265,7 @@ def test_unusual_heights_are_used_or_said(tmp_path: Path, tags: dict[str, Any], 
     footprints = read(tmp_path, collection(feature(polygon(square(0, 0)), building="yes", **tags)))
     assert footprints.buildings[0].height_m == pytest.approx(metres, abs=0.01)
     assert said(footprints, words) if words else not [text for text in footprints.actions if "assumed" not in text]
-    assert ("1 of 1 buildings have none in the map, 6 m each" in footprints.assumed) == (metres == 6)
+    assert ("none in the map for 1 of 1 building, 6 m each" in footprints.assumed) == (metres == 6)
 
 
 def test_false_is_no_building_and_the_way_out_is_named(tmp_path: Path) -> None:
@@ -378,7 +378,7 @@ def test_a_wood_takes_its_height_and_leaves_from_its_tags(tmp_path: Path) -> Non
     ]
     footprints = read(tmp_path, collection(*woods))
     assert [(f.height_m, f.evergreen_share) for f in footprints.forests] == [(20.0, 0.0), (12.0, 1.0), (20.0, 0.0)]
-    assert footprints.assumed == "height assumed: 2 of 3 woods have none in the map, 20 m each"
+    assert footprints.assumed == "height assumed: none in the map for 2 of 3 woods, 20 m each"
     assert {f.height_m for f in read(tmp_path, collection(*woods), trees=True).forests} == {None}
 
 

@@ -67,7 +67,7 @@ def test_closed_boxes_look_outward_and_other_shapes_are_told(tmp_path):
     outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert 0.5 * np.linalg.norm(outward, axis=1).sum() == pytest.approx(2 * (6 + 8 + 12))
     assert (np.einsum("ti,ti->t", outward, corners.mean(axis=1) - [2, 3.5, 2]) > 0).all()
-    assert scene.notes == ("warning: 1 shapes of type 'sphere' were left out; read is ply",)
+    assert scene.notes == ("warning: 1 shape of type 'sphere' left out; read is ply",)
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_a_solid_without_a_tag_is_said_to_be_no_building(tmp_path: Path) -> None
 def test_heights_above_sea_level_are_not_taken_for_heights_of_buildings(tmp_path: Path) -> None:
     content = kml(tmp_path / "a.kml", "absolute", "{},{},112")
     assert heights(content) == [6.0]
-    assert "height assumed: 1 of 1 buildings" in content.assumed
+    assert "height assumed: none in the map for 1 of 1 building" in content.assumed
 
 
 @pytest.mark.parametrize(
@@ -154,7 +154,7 @@ def test_assumed_heights_are_counted_once_in_print_file_and_notes(tmp_path: Path
         source, {"building": "yes"}, {"building": "yes", "height": "-1"}, {"building": "yes", "height": 8}
     )
     line = content.assumed
-    assert line.startswith("height assumed: 2 of 3 buildings have none in the map, 6 m each")
+    assert line.startswith("height assumed: none in the map for 2 of 3 buildings, 6 m each")
     assert content.actions.count(line) == 1
     model, actions = import_site([source], base=REPORTED / "kml_extruded/base.yaml")
     assert actions.count(line) == 1

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
+from ...common.counting import counted
 from ...jobs.options import RunOptions
 from ..app import DryRun, Export, Force, Json, LogsRoot, command, output
 from ..shown import number, print_files, print_json, print_plan, records, say, show, table, warn_all
@@ -89,7 +90,8 @@ def _nothing_compared(metrics: Mapping[str, Any]) -> int:
     most = max([m["n"] for m in (*channels, *metrics["rank"].values())], default=0)
     if most >= FEWEST or any(m.get("trained_on") for m in channels):
         return 0
-    say.warn(f"check failed: nothing was compared: {most} samples have measurement, pose and path; expected {FEWEST}")
+    samples = f"{counted(most, 'sample')} with measurement, pose and path"
+    say.warn(f"check failed: nothing was compared: {samples}; expected {FEWEST}")
     return 1
 
 

@@ -304,9 +304,13 @@ class Regions:
 
     def holding(self, part: float) -> BoolArray:
         """The smallest set of cells (columns, rows) that holds a part of the posterior."""
+        return self.likelier() < part
+
+    def likelier(self) -> FloatArray:
+        """Part of the posterior in all cells that are likelier than each (columns, rows)."""
         order = np.argsort(-self.share, axis=None)
-        held = np.zeros(self.share.size, dtype=np.bool_)
-        held[order[: int(np.searchsorted(np.cumsum(self.share.ravel()[order]), part)) + 1]] = True
+        held = np.empty(self.share.size)
+        held[order] = np.cumsum(self.share.ravel()[order]) - self.share.ravel()[order]
         return held.reshape(self.share.shape)
 
     def modes(self, part: float = 0.9) -> tuple[Mode, ...]:

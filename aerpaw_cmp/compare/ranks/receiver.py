@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...common.counting import counted
 from ...common.errors import InputError
 from ...common.geodesy import azimuth_rad
 from ...common.units import FloatArray, IntArray, unmasked
@@ -216,7 +217,7 @@ def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[
     good = np.asarray((ri >= 1) & np.isfinite(features).all(axis=(0, 2)))
     y = ri[good].astype(np.int64)
     if len(y) < FEWEST or np.ptp(y) == 0:
-        what = f"{len(y)} samples with rank and channel" if len(y) < FEWEST else f"rank {y[0]} throughout"
+        what = f"{counted(len(y), 'sample')} with rank and channel" if len(y) < FEWEST else f"rank {y[0]} throughout"
         raise InputError(what, expected=f"at least {FEWEST} samples of at least two ranks to fit a receiver")
     if len(np.unique(groups[good])) < 2:
         raise InputError("all training samples are in one sector", expected="samples in at least two sectors")

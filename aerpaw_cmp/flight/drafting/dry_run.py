@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError, one_line
 from ...common.units import BoolArray, FloatArray
 from ...logs.ingest import IngestedFile
@@ -75,6 +76,6 @@ def _loss(data: FlightData, time: Times, counts: tuple[int, int, int]) -> str:
     if high and placed >= 0.5 * valued:
         return ""
     if placed and placed >= 0.5 * valued:
-        return f"all of {placed} samples lie below minimum_height_m"
+        return f"all of {counted(placed, 'sample')} below minimum_height_m"
     why = "there are no positions" if data.track is None else data.track.why_not(data.track.pose_at(time))
-    return f"{high} of {valued} samples lie within the telemetry: {why}"
+    return f"{high} of {counted(valued, 'sample')} within the telemetry: {why}"

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.errors import AerpawCmpError
 from ...common.jsonable import named
 from ...common.stages import Progress
@@ -137,7 +138,7 @@ def kept_outcomes(
     for text in store.warnings:
         progress(text)
     if len(outcomes):
-        progress(f"{len(outcomes)} of {len(tasks)} outcomes are kept from before in {store.folder}")
+        progress(f"{len(outcomes)} of {counted(len(tasks), 'outcome')} kept from before in {store.folder}")
     return outcomes, orders
 
 

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 
 from ...common.cf import file_attributes
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError, noting_interrupts
 from ...common.jsonable import named
 from ...common.stages import Progress, Stages, share_of
@@ -465,9 +466,9 @@ def _write_tiles(
     empty, tiling = channels.empty(store.tiling.grid_of(0)), store.tiling
     missing = store.begin(empty, outcome.site.frame, _about_maps(outcome.site))
     if store.damaged:
-        progress(f"{store.damaged} finished tiles have chunks that are missing or were changed: computed again")
+        progress(f"{counted(store.damaged, 'finished tile')} with missing or changed chunks: computed again")
     if len(missing) < len(tiling):
-        progress(f"{len(tiling) - len(missing)} of {len(tiling)} tiles were computed before")
+        progress(f"{len(tiling) - len(missing)} of {counted(len(tiling), 'tile')} computed before")
     lost: list[str] = []
     written = itertools.count(len(tiling) - len(missing) + 1)
 
@@ -482,7 +483,7 @@ def _write_tiles(
         run([order(number=number) for number in missing], done)
     if lost:
         raise InputError(
-            f"{len(lost)} of {len(tiling)} tiles were lost: {lost[0]}",
+            f"{len(lost)} of {counted(len(tiling), 'tile')} lost: {lost[0]}",
             cause="too little memory; the finished tiles are kept, and the same command computes the others",
         )
     outcome.paths = int(store.paths().sum())
@@ -747,7 +748,7 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
     if outcome.tiles:
         each, all_ = outcome.tiles["shown_every"], outcome.tiles["positions"]
         notes.append(
-            f"All {all_} positions of the map are in {Path(outcome.tiles['store']).name}. "
+            f"The map of {counted(all_, 'position')} is in {Path(outcome.tiles['store']).name}. "
             f"This page and the files beside it hold one in {each} along either axis."
         )
     return tuple(notes)

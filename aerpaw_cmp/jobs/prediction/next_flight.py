@@ -185,7 +185,8 @@ def _plan_flight(
         place_m=next(iter(shown.values())).position_m,
         before_db=_rms_of_antennas(before),
         after_db=_rms_of_antennas(after),
-        towers={name: np.asarray(t.position_m) for name, t in site.towers.items()},
+        seen_from_m=np.asarray(site.towers[next(iter(ends.values()))[0]].position_m) if points is None else None,
+        site=site,
         files={
             "route.plan": plan_text(ways, site.frame, speed),
             "route.csv": waypoints_csv(ways, site.frame),
@@ -425,7 +426,7 @@ def _of_length(candidate: Candidate, share: float, area: Any, plan: PlanOptions)
 
 
 def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: RunOptions = DEFAULT) -> JobOutcome:
-    """Rank flights and write ``plan.html``, the chosen route, ``sd_map.csv``, ``metrics.json`` and figures.
+    """Rank flights and write ``plan.html``, the chosen route, ``sd_map.csv`` and ``metrics.json``.
 
     Parameters
     ----------

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError, parsing
 from ...common.units import BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples, link_directions
@@ -249,7 +250,7 @@ def _local_points(path: Path) -> Targets | None:
         position_m=position,
         yaw_deg=numbers["yaw_deg"].to_numpy(np.float64),
         time_s=time if np.isfinite(time := numbers["time_s"].to_numpy(np.float64)).all() else np.zeros(len(position)),
-        remarks=(f"{lost} of {len(position)} points have no position.",) if lost else (),
+        remarks=(f"{lost} of {counted(len(position), 'point')} without a position.",) if lost else (),
     )
 
 
@@ -270,7 +271,7 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
     up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)
     if buried.any():
         raise InputError(
-            f"{int(buried.sum())} of {len(up)} points lie below the site's ground",
+            f"{int(buried.sum())} of {counted(len(up), 'point')} below the site's ground",
             expected="heights above take-off",
             cause="heights of another datum, or origin.takeoff_ground_m of the site",
             path=where,

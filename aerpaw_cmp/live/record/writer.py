@@ -11,6 +11,7 @@ import threading
 from collections import deque
 from pathlib import Path
 
+from ...common.counting import counted
 from ...logs.files.checksums import Record
 from .log import SegmentLog
 
@@ -111,7 +112,7 @@ class LogWriter:
         self._thread.join(timeout_s)
         if self._thread.is_alive():
             self._dropped += len(self._queue)
-            self._tell(f"the disk hangs: {len(self._queue)} records were lost")
+            self._tell(f"the disk hangs: {counted(len(self._queue), 'record')} lost")
         else:
             self._log.close()
 

@@ -13,6 +13,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.errors import UsageError
 from ...common.units import AnyArray, BoolArray, IntArray
 from ..readers import ReadOptions
@@ -143,12 +144,12 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     warnings = []
     if ambiguous.any():
         warnings.append(
-            f"{int(ambiguous.sum())} times lie in the hour that {name} had twice: read as daylight time "
+            f"{counted(int(ambiguous.sum()), 'time')} in the hour that {name} had twice: read as daylight time "
             f"until the log's clock steps back; flagged {_AMBIGUOUS}"
         )
     if nonexistent.any():
         warnings.append(
-            f"{int(nonexistent.sum())} times lie in the hour that {name} skipped: wrong zone? flagged {_NONEXISTENT}"
+            f"{counted(int(nonexistent.sum()), 'time')} in the hour that {name} skipped (wrong zone?): {_NONEXISTENT}"
         )
     return Instants(utc, ambiguous, nonexistent, tuple(warnings))
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ...common.counting import counted
 from ...common.jsonable import named
 from ...common.units import AnyArray
 from ..readers import ReadOptions
@@ -71,4 +72,4 @@ def steps_back(records: pd.DataFrame) -> list[str]:
     """Warning where the clock of a log runs backwards."""
     time = records["time"].to_numpy()
     back = int(np.count_nonzero(time[1:] < time[:-1]))
-    return [f"time steps back at {back} places"] if back else []
+    return [f"time steps back at {counted(back, 'place')}"] if back else []

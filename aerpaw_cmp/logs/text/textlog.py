@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable
 
+from ...common.counting import counted
 from ...common.units import BoolArray, IntArray
 from ..readers import Reader, ReadOptions
 from ..records import Kind, ReadResult, Stream
@@ -73,7 +74,7 @@ def reader(
         if torn is not None:
             return "an incomplete row (torn line?)" if torn.match(line) else None
         count = line.count(b",") + 1
-        return f"{count} fields where {fields} were expected (torn line?)" if fields not in (0, count) else otherwise
+        return f"{counted(count, 'field')}, expected {fields} (torn line?)" if fields not in (0, count) else otherwise
 
     def read(data: bytes, options: ReadOptions) -> ReadResult:
         pattern = row if isinstance(row, re.Pattern) else row(data)

@@ -256,7 +256,7 @@ class _OneLink:
                     missing += 1
                     keys.add(key)
             if missing:
-                failures.append(f"{self.name}: {missing} paths are missing")
+                failures.append(f"{self.name}: {counted(missing, 'path is', 'paths are')} missing")
         return FieldAudit(missing_paths=missing, phantom_paths=phantom, doubtful=doubtful, failures=tuple(failures))
 
     def field_checked(self, ks: Sequence[float]) -> FieldAudit:
@@ -520,7 +520,7 @@ def _paths_against_sionna(
             worst = int(np.argmax(np.where(bad, error, -1.0)))
             faces = ", ".join(replay.faces.label[face] for face in ours.faces[worst] if face >= 0)
             failures.append(
-                f"{int(bad.sum())} paths differ from Sionna's own by up to {error[worst]:.3g} {unit}: worst "
+                f"{counted(int(bad.sum()), 'path')} unlike Sionna's own by up to {error[worst]:.3g} {unit}: worst "
                 f"{replay.towers[ours.tower[worst]]}, pose {chosen[ours.pose[worst]]}, {faces or 'line of sight'}"
             )
     if rss > _LINK_TOLERANCE_DB:
@@ -596,5 +596,5 @@ def _lacking(
         exists = reference.verdict(sequence, (east, north, up), _SIONNA_MARGIN_M)  # type: ignore[arg-type]
         missing += exists is True
         doubtful += exists is not True
-    failures = (f"{missing} paths that Sionna has are missing",) if missing else ()
+    failures = (f"{counted(missing, 'path of Sionna is', 'paths of Sionna are')} missing",) if missing else ()
     return FieldAudit(missing_paths=missing, doubtful=doubtful, failures=failures)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.errors import UsageError
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Site, Tower
@@ -119,7 +120,8 @@ def replay_moving(
     """
     if len(link.tower_arrays) != 1:
         raise UsageError(
-            f"{len(link.tower_arrays)} towers in a link whose tower moves", expected="one tower: links of their own"
+            f"{counted(len(link.tower_arrays), 'tower')} in a link whose tower moves",
+            expected="one tower: links of their own",
         )
     (name,) = link.tower_arrays
     if search.engine != "image":

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.errors import InputError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...site.mesh_scenes.mitsuba import TriangleScene
@@ -47,7 +48,7 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     good = area > _SMALLEST_M2
     notes = list(scene.notes)
     if not good.all():
-        notes.append(f"{int((~good).sum())} triangles without an area were dropped")
+        notes.append(f"{counted(int((~good).sum()), 'triangle was', 'triangles were')} dropped for want of an area")
     if not good.any():
         raise InputError("no triangle of the scene has an area", expected="surfaces in metres")
     corners, normal, offset, area = corners[good], normal[good], offset[good], area[good]

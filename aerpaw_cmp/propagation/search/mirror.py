@@ -19,6 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..geometry.faces import corners, inside
@@ -235,7 +236,7 @@ class _Growth:
             if left < 0:
                 raise UsageError(
                     f"the scene has more than {self.budget} face sequences of up to {depth + 1} reflections "
-                    f"({len(faces)} faces)",
+                    f"({counted(len(faces), 'face')})",
                     expected="a rural scene with few faces",
                     cause="many buildings: engine 'sionna', a smaller max_depth, or pip install 'aerpaw-cmp[fast]'",
                 )

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
+from ...common.counting import counted
 from ..geometry.paths import Faces, PathSet
 from .mirror import plane_keys, planes_of
 
@@ -61,8 +62,8 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
         samples *= _FACTOR
         paths = pilot(samples)
         if set(plane_keys(paths, plane)) == set(plane_keys(before, plane)):
-            words = f"{samples // _FACTOR:,} and {samples:,} rays a tower found the same {len(paths)} paths"
-            return Choice(samples, f"{words} at {poses} poses".replace(",", " "), paths)
+            words = f"{samples // _FACTOR:,} and {samples:,} rays a tower found the same {counted(len(paths), 'path')}"
+            return Choice(samples, f"{words} at {counted(poses, 'pose')}".replace(",", " "), paths)
         before = paths
-    words = f"{samples:,} rays a tower still found other paths than {samples // _FACTOR:,} at {poses} poses"
+    words = f"{samples:,} rays a tower still found other paths than {samples // _FACTOR:,} at {counted(poses, 'pose')}"
     return Choice(samples, words.replace(",", " "), before)

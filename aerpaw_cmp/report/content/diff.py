@@ -101,7 +101,7 @@ def _level_clauses(level: LevelDifference) -> Iterator[str]:
     if level.samples.only_first or level.samples.only_second:
         yield _alone(level.samples)
     elif level.scored.first != level.scored.second or level.scored.common != level.scored.first:
-        yield f"{level.scored.first} scored samples against {level.scored.second}"
+        yield f"{counted(level.scored.first, 'scored sample')} against {level.scored.second}"
 
 
 def _alone(samples: Overlap) -> str:
@@ -112,8 +112,8 @@ def _alone(samples: Overlap) -> str:
 
 def _rank_clauses(rank: RankDifference) -> Iterator[str]:
     if rank.n_changed:
-        yield f"{rank.n_changed} of {rank.samples.common} simulated ranks"
+        yield f"{rank.n_changed} of {counted(rank.samples.common, 'simulated rank')}"
     if rank.n_reported_changed:
-        yield f"{rank.n_reported_changed} of {rank.samples.common} reported ranks"
+        yield f"{rank.n_reported_changed} of {counted(rank.samples.common, 'reported rank')}"
     if rank.samples.only_first or rank.samples.only_second:
         yield _alone(rank.samples)

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.jsonable import named
 from ...common.versions import utc_now, versions
 from ...compare.result import APPLIED, NOT_APPLIED, ClockResult, FlightResult, RankResult, RssResult
@@ -118,13 +119,14 @@ def rank_warnings(result: RankResult) -> tuple[str, ...]:
     """Warnings that the reader must know of the rank of one tower before believing its numbers."""
     out = []
     if left_out := result.n_samples - len(result.time):
-        out.append(f"Rank {result.tower}: {left_out} of {result.n_samples} samples are too low or have no pose.")
+        of = counted(result.n_samples, "sample")
+        out.append(f"Rank {result.tower}: {left_out} of {of} left out: too low, or without a pose.")
     if result.score.n == 0:
         out.append(f"Rank {result.tower}: the modem reported no rank at any compared pose.")
     if result.score.staleness.verdict == "held":
         out.append(
             f"Rank {result.tower}: the modem holds each report for about {result.score.staleness.hold_s:.1f} s; "
-            f"{result.score.n} samples are {result.score.staleness.n_reports} reports."
+            f"{counted(result.score.n, 'sample')} hold {counted(result.score.staleness.n_reports, 'report')}."
         )
     return tuple(out)
 

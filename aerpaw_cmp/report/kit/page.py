@@ -11,7 +11,7 @@ import hashlib
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from importlib import resources
 from pathlib import Path
@@ -23,7 +23,7 @@ from markupsafe import Markup, escape
 from ...common.counting import counted
 from ...logs.records import has_wall_clock
 from ..names import iso_time, k_key
-from .canvas import FigureSpec, Picture, write_figures
+from .canvas import Picture
 from .files import json_text, write_file
 
 # ``script``: 'none', or the digest of the page's one script. Lets a browser refuse whatever would be loaded or run
@@ -229,9 +229,9 @@ def embedded(content: Mapping[str, Any] | None) -> Markup:
 
 
 def write_page(
-    folder: Path, name: str, numbers: Mapping[str, Any], specs: Iterable[FigureSpec], **content: Any
+    folder: Path, name: str, numbers: Mapping[str, Any], shown: Mapping[str, Any], **content: Any
 ) -> list[Path]:
-    """Write ``metrics.json``, ``figures/`` and the page NAME.html of a job.
+    """Write ``metrics.json`` and the page NAME.html of a job.
 
     Parameters
     ----------
@@ -240,8 +240,8 @@ def write_page(
         Of the page and its template.
     numbers : mapping
         For metrics.json.
-    specs : iterable of FigureSpec
-        Figures; the page has them by section in ``sections``.
+    shown : mapping
+        Data of the live canvas, as :func:`aerpaw_cmp.report.pages.places.payload` makes it.
     content
         For the template.
 
@@ -250,13 +250,8 @@ def write_page(
     list of Path
         The page first.
     """
-    drawn, figures = write_figures(list(specs), folder / "figures")
-    page = rendered(name, sections=by_section(drawn), **content)
-    return [
-        write_file(folder / f"{name}.html", page),
-        write_file(folder / "metrics.json", json_text(numbers)),
-        *figures,
-    ]
+    page = rendered(name, ("common.js", "places.js"), explorer=embedded(shown), **content)
+    return [write_file(folder / f"{name}.html", page), write_file(folder / "metrics.json", json_text(numbers))]
 
 
 def by_section(pictures: Sequence[Picture]) -> dict[str, list[Picture]]:

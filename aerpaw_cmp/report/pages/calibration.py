@@ -1,24 +1,20 @@
-"""calibration.html with metrics.json and figures: antennas over the sphere, where flights looked, scores left out."""
+"""calibration.html with metrics.json: antennas over the sphere, where flights looked, scores left out."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
-from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.jsonable import json_object, named
+from ...common.units import FloatArray
 from ...compare.learning.calibration import BASELINES
 from ..content.calibration import AntennaMap, CalibrationData
 from ..content.made import about
-from ..kit import canvas
-from ..kit.canvas import FigureSpec
 from ..kit.page import write_page
-from ..names import safe_name
+from .places import BODY, COMPASS, Places, payload
 
 SPLIT_TITLE = {
     "flight_left_out": "each flight left out",
@@ -44,69 +40,47 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
     )
 
 
+def _directions(antenna: AntennaMap) -> FloatArray:
+    """Unit vectors (t, p, 3) of the grid."""
+    t, p = np.radians(antenna.theta_deg)[:, None], np.radians(antenna.azimuth_deg)[None, :]
+    return np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
+
+
 def _share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
     """Share of the sphere within some degrees of a direction that a flight looked in."""
-    t, p = np.radians(antenna.theta_deg)[:, None], np.radians(antenna.azimuth_deg)[None, :]
-    grid = np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
+    grid = _directions(antenna)
     near = np.zeros(grid.shape[:2], bool)
     for part in np.array_split(antenna.flown, max(1, len(antenna.flown) // 500)):
         near |= (grid @ part.T > np.cos(np.radians(within_deg))).any(axis=-1)
-    weight = np.sin(t) * np.ones_like(near)
+    weight = np.sin(np.radians(antenna.theta_deg))[:, None] * np.ones_like(near)
     return float((near * weight).sum() / weight.sum())
-
-
-def draw_antenna(antenna: AntennaMap) -> Figure:
-    """Gain and its standard deviation over azimuth and elevation, with the directions flown."""
-    fig, axes = canvas.subplots((9.2, 6.4), 2, 1, sharex=True)
-    elevation = 90.0 - antenna.theta_deg
-    azimuth = np.append(antenna.azimuth_deg, 360.0)
-
-    def closed(values: Any) -> Any:
-        return np.concatenate([values, values[:, :1]], axis=1)
-
-    level = closed(antenna.gain_dbi)
-    low, high = np.percentile(level, [2, 98])
-    for ax, values, label, limits in (
-        (axes[0], level, "gain [dBi]", (low, high)),
-        (axes[1], closed(antenna.sd_db), "standard deviation [dB]", (0.0, float(antenna.sd_db.max()))),
-    ):
-        mesh = ax.pcolormesh(azimuth, elevation, values, shading="gouraud", vmin=limits[0], vmax=limits[1],
-                             cmap="viridis" if ax is axes[0] else "plasma", rasterized=True)  # fmt: skip
-        fig.colorbar(mesh, ax=ax, label=label, pad=0.01)
-        ax.set_ylabel("elevation [deg]")
-        ax.set_yticks([-90, -45, 0, 45, 90])
-    at, up = np.degrees(azimuth_rad(antenna.flown)) % 360.0, np.degrees(elevation_rad(antenna.flown))
-    for ax, colour in zip(axes, ("black", "white"), strict=True):
-        ax.plot(at, up, ".", markersize=1.5, color=colour, alpha=0.6, label="flown")
-    axes[1].set_xlabel("azimuth, counter-clockwise from forward or east [deg]")
-    axes[1].set_xticks(range(0, 361, 45))
-    axes[0].set_title(antenna.name)
-    return fig
 
 
 def _mean(rows: Sequence[Mapping[str, Any]], key: str = "rmse_db") -> float:
     return float(np.mean([r[key] for r in rows])) if rows else float("nan")
 
 
-def figure_specs(data: CalibrationData) -> Iterator[FigureSpec]:
-    """All figures."""
+def _groups(data: CalibrationData) -> Iterator[Places]:
+    """Each antenna over the sphere."""
     for a in data.antennas:
-        yield FigureSpec(
-            f"antenna_{safe_name(a.name)}", "antennas", a.name,
-            f"Flights saw directions within 10 degrees of {100 * _share_seen(a):.0f} % of the sphere (dots). "
-            "Elsewhere the gain is a guess, and its standard deviation says so. The level is normalised to a mean of "
-            "0 dBi over the sphere: it is not identified beside the offsets.",
-            partial(draw_antenna, a),
-        )  # fmt: skip
+        yield Places(
+            name=a.name,
+            at=_directions(a).reshape(-1, 3),
+            values={"gain [dBi]": a.gain_dbi.ravel(), "standard deviation [dB]": a.sd_db.ravel()},
+            around=BODY if a.name.endswith(" uav") else COMPASS,
+            dots=a.flown,
+        )
 
 
 def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:
-    """Write ``calibration.html``, ``metrics.json`` and ``figures/``."""
+    """Write ``calibration.html`` and ``metrics.json``."""
+    numbers = calibration_metrics(data)
     rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
     columns = ("rmse_db", "rmse_4s_db", *BASELINES)
     return write_page(
-        folder, "calibration", calibration_metrics(data), figure_specs(data),
+        folder, "calibration", numbers, payload(list(_groups(data))) if data.antennas else {},
         data=data,
+        metrics=numbers,
         split_title=SPLIT_TITLE,
         baselines=BASELINES,
         means={name: ([_mean(scores, key) for key in columns], len(scores)) for name, scores in rows.items()},

@@ -1,29 +1,27 @@
-"""prediction.html with metrics.json, prediction.csv, prediction.nc and figures."""
+"""prediction.html with metrics.json, prediction.csv and prediction.nc."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from matplotlib.figure import Figure
+from numpy.typing import ArrayLike
 
 from ...common.cells import guarded
 from ...common.cf import dataset, file_attributes, netcdf_bytes
 from ...common.errors import UsageError
 from ...common.jsonable import json_object, named
 from ...site.site import Site
+from ..content.flight import RANKS
 from ..content.made import Made, about
-from ..kit import canvas
-from ..kit.canvas import FigureSpec
 from ..kit.files import write_file
 from ..kit.page import write_page
-from ..names import safe_name
 from ..words.prediction import FLAGS
+from .places import BAND, LIKELIEST, Places, payload
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +107,8 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
     said : list of str
     """
     numbers = prediction_metrics(data)
-    written = write_page(folder, "prediction", numbers, _figures(data), data=data, metrics=numbers, flags=FLAGS)
+    shown = payload(list(_groups(data)), data.site, lines=[np.asarray(line).T for line in data.flown.values()])
+    written = write_page(folder, "prediction", numbers, shown, data=data, metrics=numbers, flags=FLAGS)
     digits = {c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))}
     digits |= {c: 4 for c in data.table.columns if c.startswith("p_")}
     with (folder / "prediction.csv").open("w", encoding="utf-8", newline="") as book:
@@ -146,72 +145,29 @@ def _dataset(data: PredictionPage) -> Any:
     return dataset(variables, about)
 
 
-# --- figures -------------------------------------------------------------------------------------------------------
-
-
-def _figures(data: PredictionPage) -> Iterator[FigureSpec]:
-    size = 0 if data.shape is None else data.shape[0] * data.shape[1]
+def _groups(data: PredictionPage) -> Iterator[Places]:
+    """Each tower and channel, each receiver of ranks: at each height of a grid, or at all points."""
+    groups: list[tuple[str, dict[str, ArrayLike], pd.DataFrame]] = []
     for name, part in data.series:
-        for k, height in enumerate(data.heights_m if size else ()):
-            yield _map_spec(data, name, part.iloc[k * size : (k + 1) * size], f", {height:g} m")
-        if not size:
-            yield _map_spec(data, name, part)
-            if data.kind == "route":
-                yield FigureSpec(
-                    f"route_{safe_name(name)}", "routes", f"{name} along the route",
-                    "The interval holds one sample in nine of ten cases: model, field, flight, noise and fading.",
-                    partial(_draw_profile, data, name, part),
-                )  # fmt: skip
-
-
-def _map_spec(data: PredictionPage, name: str, part: pd.DataFrame, height: str = "") -> FigureSpec:
-    return FigureSpec(
-        f"map_{safe_name(name + height)}", "maps", name + height,
-        f"Median level [{data.units.get(name, 'dB')}] and the standard deviation of one sample [dB]. Grey lines: "
-        f"flights that were learned from. Median SD {part['sd_db'].median():.1f} dB.",
-        partial(_draw_map, data, part),
-    )  # fmt: skip
-
-
-# Points of a map that are drawn.
-_MOST_DOTS = 50_000
-
-
-def _draw_map(data: PredictionPage, part: pd.DataFrame) -> Figure:
-    fig, axes = canvas.subplots((9.2, 5.2), 1, 2, sharex=True, sharey=True)
-    east, north = part["east_m"].to_numpy(), part["north_m"].to_numpy()
-    for ax, column, label, colours in (
-        (axes[0], "level_db", "level [dB]", "viridis"),
-        (axes[1], "sd_db", "standard deviation [dB]", "plasma"),
-    ):
-        values = part[column].to_numpy()
-        for line in data.flown.values():
-            ax.plot(line[0], line[1], color="0.7", linewidth=0.6, zorder=1)
-        if data.shape is None:
-            some = slice(None, None, -(-len(values) // _MOST_DOTS))
-            shown = ax.scatter(east[some], north[some], c=values[some], s=7, cmap=colours, zorder=2, rasterized=True)
-        else:
-            grid = [v.reshape(data.shape) for v in (east, north, values)]
-            shown = ax.pcolormesh(*grid, cmap=colours, shading="nearest", rasterized=True, zorder=0)
-        fig.colorbar(shown, ax=ax, label=label, pad=0.02, shrink=0.85)
-        for tower in data.site.towers.values():
-            ax.plot(tower.position_m[0], tower.position_m[1], "^", color="black", markersize=5, zorder=3)
-        canvas.plan_axes(ax)
-        ax.label_outer()
-    canvas.frame_around(axes[0], east, north, shape=canvas.plan_shape(east, north))
-    return fig
-
-
-def _draw_profile(data: PredictionPage, name: str, part: pd.DataFrame) -> Figure:
-    fig, ax = canvas.subplots((9.2, 3.2))
-    time = part["time_s"].to_numpy()
-    ax.fill_between(time, part["q05_db"], part["q95_db"], color=canvas.SIMULATED, alpha=0.25, linewidth=0,
-                    label="90 % interval of one sample")  # fmt: skip
-    ax.plot(time, part["level_db"], color=canvas.SIMULATED, linewidth=1.2, label="median")
-    ax.set(xlabel="time along the route [s]", ylabel=f"level [{data.units.get(name, 'dB')}]")
-    if "p_lock" in part and part["p_lock"].notna().any():
-        share = ax.twinx()
-        share.plot(time, part["p_lock"], color="0.4", linewidth=0.9, linestyle=":")
-        share.set(ylim=(0.0, 1.0), ylabel="probability of lock (dotted)")
-    canvas.legend_below(ax, 2)
-    return fig
+        level = {f"level [{data.units.get(name, 'dB')}]": part["level_db"], "standard deviation [dB]": part["sd_db"]}
+        if "p_lock" in part and part["p_lock"].notna().any():
+            level["probability of lock"] = part["p_lock"]
+        groups.append((name, {**level, BAND[0]: part["q05_db"], BAND[1]: part["q95_db"]}, part))
+    ranks = data.table[data.table["channel"] == "rank"]
+    for tower, part in ranks.groupby("tower", sort=False, observed=True):
+        chance = part[[f"p_rank{k}" for k in RANKS]].to_numpy(np.float64)
+        likeliest = np.where(np.isfinite(chance).all(axis=1), 1 + chance.argmax(axis=1), np.nan)
+        each = {f"probability of rank {k}": chance[:, i] for i, k in enumerate(RANKS)}
+        groups.append((f"{tower} rank", {LIKELIEST: likeliest, **each}, part))
+    for name, values, part in groups:
+        at = part[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
+        size = len(part) if data.shape is None else data.shape[0] * data.shape[1]
+        for k, start in enumerate(range(0, len(part), max(size, 1))):
+            some = slice(start, start + size)
+            yield Places(
+                name=name if data.shape is None else f"{name}, {data.heights_m[k]:g} m",
+                at=at[some],
+                values={key: np.asarray(column)[some] for key, column in values.items()},
+                cell_m=0.0 if data.shape is None else float(np.ptp(at[:size, 0])) / max(data.shape[1] - 1, 1),
+                time_s=part["time_s"].to_numpy(np.float64) if data.kind == "route" else None,
+            )

@@ -84,7 +84,7 @@ def headline(data: CampaignData) -> list[str]:
             share = 100 * float(np.mean([p.share for p in pairs]))
             out.append(
                 f"Two flights at the same places differ by {mean:.1f} dB RMS after one constant "
-                f"({sum(p.n for p in pairs):,} pairs, {share:.0f} % of the samples)."
+                f"({counted(sum(p.n for p in pairs), 'pair')}, {share:.0f} % of the samples)."
             )
         else:
             out.append("No two flights pass the same places within the radius, so there is no repeatability floor.")

@@ -73,7 +73,7 @@ def headline(data: ReportData) -> str:
     if data.rss:
         towers = list(dict.fromkeys(panel.tower for panel in data.rss))
         samples = sum(len(panel.time) for panel in data.rss)
-        panels = "1 channel" if len(data.rss) == 1 else f"{len(data.rss)} tower channels"
+        panels = counted(len(data.rss), "channel")
         parts.append(f"received signal strength at {_listed(towers)} ({panels}, {counted(samples, 'sample')})")
     if data.rank:
         samples = sum(len(panel.time) for panel in data.rank)
@@ -303,7 +303,7 @@ def rss_verdict(panel: RssResult) -> str:
         return training_sentence([panel.name], "the antennas") + _learned_from(panel.further.trained_on or ())
     score = panel.score
     if score.n == 0 or not math.isfinite(score.rmse_db):
-        return f"{panel.name}: nothing to score; all {count(len(panel.time))} samples are out of coverage on one side."
+        return f"{panel.name}: nothing to score; {counted(len(panel.time), 'sample')} out of coverage on one side."
     text = (
         f"{panel.name}: RMSE of ray tracing {score.rmse_db:.1f} dB"
         f"{_within(score.rmse_ci95_db, panel.further.rmse_bound)} "
@@ -430,7 +430,7 @@ def cautions(data: ReportData) -> list[str]:
     texts += data.warnings
     rejected = sum(f.rejected for f in data.inputs)
     if rejected:
-        texts.append(f"{count(rejected)} log lines were rejected; see the account of the inputs.")
+        texts.append(f"{counted(rejected, 'log line was', 'log lines were')} rejected; see the account of the inputs.")
     return list(dict.fromkeys(texts))
 
 

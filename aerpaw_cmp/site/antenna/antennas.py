@@ -21,6 +21,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError, about_file, parsed
 from ...common.files import LARGEST_TABLE, read_input
 from ...common.units import (
@@ -334,7 +335,7 @@ def _numbers(line: str, path: Path, number: int) -> list[float]:
     if len(row) != 7 or not all(math.isfinite(cell) for cell in row):
         cause = "the line was cut off" if len(cells) < 7 else None
         raise InputError(
-            f"{len(cells)} fields: '{line.strip()[:60]}'",
+            f"{counted(len(cells), 'field')}: '{line.strip()[:60]}'",
             expected="7 numbers",
             cause="decimal commas in place of points" if re.search(r"\d,\d", line) else cause,
             path=path,
@@ -395,7 +396,7 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
         i, j = np.argwhere(seen != 1)[0]
         what = "missing" if seen[i, j] == 0 else "given twice"
         raise InputError(
-            f"{int((seen != 1).sum())} directions are missing or given twice, the first at phi "
+            f"{counted(int((seen != 1).sum()), 'direction')} missing or given twice, the first at phi "
             f"{math.degrees(phi[i]):.1f} deg, theta {math.degrees(theta[j]):.1f} deg ({what})",
             expected=f"each of {len(phi)} x {len(theta)} directions once",
             cause="the file was cut off, or a line is lost" if what == "missing" else "a line was copied",
@@ -519,7 +520,7 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
     if not np.isfinite(gain).all():
         row, column = np.argwhere(~np.isfinite(gain))[0]
         raise InputError(
-            f"'{variable}' has {int((~np.isfinite(gain)).sum())} values that are no numbers, the first at elevation "
+            f"'{variable}': {counted(int((~np.isfinite(gain)).sum()), 'value')} without a number, first at elevation "
             f"{elevation[row]:g} deg, azimuth {azimuth[column]:g} deg",
             expected="dBi in every direction",
             path=path,
@@ -568,8 +569,9 @@ def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> Non
             (len(axis) >= 3 and np.abs(axis - 90 - grid).max() <= 0.05, "zenith angles in place of elevation"),
             (True, "angles are missing"),
         )
+        ends = f"{axis.min(initial=np.inf):g} to {axis.max(initial=-np.inf):g}"
         raise InputError(
-            f"{what} runs from {axis.min(initial=np.inf):g} to {axis.max(initial=-np.inf):g} in {len(axis)} values",
+            f"{what} runs from {ends} in {counted(len(axis), 'value')}",
             expected=f"{grid[0]:g} to {grid[-1]:g} deg, equally spaced" if len(axis) >= 3 else "a whole sphere",
             cause=next(cause for holds, cause in causes if holds),
             path=path,

@@ -266,7 +266,9 @@ def memory_lines(site: str | Path) -> list[str]:
         what += [f"rank receiver at {r.tower}" for r in entry.receivers]
         source = ", ".join(part for part in (entry.source.title, entry.source.doi, entry.source.licence) if part)
         lines.append(f"{name}: {', '.join(what)}; {entry.about()}; airframe: {entry.source.airframe}")
-        lines.append(f"  source: {source}; {len(entry.trained_on)} logs, SHA-256 in {folder_of(site).name}/{_INDEX}")
+        lines.append(
+            f"  source: {source}; {counted(len(entry.trained_on), 'log')}, SHA-256 in {folder_of(site).name}/{_INDEX}"
+        )
         lines.append(f"  made {entry.made} by: {entry.command}")
     return lines
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.errors import InputError, parsed
 from ...common.files import LARGEST_TABLE, read_input
 from ...common.provenance import marks, trained_on
@@ -134,7 +135,9 @@ def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:
         except (ValueError, IndexError):
             raise InputError(f"'{line.strip()[:60]}'", expected="an angle and a value", path=path) from None
     if len(rows) < count or count < 4:
-        raise InputError(f"a cut of {len(rows)} lines", expected=f"{max(count, 4)}", cause="a cut file", path=path)
+        raise InputError(
+            f"a cut of {counted(len(rows), 'line')}", expected=f"{max(count, 4)}", cause="a cut file", path=path
+        )
     return np.array(rows, dtype=np.float64)
 
 

@@ -22,6 +22,7 @@ from scipy.sparse.csgraph import connected_components
 from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError
 from ...common.geodesy import SiteFrame
 from ...common.jsonable import named
@@ -207,7 +208,7 @@ def _sort(
             shapes[kind].append(shape)
     if skipped:
         listed = ", ".join(f"{count} {tag}" for tag, count in skipped.most_common(5))
-        more = "" if len(skipped) <= 5 else f" and {len(skipped) - 5} other tags"
+        more = "" if len(skipped) <= 5 else f" and {counted(len(skipped) - 5, 'other tag')}"
         hint = "; '--untagged building' takes areas without tags for buildings" if skipped["untagged"] else ""
         actions.append(f"{path.name}: left out, no building or forest above the ground: {listed}{more}{hint}")
 
@@ -228,7 +229,7 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
         return []
     if len(points) > 1:
         points = _along(points, crown or _ROW_SPACING_M)
-        notes.append(f"{len(points)} trees were placed along the row, {crown or _ROW_SPACING_M:g} m apart")
+        notes.append(f"{counted(len(points), 'tree')} placed along the row, {crown or _ROW_SPACING_M:g} m apart")
     actions += [f"{tree.source}: {note}" for note in notes]
     trunk = None if girth is None else girth / math.pi
     return [SingleTree(float(east), float(north), height, crown, trunk) for east, north in points]
@@ -275,9 +276,11 @@ def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float 
     guesses = [_assumed_heights(buildings)]
     if canopy_m is None and result.forests:
         density = result.forests[0].trees_per_hectare
-        guesses.append(f"trees assumed: {density:g} per hectare at random places in {len(woods)} woods")
+        guesses.append(f"trees assumed: {density:g} per hectare at random places in {counted(len(woods), 'wood')}")
     elif low := [shape for shape in woods if not shape.height_m]:
-        guesses.append(f"height assumed: {len(low)} of {len(woods)} woods have none in the map, {canopy_m:g} m each")
+        guesses.append(
+            f"height assumed: none in the map for {len(low)} of {counted(len(woods), 'wood')}, {canopy_m:g} m each"
+        )
     result.assumed = "; ".join(filter(None, guesses))
     if result.assumed:
         actions.insert(0, result.assumed)
@@ -445,7 +448,8 @@ def _assumed_heights(shapes: list[_Shape]) -> str:
         return ""
     heights = " and ".join(f"{height:g} m" for height in sorted({shape.height_m for shape in assumed}))
     named = ", ".join(shape.name for shape in assumed[:5]) + ("" if len(assumed) <= 5 else ", ...")
-    return f"height assumed: {len(assumed)} of {len(shapes)} buildings have none in the map, {heights} each: {named}"
+    of = counted(len(shapes), "building")
+    return f"height assumed: none in the map for {len(assumed)} of {of}, {heights} each: {named}"
 
 
 def _describe_wood(shape: _Shape, tags: Mapping[str, str], actions: list[str]) -> None:

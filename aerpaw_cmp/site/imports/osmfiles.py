@@ -11,6 +11,7 @@ from typing import Any
 import shapely
 from shapely.geometry import Polygon
 
+from ...common.counting import counted
 from .outlines import BROKEN_ELEMENT, OSM_CREDIT, MapFile, Outline, Position, TreeLine, is_tangled, left_out, lonlat
 from .tags import kind_of
 
@@ -122,14 +123,16 @@ def _points(way: Element, data: _Data, outline: Outline) -> list[Position]:
         points = [point for point in way["geometry"] if point]
         if len(points) < len(way["geometry"]):
             lost = len(way["geometry"]) - len(points)
-            outline.broken.append(f"{lost} of {len(way['geometry'])} points are unknown: cut off at the query's box")
+            outline.broken.append(
+                f"{lost} of {counted(len(way['geometry']), 'point')} unknown: cut off at the query's box"
+            )
         return [lonlat((point.get("lon"), point.get("lat")), outline.source, data.path) for point in points]
     references = [str(reference) for reference in way.get("nodes") or []]
     known = [data.nodes[reference] for reference in references if reference in data.nodes]
     if not known:
         outline.broken.append("it has no outline in the file; end the Overpass query with 'out geom;'")
     elif len(known) < len(references):
-        outline.broken.append(f"{len(references) - len(known)} of {len(references)} nodes are not in the file")
+        outline.broken.append(f"{len(references) - len(known)} of {counted(len(references), 'node')} not in the file")
     return known
 
 

@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 
 import numpy as np
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError, parsed
 from ...common.files import inside, read_input
 from ...common.units import FloatArray, IntArray
@@ -130,7 +131,7 @@ def _gathered(reading: _Reading, notes: list[str]) -> TriangleScene:
     if reading.bent:
         notes.append(f"{reading.bent} polygons are not flat: they were cut into triangles from their first corner")
     for kind, count in reading.skipped.items():
-        notes.append(f"warning: {count} shapes of type '{kind}' were left out; read is ply")
+        notes.append(f"warning: {counted(count, 'shape')} of type '{kind}' left out; read is ply")
     return TriangleScene(
         vertices_m=np.concatenate(reading.vertices),
         triangles=np.concatenate(triangles),

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 from scipy.spatial.distance import cdist
 
+from ...common.counting import counted
 from ...common.errors import UsageError
 from ...common.gaussian import Factor
 from ...common.geodesy import SiteFrame
@@ -147,7 +148,7 @@ def surface_through(points_m: FloatArray, frame: SiteFrame, reach_m: tuple[float
         Too few points, or two that contradict.
     """
     if len(points_m) < 3:
-        raise UsageError(f"ground_points has {len(points_m)} points", expected="3 or more")
+        raise UsageError(f"ground_points has {counted(len(points_m), 'point')}", expected="3 or more")
     place, height, error = points_m[:, :2], points_m[:, 2], points_m[:, 3]
     for i, j in sorted(cKDTree(place).query_pairs(_SAME_PLACE_M)):
         if abs(height[i] - height[j]) > _CONTRADICTION * np.hypot(error[i], error[j]):

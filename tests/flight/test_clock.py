@@ -278,21 +278,6 @@ def test_the_verdict_follows_from_the_lags_that_are_left(peaks, verdict):
     assert -15.0 <= clock.ci95_s[0] <= clock.radio_minus_telemetry_s <= clock.ci95_s[1] <= 15.0
 
 
-def test_means_of_many_samples_are_those_of_their_seconds():
-    t = np.arange(40.0, 400.0, 1 / 30.0)
-    sine = ClockChannel(name="one", time_s=t, measured_db=np.sin(t), along=ALONG)
-    bins = _Bins.of([sine], ALONG.features(), 15.0)
-    assert bins is not None
-    assert bins.n == 360
-    np.testing.assert_allclose(bins.mean_db[7], np.sin(t[(t >= 47) & (t < 48)]).mean())
-    # and what they depend on is averaged over as long a time, half a second before and after
-    seen = np.subtract(*bins.systems(np.array([0.0, 3.0]))[7, :, 1])
-    slope = np.log10(ALONG.distance_m)
-    expected = [slope[np.abs(GRID - at) <= 0.5].mean() for at in (bins.mean_s[7], bins.mean_s[7] - 3.0)]
-    assert seen == pytest.approx(expected[0] - expected[1], abs=1e-3)
-    assert bins.likelihood(np.array([0.0]), [[_Parts(5.0, 0.3, 1.0)]]).shape == (1, 1, 1)
-
-
 def test_channels_of_one_place_and_time_have_the_likelihoods_of_each_alone():
     level = ALONG.predicted_db["free space"]
     other = along(**{"free space": level + 3.0 * np.sin(GRID / 9.0)})  # another antenna: another prediction
@@ -458,20 +443,3 @@ def test_an_optimum_between_two_excluded_lags_is_found() -> None:
     tried, own = _finer(lags, likelihood, 15.0)
     assert own[0, 0, np.abs(tried - 3.25) < 0.02].max() > -EVIDENCE_NAT
     assert _judged(tried, own, ["one"], 15.0).ci95_s[1] > 3.25
-
-
-def test_the_parts_of_a_likelihood_are_the_best_of_their_grid() -> None:
-    bins = _Bins.of([channel(0.0, 5, t=np.arange(20.0, 120.0, 1.0))], ALONG.features(), 15.0)
-    assert bins is not None
-    columns, flat = (
-        bins.systems(np.array([0.5])),
-        np.column_stack([np.ones(bins.n), np.zeros(bins.n), bins.mean_db - bins.mean_db.mean()]),
-    )
-    tried = {
-        (memory, white, gain): _likelihood(columns, bins.mean_s, 1, [_Parts(memory, white, gain)])[0, 0, 0]
-        for memory in (2.0, 5.0, 15.0, 40.0) for white in (0.1, 0.3, 0.9) for gain in (0.05, 0.5, 1.0, 2.0)
-    }  # fmt: skip
-    assert bins.fitted(np.array([0.5])) == [[_Parts(*max(tried, key=tried.__getitem__))]]
-    memories = {key[:2] for key in tried}
-    constant = [_likelihood(flat[:, None], bins.mean_s, 1, [_Parts(*key, 0.0)])[0, 0, 0] for key in memories]
-    assert bins.constant() == pytest.approx(max(constant))

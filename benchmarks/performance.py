@@ -297,7 +297,7 @@ def reports(run: dict[str, Any]) -> list[str]:
         return []
     rows = [("with `--audit none`, " + name, result["later"][key]) for key, name in WHEN.items()]
     rows = [("as it comes, " + name, result["now"][key]) for key, name in WHEN.items() if "now" in result] + rows
-    short, sample, later = result["two_channels"], result["sample"], result["sample_later"]
+    short = result["two_channels"]
     return [
         "## A report", "",
         f"Two channels ({short['flight']}), as processes, by processor time, against `import sionna.rt, "
@@ -308,14 +308,9 @@ def reports(run: dict[str, Any]) -> list[str]:
             f"| {name} | {row['cpu_s']:.1f} | {row['ratio']:.2f} | {row['ratio_light']:.2f} | {row['peak_mib']:.0f} |"
             for name, row in rows
         ),
-        "",
-        f"With its audit and the caches of this machine: {short['ratio_cpu']:.2f} x the imports, "
+        "", f"With audit and the caches of this machine: {short['ratio_cpu']:.2f} x the imports, "
         f"{short['peak_mib']:.0f} MiB.",
-        "", "The sample flight (five towers, ten channels):", "",
-        *(
-            f"- {name}: {row['cpu_s']:.1f} s of processor, {row['wall_s']:.1f} s on the wall, {row['peak_mib']:.0f} MiB"
-            for name, row in (("as it comes", sample), ("with `--audit none`", later))
-        ), "",
+        "",
     ]  # fmt: skip
 
 

@@ -89,7 +89,7 @@ FAULTS = (
     Fault("every fifth path dropped", f"{P}.search.mirror", "find_paths", "return merge(pieces, max_depth, faces)", "return (lambda p: p.select(np.arange(len(p)) % 5 > 0))(merge(pieces, max_depth, faces))"),
     Fault("direct paths dropped", f"{P}.search.mirror", "find_paths", "for level in sequences(tower):", "for level in sequences(tower)[1:]:"),
     Fault("nothing hides", f"{P}.search.occlusion", "Occlusion.segments", "if not self.pieces:", "if self.pieces:"),
-    Fault("walls 5 m longer than they are", f"{P}.geometry.faces", "inside", "faces.upper[index] + tolerance_m", "faces.upper[index] + 5.0"),
+    Fault("walls 5 m longer than they are", f"{P}.geometry.faces", "inside", "(faces.upper + tolerance_m)", "(faces.upper + 5.0)"),
     Fault("reflection points off by 1 % of the way", f"{P}.search.mirror", "trace_back", "share = behind / (behind + ahead)", "share = 0.99 * behind / (behind + ahead)"),
     Fault("walls moved by 5 cm", f"{P}.geometry.faces", "_walls", "offset = float(normal[:2] @ start)", "offset = float(normal[:2] @ start) + 0.05"),
     Fault("antenna 30 cm higher", "aerpaw_cmp.site.site", "Tower.position_m", "self.ground_m + self.antenna_height_m", "self.ground_m + self.antenna_height_m + 0.3"),

@@ -2,9 +2,7 @@
 
 1. A two-channel flight of 3304 samples, image engine: processor time over that of importing what it is made of
    (``import sionna.rt, matplotlib.pyplot, pandas``). The real one where AERPAW_CMP_FIELD_DATA is set, else a simulated.
-2. The sample flight: seconds and peak memory; the same without audit, both with the caches of this machine, which a
-   report that is not counted fills.
-   The first and the next report of part 1, as it comes and with ``--audit none``: every cache of the program, of Dr.Jit
+2. The first and the next report of part 1, as it comes and with ``--audit none``: every cache of the program, of Dr.Jit
    and of matplotlib is empty before the first, whose time holds the trial of an LLVM. Bytecode is compiled before.
    Ratios are to those imports, and to the imports without Sionna, which a report without audit does not load: the
    median of all that the run measured, one before and one after each report.
@@ -26,12 +24,9 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 # What every report with its audit has to load, as a program.
-IMPORTS = "; ".join(
-    (
-        "from aerpaw_cmp.propagation.native.llvm import let_sionna_load",
-        "let_sionna_load()",
-        "import sionna.rt, matplotlib.pyplot, pandas",
-    )
+IMPORTS = (
+    "from aerpaw_cmp.propagation.native.llvm import let_sionna_load; let_sionna_load(); "
+    "import sionna.rt, matplotlib.pyplot, pandas"
 )
 LIGHT = "import matplotlib.pyplot, pandas"
 
@@ -126,10 +121,6 @@ def main() -> None:
         for number in range(repeats):
             IMPORTED.take()
             reports.append(run(report(flight, folder / f"r{number}", *options)))
-        some = ROOT / "sample_logs" / "flight.yaml"
-        run(report(some, folder / "unmeasured_sample"))
-        sample = run(report(some, folder / "sample"))
-        sample_later = run(report(some, folder / "sample_later", "--audit", "none"))
         now = cold_and_warm(flight, options, folder / "now", repeats)
         later = cold_and_warm(flight, [*options, "--audit", "none"], folder / "later", repeats)
     now, later = ({name: IMPORTED.ratios(row) for name, row in rows.items()} for rows in (now, later))
@@ -142,19 +133,16 @@ def main() -> None:
             "ratio_cpu": statistics.median(IMPORTED.ratios(r)["ratio"] for r in reports),
             "peak_mib": max(r["peak_mib"] for r in reports),
         },
-        "sample": sample, "sample_later": sample_later, "now": now, "later": later,
+        "now": now, "later": later,
     }  # fmt: skip
     if arguments.json:
         print(json.dumps(result, indent=1))
         return
-    short, whole_sample = result["two_channels"], result["sample"]
+    short = result["two_channels"]
     print(
         f"report of {short['flight']}: {short['report_s']:.1f} s, {short['ratio_cpu']:.2f} x the imports of "
         f"{statistics.median(short['imports_cpu_s']):.2f} s in processor time ({len(short['imports_cpu_s'])} times)"
     )
-    print(f"sample flight: {whole_sample['wall_s']:.1f} s, peak memory {whole_sample['peak_mib']:.0f} MiB")
-    print(f"sample flight without audit: {sample_later['cpu_s']:.1f} s of processor, "
-          f"{sample_later['wall_s']:.1f} s, {sample_later['peak_mib']:.0f} MiB")  # fmt: skip
     for name, row in {**now, **{f"{key}, --audit none": row for key, row in later.items()}}.items():
         print(f"{name}: {row['cpu_s']:.1f} s of processor ({row['wall_s']:.1f} s), {row['ratio']:.2f} x "
               f"the imports, {row['ratio_light']:.2f} x the imports without Sionna")  # fmt: skip

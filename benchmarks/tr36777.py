@@ -33,6 +33,7 @@ from aerpaw_cmp.site.site import Site, Tower
 ELEMENTS, SPACING = 8, 0.8
 HEIGHTS_M = (50.0, 100.0, 200.0, 300.0)
 PERCENTILES = (5, 50, 95)
+GROUND = "constant with permittivity=15 conductivity=0.01"  # no path meets it
 
 
 @dataclass(frozen=True)
@@ -48,10 +49,7 @@ class Scenario:
 # Loss of a target [dB] by percentile, as nine companies of R1-2509126 have it: least, most.
 PUBLISHED_DB = {5: (164.3, 165.1), 50: (177.0, 177.8), 95: (183.3, 183.9)}
 
-SCENARIOS = {
-    "RMa-AV": Scenario(1732.0, 35.0, 0.7e9, 6.0),
-    "UMa-AV": Scenario(500.0, 25.0, 2.0e9, 10.0),
-}
+SCENARIOS = {"RMa-AV": Scenario(1732.0, 35.0, 0.7e9, 6.0), "UMa-AV": Scenario(500.0, 25.0, 2.0e9, 10.0)}
 
 
 def sight_probability(name: str, across_m: np.ndarray, height_m: float) -> np.ndarray:
@@ -103,8 +101,7 @@ def sectors(scenario: Scenario) -> tuple[Site, Link]:
             mount = rotation_from_yaw_pitch_roll(np.radians(30.0 + 120.0 * sector), 0.0, 0.0)
             arrays[name] = Array(column, np.zeros(ELEMENTS), (TR38901(),), mount)
     link = Link(scenario.carrier_hz, arrays, single_element(), uav_transmits=False, noise_floor_dbm=-np.inf)
-    ground = "constant with permittivity=15 conductivity=0.01"  # no path meets it
-    return Site("hexagons", SiteFrame(0.0, 0.0), towers, ground_material=ground), link
+    return Site("hexagons", SiteFrame(0.0, 0.0), towers, ground_material=GROUND), link
 
 
 def peak_dbi(name: str) -> float:
@@ -160,9 +157,7 @@ def calibration(targets: int, rng: np.random.Generator) -> dict[str, float]:
     scenario, carrier_hz, height_m, scattering_db = SCENARIOS["UMa-AV"], 6e9, 200.0, -12.81
     names = {f"S{n}": place for n, place in enumerate(sites_m(scenario.apart_m))}
     towers = {name: Tower(name, 0.0, 0.0, float(e), float(n), scenario.tower_m) for name, (e, n) in names.items()}
-    site = Site(
-        "hexagons", SiteFrame(0.0, 0.0), towers, ground_material="constant with permittivity=15 conductivity=0.01"
-    )
+    site = Site("hexagons", SiteFrame(0.0, 0.0), towers, ground_material=GROUND)
     link = Link(carrier_hz, dict.fromkeys(towers, single_element()), single_element(), noise_floor_dbm=-np.inf)
     square = rng.uniform(-scenario.apart_m, scenario.apart_m, (8 * targets, 2))
     sides = np.array([(np.cos(turn), np.sin(turn)) for turn in np.radians([0.0, 60.0, 120.0])])

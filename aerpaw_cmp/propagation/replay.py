@@ -343,7 +343,7 @@ def _evaluated(
     """Fields of the paths; times are the caller's."""
     paths = contributions[0]
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
-    work = None if run.job is None else run.job.pairs
+    work = 0 if run.job is None else run.job.pairs
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads, work=work)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle

@@ -17,6 +17,7 @@ from aerpaw_cmp.jobs.learning.calibrate_rank import (
     features_of,
     read_receiver,
 )
+from aerpaw_cmp.propagation.drivers import geometries
 from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
 
 SETTINGS = RankFitSettings(
@@ -111,3 +112,17 @@ def test_another_file_is_one_message(text: str, tmp_path: Path) -> None:
         read_receiver(path)
     with pytest.raises(InputError, match="cannot be read"):
         read_receiver(tmp_path / "nowhere.json")
+
+
+def test_channels_of_a_mount_are_evaluated_once_in_whatever_order(monkeypatch):
+    flown, slants = flight(0), [(45.0, -45.0, -45.0, 45.0), (0.0, 90.0, 0.0, 90.0)]
+    every = geometries.every_geometry([(0.0, 0.0, 0.0), (30.0, 0.0, 90.0)], [slants[0]], slants, [0.0, 0.5])
+    mixed = [every[i] for i in (0, 6, 3, 5, 1, 7)]
+    alone = np.concatenate([features_of([g], flown) for g in mixed])
+    calls = []
+    field = geometries.channel_matrices
+    monkeypatch.setattr(geometries, "channel_matrices", lambda *a, **k: calls.append(1) or field(*a, **k))
+    np.testing.assert_allclose(features_of(mixed, flown), alone, rtol=1e-12)
+    assert len(calls) == 4  # two mounts, direct and off the ground
+    features_of([g for g in mixed if g.ground == 0.0], flown)
+    assert len(calls) == 6

@@ -506,6 +506,14 @@ def test_many_jobs_of_one_process_pay_for_a_compiler(monkeypatch, tmp_path):
     before = [compiled.kernels_for(pairs) is not None for _ in range(30)]
     assert before == sorted(before)
     assert before.index(True) * 1.0 == pytest.approx(compiled.COMPILE_S[compiled.FIELD], abs=1.0)
+    # parts of one job: its size loads what is compiled, and only the parts that ran count for a compiler
+    monkeypatch.setitem(compiled._in_numpy_s, compiled.FIELD, 0.0)
+    part = pairs // 100
+    assert not any(compiled.kernels_for(part, pairs) for _ in range(100))
+    (tmp_path / f"{compiled.FIELD}.compiled").touch()
+    monkeypatch.setitem(compiled._in_numpy_s, compiled.FIELD, 0.0)
+    assert compiled.kernels_for(part, pairs)
+    assert not compiled.kernels_for(part)
 
 
 DAMAGED = {

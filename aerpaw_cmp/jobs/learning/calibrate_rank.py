@@ -233,11 +233,13 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
 
 def _powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
     """Squares (geometries, n, 4) of the singular values of the modelled channels."""
+    order = sorted(range(len(geometries)), key=lambda i: geometries[i].mount_deg)  # best first: mounts come again
     singular = singular_values_of(
-        geometries, samples.link.tower_arrays[samples.tower], samples.tower_m, samples.link.uav_array, samples.poses,
-        samples.link.carrier_hz,
+        [geometries[i] for i in order], samples.link.tower_arrays[samples.tower], samples.tower_m,
+        samples.link.uav_array, samples.poses, samples.link.carrier_hz,
     )  # fmt: skip
-    return np.stack([sigma**2 for sigma in singular])
+    by_place = dict(zip(order, singular, strict=True))
+    return np.stack([by_place[i] ** 2 for i in range(len(geometries))])
 
 
 def features_of(geometries: Sequence[Geometry], samples: RankSamples, timing: Timing | None = None) -> FloatArray:

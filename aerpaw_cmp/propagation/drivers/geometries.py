@@ -14,9 +14,9 @@ cycle where the two differ by 3 m, so beside the coherent sum at the carrier the
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from itertools import product
+from itertools import groupby, product
 from typing import Literal
 
 import numpy as np
@@ -54,6 +54,11 @@ class Geometry:
     uav_slant_deg: tuple[float, ...]
     ground: float
     sum: Ground = "power_sum"
+
+    @property
+    def mount_deg(self) -> tuple[float, float, float]:
+        """Yaw, pitch and roll."""
+        return self.uav_yaw_deg, self.uav_pitch_deg, self.uav_roll_deg
 
     def in_words(self) -> str:
         """For tables."""
@@ -99,7 +104,7 @@ def every_geometry(
 
 
 def singular_values_of(
-    geometries: Iterable[Geometry],
+    geometries: Sequence[Geometry],
     tower: Array,
     tower_m: FloatArray,
     uav: Array,
@@ -110,8 +115,8 @@ def singular_values_of(
 
     Parameters
     ----------
-    geometries : iterable of Geometry
-        In runs of one mount: each run costs one evaluation of the field.
+    geometries : sequence of Geometry
+        In runs of one mount: each run costs one evaluation of the field, two with the ground.
     tower : Array
         Positions, pattern and mount; its slants are those of the geometry.
     tower_m : (3,)
@@ -131,17 +136,16 @@ def singular_values_of(
     Over receiving ports at the UAV. With the power sum they are the roots of the eigenvalues of ``L L^H + g^2 G G^H``:
     the mean of ``H H^H`` over a band in which the ground ray takes all phases against the direct one.
     """
-    last: tuple[float, float, float] | None = None
-    direct = bounced = np.zeros(0, dtype=np.complex128)
-    for g in geometries:
-        mount = (g.uav_yaw_deg, g.uav_pitch_deg, g.uav_roll_deg)
-        if mount != last:
-            turned = dataclasses.replace(uav, mount=np.asarray(rotation_from_yaw_pitch_roll(*map(np.radians, mount))))
-            direct, bounced = basis_fields(tower, tower_m, turned, poses, carrier_hz)
-            last = mount
-        at_uav, at_tower = slant_basis(g.uav_slant_deg), slant_basis(g.tower_slant_deg).T
-        los, ground = at_uav @ direct @ at_tower, g.ground * (at_uav @ bounced @ at_tower)
-        yield np.linalg.svd(los + ground, compute_uv=False) if g.sum == "coherent" else _of_power_sum(los, ground)
+    runs = [(mount, list(run)) for mount, run in groupby(geometries, lambda g: g.mount_deg)]
+    work = 2 * len(runs) * len(poses) * 4 * len(tower) * len(uav)
+    for mount, run in runs:
+        turned = dataclasses.replace(uav, mount=np.asarray(rotation_from_yaw_pitch_roll(*map(np.radians, mount))))
+        fields = basis_fields(tower, tower_m, turned, poses, carrier_hz, any(g.ground for g in run), work)
+        for g in run:
+            at_uav, at_tower = slant_basis(g.uav_slant_deg), slant_basis(g.tower_slant_deg).T
+            los, ground = (at_uav @ field @ at_tower for field in fields)
+            ground *= g.ground
+            yield np.linalg.svd(los + ground, compute_uv=False) if g.sum == "coherent" else _of_power_sum(los, ground)
 
 
 def _of_power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
@@ -155,7 +159,13 @@ def _hermitian(matrix: ComplexArray) -> ComplexArray:
 
 
 def basis_fields(
-    tower: Array, tower_m: FloatArray, uav: Array, poses: Poses, carrier_hz: float
+    tower: Array,
+    tower_m: FloatArray,
+    uav: Array,
+    poses: Poses,
+    carrier_hz: float,
+    with_ground: bool = True,
+    work: int = 0,
 ) -> tuple[ComplexArray, ComplexArray]:
     """Channel matrices (n, 2 uav ports, 2 tower ports) of line of sight and of the ground reflection alone.
 
@@ -169,6 +179,10 @@ def basis_fields(
         [m].
     poses : Poses
     carrier_hz : float
+    with_ground : bool
+        Otherwise the second is all zeros.
+    work : int
+        See :func:`~aerpaw_cmp.propagation.field.sum.channel_matrices`.
 
     Returns
     -------
@@ -179,10 +193,10 @@ def basis_fields(
     n = len(poses)
     index, zero = np.arange(n), np.zeros(n, dtype=np.int64)
     fields = []
-    for depth in (0, 1):
+    for depth in (0, 1) if with_ground else (0,):
         path = PathSet(index, zero, zero + depth, np.full((n, 1), depth - 1), np.full((n, 1, 3), np.nan))
-        fields.append(channel_matrices(path, faces, np.asarray(tower_m)[None, :], poses, link).h[:, 0])
-    return fields[0], fields[1]
+        fields.append(channel_matrices(path, faces, np.asarray(tower_m)[None, :], poses, link, work=work).h[:, 0])
+    return fields[0], fields[1] if with_ground else np.zeros_like(fields[0])
 
 
 def _both_slants(array: Array) -> Array:

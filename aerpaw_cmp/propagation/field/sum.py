@@ -109,7 +109,7 @@ def channel_matrices(
     loss_db: FloatArray | None = None,
     *,
     threads: int | None = None,
-    work: int | None = None,
+    work: int = 0,
 ) -> Fields:
     """Channel matrices of a path set.
 
@@ -129,7 +129,7 @@ def channel_matrices(
     threads : int, optional
         Of compiled code (default: the cores this process may use); results do not depend on it.
     work : int, optional
-        Element pairs of all links of the replay that this call is a part of; decides whether compiled code is worth
+        Element pairs of all links of the job that this call is a part of; decides whether compiled code is worth
         loading (:mod:`aerpaw_cmp.propagation.native.compiled`).
 
     Returns
@@ -148,7 +148,7 @@ def channel_matrices(
     arrays = list(link.tower_arrays.values())
     ports, uavs = _ports(arrays), len(link.uav_array)
     _check_patterns([*arrays, link.uav_array])
-    kernels = compiled.kernels_for(len(poses) * len(arrays) * ports * uavs if work is None else work)
+    kernels = compiled.kernels_for(len(poses) * len(arrays) * ports * uavs, work)
     evaluate = amplitudes if kernels is None else kernels.amplitudes
     elements, wavelength = Elements.of(link), wavelength_m(link.carrier_hz)
     table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)

@@ -117,9 +117,12 @@ def _is_private(status: os.stat_result) -> bool:
     return not hasattr(os, "geteuid") or (status.st_uid == os.geteuid() and not status.st_mode & 0o022)
 
 
-def kernels_for(pairs: int) -> ModuleType | None:
-    """Compiled kernels of the field, or None: a job of so many element pairs of links is too small, or they fail."""
-    return _worth(FIELD, pairs * FIELD_S)
+def kernels_for(pairs: int, work: int = 0) -> ModuleType | None:
+    """Compiled kernels of the field, or None: so many element pairs of links are too few, or they fail.
+
+    ``work`` is that of the job that these pairs are a part of.
+    """
+    return _worth(FIELD, pairs * FIELD_S, work * FIELD_S)
 
 
 def beams_for(links: int, faces: int) -> bool:
@@ -139,11 +142,12 @@ def triangles_for(systems: int, size: int) -> ModuleType | None:
     return _worth(TRIANGLES, systems * size**3 * TRIANGLE_S)
 
 
-def _worth(name: str, numpy_s: float) -> ModuleType | None:
-    """Compiled code for a job that takes NumPy so many CPU seconds; None where that is quicker."""
+def _worth(name: str, numpy_s: float, job_s: float = 0.0) -> ModuleType | None:
+    """Compiled code for (a part of) a job that takes NumPy so many CPU seconds; None where that is quicker."""
     chosen = switch()
     _in_numpy_s[name] += numpy_s  # many small jobs of one process are a large one
-    if chosen == "never" or (chosen == "auto" and (numpy_s < LEAST_S or _in_numpy_s[name] < _cost_s(name))):
+    job_s = max(job_s, numpy_s)
+    if chosen == "never" or (chosen == "auto" and (job_s < LEAST_S or max(job_s, _in_numpy_s[name]) < _cost_s(name))):
         return None
     state = load(name)
     if state.kernels is None and (chosen == "always" or find_spec("numba") is not None):

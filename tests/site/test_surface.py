@@ -53,6 +53,8 @@ def test_draws_spread_as_the_surface_says() -> None:
     surface = surface_through(hills(25, 0.3), FRAME, REACH)
     at = np.array([[-300.0, 200.0], [0.0, 0.0], [250.0, -350.0], [480.0, 480.0]])
     drawn = np.array([surface.dem(np.random.default_rng(k)).absolute_m(*at.T) for k in range(100)])
+    together = [dem.absolute_m(*at.T) for dem in surface.dems(map(np.random.default_rng, range(3)))]
+    np.testing.assert_array_equal(together, drawn[:3])
     np.testing.assert_allclose(drawn.mean(axis=0), surface.dem().absolute_m(*at.T), atol=0.25 * surface.deviation_m)
     np.testing.assert_allclose(drawn.std(axis=0), surface.sd_m(*at.T), rtol=0.2, atol=0.05)
 

@@ -47,10 +47,9 @@ def agreement_by_ground(
         return {}
     known = known[spread_out(len(known), _POSES)]
     some = Poses(replayed.poses.position_m[poses[known]], replayed.poses.rotation[poses[known]])
-    surface, agreed = ground_surface(model, data.site.frame), []
-    for seed in range(_DRAWS):
-        site = _on(data.site, surface.dem(np.random.default_rng(seed)))
-        h = replay_poses(site, data.settings.rt, replayed.link, some).h[:, 0]
+    agreed = []
+    for ground in ground_surface(model, data.site.frame).dems(map(np.random.default_rng, range(_DRAWS))):
+        h = replay_poses(_on(data.site, ground), data.settings.rt, replayed.link, some).h[:, 0]
         agreed.append([float((channel_rank(h, k) == measured[known]).mean()) for k in ks])
     return {f"{k:g}": float(sd) for k, sd in zip(ks, np.std(agreed, axis=0, ddof=1), strict=True)}
 

@@ -6,6 +6,7 @@ curvature is not); its variance and length are those under which the points are 
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import product
@@ -66,6 +67,10 @@ class Surface:
 
     def dem(self, drawn: np.random.Generator | None = None) -> Dem:
         """The most likely surface as an elevation model, or one drawn from those that the points allow."""
+        return next(self.dems([drawn]))
+
+    def dems(self, draws: Iterable[np.random.Generator | None]) -> Iterator[Dem]:
+        """:meth:`dem` of each, the covariance of cells and points computed once."""
         west, east, south, north = self.reach_m
         cell = max(_CELL_M, float(np.sqrt((east - west) * (north - south) / _MOST_CELLS)))
         columns, rows = (int(np.ceil(span / cell)) + 1 for span in (east - west, north - south))
@@ -74,17 +79,19 @@ class Surface:
             south + cell * np.arange(rows, dtype=np.float64),
         )
         place = np.stack(np.meshgrid(across, along), axis=-1).reshape(-1, 2)
-        off = self.height_m - self.level_m
-        prior = np.zeros(len(place))
-        if drawn is not None:  # what was drawn, corrected by what the points say of it
-            waves = self._waves(drawn)
-            prior = waves.on_grid(across, along).ravel()
-            off = off + drawn.normal(0.0, self.error_m) - waves(self.place_m)
-        height = self.level_m + prior + self._between(place) @ self._factor().solve(off)
-        return Dem(
-            height_m=height.reshape(rows, columns), west=west, south=south, step_x=cell, step_y=cell, crs="local",
-            frame=self.frame,
-        )  # fmt: skip
+        near, factor = self._between(place), self._factor()
+        for drawn in draws:
+            off = self.height_m - self.level_m
+            prior = np.zeros(len(place))
+            if drawn is not None:  # what was drawn, corrected by what the points say of it
+                waves = self._waves(drawn)
+                prior = waves.on_grid(across, along).ravel()
+                off = off + drawn.normal(0.0, self.error_m) - waves(self.place_m)
+            height = self.level_m + prior + near @ factor.solve(off)
+            yield Dem(
+                height_m=height.reshape(rows, columns), west=west, south=south, step_x=cell, step_y=cell, crs="local",
+                frame=self.frame,
+            )  # fmt: skip
 
     def sd_m(self, east_m: FloatArray, north_m: FloatArray) -> FloatArray:
         """Standard deviation (places,) of the surface [m]."""

@@ -117,7 +117,7 @@
   }
   function describe() {
     const i = state.point;
-    cells(at("here"), i === null ? [["At the pointer", "point at the map"]] : [...place(i), ...group().layers.map(l => [l.name.replace(/ \[.*\]/, ""), words(l, values(l)[i])])]);
+    cells(at("here"), i === null ? [["At the pointer", `point at the ${sphere() ? "sphere" : "map"}`]] : [...place(i), ...group().layers.map(l => [l.name.replace(/ \[.*\]/, ""), words(l, values(l)[i])])]);
   }
   function everything() { later(drawMap, drawLegend, drawAlong, describe); }
   function choose(i, name = "") {

@@ -34,7 +34,7 @@ from aerpaw_cmp.jobs.learning.calibrate import (
     recipe_of,
 )
 from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks
-from aerpaw_cmp.jobs.learning.calibrate_rank import fit_rank
+from aerpaw_cmp.jobs.learning.calibrate_rank import fit_rank, samples_by_tower
 from aerpaw_cmp.jobs.learning.calibration_files import Calibrated, site_entry
 from aerpaw_cmp.site.antenna.learned import folder_of, remember
 
@@ -60,7 +60,7 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
     shutil.copyfile(packaged.with_suffix(".yaml"), site)
     settings = load_calibration(path)
     flights, _ = read_flights(settings, path.parent, field)
-    ranked = None if settings.rank is None else fit_rank(flights, settings.rank)
+    ranked = None if settings.rank is None else fit_rank(samples_by_tower(flights), settings.rank)
     observed, _ = observe(flights)
     chosen = recipe_of(settings, observed, field)
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(SPLITS, ())

@@ -25,7 +25,8 @@ from typer.core import TyperCommand
 
 from ..common.commands import COMMANDS
 from ..common.errors import UsageError
-from .shown import say
+from ..common.stages import NotRun
+from .shown import print_plan, say
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
@@ -66,7 +67,9 @@ Flights = Annotated[
         help="Flown flight.yaml to learn from, or calibration.yaml: its flights; repeatable.",
     ),
 ]
-DryRun = Annotated[bool, Option("--dry-run", help="Print stages and time estimate; write nothing.")]
+DryRun = Annotated[
+    bool, Option("--dry-run", help="Check everything but the computing, print the stages, write nothing.")
+]
 Quiet = Annotated[
     bool,
     Option("-q", "--quiet", help="Results, warnings and failures only."),
@@ -136,6 +139,9 @@ def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
                     raise UsageError(f"--{option.replace('_', '-')} {number}", expected="a finite number")
         try:
             return function(**arguments)
+        except NotRun as ended:
+            print_plan(ended.plan, arguments["as_json"])
+            return 0
         except KeyboardInterrupt as error:
             raise Interrupted(error) from None  # typer would make a silent exit code of it
 

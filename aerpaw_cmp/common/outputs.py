@@ -322,12 +322,6 @@ class OutputFolder:
             if not self._written:
                 _say_kept(error, self.named)
 
-    def refuse(self) -> None:
-        """UsageError where a run with this output would be refused; writes nothing."""
-        with explained_os_errors(self.named):
-            self._refuse_shape()
-            self._refuse_content()
-
     def _refuse_shape(self) -> None:
         """UsageError for a name that no folder of results can have."""
         if _taken(self.target) and not self.target.is_dir():

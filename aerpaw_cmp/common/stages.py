@@ -7,12 +7,12 @@ import logging
 import re
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from .interrupts import raise_interrupt
 
@@ -64,6 +64,63 @@ def share_of(progress: Progress, text: str) -> Callable[[float], None]:
     return step
 
 
+_MEASURED = "seconds of reading, CPU seconds of a replay tried on a few poses now; a stage with a dash was not tried"
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedStage:
+    """A stage: what it works on, and seconds, None where they cannot be told beforehand."""
+
+    name: str
+    work: str
+    seconds: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """Plan of what a command would do.
+
+    Parameters
+    ----------
+    job : str
+    inputs : tuple of Path
+        Files that would be read.
+    output : Path
+        What would be written; its place was tried and would be taken.
+    stages : tuple of PlannedStage
+    """
+
+    job: str
+    inputs: tuple[Path, ...]
+    output: Path
+    stages: tuple[PlannedStage, ...] = ()
+
+    @property
+    def seconds(self) -> float:
+        """Of all stages that can be told."""
+        return sum(stage.seconds or 0.0 for stage in self.stages)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The plan as JSON can hold it."""
+        return {
+            "job": self.job,
+            "inputs": [str(path) for path in self.inputs],
+            "output": str(self.output),
+            "stages": [asdict(stage) for stage in self.stages],
+            "seconds": self.seconds,
+            "not_estimated": [stage.name for stage in self.stages if stage.seconds is None],
+            "measured": _MEASURED,
+        }
+
+
+class NotRun(Exception):  # noqa: N818  # the end that a dry run has, no error
+    """A dry run came to where computing would begin; ``plan`` says what the run would do."""
+
+    def __init__(self, plan: Plan) -> None:
+        super().__init__(f"{plan.job} was not run")
+        self.plan = plan
+
+
 @dataclass(slots=True)
 class Stages:
     """Seconds of each named stage, in order.
@@ -74,6 +131,8 @@ class Stages:
         Gets the name of each stage as it begins.
     seconds : dict of str to float
         What has been spent; a name that comes twice adds up.
+    plan : Plan, optional
+        Of a dry run.
 
     Examples
     --------
@@ -86,6 +145,13 @@ class Stages:
 
     progress: Progress = logged
     seconds: dict[str, float] = field(default_factory=dict)
+    plan: Plan | None = None
+
+    def checked(self, rest: Callable[[], Iterable[PlannedStage]]) -> None:
+        """End a dry run by :class:`NotRun`: a job calls it when only computing is left, the stages of ``rest``."""
+        if self.plan is not None:
+            done = (PlannedStage(name, "done", seconds) for name, seconds in self.seconds.items())
+            raise NotRun(replace(self.plan, stages=(*done, *rest())))
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:

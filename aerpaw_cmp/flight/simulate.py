@@ -8,9 +8,10 @@ flight.yaml for ``aerpaw-cmp report``, which must recover what was planted.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from datetime import datetime
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,12 +22,12 @@ from ..common.errors import UsageError
 from ..common.files import inside
 from ..common.geodesy import SiteFrame, bearing_deg
 from ..common.outputs import SUMS, OutputFolder
-from ..common.stages import Progress, logged
+from ..common.stages import PlannedStage, Stages
 from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
 from ..common.yamlfile import dump_yaml
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
-from ..propagation.geometry.arrays import Poses, rotation_from_aircraft
+from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
 from ..site.site import Site
 from .data import site_place
 from .pose.track import interpolated
@@ -249,7 +250,7 @@ class FlightSimulator:
         self.folder = folder
 
     def run(
-        self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, progress: Progress = logged
+        self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, stages: Stages | None = None
     ) -> list[Path]:
         """Write a folder with every log of the flight file, the file itself and truth.json; gives the paths written.
 
@@ -261,8 +262,8 @@ class FlightSimulator:
             Files that may not lie in it: the flight file and what it names.
         force : bool
             Replace files that were changed after this tool wrote them, too.
-        progress : Progress
-            Gets the path of each log.
+        stages : Stages, optional
+            Its progress gets the path of each log.
 
         Returns
         -------
@@ -290,12 +291,16 @@ class FlightSimulator:
         self.start_utc = start.tz_convert("UTC").tz_localize(None)
         self.truth_: dict[str, Any] = {"flight": self.settings.flight.name, "synthetic": True, "rss": {}, "rank": {}}
         self._check_names(out)
+        writers = {log.path: self._writer(log) for log in self.settings.logs}
+        stages = stages or Stages()
         with OutputFolder(out, job="simulate", inputs=inputs, force=force) as output:
+            lasts = f"{self.trajectory.duration_s:.0f} s of flight: "
+            stages.checked(lambda: [PlannedStage("logs", lasts + ", ".join(writers))])
             contents: dict[str, bytes] = {}
-            for log in self.settings.logs:
-                progress(log.path)
-                contents[log.path], damage = self._with_bad_lines(self._log_bytes(log))
-                self.truth_.setdefault("bad_lines", {})[log.path] = damage
+            for name, write in writers.items():
+                stages.progress(name)
+                contents[name], damage = self._with_bad_lines(write())
+                self.truth_.setdefault("bad_lines", {})[name] = damage
             self.truth_["plan"] = plan.model_dump(mode="json")
             contents |= {
                 FLIGHT: dump_yaml(self._flight_file()).encode("utf-8"),
@@ -322,7 +327,8 @@ class FlightSimulator:
             if names.count(name) > 1 or name in (_TRUTH, FLIGHT, SUMS):
                 raise UsageError(f"two files of this flight are named {name!r}", expected="a name of its own for each")
 
-    def _log_bytes(self, log: LogSettings) -> bytes:
+    def _writer(self, log: LogSettings) -> Callable[[], bytes]:
+        """Function that computes a log; UsageError for one that cannot be."""
         writers = {
             "vehicle_out": self._telemetry_log,
             "sounder_log": self._rss_log,
@@ -332,7 +338,17 @@ class FlightSimulator:
             raise UsageError(
                 f"no writer for log {log.path!r} with reader {log.reader!r}", expected="one of " + ", ".join(writers)
             )
-        return writers[log.reader](log)
+        if log.reader == "vehicle_out":
+            return partial(self._telemetry_log, log)
+        if log.reader == "sounder_log" and (log.node is None or log.channel is None):
+            raise UsageError(f"log {log.path!r} does not say whose it is", expected="'node' and 'channel'")
+        links, tower = self.settings.link, log.node or self.settings.rank.tower
+        if tower not in self.site.towers:
+            raise UsageError(f"the site has no tower {tower!r}", expected="one of " + ", ".join(self.site.towers))
+        if log.reader == "quectel_ri":
+            return partial(self._rank_log, log, tower, links.rank.build([tower], self.folder))
+        link = links.channels.get(str(log.channel), links.rss).build([tower], self.folder)
+        return partial(self._rss_log, log, tower, link)
 
     def _telemetry_log(self, log: LogSettings) -> bytes:
         frame = telemetry_frame(self.trajectory, self.start_utc, self.plan.telemetry_interval_s, self.site.frame)
@@ -349,28 +365,22 @@ class FlightSimulator:
             roll, pitch = np.zeros_like(roll), np.zeros_like(pitch)
         return Poses(position, rotation_from_aircraft(roll, pitch, yaw))
 
-    def _rss_log(self, log: LogSettings) -> bytes:
-        if log.node is None or log.channel is None:
-            raise UsageError(f"log {log.path!r} does not say whose it is", expected="'node' and 'channel'")
-        if log.node not in self.site.towers:
-            raise UsageError(f"the site has no tower {log.node!r}", expected="one of " + ", ".join(self.site.towers))
+    def _rss_log(self, log: LogSettings, tower: str, link: Link) -> bytes:
         plan = self.plan
         time_s = np.arange(0.0, self.trajectory.duration_s, plan.rss_interval_s)
-        links = self.settings.link
-        link = links.channels.get(log.channel, links.rss).build([log.node], self.folder)
         result = replay_poses(self.site, self.settings.rt, link, self._poses(time_s))
-        offset = plan.offsets_db.get(log.node, {}).get(log.channel, 0.0)
+        offset = plan.offsets_db.get(tower, {}).get(str(log.channel), 0.0)
         summed = result.rss_power_dbm if self.settings.rss.field == "power" else result.rss_dbm
         level = summed[:, 0] - offset
         level = level + correlated_noise(
             self.generator, len(level), plan.fading_db, plan.rss_interval_s, plan.fading_correlation_s
         )
         out_of_coverage = ~np.isfinite(level) | (level < _LOWEST_DBM)
-        shift = plan.clock_shift_s.get(log.node, 0.0)
-        self.truth_["rss"].setdefault(log.node, {})[log.channel] = {
+        shift = plan.clock_shift_s.get(tower, 0.0)
+        self.truth_["rss"].setdefault(tower, {})[str(log.channel)] = {
             "offset_db": offset,
             "fading_db": plan.fading_db,
-            "clock_shift_s": plan.clock_shift_s.get(log.node, 0.0),
+            "clock_shift_s": shift,
             "samples": len(level),
             "out_of_coverage": int(out_of_coverage.sum()),
         }
@@ -380,10 +390,9 @@ class FlightSimulator:
             str(log.timezone or self.settings.timezone),
         )
 
-    def _rank_log(self, log: LogSettings) -> bytes:
-        plan, tower = self.plan, log.node or self.settings.rank.tower
+    def _rank_log(self, log: LogSettings, tower: str, link: Link) -> bytes:
+        plan = self.plan
         time_s = np.arange(0.0, self.trajectory.duration_s, plan.rank_interval_s)
-        link = self.settings.link.rank.build([tower], self.folder)
         poses = self._poses(time_s)
         result = replay_poses(self.site, self.settings.rt, link, poses)
         truth = channel_rank(result.h[:, 0], plan.rank_k)

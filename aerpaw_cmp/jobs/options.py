@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..common.stages import Progress, logged
+from ..common.stages import Plan, Progress, Stages, logged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,6 +28,8 @@ class RunOptions:
         Address of a Dask scheduler, in place of workers here.
     progress : Progress
         Gets stages and the share done.
+    dry : bool
+        Check and write nothing: the job ends by :class:`~aerpaw_cmp.common.stages.NotRun` where computing would begin.
     """
 
     out: Path | None = None
@@ -35,6 +38,12 @@ class RunOptions:
     workers: int = 1
     scheduler: str | None = None
     progress: Progress = logged
+    dry: bool = False
+
+    def stages(self, job: str, inputs: Iterable[Path], output: Path) -> Stages:
+        """Stages of a job; those of a dry run end it."""
+        plan = Plan(job=job, inputs=tuple(inputs), output=output) if self.dry else None
+        return Stages(self.progress, plan=plan)
 
 
 DEFAULT = RunOptions()

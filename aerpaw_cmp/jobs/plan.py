@@ -1,4 +1,4 @@
-"""Plan of what a command would do and about how long it would take: ``report --dry-run`` and ``map --dry-run``.
+"""Stages of a report or a map, and about how long they would take, for ``--dry-run``.
 
 The replay is timed: a few poses of the job itself, on this machine, now. Stages that cannot be tried in a second have
 no time.
@@ -8,71 +8,20 @@ from __future__ import annotations
 
 import dataclasses
 import time
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..common.counting import counted
-from ..common.stages import Stages
+from ..common.stages import PlannedStage, Stages
 from ..common.units import spread_out
 from ..flight.data import FlightData
-from ..flight.settings import FlightFile, RtSettings
+from ..flight.settings import RtSettings
 from ..propagation.geometry.arrays import Link, Poses
 from ..site.site import Site
-from ..site.siteyaml import load_site
-
-MEASURED = "CPU seconds of reading and replay, tried on a few poses now; a stage with a dash was not tried"
 
 # Of the two replays that a time is extrapolated from, and of the tiles of a map.
 TRIED_POSES, _TRIED_TILES = (32, 160), 4
-
-
-@dataclass(frozen=True, slots=True)
-class PlannedStage:
-    """A stage: what it works on, and CPU seconds, None where they cannot be told beforehand."""
-
-    name: str
-    work: str
-    seconds: float | None = None
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Plan:
-    """Plan of what a command would do.
-
-    Parameters
-    ----------
-    job : str
-    inputs : tuple of Path
-        Files that would be read.
-    output : Path
-        What would be written; it was looked at and would be taken.
-    stages : tuple of PlannedStage
-    """
-
-    job: str
-    inputs: tuple[Path, ...]
-    output: Path
-    stages: tuple[PlannedStage, ...]
-
-    @property
-    def seconds(self) -> float:
-        """CPU seconds of all stages that can be told."""
-        return sum(stage.seconds or 0.0 for stage in self.stages)
-
-    def as_dict(self) -> dict[str, Any]:
-        """The plan as JSON can hold it."""
-        return {
-            "job": self.job,
-            "inputs": [str(path) for path in self.inputs],
-            "output": str(self.output),
-            "stages": [dataclasses.asdict(stage) for stage in self.stages],
-            "seconds": self.seconds,
-            "not_estimated": [stage.name for stage in self.stages if stage.seconds is None],
-            "measured": MEASURED,
-        }
 
 
 def _cpu_seconds(work: Any) -> float:
@@ -81,46 +30,12 @@ def _cpu_seconds(work: Any) -> float:
     return time.process_time() - start
 
 
-def report_plan(
-    settings: FlightFile, folder: Path, logs_root: Path | None, *, inputs: list[Path], out: Path, figures: str = "none"
-) -> Plan:
-    """Stages, links, poses and time of a report; reads the logs and writes nothing.
-
-    Parameters
-    ----------
-    settings : FlightFile
-        With what the command line says instead.
-    folder : Path
-        Of the flight file.
-    logs_root : Path, optional
-    inputs : list of Path
-        Files that the flight names.
-    out : Path
-        Folder of the results.
-    figures : str
-        As for the report.
-
-    Returns
-    -------
-    Plan
-        Stages with their work and time [s].
-
-    Raises
-    ------
-    UsageError, InputError
-        What the report itself would raise of its settings and logs.
-    """
-    from ..flight.data import load_data
-
-    start = time.process_time()
-    data = load_data(settings, folder, logs_root)
-    reading = time.process_time() - start
+def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
+    """Links, poses and time [s] of a report of a flight that was read; ``figures`` as for the report."""
     n_rss, n_rank = (sum(len(item.time) for item in series) for series in (data.rss, data.rank))
     rss, rank = _tried_replays(data)
-    rt = settings.rt
-    stages = [
-        PlannedStage("read", counted(len(inputs), "file"), reading),
-    ]
+    settings, rt = data.settings, data.settings.rt
+    stages = []
     if n_rss and settings.rss.lag in ("estimate", "apply"):
         stages.append(PlannedStage("clocks", counted(len({series.tower for series in data.rss}), "receiver")))
     stages += [
@@ -135,8 +50,7 @@ def report_plan(
     if n_rss and rt.engine == "image":
         stages.append(PlannedStage("ladder", "simpler and richer models"))
     drawn = 0 if figures == "none" else len(data.rss) + len(data.rank)
-    stages.append(PlannedStage("report", f"page, figures of {counted(drawn, 'channel')}"))
-    return Plan(job="report", inputs=tuple(inputs), output=out, stages=tuple(stages))
+    return [*stages, PlannedStage("report", f"page, figures of {counted(drawn, 'channel')}")]
 
 
 def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedStage]]:
@@ -196,28 +110,12 @@ def _tiles(site: Site, settings: Any, tiling: Any) -> PlannedStage:
     )
 
 
-def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan:
-    """Stages, links and time of a map; a coarse grid is computed for the estimate, and nothing is written.
-
-    Parameters
-    ----------
-    site : str
-        site.yaml, or the name of a packaged site.
-    settings : MapSettings
-    inputs : list of Path
-    out : Path
-        Folder of the results.
-
-    Returns
-    -------
-    Plan
-        Stages with their work and time [s].
-    """
+def map_stages(place: Site, settings: Any, n_flights: int = 0) -> list[PlannedStage]:
+    """Links and time [s] of a map with :class:`MapSettings`; a coarse grid is computed for the estimate."""
     from ..maps.grid import Grid
     from ..maps.tiles import Tiling
     from .mapping.coverage_map import make_maps
 
-    place = load_site(site)
     grid = Grid.over_area(place.area_m, settings.spacing_m)
     positions, cells = len(grid), settings.tile_cells(grid) if settings.engine == "image" else None
     heights = len(set(settings.rss_altitudes_m) | set(settings.rank_altitudes_m))
@@ -234,8 +132,9 @@ def map_plan(site: str, settings: Any, *, inputs: list[Path], out: Path) -> Plan
             tried = len(Grid.over_area(place.area_m, coarse.spacing_m))
             seconds = _cpu_seconds(lambda chosen=coarse: make_maps(place, chosen, Stages())) * positions / tried
         stages.append(PlannedStage(f"maps, foliage {mode}", work, seconds))
+    if n_flights:
+        stages.append(PlannedStage("correct, compare", counted(n_flights, "flight")))
     if settings.study and not cells:
         stages.append(PlannedStage("study", "correlation and interpolation"))
     layers = heights * len(place.towers) * len(settings.foliage) * (1 + len(settings.ks))
-    stages.append(PlannedStage("export, page", f"some {layers} layers"))
-    return Plan(job="map", inputs=tuple(inputs), output=out, stages=tuple(stages))
+    return [*stages, PlannedStage("export, page", f"some {layers} layers")]

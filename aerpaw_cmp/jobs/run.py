@@ -15,7 +15,7 @@ from ..common.errors import UsageError, noting_interrupts
 from ..common.files import cache_folder
 from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
-from ..common.stages import Stages
+from ..common.stages import PlannedStage, Stages
 from .options import DEFAULT, JobOutcome, RunOptions
 
 _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
@@ -156,7 +156,8 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
     simulator = FlightSimulator(settings, site, flight.parent)
     inputs = inputs_of_flight(settings.model_copy(update={"logs": []}), flight)  # the logs are its outputs
     folder = options.out or Path("simulated") / settings.flight.name
-    files = simulator.run(folder, inputs=inputs, force=options.force, progress=options.progress)
+    stages = options.stages("simulate", inputs, folder)
+    files = simulator.run(folder, inputs=inputs, force=options.force, stages=stages)
     return JobOutcome(folder=folder, files=tuple(files))
 
 
@@ -213,6 +214,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
     from ..report.content.flight_parts import report_data
     from ..report.exports.tables import metrics as metrics_of
     from ..report.pages.flight_folder import write_report
+    from .plan import report_stages
     from .reporting.flight_run import run_flight
     from .reporting.foliage_notes import foliage_notes
     from .reporting.ladder import recommended_text
@@ -221,7 +223,8 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
 
     formats = _checked(flight, chosen, options)
     settings, inputs, folder = _report_inputs(flight, chosen, options)
-    stages, learned = Stages(options.progress), None if chosen.learned is None else Path(chosen.learned)
+    stages = options.stages("report", inputs, folder)
+    learned = None if chosen.learned is None else Path(chosen.learned)
     with ExitStack() as outputs:
         output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=options.force))
         target = None
@@ -235,6 +238,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
                 from .prediction.against import score_against  # loads what calibration and prediction need
 
                 before = score_against(data, Path(chosen.against))
+        stages.checked(lambda: report_stages(data, chosen.figures))
         replays = replay_flight(data, stages)
         flight_run = run_flight(data, stages, replays=replays, anew=chosen.audit is not None, ladder=True)
         carriers = {replayed.link.carrier_hz for replayed in replays.all}
@@ -280,16 +284,6 @@ def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> 
     settings = _with_audit(load_with_learned(flight, learned), chosen.audit)
     inputs = [*inputs_of_flight(settings, flight, options.logs_root), *([] if learned is None else [learned])]
     return settings, inputs, options.out or Path("reports") / settings.flight.name
-
-
-def plan_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunOptions = DEFAULT) -> Any:
-    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing."""
-    from .plan import report_plan
-
-    _checked(flight, chosen, options)
-    settings, inputs, folder = _report_inputs(flight, chosen, options)
-    OutputFolder(folder, job="report", inputs=inputs, force=options.force).refuse()
-    return report_plan(settings, flight.parent, options.logs_root, inputs=inputs, out=folder, figures=chosen.figures)
 
 
 def _require_same_folder(recommend: Path, flight: Path, logs_root: Path | None) -> None:
@@ -432,16 +426,20 @@ def run_map(
     from ..site.siteyaml import load_site
     from .mapping import coverage_map as mapping
     from .mapping.paper_table import paper_markdown, paper_rows
+    from .plan import map_stages
     from .prediction.sources import files_of, named_flights
+    from .tasks.manifest import inputs_of_site
     from .tasks.workers import open_workers
 
     known = named_flights(flights)
-    place, progress, stages = load_site(site), options.progress, Stages(options.progress)
+    place, progress = load_site(site), options.progress
     if flights and settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m)):
         raise UsageError("flights and a map in tiles", expected="fewer receivers, or a map without --with")
-    inputs, folder = _map_inputs(site, options)
-    inputs += files_of(known, options.logs_root)
+    inputs = [*inputs_of_site(site), *files_of(known, options.logs_root)]
+    folder = options.out or Path("reports") / f"map-{Path(site).stem}"
+    stages = options.stages("map", inputs, folder)
     with OutputFolder(folder, job="map", inputs=inputs, force=options.force) as output:
+        stages.checked(lambda: map_stages(place, settings, len([flight.load(options.logs_root) for flight in known])))
         file = [Path(site).absolute()] if Path(site).is_file() else []
         with open_workers(options.workers, options.scheduler, paths=file, progress=progress) as crew:
             outcome = mapping.make_maps(
@@ -468,38 +466,6 @@ def run_map(
                 written.append(part / "paper.md")
                 written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
         return JobOutcome(folder=folder, metrics=maps_metrics(record), files=output.placed([*written, *files]))
-
-
-def _map_inputs(site: str, options: RunOptions) -> tuple[list[Path], Path]:
-    """Files that a map is made from, and the folder of its results."""
-    from .tasks.manifest import inputs_of_site
-
-    return inputs_of_site(site), options.out or Path("reports") / f"map-{Path(site).stem}"
-
-
-def plan_map(site: str, settings: Any, options: RunOptions = DEFAULT) -> Any:
-    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a map: what :func:`run_map` would do; writes nothing.
-
-    Parameters
-    ----------
-    site : str
-    settings : MapSettings
-    options : RunOptions
-
-    Returns
-    -------
-    Plan
-
-    Raises
-    ------
-    UsageError, InputError
-        What the map itself would raise of its settings and output.
-    """
-    from .plan import map_plan
-
-    inputs, folder = _map_inputs(site, options)
-    OutputFolder(folder, job="map", inputs=inputs, force=options.force).refuse()
-    return map_plan(site, settings, inputs=inputs, out=folder)
 
 
 def _compared(flight: Any, options: RunOptions, stages: Stages) -> Any:
@@ -635,7 +601,7 @@ def run_calibrate(
     from ..site.antenna.learned import read_learned, remember
     from ..site.siteyaml import site_model
     from .learning.calibrate import calibrate, load_calibration, read_flights
-    from .learning.calibrate_rank import fit_rank
+    from .learning.calibrate_rank import fit_rank, samples_by_tower
     from .learning.calibration_files import Calibrated, site_entry, write_files
     from .tasks.manifest import inputs_of_flights, inputs_of_site
 
@@ -649,19 +615,21 @@ def run_calibrate(
     inputs = input_files(settings, path, options.logs_root)
     inputs += inputs_of_flights([*(path.parent / name for name in settings.flights), *score], options.logs_root)
     inputs += [] if into_site is None else inputs_of_site(into_site)
-    stages, folder = Stages(options.progress), target.with_suffix("")
+    stages, folder = options.stages("calibrate", inputs, target), target.with_suffix("")
     with (
         OutputFile(target, own=is_sealed, inputs=inputs, force=options.force) as file,
         OutputFolder(folder, job="calibrate", inputs=inputs, force=options.force) as output,
     ):
         with stages("read"):
             flights, remarks = read_flights(settings, path.parent, options.logs_root)
+            reports = {} if settings.rank is None else samples_by_tower(flights)
         ranked, calibration = None, None
+        if settings.rank is None or any(data.rss for data in flights):
+            calibration = calibrate(settings, flights, path.parent, options.logs_root, stages=stages, score=score)
+        stages.checked(lambda: [PlannedStage("rank", counted(len(reports), "receiver"))])
         if settings.rank is not None:
             with stages("rank"):
-                ranked = fit_rank(flights, settings.rank)
-        if ranked is None or any(data.rss for data in flights):
-            calibration = calibrate(settings, flights, path.parent, options.logs_root, stages=stages, score=score)
+                ranked = fit_rank(reports, settings.rank)
         calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked)
         with output.filling() as place:
             metrics, text = write_files(calibrated, place, folder.name, stages.seconds)

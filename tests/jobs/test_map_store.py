@@ -373,10 +373,9 @@ def test_the_command_in_tiles(tmp_path, monkeypatch, capsys, blank_pictures):
 
 
 def test_the_plan_of_tiles_tries_some_of_them(tmp_path):
-    from aerpaw_cmp.jobs.plan import map_plan
+    from aerpaw_cmp.jobs.plan import map_stages
 
-    plan = map_plan(SITE, SETTINGS, inputs=[], out=tmp_path / "out")
-    maps = next(stage for stage in plan.stages if stage.name == "maps in tiles")
+    maps = next(stage for stage in map_stages(load_site(SITE), SETTINGS) if stage.name == "maps in tiles")
     assert maps.work == "8 tiles of 5 x 5 positions"
     assert maps.seconds > 0
     assert not list(tmp_path.iterdir())

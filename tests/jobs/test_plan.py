@@ -1,6 +1,7 @@
 """``--dry-run``: what would run is what runs, the time follows the work, nothing is written."""
 
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -56,13 +57,74 @@ def test_a_planned_report_names_its_links_and_poses_and_writes_nothing(
     assert "not run" in capsys.readouterr().out
 
 
-def test_what_a_run_would_refuse_a_plan_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+COMMANDS = {
+    "report": "report FLIGHT --audit none",
+    "map": "map --quick --foliage none --with FLIGHT",
+    "predict": "predict lake_wheeler --with FLIGHT --spacing 120",
+    "plan": "plan lake_wheeler --with FLIGHT",
+    "calibrate": "calibrate CALIBRATION --score FLIGHT",
+    "simulate": "simulate FLIGHT",
+}
+WRONG = {
+    "report": "--recommend FLIGHT|--against nope|--export bananas|report LOST",
+    "map": "--with nope.yaml|--with LOST",
+    "predict": "--with nope.yaml|--with LOST|--site nowhere",
+    "plan": "--route nope.kml|--geofence nope.kml|--minutes 1 --tower-distance 5000|--with LOST",
+    "calibrate": "--score LOST|--into-site nowhere|-o learned.txt|calibrate LOST",
+    "simulate": "--nonsense|simulate LOST",
+}
+
+
+@pytest.fixture
+def place(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Folder with a flight and what names it, one without its logs, and places that no output can take."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copytree(SAMPLE, tmp_path / "logs")
+    (tmp_path / "calibration.yaml").write_text("calibration: mine\nflights: [logs/flight.yaml]\n")
+    (tmp_path / "lost.yaml").write_text((SAMPLE / "flight.yaml").read_text().replace("node: LW3", "node: LW9"))
+    (tmp_path / "taken").write_text("x")
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "notes.txt").write_text("x")
-    for line in (["report", SAMPLE / "flight.yaml", "-o", tmp_path / "mine"], ["map", "--quick", "-o", tmp_path / "mine"],
-                 ["report", SAMPLE / "flight.yaml", "--export", "bananas"], ["report", tmp_path / "missing.yaml"], ["map", tmp_path / "missing.yaml"]):  # fmt: skip
-        assert main([*map(str, line), "--dry-run"]) in (2, 3), line
-        assert capsys.readouterr().out == ""
+    return tmp_path
+
+
+def words(line: str) -> list[str]:
+    files = {"FLIGHT": "logs/flight.yaml", "CALIBRATION": "calibration.yaml", "LOST": "lost.yaml"}
+    return [files.get(word, word) for word in line.split()]
+
+
+def everything(folder: Path) -> dict[Path, bytes | None]:
+    return {path: path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_dry_run_says_what_it_would_do_and_writes_nothing(
+    name: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = everything(place)
+    plan = planned(capsys, *words(COMMANDS[name]), "-o", "out.yaml")
+    assert everything(place) == before
+    assert (plan["job"], plan["output"]) == (name, "out.yaml")
+    assert plan["inputs"]
+    assert [stage["name"] for stage in plan["stages"] if stage["name"] not in ("read", "candidates")]
+    assert main([*words(COMMANDS[name]), "--dry-run"]) == 0
+    assert f"{name}, not run" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_a_dry_run_ends_as_the_run_does_on_wrong_input(
+    name: str, place: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = everything(place)
+    every = ("-o taken/out.yaml", "-o mine", f"{name} nope.yaml", *WRONG[name].split("|"))
+    for line in (wrong if wrong.startswith(name) else f"{COMMANDS[name]} {wrong}" for wrong in every):
+        said = []
+        for option in ([], ["--dry-run"]):
+            code = main([*words(line), *option])
+            said.append((code, capsys.readouterr().err.splitlines()[-1]))
+        assert said[0][0] in (2, 3), line
+        assert said[0] == said[1], line
+    assert everything(place) == before
 
 
 def test_the_time_of_a_replay_follows_its_poses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

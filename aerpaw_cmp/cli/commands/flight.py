@@ -11,7 +11,7 @@ from typer import Argument, Option
 from ...common.counting import counted
 from ...jobs.options import RunOptions
 from ..app import DryRun, Export, Force, Json, LogsRoot, command, output
-from ..shown import number, print_files, print_json, print_plan, records, say, show, table, warn_all
+from ..shown import number, print_files, print_json, records, say, show, table, warn_all
 
 
 @command(
@@ -70,10 +70,7 @@ def report(
         style=style,
         export=export or (),
     )
-    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
-    if dry_run:
-        print_plan(run.plan_report(flight, chosen, options), as_json)
-        return 0
+    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     outcome = run.run_report(flight, chosen, options)
     if as_json:
         print_json(outcome.metrics)
@@ -188,13 +185,14 @@ def calibrate(
     score: Annotated[
         list[Path] | None, Option(help="flight.yaml to score with the learned settings; repeatable.")
     ] = None,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Learn antennas and ground from several flights."""
     from ...jobs import run
 
-    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+    options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     outcome = run.run_calibrate(calibration_yaml, options, into_site=into_site, score=score or ())
     if as_json:
         print_json(outcome.metrics)
@@ -236,13 +234,14 @@ def calibrate(
 def simulate(
     flight: Annotated[Path, Argument(help="flight.yaml with flight.plan")],
     out: Annotated[Path | None, output("Output folder  [default: simulated/<flight>]")] = None,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Forward-simulate a planned flight into logs of the real formats."""
     from ...jobs import run
 
-    options = RunOptions(out=out, force=force, progress=say)
+    options = RunOptions(out=out, force=force, progress=say, dry=dry_run)
     print_files(run.run_simulate(flight, options).files, as_json)
 
 

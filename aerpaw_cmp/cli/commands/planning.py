@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from ...common.counting import counted
 from ...jobs.options import RunOptions
-from ..app import Flights, Force, Json, LogsRoot, command, output
+from ..app import DryRun, Flights, Force, Json, LogsRoot, command, output
 from ..shown import print_json, records, say, show, warn_all
 
 
@@ -45,6 +45,7 @@ def predict(
         Option(help="Heading at all points [deg]  [default: that of the route; where it says none, all count alike]"),
     ] = None,
     logs_root: LogsRoot = None,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -56,7 +57,7 @@ def predict(
         where,
         flights or (),
         TargetOptions(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading, site=site),
-        RunOptions(out=out, logs_root=logs_root, force=force, progress=say),
+        RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run),
     )
     print_json(outcome.metrics) if as_json else _print_prediction(outcome)
 
@@ -109,6 +110,7 @@ def plan(
     tower_distance: Annotated[float, Option(min=0.0, help="Least distance to towers [m].")] = 30.0,
     out: Annotated[Path | None, output("Output folder  [default: reports/plan-<TARGET>]")] = None,
     logs_root: LogsRoot = None,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -128,7 +130,7 @@ def plan(
         target=TargetOptions(heights_m=tuple(height or (40.0,)), spacing_m=60.0, site=site),
     )
     outcome = run_plan(
-        target, flights or (), options, RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
+        target, flights or (), options, RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     )
     print_json(outcome.metrics) if as_json else _print_plan(outcome)
 

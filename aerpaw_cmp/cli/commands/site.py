@@ -10,7 +10,7 @@ from typer import Argument, Option
 from ...common.errors import UsageError
 from ...jobs.options import RunOptions
 from ..app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
-from ..shown import print_files, print_json, print_plan, say, show, table
+from ..shown import print_files, print_json, say, show, table
 
 
 @command(
@@ -214,10 +214,9 @@ def map_(
         "tile_m": tile_m,
     }
     settings = map_settings(fields, quick=quick)
-    options = RunOptions(out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say)
-    if dry_run:
-        print_plan(run.plan_map(site, settings, options), as_json)
-        return
+    options = RunOptions(
+        out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say, dry=dry_run
+    )
     outcome = run.run_map(site, settings, options, flights=flights or (), figures=figures)
     if as_json:
         print_json(outcome.metrics)

@@ -12,9 +12,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError
 from ...common.provenance import union
-from ...common.stages import Stages
+from ...common.stages import PlannedStage, Stages
 from ...common.units import FloatArray
 from ...common.yamlfile import StrictModel, load_yaml
 from ...compare.gains import direction_gain
@@ -185,7 +186,13 @@ def calibrate(
     stages = stages or Stages()
     observed, warnings = observe(flights)
     recipe = recipe_of(settings, observed, logs_root or folder)
+    with stages("read"):
+        further = [load_data(load_with_learned(path), path.parent, logs_root) for path in score]
     series = [o.samples for o in observed]
+    rest = [("fit, ground, scores, curve", ", ".join(sorted({samples.antenna for samples in series})))]
+    rest += [("score", counted(len(score), "flight"))] if score else []
+    rest += [("rank", "of all flights")] if settings.rank else []
+    stages.checked(lambda: [PlannedStage(*row) for row in rest])
     with stages("fit"):
         learned = calibration.learn(series, recipe)
     with stages("ground"):
@@ -199,9 +206,9 @@ def calibrate(
     with stages("curve"):
         curve = learning_curve(observed, recipe)
     warnings += _mount_warnings(learned)
-    if score:
+    if further:
         with stages("score"):
-            further_scores, remarks = _score_further(score, flights, logs_root, learned, observed)
+            further_scores, remarks = _score_further(further, flights, learned, observed)
         scores, warnings = {**scores, "other_flights": further_scores}, list(dict.fromkeys([*warnings, *remarks]))
     return Calibration(
         settings=settings,
@@ -222,14 +229,12 @@ def calibrate(
 
 
 def _score_further(
-    paths: Sequence[Path],
+    further: Sequence[FlightData],
     flights: Sequence[FlightData],
-    logs_root: Path | None,
     learned: Learned,
     observed: Sequence[Observed],
 ) -> tuple[tuple[Score, ...], list[str]]:
     """Scores of further flights with what was learned, and which of them were learned from."""
-    further = [load_data(load_with_learned(path), path.parent, logs_root) for path in paths]
     distinct, remarks = counted_once([*flights, *further])
     fresh = [data for data in distinct if not any(data is item for item in flights)]
     if not fresh:
@@ -474,7 +479,7 @@ def _controls_of(
         return {}
     left_out, only = calibration.flight_left_out, calibration.only_terms
     bare = dataclasses.replace(recipe, patterns={})
-    scores = {
+    controls = {
         "world frame at the UAV": left_out(calibration.world_frame(observed), bare),
         "heading turned the wrong way": left_out(calibration.wrong_way(observed), bare),
         "body frame, no patterns": left_out(observed, bare) if recipe.patterns else scores,
@@ -482,7 +487,7 @@ def _controls_of(
         "tower end only": left_out(observed, only(bare, direction_gain.TOWER_TERMS)),
         "field over places only": left_out(observed, only(bare, (direction_gain.PLACE_TERM,))),
     }
-    return scores | (
+    return controls | (
         {"patterns with fitted mounts only": left_out(observed, only(recipe, ()))} if recipe.patterns else {}
     )
 

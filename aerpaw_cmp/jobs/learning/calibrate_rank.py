@@ -50,7 +50,7 @@ class RankFitSettings(StrictModel):
     """``rank`` of calibration.yaml: which geometries are tried."""
 
     yaw_step_deg: Annotated[float, Field(ge=5, le=90)] = 30.0
-    uav_slant_deg: list[list[float]] | None = None
+    uav_slant_deg: list[Annotated[list[float], Field(min_length=4, max_length=4)]] | None = None
     """Slants of the modem's ports to try; by default :data:`_SLANTS_DEG`."""
     ground: list[Annotated[float, Field(ge=0, le=2)]] = Field(default_factory=lambda: [0.0, 0.2, 0.5, 1.0])
     """Amplitude factors on the ground reflection to try."""
@@ -259,27 +259,22 @@ def candidates(settings: RankFitSettings, samples: RankSamples) -> tuple[Geometr
     mounts = [(float(y), 0.0, r) for r in (0.0, 90.0) for y in half] + [(float(y), 90.0, 0.0) for y in full]
     tower = tuple(np.degrees(samples.link.tower_arrays[samples.tower].slant_rad).round(9).tolist())
     slants = [tuple(s) for s in settings.uav_slant_deg] if settings.uav_slant_deg else list(_SLANTS_DEG)
-    if any(len(s) != 4 for s in slants):
-        raise UsageError(f"rank.uav_slant_deg {slants}", expected="four slants per way, one per port")
     return every_geometry(mounts, [tower], slants, settings.ground, (settings.sum,))
 
 
-def fit_rank(flights: Sequence[FlightData], settings: RankFitSettings) -> RankCalibration:
-    """Fit a receiver per tower on all flights, and score it on each flight left out.
-
-    Raises
-    ------
-    InputError
-        No flight has rank, or too few reports.
-    UsageError
-        Arrays or slants of other than four ports.
-    """
+def samples_by_tower(flights: Sequence[FlightData]) -> dict[str, list[RankSamples]]:
+    """Reports of all flights; InputError without any, UsageError of :func:`rank_samples`."""
     towers: dict[str, list[RankSamples]] = {}
     for data in flights:
         for series in data.rank:
             towers.setdefault(series.tower, []).append(rank_samples(data, series))
     if not towers:
         raise InputError("none of the flights has rank", expected="rank logs", cause="'rank:' in calibration.yaml")
+    return towers
+
+
+def fit_rank(towers: Mapping[str, Sequence[RankSamples]], settings: RankFitSettings) -> RankCalibration:
+    """Fit a receiver per tower on all flights, and score it on each flight left out; InputError of too few reports."""
     receivers, warnings = {}, []
     scores: dict[str, list[tuple[str, str, ForecastScore]]] = {"flight_left_out": [], "sector_left_out": []}
     for tower, samples in towers.items():

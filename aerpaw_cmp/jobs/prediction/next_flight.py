@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import shapely
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError
 from ...common.geodesy import bearing_deg
 from ...common.outputs import OutputFolder
-from ...common.stages import Stages
+from ...common.stages import PlannedStage, Stages
 from ...common.units import FloatArray
 from ...compare.gains.direction_gain import GainModel, LinkSamples
 from ...compare.learning.correction import choose
@@ -152,11 +153,18 @@ def _plan_flight(
                 "no route fits: no pattern lies within the geofence",
                 expected="a larger area, or --route FILE",
             )
+        if all(candidate.refused for candidate in candidates):
+            raise UsageError(
+                f"no route fits: {candidates[0].route.name} {candidates[0].refused}",
+                expected="a candidate within the geofence, the battery and the distance to towers",
+            )
         points = None if target == _SPHERE else find_targets(Path(target), site, plan.target)
         if points is not None:
             remarks += points.remarks
             _check_near("target", shapely.multipoints(points.position_m[points.known]), area, "that may be flown")
         targets = _targets(points, site, ends)
+    work = f"{counted(len(candidates), 'candidate')}: {', '.join(candidate.route.name for candidate in candidates)}"
+    stages.checked(lambda: [PlannedStage("learn, rank, curve, map", work)])
     with stages("learn"):
         known = _flown_knowledge(series)
     few_targets = {a: _thinned(s, _MOST_TARGETS) for a, s in targets.items()}
@@ -215,11 +223,6 @@ def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float]
         stages.progress(f"rank {candidate.route.name}", number / len(candidates))
         ranked.append(replace(candidate, sd_db=leaves_db(candidate.route)))
     ranked.sort(key=lambda candidate: (bool(candidate.refused), candidate.sd_db))
-    if ranked[0].refused:
-        raise UsageError(
-            f"no route fits: {ranked[0].route.name} {ranked[0].refused}",
-            expected="a candidate within the geofence, the battery and the distance to towers",
-        )
     return ranked
 
 
@@ -445,8 +448,8 @@ def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: R
     inputs += [path for path in (plan.fence, *plan.avoid, *plan.routes) if path is not None]
     known = named_flights(flights)
     inputs += files_of(known, options.logs_root)
-    stages = Stages(options.progress)
     folder = options.out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
+    stages = options.stages("plan", inputs, folder)
     with OutputFolder(folder, job="plan", inputs=inputs, force=options.force) as output:
         record = _plan_flight(target, known, plan, logs_root=options.logs_root, stages=stages)
         with output.filling() as place:

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ...common.counting import counted
 from ...common.errors import InputError, UsageError
 from ...common.jsonable import named
 from ...common.outputs import OutputFolder
 from ...common.provenance import KEY, MARKS, union
-from ...common.stages import Progress, Stages
+from ...common.stages import PlannedStage, Progress, Stages
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...compare.gains.direction_gain import LinkSamples
 from ...compare.gains.spread import BAND
@@ -139,6 +140,8 @@ def predict(
             remarks += [text for text in warnings if "scored" not in text]
         _check_shared(where, sources, site, "the flights heard" if known else "the site remembers")
         targets = find_targets(where, site, options, logs_root)
+    work = f"{counted(len(targets.position_m), 'point')}: {', '.join(sources)}"
+    stages.checked(lambda: [PlannedStage("choose, predict", work)])
     with stages("choose"):
         model = memory or _best_model(targets, sources, known, place, remarks)
     with stages("predict"):
@@ -569,7 +572,8 @@ def run_predict(
     """
     known = named_flights(flights)
     inputs = [*target_files(where, target.site, options.logs_root), *files_of(known, options.logs_root)]
-    folder, stages = options.out or Path("reports") / f"prediction-{where.stem}", Stages(options.progress)
+    folder = options.out or Path("reports") / f"prediction-{where.stem}"
+    stages = options.stages("predict", inputs, folder)
     with OutputFolder(folder, job="predict", inputs=inputs, force=options.force) as output:
         prediction = predict(where, known, target, logs_root=options.logs_root, stages=stages)
         with output.filling() as place:

@@ -207,7 +207,7 @@ def test_a_damaged_tile_is_computed_again_and_said(kind, finished, tmp_path, in_
     assert_like(outcome, in_one_piece)
     assert crew.numbers == again
     entered = "an entry is gone" not in kind and bool(again)
-    assert any("1 finished tiles have chunks that are missing" in text for text in said) == entered
+    assert any("1 finished tile with missing or changed chunks" in text for text in said) == entered
     with xarray.open_zarr(store, consolidated=False) as data, xarray.open_zarr(finished, consolidated=False) as before:
         assert data.identical(before), "attributes and axes too"
 

@@ -18,7 +18,13 @@ from aerpaw_cmp.jobs.learning.calibrate_rank import (
     read_receiver,
 )
 from aerpaw_cmp.propagation.drivers import geometries
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.geometry.arrays import (
+    Link,
+    Poses,
+    rotation_from_aircraft,
+    tower_comparison_array,
+    uav_comparison_array,
+)
 
 SETTINGS = RankFitSettings(
     yaw_step_deg=45, uav_slant_deg=[[45, -45, -45, 45], [0, 90, 0, 90]], ground=[0.2], thin=2, members=3
@@ -126,3 +132,17 @@ def test_channels_of_a_mount_are_evaluated_once_in_whatever_order(monkeypatch):
     assert len(calls) == 4  # two mounts, direct and off the ground
     features_of([g for g in mixed if g.ground == 0.0], flown)
     assert len(calls) == 6
+
+
+def test_turns_of_the_uav_are_those_of_its_heading(tried: Tried) -> None:
+    fitted, flown = tried.fit([0]), flight(3)
+    level = np.zeros(400)
+    each = [
+        fitted.forecast(dataclasses.replace(flown, poses=Poses(
+            flown.poses.position_m, rotation_from_aircraft(level, level, level + heading)
+        )))[0]
+        for heading in (0.0, 45.0, 250.0)
+    ]  # fmt: skip
+    north = dataclasses.replace(flown, poses=Poses(flown.poses.position_m, rotation_from_aircraft(level, level, level)))
+    assert np.abs(each[0] - each[1]).max() > 1e-3
+    np.testing.assert_allclose(fitted.forecast(north, (0.0, 45.0, 250.0))[0], np.mean(each, axis=0), atol=1e-9)

@@ -123,9 +123,15 @@ class FittedReceiver:
         """Check whether it was fitted on these reports, by their logs or readings."""
         return not set(self.trained_on).isdisjoint(samples.logs) or among(samples.mark, self.marks)
 
-    def forecast(self, samples: RankSamples) -> tuple[FloatArray, IntArray]:
-        """Probability (n, 4) of each rank, and the one that is said."""
-        p = self.mixture.probabilities(features_of(self.geometries, samples, self.timing))
+    def forecast(self, samples: RankSamples, turns_deg: Sequence[float] = (0.0,)) -> tuple[FloatArray, IntArray]:
+        """Probability (n, 4) of each rank, and the one that is said; the mean over turns of the UAV to the right."""
+        turned = [
+            dataclasses.replace(g, uav_yaw_deg=(g.uav_yaw_deg - turn) % 360.0)  # many turned mounts are the same
+            for turn in turns_deg
+            for g in self.geometries
+        ]
+        features = np.split(features_of(turned, samples, self.timing), len(turns_deg))
+        p = np.mean([self.mixture.probabilities(some) for some in features], axis=0)
         return p, self.mixture.decide(p)
 
     def as_dict(self) -> dict[str, Any]:

@@ -523,8 +523,10 @@ def _ranks(
         if {len(link.uav_array), len(link.tower_arrays[tower])} != {4}:
             continue
         position, yaw, each = targets.position_m[some], targets.yaw_deg[some], []
-        for turn in _turns(yaw):
-            heading = np.where(np.isfinite(yaw), yaw, turn)
+        turns = _turns(yaw).tolist()
+        asked = [turns] if not np.isfinite(yaw).any() else [[turn] for turn in turns]
+        for together in asked:
+            heading = np.where(np.isfinite(yaw), yaw, together[0])
             samples = RankSamples(
                 flight="",
                 tower=tower,
@@ -534,8 +536,8 @@ def _ranks(
                 link=link,
                 time_s=targets.time_s[some] if targets.kind == "route" else 1e4 * np.arange(float(len(some))),
             )
-            each.append(receiver.forecast(samples)[0])
-            progress(f"predict rank {tower}", len(each) / len(_turns(yaw)))
+            each.append(receiver.forecast(samples, [turn - together[0] for turn in together])[0])
+            progress(f"predict rank {tower}", len(each) / len(asked))
         p = np.mean(each, axis=0)
         if len(some) < len(rows):
             p = p[cKDTree(_place_and_nose(targets, some)).query(_place_and_nose(targets, rows))[1]]

@@ -188,6 +188,23 @@ def test_a_neighbour_stands_for_the_rank_of_a_point(monkeypatch: pytest.MonkeyPa
     assert np.mean(ranks[0].argmax(axis=1) != ranks[1].argmax(axis=1)) < 0.05
 
 
+def test_headings_are_ranked_alike_one_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    site, count = load_site("lake_wheeler"), 40
+    place = np.random.default_rng(1).uniform((-300, -300, 30), (300, 300, 60), (count, 3))
+    targets = Targets(
+        kind="points", name="", position_m=place, yaw_deg=np.full(count, np.nan), time_s=np.arange(float(count))
+    )
+    receivers, ranks, steps = job._receivers([], "lake_wheeler", site), [], []
+    for most in (count * job.HEADINGS, count):  # the second leaves no room for all headings at once
+        monkeypatch.setattr(job, "MOST_RANKED", most)
+        said: list[str] = []
+        ((_, _, p),) = job._ranks(targets, receivers, site, lambda text, *_, said=said: said.append(text))
+        ranks.append(p)
+        steps.append(len(said))
+    assert steps == [1, job.HEADINGS]
+    np.testing.assert_allclose(*ranks, atol=1e-9)
+
+
 @pytest.mark.parametrize("levels", [True, False])
 def test_predicted_ranks_are_scored_where_they_were_flown(said, levels):
     data, folder = said

@@ -244,8 +244,8 @@ def _powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArr
         [geometries[i] for i in order], samples.link.tower_arrays[samples.tower], samples.tower_m,
         samples.link.uav_array, samples.poses, samples.link.carrier_hz,
     )  # fmt: skip
-    by_place = dict(zip(order, singular, strict=True))
-    return np.stack([by_place[i] ** 2 for i in range(len(geometries))])
+    by_place = {i: sigma**2 for i, sigma in zip(order, singular, strict=True)}
+    return np.stack([by_place[i] for i in range(len(geometries))])
 
 
 def features_of(geometries: Sequence[Geometry], samples: RankSamples, timing: Timing | None = None) -> FloatArray:

@@ -524,7 +524,8 @@ def _ranks(
             continue
         position, yaw, each = targets.position_m[some], targets.yaw_deg[some], []
         turns = _turns(yaw).tolist()
-        asked = [turns] if not np.isfinite(yaw).any() else [[turn] for turn in turns]
+        few = len(some) * len(turns) <= MOST_RANKED  # more would take more memory at once
+        asked = [turns] if few and not np.isfinite(yaw).any() else [[turn] for turn in turns]
         for together in asked:
             heading = np.where(np.isfinite(yaw), yaw, together[0])
             samples = RankSamples(

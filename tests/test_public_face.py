@@ -13,6 +13,8 @@ import pandas as pd
 import pytest
 
 import aerpaw_cmp as ac
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import AerpawCmpError
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -187,3 +189,24 @@ def test_variogram_finds_the_correlation_it_was_given() -> None:
     assert variogram(at) == pytest.approx(variogram.binned_.correlation[1:7], abs=0.06)
     estimate, _ = ac.OrdinaryKriging(variogram, radius_m=500.0).fit(points, fields[:, 0]).predict(points[:5])
     assert estimate == pytest.approx(fields[:5, 0], abs=1e-6)
+
+
+def test_errors_of_python_name_its_arguments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine.csv").write_text("Time (s),Power (dBm)\n" + "".join(f"{i},{-80 - i}\n" for i in range(30)))
+    (tmp_path / "lost.yaml").write_text((SAMPLE / "flight.yaml").read_text())
+    flight = ac.open_flight(SAMPLE / "flight.yaml")
+    columns = {"time": "Time (s)", "rss_db": "Power (dBm)"}
+    for call, words in (
+        (lambda: ac.read(SAMPLE / "UAV"), "the key 'timezone:' or timezone=, e.g."),
+        (lambda: ac.read(tmp_path / "mine.csv"), f"columns={columns}"),
+        (lambda: ac.open_flight(tmp_path / "lost.yaml"), "a wrong path, or logs_root="),
+        (lambda: flight.report(tmp_path / "out", audit="x"), "audit='x'"),
+    ):
+        with pytest.raises(AerpawCmpError) as caught:
+            call()
+        assert words in str(caught.value)
+        assert "--" not in str(caught.value)
+    logs = ac.read(tmp_path / "mine.csv", columns=columns, kind="rss", time_origin="2025-06-01T14:00:00Z")
+    assert len(logs["rss"]) == 30
+    assert main(["ingest", str(SAMPLE / "UAV")]) == 2
+    assert "--timezone" in capsys.readouterr().err

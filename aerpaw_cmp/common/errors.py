@@ -15,6 +15,7 @@ Any other exception that reaches a user is a bug of ours.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
@@ -211,6 +212,35 @@ def parsed(expected: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
         return run
 
     return decorate
+
+
+# Arguments of Python that have another name than the option of the command line.
+_IN_PYTHON = {"--with": "learned", "--force": "force=True"}
+
+
+def from_python(function: Callable[_P, _T]) -> Callable[_P, _T]:
+    """Decorator of a public function: errors name arguments (``timezone=``) in place of options (``--timezone``)."""
+
+    def columns(options: re.Match[str]) -> str:
+        pairs = re.findall(r"--map '([^']*)'=(\w+)", options[0])
+        return f"columns={ ({quantity: column for column, quantity in pairs}) }"
+
+    def argument(option: re.Match[str]) -> str:
+        name = _IN_PYTHON.get(option[1], option[1][2:].replace("-", "_"))
+        return name if "=" in name else f"{name}="
+
+    @wraps(function)
+    def run(*arguments: _P.args, **more: _P.kwargs) -> _T:
+        try:
+            return function(*arguments, **more)
+        except AerpawCmpError as error:
+            for part in ("found", "expected", "cause"):
+                if text := getattr(error, part):
+                    text = re.sub(r"--map '[^']*'=\w+( --map '[^']*'=\w+)*", columns, text)
+                    setattr(error, part, re.sub(r"(?<!\S)(--[a-z][a-z-]*)( (?='))?", argument, text))
+            raise
+
+    return run
 
 
 class CheckError(AerpawCmpError):

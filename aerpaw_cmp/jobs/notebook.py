@@ -12,7 +12,7 @@ import numpy as np
 import pandas as pd
 
 from ..common.counting import counted
-from ..common.errors import UsageError
+from ..common.errors import UsageError, from_python
 from ..common.htmltable import html_table
 from ..common.jsonable import named
 from ..common.units import ComplexArray, FloatArray
@@ -39,6 +39,7 @@ Series = tuple[str, str]
 _RANK_NUMBERS = "agreement kappa total_variation wasserstein"
 
 
+@from_python
 def open_flight(
     path: str | Path,
     *,
@@ -203,6 +204,7 @@ class Flight:
         """Replay and compare; arguments as :meth:`replay`."""
         return self.replay(engine, **overrides).compare()
 
+    @from_python
     def report(self, folder: str | Path, *, force: bool = False, **options: Any) -> Path:
         """Write the whole report, as ``aerpaw-cmp report`` does, and give the path of its page.
 
@@ -231,6 +233,7 @@ class Flight:
         run_report(self.path, ReportOptions(**options), RunOptions(out=out, logs_root=self.logs_root, force=force))
         return out / "report.html"
 
+    @from_python
     def channel(self, **options: Any) -> Any:
         """Paths, channel matrices and calibrated levels along the track, as ``aerpaw-cmp channel`` writes them.
 

@@ -14,7 +14,7 @@ from zoneinfo import ZoneInfo
 import pandas as pd
 
 from ..common.counting import counted
-from ..common.errors import InputError
+from ..common.errors import InputError, from_python
 from ..common.htmltable import html_table
 from .flight_file import IngestedFile, write_flight
 from .ingest import Ingested, account_notes, ingest, summary
@@ -115,6 +115,7 @@ def _in_utc(frame: pd.DataFrame) -> pd.DataFrame:
     return out
 
 
+@from_python
 def read(
     path: Source | Iterable[Source],
     timezone: str | ZoneInfo | None = None,
@@ -158,6 +159,8 @@ def read(
     """
     zone = timezone.key if isinstance(timezone, ZoneInfo) else timezone
     chosen = ReadOptions(timezone=zone, time_origin=time_origin, **options)
+    if chosen.columns:
+        reader = reader or "generic_csv"  # as with --map
     files = Ingested()
     single = isinstance(path, (str, os.PathLike)) or hasattr(path, "read")
     for source in cast("Iterable[Source]", [path] if single else path):

@@ -72,7 +72,7 @@ def zone(name: str | None, *, needed_by: str) -> tzinfo:
     if not name:
         raise UsageError(
             f"no time zone for the zone-less clock of {needed_by}",
-            expected="the key 'timezone:', --timezone or, in Python, timezone=, e.g. America/New_York",
+            expected="the key 'timezone:' or --timezone, e.g. America/New_York",
             cause="the log writes local wall time without an offset",
         )
     if name.upper() == "UTC":  # needs no zone database

@@ -167,6 +167,9 @@ def test_foreign_files(tmp_path: Path) -> None:
     path.write_text("hello\n1 2 3\n")
     with pytest.raises(InputError, match="no pattern found"):
         read_pattern_text(path)
+    path.write_text("azimuth_deg,gain_dbi\n0,3\n")
+    with pytest.raises(InputError, match="one cut of two"):
+        read_pattern_text(path)
     path.write_bytes(b"\x00\xff\x80" * 100)
     with pytest.raises(InputError, match="no UTF-8 text"):
         read_pattern_text(path)

@@ -297,7 +297,13 @@ def _read_rows(path: Path) -> _Rows:
             rows.lines.append(number)
     _check_last_line(text, rows, path)
     if not values:
-        raise InputError("no pattern found", expected="a header line 'Phi  Theta  E Total. dB ...' and rows", path=path)
+        cut = re.match(r"\s*(azimuth|elevation|theta)_deg", text)
+        raise InputError(
+            "no pattern found",
+            expected="a header line 'Phi  Theta  E Total. dB ...' and rows",
+            cause="one cut of two: 'elevation' names the other" if cut else None,
+            path=path,
+        )
     rows.values = np.array(values)
     return rows
 

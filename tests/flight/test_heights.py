@@ -55,7 +55,7 @@ def test_a_track_at_the_given_height_is_that_of_a_log_that_tells_it(tmp_path: Pa
 
 def test_without_a_height_the_message_names_the_key(tmp_path: Path) -> None:
     write(tmp_path / "phone.csv", altitude=False)
-    with pytest.raises(InputError, match="has an altitude") as raised:
+    with pytest.raises(InputError, match="no altitude in") as raised:
         flight(tmp_path, "")
     assert "'height_m: H' beside its path" in str(raised.value)
 

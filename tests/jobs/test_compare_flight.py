@@ -99,7 +99,7 @@ def test_one_sample_fits_itself_and_claims_no_interval(tmp_path: Path, capsys: p
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "Nothing could be compared: no channel has 20 samples" in page
     assert main(["report", str(path), "-o", str(tmp_path / "again")]) == 1
-    assert "1 samples have measurement, pose and path; expected 20" in capsys.readouterr().err
+    assert "1 sample with measurement, pose and path; expected 20" in capsys.readouterr().err
 
 
 def test_one_wild_sample_is_flagged_kept_and_said_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

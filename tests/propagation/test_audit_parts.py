@@ -55,7 +55,7 @@ def test_a_path_that_the_other_engine_alone_has_is_missing_only_where_it_exists(
     every = np.arange(len(paths))
     missing = _lacking(SITE, replayed, paths, replayed.faces, every, POSES, Expected.of(LINK))
     assert (missing.missing_paths, missing.doubtful) == (len(paths), 0)
-    assert missing.failures == (f"{len(paths)} paths that Sionna has are missing",)
+    assert missing.failures == (f"{len(paths)} paths of Sionna are missing",)
     # the same paths off walls that look away from the tower: none can exist
     source = SITE.towers["LW1"].position_m
     away = np.flatnonzero(

@@ -47,7 +47,7 @@ def test_formats_shows_every_reader(capsys: pytest.CaptureFixture[str]) -> None:
     assert {r["name"] for r in listed} == {r.name for r in catalogue()}
     logs = [r for r in listed if r["kinds"]]  # the others name files that are no log
     assert all(r["sample"] for r in logs)
-    assert len(logs) >= 25
+    assert len(logs) >= 29
 
 
 def test_doctor_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:

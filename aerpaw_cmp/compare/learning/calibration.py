@@ -336,8 +336,7 @@ def flight_left_out(
 
 def score_with(learned: Learned, unseen: Sequence[Observed], train: Sequence[Observed]) -> tuple[Score, ...]:
     """Scores of flights that were not learned from, at antennas that were."""
-    scored = _scored_with(unseen, learned, _offsets([o.samples for o in train], learned))
-    return tuple(s for s in scored if s is not None)
+    return tuple(_scored_with(unseen, learned, _offsets([o.samples for o in train], learned)))
 
 
 def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]:
@@ -352,24 +351,24 @@ def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]
 _SPREAD_SAMPLES = 400
 
 
-def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[str, float]) -> Iterator[Score | None]:
+def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[str, float]) -> Iterator[Score]:
     """Scores at antennas that have an offset, with their own and with that of the other flights."""
     for o in unseen:
         if o.samples.antenna not in offsets:
             continue
         gain = learned.mean(o.samples)
         fitted = score(o, gain)
-        if fitted is not None and learned.fit is not None:
+        if fitted is None:
+            continue
+        if learned.fit is not None:
             some = spread_out(len(gain), _SPREAD_SAMPLES)
             stated = StatedSpread(
                 gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
             )
             error = o.samples.residual_db - gain - fitted.offset_db
             fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
-        if fitted is not None:
-            shared = math.hypot(fitted.rmse_db, fitted.offset_db - offsets[o.samples.antenna])
-            fitted = dataclasses.replace(fitted, rmse_shared_offset_db=shared)
-        yield fitted
+        shared = math.hypot(fitted.rmse_db, fitted.offset_db - offsets[o.samples.antenna])
+        yield dataclasses.replace(fitted, rmse_shared_offset_db=shared)
 
 
 # Of more flights, this many are scored part by part, evenly over their order.

@@ -386,9 +386,8 @@ def _meets_last_face(
         point += start
         good &= point >= faces.lower[last, which, None] - tolerance_m
         good &= point <= faces.upper[last, which, None] + tolerance_m
-    if (
-        sequence.shape[1] > 1
-    ):  # the ground as the last face meets every line: tracing each back would take most of a search
+    if sequence.shape[1] > 1:
+        # the ground as the last face meets every line: tracing each back would take most of a search
         often = np.flatnonzero(good.sum(axis=1) > _OFTEN * len(targets))
         good[often] &= _passes_first_faces(faces, sequence[often], image[often], targets)
     row, column = np.nonzero(good)

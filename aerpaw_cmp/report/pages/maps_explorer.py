@@ -186,12 +186,15 @@ def _codes(values: FloatArray) -> Any:
 
 def _range(values: FloatArray, kind: str) -> list[float]:
     """Ends of the colour scale that all layers of a quantity share: 1 and 99.5 %, even about zero for differences."""
-    if not len(values):
-        return [0.0, 1.0]
-    if kind == DIFFERENCE:
+    if kind == DIFFERENCE and len(values):
         reach = float(np.percentile(np.abs(values), 99)) or float(np.abs(values).max()) or 1.0
         return [-reach, reach]
-    low, high = (float(v) for v in np.percentile(values, [1.0, 99.5]))
+    return ends_of_scale(values, 99.5)
+
+
+def ends_of_scale(values: FloatArray, most: float) -> list[float]:
+    """Ends of a colour scale: 1 % and ``most`` % of finite values, half a unit about a constant, 0 and 1 of none."""
+    low, high = (float(v) for v in np.percentile(values, [1.0, most])) if len(values) else (0.0, 1.0)
     return [low, high] if high > low else [low - 0.5, low + 0.5]
 
 

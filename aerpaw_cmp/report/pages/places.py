@@ -17,7 +17,7 @@ from ..kit.canvas import rank_colour
 from ..kit.packed import PackedArrays, step_for
 from ..kit.shapes import listed
 from .explorer import plan_of
-from .maps_explorer import ramp
+from .maps_explorer import ends_of_scale, ramp
 
 # Values that a page holds; beyond them each group is thinned.
 MOST_VALUES = 1_500_000
@@ -88,7 +88,8 @@ def payload(
     for group in groups:
         for name, column in group.values.items():
             alike.setdefault(_scale(group.name, name), []).append(np.asarray(column, dtype=np.float64))
-    ranges = {key: _range(np.concatenate(columns)) for key, columns in alike.items()}
+    every = {key: np.concatenate(columns) for key, columns in alike.items()}
+    ranges = {key: ends_of_scale(values[np.isfinite(values)], 99.0) for key, values in every.items()}
     return {
         "site": None if site is None else plan_of(site),
         "lines": [listed(np.round(np.asarray(line)[spread_out(len(line), 2000), :2], 1)) for line in lines],
@@ -128,10 +129,3 @@ def _group(
         "layers": [layer for layer in layers if layer["name"] not in BAND],
         "band": [layer for layer in layers if layer["name"] in BAND],
     }
-
-
-def _range(values: FloatArray) -> list[float]:
-    """Ends of a colour scale: 1 and 99 %."""
-    finite = values[np.isfinite(values)]
-    low, high = (float(v) for v in np.percentile(finite, [1.0, 99.0])) if len(finite) else (0.0, 1.0)
-    return [low, high] if high > low else [low - 0.5, low + 0.5]

@@ -404,6 +404,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
         ("bps", 1.0), ("bit/s", 1.0), ("kbps", 1e3), ("kbit/s", 1e3), ("mbps", 1e6), ("mbit/s", 1e6), ("gbps", 1e9),
         ("gbit/s", 1e9))},
     "db": ("dB", _times(1.0)),
+    "mv": ("V", _times(1e-3)),
     "dbm": ("dBm", _times(1.0)),
     "dbw": ("dBm", lambda values: values + 30.0),
     "mw": ("dBm", _milliwatts(1.0)), "w": ("dBm", _milliwatts(1e3)), "uw": ("dBm", _milliwatts(1e-3)),
@@ -472,7 +473,7 @@ def _program(name: str, *signs: str, **about: Any) -> Program:
 
 _MAVLINK_UNITS = {
     "relative alt": "mm", "alt": "mm", "vx": "cm/s", "vy": "cm/s", "vz": "cm/s", "hdg": "cdeg", "lat": "e7",
-    "lon": "e7",
+    "lon": "e7", "voltage battery": "mv",
 }  # fmt: skip
 _FULL_SCALE = "dB re full scale"
 AERPAW_MAT = _program(
@@ -491,7 +492,7 @@ PROGRAMS: tuple[Program, ...] = (
     _program("PX4", "timestamp,timestamp sample", "timestamp,delta alt", datum="sea level", units={"timestamp": "us"},
              angles="rad"),
     _program("MAVLink", "time boot ms", "rollspeed", datum="sea level", angles="rad", units=_MAVLINK_UNITS,
-             words={r"satellites visible": "satellites"}),
+             words={r"satellites visible": "satellites", r"voltage battery": "battery voltage"}),
     _program("ArduPilot", "timeus", "gcrs,spd", "lat,lng,q1,q2", "desroll,roll", datum="sea level", angles="deg",
              words={r"status": "fix"}),
     AERPAW_MAT,

@@ -84,6 +84,8 @@ class Flight:
         Of the stream.
     system : int, optional
         Number of the vehicle where a log may hold several.
+    battery : Series
+        ``battery_v``.
     """
 
     position: Series
@@ -95,6 +97,7 @@ class Flight:
     home: Series = field(default_factory=lambda: NONE)
     name: str = "vehicle"
     system: int | None = None
+    battery: Series = field(default_factory=lambda: NONE)
 
 
 def result(
@@ -151,6 +154,8 @@ def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     values |= {name: flight.attitude.near(name, time_s) for name in _pose.ANGLES}
     values["yaw_deg"] = np.where(np.isnan(values["yaw_deg"]), heading, values["yaw_deg"])
     values |= {name: flight.velocity.near(name, time_s) for name in _pose.VELOCITIES}
+    if len(flight.battery.time_s):
+        values["battery_v"] = flight.battery.near("battery_v", time_s)
     for name in ("fix", "satellites"):
         values[name] = np.nan_to_num(flight.fix.near(name, time_s), nan=-1).clip(-1, 255).astype(np.int64)
     return rows.stream("telemetry", flight.name, values, source=flight.source, system=flight.system)

@@ -2,7 +2,7 @@
 
 The format describes itself: every message begins with A3 95 and its number, ``FMT`` messages give the length and
 columns of each; in text each message is a line, ``NAME, value, value``.
-Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity) and ``GPS`` (UTC, fix).
+Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity), ``GPS`` (UTC, fix) and ``BAT``.
 Heights are above home at take-off (``RelHomeAlt``), else above the ground at rest or the first position.
 Source: ArduPilot ``libraries/AP_Logger/LogStructure.h``.
 """
@@ -30,7 +30,7 @@ _TYPES = {
     "n": ("4s", 0.0), "N": ("16s", 0.0), "Z": ("64s", 0.0), "a": ("64s", 0.0),
 }  # fmt: skip
 _FIX_3D = 3
-_WANTED = ("POS", "GPS", "ATT", "XKF1", "NKF1", "EKF1")
+_WANTED = ("POS", "GPS", "ATT", "XKF1", "NKF1", "EKF1", "BAT")
 
 
 _TEXT = re.compile(rb"FMT, ?128, ?89, ?FMT,")
@@ -131,7 +131,7 @@ def _series(by_name: _Rows, name: str) -> _autopilot.Series:
     table = np.array([values for _, values in rows], dtype=np.float64)
     columns = {column: table[:, i] for i, column in enumerate(names)}
     number = np.array([i for i, _ in rows], dtype=np.int64)
-    for instance in ("I", "C", "Instance"):
+    for instance in ("I", "C", "Inst", "Instance"):
         if instance in columns:
             fixed = columns.get("Status", np.zeros(len(table))) >= _FIX_3D
             of_fix = {number: int(fixed[columns[instance] == number].sum()) for number in np.unique(columns[instance])}
@@ -160,7 +160,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     filters = next((series[name] for name in ("XKF1", "NKF1", "EKF1") if len(series[name].time_s)), _autopilot.NONE)
     flight = _autopilot.Flight(
         position=position, attitude=_named(series["ATT"]), velocity=_named(filters), fix=_named(gps),
-        utc_minus_clock_s=_offset(gps), home=home, source="ArduPilot dataflash log",
+        utc_minus_clock_s=_offset(gps), home=home, source="ArduPilot dataflash log", battery=_named(series["BAT"]),
     )  # fmt: skip
     return _autopilot.result("ardupilot_bin", options, [flight], count, damaged)
 

@@ -1,8 +1,8 @@
 """MAVLink telemetry log of a ground station (``.tlog``): eight bytes of UTC in us, then one packet, and so on.
 
-Read are GLOBAL_POSITION_INT (33: position, height above home, velocity, heading), ATTITUDE (30) and GPS_RAW_INT (24:
-fix) of each vehicle that sends positions, and of the component that does: a gimbal's attitude is not the aircraft's.
-Checksums are checked. Source: MAVLink guide, "Packet Serialization".
+Read are GLOBAL_POSITION_INT (33: position, height above home, velocity, heading), ATTITUDE (30), GPS_RAW_INT (24: fix)
+and SYS_STATUS (1: battery) of each vehicle that sends positions, and of the component that does: a gimbal's attitude is
+not the aircraft's. Checksums are checked. Source: MAVLink guide, "Packet Serialization".
 """
 
 from __future__ import annotations
@@ -17,17 +17,19 @@ from aerpaw_cmp.readers import dictionary
 
 from . import _autopilot
 
-_POSITION, _ATTITUDE, _GPS = 33, 30, 24
+_POSITION, _ATTITUDE, _GPS, _STATUS = 33, 30, 24, 1
 # MAVLink's CRC_EXTRA: a hash of the fields, so that a message of another layout fails the checksum.
-_EXTRA = {_POSITION: 104, _ATTITUDE: 39, _GPS: 24}
+_EXTRA = {_POSITION: 104, _ATTITUDE: 39, _GPS: 24, _STATUS: 124}
 _LAYOUT = {
     _POSITION: struct.Struct("<IiiiihhhH"), _ATTITUDE: struct.Struct("<Iffffff"), _GPS: struct.Struct("<QiiiHHHHBB"),
+    _STATUS: struct.Struct("<14xH15x"),
 }  # fmt: skip
 # Names of the fields, as MAVLink's description of common messages has them.
 _FIELDS = {
     _POSITION: ["time_boot_ms", "lat", "lon", "alt", "relative_alt", "vx", "vy", "vz", "hdg"],
     _ATTITUDE: ["time_boot_ms", "roll", "pitch", "yaw", "rollspeed", "pitchspeed", "yawspeed"],
     _GPS: ["time_usec", "lat", "lon", "alt", "eph", "epv", "vel", "cog", "fix_type", "satellites_visible"],
+    _STATUS: ["voltage_battery"],
 }
 _EARLIEST_US, _LATEST_US = 946_684_800_000_000, 9_200_000_000_000_000
 
@@ -127,7 +129,7 @@ def _flight(messages: dict[int, list[_Message]], system: int, name: str) -> _aut
     sources = [item[1] for item in messages[_POSITION] if item[1][0] == system]
     autopilot = max(set(sources), key=sources.count) if sources else (system, 1)
     series: dict[int, _autopilot.Series] = {}
-    for kind in (_POSITION, _ATTITUDE, _GPS):
+    for kind in _EXTRA:
         rows = [item for item in messages[kind] if item[1] == autopilot]
         rows = rows or [item for item in messages[kind] if item[1][0] == system and item[1][1] not in _NO_AUTOPILOT]
         table = np.array([row[3] for row in rows], dtype=np.float64).reshape(len(rows), len(_FIELDS[kind]))
@@ -140,7 +142,7 @@ def _flight(messages: dict[int, list[_Message]], system: int, name: str) -> _aut
     home = _autopilot.of_both(position, "above_home_m")
     return _autopilot.Flight(
         position=position, attitude=series[_ATTITUDE], velocity=position, fix=series[_GPS], utc_minus_clock_s=0.0,
-        home=home, source="MAVLink telemetry log", name=name, system=system,
+        home=home, source="MAVLink telemetry log", name=name, system=system, battery=series[_STATUS],
     )  # fmt: skip
 
 

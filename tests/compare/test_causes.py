@@ -1,5 +1,6 @@
 """The likely cause of a flight's error: named where it was planted, silent where nothing was or two explain it."""
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from aerpaw_cmp.compare.result import APPLIED, ESTIMATED, ClockResult
 from aerpaw_cmp.jobs.reporting.likely_cause import is_simulated
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 from benchmarks.planted_causes import NONE, TROUBLES, situation
+from tests.parsers import autopilots
 
 MEASURED_DB = -60.0
 
@@ -176,7 +178,7 @@ def test_situations_of_the_benchmark_are_named() -> None:
     assert sum(name != NONE for _, name in wrong) <= 1, wrong
 
 
-LOADED = (12.587, 12.193, 12.242)  # V, of ArduPilot's simulated battery on the ground and in the air
+LOADED = autopilots.VOLTS
 SAGGING = tuple(np.round(np.linspace(50.3, 44.1, 40), 3))
 
 
@@ -204,6 +206,17 @@ def test_a_simulators_log_is_known_by_receiver_and_battery(
     lines = [row.format(i=i, volt=volts[i % len(volts)], fix=fix, satellites=satellites) for i in count]
     text = (title + "".join(lines)).encode()
     stream = identify(text).read(text, ReadOptions(timezone="UTC")).streams[0]
+    assert is_simulated(stream) == simulated
+
+
+@pytest.mark.parametrize("log", [autopilots.dataflash, autopilots.tlog])
+@pytest.mark.parametrize(("fix", "satellites", "simulated"), [(6, 10, True), (6, 11, False), (5, 10, False)])
+def test_a_simulators_log_is_known_in_the_autopilots_own_messages(
+    log: Callable[..., bytes], fix: int, satellites: int, simulated: bool
+) -> None:
+    data = log(count=40, fix=fix, satellites=satellites)
+    stream = identify(data).read(data, ReadOptions()).streams[0]
+    assert list(stream.frame["battery_v"][:4]) == pytest.approx([*LOADED, LOADED[0]])
     assert is_simulated(stream) == simulated
 
 

@@ -8,13 +8,17 @@ START_US = 1_740_927_600_250_000
 COUNT = 5
 
 
-def dataflash() -> bytes:
-    """ArduPilot .bin: POS, ATT, GPS and XKF1 at 1 Hz; the clock counts from switching on."""
+VOLTS = (12.587, 12.193, 12.242)  # of ArduPilot's simulated battery on the ground and in the air
+
+
+def dataflash(count: int = COUNT, fix: int = 4, satellites: int = 14) -> bytes:
+    """ArduPilot .bin: POS, ATT, GPS, XKF1 and BAT at 1 Hz; the clock counts from switching on."""
     forms = {
         129: ("POS", "QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
         130: ("ATT", "QccccCC", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
         131: ("GPS", "QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
         132: ("XKF1", "QBccCfff", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD"),
+        133: ("BAT", "QBff", "TimeUS,Inst,Volt,VoltR"),
     }
     codes = {"Q": "Q", "L": "i", "f": "f", "c": "h", "C": "H", "B": "B", "I": "I", "H": "H", "e": "i"}
     out = b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
@@ -22,16 +26,18 @@ def dataflash() -> bytes:
         size = 3 + struct.calcsize("<" + "".join(codes[c] for c in form))
         out += b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", kind, size, name.encode(), form.encode(), columns.encode())
     week = (START_US // 10**6 - 315_964_800 + 18) // 604_800
-    for i in range(COUNT):
+    for i in range(count):
         now = 30_000_000 + i * 1_000_000
         of_week_ms = (START_US // 1000 + i * 1000 - (315_964_800 - 18) * 1000) - week * 604_800_000
         lat, lng = 357_300_000 + i, -787_000_000 - i
         for kind, values in (
             (129, (now, lat, lng, 90.0 + i, float(i), 0.0)),
             (130, (now, 0, 150, 0, -250, 0, 9000)),
-            (131, (now, 0, 4, of_week_ms, week, 14, 90, lat, lng, 9000, 1.0, 2.0, 0.0, 0.0, 1)),
+            (131, (now, 0, fix, of_week_ms, week, satellites, 90, lat, lng, 9000, 1.0, 2.0, 0.0, 0.0, 1)),
             (132, (now, 0, 150, -250, 9000, 1.5, 2.5, -0.5)),
             (132, (now, 1, 150, -250, 9000, 9.5, 9.5, 9.5)),
+            (133, (now, 0, VOLTS[i % 3], 0.0)),
+            (133, (now, 1, 5.0, 0.0)),
         ):
             out += b"\xa3\x95" + bytes([kind]) + struct.pack("<" + "".join(codes[c] for c in forms[kind][1]), *values)
     return out
@@ -47,8 +53,8 @@ def _x25(data: bytes) -> int:
     return crc
 
 
-def tlog(version: int = 2, system: int = 1, count: int = COUNT) -> bytes:
-    """MAVLink telemetry: GLOBAL_POSITION_INT, ATTITUDE, GPS_RAW_INT of a system, a heartbeat of system 255."""
+def tlog(version: int = 2, system: int = 1, count: int = COUNT, fix: int = 4, satellites: int = 14) -> bytes:
+    """MAVLink telemetry: GLOBAL_POSITION_INT, ATTITUDE, GPS_RAW_INT, SYS_STATUS of a system, heartbeat of system 255."""
     out = b""
     for i in range(count):
         boot = 30_000 + 1000 * i
@@ -56,12 +62,16 @@ def tlog(version: int = 2, system: int = 1, count: int = COUNT) -> bytes:
             "<IiiiihhhH", boot, 357_300_000 + i, -787_000_000 - i, 90_000 + 1000 * i, 1000 * i, 150, 250, -50, 9000
         )
         attitude = struct.pack("<Iffffff", boot, 0.0261799388, -0.0436332313, 1.5707963268, 0.0, 0.0, 0.0)
-        gps = struct.pack("<QiiiHHHHBB", boot * 1000, 357_300_000, -787_000_000, 90_000, 90, 90, 100, 0, 4, 14)
+        gps = struct.pack(
+            "<QiiiHHHHBB", boot * 1000, 357_300_000, -787_000_000, 90_000, 90, 90, 100, 0, fix, satellites
+        )
+        status = struct.pack("<3I2Hh6Hb", 0, 0, 0, 500, round(1000 * VOLTS[i % 3]), 1500, 0, 0, 0, 0, 0, 0, 80)
         beat = struct.pack("<IBBBBB", 0, 6, 8, 0, 0, 3)
         for kind, extra, payload, sender in (
             (33, 104, position, system),
             (30, 39, attitude, system),
             (24, 24, gps, system),
+            (1, 124, status, system),
             (0, 50, beat, 255),
         ):
             if version == 2:

@@ -207,6 +207,20 @@ def test_a_second_entry_joins_the_first_and_one_of_the_same_name_replaces_it(fol
     assert find_named("mine/d12_LW1.C", folder).part == "LW1.C"
 
 
+def test_the_entries_of_a_memory_of_another_version_are_replaced_in_turn(folder: Path) -> None:
+    site, table = folder / "mine.yaml", sphere_csv(np.zeros((7, 8)), np.ones((7, 8))).encode()
+    remember(site, "other", entry("B"), {"B.t.csv.gz": table, "B.u.csv.gz": table})
+    index = folder_of(site) / "learned.yaml"
+    index.write_text(index.read_text().replace("sd_db:", "spread_db:"))
+    remember(site, "d12", entry("C"), {"C.t.csv.gz": table, "C.u.csv.gz": table})
+    assert not (folder_of(site) / "A.t.csv.gz").exists()
+    assert (folder_of(site) / "B.t.csv.gz").exists()
+    with pytest.raises(UsageError, match="spread_db"):
+        read_learned(site)
+    remember(site, "other", entry("B"), {"B.t.csv.gz": table, "B.u.csv.gz": table})
+    assert set(read_learned(site).entries) == {"d12", "other"}
+
+
 @pytest.mark.parametrize("name", ["../thesis.tex", "{folder}/thesis.tex", "link.gz"])
 @pytest.mark.parametrize("key", ["tower_file: A.t.csv.gz", "A.t.csv.gz: "])
 def test_a_memory_that_names_a_file_of_others_touches_and_shows_none(

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
-from pydantic import Field
+from pydantic import BaseModel, Field
 
 from ...common.counting import counted
 from ...common.errors import InputError, UsageError, parsing
@@ -158,11 +158,30 @@ class Entry(StrictModel):
         return text + (f"; expect kappa {sum(kappas) / len(kappas):.2f} on another flight" if kappas else "")
 
 
+class _Foreign(BaseModel, extra="allow"):
+    """An entry of another version: nothing is read of it, but others can be replaced beside it."""
+
+    tables: dict[str, str] = Field(default_factory=dict)
+
+
+_Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+
+
 class Learned(StrictModel):
     """All that a site remembers, by name."""
 
     format: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
-    entries: dict[Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")], Entry] = Field(default_factory=dict)
+    entries: dict[_Name, Entry] = Field(default_factory=dict)
+
+
+class _Index(StrictModel):
+    """The same as it is written, with entries of any version."""
+
+    format: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
+    entries: dict[_Name, Entry | _Foreign] = Field(default_factory=dict)
+
+
+_Memory = TypeVar("_Memory", Learned, _Index)
 
 
 def folder_of(site: str | Path) -> Path:
@@ -184,10 +203,14 @@ def read_learned(site: str | Path) -> Learned:
     InputError
         It names a file outside its folder.
     """
-    folder = folder_of(site)
+    return _read(folder_of(site), Learned)
+
+
+def _read(folder: Path, model: type[_Memory]) -> _Memory:
     index = inside(folder, _INDEX, folder / _INDEX)
-    memory = load_yaml(index, Learned) if index.is_file() else Learned()
-    for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
+    memory = load_yaml(index, model) if index.is_file() else model()
+    entries: Iterable[Entry | _Foreign] = memory.entries.values()
+    for name in {name for entry in entries for name in (*files_of(entry), *entry.tables)}:
         inside(folder, name, index, plain=True)
     return memory
 
@@ -211,7 +234,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     Raises
     ------
     UsageError
-        A file of the name of a table that no calibration wrote, or that was changed since.
+        A file of the name of a table that no calibration wrote, or that was changed since; a damaged index.
     InputError, OutputError
         As :func:`read_learned`; the folder cannot be written.
     """
@@ -221,7 +244,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
         with locked(folder):
-            memory = read_learned(site)
+            memory = _read(folder, _Index)
             written = {item for known in memory.entries.values() for item in known.tables.items()}
             for file in packed:
                 place = inside(folder, file, folder / _INDEX, plain=True)
@@ -234,7 +257,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
             for file, content in packed.items():
                 write_whole(folder / file, content)
             entries = {**memory.entries, name: entry.model_copy(update={"tables": tables})}
-            text = dump_yaml(Learned(entries=dict(sorted(entries.items()))).model_dump(mode="json", exclude_none=True))
+            text = dump_yaml(_Index(entries=dict(sorted(entries.items()))).model_dump(mode="json", exclude_none=True))
             write_whole(folder / _INDEX, text)
             used = {file for known in entries.values() for file in files_of(known)}
             for file, digest in sorted(written):
@@ -273,8 +296,10 @@ def memory_lines(site: str | Path) -> list[str]:
     return lines
 
 
-def files_of(entry: Entry) -> set[str]:
+def files_of(entry: Entry | _Foreign) -> set[str]:
     """Names of the tables of an entry."""
+    if isinstance(entry, _Foreign):
+        return set(entry.tables)
     return {f for s in entry.series for f in (s.tower_file, s.uav_file)} | {r.file for r in entry.receivers}
 
 

@@ -84,7 +84,7 @@ def audited() -> list[str]:
     test = runpy.run_path(str(ROOT / "tests/jobs/test_audit_raw.py"))
     with tempfile.TemporaryDirectory() as place:
         try:
-            return list(test["checked"](test["write_flight"](Path(place)), scores=True).failures)
+            return list(test["checked"](test["write_flight"](Path(place))).failures)
         except Exception as error:  # the flight is refused: that is loud enough
             return [f"refused: {type(error).__name__}: {str(error).splitlines()[0][:100]}"]
 

@@ -11,13 +11,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.cli.app import app
 from aerpaw_cmp.common.commands import COMMANDS
 from aerpaw_cmp.common.outputs import OutputFolder
 from tests.geojson import collection, feature, polygon
+from tests.test_docs import PROGRAM, check
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "sample_logs"
@@ -31,22 +30,8 @@ def leaves(group: Any, *names: str) -> dict[tuple[str, ...], Any]:
     return commands
 
 
-PROGRAM: Any = typer.main.get_command(app)
 LEAVES = leaves(PROGRAM)
 EACH = pytest.mark.parametrize("words", LEAVES, ids=" ".join)
-
-
-def parse(line: str) -> dict[str, Any]:
-    """The values that a command line gives its command, which does not run; an exception for a wrong one."""
-    program, *words = shlex.split(line)
-    assert program == "aerpaw-cmp"
-    command, context = PROGRAM, PROGRAM.make_context("aerpaw-cmp", [], resilient_parsing=True)
-    while hasattr(command, "commands"):
-        name = words.pop(0)
-        command = command.commands[name]
-        group = hasattr(command, "commands")
-        context = command.make_context(name, [] if group else words, parent=context, resilient_parsing=group)
-    return dict(context.params)
 
 
 def examples_of(words: tuple[str, ...]) -> list[str]:
@@ -65,7 +50,7 @@ def test_every_command_has_help_quiet_json_and_examples_that_parse(words: tuple[
     assert lines
     for line in lines:
         assert shlex.split(line)[1 : 1 + len(words)] == list(words), "an example shows its own command"
-        assert parse(line)
+        check(line, in_block=True)
 
 
 @EACH
@@ -76,12 +61,6 @@ def test_help_with_both_names(words: tuple[str, ...], flag: str, capsys: pytest.
     assert shown.startswith(f"Usage: aerpaw-cmp {' '.join(words)}")
     for line in examples_of(words):
         assert line in shown.splitlines() or f"    {line}" in shown.splitlines(), "not broken"
-
-
-@pytest.mark.parametrize("words", ["report f.yaml --figure none", "report", "site shown", "map --engine x"])
-def test_a_wrong_example_would_be_seen(words: str) -> None:
-    with pytest.raises(Exception, match=r".*"):
-        parse(f"aerpaw-cmp {words}")
 
 
 def cheap(tmp: Path) -> dict[str, tuple[list[str], list[str]]]:

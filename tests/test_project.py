@@ -283,27 +283,6 @@ def test_functions_of_four_parameters_describe_each_and_what_they_return() -> No
     assert seen > 1000
 
 
-def test_a_parameter_without_a_word_is_found() -> None:
-    source = '''
-def f(a, b, *, c, d) -> int:
-    """One line.
-
-    Parameters
-    ----------
-    a, b : int
-    d : int
-        Of c : nothing is said.
-
-    Notes
-    -----
-    c : int is none of a section of parameters.
-    """
-'''
-    (function,) = ast.parse(source).body
-    assert isinstance(function, ast.FunctionDef)
-    assert lacking(function) == ["c", "Returns"]
-
-
 def built_by_position(tree: ast.AST, classes: set[str], most: int) -> list[tuple[int, str]]:
     """Lines that build one of ``classes`` of more than ``most`` positional values."""
     calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and len(node.args) > most]

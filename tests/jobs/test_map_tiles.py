@@ -122,31 +122,6 @@ def test_sionna_in_tiles_keeps_every_building():
     assert reach.of(np.array([[0.0, 0.0, 2.0], [10.0, 10.0, 2.0]])).buildings == site.buildings
 
 
-def _nothing(*_):
-    return shapely.linestrings(np.zeros((0, 2, 2)))
-
-
-FAULTS = {
-    "a shorter tile": (
-        "_buildings_in_reach",
-        lambda right: lambda self, tower, box_m: right(self, tower, (box_m + box_m[:1]) / 2),
-    ),
-    "no way in": ("_way_in", lambda _: _nothing),
-    "no way out": ("_way_out", lambda _: _nothing),
-}
-
-
-@pytest.mark.parametrize("fault", FAULTS)
-def test_a_shortened_reach_is_seen(fault, monkeypatch):
-    site, chosen = town(), settings()
-    one_piece, _ = in_one_piece(site, chosen)
-    name, wrong = FAULTS[fault]
-    monkeypatch.setattr(Reach, name, wrong(getattr(Reach, name)))
-    maps, _, _ = in_tiles(site, chosen, 5)
-    with pytest.raises(AssertionError):
-        assert_equal(maps, one_piece)
-
-
 def test_a_tower_that_is_left_out_of_a_tile_reaches_no_position_of_it():
     site = town(20, side_m=4000.0)
     free = in_one_piece(site, settings(spacing_m=200.0))[0]["none"]

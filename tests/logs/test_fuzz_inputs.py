@@ -1,18 +1,12 @@
 """A short, seeded part of the fuzz driver: every target, in this process; and the driver sees planted faults."""
 
-import dataclasses
 import warnings
-from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs import limits
-from aerpaw_cmp.logs.readers import by_name, catalogue
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.readers import catalogue
 from benchmarks import fuzz_inputs as fuzz
-from tests.parsers import samples
 
 
 @pytest.fixture(scope="module")
@@ -89,41 +83,3 @@ def test_planted_faults_are_seen_and_resumed_after(monkeypatch: pytest.MonkeyPat
         5: "no message",
     }.items():
         assert any(text.startswith(f"planted {index}:") and words in text for text in messages), (index, messages)
-
-
-def test_a_reader_that_breaks_its_promises_is_seen() -> None:
-    vehicle = next(reader for reader in catalogue() if reader.name == "vehicle_out")
-    from tests.parsers.samples import VEHICLE_10
-
-    def spoilt(change: object) -> object:
-        def read(data: bytes, options: object) -> ReadResult:
-            result = vehicle.read(data, options)
-            (stream,) = result.streams
-            frame = stream.frame.copy()
-            change(frame)
-            return dataclasses.replace(result, streams=(dataclasses.replace(stream, frame=frame),))
-
-        return dataclasses.replace(vehicle, read=read)
-
-    assert fuzz._read_log(vehicle, False, VEHICLE_10, 0)
-    for change, words in (
-        (lambda frame: frame.__setitem__("line", 99), "a record of no line"),
-        (lambda frame: frame.__setitem__("flag", 0), "a flag that is no text"),
-        (lambda frame: frame.__setitem__("time", np.datetime64("NaT", "ns")), "a record without a time"),
-    ):
-        with pytest.raises(fuzz.ViolationError, match=words):
-            fuzz._read_log(spoilt(change), False, VEHICLE_10, 0)
-    beyond = vehicle.read(VEHICLE_10, fuzz.OPTIONS[0])
-    beyond.streams[0].frame["latitude_deg"] = 1e30
-    with pytest.raises(fuzz.ViolationError, match="latitude_deg beyond its range"):
-        fuzz.check_law(beyond, VEHICLE_10, False)
-    assert fuzz.check_law(limits.check(beyond), VEHICLE_10, False) is None
-
-
-def test_a_reader_that_says_otherwise_in_pieces_is_seen() -> None:
-    sounder = by_name("sounder_log")
-    data = samples.sounder_log(40)
-    assert fuzz._read_log(sounder, False, data, 1)
-    forgetful = replace(sounder, read_pieces=lambda pieces, options: sounder.read(list(pieces)[-1], options))
-    with pytest.raises(fuzz.ViolationError, match="otherwise in pieces"):
-        fuzz._read_log(forgetful, False, data, 1)

@@ -201,12 +201,39 @@ def test_errors_of_python_name_its_arguments(tmp_path: Path, capsys: pytest.Capt
         (lambda: ac.read(tmp_path / "mine.csv"), f"columns={columns}"),
         (lambda: ac.open_flight(tmp_path / "lost.yaml"), "a wrong path, or logs_root="),
         (lambda: flight.report(tmp_path / "out", audit="x"), "audit='x'"),
+        (lambda: flight.report(tmp_path), "expected a new or empty folder: a folder of results"),
+        (lambda: ac.OrdinaryKriging(np.exp).predict([[0.0, 0.0]]), "OrdinaryKriging.predict before fit()"),
+        (lambda: ac.Variogram()(np.arange(3.0)), "Variogram.__call__ before fit()"),
     ):
         with pytest.raises(AerpawCmpError) as caught:
             call()
         assert words in str(caught.value)
-        assert "--" not in str(caught.value)
+        assert not re.search(r"--|\s-o\b", str(caught.value))
     logs = ac.read(tmp_path / "mine.csv", columns=columns, kind="rss", time_origin="2025-06-01T14:00:00Z")
     assert len(logs["rss"]) == 30
     assert main(["ingest", str(SAMPLE / "UAV")]) == 2
     assert "--timezone" in capsys.readouterr().err
+
+
+def test_every_public_function_names_itself_and_an_argument_that_it_does_not_know(flight: ac.Flight) -> None:
+    replayed = flight.replay(max_depth=0, foliage="none")
+    things = [
+        ac.Flight(flight.path, flight.data),
+        replayed,
+        replayed.compare(),
+        ac.read(SAMPLE / "UAV", timezone="America/New_York"),
+        flight.site,
+    ]
+    things += [ac.Variogram(), ac.OrdinaryKriging(np.exp)]
+    first = {"read": (SAMPLE / "UAV",), "report": ("out",)}
+    calls = {name: getattr(ac, name) for name in ac.__all__ if callable(getattr(ac, name))}
+    for thing in things:
+        names = [name for name, _ in inspect.getmembers(type(thing), inspect.isfunction) if name[0] != "_"]
+        calls |= {f"{type(thing).__name__}.{name}": getattr(thing, name) for name in names}
+    del calls["Logs.select"]  # any attribute of a stream may be asked for
+    assert len(calls) > 35
+    for name, call in calls.items():
+        words = r"no key 'unheard'" if name in ("Flight.replay", "Flight.compare") else r"(\w+)\(\) .*'unheard'"
+        with pytest.raises((AerpawCmpError, TypeError), match=words) as caught:
+            call(*first.get(name.split(".")[-1], ()), unheard=1)
+        assert "Options" not in str(caught.value), name

@@ -20,6 +20,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import wraps
 from pathlib import Path
+from types import FunctionType
 from typing import Any, ParamSpec, TypeVar, cast
 
 _P = ParamSpec("_P")
@@ -218,29 +219,47 @@ def parsed(expected: str) -> Callable[[Callable[_P, _T]], Callable[_P, _T]]:
 _IN_PYTHON = {"--with": "learned", "--force": "force=True"}
 
 
-def from_python(function: Callable[_P, _T]) -> Callable[_P, _T]:
-    """Decorator of a public function: errors name arguments (``timezone=``) in place of options (``--timezone``)."""
+def _as_argument(option: re.Match[str]) -> str:
+    name = _IN_PYTHON.get(option[1], option[1][2:].replace("-", "_"))
+    return name if "=" in name else f"{name}="
 
-    def columns(options: re.Match[str]) -> str:
-        pairs = re.findall(r"--map '([^']*)'=(\w+)", options[0])
-        return f"columns={ ({quantity: column for column, quantity in pairs}) }"
 
-    def argument(option: re.Match[str]) -> str:
-        name = _IN_PYTHON.get(option[1], option[1][2:].replace("-", "_"))
-        return name if "=" in name else f"{name}="
+def _as_columns(options: re.Match[str]) -> str:
+    pairs = re.findall(r"--map '([^']*)'=(\w+)", options[0])
+    return f"columns={ ({quantity: column for column, quantity in pairs}) }"
+
+
+def from_python(public: _T) -> _T:
+    """Decorator of a public function or class: errors name arguments (``timezone=``), not options (``--timezone``).
+
+    An argument that a record of options refuses is one of the public function; what only ``fit`` knows asks for it.
+    """
+    if isinstance(public, type):
+        for name, method in vars(public).items():
+            if isinstance(method, FunctionType) and (name == "__call__" or not name.startswith("_")):
+                setattr(public, name, from_python(method))
+        return public
+    function = cast("Callable[..., Any]", public)
 
     @wraps(function)
-    def run(*arguments: _P.args, **more: _P.kwargs) -> _T:
+    def run(*arguments: Any, **more: Any) -> Any:
         try:
             return function(*arguments, **more)
         except AerpawCmpError as error:
             for part in ("found", "expected", "cause"):
                 if text := getattr(error, part):
-                    text = re.sub(r"--map '[^']*'=\w+( --map '[^']*'=\w+)*", columns, text)
-                    setattr(error, part, re.sub(r"(?<!\S)(--[a-z][a-z-]*)( (?='))?", argument, text))
+                    text = re.sub(r"--map '[^']*'=\w+( --map '[^']*'=\w+)*", _as_columns, text.replace(" after -o", ""))
+                    setattr(error, part, re.sub(r"(?<!\S)(--[a-z][a-z-]*)( (?='))?", _as_argument, text))
             raise
+        except TypeError as error:
+            refused = re.fullmatch(r"\w+\.__init__(\(\) got an unexpected keyword argument .*)", str(error))
+            raise TypeError(function.__name__ + refused[1]) if refused else error from None
+        except AttributeError as error:
+            if error.obj is not (arguments or (None,))[0] or not (error.name or "").endswith("_"):
+                raise
+            raise UsageError(f"{function.__qualname__} before fit()", expected="fit() first") from None
 
-    return run
+    return cast("_T", run)
 
 
 class CheckError(AerpawCmpError):

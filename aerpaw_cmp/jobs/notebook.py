@@ -99,6 +99,7 @@ def _drafted(file: Path, flight: str | None) -> FlightFile:
     return with_learned(parse_yaml(text, FlightFile), file.parent)
 
 
+@from_python
 class Flight:
     """A checked flight.yaml with its logs read; nothing is replayed before it is asked for.
 
@@ -204,7 +205,6 @@ class Flight:
         """Replay and compare; arguments as :meth:`replay`."""
         return self.replay(engine, **overrides).compare()
 
-    @from_python
     def report(self, folder: str | Path, *, force: bool = False, **options: Any) -> Path:
         """Write the whole report, as ``aerpaw-cmp report`` does, and give the path of its page.
 
@@ -233,7 +233,6 @@ class Flight:
         run_report(self.path, ReportOptions(**options), RunOptions(out=out, logs_root=self.logs_root, force=force))
         return out / "report.html"
 
-    @from_python
     def channel(self, **options: Any) -> Any:
         """Paths, channel matrices and calibrated levels along the track, as ``aerpaw-cmp channel`` writes them.
 
@@ -284,6 +283,7 @@ class Flight:
         return "no track" if self.data.track is None else f"{counted(len(self.track), 'pose')}"
 
 
+@from_python
 class ReplayedFlight:
     """A flight, ray-traced at its samples.
 
@@ -349,6 +349,7 @@ class ReplayedFlight:
         return "\n".join(["ReplayedFlight", *(f"  {' '.join(k)}: {v.replay!r}" for k, v in self.series.items())])
 
 
+@from_python
 class Comparison:
     """The numbers of a flight.
 

@@ -24,6 +24,7 @@ from .readers import ReadOptions
 Source: TypeAlias = str | os.PathLike[str] | BinaryIO
 
 
+@from_python
 class Logs(dict[str, pd.DataFrame]):
     """Frames by the name of their stream, with the account of every file.
 
@@ -157,7 +158,7 @@ def read(
     >>> logs = read("sample_logs/UAV", timezone="America/New_York")  # doctest: +SKIP
     >>> logs["vehicle"].altitude_m.max()  # doctest: +SKIP
     """
-    zone = timezone.key if isinstance(timezone, ZoneInfo) else timezone
+    zone = None if timezone is None else str(timezone)
     chosen = ReadOptions(timezone=zone, time_origin=time_origin, **options)
     if chosen.columns:
         reader = reader or "generic_csv"  # as with --map

@@ -36,7 +36,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.errors import UsageError
+from ..common.errors import UsageError, from_python
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 from ..propagation.native.compiled import triangles_for
 from . import neighbours as choose
@@ -79,6 +79,7 @@ class Weights:
     regularised: BoolArray
 
 
+@from_python
 class OrdinaryKriging:
     """Ordinary Kriging of one or many fields sampled at the same points.
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.errors import UsageError
+from ..common.errors import UsageError, from_python
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
 from .biexponential import PAPER_BIEXPONENTIAL, BiExponential, fit_biexponential
 
@@ -204,6 +204,7 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
 Block = Callable[[IntArray, IntArray], FloatArray]
 
 
+@from_python
 class Variogram:
     """Correlation of a field against horizontal distance, binned and fitted.
 

@@ -15,11 +15,11 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs.files import archives
 from aerpaw_cmp.logs.flight_file import write_flight
 from aerpaw_cmp.logs.ingest import ingest
-from tests.parsers.samples import IQ_NAME, NEMO_CSV, NO_LOGS, OPTIONS, SOUNDER, VEHICLE_10, iq_mat
+from tests.parsers.samples import FILES, IQ_NAME, NO_LOGS, OPTIONS, iq_mat
 
 CONTENT = {
-    "set/UAV/x_vehicleOut.txt": VEHICLE_10, "set/LW1/x_power_log.txt": SOUNDER,
-    "set/LW1/x_power_log.txt.gz": gzip.compress(SOUNDER), "set/phone.nmfs": NO_LOGS["nemo_binary"],
+    "set/UAV/x_vehicleOut.txt": FILES["vehicle_out/ten_fields"], "set/LW1/x_power_log.txt": FILES["sounder_log/runs_and_foot"],
+    "set/LW1/x_power_log.txt.gz": gzip.compress(FILES["sounder_log/runs_and_foot"]), "set/phone.nmfs": NO_LOGS["nemo_binary"],
     "__MACOSX/set/._x": b"junk",
 }  # fmt: skip
 
@@ -78,7 +78,7 @@ def test_a_missing_member_and_a_damaged_archive_are_messages(tmp_path: Path) -> 
 
 def test_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(archives, "_MARGIN", 1000)
-    data = zipped({"a.txt": b"\0" * 3_000_000, "b_vehicleOut.txt": VEHICLE_10})
+    data = zipped({"a.txt": b"\0" * 3_000_000, "b_vehicleOut.txt": FILES["vehicle_out/ten_fields"]})
     lied = bytearray(data)
     at = lied.rindex(b"PK\x01\x02", 0, lied.rindex(b"b_vehicleOut.txt") - 46)  # central entry of a.txt
     lied[at + 24 : at + 28] = struct.pack("<I", 4_000_000_000)
@@ -95,7 +95,7 @@ def test_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_an_archive_that_unpacks_to_far_more_than_its_size_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    content = {f"m{i}.txt": b"\0" * 400_000 for i in range(10)} | {"x_vehicleOut.txt": VEHICLE_10}
+    content = {f"m{i}.txt": b"\0" * 400_000 for i in range(10)} | {"x_vehicleOut.txt": FILES["vehicle_out/ten_fields"]}
     place = tmp_path / "many.zip"
     place.write_bytes(zipped(content))
     assert [Path(f.path).name for f in ingest(place, options=OPTIONS)] == ["x_vehicleOut.txt"]
@@ -108,7 +108,7 @@ def test_what_the_first_bytes_show_to_be_no_log_is_not_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = tmp_path / "a.zip"
-    place.write_bytes(zipped({"junk.bin": b"\0" * 5_000_000, "x_vehicleOut.txt": VEHICLE_10}))
+    place.write_bytes(zipped({"junk.bin": b"\0" * 5_000_000, "x_vehicleOut.txt": FILES["vehicle_out/ten_fields"]}))
     unpacked: list[tuple[str, int | None]] = []
     plain = archives._unzipped
 
@@ -124,7 +124,14 @@ def test_what_the_first_bytes_show_to_be_no_log_is_not_unpacked(
 
 def test_names_of_members_stay_in_the_archive(tmp_path: Path) -> None:
     place = tmp_path / "a.zip"
-    place.write_bytes(zipped({"/etc/x_vehicleOut.txt": VEHICLE_10, "../../y_vehicleOut.txt": VEHICLE_10}))
+    place.write_bytes(
+        zipped(
+            {
+                "/etc/x_vehicleOut.txt": FILES["vehicle_out/ten_fields"],
+                "../../y_vehicleOut.txt": FILES["vehicle_out/ten_fields"],
+            }
+        )
+    )
     ingested = ingest(place, options=OPTIONS)
     assert [f.path for f in ingested] == [str(place / "etc/x_vehicleOut.txt")]
     assert "leads out of the archive" in ingested.skipped[0].reason
@@ -133,7 +140,9 @@ def test_names_of_members_stay_in_the_archive(tmp_path: Path) -> None:
 
 
 def test_an_archive_in_an_archive_is_told(tmp_path: Path) -> None:
-    (tmp_path / "a.zip").write_bytes(zipped({"inner.zip": zipped(CONTENT), "x_vehicleOut.txt": VEHICLE_10}))
+    (tmp_path / "a.zip").write_bytes(
+        zipped({"inner.zip": zipped(CONTENT), "x_vehicleOut.txt": FILES["vehicle_out/ten_fields"]})
+    )
     assert "unpack it" in ingest(tmp_path / "a.zip", options=OPTIONS).skipped[0].reason
 
 
@@ -144,7 +153,7 @@ def test_a_folder_of_bursts_is_one_log(tmp_path: Path) -> None:
         file = io.BytesIO()
         scipy.io.savemat(file, {"IQ": np.full((1, 50), 10 ** (-i / 20), dtype=np.complex64)})
         (folder / IQ_NAME.replace("00_250", f"{i:02d}_250")).write_bytes(file.getvalue())
-    (tmp_path / "x_vehicleOut.txt").write_bytes(VEHICLE_10)
+    (tmp_path / "x_vehicleOut.txt").write_bytes(FILES["vehicle_out/ten_fields"])
     bursts, track = ingest(tmp_path, options=OPTIONS)
     assert (bursts.path, bursts.result.reader) == (str(folder), "iq_burst")
     (stream,) = bursts.result.streams
@@ -163,7 +172,7 @@ def test_a_single_burst_is_read_alone(tmp_path: Path) -> None:
 
 
 def test_a_flight_file_gives_its_logs_back(tmp_path: Path) -> None:
-    (tmp_path / "n.csv").write_bytes(NEMO_CSV)
+    (tmp_path / "n.csv").write_bytes(FILES["nemo_csv/table"])
     files = ingest(tmp_path / "n.csv", options=OPTIONS)
     write_flight(tmp_path / "flight.h5", files)
     (again,) = ingest(tmp_path / "flight.h5")

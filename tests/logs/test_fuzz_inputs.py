@@ -20,7 +20,7 @@ def known() -> dict:
 
 def test_every_reader_of_the_catalogue_is_a_target_with_seeds(known: dict) -> None:
     lacking = {f"reader:{reader.name}" for reader in catalogue()} - set(known)
-    assert not lacking, f"no seed for {lacking}: add a sample to tests/parsers/samples.py"
+    assert not lacking, f"no seed for {lacking}: add a sample to tests/parsers/sample_files"
     assert {"flight.yaml", "site.yaml", "campaign.yaml", "map:kmz", "matfile", "flight_file", "path_cache"} <= set(
         known
     )

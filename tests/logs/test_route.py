@@ -9,7 +9,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs.route import COLUMNS, read_route
-from tests.parsers.samples import VEHICLE_10
+from tests.parsers import samples
 
 HOME = (35.7275, -78.6962, 90.0)
 POINTS = ((35.7275, -78.6962, 40.0), (35.7285, -78.6962, 40.0), (35.7285, -78.6950, 55.0))
@@ -141,7 +141,7 @@ def test_a_table_with_its_own_yaw(tmp_path: Path) -> None:
 
 def test_the_track_of_a_log_is_a_route_with_times(tmp_path: Path) -> None:
     file = tmp_path / "vehicleOut.txt"
-    file.write_bytes(VEHICLE_10)
+    file.write_bytes(samples.FILES["vehicle_out/ten_fields"])
     route = read_route(file)
     assert route["time_s"].tolist() == [0.0, 2.0]  # the second record has no fix
     assert route["altitude_m"].tolist() == [0.5, 1.5]

@@ -25,10 +25,10 @@ def read(reader: str, data: bytes, options: ReadOptions = PLAIN) -> ReadResult:
 @pytest.mark.parametrize(
     ("reader", "data", "ranks", "means"),
     [
-        ("srsran_gnb", samples.SRSRAN_GNB, [2.0, None, None], [2.0, 2.2, None]),
-        ("srsran_gnb", samples.SRSRAN_GNB_OLD, [1.0], [1.0]),
-        ("srsran_gnb", samples.SRSRAN_LOG, [2.0], [2.0]),
-        ("srsran_json", samples.SRSRAN_JSON, [2.0, None], [2.0, 1.5]),
+        ("srsran_gnb", samples.FILES["srsran_gnb/console"], [2.0, None, None], [2.0, 2.2, None]),
+        ("srsran_gnb", samples.FILES["srsran_gnb/old_console"], [1.0], [1.0]),
+        ("srsran_gnb", samples.FILES["srsran_gnb/log"], [2.0], [2.0]),
+        ("srsran_json", samples.FILES["srsran_json/metrics"], [2.0, None], [2.0, 1.5]),
     ],
 )
 def test_a_mean_of_ranks_is_no_rank(
@@ -43,7 +43,7 @@ def test_a_mean_of_ranks_is_no_rank(
 
 
 def test_the_form_of_most_times_of_reports_is_that_of_all() -> None:
-    line = samples.SRSRAN_JSON.splitlines(keepends=True)[0]
+    line = samples.FILES["srsran_json/metrics"].splitlines(keepends=True)[0]
     (epoch,) = re.findall(rb'"timestamp": ?([0-9.]+)', line)
     data = line * 5 + line.replace(epoch, b'"no time"') * 4
     assert read("srsran_json", data).accepted == 5
@@ -51,13 +51,13 @@ def test_the_form_of_most_times_of_reports_is_that_of_all() -> None:
 
 @pytest.mark.parametrize("rnti", [b"70.5", b"-1", b"1e300", b'"x"'])
 def test_a_number_that_is_no_rnti_is_no_identity(rnti: bytes) -> None:
-    data = re.sub(rb'"rnti": ?\d+', b'"rnti": ' + rnti, samples.SRSRAN_JSON, count=1)
+    data = re.sub(rb'"rnti": ?\d+', b'"rnti": ' + rnti, samples.FILES["srsran_json/metrics"], count=1)
     result = read("srsran_json", data)
     assert sum(len(stream.frame) for stream in result.streams) == 2
 
 
 def test_reports_with_times_of_the_day_alone_pass_midnight() -> None:
-    line = samples.SRSRAN_JSON.splitlines(keepends=True)[0]
+    line = samples.FILES["srsran_json/metrics"].splitlines(keepends=True)[0]
     (epoch,) = re.findall(rb'"timestamp": ?([0-9.]+)', line)
     data = b"".join(
         line.replace(epoch, b'"%s"' % time) for time in (b"23:59:58", b"23:59:59", b"00:00:00", b"00:00:01")
@@ -111,7 +111,7 @@ def test_a_burst_says_its_frequency_and_needs_its_name() -> None:
 
 def test_an_export_of_the_tap_keeps_its_queries_apart() -> None:
     lte = b"2025-03-02T15:00:00.300Z,0.02,3,lte_csi,ok,4,4,11,9,,\n"
-    streams = {stream.name: stream for stream in read("drive_test", samples.TAP_EXPORT + lte).streams}
+    streams = {stream.name: stream for stream in read("drive_test", samples.FILES["tap_export"] + lte).streams}
     ranks = {name: stream.frame["rank"].tolist() for name, stream in streams.items() if stream.kind == "rank"}
     assert sorted(ranks.values()) == [[2.0], [4.0]]
     (level,) = (stream for stream in streams.values() if stream.kind == "rss")

@@ -38,7 +38,7 @@ def utc(text: str) -> pd.Timestamp:
     ],
 )
 def test_a_row_index_that_jumps_is_told_once_per_place(indices: tuple[int, ...], said: int | None) -> None:
-    rest = samples.VEHICLE_10.splitlines()[0].split(b",", 1)[1].decode()
+    rest = samples.FILES["vehicle_out/ten_fields"].splitlines()[0].split(b",", 1)[1].decode()
     rows = [f"{n},{rest.replace('00.250000', f'0{i}.250000')}\n" for i, n in enumerate(indices)]
     warnings = [text for text in read("vehicle_out", "".join(rows).encode()).warnings if "index" in text]
     expected = (
@@ -49,7 +49,13 @@ def test_a_row_index_that_jumps_is_told_once_per_place(indices: tuple[int, ...],
 
 @pytest.mark.parametrize(
     "data",
-    [samples.VEHICLE_10, samples.VEHICLE_9, samples.VEHICLE_8, samples.VEHICLE_11, samples.VEHICLE_UTC],
+    [
+        samples.FILES["vehicle_out/ten_fields"],
+        samples.FILES["vehicle_out/nine_fields"],
+        samples.FILES["vehicle_out/eight_fields"],
+        samples.FILES["vehicle_out/eleven_fields"],
+        samples.FILES["vehicle_out/utc_offset"],
+    ],
     ids=["10", "9", "8", "11", "utc"],
 )
 def test_all_generations_of_telemetry_agree(data: bytes) -> None:
@@ -63,12 +69,16 @@ def test_all_generations_of_telemetry_agree(data: bytes) -> None:
 
 
 def test_attitude_is_there_where_the_format_has_it() -> None:
-    for data, present in ((samples.VEHICLE_10, True), (samples.VEHICLE_11, True), (samples.VEHICLE_9, False)):
+    for data, present in (
+        (samples.FILES["vehicle_out/ten_fields"], True),
+        (samples.FILES["vehicle_out/eleven_fields"], True),
+        (samples.FILES["vehicle_out/nine_fields"], False),
+    ):
         assert read("vehicle_out", data).streams[0].frame["yaw_deg"].notna().iloc[0] == present
 
 
 def test_velocity_is_north_east_down() -> None:
-    first = read("vehicle_out", samples.VEHICLE_10).streams[0].frame.iloc[0]
+    first = read("vehicle_out", samples.FILES["vehicle_out/ten_fields"]).streams[0].frame.iloc[0]
     names = ["velocity_north_mps", "velocity_east_mps", "velocity_down_mps"]
     assert first[names].tolist() == [1.0, 2.0, -0.5]
 
@@ -106,23 +116,23 @@ def test_counts_of_a_vehicle_have_their_digits(index: str, fix: str, rows: int) 
 
 
 def test_no_fix_is_flagged_and_has_no_position() -> None:
-    row = read("vehicle_out", samples.VEHICLE_10).streams[0].frame.iloc[1]
+    row = read("vehicle_out", samples.FILES["vehicle_out/ten_fields"]).streams[0].frame.iloc[1]
     assert row["flag"] == "no_fix"
     assert row[["latitude_deg", "longitude_deg", "altitude_m"]].isna().all()
     assert row["yaw_deg"] == pytest.approx(np.degrees(1.5)), "the attitude does not need a fix"
 
 
 def test_zero_attitude_is_flagged_and_unknown_where_it_is_all_there_is() -> None:
-    result = read("vehicle_out", samples.VEHICLE_10)
+    result = read("vehicle_out", samples.FILES["vehicle_out/ten_fields"])
     assert result.streams[0].frame["flag"].iloc[2] == "zero_attitude"
-    third = samples.VEHICLE_10.splitlines(keepends=True)[2]
+    third = samples.FILES["vehicle_out/ten_fields"].splitlines(keepends=True)[2]
     converted = read("vehicle_out", third * 3)
     assert converted.streams[0].frame[["yaw_deg", "velocity_north_mps"]].isna().all(axis=None)
     assert any("unknown" in text for text in converted.warnings)
 
 
 def test_torn_and_impossible_telemetry_says_why() -> None:
-    lines = samples.VEHICLE_10.splitlines(keepends=True)
+    lines = samples.FILES["vehicle_out/ten_fields"].splitlines(keepends=True)
     data = lines[0] + b"2,-78.7,35.7\r\n" + lines[2].replace(b"03-02", b"13-02") + lines[2].replace(b"1.5", b"x", 1)
     result = read("vehicle_out", data)
     assert [(line.number, line.reason.split(" ")[0]) for line in result.rejected] == [(2, "3"), (3, "the"), (4, "a")]
@@ -136,7 +146,7 @@ def test_digital_twin_is_named() -> None:
 
 
 def test_sounder_offsets_are_octal_and_runs_come_back() -> None:
-    result = read("sounder_log", samples.SOUNDER)
+    result = read("sounder_log", samples.FILES["sounder_log/runs_and_foot"])
     frame = result.streams[0].frame
     # offsets 0, 4, 010 = 8, then 030 = 24: samples 3, 4 and 5 were suppressed
     assert len(frame) == 3 + 3 + 2
@@ -160,19 +170,21 @@ def test_sounder_numbers_are_read_as_python_reads_them(text: str, width: int) ->
 @pytest.mark.parametrize("text", ["- 5", "1 5", "1-5", "1.2.3", "", "-", ".", "1x", "-.5"])
 def test_sounder_rejects_what_is_no_number(text: str) -> None:
     data = f"[2025-03-02 10:00:00.000000] 0001234{text:>16}\n".encode()
-    result = read("sounder_log", samples.SOUNDER_GROWN + data)
+    result = read("sounder_log", samples.FILES["sounder_log/grown_offset"] + data)
     assert (result.accepted, len(result.rejected)) == (4, 1)
 
 
 def test_sounder_offset_outgrows_seven_digits() -> None:
-    result = read("sounder_log", samples.SOUNDER_GROWN)
+    result = read("sounder_log", samples.FILES["sounder_log/grown_offset"])
     assert not [text for text in result.warnings if "jump" in text]
     assert (result.streams[0].frame["flag"] == "").all()
 
 
 def test_sounder_channel_names_the_stream() -> None:
-    quality = read("sounder_log", samples.SOUNDER, replace(OPTIONS, channel="quality", unit=None)).streams[0]
-    power = read("sounder_log", samples.SOUNDER, replace(OPTIONS, unit=None))
+    quality = read(
+        "sounder_log", samples.FILES["sounder_log/runs_and_foot"], replace(OPTIONS, channel="quality", unit=None)
+    ).streams[0]
+    power = read("sounder_log", samples.FILES["sounder_log/runs_and_foot"], replace(OPTIONS, unit=None))
     assert (quality.name, quality.attributes["unit"]) == ("quality", "dB")
     assert (power.streams[0].name, power.streams[0].attributes["unit"]) == ("power", "dB re full scale")
     assert any("one layout" in text for text in power.warnings)
@@ -219,7 +231,10 @@ def test_mat_of_another_kind_is_not_sniffed() -> None:
     assert not by_name("flight_mat").sniff(file.getvalue())
 
 
-@pytest.mark.parametrize(("reader", "data"), [("nemo_csv", samples.NEMO_CSV), ("nemo_kml", samples.NEMO_KML)])
+@pytest.mark.parametrize(
+    ("reader", "data"),
+    [("nemo_csv", samples.FILES["nemo_csv/table"]), ("nemo_kml", samples.FILES["nemo_kml/placemarks"])],
+)
 def test_nemo_relative_times(reader: str, data: bytes) -> None:
     result = read(reader, data)
     frame = result.streams[0].frame
@@ -235,8 +250,8 @@ def test_nemo_relative_times(reader: str, data: bytes) -> None:
 
 def test_nemo_calls_one_level_alike_in_both_exports() -> None:
     """What was learned of the level of one export fits the other: same channel, technology and quantity."""
-    table = next(s for s in read("nemo_csv", samples.NEMO_CSV).streams if s.kind == "rss")
-    placemarks = samples.NEMO_KML.replace(b"PDSCH rank (NR) = 2.0", b"RSRP (NR SpCell) = -80.5 dBm")
+    table = next(s for s in read("nemo_csv", samples.FILES["nemo_csv/table"]).streams if s.kind == "rss")
+    placemarks = samples.FILES["nemo_kml/placemarks"].replace(b"PDSCH rank (NR) = 2.0", b"RSRP (NR SpCell) = -80.5 dBm")
     level = next(s for s in read("nemo_kml", placemarks).streams if s.kind == "rss")
     for name in ("channel", "rat", "quantity", "unit"):
         assert level.attributes[name] == table.attributes[name]
@@ -244,18 +259,18 @@ def test_nemo_calls_one_level_alike_in_both_exports() -> None:
 
 
 def test_nemo_local_origin() -> None:
-    local = read("nemo_csv", samples.NEMO_CSV, replace(OPTIONS, time_origin="2025-03-02 10:00:00"))
-    zoned = read("nemo_csv", samples.NEMO_CSV)
+    local = read("nemo_csv", samples.FILES["nemo_csv/table"], replace(OPTIONS, time_origin="2025-03-02 10:00:00"))
+    zoned = read("nemo_csv", samples.FILES["nemo_csv/table"])
     assert local.streams[0].frame["time"].equals(zoned.streams[0].frame["time"])
     with pytest.raises(UsageError, match="timezone:"):
-        read("nemo_csv", samples.NEMO_CSV, ReadOptions(time_origin="2025-03-02 10:00:00"))
+        read("nemo_csv", samples.FILES["nemo_csv/table"], ReadOptions(time_origin="2025-03-02 10:00:00"))
     with pytest.raises(UsageError, match="time_origin"):
-        read("nemo_csv", samples.NEMO_CSV, replace(OPTIONS, time_origin="yesterday"))
+        read("nemo_csv", samples.FILES["nemo_csv/table"], replace(OPTIONS, time_origin="yesterday"))
 
 
 def test_kml_with_styles_in_front_is_still_known() -> None:
     styles = b"    <Style id='8'><width>3</width></Style>\n" * 2000
-    data = samples.NEMO_KML.replace(b"  <Document>\n", b"  <Document>\n" + styles)
+    data = samples.FILES["nemo_kml/placemarks"].replace(b"  <Document>\n", b"  <Document>\n" + styles)
     assert not by_name("nemo_kml").sniff(data[:65536])
     assert identify(data).name == "nemo_kml"
     fence = (
@@ -266,8 +281,12 @@ def test_kml_with_styles_in_front_is_still_known() -> None:
 
 def test_srsenb_layout_with_a_pci_column_reads_the_same_numbers() -> None:
     """Newer versions print the cell's pci before the rnti; an rnti of decimal digits must not be taken for it."""
-    before = read("srsenb_log", samples.SRSENB).streams[0].frame
-    newer = samples.SRSENB.replace(b"rat rnti", b"rat  pci rnti").replace(b"lte   46", b"lte    1   46")
+    before = read("srsenb_log", samples.FILES["srsenb_log/console"]).streams[0].frame
+    newer = (
+        samples.FILES["srsenb_log/console"]
+        .replace(b"rat rnti", b"rat  pci rnti")
+        .replace(b"lte   46", b"lte    1   46")
+    )
     assert by_name("srsenb_log").sniff(newer)
     after = read("srsenb_log", newer).streams[0].frame
     columns = ["rank", "ri_raw", "cqi", "mcs", "flag"]
@@ -276,7 +295,7 @@ def test_srsenb_layout_with_a_pci_column_reads_the_same_numbers() -> None:
 
 
 def test_generic_columns() -> None:
-    level = read("generic_csv", samples.GENERIC).streams[0]
+    level = read("generic_csv", samples.FILES["generic_csv/mapped"]).streams[0]
     assert level.frame["rss_db"].tolist() == [-81.5, -82.5]
     assert level.frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
     epoch = read("generic_csv", b"Time,Level\n1740927600.5,-81.5\n", replace(OPTIONS, time_origin=None))
@@ -305,7 +324,7 @@ def test_generic_columns() -> None:
 )
 def test_generic_says_what_is_missing(change: dict[str, object], message: str) -> None:
     with pytest.raises(UsageError, match=message):
-        read("generic_csv", samples.GENERIC, replace(OPTIONS, **change))
+        read("generic_csv", samples.FILES["generic_csv/mapped"], replace(OPTIONS, **change))
 
 
 @pytest.mark.parametrize(("base", "expected"), [("one", [np.nan, 1, 2]), ("zero", [1, 2, 3])])
@@ -325,12 +344,12 @@ def test_a_clock_without_zone_names_the_key(reader: str, sample: str) -> None:
 
 
 def test_a_clock_with_offset_needs_no_zone() -> None:
-    frame = read("vehicle_out", samples.VEHICLE_UTC, ReadOptions()).streams[0].frame
+    frame = read("vehicle_out", samples.FILES["vehicle_out/utc_offset"], ReadOptions()).streams[0].frame
     assert frame["time"].iloc[0] == utc("2025-03-02 15:00:00.25")
 
 
 def test_gzip_is_transparent(tmp_path) -> None:
     from aerpaw_cmp.logs.ingest import ingest
 
-    (tmp_path / "a.kml.gz").write_bytes(gzip.compress(samples.NEMO_KML))
+    (tmp_path / "a.kml.gz").write_bytes(gzip.compress(samples.FILES["nemo_kml/placemarks"]))
     assert ingest(tmp_path / "a.kml.gz", options=OPTIONS)[0].result.accepted == 2

@@ -48,7 +48,7 @@ def test_a_bare_rank_beside_a_level_is_the_rank_of_the_channel() -> None:
 
 
 def test_nemo_times_of_the_day_take_the_date_of_the_file_name() -> None:
-    data = samples.NEMO_WIDE.replace(b"2025-03-02 ", b"")
+    data = samples.FILES["drive_test/nemo"].replace(b"2025-03-02 ", b"")
     named = read("drive_test", data, replace(PLAIN, file_name="25Mar02_100000.1.csv"))
     assert named.streams[0].frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00.250")
     nobody = read("drive_test", data, replace(PLAIN, file_name="60m.csv"))
@@ -92,21 +92,23 @@ def test_values_are_in_the_unit_that_their_stream_says(name: str, unit: str, val
 
 @pytest.mark.parametrize(("written", "flag"), [("0", "no_csi"), ("9", "ri_out_of_range"), ("1,5", "rank_is_a_mean")])
 def test_a_rank_that_is_none_says_why(written: str, flag: str) -> None:
-    result = read("drive_test", samples.XCAL.replace(b'"-81,5";"2"', b'"-81,5";"%s"' % written.encode()))
+    result = read(
+        "drive_test", samples.FILES["drive_test/xcal"].replace(b'"-81,5";"2"', b'"-81,5";"%s"' % written.encode())
+    )
     (rank,) = (series for series in result.streams if series.kind == "rank")
     assert rank.frame["rank"].isna().all()
     assert rank.frame["flag"].tolist() == [flag]
 
 
 def test_g_nettrack_neighbours_are_not_the_serving_cell() -> None:
-    result = read("drive_test", samples.GNETTRACK)
+    result = read("drive_test", samples.FILES["drive_test/g_nettrack"])
     serving = next(series for series in result.streams if series.attributes.get("pci") == 42)
     assert serving.frame["rss_db"].tolist() == [-95.0, -96.0]
     assert serving.frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00")
 
 
 def test_g_nettrack_pro_rssi_is_beside_its_level_and_steps_are_none() -> None:
-    rows = samples.GNETTRACK_PRO.splitlines(keepends=True)
+    rows = samples.FILES["drive_test/g_nettrack_pro"].splitlines(keepends=True)
     result = read("drive_test", b"".join([*rows[:2], rows[1].replace(b"|-70|", b"|17|").replace(b"00.00|", b"00.02|")]))
     (cell,) = (series for series in result.streams if series.name == "lte_pci42")
     assert cell.frame["rssi_dbm"].tolist()[:1] == [-70.0]
@@ -115,16 +117,16 @@ def test_g_nettrack_pro_rssi_is_beside_its_level_and_steps_are_none() -> None:
 
 @pytest.mark.parametrize("columns", [lambda names: names[::-1], lambda names: names[3:] + names[:3]])
 def test_columns_in_any_order(columns: object) -> None:
-    lines = [line.split(b",") for line in samples.NEMO_WIDE.strip().split(b"\n")[:-1]]
+    lines = [line.split(b",") for line in samples.FILES["drive_test/nemo"].strip().split(b"\n")[:-1]]
     turned = b"\n".join(b",".join(columns(line)) for line in lines) + b"\n"  # type: ignore[operator]
-    usual, reordered = read("drive_test", samples.NEMO_WIDE), read("drive_test", turned)
+    usual, reordered = read("drive_test", samples.FILES["drive_test/nemo"]), read("drive_test", turned)
     for name in ("lte_pci110", "lte_pci22", "phone"):
         pd.testing.assert_frame_equal(stream(usual, name).frame, stream(reordered, name).frame)
 
 
 def test_the_same_pose_from_every_program() -> None:
     """One flight state, written by four programs in their own units."""
-    airdata = read("pose_csv", samples.AIRDATA).streams[0].frame
+    airdata = read("pose_csv", samples.FILES["pose_csv/airdata"]).streams[0].frame
     feet = airdata.iloc[0]
     assert feet["altitude_m"] == pytest.approx(3.048)
     assert feet["velocity_north_mps"] == pytest.approx(4.4704)
@@ -132,25 +134,25 @@ def test_the_same_pose_from_every_program() -> None:
     assert airdata["time"].tolist() == [pd.Timestamp("2025-03-02T15:00:00.9"), pd.Timestamp("2025-03-02T15:00:01")], (
         "datetime(utc) has whole seconds, time(millisecond) their fractions"
     )
-    dji = read("pose_csv", samples.DJI).streams[0].frame.iloc[0]
+    dji = read("pose_csv", samples.FILES["pose_csv/dji"]).streams[0].frame.iloc[0]
     assert dji["altitude_m"] == pytest.approx(9.99744)
     assert dji["time"] == pd.Timestamp("2025-03-02T15:00:00.250"), "local"
-    own = read("vehicle_out", samples.VEHICLE_10).streams[0].frame.iloc[0]
-    converted = read("pose_csv", samples.CONVERTED).streams[0].frame.iloc[0]
+    own = read("vehicle_out", samples.FILES["vehicle_out/ten_fields"]).streams[0].frame.iloc[0]
+    converted = read("pose_csv", samples.FILES["pose_csv/converted"]).streams[0].frame.iloc[0]
     for name in ("time", "latitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "velocity_east_mps", "fix"):
         assert converted[name] == own[name], name
 
 
 def test_milliseconds_beyond_any_time_stamp_are_left_out() -> None:
-    first = samples.AIRDATA.splitlines(keepends=True)[1]
-    wild = samples.AIRDATA.replace(first, b"9" * 16 + first[first.index(b",") :])
+    first = samples.FILES["pose_csv/airdata"].splitlines(keepends=True)[1]
+    wild = samples.FILES["pose_csv/airdata"].replace(first, b"9" * 16 + first[first.index(b",") :])
     result = read("pose_csv", wild)
     assert any("column of milliseconds" in text for text in result.warnings)
     assert (result.streams[0].frame["time"].to_numpy().astype("int64") % 1_000_000_000 == 0).all()
 
 
 def test_title_lines_in_front_of_a_table() -> None:
-    data = b"Flight of the second\nexported by x\n\n" + samples.AIRDATA
+    data = b"Flight of the second\nexported by x\n\n" + samples.FILES["pose_csv/airdata"]
     assert read("pose_csv", data).accepted == 2
     assert by_name("pose_csv").sniff(data)
 
@@ -207,6 +209,10 @@ def test_past_midnight() -> None:
 
 
 def test_a_local_clock_without_a_zone_is_asked_for() -> None:
-    for reader, data in (("drive_test", samples.NEMO_WIDE), ("srsue_log", samples.SRSUE), ("pose_csv", samples.DJI)):
+    for reader, data in (
+        ("drive_test", samples.FILES["drive_test/nemo"]),
+        ("srsue_log", samples.FILES["srsue_log/console"]),
+        ("pose_csv", samples.FILES["pose_csv/dji"]),
+    ):
         with pytest.raises(UsageError, match="timezone:"):
             read(reader, data, replace(OPTIONS, timezone=None, time_origin=None))

@@ -237,7 +237,7 @@ def test_levels_in_another_unit_are_said() -> None:
 
 def test_two_phone_lines_glued_by_a_torn_one_are_rejected() -> None:
     """The cells of the second would get the time of the first."""
-    first, second = samples.PAWPRINTS_TEXT.split(b"\n")[:2]
+    first, second = samples.FILES["pawprints/text_of_2023"].split(b"\n")[:2]
     result = read("pawprints", first[:40] + second + b"\n" + second + b"\n")
     assert (result.accepted, [line.number for line in result.rejected]) == (1, [1])
 

@@ -525,10 +525,10 @@ BINARY: dict[str, tuple[str, str, bytes, Truth, ReadOptions]] = {
     "I/Q without a signal": (
         "iq_burst", samples.IQ_NAME, samples.saved({"IQ": np.zeros((1, 8), dtype=complex)}), {"USRP1": {"rss_db": [np.nan]}}, LOCAL,
     ),
-    "tap: cell, rank, no CSI, a torn line": ("tap_jsonl", "x.jsonl", samples.TAP, TAP, LOCAL),
+    "tap: cell, rank, no CSI, a torn line": ("tap_jsonl", "x.jsonl", samples.FILES["tap_jsonl/session"], TAP, LOCAL),
     "tap: an answer that failed, then LTE": (
         "tap_jsonl", "x.jsonl",
-        samples.TAP.rpartition(b'{"kind"')[0] + exchange(4, "80", "nr5g_csi", "{}", "timeout")
+        samples.FILES["tap_jsonl/session"].rpartition(b'{"kind"')[0] + exchange(4, "80", "nr5g_csi", "{}", "timeout")
         + exchange(5, "90", "lte_csi", '{"rank":1,"ri_raw":0,"cqi":7}'),
         {
             "nr5g": {"time": [0.202, 0.702, 0.802], "rank": [2, np.nan, np.nan], "flag": ["", "no_csi", "status:timeout"]},
@@ -537,7 +537,7 @@ BINARY: dict[str, tuple[str, str, bytes, Truth, ReadOptions]] = {
     ),
     "tap: the cell was asked longer ago than two seconds": (
         "tap_jsonl", "x.jsonl",
-        samples.TAP.splitlines(keepends=True)[0] + exchange(1, "00", "servingcell", '{"nr":{"rsrp_dbm":-70,"sinr_db":5}}')
+        samples.FILES["tap_jsonl/session"].splitlines(keepends=True)[0] + exchange(1, "00", "servingcell", '{"nr":{"rsrp_dbm":-70,"sinr_db":5}}')
         + exchange(2, "10", "nr5g_csi", '{"rank":3,"ri_raw":3}').replace(b"1740927600", b"1740927602"),
         {"nr5g_rsrp": {"time": [0.002], "rss_db": [-70]}}, LOCAL,
     ),
@@ -547,62 +547,62 @@ CASES |= {name: Case(file, data, truth, reader, how) for name, (reader, file, da
 
 NAN = np.nan
 SAMPLES = [
-    Case("Quectel: 0 is no CSI", samples.QUECTEL_CSI, {
+    Case("Quectel: 0 is no CSI", samples.FILES["quectel_csv/csi"], {
         "nr5g_csi": {"time": [0.25, 2.25, 6.25], "ri_raw": [2, 0, 4], "rank": [2, NAN, 4], "flag": ["", "no_csi", ""], "mcs": [24, NAN, 24]},
         "lte_csi": {"rank": [1, 1, 1]},
     }, "quectel_csv", refused="torn"),
-    Case("Quectel: first generation, an impossible RI", samples.QUECTEL_FIRST, {
+    Case("Quectel: first generation, an impossible RI", samples.FILES["quectel_csv/csi_first_generation"], {
         "nr5g_csi": {"time": [0, 9], "rank": [3, NAN], "flag": ["", "ri_out_of_range"]},
     }, "quectel_csv"),
-    Case("Quectel: NSA writes RSRP, SINR, RSRQ", samples.QUECTEL_ENDC, {
+    Case("Quectel: NSA writes RSRP, SINR, RSRQ", samples.FILES["quectel_csv/endc"], {
         "nr_rsrp": {"rss_db": [-82, NAN], "sinr_db": [21, NAN]}, "lte_rsrp": {"rss_db": [-91, -91]},
     }, "quectel_csv", about={"nr_rsrp": {"unit": "dBm"}}, refused="searching"),
-    Case("Quectel: SA writes RSRP, RSRQ, SINR, among LTE rows", samples.QUECTEL_ONE_LINE, {
+    Case("Quectel: SA writes RSRP, RSRQ, SINR, among LTE rows", samples.FILES["quectel_csv/lte_only"], {
         "lte_rsrp": {"rss_db": [-93]}, "nr_rsrp": {"rss_db": [-71], "sinr_db": [32]},
     }, "quectel_csv"),
-    Case("Quectel: console, cells by their tables", samples.QUECTEL_CONSOLE, {
+    Case("Quectel: console, cells by their tables", samples.FILES["quectel_console/tables"], {
         "nr_pci77": {"rss_db": [-82], "rsrq_db": [-11], "sinr_db": [21]}, "nr5g_csi": {"rank": [2]},
     }, "quectel_console", about={"lte_pci492": {"arfcn": 950}}),
-    Case("table of ranks", samples.RI_TABLE, {"nr5g_csi": {"rank": [2, NAN], "altitude_m": [30.1, 30.2]}}, "quectel_ri"),
-    Case("Nemo: a row without a rank keeps its level", samples.NEMO_CSV, {
+    Case("table of ranks", samples.FILES["quectel_ri/table"], {"nr5g_csi": {"rank": [2, NAN], "altitude_m": [30.1, 30.2]}}, "quectel_ri"),
+    Case("Nemo: a row without a rank keeps its level", samples.FILES["nemo_csv/table"], {
         "pdsch_rank": {"rank": [2, NAN, 4], "flag": ["", "no_rank_in_row", ""], "rsrp_dbm": [NAN, -80.5, NAN], "cqi": [NAN, 14, NAN]},
     }, "nemo_csv", FROM_TEN, about={"pdsch_rank": {"clock": "utc"}}),
-    Case("Nemo: cells by PCI; one goes on serving when it is detected later", samples.NEMO_WIDE, {
+    Case("Nemo: cells by PCI; one goes on serving when it is detected later", samples.FILES["drive_test/nemo"], {
         "lte_pci110": {"rss_db": [-76, -77], "serving": [1, 1]}, "lte_pci22": {"serving": [0]}, "rs_snr": {"value": [19]},
         "phone": {"fix": [-1] * 3},
     }, "drive_test"),
-    Case("SNR table of towers", samples.SNR_CSV, {"LW2": {"flag": ["", "out_of_coverage"]}}, "aadm_snr",
+    Case("SNR table of towers", samples.FILES["aadm_snr/table"], {"LW2": {"flag": ["", "out_of_coverage"]}}, "aadm_snr",
          about={name: {"node": name, "unit": "dB"} for name in ("LW1", "LW2")}),
-    Case("controller: the Download block holds no levels", samples.CONTROLLER, {
+    Case("controller: the Download block holds no levels", samples.FILES["controller_log/console"], {
         "LW1": {"rss_db": [9.5, 8.5]}, "LW2": {"rss_db": [-1.25]},
     }, "controller_log"),
-    Case("srsENB: 0 is no report, 1 is rank one", samples.SRSENB, {
+    Case("srsENB: 0 is no report, 1 is rank one", samples.FILES["srsenb_log/console"], {
         "srsenb": {"rank": [NAN, 1, NAN], "ri_raw": [0, 1, NAN], "cqi": [11, 11, NAN], "mcs": [2, 2, 0], "flag": ["no_csi", "", "no_csi"]},
     }, "srsenb_log", about={"srsenb": {"ri_base": "one"}}, warned="truncated mean"),
-    Case("PawPrints: who serves; 2147483647 is no level; the companion's clock, UTC", samples.PAWPRINTS, {
+    Case("PawPrints: who serves; 2147483647 is no level; the companion's clock, UTC", samples.FILES["pawprints/session"], {
         "lte_pci1": {"rss_db": [-71, -70], "serving": [0, 1]}, "lte_pci2": {"time": [0.2505], "rss_db": [-62]},
         "nr_ss_rsrp": {"rss_db": [-88], "rsrq_db": [-11], "sinr_db": [33]},
     }, "pawprints", about={"lte_pci2": {"pci": 2, "arfcn": 66911, "rat": "lte"}}),
-    Case("PawPrints with a location", samples.PAWPRINTS.replace(
+    Case("PawPrints with a location", samples.FILES["pawprints/session"].replace(
         b'"rel_time": 1.0', b'"location": {"latitude": 35.5, "longitude": -78.5, "altitude": 90}'
     ), {"phone": {"latitude_deg": [35.5], "longitude_deg": [-78.5], "altitude_m": [0]}}, "pawprints"),
-    Case("XCAL: semicolons and decimal commas", samples.XCAL, {
+    Case("XCAL: semicolons and decimal commas", samples.FILES["drive_test/xcal"], {
         "nr_pci7": {"rss_db": [-81.5, -82.5]}, "phone": {"longitude_deg": [-78.7000001] * 2}, "5g_kpi_pcell_rf_ri": {"rank": [2]},
     }, "drive_test"),
-    Case("GPX: heights count from the first point", samples.GPX, {"track": {"time": [0.25, 1], "altitude_m": [0, 10]}}, "gpx"),
-    Case("flight script: neither home nor a waypoint is a position", samples.VEHICLE_LOG, {
+    Case("GPX: heights count from the first point", samples.FILES["gpx/track"], {"track": {"time": [0.25, 1], "altitude_m": [0, 10]}}, "gpx"),
+    Case("flight script: neither home nor a waypoint is a position", samples.FILES["vehicle_log/console"], {
         "vehicle": {"altitude_m": [40.5, 40.0], "yaw_deg": [312.5, NAN]}, "power": {"value": [-12.5, NAN]},
     }, "vehicle_log"),
-    Case("srsUE: cells and SI suffixes", samples.SRSUE, {
+    Case("srsUE: cells and SI suffixes", samples.FILES["srsue_log/console"], {
         "lte_pci1": {"rss_db": [-61, -62], "pathloss_db": [61, 62]}, "lte_pci7": {"serving": [1]}, "cfo": {"value": [-4200, -950, 1500]},
     }, "srsue_log"),
-    Case("OAI gNB: the old layout and the new", samples.OAI_GNB, {
+    Case("OAI gNB: the old layout and the new", samples.FILES["oai_log/gnb"], {
         "oai": {"rank": [2, 1], "rnti": [0x1F4D] * 2}, "nr_rsrp": {"rss_db": [-78]},
     }, "oai_log"),
-    Case("OAI gNB: 128 frames of 10 ms", samples.OAI_GNB_FRAMES, {"oai": {"time": [0, 1.28]}}, "oai_log",
+    Case("OAI gNB: 128 frames of 10 ms", samples.FILES["oai_log/frames"], {"oai": {"time": [0, 1.28]}}, "oai_log",
          replace(LOCAL, time_origin="2025-03-02T15:00:00Z")),
-    Case("OAI UE", samples.OAI_UE, {"oai": {"time": [0.25, 1.25], "rank": [2, 1], "sinr_db": [20, 19]}}, "oai_log"),
-    Case("SigMF of dataset 12", samples.SIGMF, {
+    Case("OAI UE", samples.FILES["oai_log/ue"], {"oai": {"time": [0.25, 1.25], "rank": [2, 1], "sinr_db": [20, 19]}}, "oai_log"),
+    Case("SigMF of dataset 12", samples.FILES["sigmf/dataset12"], {
         "vehicle": {"longitude_deg": [-78.7, -78.71]}, "USRP1": {"time": [0.25, 0.55], "rss_db": [-40.5, -41.5]},
         "USRP2": {"flag": ["", "out_of_coverage"]},
     }, "sigmf"),

@@ -9,7 +9,7 @@ import pytest
 
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import by_name, identify
-from tests.parsers.samples import BINARY, NEMO_CSV, OPTIONS, QUECTEL_CSI, SAMPLES
+from tests.parsers.samples import BINARY, FILES, OPTIONS, SAMPLES
 
 TEXTS = [
     (reader, name, data, accepted)
@@ -67,8 +67,8 @@ def _cells(data: bytes) -> list[list[bytes]]:
     ids=["order", "decimal comma", "tabs", "title and more columns", "quoted", "capitals"],
 )
 def test_a_rank_table_in_another_dress_gives_the_same_ranks(change) -> None:  # type: ignore[no-untyped-def]
-    usual = by_name("nemo_csv").read(NEMO_CSV, OPTIONS).streams[0].frame
-    data = change(_cells(NEMO_CSV))
+    usual = by_name("nemo_csv").read(FILES["nemo_csv/table"], OPTIONS).streams[0].frame
+    data = change(_cells(FILES["nemo_csv/table"]))
     result = identify(data).read(data, OPTIONS)
     (rank,) = (stream.frame for stream in result.streams if stream.kind == "rank")
     shown = usual[usual["rank"].notna()]
@@ -89,7 +89,7 @@ def test_what_fuzzing_found() -> None:
     """A dot is no number; a number means the same whatever stands on other lines."""
     log = b"2025-03-02T10:00:00.250000 [METRICS ] [I] Scheduler UE pci=1 rnti=0x4601 cqi=. dl_ri=. dl_mcs=27\n"
     assert by_name("srsran_gnb").read(log, OPTIONS).accepted == 0
-    head = NEMO_CSV.split(b"\r\n")[0] + b"\n"
+    head = FILES["nemo_csv/table"].split(b"\r\n")[0] + b"\n"
     row = b"11,500.0,35.7300002,-78.7000003,3.916381539223372036854775808,2.0,,,\n"
     odd = b"12,600.0,35.73-1e30,-78.7000003,3.9,2.0,,,\n"
     assert by_name("nemo_csv").read(head + row, OPTIONS).accepted == 1
@@ -114,7 +114,7 @@ def test_further_fields_behind_a_row_are_left_out(name: str) -> None:
 
 
 def test_an_offset_in_the_times_of_the_modem_logger_wins() -> None:
-    data = QUECTEL_CSI
+    data = FILES["quectel_csv/csi"]
     zoned = re.sub(rb"(?m)^(20\d\d-\d\d-\d\d) (\d\d:\d\d:\d\d\.\d+)", rb"\1T\2-05:00", data)
     assert zoned != data
     usual = by_name("quectel_csv").read(data, OPTIONS)

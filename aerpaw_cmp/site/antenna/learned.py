@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import gzip
 import hashlib
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Literal
 
 from pydantic import BaseModel, Field
 
@@ -174,14 +174,10 @@ class Learned(StrictModel):
     entries: dict[_Name, Entry] = Field(default_factory=dict)
 
 
-class _Index(StrictModel):
+class _Index(Learned):
     """The same as it is written, with entries of any version."""
 
-    format: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
-    entries: dict[_Name, Entry | _Foreign] = Field(default_factory=dict)
-
-
-_Memory = TypeVar("_Memory", Learned, _Index)
+    entries: dict[_Name, Entry | _Foreign] = Field(default_factory=dict)  # type: ignore[assignment]
 
 
 def folder_of(site: str | Path) -> Path:
@@ -206,11 +202,10 @@ def read_learned(site: str | Path) -> Learned:
     return _read(folder_of(site), Learned)
 
 
-def _read(folder: Path, model: type[_Memory]) -> _Memory:
+def _read(folder: Path, model: type[Learned]) -> Learned:
     index = inside(folder, _INDEX, folder / _INDEX)
     memory = load_yaml(index, model) if index.is_file() else model()
-    entries: Iterable[Entry | _Foreign] = memory.entries.values()
-    for name in {name for entry in entries for name in (*files_of(entry), *entry.tables)}:
+    for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
         inside(folder, name, index, plain=True)
     return memory
 
@@ -256,8 +251,8 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
                     )
             for file, content in packed.items():
                 write_whole(folder / file, content)
-            entries = {**memory.entries, name: entry.model_copy(update={"tables": tables})}
-            text = dump_yaml(_Index(entries=dict(sorted(entries.items()))).model_dump(mode="json", exclude_none=True))
+            entries = dict(sorted({**memory.entries, name: entry.model_copy(update={"tables": tables})}.items()))
+            text = dump_yaml(memory.model_copy(update={"entries": entries}).model_dump(mode="json", exclude_none=True))
             write_whole(folder / _INDEX, text)
             used = {file for known in entries.values() for file in files_of(known)}
             for file, digest in sorted(written):

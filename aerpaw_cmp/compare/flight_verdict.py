@@ -19,9 +19,10 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
     """Channels whose verdicts against each baseline are corrected for the number of channels."""
     rows = [dict(panel.further.compared_with) for panel in panels]
     for name in dict.fromkeys(name for row in rows for name in row):
-        members = [row for row in rows if name in row]
-        for row, pair in zip(members, corrected([row[name] for row in members]), strict=True):
-            row[name] = pair
+        members = [i for i, row in enumerate(rows) if name in row]
+        measured = [panels[i].measured_db.tobytes() for i in members]
+        for i, pair in zip(members, corrected([rows[i][name] for i in members], measured), strict=True):
+            rows[i][name] = pair
     return [
         replace(panel, further=replace(panel.further, compared_with=row))
         for panel, row in zip(panels, rows, strict=True)

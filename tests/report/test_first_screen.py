@@ -6,12 +6,13 @@ import itertools
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.flight_verdict import baseline_errors, flight_verdict, pooled_db
+from aerpaw_cmp.compare.flight_verdict import baseline_errors, flight_verdict, pooled_db, with_corrected_verdicts
 from aerpaw_cmp.compare.judge.causes import MOST_CAUSE_WORDS, Cause
 from aerpaw_cmp.compare.level.detection import DetectionScore, floored_fit
 from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.compare.ranks.forecast import score_forecast
 from aerpaw_cmp.compare.result import FlightVerdict
+from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.report.exports.tables import metrics
 from aerpaw_cmp.report.pages.diff import DIFFERENCE
 from aerpaw_cmp.report.words.flight import (
@@ -318,6 +319,19 @@ def test_two_channels_of_the_same_levels_are_told(report_data):
     pooled = flight_verdict(twice.rss)
     assert pooled is not None
     assert (pooled.channels, pooled.ci95_db) == (1, flight_verdict([panel]).ci95_db)
+
+
+@pytest.mark.parametrize("shift_db", [0.0, 1.0])
+def test_channels_of_the_same_levels_are_corrected_for_once(report_data, shift_db):
+    """At 0.02 over all channels: 0.012 stays as that of one measurement, not as one of three."""
+    panel = report_data.rss[0]
+    pair = dataclasses.replace(paired_difference([], []), p_value=0.012, verdict="better")
+    further = dataclasses.replace(panel.further, compared_with={"free_space": pair})
+    copies = [
+        dataclasses.replace(panel, further=further, measured_db=panel.measured_db + k * shift_db) for k in range(3)
+    ]
+    words = {copy.further.compared_with["free_space"].verdict for copy in with_corrected_verdicts(copies)}
+    assert words == {"not significant" if shift_db else "better"}
 
 
 def test_a_receiver_that_lost_its_lock_has_one_error_that_with_the_floor(report_data):

@@ -8,7 +8,7 @@ the statistic over the draws, corrected for the finite number of blocks, gives t
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -552,16 +552,21 @@ def pooled_difference(
     return paired_difference(first[order], second[order], free_offset=False)
 
 
-def corrected(pairs: Sequence[PairedDifference]) -> list[PairedDifference]:
-    """Verdicts of several channels, corrected for their number (Holm 1979): all that stay are true in 95 % of cases."""
+def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | None = None) -> list[PairedDifference]:
+    """Verdicts of several channels, corrected for their number (Holm 1979): all that stay are true in 95 % of cases.
+
+    Channels of which the same was ``measured`` count once.
+    """
     order = sorted(range(len(pairs)), key=lambda i: pairs[i].p_value)
-    out, tried = list(pairs), sum(pair.verdict != "no interval" for pair in pairs)
+    names = measured or range(len(pairs))
+    out, tried = list(pairs), {names[i] for i in order if pairs[i].verdict != "no interval"}
     for place, i in enumerate(order):
-        if pairs[i].p_value * (tried - place) > _FAMILY:
+        if pairs[i].p_value * max(len(tried), 1) > _FAMILY:
             for rest in order[place:]:
                 if pairs[rest].verdict in ("better", "worse"):
                     out[rest] = replace(pairs[rest], verdict="not significant")
             break
+        tried.discard(names[i])
     return out
 
 

@@ -217,9 +217,9 @@ def test_an_interval_wider_than_twice_its_value_is_a_bound(monkeypatch):
 
 
 def test_a_difference_whose_interval_nobody_can_use_has_none(monkeypatch):
-    """One that holds 0 and is wider than twice both errors together, here 4 dB; exchanged models have none either."""
+    """One that holds 0 and reaches beyond an error itself, here 2 dB; exchanged models have none either."""
     errors = np.tile([2.0, -2.0], 50), np.tile([2.0, 2.0, -2.0, -2.0], 25)
-    for half_db2, given in ((15.9, True), (16.1, False)):
+    for half_db2, given in ((7.9, True), (8.1, False)):
         draws = np.linspace(-half_db2 / 0.95, half_db2 / 0.95, 4097)
         monkeypatch.setattr(statistics, "mean_draws", lambda *_, draws=draws: draws)
         for pair in (errors, errors[::-1]):
@@ -235,7 +235,7 @@ def test_a_significant_difference_of_a_flight_of_few_correlation_times_is_found(
     for _ in range(60):
         first, second = (shadowing(rng, 500, 25, 4.0) for _ in range(2))
         words.append(paired_difference(2 * first, second).verdict)
-    assert set(words) <= {"worse", "not significant"}
+    assert "better" not in words
     assert words.count("worse") > 20
 
 

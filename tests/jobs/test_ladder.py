@@ -12,6 +12,7 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.yamledit import edited
+from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
@@ -224,3 +225,14 @@ def test_channels_that_share_a_replay_cost_its_seconds_once() -> None:
     assert _Climber._of_flight(climber, [5.0] * 10 + [2.0]) == 7.0  # type: ignore[arg-type]
     other = [*rss[:2], SimpleNamespace(tower="LW1", settings_key='{"carrier_hz": 1}')]
     assert _Climber._of_flight(SimpleNamespace(_data=SimpleNamespace(rss=other)), [5.0, 4.0, 3.0]) == 8.0  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("share", "gains"), [(0.98, False), (0.9, True)])
+def test_a_gain_that_no_page_could_show_is_no_advice(share: float, gains: bool) -> None:
+    """Of 3 dB, 0.06 and 0.3 dB less: both are significant."""
+    error_db = 3.0 * np.random.default_rng(1).normal(size=3000)
+    climber = _Climber.__new__(_Climber)
+    climber._series = [SimpleNamespace(time_s=np.arange(3000.0))]  # type: ignore[list-item]
+    ladder = SimpleNamespace(recommended=0, rungs=(0, 1), error_db=([share * error_db], [error_db]))
+    assert paired_difference(share * error_db, error_db).verdict == "better"
+    assert climber._is_better(ladder) == gains  # type: ignore[arg-type]

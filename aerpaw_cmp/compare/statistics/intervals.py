@@ -38,7 +38,7 @@ _FEWEST_INDEPENDENT = 10.0
 # on simulated flights).
 _UNSURE = 3.0
 
-# Width of an interval over its value from which its lower end alone is given; of a difference, over both errors.
+# Width of an interval over its value from which its lower end alone is given.
 _BOUND = 2.0
 
 # Stretches of a flight; the share of each comes from the others.
@@ -405,8 +405,8 @@ class PairedDifference:
     difference_db : float
         ``rmse_db - other_rmse_db`` [dB]: negative where the first model is better.
     difference_ci95_db : (low, high)
-        95 % interval of it [dB]; NaN where none can be given, and where one that holds 0 is wider than
-        :data:`_BOUND` times the two errors together: the flight is too short for its memory.
+        95 % interval of it [dB]; NaN where none can be given, and where one that holds 0 reaches beyond an error of
+        none for either model: the flight is too short for its memory.
     standard_error_db : float
         Of ``difference_db`` [dB]: half of its central 68 % interval; NaN where none can be given.
     mean_square_difference_db2, mean_square_ci95_db2 : float, (low, high)
@@ -492,7 +492,7 @@ def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_of
         squares = _ends(drawn)
         scale = max(rmse + other_rmse, 1e-300)
         bounds = squares[0] / scale, squares[1] / scale
-        if bounds[0] <= 0.0 <= bounds[1] and bounds[1] - bounds[0] > _BOUND * scale:
+        if bounds[0] <= 0.0 <= bounds[1] and (bounds[0] < -other_rmse or bounds[1] > rmse):
             bounds = NO_INTERVAL
         spread = float(0.5 * np.diff(np.quantile(drawn, [0.1587, 0.8413]))[0]) / scale
         chance = 2.0 * min(float(np.mean(drawn <= 0.0)), float(np.mean(drawn >= 0.0)), 0.5)

@@ -49,6 +49,9 @@ from .levels import Levels, levels_of
 # Loss of the weakened ground reflection: a smooth half-space reflects more than any field.
 _WEAK_GROUND_DB = 10.0
 
+# A smaller gain is none that a page could show [dB].
+_SHOWN_DB = 0.1
+
 # Per series; of longer ones every second, third, ... sample is taken.
 _MOST_SAMPLES = 4000
 
@@ -229,13 +232,14 @@ class _Climber:
         return next(better, dataclasses.replace(climbed[-1], ladder=ladder))
 
     def _is_better(self, ladder: Ladder) -> bool:
-        """Check a recommended model against the last rung, the flight as set, over all series at once."""
+        """Check that a recommended model gains on the last rung, the flight as set, over all series at once."""
         if ladder.recommended is None:
             return False
         as_set = len(ladder.rungs) - 1
         chosen, stated = ladder.error_db[ladder.recommended], ladder.error_db[as_set]
         columns = [(s.time_s, a, b) for s, a, b in zip(self._series, chosen, stated, strict=True)]
-        return pooled_difference(columns, free_offset=False).verdict == "better"
+        pair = pooled_difference(columns, free_offset=False)
+        return pair.verdict == "better" and pair.difference_db <= -_SHOWN_DB
 
     def _by_flights_left_out(self, climbed: FlightLadder) -> FlightLadder:
         """The learned model, as it was calibrated, where flights left out say that it beats free space."""

@@ -278,7 +278,7 @@ def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     if best.elsewhere_db is not None:
         how = "the best on other flights ({:.1f} dB, free space {:.1f} dB)".format(*best.elsewhere_db)
     if chosen == AS_SET:
-        return f"{text} No replay is significantly better than the settings of this flight file."
+        return f"{text} No replay improves significantly, by 0.1 dB or more, on the settings of this flight file."
     return f"{text} \u201c{chosen}\u201d is {how}: {error[chosen]:.1f} dB."
 
 

@@ -30,7 +30,7 @@ from .field.sum import Fields, Further, parts_between_poses
 from .field.wedge import wedge
 from .geometry.arrays import Array, Link, Poses
 from .geometry.faces import inside
-from .geometry.paths import Faces, PathSet, legs
+from .geometry.paths import Faces, PathSet, legs, sources_of
 from .scene import Scene
 from .search.mirror import scene_tolerance_m
 from .search.occlusion import Occlusion
@@ -116,7 +116,7 @@ class EdgePaths(Further):
         Parameters
         ----------
         faces : Faces
-        sources_m : (towers, 3)
+        sources_m : (towers, 3) or (poses, towers, 3)
             Centres of the tower arrays, in the order of ``link.tower_arrays`` [m].
         poses : Poses
         link : Link
@@ -127,7 +127,7 @@ class EdgePaths(Further):
         -------
         Fields
         """
-        shape = (len(poses), len(sources_m))
+        shape = (len(poses), len(link.tower_arrays))
         h = np.zeros((shape[0] * shape[1], len(link.uav_array), len(next(iter(link.tower_arrays.values())))), complex)
         path_power, key = np.zeros(len(self)), self.pose * shape[1] + self.tower
         for part in parts_between_poses(self.pose, PATHS_AT_ONCE):
@@ -407,7 +407,7 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     ----------
     paths : EdgePaths
     faces : Faces
-    sources_m : (towers, 3)
+    sources_m : (towers, 3) or (poses, towers, 3)
         [m]
     poses : Poses
     link : Link
@@ -462,7 +462,7 @@ def _ends(
     axes = np.einsum("nij,jk->nki", poses.rotation[paths.pose], uav.mount)
     places, slants = np.stack([a.positions_m.T for a in arrays]), np.stack([a.slant_parts for a in arrays])
     rows = (
-        (sources_m[paths.tower], mounts[paths.tower], places[paths.tower], slants[paths.tower]),
+        (sources_of(paths, sources_m), mounts[paths.tower], places[paths.tower], slants[paths.tower]),
         (poses.position_m[paths.pose], axes, uav.positions_m.T[None], uav.slant_parts[None]),
     )
     ends = []

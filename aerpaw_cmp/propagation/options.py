@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -66,7 +66,12 @@ class Field:
     loss: Loss | None = None
 
     def loss_db(self, paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray | None:
-        """Further loss (paths,) [dB] between sources (towers, 3) and targets (poses, 3); None where none is lost."""
+        """Further loss (paths,) [dB] between sources and targets (poses, 3); None where none is lost.
+
+        Sources are (towers, 3), or (poses, 1, 3) of a tower that moves.
+        """
+        if self.loss is not None and sources_m.ndim == 3:
+            paths, sources_m = replace(paths, tower=paths.pose), sources_m[:, 0]
         return None if self.loss is None else self.loss(paths, sources_m, targets_m)
 
 

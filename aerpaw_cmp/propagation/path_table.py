@@ -8,7 +8,6 @@ the site frame, from the boresight and its plane in the array frame (:mod:`aerpa
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -18,10 +17,10 @@ from numpy.typing import ArrayLike
 from ..common.errors import UsageError
 from ..common.geodesy import azimuth_rad, elevation_rad, unit_vectors
 from ..common.units import SPEED_OF_LIGHT_MPS, AnyArray, ComplexArray, FloatArray, IntArray, unmasked
-from .field.sum import channel_matrices
+from .field.sum import fields_of
 from .geometry.arrays import Link, Poses
-from .geometry.paths import Faces, PathSet, path_lengths
-from .options import Loss
+from .geometry.paths import Faces, PathSet, legs, sources_of
+from .options import Field
 
 # Codes of ``kind``.
 KINDS = ("line_of_sight", "reflection", "edge")
@@ -40,14 +39,14 @@ class Ends:
     poses : Poses
     sources_m : (towers, 3) or (poses, 1, 3)
         Centres of the tower arrays; the latter of one tower that moves.
-    loss : callable or None
-        Further loss per path.
+    field : Field
+        Further losses.
     """
 
     link: Link
     poses: Poses
     sources_m: FloatArray
-    loss: Loss | None = None
+    field: Field = Field()
 
     def part(self, rows: slice) -> Ends:
         """Those of some poses."""
@@ -58,26 +57,6 @@ class Ends:
     def moving(self) -> bool:
         """True where the tower has a place of its own at every pose."""
         return self.sources_m.ndim == 3
-
-    def loss_db(self, lines: PathSet) -> FloatArray | None:
-        """Further loss (paths,) [dB]."""
-        if self.loss is None:
-            return None
-        if self.moving:
-            return self.loss(replace(lines, tower=lines.pose), self.sources_m[:, 0], self.poses.position_m)
-        return self.loss(lines, self.sources_m, self.poses.position_m)
-
-    def alike(self, paths: Any) -> Iterator[tuple[IntArray | slice, str, FloatArray]]:
-        """Paths that share an array: rows, the tower's name, and its place (1, 3), or (paths, 1, 3) of each."""
-        names = tuple(self.link.tower_arrays)
-        if self.moving and isinstance(paths, PathSet):
-            yield slice(None), names[0], self.sources_m[paths.pose]
-            return
-        places, member = self.sources_m, paths.tower
-        if self.moving:
-            places, member = np.unique(self.sources_m[paths.pose, 0], axis=0, return_inverse=True)
-        for number, place in enumerate(places):
-            yield np.flatnonzero(member.ravel() == number), names[0 if self.moving else number], place[None, :]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -127,6 +106,12 @@ class PathTable:
     def delay_s(self) -> FloatArray:
         """Delay (paths,) between the centres of the arrays."""
         return np.asarray(self.length_m / SPEED_OF_LIGHT_MPS)
+
+    def by_link(self, values: AnyArray, links: tuple[int, ...], fill: Any = np.nan) -> AnyArray:
+        """Values per path (paths, ...) as (most paths of a link, poses, towers, ...) of ``links``: poses and towers."""
+        out = np.full((self.most, *links, *values.shape[1:]), fill, values.dtype)
+        out[self.number, self.pose, self.tower] = values
+        return out
 
     def doppler_hz(self, carrier_hz: float, velocity_mps: FloatArray, tower_mps: ArrayLike = 0.0) -> FloatArray:
         """Doppler shift (paths,), positive while a path gets shorter.
@@ -183,23 +168,20 @@ def path_table(
     -------
     PathTable
     """
-    pieces = []
+    pieces, labels = [], (*faces.label, "")
     most = max(item.lines().vertices_m.shape[1] for item in contributions)
     for item in contributions:
         lines = item.lines()
-        loss_db = ends.loss_db(lines)
+        loss_db = ends.field.loss_db(lines, ends.sources_m, ends.poses.position_m)
         good = counts[lines.pose, lines.tower]
         good &= True if loss_db is None else np.isfinite(loss_db)
         item, lines, loss_db = item.select(good), lines.select(good), None if loss_db is None else loss_db[good]
-        labels = (*faces.label, "")
         unique, via = np.unique(item.touched, axis=0, return_inverse=True)
         texts = [", ".join(labels[i] for i in row if i >= 0) for row in unique.tolist()]
         codes = np.array([names.setdefault(text, len(names)) for text in texts], dtype=np.int64)
-        sources = ends.sources_m[lines.pose, 0] if ends.moving else ends.sources_m[lines.tower]
-        targets, own = ends.poses.position_m[lines.pose], np.arange(len(lines))
-        last = lines.vertices_m[own, lines.depth - 1] if lines.vertices_m.shape[1] else targets
-        first = lines.vertices_m[:, 0] if lines.vertices_m.shape[1] else targets
-        bent = lines.depth[:, None] > 0
+        places = sources_of(lines, ends.sources_m), lines.vertices_m, ends.poses.position_m[lines.pose]
+        away = list(legs(*places))
+        back = next(legs(places[2], lines.vertices_m[:, ::-1], places[0]))  # from the UAV
         pieces.append(
             {
                 "pose": item.pose,
@@ -207,9 +189,9 @@ def path_table(
                 "kind": np.minimum(lines.depth, 1 if isinstance(item, PathSet) else 2),
                 "via": codes[via.ravel()],
                 "gain": _gains(item, faces, ends, loss_db),
-                "length_m": path_lengths(replace(lines, pose=own, tower=own), sources, targets),
-                "at_tower": unit_vectors(np.where(bent, first, targets) - sources),
-                "at_uav": unit_vectors(np.where(bent, last, sources) - targets),
+                "length_m": sum(np.linalg.norm(end - start, axis=1) for start, end in away),
+                "at_tower": unit_vectors(away[0][1] - away[0][0]),
+                "at_uav": unit_vectors(back[1] - back[0]),
                 "turns": item.turns,
                 "vertices_m": np.pad(
                     lines.vertices_m, ((0, 0), (0, most - lines.vertices_m.shape[1]), (0, 0)), constant_values=np.nan
@@ -226,21 +208,16 @@ def path_table(
 
 def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> ComplexArray:
     """Gain (paths, n_rx, n_tx) of each path: H of a pose of its own, where it is the only path."""
-    link = ends.link
-    ports, uavs = len(next(iter(link.tower_arrays.values()))), len(link.uav_array)
-    gain = np.empty((len(item), *((ports, uavs) if link.uav_transmits else (uavs, ports))), dtype=np.complex128)
-    for rows, name, places in ends.alike(item):
-        some = item.select(rows)
-        own = np.arange(len(some))
-        alone = replace(some, pose=own, tower=0 * own)
+    pieces, order = [], []
+    for tower, (name, array) in enumerate(ends.link.tower_arrays.items()):
+        rows = np.flatnonzero(item.tower == tower)
+        some, own, link = item.select(rows), np.arange(len(rows)), replace(ends.link, tower_arrays={name: array})
         poses = Poses(ends.poses.position_m[some.pose], ends.poses.rotation[some.pose])
-        single = replace(link, tower_arrays={name: link.tower_arrays[name]})
-        lost = None if loss_db is None else loss_db[rows]
-        if isinstance(alone, PathSet):
-            gain[rows] = channel_matrices(alone, faces, places, poses, single, lost).h[:, 0]
-        else:
-            gain[rows] = alone.fields(faces, places, poses, single, lost).h[:, 0]
-    return gain
+        places, lost = sources_of(some, ends.sources_m)[:, None], None if loss_db is None else loss_db[rows]
+        alone = replace(some, pose=own, tower=0 * own)
+        pieces.append(fields_of(alone, faces, places, poses, link, lost).h[:, 0])
+        order.append(rows)
+    return np.concatenate(pieces)[np.argsort(np.concatenate(order))]
 
 
 def impulse_responses(
@@ -263,20 +240,14 @@ def impulse_responses(
     tau : (rx, tx, paths)
         Delay [s]; zero where there is no path.
     """
-    shape = len(ends.poses), len(ends.link.tower_arrays)
-    turned = table.gain[..., None]
+    links, turned = (len(ends.poses), len(ends.link.tower_arrays)), table.gain[..., None]
     if velocity_mps is not None:
         cycles = table.doppler_hz(ends.link.carrier_hz, velocity_mps)[:, None] * unmasked(times_s)
         turned = turned * np.exp(2j * np.pi * cycles)[:, None, None, :]
-    a = np.zeros((*shape, table.most, *turned.shape[1:]), dtype=np.complex128)
-    tau = np.zeros((*shape, table.most))
-    at = table.pose, table.tower, table.number
-    a[at], tau[at] = turned, table.delay_s
-    # a is (pose, tower, path, rx_ant, tx_ant, time)
-    ways = (1, 3, 0, 4, 2, 5) if ends.link.uav_transmits else (0, 3, 1, 4, 2, 5)
-    return np.ascontiguousarray(a.transpose(ways)), np.ascontiguousarray(
-        tau.swapaxes(0, 1) if ends.link.uav_transmits else tau
-    )
+    # by path, pose, tower (, rx_ant, tx_ant, time)
+    rx, tx = (2, 1) if ends.link.uav_transmits else (1, 2)
+    a, tau = table.by_link(turned, links, 0.0).transpose(rx, 3, tx, 4, 0, 5), table.by_link(table.delay_s, links, 0.0)
+    return np.ascontiguousarray(a), np.ascontiguousarray(tau.transpose(rx, tx, 0))
 
 
 def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> ComplexArray:

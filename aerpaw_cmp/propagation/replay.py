@@ -359,7 +359,7 @@ def _evaluated(
         has_path=has_path,
         contributions=contributions,
         faces=scene.faces,
-        ends=Ends(link, poses, scene.sources_m, field.loss),
+        ends=Ends(link, poses, scene.sources_m, field),
         seconds=0.0,
         search_seconds=0.0,
         engine=search.engine,

@@ -33,12 +33,12 @@ from ...flight.gains.losses import path_loss
 from ...flight.replay import FlightReplay, Replayed, attitude_rotation
 from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import learned_here
-from ...propagation.drivers.moving import loss_along, replay_moving
+from ...propagation.drivers.moving import replay_moving
 from ...propagation.edges import diffracted
-from ...propagation.field.sum import channel_matrices, mean_pair_power, rss_dbm
+from ...propagation.field.sum import fields_of, mean_pair_power, rss_dbm
 from ...propagation.geometry.arrays import Link, Poses, single_element
 from ...propagation.geometry.paths import PathSet
-from ...propagation.options import Run, Search
+from ...propagation.options import Field, Run, Search
 from ...propagation.replay import Replay, replay
 from ...site.antenna.antennas import Isotropic
 from ...site.antenna.sphere_pattern import SpherePattern
@@ -382,12 +382,10 @@ class _Climber:
         traced, paths, losses_db, search_s = self._paths(index, model)
         begin = time.perf_counter()
         poses, sources = self._poses(series, model.attitude), self._sources(series, site)
-        places = sources if len(sources) == 1 else sources[:, None]
-        reflected = channel_matrices(paths, traced.faces, places, poses, link, losses_db[0])
-        fields = [reflected, *(
-            some.fields(traced.faces, sources, poses, link, loss_db)
-            for some, loss_db in zip(traced.further, losses_db[1:], strict=True)
-        )]  # fmt: skip
+        fields = [
+            fields_of(some, traced.faces, traced.ends.sources_m, poses, link, loss_db)
+            for some, loss_db in zip((paths, *traced.further), losses_db, strict=True)
+        ]
         if model.ground == "power sum":
             power = sum(item.power for item in fields)
         else:
@@ -402,13 +400,12 @@ class _Climber:
         if key not in self._lost:
             traced, search_s = self._traced_for(index, model)
             begin = time.perf_counter()
-            rt, series, site = self._data.settings.rt, self._series[index], self._site(model.relief)
+            rt, site = self._data.settings.rt, self._site(model.relief)
             paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
             changed = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
-            loss, sources = path_loss(site, changed, self._links[index].carrier_hz), self._sources(series, site)
-            targets = series.replayed.poses.position_m[series.picked]
+            field, ends = Field(path_loss(site, changed, self._links[index].carrier_hz)), traced.ends
             lines = [paths, *(some.lines() for some in traced.further)]
-            losses = [loss_along(loss, some, sources, targets) for some in lines]
+            losses = [field.loss_db(some, ends.sources_m, ends.poses.position_m) for some in lines]
             self._lost[key] = traced, paths, losses, search_s + time.perf_counter() - begin
         return self._lost[key]
 

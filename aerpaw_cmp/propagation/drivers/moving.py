@@ -18,8 +18,7 @@ from ...common.errors import UsageError
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...site.site import Site, Tower
 from ..geometry.arrays import Link, Poses
-from ..geometry.paths import PathSet
-from ..options import Field, Job, Loss, Run, Search
+from ..options import Field, Job, Run, Search
 from ..path_table import Ends
 from ..replay import PER_LINK, Replay, replay
 from .parts import in_turn
@@ -142,7 +141,7 @@ def replay_moving(
         return _of_one_tower(replay(moved_site, several, some, replace(search, links=links), field, run), name, block)
 
     result = in_turn([block.rows for block in blocks], map(of, blocks), progress)
-    return replace(result, ends=Ends(link, poses, sources_m[:, None], field.loss))
+    return replace(result, ends=Ends(link, poses, sources_m[:, None], field))
 
 
 def _shared_by_blocks(link: Link, poses: Poses, sources_m: FloatArray) -> Job:
@@ -184,26 +183,3 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
         towers=(name,),
         omitted=[replace(item, tower=name if item.tower else "") for item in replayed.omitted],
     )
-
-
-def loss_along(loss: Loss | None, paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray | None:
-    """Loss (paths,) [dB] of paths from a place per pose; None where nothing is lost.
-
-    Parameters
-    ----------
-    loss : callable or None
-    paths : PathSet
-    sources_m : (1 or poses, 3)
-        Place of the one tower, at all poses or at each [m].
-    targets_m : (poses, 3)
-        Of the UAV [m].
-
-    Returns
-    -------
-    (paths,) or None
-        Loss [dB].
-    """
-    if loss is None:
-        return None
-    moving = paths if len(sources_m) == 1 else replace(paths, tower=paths.pose)
-    return loss(moving, sources_m, targets_m)

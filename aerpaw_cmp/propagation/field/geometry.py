@@ -9,7 +9,7 @@ import numpy as np
 from ...common.units import AnyArray, FloatArray, IntArray
 from ...site.antenna.antennas import Isotropic
 from ..geometry.arrays import Array, Link, Pattern, Poses
-from ..geometry.paths import Faces, PathSet
+from ..geometry.paths import Faces, PathSet, sources_of
 from . import dyads
 
 
@@ -89,7 +89,7 @@ def geometry(
     depth = int(paths.depth.max(initial=0))
     sequence = paths.faces[:, :depth]
     mounts = np.stack([array.mount.T for array in link.tower_arrays.values()])
-    image = sources_m[paths.tower] if sources_m.ndim == 2 else sources_m[paths.pose, paths.tower]
+    image = sources_of(paths, sources_m)
     frame = mounts[paths.tower]
     normals = np.where((sequence >= 0)[..., None], faces.normal[sequence], 0.0)
     for step in range(depth):

@@ -16,7 +16,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -98,6 +98,25 @@ class Further(Rows):
     def turns(self) -> IntArray:
         """A digit for each corner (paths,), from tower to UAV: 1 a reflection, 2 an edge."""
         raise NotImplementedError
+
+
+def fields_of(
+    paths: Any, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
+) -> Fields:
+    """Part of any contribution of a replay in H and in the powers.
+
+    Parameters
+    ----------
+    paths : PathSet or Further
+    faces, sources_m, poses, link, loss_db
+        As for :func:`channel_matrices`.
+
+    Returns
+    -------
+    Fields
+    """
+    evaluate = channel_matrices if isinstance(paths, PathSet) else type(paths).fields
+    return evaluate(paths, faces, sources_m, poses, link, loss_db)
 
 
 def channel_matrices(

@@ -288,6 +288,11 @@ class PathSet(Rows):
         return cls(zero, zero, zero, np.zeros((0, max_depth), dtype=np.int64), np.zeros((0, max_depth, 3)))
 
 
+def sources_of(paths: Rows, sources_m: FloatArray) -> FloatArray:
+    """Sources (paths, 3) of paths, of places (towers, 3), or (poses, towers, 3) of towers that move."""
+    return np.asarray(sources_m[paths.tower] if sources_m.ndim == 2 else sources_m[paths.pose, paths.tower])
+
+
 def legs(source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> Iterator[tuple[FloatArray, FloatArray]]:
     """Starts and ends (paths, 3) of the legs of polylines, leg by leg.
 

@@ -88,11 +88,11 @@ class FlightData:
     site_place: str | Path
     """The site's file, which lies by the flight file, or the name of a packaged site."""
     site: Site
-    files: tuple[IngestedFile, ...]
-    track: Track | None
-    rss: tuple[RssSeries, ...]
-    rank: tuple[RankSeries, ...]
-    warnings: tuple[str, ...]
+    files: tuple[IngestedFile, ...] = ()
+    track: Track | None = None
+    rss: tuple[RssSeries, ...] = ()
+    rank: tuple[RankSeries, ...] = ()
+    warnings: tuple[str, ...] = ()
     nodes: Mapping[str, Track] = field(default_factory=dict)
     """Tracks of the towers that move; ``site`` has them in the middle of their positions."""
     doubts: tuple[str, ...] = ()
@@ -358,7 +358,7 @@ def gather(
     warnings: list[str] = []
     files = [at_height(log, file) for log, file in zip(settings.logs, files, strict=True)]
     site, nodes = ground_nodes(choose_site(settings.site, folder), settings, logs_root or folder, warnings)
-    telemetry: list[tuple[str, Stream]] = []
+    telemetry, placed = list[tuple[str, Stream]](), list[tuple[str, Stream]]()
     rss: list[tuple[str, RssSeries]] = []
     rank: list[tuple[str, RankSeries]] = []
     for number, (log, file) in enumerate(zip(settings.logs, files, strict=True)):
@@ -371,7 +371,8 @@ def gather(
             warnings += [f"{log.path}: {remark}"] if remark else []
             rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number, locked=locked)))
         tower = log.node or settings.rank.tower
-        ranked = (stream for stream in streams if stream.kind == "rank")
+        ranked = [stream for stream in streams if stream.kind == "rank"]
+        placed += [(log.path, stream) for stream in ranked if "latitude_deg" in stream.frame]
         rank += [(log.path, _rank_series(log, stream, site, tower=tower, number=number)) for stream in ranked]
         if unnamed := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
             warnings.append(f"{log.path}: {counted(len(unnamed), 'cell')} left out that 'cells' does not name")
@@ -408,7 +409,8 @@ def gather(
         warnings=tuple(warnings),
         nodes=nodes,
     )
-    _check_place(data, [(path, stream) for path, stream in telemetry[:1]])
+    for path, stream in (*telemetry[:1], *placed):
+        check_place(site, path, stream)
     _check_overlap(data)
     asked = (
         () if track is None else doubts(track, telemetry[0][1], _times_on_track(data), _undated(data, telemetry[0][0]))
@@ -497,7 +499,7 @@ def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximu
 FAR_M = 30_000.0
 
 
-def _check_place(data: FlightData, telemetry: Sequence[tuple[str, Stream]]) -> None:
+def check_place(site: Site, path: str, stream: Stream) -> None:
     """A flight far from every tower is no flight of this site: exchanged or mirrored angles are named.
 
     Raises
@@ -505,30 +507,22 @@ def _check_place(data: FlightData, telemetry: Sequence[tuple[str, Stream]]) -> N
     InputError
         If no position comes within :data:`FAR_M` of any tower.
     """
-    flown = [(path, stream) for path, stream in telemetry] + [
-        (log.path, stream)
-        for log, file in zip(data.settings.logs, data.files, strict=True)
-        for stream in file.result.streams
-        if stream.kind == "rank" and stream.name not in log.skip and "latitude_deg" in stream.frame
-    ]
-    for path, stream in flown:
-        latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
-        near = nearest_m(data.site, latitude, longitude)
-        if not near > FAR_M:
-            continue
-        turned = {
-            "latitude and longitude are exchanged": (longitude, latitude),
-            "the longitude lacks its sign (west is negative)": (latitude, -longitude),
-            "the latitude lacks its sign (south is negative)": (-latitude, longitude),
-            "latitude and longitude are exchanged and a sign is missing": (longitude, -latitude),
-        }
-        causes = [why for why, angles in turned.items() if nearest_m(data.site, *angles) <= FAR_M]
-        raise InputError(
-            f"the positions come no nearer than {near / 1000.0:.0f} km to any tower of site {data.site.name!r}",
-            expected=f"a flight within {FAR_M / 1000.0:.0f} km of a tower",
-            cause=causes[0] if causes else "another site, or a log of another flight",
-            path=path,
-        )
+    latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
+    if not (near := nearest_m(site, latitude, longitude)) > FAR_M:
+        return
+    turned = {
+        "latitude and longitude are exchanged": (longitude, latitude),
+        "the longitude lacks its sign (west is negative)": (latitude, -longitude),
+        "the latitude lacks its sign (south is negative)": (-latitude, longitude),
+        "latitude and longitude are exchanged and a sign is missing": (longitude, -latitude),
+    }
+    causes = [why for why, angles in turned.items() if nearest_m(site, *angles) <= FAR_M]
+    raise InputError(
+        f"the positions come no nearer than {near / 1000.0:.0f} km to any tower of site {site.name!r}",
+        expected=f"a flight within {FAR_M / 1000.0:.0f} km of a tower",
+        cause=causes[0] if causes else "another site, or a log of another flight",
+        path=path,
+    )
 
 
 def nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -> float:

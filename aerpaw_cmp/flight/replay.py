@@ -57,7 +57,7 @@ class Replayed:
 
     def level_dbm(self, kind: Literal["coherent", "power"]) -> FloatArray:
         """Level (poses,) of the paths, with what learned antennas add towards both ends at once [dBm]."""
-        level = (self.replay.rss_power_dbm if kind == "power" else self.replay.rss_dbm)[:, 0]
+        level = self.replay.level_dbm(kind)[:, 0]
         return level if self.learned is None else level + self.learned.pair_db
 
     def source_m(self, site: Site) -> FloatArray:

@@ -370,8 +370,7 @@ class FlightSimulator:
         time_s = np.arange(0.0, self.trajectory.duration_s, plan.rss_interval_s)
         result = replay_poses(self.site, self.settings.rt, link, self._poses(time_s))
         offset = plan.offsets_db.get(tower, {}).get(str(log.channel), 0.0)
-        summed = result.rss_power_dbm if self.settings.rss.field == "power" else result.rss_dbm
-        level = summed[:, 0] - offset
+        level = result.level_dbm(self.settings.rss.field)[:, 0] - offset
         level = level + correlated_noise(
             self.generator, len(level), plan.fading_db, plan.rss_interval_s, plan.fading_correlation_s
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+from ..common.errors import UsageError
 from ..common.outputs import OutputFile, is_sealed, sealed
 from ..flight.settings import AntennaSettings, load_pattern
 from ..site.antenna.antennas import MeasuredPattern
@@ -44,8 +45,11 @@ def run_antenna_export(
     bare = out.suffix == ".msi"  # the format begins with NAME: no line in front
     with OutputFile(out, own=is_sealed, inputs=inputs, force=force) as output:
         cut = None if elevation is None else str(elevation.absolute())
-        kind: Any = {"model": "file" if variable is None else "gain_grid"}
-        settings = AntennaSettings(**kind, file=str(file.absolute()), variable=variable, elevation=cut)
+        grid = variable is not None or file.suffix == ".mat"
+        if grid and cut is not None:
+            raise UsageError("an elevation cut beside a gain grid", expected="an azimuth cut as FILE", path=file)
+        kind: Any = {"model": "gain_grid", "variable": variable or ""} if grid else {"model": "file"}
+        settings = AntennaSettings(**kind, file=str(file.absolute()), elevation=cut)
         pattern = load_pattern(settings, Path(), carrier_hz)
         assert isinstance(pattern, MeasuredPattern)
         text = exported(pattern, file.stem, out, carrier_hz)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -11,24 +10,23 @@ import numpy as np
 
 from ..common.counting import counted
 from ..common.errors import InputError, UsageError
-from ..common.jsonable import named
+from ..common.jsonable import json_object, named
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
-from ..common.units import FloatArray
 from ..compare.gains.spread import NO_SPREAD, Spread
 from ..compare.learning.locate import FEWEST, UNKNOWN, LevelModel, LevelTrack, NodeEstimate, locate
-from ..flight.data import choose_site, is_ratio, read_logs, site_place
+from ..flight.data import check_place, choose_site, is_ratio, read_logs, site_place
 from ..flight.drafting.draft import receiver_floor_db
 from ..flight.drafting.node import Placer
 from ..flight.drafting.remembered import searching_airframe, taught
-from ..flight.gains.learned_gain import sphere_angles
 from ..flight.gains.memory import load_with_learned
 from ..flight.marks import mark_of
 from ..flight.rows.lock import LOCK_FLOOR_DB, is_sounder_power
 from ..flight.settings import FlightFile
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream
-from ..report.pages.locate import LocatePage, locate_metrics, write_locate
+from ..report.content.made import Made, about
+from ..report.pages.locate import write_locate
 from ..site.antenna.antennas import MeasuredPattern
 from ..site.antenna.sphere_pattern import SpherePattern
 from ..site.site import Site
@@ -67,11 +65,11 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
         with stages("read"):
             site = choose_site(settings.site, flight.parent)
             vehicle, file, level = _streams(settings, flight, options.logs_root, channel)
+            check_place(site, str(flight), vehicle)
             node, uav = _antennas(settings, flight, options.logs_root, site, (file, level))
         with stages("locate"):
             floor = LOCK_FLOOR_DB if is_sounder_power(level) else receiver_floor_db([level])
-            floor = -np.inf if floor is None else floor
-            track = Placer(site, vehicle).levels(level, floor, uav)
+            track = Placer(site, vehicle).levels(level, -np.inf if floor is None else floor, uav, node)
             if len(track.level_db) < FEWEST:
                 raise InputError(
                     f"{counted(len(track.level_db), 'bin')} of 4 s with a level and a position above 5 m",
@@ -79,17 +77,14 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
                     cause="a short flight, or logs of two flights",
                     path=flight,
                 )
-            model, assumed = UNKNOWN, "unknown, one gain over the elevation"
-            if track.airframe_db is not None and isinstance(node, SpherePattern):
-                model, assumed = _model_of(node), f"{node.name}, learned on other flights"
-                track = replace(track, airframe_db=_both_ends(track.airframe_db, node))
-            airframe = "unknown" if uav is None else uav.name
-            estimate = locate(track, model=model)
-        ends = f"Antenna of the UAV: {airframe}. Antenna of the node: {assumed}."
-        page = _page(settings.flight.name, level, site, track, estimate, ends)
+            estimate = locate(track, model=UNKNOWN if node is None else _model_of(node))
+        assumed = "unknown, one gain over the elevation" if node is None else f"{node.name}, learned on other flights"
+        ends = f"Antenna of the UAV: {'unknown' if uav is None else uav.name}. Antenna of the node: {assumed}."
+        numbers = {"flight": settings.flight.name, "channel": level.channel, **_numbers(site, track, estimate, ends)}
+        metrics = json_object(**numbers, **about(Made()))
         with output.filling() as part:
-            written = write_locate(page, part)
-        return JobOutcome(folder=folder, metrics=locate_metrics(page), files=output.placed(written))
+            written = write_locate(metrics, estimate.regions, track.position_m, site, part)
+        return JobOutcome(folder=folder, metrics=metrics, files=output.placed(written))
 
 
 def _streams(
@@ -109,66 +104,54 @@ def _streams(
 
 def _antennas(
     settings: FlightFile, flight: Path, logs_root: Path | None, site: Site, log: tuple[IngestedFile, Stream]
-) -> tuple[Any, MeasuredPattern | None]:
+) -> tuple[MeasuredPattern | None, MeasuredPattern | None]:
     """Antennas of node and airframe that the flight file or else the site knows; none that this very log taught."""
     file, level = log
     link = settings.link.channels.get(level.channel, settings.link.rss)
     known = link.build([_NODE], logs_root or flight.parent)
     node, uav = (array.patterns[0] for array in (known.tower_arrays[_NODE], known.uav_array))
     if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
-        return node, uav
+        return node if isinstance(node, SpherePattern) else None, uav
     mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
     place, series = site_place(settings.site.file, flight.parent), (level.channel, file.result.reader)
     every = taught(place, series, (file.sha256, mark)).items()
-    both = next((antennas for name, antennas in every if name not in site.towers), None)
-    if both is not None:
-        return both.tower, both.uav
-    return None, searching_airframe(place, site.towers, series, (file.sha256, mark))
+    both = next(((ends.tower, ends.uav) for name, ends in every if name not in site.towers), None)
+    return both or (None, searching_airframe(place, site.towers, series, (file.sha256, mark)))
 
 
-def _model_of(node: SpherePattern) -> LevelModel:
+def _model_of(node: Any) -> LevelModel:
     """Levels about antennas that are known at both ends, near free space."""
     spread = Spread.from_text(node.notes) or NO_SPREAD
     scatter_db = spread.noise_sd_db or UNKNOWN.scatter_sd_db
     return LevelModel(slope=2.0, slope_sd=0.2, elevation_sd_db=spread.own_sd_db, scatter_sd_db=scatter_db)
 
 
-def _both_ends(
-    airframe_db: Callable[[FloatArray], FloatArray], node: SpherePattern
-) -> Callable[[FloatArray], FloatArray]:
-    return lambda towards: airframe_db(towards) + node.gain_dbi(*sphere_angles(-towards))
-
-
-def _page(flight: str, level: Stream, site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -> LocatePage:
-    regions, modes = estimate.regions, list[dict[str, float]]()
-    parts = regions.modes()
-    for mode in parts:
-        (latitude,), (longitude,) = site.frame.to_geographic(mode.place_m[:1], mode.place_m[1:])
-        (east, north), angles = mode.place_m, {"latitude_deg": float(latitude), "longitude_deg": float(longitude)}
-        modes.append(angles | {"east_m": float(east), "north_m": float(north)} | named(mode, "share radius_m"))
-    region50_m, region90_m = (regions.radius_m(parts[0].place_m, part) for part in (0.5, 0.9))
+def _numbers(site: Site, track: LevelTrack, estimate: NodeEstimate, ends: str) -> dict[str, Any]:
+    """Numbers and sentences on the node for metrics.json and the page; ``ends`` is one on the antennas."""
+    parts, names = estimate.regions.modes(), ("latitude_deg", "longitude_deg", "east_m", "north_m")
+    angles = site.frame.to_geographic(*np.array([mode.place_m for mode in parts]).T)
+    modes = [
+        dict(zip(names, (*at, *mode.place_m), strict=True)) | named(mode, "share radius_m")
+        for *at, mode in zip(*angles, parts, strict=True)
+    ]
+    region50_m, region90_m = (estimate.regions.radius_m(parts[0].place_m, part) for part in (0.5, 0.9))
     low, high = estimate.height_m
     floor = "none shows" if not np.isfinite(track.floor_db) else f"{track.floor_db:.1f} dB, no level below it is known"
     edge = "The region reaches the edge of the search, 400 m beyond the flight: the node may stand farther away."
-    return LocatePage(
-        flight=flight,
-        channel=level.channel,
-        sentence=_sentence(modes, region90_m),
-        position={key: modes[0][key] for key in ("latitude_deg", "longitude_deg")},
-        region50_m=region50_m,
-        region90_m=region90_m,
-        modes=modes,
-        assumed=(
+    return {
+        "sentence": _sentence(modes, region90_m),
+        "position": {key: modes[0][key] for key in names[:2]},
+        "region50_m": region50_m,
+        "region90_m": region90_m,
+        "modes": modes,
+        "assumed": (
             f"Path-loss exponent {estimate.slope:.1f} ± {2.0 * estimate.slope_sd:.1f} (fitted, 95 %).",
             ends,
             f"Height of the node: {low:g} m" + ("." if low == high else f" or {high:g} m; the levels do not decide."),
             f"Floor of the receiver: {floor}. Shadowing is remembered for 30 s; nothing is ray-traced.",
         ),
-        warnings=(edge,) if estimate.at_edge else (),
-        regions=regions,
-        track_m=track.position_m,
-        site=site,
-    )
+        "warnings": (edge,) if estimate.at_edge else (),
+    }
 
 
 def _sentence(modes: Sequence[dict[str, Any]], radius_m: float) -> str:

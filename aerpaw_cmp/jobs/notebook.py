@@ -246,9 +246,10 @@ class Flight:
         xarray.Dataset
         """
         from ..report.exports.channel import channel_dataset
-        from .channel import ChannelOptions, flight_channel
+        from .channel import ChannelOptions, channel_parts
 
-        return channel_dataset(flight_channel(self.data, ChannelOptions(**options)))
+        (channel,) = channel_parts(self.data, ChannelOptions(**options), in_memory=True)
+        return channel_dataset(channel)
 
     def plot(self, axes: Any = None) -> Any:
         """Draw the trajectory with the towers, seen from above, on matplotlib axes (default: new ones); give them."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -95,6 +95,10 @@ class Replay:
     def further(self) -> tuple[Further, ...]:
         """Paths of further kinds."""
         return self.contributions[1:]
+
+    def level_dbm(self, summed: Literal["coherent", "power"]) -> FloatArray:
+        """Level (poses, towers) of the paths, added up as fields or as powers [dBm]; NaN without a path."""
+        return self.rss_power_dbm if summed == "power" else self.rss_dbm
 
     @property
     def left_out(self) -> list[str]:

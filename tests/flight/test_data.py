@@ -183,18 +183,17 @@ def test_places_are_near_a_tower_up_to_thirty_kilometres(away: float, near: bool
         "A": SimpleNamespace(position_m=[500.0, 700.0, 9.0]),
         "B": SimpleNamespace(position_m=[500.0, -700.0, 9.0]),
     }
-    of: Any = SimpleNamespace(site=SimpleNamespace(frame=frame, towers=towers, name="s"),
-                              settings=SimpleNamespace(logs=[]), files=[])  # fmt: skip
+    site: Any = SimpleNamespace(frame=frame, towers=towers, name="s")
     places = np.array([[0.7 + 3.0, 0.5 + away], [0.7, 0.5 + away], [91.0, 0.5], [np.nan, 0.5], [0.7, -181.0]])
-    assert data.nearest_m(of.site, places[:, 0], places[:, 1]) == pytest.approx(1000.0 * abs(away))
-    flown = [("a", _stream("telemetry", "x", pd.DataFrame(places, columns=["latitude_deg", "longitude_deg"])))]
+    assert data.nearest_m(site, places[:, 0], places[:, 1]) == pytest.approx(1000.0 * abs(away))
+    flown = _stream("telemetry", "x", pd.DataFrame(places, columns=["latitude_deg", "longitude_deg"]))
     if near:
-        data._check_place(of, flown)
+        data.check_place(site, "a", flown)
     else:
         with pytest.raises(InputError):
-            data._check_place(of, flown)
-    assert np.isnan(data.nearest_m(of.site, np.array([91.0, np.nan]), np.array([0.0, 1.0])))
-    assert np.isfinite(data.nearest_m(of.site, np.array([90.0]), np.array([-180.0])))
+            data.check_place(site, "a", flown)
+    assert np.isnan(data.nearest_m(site, np.array([91.0, np.nan]), np.array([0.0, 1.0])))
+    assert np.isfinite(data.nearest_m(site, np.array([90.0]), np.array([-180.0])))
 
 
 @pytest.mark.parametrize(
@@ -206,9 +205,8 @@ def test_angles_that_are_turned_are_told_from_their_place(turned: Any, cause: st
     site = load_site("lake_wheeler")
     latitude, longitude = turned(np.array([35.7275, np.nan]), np.array([-78.696, np.nan]))
     frame = pd.DataFrame({"latitude_deg": latitude, "longitude_deg": longitude})
-    of: Any = SimpleNamespace(site=site, settings=SimpleNamespace(logs=[]), files=[])
     with pytest.raises(InputError) as raised:
-        data._check_place(of, [("a", _stream("telemetry", "x", frame))])
+        data.check_place(site, "a", _stream("telemetry", "x", frame))
     assert cause in str(raised.value)
 
 

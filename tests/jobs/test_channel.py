@@ -252,6 +252,37 @@ def test_what_cannot_be_is_refused_in_one_line(folder, options, expected, capsys
     assert not (tmp_path / "out").exists()
 
 
+def test_times_nodes_and_sizes_that_do_not_fit_are_refused(folder, capsys, tmp_path):
+    (folder / "late.csv").write_text("east_m,north_m,height_m,time_s\n50,0,30,0\n50,40,30,1e8\n")
+    late, flight = ["--route", str(folder / "late.csv"), "--format"], folder / "plan.yaml"
+    drawn = folder / "drawn.yaml"
+    drawn.write_text(PLAN + "rt: {engine: sionna}\n")
+    (folder / "moves.csv").write_text("latitude,longitude,altitude,time\n35.727,-78.696,0,2025-06-01T14:00:00Z\n"
+                                      "35.728,-78.696,0,2025-06-01T14:05:00Z\n")  # fmt: skip
+    moving = folder / "moving.yaml"
+    moving.write_text(PLAN + "towers: {N: {track: {path: moves.csv}, height: ground, antenna_height_m: 2}}\n")
+    for path, options, expected in (
+        (flight, [*late, "csv"], "at most 10000000"),
+        (flight, [*late, "npz", "--step", "20"], "netcdf and csv alone."),
+        (drawn, [*late, "csv", "--step", "20"], "netcdf and csv alone with rt.engine: image"),
+        (moving, ["--tower", "N", "--format", "csv"], "it alone, along the track"),
+    ):
+        assert main(["channel", str(path), "-o", str(tmp_path / "out"), *options]) == 2
+        assert expected in capsys.readouterr().err
+    assert main(["channel", str(moving), "-o", str(tmp_path / "out"), "--format", "csv"]) == 0  # the others stand
+
+
+def test_a_node_of_the_flight_itself_and_a_step_longer_than_it(folder, tmp_path):
+    own = folder / "node.yaml"
+    place = "latitude_deg: 35.7281, longitude_deg: -78.6961, antenna_height_m: 2"
+    own.write_text(PLAN + "towers: {ROVER: {" + place + "}}\n")
+    chosen = ChannelOptions(towers=("ROVER",), step_s=1e300, formats=("csv",))
+    assert run_channel(own, chosen, RunOptions(out=tmp_path / "out")).metrics["poses"] == 1
+    book = aerpaw_cmp.open_flight(SAMPLE).channel(towers=("LW2",), step_s=1e300)
+    assert book.sizes["pose"] == 1
+    assert "no point has a neighbour in time" in book.attrs["comment"]
+
+
 def test_a_missing_library_is_told_before_the_replay(folder, capsys, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "netCDF4", None)
     assert main(["channel", str(folder / "plan.yaml"), "-o", str(tmp_path / "out")]) == 2

@@ -79,6 +79,11 @@ def test_what_cannot_be_located_is_refused(flight, capsys, tmp_path):
     (flight.parent / "short.yaml").write_text(flight.read_text().replace("path: power.txt", "path: short.txt"))
     assert main(["locate", str(flight.parent / "short.yaml"), "-o", str(tmp_path / "out")]) == 3
     assert " of 4 s with a level" in capsys.readouterr().err
+    track = flight.with_name("vehicleOut.txt").read_text()
+    flight.with_name("abroad.txt").write_text(track.replace(",35.7", ",48.1"))
+    (flight.parent / "abroad.yaml").write_text(flight.read_text().replace("vehicleOut.txt", "abroad.txt"))
+    assert main(["locate", str(flight.parent / "abroad.yaml"), "-o", str(tmp_path / "out")]) == 3
+    assert "no nearer than" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -4,6 +4,7 @@ import importlib.util
 
 import numpy as np
 import pytest
+import scipy.io
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
@@ -100,6 +101,20 @@ def test_a_sphere_that_was_learned_keeps_its_logs(tmp_path):
         assert digest in (tmp_path / name).read_text()
     assert read_sphere_csv(tmp_path / "out.csv").trained_on == (digest,)
     assert read_sphere_csv(tmp_path / "out.csv").largest_sd_db == pytest.approx(1.0)
+
+
+def test_what_a_pattern_is_not_is_refused(cuts, tmp_path, capsys):
+    grid = tmp_path / "grids.mat"
+    axes = {"theta2": np.linspace(90.0, -90.0, 61), "phi2": np.arange(180.0, -180.0, -3.0)}
+    scipy.io.savemat(grid, {"SA": np.zeros((61, 120)), **axes})
+    assert export(cuts, tmp_path / "out.msi", "--carrier", "3.4e9") == 0
+    for words, said in (
+        ([str(grid)], "expected one of SA"),
+        ([str(grid), "--variable", "SA", "--elevation", str(cuts[1])], "beside a gain grid"),
+        ([str(tmp_path / "out.msi"), "--carrier", "6e9"], "a pattern of 3.4 GHz"),
+    ):
+        assert main(["antenna", "export", *words, "-o", str(tmp_path / "new.msi")]) == 2
+        assert said in capsys.readouterr().err
 
 
 def test_no_file_of_others_and_no_input_is_replaced(cuts, tmp_path, capsys):

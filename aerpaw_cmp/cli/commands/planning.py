@@ -11,7 +11,7 @@ from typer import Argument, Option
 from ...common.counting import counted
 from ...jobs.options import RunOptions
 from ..app import DryRun, Flights, Force, Json, LogsRoot, command, output
-from ..shown import print_json, records, say, show, warn_all
+from ..shown import print_files, print_json, records, say, show, warn_all
 
 
 @command(
@@ -193,17 +193,19 @@ def channel(
         subcarriers=subcarriers,
     )
     outcome = run_channel(flight, chosen, RunOptions(out=out, logs_root=logs_root, force=force, progress=say))
+    m = outcome.metrics
+    size = f"{counted(m['paths'], 'path')}, {counted(m['poses'], 'pose')}"
+    _print(outcome, f"{size}, towers {', '.join(m['towers'])}, link {m['link']}", as_json)
+
+
+def _print(outcome: Any, sentence: str, as_json: bool) -> None:
+    """Print a sentence, warnings and files, or the metrics alone."""
     if as_json:
         print_json(outcome.metrics)
         return
-    m = outcome.metrics
-    show(
-        f"{counted(m['paths'], 'path')}, {counted(m['poses'], 'pose')}, towers {', '.join(m['towers'])}, "
-        f"link {m['link']}"
-    )
-    warn_all(m["warnings"])
-    for file in outcome.files:
-        show(file)
+    show(sentence)
+    warn_all(outcome.metrics["warnings"])
+    print_files(outcome.files)
 
 
 @command(
@@ -225,12 +227,7 @@ def locate(
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
     while True:
         outcome = run_locate(flight, options, channel)
-        if as_json:
-            print_json(outcome.metrics)
-        else:
-            show(outcome.metrics["sentence"])
-            warn_all(outcome.metrics["warnings"])
-            show(f"page: {outcome.files[0]}")
+        _print(outcome, outcome.metrics["sentence"], as_json)
         if not follow:
             return
         time.sleep(10.0)

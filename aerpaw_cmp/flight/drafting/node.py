@@ -131,8 +131,26 @@ class Placer:
         place = self.track.pose_at(times.iloc[spread_out(len(times), count)]).position_m
         return place[place[:, 2] > self.track.ground_m + _LOW_M]
 
-    def levels(self, stream: Stream, floor_db: float = -np.inf, airframe: MeasuredPattern | None = None) -> LevelTrack:
-        """Levels of a log where the UAV flew, with the gain of its airframe where it is known."""
+    def levels(
+        self,
+        stream: Stream,
+        floor_db: float = -np.inf,
+        airframe: MeasuredPattern | None = None,
+        node: MeasuredPattern | None = None,
+    ) -> LevelTrack:
+        """Levels of a log where the UAV flew, with the gains of its airframe and of a node where they are known.
+
+        Parameters
+        ----------
+        stream : Stream
+        floor_db : float
+            Of the receiver; -inf where none is known.
+        airframe, node : MeasuredPattern, optional
+
+        Returns
+        -------
+        LevelTrack
+        """
         frame = stream.frame[~unscored(stream.frame)]
         poses = self.track.pose_at(frame["time"])
         place = np.where((poses.position_m[:, 2] > self.track.ground_m + _LOW_M)[:, None], poses.position_m, np.nan)
@@ -143,7 +161,7 @@ class Placer:
         track = level_track(time, place, level, floor_db=floor_db)
         if airframe is None or not len(track.time_s):
             return track
-        return replace(track, airframe_db=self._airframe_db(track, airframe))
+        return replace(track, airframe_db=self._gain_db(track, airframe, node))
 
     def propose(self, track: LevelTrack, taught: Mapping[str, Taught] = MappingProxyType({})) -> Placement | None:
         """Tower, listed place or estimated place that the levels fit; None where they are too few.
@@ -191,18 +209,20 @@ class Placer:
 
     def _taught_odds(self, track: LevelTrack, tower: str, gains: Taught) -> float:
         """Log evidence of a tower with the antennas at both ends that flights taught."""
-
-        def gain_db(towards: FloatArray) -> FloatArray:
-            uav_db = self._airframe_db(track, gains.uav)(towards)
-            return uav_db + gains.tower.gain_dbi(*sphere_angles(-towards))
-
-        place = self.site.towers[tower].position_m[None, :]
+        place, gain_db = self.site.towers[tower].position_m[None, :], self._gain_db(track, gains.uav, gains.tower)
         return float(fit_places(replace(track, airframe_db=gain_db), place, gains.model).evidence[0])
 
-    def _airframe_db(self, track: LevelTrack, airframe: MeasuredPattern) -> Callable[[FloatArray], FloatArray]:
-        """Gain of an airframe at each level of a track towards unit vectors (m, n, 3)."""
+    def _gain_db(
+        self, track: LevelTrack, airframe: MeasuredPattern, node: MeasuredPattern | None = None
+    ) -> Callable[[FloatArray], FloatArray]:
+        """Gain of an airframe, and of a node, at each level of a track towards unit vectors (m, n, 3)."""
         rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
-        return lambda towards: airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", rotation, towards)))
+
+        def gain_db(towards: FloatArray) -> FloatArray:
+            uav_db = airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", rotation, towards)))
+            return uav_db if node is None else uav_db + node.gain_dbi(*sphere_angles(-towards))
+
+        return gain_db
 
     def evidence(self, stream: Stream) -> float:
         """Log evidence a bin of levels along this track at the best tower; -inf where they are too few."""

@@ -136,8 +136,7 @@ class Source:
         for start in range(0, len(samples), _REPLAYED_AT_ONCE):
             part = slice(start, start + _REPLAYED_AT_ONCE)
             poses = Poses(samples.position_m[part], rotation[part])
-            replayed = replay_poses(self.site, self.rt, link, poses)
-            total = replayed.rss_dbm if self.rss.field == "coherent" else replayed.rss_power_dbm
+            total = replay_poses(self.site, self.rt, link, poses).level_dbm(self.rss.field)
             level[part] = total[:, 0] + pair_db(link, poses, self.tower_m[None, :])
         return np.asarray(level - self.free_space_db(samples.position_m))
 

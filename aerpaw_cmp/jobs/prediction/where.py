@@ -33,6 +33,9 @@ SPEED_MPS = 8.0
 
 _MOST_POINTS = 2_000_000
 
+# Points further away are none [m].
+NEAR_M = 1e6
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Targets:
@@ -68,8 +71,8 @@ class Targets:
 
     @property
     def known(self) -> BoolArray:
-        """Points (n,) that have a position."""
-        return np.asarray(np.isfinite(self.position_m).all(axis=1))
+        """Points (n,) that have a position near the site."""
+        return np.asarray((np.abs(self.position_m) < NEAR_M).all(axis=1))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -186,8 +189,8 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
     if len(targets) > _MOST_POINTS:
         raise UsageError(f"{len(targets)} points", expected=f"at most {_MOST_POINTS}", cause="too fine a spacing")
     if not targets.known.any():
-        raise InputError("no point has a position", expected="east, north and height, or latitude and longitude",
-                         path=where)  # fmt: skip
+        places = "east, north and height in metres, or latitude and longitude"
+        raise InputError("no point has a position near the site", expected=places, path=where)
     return targets
 
 
@@ -243,14 +246,14 @@ def _local_points(path: Path) -> Targets | None:
     numbers = table.reindex(columns=["east_m", "north_m", "height_m", "yaw_deg", "time_s"])
     numbers = numbers.apply(pd.to_numeric, errors="coerce")
     position = numbers[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
-    lost = int((~np.isfinite(position).all(axis=1)).sum())
+    lost = int((~(np.abs(position) < NEAR_M).all(axis=1)).sum())
     return Targets(
         kind="points",
         name=path.stem,
         position_m=position,
         yaw_deg=numbers["yaw_deg"].to_numpy(np.float64),
         time_s=time if np.isfinite(time := numbers["time_s"].to_numpy(np.float64)).all() else np.zeros(len(position)),
-        remarks=(f"{lost} of {counted(len(position), 'point')} without a position.",) if lost else (),
+        remarks=(f"{lost} of {counted(len(position), 'point')} without a position near the site.",) if lost else (),
     )
 
 

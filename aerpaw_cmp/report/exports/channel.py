@@ -4,62 +4,67 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
 
 from ...common.cf import GrowingNetcdf, dataset, file_attributes
 from ...common.counting import counted
-from ...common.errors import UsageError
+from ...common.jsonable import named
 from ...common.provenance import KEY
 from ...common.stages import Stages
 from ...common.units import AnyArray, FloatArray
 from ...common.versions import tool_version, utc_now
 from ...propagation.drivers.parts import added_up
+from ...propagation.geometry.arrays import Poses
 from ...propagation.path_table import KINDS, PathTable, frequency_responses, impulse_responses
 from ...propagation.replay import Replay
 
-# Gains and frequency responses that are held in memory at once.
-MOST_BYTES = 2 << 30
-
 _LINK, _PORTS = ("pose", "tower"), ("rx", "tx")
 _PATH = ("path", *_LINK)
-# Dimensions, unit and meaning of the variables of a file; *_real and *_imag of one name share a row.
 _SITE, _ARRAY = "site frame, azimuth from east, counter-clockwise", "array frame, from the boresight, counter-clockwise"
-_ABOUT: dict[str, tuple[tuple[str, ...], str, str]] = {
-    "gain": ((*_PATH, *_PORTS), "1", "gain of a path at the carrier, its phase included; 0 without a path"),
-    "h": ((*_LINK, *_PORTS), "1", "channel matrix: sum of the gains over the paths"),
-    "cfr": ((*_LINK, *_PORTS, "subcarrier"), "1", "channel matrix at the subcarriers"),
-    "subcarrier_hz": (("subcarrier",), "Hz", "offset of a subcarrier from the carrier"),
-    "delay_s": (_PATH, "s", "delay between the array centres"),
-    "doppler_hz": (_PATH, "Hz", "Doppler shift, positive while the path gets shorter"),
-    "kind": (_PATH, "", "kind of the path"),
-    "faces": (_PATH, "", "row of face_names"),
-    "face_names": (("faces_of_a_path",), "", "faces that a path touches, from tower to UAV"),
-    **{
-        f"{angle}_{end}{frame}_deg": (_PATH, "degree", f"{angle} towards the path at its {end}: {text}")
-        for angle in ("azimuth", "elevation")
-        for end in ("departure", "arrival")
-        for frame, text in (("", _SITE), ("_array", _ARRAY))
-    },
-    "level_db": (_LINK, "1", "level that the receiver would log, of antennas that flights taught"),
-    "level_sd_db": (_LINK, "1", "standard deviation of level_db [dB]"),
-    "tower_name": (("tower",), "", "name of the tower"),
-    "time": (("pose",), "s", "since the start of the route"),
-    **{
-        f"{end}{name}_m": ((dimension,), "m", f"{name} of the site origin, {text}")
-        for end, dimension, text in (("", "pose", "UAV"), ("tower_", "tower", "tower"))
-        for name in ("east", "north", "up")
-    },
-    **{f"velocity_{name}_mps": (("pose",), "m s-1", f"velocity {name}, UAV") for name in ("east", "north", "up")},
-}
 # Dimensions along which the file grows, pose by pose or with the link that has most paths.
 _GROWS = ("pose", "path", "faces_of_a_path", "face_names_length")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Along:
+    """Poses of the UAV at equal steps of a flight or a route.
+
+    Parameters
+    ----------
+    name : str
+    poses : Poses
+    time_s : (poses,)
+        Since ``start``.
+    start : datetime64, optional
+        UTC; None of a route that was not flown.
+    towers_m : (poses, 3), optional
+        Places of a tower that moves.
+    velocity_mps, tower_mps : (poses, 3), optional
+        Of the UAV where the times say it, and of a tower that moves.
+    remarks : tuple of str
+    """
+
+    name: str
+    poses: Poses
+    time_s: FloatArray
+    start: Any = None
+    towers_m: FloatArray | None = None
+    velocity_mps: FloatArray | None = None
+    tower_mps: FloatArray | None = None
+    remarks: tuple[str, ...] = ()
+
+    def part(self, rows: slice) -> Along:
+        """Some of the poses."""
+        arrays = named(self, "time_s towers_m velocity_mps tower_mps")
+        some: Any = {name: None if values is None else values[rows] for name, values in arrays.items()}
+        return replace(self, poses=Poses(self.poses.position_m[rows], self.poses.rotation[rows]), **some)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,18 +73,11 @@ class Channel:
 
     Parameters
     ----------
-    name : str
+    along : Along
     link : str
         Which link of the flight file.
     replay : Replay
     table : PathTable
-    time_s : (poses,)
-        Since ``start``.
-    start : datetime64, optional
-        UTC; None of a route that was not flown.
-    velocity_mps : (poses, 3), optional
-    tower_mps : (poses, 3), optional
-        Of a tower that moves.
     summed : {"coherent", "power"}
         How the level of a link adds up its paths.
     level_db, level_sd_db : (poses, towers), optional
@@ -91,25 +89,19 @@ class Channel:
         Levels where no flight taught the antennas.
     offsets_hz : (subcarriers,), optional
         Of the frequency response.
-    remarks : tuple of str
     """
 
-    name: str
+    along: Along
     link: str
     replay: Replay
     table: PathTable
-    time_s: FloatArray
-    start: Any = None
-    velocity_mps: FloatArray | None = None
-    tower_mps: FloatArray | float = 0.0
-    summed: str = "power"
+    summed: Literal["coherent", "power"] = "power"
     level_db: FloatArray | None = None
     level_sd_db: FloatArray | None = None
     level_unit: str = ""
     trained_on: tuple[str, ...] = ()
     guesses: int = 0
     offsets_hz: FloatArray | None = None
-    remarks: tuple[str, ...] = ()
 
     @property
     def carrier_hz(self) -> float:
@@ -119,15 +111,13 @@ class Channel:
     @property
     def doppler_hz(self) -> FloatArray | None:
         """Doppler shift (paths,); None without a velocity."""
-        if self.velocity_mps is None:
-            return None
-        return self.table.doppler_hz(self.carrier_hz, self.velocity_mps, self.tower_mps)
+        own, other = self.along.velocity_mps, self.along.tower_mps
+        return None if own is None else self.table.doppler_hz(self.carrier_hz, own, 0.0 if other is None else other)
 
     @property
     def gain_db(self) -> FloatArray:
         """Received over sent power (poses, towers) [dB]; NaN without a path."""
-        level = self.replay.rss_power_dbm if self.summed == "power" else self.replay.rss_dbm
-        return np.asarray(level - self.replay.ends.link.transmit_power_dbm)
+        return np.asarray(self.replay.level_dbm(self.summed) - self.replay.ends.link.transmit_power_dbm)
 
     @property
     def warnings(self) -> list[str]:
@@ -135,27 +125,11 @@ class Channel:
         words = (
             f"Where no flight taught the antennas: {counted(self.guesses, 'level')}, of a larger standard deviation."
         )
-        return [*self.remarks, *([words] if self.guesses else []), *self.replay.left_out]
+        return [*self.along.remarks, *([words] if self.guesses else []), *self.replay.left_out]
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
         """Values per path (paths, ...) as (most paths of a link, poses, towers, ...); None of None."""
-        if values is None:
-            return None
-        table = self.table
-        out = np.full((table.most, *self.replay.has_path.shape, *values.shape[1:]), fill, values.dtype)
-        out[table.number, table.pose, table.tower] = values
-        return out
-
-
-def refuse_size(size: int, what: str, most: int = MOST_BYTES) -> None:
-    """UsageError for more bytes of gains than there is room for: in memory, else on the disk."""
-    if size > most:
-        further = ", or netcdf and csv alone" if most == MOST_BYTES else " of disk"
-        raise UsageError(
-            f"{size / 2**30:.0f} GiB of gains: {what}",
-            expected=f"at most {most / 2**30:.0f} GiB{further}",
-            cause="too short a --step, or too many --subcarriers",
-        )
+        return None if values is None else self.table.by_link(values, self.replay.has_path.shape, fill)
 
 
 def channel_dataset(channel: Channel) -> Any:
@@ -164,48 +138,59 @@ def channel_dataset(channel: Channel) -> Any:
     Raises
     ------
     UsageError
-        xarray is not installed; more numbers than fit in memory.
+        xarray is not installed.
     """
-    table, replay, offsets = channel.table, channel.replay, channel.offsets_hz
-    poses, towers = replay.has_path.shape
-    size = 16 * replay.h.size * (table.most + (0 if offsets is None else len(offsets)))
-    refuse_size(size, f"{poses} poses, {towers} towers, {table.most} paths")
-    values: dict[str, AnyArray | None] = {
-        "gain": channel.by_link(table.gain, 0.0),
-        "kind": channel.by_link(table.kind.astype(np.int8), -1),
-        "faces": channel.by_link(table.via.astype(np.int32), -1),
-        "face_names": np.array(table.names, dtype=object),
-        "h": replay.h,
-        "tower_name": np.array(replay.towers, dtype=object),
-        "delay_s": channel.by_link(table.delay_s),
-        "doppler_hz": channel.by_link(channel.doppler_hz),
-        **{name: channel.by_link(angle) for name, angle in table.angles_deg(replay.ends).items()},
-        "level_db": channel.level_db,
-        "level_sd_db": channel.level_sd_db,
-        "cfr": None if offsets is None else frequency_responses(table, replay.ends, offsets),
-        "subcarrier_hz": offsets,
-        "time": channel.time_s,
-        **_places(channel),
-    }
     variables: dict[str, Any] = {}
-    for name, array in values.items():
-        if array is not None:
-            variables |= _variables(name, array, replay.ends.moving)
+    for name, values, dimensions, *about in _quantities(channel):
+        if values is not None:
+            variables |= _variables(name, values, dimensions, *about)
     data = dataset(variables, _file(channel))
     data.kind.attrs |= {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
-    if channel.start is not None:
-        start = str(channel.start).replace("T", " ")
+    if channel.along.start is not None:
+        start = str(channel.along.start).replace("T", " ")
         data.time.attrs |= {"long_name": f"since {start} UTC", "units": f"seconds since {start[:19]} UTC"}
     if channel.level_db is not None:
         data.level_db.attrs["comment"] = f"unit: {channel.level_unit}"
     return data
 
 
-def _variables(name: str, values: AnyArray, moving: bool) -> dict[str, Any]:
+def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[str, ...], str, str]]:
+    """Name, values, dimensions, unit and meaning of each quantity of a file; values are None where it has none."""
+    table, replay, of, sd = channel.table, channel.replay, channel.by_link, channel.level_sd_db
+    ends, ports, offsets, speed = replay.ends, (*_LINK, *_PORTS), channel.offsets_hz, channel.along.velocity_mps
+    cfr = None if offsets is None else frequency_responses(table, ends, offsets)
+    yield "gain", of(table.gain, 0.0), (*_PATH, *_PORTS), "1", _GAIN
+    yield "kind", of(table.kind.astype(np.int8), -1), _PATH, "", "kind of the path"
+    yield "faces", of(table.via.astype(np.int32), -1), _PATH, "", "row of face_names"
+    faces = np.array(table.names, dtype=object)
+    yield "face_names", faces, ("faces_of_a_path",), "", "faces that a path touches, from tower to UAV"
+    yield "h", replay.h, ports, "1", "channel matrix: sum of the gains over the paths"
+    yield "tower_name", np.array(replay.towers, dtype=object), ("tower",), "", "name of the tower"
+    yield "delay_s", of(table.delay_s), _PATH, "s", "delay between the array centres"
+    doppler = "Doppler shift, positive while the path gets shorter"
+    yield "doppler_hz", of(channel.doppler_hz), _PATH, "Hz", doppler
+    for name, values in table.angles_deg(ends).items():
+        angle, end, *array, _ = name.split("_")
+        meaning = f"{angle} towards the path at its {end}: {_ARRAY if array else _SITE}"
+        yield name, of(values), _PATH, "degree", meaning
+    yield "level_db", channel.level_db, _LINK, "1", "level that the receiver would log, of antennas that flights taught"
+    yield "level_sd_db", sd, _LINK, "1", "standard deviation of level_db [dB]"
+    yield "cfr", cfr, (*ports, "subcarrier"), "1", "channel matrix at the subcarriers"
+    yield "subcarrier_hz", offsets, ("subcarrier",), "Hz", "offset of a subcarrier from the carrier"
+    yield "time", channel.along.time_s, ("pose",), "s", "since the start of the route"
+    sources, along = (ends.sources_m[:, 0], "pose") if ends.moving else (ends.sources_m, "tower")
+    for i, name in enumerate(("east", "north", "up")):
+        yield f"{name}_m", ends.poses.position_m[:, i], ("pose",), "m", f"{name} of the site origin, UAV"
+        yield f"tower_{name}_m", sources[:, i], (along,), "m", f"{name} of the site origin, tower"
+        velocity = None if speed is None else speed[:, i]
+        yield f"velocity_{name}_mps", velocity, ("pose",), "m s-1", f"velocity {name}, UAV"
+
+
+_GAIN = "gain of a path at the carrier, its phase included; 0 without a path"
+
+
+def _variables(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: str, meaning: str) -> dict[str, Any]:
     """A variable as ``xarray`` takes it, by name; two of complex numbers."""
-    dimensions, unit, meaning = _ABOUT[name]
-    if moving and dimensions == ("tower",) and unit:
-        dimensions = ("pose",)  # its place
     about = {"long_name": meaning, **({"units": unit} if unit else {})}
     if np.iscomplexobj(values):
         # digits of a phase do not deflate: level 1 takes out the zeros alone
@@ -220,20 +205,9 @@ def _variables(name: str, values: AnyArray, moving: bool) -> dict[str, Any]:
     return {name: (dimensions, values, about, {"_FillValue": missing} if of_links else {})}
 
 
-def _places(channel: Channel) -> dict[str, AnyArray | None]:
-    """Places of both ends, velocity."""
-    ends, velocity = channel.replay.ends, channel.velocity_mps
-    sources = ends.sources_m[:, 0] if ends.moving else ends.sources_m
-    out: dict[str, AnyArray | None] = {}
-    for i, name in enumerate(("east", "north", "up")):
-        out[f"{name}_m"], out[f"tower_{name}_m"] = ends.poses.position_m[:, i], sources[:, i]
-        out[f"velocity_{name}_mps"] = None if velocity is None else velocity[:, i]
-    return out
-
-
 def _file(channel: Channel) -> dict[str, Any]:
     about = file_attributes(
-        title=f"Channel along {channel.name}, link {channel.link}",
+        title=f"Channel along {channel.along.name}, link {channel.link}",
         source="ray tracing along a flight",
         generated=utc_now(),
         version=tool_version(),
@@ -279,19 +253,18 @@ def write_channel(
     with ExitStack() as stack:
         writers = [stack.enter_context(FORMATS[name](folder)) for name in formats]
         for channel in parts:
-            poses, paths = poses + len(channel.time_s), paths + len(channel.table.pose)
+            poses, paths = poses + len(channel.along.time_s), paths + len(channel.table.pose)
             guesses, omitted = guesses + channel.guesses, added_up([*omitted, *channel.replay.omitted])
             latest = replace(channel, guesses=guesses, replay=replace(channel.replay, omitted=omitted))
             with stages("write"):
                 files = [write(latest) for write in writers]
     return files, {
-        "flight": latest.name,
-        "link": latest.link,
-        "carrier_hz": latest.carrier_hz,
+        "flight": latest.along.name,
+        **named(latest, "link carrier_hz"),
         "towers": list(latest.replay.towers),
         "poses": poses,
         "paths": paths,
-        "has_doppler": latest.velocity_mps is not None,
+        "has_doppler": latest.along.velocity_mps is not None,
         "has_level": latest.level_db is not None,
         KEY: list(latest.trained_on),
         "warnings": latest.warnings,
@@ -319,13 +292,12 @@ def _arrays(channel: Channel) -> dict[str, Any]:
         "a": a,
         "tau": tau,
         "h": channel.replay.h,
-        "time_s": channel.time_s,
+        "time_s": channel.along.time_s,
         "position_m": channel.replay.ends.poses.position_m,
         "towers": np.array(channel.replay.towers),
         "carrier_hz": channel.carrier_hz,
         "doppler_hz": channel.by_link(channel.doppler_hz),
-        "level_db": channel.level_db,
-        "level_sd_db": channel.level_sd_db,
+        **named(channel, "level_db level_sd_db"),
     }
     return {name: values for name, values in arrays.items() if values is not None}
 
@@ -344,21 +316,20 @@ def _write_mat(channel: Channel, folder: Path) -> Path:
 
 def _write_csv(channel: Channel, folder: Path) -> Path:
     """A row per instant and tower: the level of the link, delay and Doppler shift of its strongest path."""
-    path = folder / "channel.csv"
-    poses, towers = channel.gain_db.shape
-    power = channel.by_link((np.abs(channel.table.gain) ** 2).mean(axis=(1, 2)), 0.0)
-    columns = {"delay_s": channel.table.delay_s, "doppler_hz": channel.doppler_hz}
-    time: AnyArray = channel.time_s
-    if channel.start is not None:
-        instants = channel.start + np.round(channel.time_s * 1e9).astype("timedelta64[ns]")
+    path, table, (poses, towers) = folder / "channel.csv", channel.table, channel.gain_db.shape
+    # the strongest path of a link comes last, the first of equals
+    order = np.argsort(-(np.abs(table.gain) ** 2).mean(axis=(1, 2)), kind="stable")[::-1]
+    strongest = np.full((poses, towers), -1)
+    strongest[table.pose[order], table.tower[order]] = order
+    time: AnyArray = channel.along.time_s
+    if channel.along.start is not None:
+        instants = channel.along.start + np.round(channel.along.time_s * 1e9).astype("timedelta64[ns]")
         time = np.char.add(np.datetime_as_string(instants, unit="ms"), "Z")
     shown = {"time": np.repeat(time, towers), "tower": np.tile(channel.replay.towers, poses)}
     shown["gain_db"] = channel.gain_db.ravel().round(3)
-    for name, values in columns.items():
-        at = channel.gain_db * np.nan
-        if values is not None and len(power):
-            at = np.take_along_axis(channel.by_link(values), power.argmax(axis=0)[None], axis=0)[0]
-        shown[name] = at.ravel()
+    for name, values in (("delay_s", table.delay_s), ("doppler_hz", channel.doppler_hz)):
+        known = np.full(len(order), np.nan) if values is None else values
+        shown[name] = np.append(known, np.nan)[strongest].ravel()
     pd.DataFrame(shown).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
     return path
 
@@ -366,7 +337,7 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
 def _write_deepmimo(channel: Channel, folder: Path) -> Path:
     """A scenario of DeepMIMO 4: towers transmit to the poses, first port to first port, elevations from the zenith."""
     table, ends, link = channel.table, channel.replay.ends, channel.replay.ends.link
-    scenario = folder / "deepmimo" / (re.sub(r"[^a-z0-9]+", "_", channel.name.lower()).strip("_") or "flight")
+    scenario = folder / "deepmimo" / (re.sub(r"[^a-z0-9]+", "_", channel.along.name.lower()).strip("_") or "flight")
     scenario.mkdir(parents=True)
     gain = table.gain[:, 0, 0]
     angles = table.angles_deg(ends)

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...common.errors import UsageError
 from .antennas import MeasuredPattern, check_power
+from .learned import BAND
 from .sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid
 
 _STEP_DEG = 3.0
@@ -39,9 +40,13 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
     notes = getattr(pattern, "notes", "") or f"trained_on: {' '.join(pattern.trained_on)}" * bool(pattern.trained_on)
     lines = tuple(line.lstrip("# ") for line in notes.splitlines())
     if target.suffix == ".msi":
-        frequency = carrier_hz or pattern.frequency_hz
+        frequency = pattern.frequency_hz or carrier_hz
         if not frequency:
             raise UsageError("the pattern has no frequency", expected="--carrier HZ", path=target)
+        if abs((carrier_hz or frequency) / frequency - 1.0) > BAND:
+            raise UsageError(
+                f"a pattern of {frequency / 1e9:g} GHz", expected="--carrier within 2 % of it", path=target
+            )
         return planning_cuts(pattern, name, frequency, lines)
     theta, phi, _ = sphere_grid(_STEP_DEG)
     if target.suffix == ".csv":

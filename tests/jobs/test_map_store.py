@@ -1,12 +1,10 @@
 """The store of a map in tiles: what it holds, and what becomes of it when a run, a worker or a disk ends early."""
 
 import json
-import os
 import pickle
 import re
 import resource
 import shutil
-import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +16,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.jobs.mapping import coverage_map as mapping
-from aerpaw_cmp.jobs.tasks.workers import InProcess, Processes
+from aerpaw_cmp.jobs.tasks.workers import InProcess, Lost
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import RATIO_LIMIT_DB
 from aerpaw_cmp.maps.store import LEDGER
@@ -30,8 +28,8 @@ xarray = pytest.importorskip("xarray")
 
 SITE = "lake_wheeler"
 SETTINGS = mapping.MapSettings(
-    spacing_m=120.0, rss_altitudes_m=(30.0,), rank_altitudes_m=(3.0, 30.0), foliage=("none", "opaque"), max_depth=1,
-    study=False, tile_m=600.0,
+    spacing_m=120.0, rss_altitudes_m=(30.0,), rank_altitudes_m=(3.0, 30.0), foliage=("none",), max_depth=1, study=False,
+    tile_m=600.0,
 )  # fmt: skip
 TILES = 8  # 9 x 17 positions in tiles of 5
 
@@ -69,8 +67,10 @@ class Watched(InProcess):
             done(place, function(item))
 
 
-def test_a_store_holds_the_map_in_one_piece(tmp_path, in_one_piece):
-    outcome = make(tmp_path / "map.zarr")
+def test_a_store_holds_the_map_in_one_piece(tmp_path):
+    both = replace(SETTINGS, foliage=("none", "opaque"))
+    in_one_piece = mapping.make_maps(load_site(SITE), replace(both, tile_m=None), Stages(), name=SITE)
+    outcome = make(tmp_path / "map.zarr", both)
     assert_like(outcome, in_one_piece)
     assert outcome.tiles == {
         "store": str(tmp_path / "map.zarr"), "tiles": TILES, "positions": 153, "shown_every": 1,
@@ -212,17 +212,17 @@ def test_a_damaged_tile_is_computed_again_and_said(kind, finished, tmp_path, in_
         assert data.identical(before), "attributes and axes too"
 
 
-@pytest.mark.parametrize("force", [False, True], ids=["", "force"])
 @pytest.mark.parametrize("kind", REFUSED)
-def test_a_store_with_other_metadata_is_refused_before_it_is_opened(kind, force, finished, tmp_path, monkeypatch):
+def test_a_store_with_other_metadata_is_refused_before_it_is_opened(kind, finished, tmp_path, monkeypatch):
     damage, message = REFUSED[kind]
     store = tmp_path / "map.zarr"
     shutil.copytree(finished, store)
     damage(store)
     before = {path: path.read_bytes() for path in store.rglob("*") if path.is_file()}
     monkeypatch.setattr(zarr, "open_group", lambda place, **how: OPEN(place, **only_in_memory(place, how)))
-    with pytest.raises(InputError, match=re.escape(message)):
-        make(store, force=force)
+    for force in (False, True):
+        with pytest.raises(InputError, match=re.escape(message)):
+            make(store, force=force)
     assert {path: path.read_bytes() for path in store.rglob("*") if path.is_file()} == before
 
 
@@ -332,22 +332,15 @@ def test_a_full_disk_is_one_message_and_the_run_goes_on_later(tmp_path, in_one_p
     assert crew.numbers == [2, 3, 4, 5, 6, 7]
 
 
-def killed(order):
-    """As ``map_tile``, but the worker of tile 4 ends."""
-    with Path(os.environ["TEST_MAP_STORE"]).open("a") as stream:
-        stream.write(f"{order.number}\n")
-    if order.number == 4:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return mapping.map_tile(order)
+def test_a_tile_whose_worker_is_killed_each_time_is_lost_alone(tmp_path, in_one_piece):
+    class Kills(Watched):
+        def run(self, function, items, done):
+            super().run(
+                lambda item: Lost("its worker process ended") if item.number == 4 else function(item), items, done
+            )
 
-
-def test_a_worker_that_is_killed_each_time_costs_one_tile(tmp_path, in_one_piece, monkeypatch):
-    monkeypatch.setenv("TEST_MAP_STORE", str(tmp_path / "tries"))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mapping, "map_tile", killed)
-        with pytest.raises(InputError, match="1 of 8 tiles lost: its worker process ended"):
-            make(tmp_path / "map.zarr", workers=Processes(2))
-    assert sorted(map(int, (tmp_path / "tries").read_text().split())) == sorted([*range(TILES), 4, 4])
+    with pytest.raises(InputError, match="1 of 8 tiles lost: its worker process ended"):
+        make(tmp_path / "map.zarr", workers=Kills())
     crew = Watched()
     assert_like(make(tmp_path / "map.zarr", workers=crew), in_one_piece)
     assert crew.numbers == [4]

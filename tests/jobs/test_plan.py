@@ -54,7 +54,7 @@ def test_a_planned_report_names_its_links_and_poses_and_writes_nothing(
     sionna = planned(capsys, "report", file, "--logs-root", SAMPLE)
     assert "replay RSS LW1 USRP1" in sionna["not_estimated"]
     assert main(["report", str(file), "--logs-root", str(SAMPLE), "--audit", "none", "--dry-run"]) == 0
-    assert "not run" in capsys.readouterr().out
+    assert "report, not run" in capsys.readouterr().out
 
 
 COMMANDS = {
@@ -107,8 +107,6 @@ def test_a_dry_run_says_what_it_would_do_and_writes_nothing(
     assert (plan["job"], plan["output"]) == (name, "out.yaml")
     assert plan["inputs"]
     assert [stage["name"] for stage in plan["stages"] if stage["name"] not in ("read", "candidates")]
-    assert main([*words(COMMANDS[name]), "--dry-run"]) == 0
-    assert f"{name}, not run" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", COMMANDS)

@@ -383,7 +383,6 @@ def test_a_fault_planted_in_a_file_that_a_kernel_takes_in_reaches_compiled_code(
         return float(said.stdout)
 
     before = coefficient()
-    assert coefficient() == before
     law = tmp_path / "aerpaw_cmp" / "propagation" / "field" / "fresnel.py"
     text = law.read_text(encoding="utf-8")
     planted = text.replace("    return te_re, te_im, tm_re", "    return 2.0 * te_re, te_im, tm_re", 1)

@@ -1,7 +1,7 @@
 """Made-up files with their truth beside them: what real programs vary, for each format.
 
-A case is a file's name, its bytes and, for each stream that it must give, columns as they must come out; ``time`` in
-seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
+``truth.yaml`` holds those in text. A case is a file's name, its bytes and, for each stream that it must give, columns as
+they must come out; ``time`` in seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
 """
 
 from dataclasses import dataclass, field, replace
@@ -13,6 +13,7 @@ from zoneinfo import ZoneInfo
 import numpy as np
 import pandas as pd
 import pytest
+import yaml
 
 from aerpaw_cmp.logs.files.chunks import whole_lines
 from aerpaw_cmp.logs.ingest import ingest
@@ -39,413 +40,20 @@ class Case:
     refused: str = ""
 
 
-def od(*samples: tuple[float, float]) -> str:
-    """Lines of the sounder: seconds and levels."""
-    rows = [f"[2025-03-02 10:00:{s:09.6f}] {4 * i:07o} {v:15.4f}" for i, (s, v) in enumerate(samples)]
-    return "\n".join(rows) + "\n"
-
-
-LEVELS: Truth = {"x": {"time": [1.0, 1.5], "rss_db": [-20.5, 3.25]}}
-CASES: dict[str, Case] = {
-    f"sounder {name}": Case(name, od((1.0, -20.5), (1.5, 3.25)), {stream: LEVELS["x"]}, "sounder_log")
-    for name, stream in {
-        "2025-03-02_10_00_00_power_log.txt": "power",
-        "x_quality_log.txt": "quality",
-        "lw1_snr.txt": "snr",
-        "LW3_SNR_run2.txt": "snr",
-        "powerlog.txt": "power",
-    }.items()
-}
-CASES |= {
-    "milliseconds of the day, a date in the name": Case(
-        "2025-03-02_merged.csv",
-        ",TIME,SNR,LAT,LON,ALT\n0,36000250,12.5,35.73,-78.7,0.5\n1,36002750,13.5,35.73,-78.7,0.5\n",
-        {"snr": {"time": [0.25, 2.75], "value": [12.5, 13.5]}}, "drive_test"),
-    "AirData: whole seconds and a column of milliseconds": Case(
-        "airdata.csv",
-        "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet)\n"
-        + "".join(f"{100 * i},2025-03-02 15:00:{i // 10:02d},35.73,-78.7,{i}\n" for i in range(25)),
-        {"vehicle": {"time": [i / 10 for i in range(25)], "altitude_m": [0.3048 * i for i in range(25)]}},
-        "pose_csv",
-    ),
-    "Nemo throughput, lower case, in Mbps": Case(
-        "flight1_inst_throughput_mbps.kml",
-        "<kml>\n<Placemark><description>rel_time = 1500 ms inst_throughput_mbps = 126.75 Mbps (lat, lon) = "
-        "(35.73,-78.7) altitude = 4.5 m</description></Placemark>\n</kml>\n",
-        {"inst_throughput_mbps": {"time": [1.5], "value": [126.75]}, "phone": {"altitude_m": [4.5]}},
-        "nemo_kml",
-        replace(LOCAL, time_origin="2025-03-02T15:00:00Z"),
-    ),
-    "Nemo table: what stands in rows without a rank": Case(
-        "nemo_nr.csv",
-        "index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi\n"
-        "1,500,35.73,-78.7,4.5,2,,,\n2,1500,35.73,-78.7,4.5,,-80.5,21.5,\n3,2500,35.73,-78.7,4.5,,,,14\n",
-        {
-            "pdsch_rank": {"time": [0.5, 1.5, 2.5], "rank": [2.0, np.nan, np.nan]},
-            "nr_rsrp": {"time": [1.5], "rss_db": [-80.5]},
-            "nr_sinr": {"time": [1.5], "value": [21.5]},
-            "wb_cqi": {"time": [2.5], "value": [14.0]},
-        },
-        "nemo_csv",
-        replace(LOCAL, time_origin="2025-03-02T15:00:00Z"),
-    ),
-}  # fmt: skip
-
-
-LOG2CSV = "Number,Time,Longitude,Latitude,Altitude,Voltage,Battery Level,Fix,Number of Satellites\n"
-
-
-def table(head: str, row: str, count: int = 8) -> str:
-    """A table of poses: ``i`` counts rows, ``s`` whole seconds after ten o'clock."""
-    return head + "".join(
-        row.format(i=i, s=i % 60, rise=50.0 + i, rest=134.5, north=35.73 + 1e-4 * i) for i in range(count)
+def written_cases() -> dict[str, Case]:
+    """Those of ``truth.yaml``."""
+    table = yaml.load(
+        (Path(__file__).with_name("truth.yaml")).read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
     )
+    out = {}
+    for name, case in table.items():
+        data = samples.FILES[case.pop("sample")] if "sample" in case else case.pop("text")
+        options = replace(LOCAL, time_origin=case.pop("time_origin", None))
+        out[name] = Case(case.pop("file", name), data, case.pop("streams"), options=options, **case)
+    return out
 
 
-MERGED = "2025-03-02 10:00:{s:02d},-78.7,35.73,{rise},{i},4,29\n"
-HEIGHTS = [50.0 + i for i in range(8)]
-CASES |= {
-    "converted vehicleOut cut in flight keeps its heights": Case(
-        "cut.csv", table(LOG2CSV, "{i},2025-03-02 10:00:{s:02d},-78.7,{north},{rise},48.1,90,4,29\n"),
-        {"vehicle": {"time": list(range(8)), "altitude_m": HEIGHTS}}, "pose_csv"),
-    "MATLAB merge of vehicleOut that begins in the air": Case(
-        "merged.csv", table("time,Longitude,Latitude,Altitude,BatteryVolts,GPSFix,NumberOfSatellites\n", MERGED),
-        {"vehicle": {"altitude_m": HEIGHTS}}, "pose_csv"),
-    "a table of nobody that begins in flight keeps its heights": Case(
-        "x.csv", table("time,lat,lon,alt\n", "2025-03-02 10:00:{s:02d},{north},-78.7,{rise}\n"),
-        {"vehicle": {"altitude_m": HEIGHTS}}, "pose_csv"),
-    "a table of nobody that never leaves its height is not on the ground": Case(
-        "x.csv", table("time,lat,lon,alt\n", "2025-03-02 10:00:{s:02d},35.73,-78.7,{rest}\n"),
-        {"vehicle": {"altitude_m": [134.5] * 8}}, "pose_csv"),
-    "altitudes that the header calls above sea level": Case(
-        "x.csv", table("time,lat,lon,altitude_msl\n", "2025-03-02 10:00:{s:02d},{north},-78.7,{rise}\n"),
-        {"vehicle": {"altitude_m": [float(i) for i in range(8)]}}, "pose_csv"),
-    "Nemo's name is year, month, day; times that are not its name's are UTC, as they say": Case(
-        "25Mar02_100000.1.gpx",
-        '<gpx><trkpt lat="35.73" lon="-78.7"><ele>90.5</ele><time>T14:00:01.250Z</time></trkpt>\n'
-        '<trkpt lat="35.73" lon="-78.7"><ele>91.5</ele><time>T14:00:02.250Z</time></trkpt></gpx>\n',
-        {"track": {"time": [-3598.75, -3597.75], "altitude_m": [0.0, 1.0]}},
-        "gpx",
-    ),
-    "gnb.log of srsRAN Project is UTC": Case(
-        "gnb.log",
-        "2025-03-02T15:00:01.250000 [METRICS ] [I] Scheduler UE pci=1 rnti=0x4601 cqi=12 dl_ri=2.0 dl_mcs=27\n",
-        {"gnb": {"time": [1.25], "rank": [2.0], "rnti": [0x4601]}}, "srsran_gnb"),
-    "srsRAN Project's JSON with texts is UTC": Case(
-        "gnb.json",
-        '{"timestamp": "2025-03-02T15:00:02.500", "ue_list": [{"ue_container": {"pci": 1, "rnti": 17921, "dl_ri": 1}}]}\n',
-        {"gnb": {"time": [2.5], "rank": [1.0]}}, "srsran_json"),
-}  # fmt: skip
-
-STAMPED = "[2025-03-02 10:00:{s:02d}.000000] {text}\n"
-
-
-def srsenb(*rows: tuple[int, str, int]) -> str:
-    """srsENB's console: seconds, UE and rank of each row."""
-    head = "rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr"
-    row = "lte {ue}   11   {ri}    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k"
-    texts = [(0, head), *((s, row.format(ue=ue, ri=ri)) for s, ue, ri in rows)]
-    return "".join(STAMPED.format(s=s, text=text) for s, text in texts)
-
-
-CASES |= {
-    "two UEs of an OAI gNB": Case(
-        "oai.log",
-        "".join(
-            STAMPED.format(s=s, text=f"[NR_MAC] UE {ue}: CQI {15 - s}, RI {ri}, PMI (14,1)")
-            + STAMPED.format(s=s, text=f"UE RNTI {ue} CU-UE-ID 1 in-sync PH 0 dB average RSRP {rsrp - s} (16 meas)")
-            for s in (1, 2)
-            for ue, ri, rsrp in (("1f4d", 2, -78), ("2a3b", 1, -98))
-        ),
-        {
-            "oai_rnti1f4d": {"time": [1, 2], "rank": [2, 2], "cqi": [14, 13]},
-            "oai_rnti2a3b": {"time": [1, 2], "rank": [1, 1], "cqi": [14, 13]},
-            "nr_rsrp_rnti1f4d": {"time": [1, 2], "rss_db": [-79, -80]},
-            "nr_rsrp_rnti2a3b": {"time": [1, 2], "rss_db": [-99, -100]},
-        },
-        "oai_log",
-    ),
-    "two UEs of srsENB": Case(
-        "x_radio_enb_log.txt", srsenb((1, "46", 2), (1, "47", 1), (2, "46", 2), (2, "47", 1)),
-        {"srsenb_rnti0046": {"time": [1, 2], "rank": [2, 2]}, "srsenb_rnti0047": {"time": [1, 2], "rank": [1, 1]}},
-        "srsenb_log"),
-    "one UE of srsENB that attaches again": Case(
-        "x_radio_enb_log.txt", srsenb((1, "46", 2), (2, "46", 2), (3, "47", 2)),
-        {"srsenb": {"time": [1, 2, 3], "rank": [2, 2, 2], "rnti": [0x46, 0x46, 0x47]}}, "srsenb_log"),
-}  # fmt: skip
-
-
-DJI = "OSD.latitude,OSD.longitude,OSD.height [ft],OSD.yaw"
-CASES |= {
-    "AirData in metres begins in the air": Case(
-        "airdata.csv",
-        "time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(meters),altitude_above_seaLevel(meters)\n"
-        + "".join(f"{500 * i},2025-03-02 15:00:{i // 2:02d},35.73,-78.7,{10 + i},{110 + i}\n" for i in range(4)),
-        {"vehicle": {"time": [0, 0.5, 1, 1.5], "altitude_m": [10, 11, 12, 13]}},
-        "pose_csv",
-    ),
-    "FlyTrex and Litchi: ascent is above take-off, UTC beside local": Case(
-        "flight.csv",
-        "latitude,longitude,altitude(feet),ascent(feet),time(millisecond),datetime(utc),datetime(local),satellites\n"
-        "35.73,-78.7,400,0,0,2025-03-02 15:00:00,2025-03-02 10:00:00,12\n"
-        "35.73,-78.7,500,100,1000,2025-03-02 15:00:01,2025-03-02 10:00:01,12\n",
-        {"vehicle": {"time": [0, 1], "altitude_m": [0, 30.48], "satellites": [12, 12]}},
-        "pose_csv",
-    ),
-    "DJI Flight Reader: decimal commas, twelve hours, home beside the aircraft": Case(
-        "dji.csv",
-        '"CUSTOM.date [local]","CUSTOM.updateTime [local]","HOME.latitude","HOME.longitude","OSD.latitude","OSD.longitude",'
-        '"OSD.height [ft]","OSD.yaw","GIMBAL.yaw"\n'
-        '"2025-03-02","10:00:01,5 am","35,5","-78,5","35,73","-78,7","10,0","-9,5","0,0"\n',
-        {"vehicle": {"time": [1.5], "latitude_deg": [35.73], "altitude_m": [3.048], "yaw_deg": [-9.5]}},
-        "pose_csv",
-    ),
-    "DJI Flight Reader: UTC beside local": Case(
-        "dji.csv",
-        f"CUSTOM.date [UTC],CUSTOM.updateTime [UTC],CUSTOM.date [local],CUSTOM.updateTime [local],{DJI}\n"
-        "2025-03-02,3:00:01.25 pm,2025-03-02,10:00:01.25 am,35.73,-78.7,10,-9.5\n",
-        {"vehicle": {"time": [1.25], "yaw_deg": [-9.5]}},
-        "pose_csv",
-    ),
-    "DJI Flight Reader: epochs": Case(
-        "dji.csv", f"CUSTOM.updateTime [epoch],{DJI}\n1740927601.5,35.73,-78.7,10,-9.5\n",
-        {"vehicle": {"time": [1.5], "altitude_m": [3.048]}}, "pose_csv"),
-    "QGroundControl's CSV": Case(
-        "qgc.csv",
-        "Timestamp,roll,pitch,heading,altitudeRelative,altitudeAMSL,gps.lat,gps.lon,gps.courseOverGround,gps.lock,gps.count\n"
-        "2025-03-02 10:00:01.125,1.5,-2,270,12.3,102.3,35.73,-78.7,265,3,14\n",
-        {"vehicle": {"time": [1.125], "altitude_m": [12.3], "yaw_deg": [270], "fix": [3], "satellites": [14]}},
-        "pose_csv",
-    ),
-    "PX4's receiver through ulog2csv": Case(
-        "log_vehicle_gps_position_0.csv",
-        "timestamp,time_utc_usec,lat,lon,alt,alt_ellipsoid,vel_n_m_s,vel_e_m_s,vel_d_m_s,fix_type,satellites_used\n"
-        "112684000,1740927600250000,357300001,-787000001,120500,86500,0.5,0.25,-0.1,3,14\n"
-        "112884000,1740927600450000,357300101,-787000001,121500,87500,0.5,0.25,-0.1,3,14\n",
-        {
-            "vehicle": {
-                "time": [0.25, 0.45],
-                "latitude_deg": [35.7300001, 35.7300101],
-                "altitude_m": [0, 1],
-                "velocity_north_mps": [0.5, 0.5],
-            }
-        },
-        "pose_csv",
-    ),
-    "PX4's estimate through ulog2csv counts microseconds": Case(
-        "log_vehicle_global_position_0.csv",
-        "timestamp,timestamp_sample,lat,lon,alt,eph,epv\n1500000,1490000,35.73,-78.7,120.5,1,1\n2000000,1990000,35.73,-78.7,121.5,1,1\n",
-        {"vehicle": {"time": [1.5, 2.0], "altitude_m": [0, 1]}}, "pose_csv",
-        replace(LOCAL, time_origin="2025-03-02T15:00:00Z")),
-    "ArduPilot's log in text": Case(
-        "x.log",
-        "FMT, 128, 89, FMT, BBnNZ, Type,Length,Name,Format,Columns\n"
-        "FMT, 130, 45, GPS, QBIHBLLe, TimeUS,Status,GMS,GWk,NSats,Lat,Lng,Alt\n"
-        "FMT, 131, 29, ATT, Qccc, TimeUS,Roll,Pitch,Yaw\n"
-        "GPS, 50000000, 3, 54018250, 2356, 12, 35.73, -78.7, 120.5\n"
-        "ATT, 50000000, 1.5, -2.5, 270.5\n"
-        "GPS, 50200000, 3, 54018450, 2356, 12, 35.7301, -78.7, 121.5\n",
-        {"vehicle": {"time": [0.25, 0.45], "altitude_m": [0, 1], "yaw_deg": [270.5, 270.5], "satellites": [12, 12]}},
-        "ardupilot_bin",
-    ),
-}  # fmt: skip
-
-GNETTRACK = "Timestamp\tLongitude\tLatitude\tNetworkTech\tLevel\tQual\tARFCN\tPSC\tAltitude\tHeight\n"
-NEMO = "Time,Longitude,Latitude,{c} (LTE pcell),Channel number (LTE pcell),RSRP (LTE pcell)," + (
-    "{c} (LTE scell0),Channel number (LTE scell0),RSRP (LTE scell0)\n"
-)
-CASES |= {
-    "G-NetTrack: 4G and 5G share a PCI, 3G has none; heights are the altitudes'": Case(
-        "x.txt",
-        GNETTRACK
-        + "".join(
-            f"2025.03.02_10.00.0{s}\t-78.7\t35.73\t{tech}\t{level}\t-9\t{arfcn}\t7\t{74 + s}\t0\n"
-            for s, (tech, level, arfcn) in enumerate((("4G", -80, 2850), ("5G", -90, 631000), ("3G", -70, 10700)))
-        ),
-        {
-            "lte_pci7": {"time": [0], "rss_db": [-80]},
-            "nr_pci7": {"time": [1], "rss_db": [-90]},
-            "phone": {"altitude_m": [0, 1, 2]},
-        },
-        "drive_test",
-    ),
-    "G-NetTrack's KML": Case(
-        "x.kml",
-        "<kml><Document>\n"
-        + "".join(
-            f'<Placemark><ExtendedData>\n<Data name="TIME"><value>2025.03.02_10.00.0{s}</value></Data>\n'
-            f'<Data name="RSRP"><value>{-80 - s}</value></Data><Data name="PCI"><value>7</value></Data></ExtendedData>\n'
-            f"<Point><coordinates>-78.7,35.73,{74 + s}</coordinates></Point></Placemark>\n"
-            for s in (1, 2)
-        )
-        + "</Document></kml>\n",
-        {"pci7": {"time": [1, 2], "rss_db": [-81, -82]}, "phone": {"altitude_m": [0, 1], "latitude_deg": [35.73] * 2}},
-        "gnettrack_kml",
-    ),
-    "Nemo: two carriers serve at once": Case(
-        "x.csv",
-        NEMO.format(c="Physical cell identity")
-        + "2025-03-02 10:00:01.250,-78.7,35.73,7,1300,-80.5,22,2850,-87\n"
-        + "2025-03-02 10:00:02.250,-78.7,35.73,7,1300,-81.5,7,2850,-77\n",
-        {
-            "lte_pci7_arfcn1300": {"time": [1.25, 2.25], "rss_db": [-80.5, -81.5], "serving": [1, 1]},
-            "lte_pci22": {"time": [1.25], "rss_db": [-87], "serving": [1]},
-            "lte_pci7_arfcn2850": {"time": [2.25], "rss_db": [-77], "serving": [1]},
-        },
-        "drive_test",
-    ),
-    "TEMS: decimal commas say that the day comes first": Case(
-        "x.csv",
-        "Time;Longitude;Latitude;Serving PCI;Serving EARFCN (DL);Serving RSRP (dBm);Neighbor PCI[0];Neighbor EARFCN[0];"
-        "Neighbor RSRP (dBm)[0]\n02/03/2025 10:00:00.250;-78,7;35,73;12;1300;-80,5;12;2850;-91,5\n",
-        {
-            "pci12_arfcn1300": {"time": [0.25], "rss_db": [-80.5]},
-            "pci12_arfcn2850": {"time": [0.25], "rss_db": [-91.5]},
-        },
-        "drive_test",
-    ),
-    "TEMS: the file's name says which is the day": Case(
-        "run_2025-03-02.csv", "Time,PCI,EARFCN,RSRP (dBm)\n02/03/2025 10:00:00.250,12,1300,-80.5\n",
-        {"pci12": {"time": [0.25], "rss_db": [-80.5]}}, "drive_test"),
-    "TEMS: words for months, tabs": Case(
-        "x.txt", "Time\tServing PCI\tServing EARFCN\tServing RSRP (dBm)\n02-Mar-2025 10:00:00.250\t12\t1300\t-80.5\n",
-        {"pci12": {"time": [0.25], "rss_db": [-80.5]}}, "drive_test"),
-    "XCAL: NR and LTE in one row, a row without fix": Case(
-        "x.csv",
-        "TIME_STAMP,Lat,Lon,5G KPI PCell RF Serving PCI,5G KPI PCell RF Serving NR-ARFCN,5G KPI PCell RF Serving SS-RSRP [dBm],"
-        "5G KPI PCell RF RI,LTE KPI PCell Serving PCI,LTE KPI PCell Serving RSRP[dBm]\n"
-        "2025-03-02 10:00:00.250,35.73,-78.7,101,631000,-85.5,2,7,-80.5\n2025-03-02 10:00:01.250,,,101,631000,-86.5,3,7,-81.5\n",
-        {
-            "nr_pci101": {"time": [0.25, 1.25], "rss_db": [-85.5, -86.5]},
-            "lte_pci7": {"time": [0.25, 1.25], "rss_db": [-80.5, -81.5]},
-            "5g_kpi_pcell_rf_ri": {"time": [0.25, 1.25], "rank": [2, 3]},
-        },
-        "drive_test",
-    ),
-    "XCAL: a layer number, times of the day, a date in the name": Case(
-        "2025-03-02_xcal.csv",
-        "TIME_STAMP,Lat,Lon,5G KPI PCell Layer1 DL Layer Num (Mode),5G KPI PCell RF Serving PCI,5G KPI PCell RF Serving SS-RSRP [dBm]\n"
-        "10:00:00.250,35.73,-78.7,2,101,-85.5\n10:00:01.250,35.73,-78.7,4,101,-86.5\n",
-        {"nr_pci101": {"time": [0.25, 1.25]}, "5g_kpi_pcell_layer1_dl_layer_num_mode": {"rank": [2, 4]}},
-        "drive_test",
-    ),
-    "XCAL: title lines, epochs in ms": Case(
-        "x.csv",
-        "XCAL export\n\nTIMESTAMP,Serving PCI,SS-RSRP [dBm]\n1740927600250,101,-85.5\n1740927601250,102,-86.5\n",
-        {"nr_pci101": {"time": [0.25], "rss_db": [-85.5]}, "nr_pci102": {"time": [1.25], "rss_db": [-86.5]}},
-        "drive_test"),
-    "QualiPoc: date and time apart": Case(
-        "x.csv",
-        "Date,Time,GPS Latitude,GPS Longitude,LTE Serving Cell PCI,LTE Serving Cell RSRP [dBm],LTE Rank Indicator\n"
-        "02.03.2025,10:00:00.250,35.73,-78.7,7,-80.5,1\n02.03.2025,10:00:01.250,35.73,-78.7,7,-81.5,2\n",
-        {"lte_pci7": {"time": [0.25, 1.25], "rss_db": [-80.5, -81.5]}, "lte_rank_indicator": {"rank": [1, 2]}},
-        "drive_test",
-    ),
-    "QualiPoc: UTC by the column's name": Case(
-        "x.csv", "Time UTC;LTE Serving Cell PCI;LTE Serving Cell RSRP [dBm]\n2025-03-02 15:00:00.250;7;-80,5\n",
-        {"lte_pci7": {"time": [0.25], "rss_db": [-80.5]}}, "drive_test"),
-    "QualiPoc: twelve hours, month first": Case(
-        "x.csv",
-        "Time,LTE Serving Cell PCI,LTE Serving Cell RSRP [dBm]\n03/02/2025 10:00:00.250 AM,7,-80.5\n03/13/2025 10:00:00 AM,7,-80.5\n",
-        {"lte_pci7": {"time": [0.25, 946800.0], "rss_db": [-80.5, -80.5]}}, "drive_test"),
-    "a cell a row: the registered one serves": Case(
-        "phone.csv",
-        "timestamp,latitude,longitude,rat,pci,earfcn,rsrp,is_registered\n"
-        "2025-03-02T10:00:00.250-05:00,35.73,-78.7,LTE,7,1300,-80,true\n"
-        "2025-03-02T10:00:00.250-05:00,35.73,-78.7,LTE,8,1300,-90,false\n"
-        "2025-03-02T10:00:01.250-05:00,35.73,-78.7,LTE,7,2850,-81,true\n",
-        {
-            "lte_pci7_arfcn1300": {"time": [0.25], "serving": [1]},
-            "lte_pci8": {"time": [0.25], "serving": [0]},
-            "lte_pci7_arfcn2850": {"time": [1.25], "serving": [1]},
-        },
-        "drive_test",
-    ),
-    "CellMapper: signal of a PCI": Case(
-        "cm.csv",
-        "Latitude,Longitude,MCC,MNC,CID,Signal,Type,ARFCN,PSC or PCI,Timestamp\n35.73,-78.7,310,260,2,-85,LTE,2850,325,1740927600250\n",
-        {"lte_pci325": {"time": [0.25], "rss_db": [-85]}}, "drive_test"),
-    "one RNTI in two cells of an srsRAN gNB": Case(
-        "gnb.json",
-        "".join(
-            f'{{"timestamp": "2025-03-02T15:00:0{s}.500", "cells": [{{"cell_metrics": {{"pci": {pci}}}, "ue_list": '
-            f'[{{"pci": {pci}, "rnti": 17921, "dl_ri": {pci}.0}}]}}]}}\n'
-            for s in (1, 2)
-            for pci in (1, 2)
-        ),
-        {"gnb_pci1": {"time": [1.5, 2.5], "rank": [1, 1]}, "gnb_pci2": {"time": [1.5, 2.5], "rank": [2, 2]}},
-        "srsran_json",
-    ),
-    "OAI's newest layout": Case(
-        "oai.log",
-        "".join(
-            STAMPED.format(
-                s=s,
-                text="UE RNTI 2460 CU-UE-ID 2 in-sync PH 28 dB PCMAX 24 dBm, average RSRP -74 (8 meas), average SINR 40.0",
-            )
-            + STAMPED.format(
-                s=s, text="UE 2460: dlsch_rounds 9/5/1/0, dlsch_errors 2, BLER 0.19557 MCS (1) 23 (Qm 8) CCE fail 3"
-            )
-            + STAMPED.format(s=s, text=f"UE 2460: CSI [CQI {16 - s} RI {s} PMI (14,1)] SRS [UL-RI 2 TPMI 0]")
-            for s in (1, 2)
-        ),
-        {"oai": {"time": [1, 2], "rank": [1, 2], "cqi": [15, 14]}, "nr_rsrp": {"rss_db": [-74, -74]}},
-        "oai_log",
-    ),
-}  # fmt: skip
-
-
-ENDC = (
-    '2025-03-02 10:00:0{s}.250,"+QENG: ""servingcell""","NOCONN","LTE","FDD",310,410,ABCDEF,{lte},3,5,5,1234,{level},-9,-55,20,'
-    '12,230,40,"+QENG: ""NR5G-NSA""",310,410,{nr}\n'
-)
-UE = "   0    {pci}  {level}   61 -4.2k |   2   25   1.0   3.9k    0%    1.6 |  18    0.0    35k    0%"
-CASES |= {
-    "Quectel: a handover to another cell on the way, and NR lost": Case(
-        "Serving_cell_Params_ENDC.csv",
-        ENDC.format(s=0, lte="7,1300", level=-85, nr="101,-88,25,-11,631000,78,12,1")
-        + ENDC.format(s=1, lte="8,2850", level=-86, nr="65535,-32768,-32768,-32768")
-        + ENDC.format(s=2, lte="7,2850", level=-87, nr="101,-89,24,-11,631000,78,12,1"),
-        {
-            "lte_pci7_arfcn1300": {"time": [0.25], "rss_db": [-85]},
-            "lte_pci8": {"time": [1.25], "rss_db": [-86]},
-            "lte_pci7_arfcn2850": {"time": [2.25], "rss_db": [-87]},
-            "nr_rsrp": {"time": [0.25, 1.25, 2.25], "rss_db": [-88, np.nan, -89], "sinr_db": [25, np.nan, 24]},
-        },
-        "quectel_csv",
-    ),
-    "srsUE: two carriers share a PCI": Case(
-        "x_radio_log.txt",
-        STAMPED.format(
-            s=0, text=" cc  pci  rsrp   pl   cfo | mcs  snr  iter  brate  bler  ta_us | mcs   buff  brate  bler"
-        )
-        + "".join(
-            STAMPED.format(s=s, text=UE.format(pci=1, level=level).replace("   0 ", f"   {cc} ", 1))
-            for s in (1, 2)
-            for cc, level in ((0, -60 - s), (1, -70 - s))
-        ),
-        {"lte_pci1": {"time": [1, 2], "rss_db": [-61, -62]}, "lte_pci1_cc1": {"time": [1, 2], "rss_db": [-71, -72]}},
-        "srsue_log",
-    ),
-    "srsUE of srsLTE, before 2020": Case(
-        "x_radio_log.txt",
-        STAMPED.format(
-            s=0, text="cc  rsrp    pl    cfo   mcs   snr turbo  brate   bler   ta_us  mcs   buff  brate   bler"
-        )
-        + STAMPED.format(
-            s=1, text=" 0   -77    78   1.2k    24    33  0.84   5.8M     0%   0.0    18   193k   624k     0%"
-        ),
-        {"lte_rsrp": {"time": [1], "rss_db": [-77], "sinr_db": [33], "pathloss_db": [78]}},
-        "srsue_log",
-    ),
-    "srsENB of srsLTE, before 2020": Case(
-        "x_radio_enb_log.txt",
-        STAMPED.format(s=0, text="rnti  cqi    ri   mcs  brate   bler   snr   phr   mcs  brate   bler    bsr")
-        + STAMPED.format(s=1, text="  46  15.0     2  27.5   1.2M     0%  33.1  40.0  22.9   624k     0%    0.0"),
-        {"srsenb": {"time": [1], "rank": [2], "cqi": [15]}},
-        "srsenb_log",
-    ),
-}
+CASES = written_cases()
 
 
 # --- binary logs, MATLAB and the tap: the bytes are those of tests/parsers/autopilots.py and samples.py -------------------
@@ -543,78 +151,18 @@ BINARY: dict[str, tuple[str, str, bytes, Truth, ReadOptions]] = {
     ),
 }  # fmt: skip
 CASES |= {name: Case(file, data, truth, reader, how) for name, (reader, file, data, truth, how) in BINARY.items()}
-
-
-NAN = np.nan
-SAMPLES = [
-    Case("Quectel: 0 is no CSI", samples.FILES["quectel_csv/csi"], {
-        "nr5g_csi": {"time": [0.25, 2.25, 6.25], "ri_raw": [2, 0, 4], "rank": [2, NAN, 4], "flag": ["", "no_csi", ""], "mcs": [24, NAN, 24]},
-        "lte_csi": {"rank": [1, 1, 1]},
-    }, "quectel_csv", refused="torn"),
-    Case("Quectel: first generation, an impossible RI", samples.FILES["quectel_csv/csi_first_generation"], {
-        "nr5g_csi": {"time": [0, 9], "rank": [3, NAN], "flag": ["", "ri_out_of_range"]},
-    }, "quectel_csv"),
-    Case("Quectel: NSA writes RSRP, SINR, RSRQ", samples.FILES["quectel_csv/endc"], {
-        "nr_rsrp": {"rss_db": [-82, NAN], "sinr_db": [21, NAN]}, "lte_rsrp": {"rss_db": [-91, -91]},
-    }, "quectel_csv", about={"nr_rsrp": {"unit": "dBm"}}, refused="searching"),
-    Case("Quectel: SA writes RSRP, RSRQ, SINR, among LTE rows", samples.FILES["quectel_csv/lte_only"], {
-        "lte_rsrp": {"rss_db": [-93]}, "nr_rsrp": {"rss_db": [-71], "sinr_db": [32]},
-    }, "quectel_csv"),
-    Case("Quectel: console, cells by their tables", samples.FILES["quectel_console/tables"], {
-        "nr_pci77": {"rss_db": [-82], "rsrq_db": [-11], "sinr_db": [21]}, "nr5g_csi": {"rank": [2]},
-    }, "quectel_console", about={"lte_pci492": {"arfcn": 950}}),
-    Case("table of ranks", samples.FILES["quectel_ri/table"], {"nr5g_csi": {"rank": [2, NAN], "altitude_m": [30.1, 30.2]}}, "quectel_ri"),
-    Case("Nemo: a row without a rank keeps its level", samples.FILES["nemo_csv/table"], {
-        "pdsch_rank": {"rank": [2, NAN, 4], "flag": ["", "no_rank_in_row", ""], "rsrp_dbm": [NAN, -80.5, NAN], "cqi": [NAN, 14, NAN]},
-    }, "nemo_csv", FROM_TEN, about={"pdsch_rank": {"clock": "utc"}}),
-    Case("Nemo: cells by PCI; one goes on serving when it is detected later", samples.FILES["drive_test/nemo"], {
-        "lte_pci110": {"rss_db": [-76, -77], "serving": [1, 1]}, "lte_pci22": {"serving": [0]}, "rs_snr": {"value": [19]},
-        "phone": {"fix": [-1] * 3},
-    }, "drive_test"),
-    Case("SNR table of towers", samples.FILES["aadm_snr/table"], {"LW2": {"flag": ["", "out_of_coverage"]}}, "aadm_snr",
-         about={name: {"node": name, "unit": "dB"} for name in ("LW1", "LW2")}),
-    Case("controller: the Download block holds no levels", samples.FILES["controller_log/console"], {
-        "LW1": {"rss_db": [9.5, 8.5]}, "LW2": {"rss_db": [-1.25]},
-    }, "controller_log"),
-    Case("srsENB: 0 is no report, 1 is rank one", samples.FILES["srsenb_log/console"], {
-        "srsenb": {"rank": [NAN, 1, NAN], "ri_raw": [0, 1, NAN], "cqi": [11, 11, NAN], "mcs": [2, 2, 0], "flag": ["no_csi", "", "no_csi"]},
-    }, "srsenb_log", about={"srsenb": {"ri_base": "one"}}, warned="truncated mean"),
-    Case("PawPrints: who serves; 2147483647 is no level; the companion's clock, UTC", samples.FILES["pawprints/session"], {
-        "lte_pci1": {"rss_db": [-71, -70], "serving": [0, 1]}, "lte_pci2": {"time": [0.2505], "rss_db": [-62]},
-        "nr_ss_rsrp": {"rss_db": [-88], "rsrq_db": [-11], "sinr_db": [33]},
-    }, "pawprints", about={"lte_pci2": {"pci": 2, "arfcn": 66911, "rat": "lte"}}),
-    Case("PawPrints with a location", samples.FILES["pawprints/session"].replace(
-        b'"rel_time": 1.0', b'"location": {"latitude": 35.5, "longitude": -78.5, "altitude": 90}'
-    ), {"phone": {"latitude_deg": [35.5], "longitude_deg": [-78.5], "altitude_m": [0]}}, "pawprints"),
-    Case("XCAL: semicolons and decimal commas", samples.FILES["drive_test/xcal"], {
-        "nr_pci7": {"rss_db": [-81.5, -82.5]}, "phone": {"longitude_deg": [-78.7000001] * 2}, "5g_kpi_pcell_rf_ri": {"rank": [2]},
-    }, "drive_test"),
-    Case("GPX: heights count from the first point", samples.FILES["gpx/track"], {"track": {"time": [0.25, 1], "altitude_m": [0, 10]}}, "gpx"),
-    Case("flight script: neither home nor a waypoint is a position", samples.FILES["vehicle_log/console"], {
-        "vehicle": {"altitude_m": [40.5, 40.0], "yaw_deg": [312.5, NAN]}, "power": {"value": [-12.5, NAN]},
-    }, "vehicle_log"),
-    Case("srsUE: cells and SI suffixes", samples.FILES["srsue_log/console"], {
-        "lte_pci1": {"rss_db": [-61, -62], "pathloss_db": [61, 62]}, "lte_pci7": {"serving": [1]}, "cfo": {"value": [-4200, -950, 1500]},
-    }, "srsue_log"),
-    Case("OAI gNB: the old layout and the new", samples.FILES["oai_log/gnb"], {
-        "oai": {"rank": [2, 1], "rnti": [0x1F4D] * 2}, "nr_rsrp": {"rss_db": [-78]},
-    }, "oai_log"),
-    Case("OAI gNB: 128 frames of 10 ms", samples.FILES["oai_log/frames"], {"oai": {"time": [0, 1.28]}}, "oai_log",
-         replace(LOCAL, time_origin="2025-03-02T15:00:00Z")),
-    Case("OAI UE", samples.FILES["oai_log/ue"], {"oai": {"time": [0.25, 1.25], "rank": [2, 1], "sinr_db": [20, 19]}}, "oai_log"),
-    Case("SigMF of dataset 12", samples.FILES["sigmf/dataset12"], {
-        "vehicle": {"longitude_deg": [-78.7, -78.71]}, "USRP1": {"time": [0.25, 0.55], "rss_db": [-40.5, -41.5]},
-        "USRP2": {"flag": ["", "out_of_coverage"]},
-    }, "sigmf"),
-    Case("MATLAB, two channels: units and silence", samples.mat_flight(), {"USRP1": {"flag": ["", "", "out_of_coverage", "", ""]}},
-         "flight_mat", about={"USRP1": {"unit": "dB re full scale"}}),
-    Case("MATLAB, LTE: unit and silence", samples.lte_flight(),
-         {key: {"flag": ["", "", "out_of_coverage", "", ""]} for key in ("RSRP", "RSRP2")},
-         "flight_mat", about={"RSRP": {"quantity": "RSRP", "unit": "dB re full scale"}}),
-    Case("MATLAB, processed: no clock", samples.processed_flight(), {"vehicle": {"yaw_deg": [90.0] * 4}}, "flight_mat",
-         about={"vehicle": {"clock": "relative"}, "RSRP": {"unit": "dBm"}}, warned="no clock"),
-]  # fmt: skip
-CASES |= {case.name: case for case in SAMPLES}
+SILENT = ["", "", "out_of_coverage", "", ""]
+CASES |= {
+    case.name: case
+    for case in (
+        Case("MATLAB, two channels: units and silence", samples.mat_flight(), {"USRP1": {"flag": SILENT}}, "flight_mat",
+             about={"USRP1": {"unit": "dB re full scale"}}),
+        Case("MATLAB, LTE: unit and silence", samples.lte_flight(), {key: {"flag": SILENT} for key in ("RSRP", "RSRP2")},
+             "flight_mat", about={"RSRP": {"quantity": "RSRP", "unit": "dB re full scale"}}),
+        Case("MATLAB, processed: no clock", samples.processed_flight(), {"vehicle": {"yaw_deg": [90.0] * 4}}, "flight_mat",
+             about={"vehicle": {"clock": "relative"}, "RSRP": {"unit": "dBm"}}, warned="no clock"),
+    )
+}  # fmt: skip
 
 
 def shown(values: Any) -> list[Any]:
@@ -663,6 +211,7 @@ class Form:
     name: str = "log.txt"
 
 
+LOG2CSV = "Number,Time,Longitude,Latitude,Altitude,Voltage,Battery Level,Fix,Number of Satellites\n"
 RANKS, ENB = "rank", "| 31.5 12.5 40 15 38k"
 FORMS = {
     "vehicle_out, 10 fields": Form(
@@ -785,7 +334,7 @@ ORIGINS = {
 ROW = '1,-78.7,35.73,30.5,"(0.1,1.5,0.1)","(0.0,5.0,0.1)",48.1,2025-03-02 10:00:07.000000{zone},4,18\n'
 FILES = {
     "x_vehicleOut.txt": ROW.format(zone=""), "utc_vehicleOut.txt": ROW.format(zone="+00:00"),
-    "x_power_log.txt": od((1.0, -20.5)), "gnb.json": CASES["srsRAN Project's JSON with texts is UTC"].data,
+    "x_power_log.txt": "[2025-03-02 10:00:01.000000] 0000000        -20.5000\n", "gnb.json": CASES["srsRAN Project's JSON with texts is UTC"].data,
     "nobody.csv": CASES["a table of nobody that begins in flight keeps its heights"].data,
     "amsl.csv": CASES["altitudes that the header calls above sea level"].data,
 }  # fmt: skip

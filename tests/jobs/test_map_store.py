@@ -75,7 +75,7 @@ def test_a_store_holds_the_map_in_one_piece(tmp_path):
     assert outcome.tiles == {
         "store": str(tmp_path / "map.zarr"), "tiles": TILES, "positions": 153, "shown_every": 1,
     }  # fmt: skip
-    with xarray.open_zarr(tmp_path / "map.zarr", consolidated=False) as data:
+    with xarray.open_zarr(tmp_path / "map.zarr", consolidated=False, chunks=None) as data:
         at = data.isel(foliage=0, y=11, x=7)
         level = in_one_piece.maps["none"].rss("siso", "LW2")[0, 11 * 9 + 7]
         assert float(at["rss_siso"].sel(height=30.0)[1]) == pytest.approx(level, abs=0.006)
@@ -208,7 +208,10 @@ def test_a_damaged_tile_is_computed_again_and_said(kind, finished, tmp_path, in_
     assert crew.numbers == again
     entered = "an entry is gone" not in kind and bool(again)
     assert any("1 finished tile with missing or changed chunks" in text for text in said) == entered
-    with xarray.open_zarr(store, consolidated=False) as data, xarray.open_zarr(finished, consolidated=False) as before:
+    with (
+        xarray.open_zarr(store, consolidated=False, chunks=None) as data,
+        xarray.open_zarr(finished, consolidated=False, chunks=None) as before,
+    ):
         assert data.identical(before), "attributes and axes too"
 
 

@@ -84,15 +84,6 @@ def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]
     assert {Path(path).suffix for path in written} >= {".html", ".png", ".svg"}
 
 
-@pytest.mark.parametrize("command", [["report", SAMPLE / "flight.yaml", "--audit", "none"], ["site", "show"]])
-def test_a_file_in_the_way_of_the_folder(
-    command: list[object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (tmp_path / "taken").write_text("")
-    assert main([str(a) for a in (*command, "-o", tmp_path / "taken" / "x")]) == 2
-    assert "a file is in the way" in capsys.readouterr().err
-
-
 @pytest.mark.sionna
 def test_bench_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Of the two numbers of samples that ``--quick`` asks for, one is run: the rows are of the same kinds."""

@@ -179,14 +179,6 @@ def test_the_reference_has_every_public_name_and_every_command(pages: Path) -> N
     assert all(f"aerpaw-cmp {name}" in listed for name in COMMANDS)
 
 
-@pytest.mark.parametrize("script", sorted((ROOT / "docs" / "gallery").glob("*.py")), ids=lambda path: path.stem)
-def test_a_script_of_the_gallery_has_a_title_and_draws(script: Path) -> None:
-    code = script.read_text()
-    assert code.startswith('"""')
-    assert "figure" in code
-    compile(code, str(script), "exec")
-
-
 def test_pages_that_a_user_reads_are_short() -> None:
     """Research notes and the reference may be long; every other page has at most 1200 words, and a place in the menu."""
     menu = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]

@@ -10,9 +10,6 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.flight.overrides import overridden
-from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, run
 from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.jobs.options import RunOptions
@@ -208,22 +205,6 @@ def test_a_cluster_needs_distributed(
     for option in ("--cluster", "--scheduler"):
         assert main(["campaign", str(path), "-o", str(folder / "c"), "--fresh", option, "tcp://127.0.0.1:1"]) == 2
         assert "pip install 'aerpaw-cmp[cluster]'" in capsys.readouterr().err
-
-
-def test_a_channel_of_its_own_starts_as_a_copy(folder: Path) -> None:
-    flight = load_flight(folder / "first.yaml")
-    # the copy has what the same overrides change in its original, whatever their order
-    changed = overridden(flight, {"link.channels.USRP2.tower.yaw_deg": 5.0, "link.rss.uav.yaw_deg": 7.0})
-    channel = changed.link.channels["USRP2"]
-    assert (channel.tower.yaw_deg, channel.uav.yaw_deg) == (5.0, 7.0)
-    assert channel.tower.antenna.model == "tr38901"
-    assert changed.link.rss.tower.yaw_deg == 0.0
-    tower = overridden(flight, {"link.rss.towers.LW1.pitch_deg": 3.0}).link.rss.towers["LW1"]
-    assert (tower.pitch_deg, tower.antenna.model) == (3.0, "tr38901")
-    assert overridden(flight, {"logs.1.node": "LW2"}).logs[1].node == "LW2"
-    assert isinstance(changed, FlightFile)
-    with pytest.raises(UsageError, match="no key 'wings'"):
-        overridden(flight, {"wings": 2})
 
 
 def test_shared_offsets_have_their_closed_form() -> None:

@@ -198,33 +198,6 @@ def test_a_token_that_was_set_is_not_printed(tools):
         assert not [url for url in web.urls if "unit" in url]
 
 
-def test_pictures_of_another_page_do_not_keep_the_pilot_out(tools):
-    """An endless loop of ``<img>`` and connections that say nothing share the address of the pilot's browser."""
-    with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", 0), limits=Limits(connections=8)) as web:
-        stop = threading.Event()
-
-        def loop():
-            while not stop.is_set():
-                with contextlib.suppress(OSError, http.client.HTTPException):
-                    assert ask(web, "/?x=1", Cookie=None)[0] == 403
-
-        loops = [threading.Thread(target=loop) for _ in range(6)]
-        for thread in loops:
-            thread.start()
-        silent = [socket.create_connection(("127.0.0.1", web.address.port), 5) for _ in range(40)]
-        browser = tools.Browser.of(web)
-        try:
-            answers = [ask(web)[0] for _ in range(5)]
-            until(lambda: browser.messages, 10.0)
-        finally:
-            stop.set()
-            browser.close()
-            for item in (*loops, *silent):
-                item.join() if isinstance(item, threading.Thread) else item.close()
-        assert answers == [200] * 5
-        assert browser.connections == 1
-
-
 def test_a_flood_of_an_address_keeps_neither_others_out_nor_who_has_the_token(tools):
     """An allowance that never comes back, used up by one address, which also fills all places that wait."""
     limits = Limits(connections=4, per_second=1e-9, burst=6)
@@ -588,24 +561,6 @@ def test_no_interval_before_there_is_anything_to_judge_by():
 
 
 # the tap with a page -------------------------------------------------------------------------------------------
-
-
-def test_the_log_is_as_without_the_page(modem, tap, tools, tmp_path):
-    logs = []
-    for name in ("with", "without"):
-        sim = modem(link=tmp_path / name)
-        with tools.page_open(name == "with") as feed:
-            options = {} if feed is None else {"watch": lambda item, feed=feed: feed.put(0, item)}
-            session = tap(sim.port, folder=tmp_path / f"log-{name}", options=options)
-            session.wait(lambda sim=sim: len(sim.journal) > 60)
-            session.end()
-        records, bad = tools.records_of(tmp_path / f"log-{name}")
-        assert not bad
-        assert [record["n"] for record in records] == list(range(len(records)))
-        logs.append({(record["kind"], tuple(record)) for record in records})
-        (file,) = (tmp_path / f"log-{name}").iterdir()
-        assert file.name.startswith("tap_")
-    assert logs[0] == logs[1]
 
 
 def test_the_page_gets_every_answer_of_the_log(modem, tap, tools, tmp_path):

@@ -254,12 +254,6 @@ def test_doubts_are_said(report_data):
     assert any("was not audited" in text for text in cautions(none))
 
 
-def test_nothing_to_score(report_data):
-    panels = tuple(with_numbers(panel, n=0, rmse_db=np.nan) for panel in report_data.rss)
-    first = paragraph(dataclasses.replace(report_data, rss=panels, rank=()))
-    assert first.startswith("Nothing could be compared")
-
-
 def test_a_rank_forecast_is_the_headline_where_there_is_one(report_data):
     rng = np.random.default_rng(3)
     measured = rng.integers(1, 5, 200).astype(float)

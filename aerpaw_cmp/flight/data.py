@@ -453,7 +453,7 @@ def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
     """Remarks on streams that are compared with a level over noise, or as if they were one."""
     ratios = [s for s in streams if is_ratio(s) and s.name not in log.skip]
-    blind = [s.name for s in ratios if _noise(s, _link_of(links, log, s))[0] is None]
+    blind = [s.name for s in ratios if _noise(s, links.of(_channel_of(log, s)))[0] is None]
     if not blind:
         return []
     shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
@@ -462,11 +462,6 @@ def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]
         f"'noise_figure_db' of link.rss make an SNR absolute; 'skip: [{', '.join(blind)}]' beside the path leaves "
         "it out)"
     ]
-
-
-def _link_of(links: LinksSettings, log: LogSettings, stream: Stream) -> LinkSettings:
-    """Of the stream's channel."""
-    return links.channels.get(_channel_of(log, stream), links.rss)
 
 
 def _channel_of(log: LogSettings, stream: Stream) -> str:
@@ -589,7 +584,7 @@ def _rss_series(
     home = log.cells.get(int(pci)) if pci is not None else None
     tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
     channel = _channel_of(log, stream)
-    noise_dbm, link = _noise(stream, _link_of(links, log, stream))
+    noise_dbm, link = _noise(stream, links.of(channel))
     frame, left_out = scored_rows(stream, log.path)
     return RssSeries(
         tower=tower,

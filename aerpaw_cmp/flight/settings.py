@@ -190,6 +190,10 @@ class LinksSettings(StrictModel):
     """RSS link of single channels that differ, by channel name (two antennas point differently)."""
     rank: LinkSettings = Field(default_factory=_rank_link)
 
+    def of(self, channel: str) -> LinkSettings:
+        """The RSS link of a channel."""
+        return self.channels.get(channel, self.rss)
+
 
 class LogSettings(StrictModel):
     """One log file and what it cannot say about itself."""

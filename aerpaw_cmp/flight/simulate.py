@@ -347,7 +347,7 @@ class FlightSimulator:
             raise UsageError(f"the site has no tower {tower!r}", expected="one of " + ", ".join(self.site.towers))
         if log.reader == "quectel_ri":
             return partial(self._rank_log, log, tower, links.rank.build([tower], self.folder))
-        link = links.channels.get(str(log.channel), links.rss).build([tower], self.folder)
+        link = links.of(str(log.channel)).build([tower], self.folder)
         return partial(self._rss_log, log, tower, link)
 
     def _telemetry_log(self, log: LogSettings) -> bytes:

@@ -107,8 +107,7 @@ def _antennas(
 ) -> tuple[MeasuredPattern | None, MeasuredPattern | None]:
     """Antennas of node and airframe that the flight file or else the site knows; none that this very log taught."""
     file, level = log
-    link = settings.link.channels.get(level.channel, settings.link.rss)
-    known = link.build([_NODE], logs_root or flight.parent)
+    known = settings.link.of(level.channel).build([_NODE], logs_root or flight.parent)
     node, uav = (array.patterns[0] for array in (known.tower_arrays[_NODE], known.uav_array))
     if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
         return node if isinstance(node, SpherePattern) else None, uav

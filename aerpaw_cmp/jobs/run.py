@@ -385,8 +385,8 @@ def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:
     JobOutcome
     """
     from ..report.pages.site import write_site_view
+    from ..site.inputs import inputs_of_site
     from ..site.siteyaml import load_site
-    from .tasks.manifest import inputs_of_site
 
     out = options.out or Path("reports") / f"site-{Path(site).stem}"
     with OutputFolder(out, job="site show", inputs=inputs_of_site(site), force=options.force) as output:
@@ -423,12 +423,12 @@ def run_map(
     """
     from ..maps.grid import Grid
     from ..report.pages.maps import maps_metrics, write_maps
+    from ..site.inputs import inputs_of_site
     from ..site.siteyaml import load_site
     from .mapping import coverage_map as mapping
     from .mapping.paper_table import paper_markdown, paper_rows
     from .plan import map_stages
     from .prediction.sources import files_of, named_flights
-    from .tasks.manifest import inputs_of_site
     from .tasks.workers import open_workers
 
     known = named_flights(flights)
@@ -599,11 +599,12 @@ def run_calibrate(
         The settings file is the first of its ``files``.
     """
     from ..site.antenna.learned import read_learned, remember
+    from ..site.inputs import inputs_of_site
     from ..site.siteyaml import site_model
     from .learning.calibrate import calibrate, load_calibration, read_flights
     from .learning.calibrate_rank import fit_rank, samples_by_tower
     from .learning.calibration_files import Calibrated, site_entry, write_files
-    from .tasks.manifest import inputs_of_flights, inputs_of_site
+    from .tasks.manifest import inputs_of_flights
 
     settings = load_calibration(path)
     if into_site is not None:

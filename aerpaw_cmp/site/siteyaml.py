@@ -328,7 +328,7 @@ def _find(name_or_path: str | Path) -> tuple[str, SiteModel, LineOf]:
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml") or path.is_file():
         return str(path), *load_yaml_and_lines(path, SiteModel)
-    name = str(name_or_path).lower().replace("-", "_").replace(" ", "_")
+    name = packaged_name(str(name_or_path))
     if name not in PACKAGED:
         near = nearest(name, PACKAGED)
         raise UsageError(
@@ -337,6 +337,11 @@ def _find(name_or_path: str | Path) -> tuple[str, SiteModel, LineOf]:
             cause=f"did you mean '{near}'?" if near else None,
         )
     return name, *_packaged(name)
+
+
+def packaged_name(name: str) -> str:
+    """The name of a packaged site as its file has it: lake-wheeler, Lake Wheeler."""
+    return name.lower().replace("-", "_").replace(" ", "_")
 
 
 @cache

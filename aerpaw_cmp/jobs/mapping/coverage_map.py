@@ -21,6 +21,7 @@ from ...common.cf import file_attributes
 from ...common.counting import counted
 from ...common.errors import InputError, UsageError, noting_interrupts
 from ...common.jsonable import named
+from ...common.outputs import file_digest
 from ...common.stages import Progress, Stages, share_of
 from ...common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, db_from_power, finite_mean, wavelength_m
 from ...common.versions import utc_now, versions
@@ -50,11 +51,11 @@ from ...propagation.replay import Replay, replay
 from ...report.content import maps as page
 from ...report.content.flight import ReportData
 from ...report.pages.prediction import outside_share
+from ...site.inputs import inputs_of_site
 from ...site.site import Site
 from ...site.siteyaml import load_site
 from ..prediction.corrected_map import CorrectedMaps
 from ..reporting.foliage_notes import p833_note
-from ..tasks.manifest import site_inputs
 from ..tasks.outcomes import code_digest
 from ..tasks.workers import InProcess, Lost, Workers
 
@@ -499,7 +500,7 @@ def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
     """All that the values of a map depend on: settings, content of the site's files, program."""
     without = ("study", "neighbours", "radius_m", "block_m", "seed")
     chosen = {key: str(value) for key, value in asdict(settings).items() if key not in without}
-    files = [entry.sha256[:12] for entry, _ in site_inputs(site, Path())]
+    files = [file_digest(file)[:12] for file in inputs_of_site(site)]
     return {"site": files, **chosen, "program": code_digest()[:12]}
 
 

@@ -22,8 +22,9 @@ from ...flight.simulate import planned_poses
 from ...logs.route import read_route
 from ...maps.grid import Grid
 from ...propagation.geometry.arrays import rotation_from_aircraft
+from ...site.inputs import inputs_of_site
 from ...site.site import Site
-from ..tasks.manifest import inputs_of_flight, inputs_of_site
+from ..tasks.manifest import inputs_of_flight
 
 # Between points of a route that is given by its corners [m].
 STEP_M = 10.0

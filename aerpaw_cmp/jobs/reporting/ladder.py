@@ -447,8 +447,7 @@ def _root_mean_square(values: Sequence[float]) -> float:
 
 def _link_of(settings: FlightFile, data: FlightData, series: RssSeries) -> Link:
     """The link of a series as other settings have it."""
-    link = settings.link.channels.get(series.channel, settings.link.rss)
-    return link.build([series.tower], data.folder)
+    return settings.link.of(series.channel).build([series.tower], data.folder)
 
 
 def _arrays(link: Link) -> list[Any]:

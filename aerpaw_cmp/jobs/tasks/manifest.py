@@ -6,12 +6,10 @@ Whatever text of the flight file or of the site file names a file is one (:mod:`
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import lru_cache
-from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from ...common.errors import AerpawCmpError
 from ...common.files import LARGEST_TABLE
@@ -22,6 +20,7 @@ from ...flight.gains.memory import load_with_learned
 from ...flight.settings import FlightFile
 from ...report.content.flight import InputFile
 from ...site.antenna.learned import read_table
+from ...site.inputs import inputs_of_site, site_files
 
 
 def other_inputs(
@@ -54,16 +53,9 @@ def other_inputs(
     for key, text, place in named_files(content, roots):
         if key != "site.file":
             entries.setdefault(os.path.realpath(place), _entry(text, place, key))
-    for entry, place in site_inputs(settings.site.file, flight.parent):
-        entries.setdefault(os.path.realpath(place), entry)
+    for text, role, place in site_files(settings.site.file, flight.parent):
+        entries.setdefault(os.path.realpath(place), _entry(text, place, role))
     return tuple(entries.values())
-
-
-def inputs_of_site(site: str | Path, folder: Path = Path()) -> list[Path]:
-    """The site file, as it is named in a folder, and what it names; none where it is wrong, which its reader says."""
-    with suppress(AerpawCmpError, OSError):
-        return [place for _, _, place in _site_files(str(site), folder)]
-    return []
 
 
 def inputs_of_flight(settings: FlightFile, flight: Path, logs_root: Path | None = None) -> list[Path]:
@@ -79,38 +71,6 @@ def inputs_of_flights(flights: Iterable[Path], logs_root: Path | None = None) ->
         with suppress(AerpawCmpError, OSError):
             files += inputs_of_flight(load_with_learned(flight), flight, logs_root)
     return files
-
-
-def site_inputs(name: str, folder: Path) -> Iterator[tuple[InputFile, Path]]:
-    """The site file, as it is named in a folder, and what it names."""
-    for text, role, place in _site_files(name, folder):
-        yield _entry(text, place, role), place
-
-
-def _site_files(name: str, folder: Path) -> Iterator[tuple[str, str, Path]]:
-    """Name, role and place of the site file and of what it names."""
-    path = folder / name
-    if path.is_file():
-        yield name, "site file", path
-        status = path.stat()
-        model = _site_model(path, status.st_size, status.st_mtime_ns)
-    else:
-        model = _site_model(name, 0, 0)
-        packaged = name.lower().replace("-", "_").replace(" ", "_") + ".yaml"
-        with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / packaged) as file:
-            if file.is_file():
-                yield f"aerpaw_cmp/site/data/{packaged}", "site file (packaged)", file
-        return
-    for key, text, place in named_files(model.model_dump(), [path.parent]):
-        yield text, f"site: {key}", place
-
-
-@lru_cache(maxsize=16)
-def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> Any:
-    """A site file as checked; a campaign asks for the same one with every task."""
-    from ...site.siteyaml import site_model
-
-    return site_model(site)
 
 
 @lru_cache(maxsize=1024)

@@ -23,6 +23,7 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.limits import NEAR_DEG
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine
+from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import ReadOptions, dictionary
@@ -549,7 +550,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
         texts = [f"{date} {time}".strip() for date, time in pairs]
     name, unit = dictionary.plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", sheet.names[column])), sheet.unit(column)
-    count = next((short for short, form in _COUNTS.items() if form.search(unit) or form.search(name)), None)
+    count = next((short for short, c in _time.COUNTS.items() if c.said.search(unit) or c.said.search(name)), None)
     # the sign for micro is no letter of a plain name: 'Time [\u00b5s]' is 'time s' there
     if unit in ("\u00b5s", "\u03bcs") or (unit and count is None):
         count = "us" if unit in ("\u00b5s", "\u03bcs") else "s"
@@ -561,12 +562,6 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         texts = [f"{time} {own}".strip() for time, own in zip(texts, zones, strict=True)]
     gps = re.search(r"\bgps", name) is not None
     return _stamps.read(texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps)
-
-
-_COUNTS = {"ns": re.compile(r"\bn(s|sec|anos\w*)\b"), "us": re.compile(r"(\b|time|stamp)(us|usec|micros\w*)\b"),
-           "ms": re.compile(r"(\b|time|stamp)ms\b|^m?sec$|millisecond"),
-           "s": re.compile(r" s$|^s$|\bsec(ond)?s\b"), "min": re.compile(r"\bmin(ute)?s?\b"),
-           "h": re.compile(r" h$|^h$|\bh(ou)?rs?\b")}  # fmt: skip
 
 
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:

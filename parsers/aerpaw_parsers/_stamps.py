@@ -383,7 +383,7 @@ def _numbers(
     value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in texts])
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
-        if middle >= 0.9 * scale and scale >= _LEAST_EPOCH.get(unit or "", 0.0):
+        if middle >= 0.9 * scale and (unit is None or scale >= _time.COUNTS[unit].least_epoch):
             if gps and middle < 1.58 * scale:  # as an epoch of 1970 before 2020, as one of 1980 before 2030
                 value, warnings = value + (GPS_S - LEAP_S) * scale / 1e9, [_GPS_COUNT]
             else:
@@ -403,8 +403,6 @@ def _numbers(
 # GPS time counts from 6 January 1980; since 2017 it is 18 s ahead of UTC (IERS Bulletin C 52).
 GPS_S, LEAP_S = 315_964_800, 18
 _GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were taken off"
-# An epoch in a unit that the head of the column says; 1e9 microseconds are a quarter of an hour of PX4's own clock.
-_LEAST_EPOCH = {"s": 1e9, "ms": 1e12, "us": 1e15, "ns": 1e18, "min": np.inf, "h": np.inf}
 # Date of number zero, and the numbers of the years 2000 to 2099.
 _DAY_NUMBERS = (("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"), ("-001-12-31", 730_486.0, 767_011.0, "MATLAB"))
 

@@ -6,9 +6,11 @@ as if it were UTC. Every reader comes here, so the rule exists once.
 
 from __future__ import annotations
 
+import math
 import re
 from dataclasses import dataclass, field
 from datetime import datetime, timedelta, timezone, tzinfo
+from typing import NamedTuple
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
@@ -35,6 +37,26 @@ WINTER = {
     "AEST": ((10.0, "Australia/Sydney"),), "NZST": ((12.0, "Pacific/Auckland"),),
     "IST": ((5.5, "Asia/Kolkata"), (1.0, "Europe/Dublin"), (2.0, "Asia/Jerusalem")),
 }  # fmt: skip
+
+
+class Count(NamedTuple):
+    """A unit that clocks count in: nanoseconds, what a column's name says, and the least count that is an epoch."""
+
+    ns: float
+    said: re.Pattern[str]
+    least_epoch: float
+
+
+# In the order in which a name is searched. 1e9 microseconds are a quarter of an hour of PX4's own clock, no epoch.
+COUNTS = {
+    "ns": Count(1.0, re.compile(r"\bn(s|sec|anos\w*)\b"), 1e18),
+    "us": Count(1e3, re.compile(r"(\b|time|stamp)(us|usec|micros\w*)\b"), 1e15),
+    "ms": Count(1e6, re.compile(r"(\b|time|stamp)ms\b|^m?sec$|millisecond"), 1e12),
+    "s": Count(1e9, re.compile(r" s$|^s$|\bsec(ond)?s\b"), 1e9),
+    "min": Count(6e10, re.compile(r"\bmin(ute)?s?\b"), math.inf),
+    "h": Count(3.6e12, re.compile(r" h$|^h$|\bh(ou)?rs?\b"), math.inf),
+}
+
 _BUCKET_S = 900  # no zone in use changes its offset within a quarter of an hour of wall clock
 _MONTH_DAYS = np.array([0, 31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
 

@@ -316,7 +316,6 @@ def _untimed(lines: _lines.Lines, rows: IntArray, cells: AnyArray, valid: BoolAr
 
 
 RELATIVE = "the times are relative and no time_origin is given: they count from 1970-01-01T00:00"
-_SCALE_NS = {"ns": 1.0, "us": 1e3, "ms": 1e6, "s": 1e9, "min": 6e10, "h": 3.6e12}
 _MOST_S = 9.2e9
 # Relative times beyond about 285 years would leave the range of datetime64[ns].
 _FLIGHT_S = 9.0e9
@@ -346,14 +345,15 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
         instants, valid = _time.texts_to_utc(cells, options, needed_by=reader)
         return False, instants, valid
     form, unit = clock.split("_")
+    unit_ns = _time.COUNTS[unit].ns
     value = cells if cells.dtype.kind == "f" else np.asarray(_lines.numbers(cells), dtype=np.float64)
     origin = _time.origin_ns(options, needed_by=reader) if form == "relative" else 0
     most = _FLIGHT_S if form == "relative" else _MOST_S
-    valid = np.isfinite(value) & (np.abs(value) * _SCALE_NS[unit] <= most * 1e9)
+    valid = np.isfinite(value) & (np.abs(value) * unit_ns <= most * 1e9)
     safe = np.where(valid, value, 0.0)
     integer = np.floor(safe)  # the fraction apart: a float64 epoch in ns has no room for it
-    ns = integer.astype(np.int64) * int(_SCALE_NS[unit])
-    ns += np.round((safe - integer) * _SCALE_NS[unit]).astype(np.int64) + (origin or 0)
+    ns = integer.astype(np.int64) * int(unit_ns)
+    ns += np.round((safe - integer) * unit_ns).astype(np.int64) + (origin or 0)
     if form == "epoch" and options.clock in ("local", "local_as_utc"):
         return False, _time.local_to_utc(ns, options.timezone, needed_by=reader), valid
     none = np.zeros(len(ns), dtype=bool)

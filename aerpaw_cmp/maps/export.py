@@ -1,13 +1,13 @@
 """Maps as files that other programs open: one function per format, ``write_X(path, maps)`` (NetCDF: ``netcdf.py``).
 
 A :class:`MapLayers` holds what is written: a grid, the site's frame and any layers (a level, its standard deviation, a
-corrected level, classes). Out of coverage is an empty cell (CSV), NaN (GeoTIFF), and in layers of classes the class 0,
-"Z". Samples along a flight are written by :mod:`aerpaw_cmp.report.exports`.
+corrected level, classes). Out of coverage is an empty cell (CSV), and in layers of classes the class 0, "Z". Samples
+along a flight are written by :mod:`aerpaw_cmp.report.exports`.
 
     maps = MapLayers(grid=grid, frame=site.frame, layers=(Layer("level_db", level, "dBm", "Level"),))
-    write_geotiff(folder / "level.tif", maps)
+    write_csv(folder / "level.csv", maps)
 
-GeoTIFF needs rasterio: ``pip install aerpaw-cmp[geo]``. A file that exists is replaced; each function returns its path.
+A file that exists is replaced; each function returns its path.
 """
 
 from __future__ import annotations
@@ -22,8 +22,6 @@ import numpy as np
 
 from ..common import kml
 from ..common.cells import guarded
-from ..common.cf import site_crs
-from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
 from ..common.kml import CLASS_COLOURS
 from ..common.units import AnyArray, FloatArray
@@ -96,51 +94,6 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
     }
     target = Path(path)
     guarded(pd.DataFrame(table)).to_csv(target, index=False, lineterminator="\n")
-    return target
-
-
-def write_geotiff(path: str | Path, maps: MapLayers) -> Path:
-    """Cloud-optimised GeoTIFF, one float32 band per layer with name, unit, title and classes; north up.
-
-    NaN is out of coverage. A band of classes has no missing value: its 0 is the class "Z", which its tag ``classes``
-    names.
-
-    Raises
-    ------
-    UsageError
-        If rasterio is not installed.
-    """
-    try:
-        import rasterio
-        from rasterio.io import MemoryFile
-        from rasterio.shutil import copy
-    except ImportError as missing:
-        raise UsageError(
-            f"GeoTIFF needs {missing.name}, which is not installed",
-            expected="pip install 'aerpaw-cmp[geo]', or another format",
-        ) from None
-    grid = maps.grid
-    half, step = grid.spacing_m / 2, grid.spacing_m
-    corner = rasterio.Affine(step, 0.0, grid.east_m[0] - half, 0.0, -step, grid.north_m[-1] + half)
-    rows, columns = grid.shape
-    target = Path(path)
-    # GDAL says nothing of what a full disk did not take: made in memory, the layout by a copy
-    with MemoryFile() as memory, MemoryFile(ext=".tif") as ordered:
-        with memory.open(
-            driver="GTiff", width=columns, height=rows, count=len(maps.layers), dtype="float32",
-            crs=site_crs(maps.frame).to_wkt("WKT2_2019"), transform=corner, nodata=np.nan,
-        ) as file:  # fmt: skip
-            for band, layer in enumerate(maps.layers, start=1):
-                values = np.asarray(layer.values, dtype=np.float32)
-                file.write(grid.raster(values)[::-1], band)
-                file.set_band_description(band, layer.name)
-                file.set_band_unit(band, layer.unit)
-                file.update_tags(band, title=layer.title, unit=layer.unit, classes=" ".join(layer.classes))
-            if maps.credit:
-                file.update_tags(TIFFTAG_COPYRIGHT=maps.credit)
-        with memory.open() as file:
-            copy(file, ordered.name, driver="COG", compress="deflate", overview_resampling="nearest")
-        target.write_bytes(ordered.read())
     return target
 
 

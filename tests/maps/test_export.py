@@ -1,7 +1,6 @@
 """Files are read back with the programs that others use."""
 
 import io
-import sys
 import zipfile
 from dataclasses import replace
 from xml.etree import ElementTree
@@ -12,7 +11,6 @@ import pytest
 from matplotlib import colormaps
 from matplotlib.image import imread
 
-from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import export
 from aerpaw_cmp.maps.grid import Grid, Layer, class_names, voronoi_borders
@@ -104,66 +102,11 @@ def test_constant_and_empty_layers_can_be_drawn(tmp_path):
     assert export.write_kmz(tmp_path / "m.kmz", over(GRID, [flat, empty, endless])).stat().st_size > 0
 
 
-@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # rasterio's own, of affine
-def test_geotiff_is_north_up_named_and_has_units(tmp_path):
-    rasterio = pytest.importorskip("rasterio")
-    path = export.write_geotiff(tmp_path / "m.tif", BARE)
-    with rasterio.open(path) as file:
-        assert file.count == 2
-        assert file.descriptions == tuple(layer.name for layer in LAYERS)
-        assert file.units == ("1", "dBm")
-        row, column = file.index(*GRID.points_m[6])
-        assert file.read(2)[row, column] == pytest.approx(RSS[6], rel=1e-6)
-        assert np.isnan(file.read(2)[file.index(*GRID.points_m[3])])
-        np.testing.assert_array_equal(file.read(1)[::-1].ravel(), RANK)
-        assert file.tags(1)["classes"].startswith("Z 1")
-        assert file.tags(2)["title"] == LAYERS[1].title
-        wkt = file.crs.to_wkt()
-        assert "Site frame" in wkt
-        assert "unknown" not in wkt.split("GEOGCS")[0]
-        import pyproj
-
-        there = pyproj.Transformer.from_crs(4326, wkt, always_xy=True)
-        latitude, longitude = FRAME.to_geographic(50.0, -20.0)
-        assert there.transform(float(longitude), float(latitude)) == pytest.approx((50.0, -20.0), abs=1e-3)
-
-
-@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning", "ignore::DeprecationWarning")
-def test_geotiff_has_the_layout_of_a_cloud_optimised_one(tmp_path):
-    """A large map, since a small one needs neither tiles nor overviews; a plain GeoTIFF of it is none."""
-    rasterio = pytest.importorskip("rasterio")
-    cogeo = pytest.importorskip("rio_cogeo.cogeo")
-    grid = Grid.over_area((0.0, 1100.0, 0.0, 1200.0), 1.0)
-    layer = Layer("level", np.linspace(-120.0, -40.0, len(grid)), "dBm", "Level")
-    path = export.write_geotiff(tmp_path / "m.tif", over(grid, [layer]))
-    valid, errors, warnings = cogeo.cog_validate(path, strict=True)
-    assert (valid, errors, warnings) == (True, [], [])
-    with rasterio.open(path) as file:
-        assert file.overviews(1)
-        np.testing.assert_array_equal(file.read(1)[::-1].ravel(), layer.values.astype(np.float32))
-        with rasterio.open(
-            tmp_path / "plain.tif",
-            "w",
-            **{**file.profile, "driver": "GTiff", "tiled": False, "blockxsize": None, "blockysize": None},
-        ) as plain:
-            plain.write(file.read())
-    assert not cogeo.cog_validate(tmp_path / "plain.tif", strict=True)[0]
-
-
 def test_what_is_made_of_a_map_credits_it(tmp_path):
-    rasterio = pytest.importorskip("rasterio")
     credit = "© OpenStreetMap contributors, ODbL"
     credited = replace(BARE, credit=credit)
-    with rasterio.open(export.write_geotiff(tmp_path / "m.tif", credited)) as file:
-        assert file.tags()["TIFFTAG_COPYRIGHT"] == credit
     with zipfile.ZipFile(export.write_kmz(tmp_path / "m.kmz", credited)) as archive:
         assert f"<description>{credit}</description>" in archive.read("doc.kml").decode()
-
-
-def test_missing_extra_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rasterio", None)
-    with pytest.raises(UsageError, match=r"aerpaw-cmp\[geo\]"):
-        export.write_geotiff(tmp_path / "m", BARE)
 
 
 def test_wrong_layers_are_a_bug():

@@ -781,9 +781,9 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
 
 
 def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[Path]:
-    """layers.csv and maps.kmz; maps.nc and maps.tif where the libraries are installed.
+    """layers.csv and maps.kmz; maps.nc where its libraries are installed.
 
-    ``progress`` is told of files that are left out, and why.
+    ``progress`` is told where it is left out, and why.
     """
     site, grid = outcome.site, outcome.shown.grid
     flown = [] if outcome.corrected is None else outcome.corrected.layers()
@@ -792,29 +792,19 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
     every = [layer for layer in every if layer.name in names or not layer.name.startswith(RATIOS)]
     shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
     named = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
-    every_layer = export.MapLayers(
+    table = export.MapLayers(
         grid=grid, frame=site.frame, layers=every, towers_m=named, borders=outcome.shown.borders, credit=site.credit
     )
-    all_joint, levels_and_ranks = replace(every_layer, layers=joint), replace(every_layer, layers=shown)
     written = [
-        export.write_csv(folder / "layers.csv", every_layer),
-        export.write_kmz(folder / "maps.kmz", levels_and_ranks, title=site.name),
+        export.write_csv(folder / "layers.csv", table),
+        export.write_kmz(folder / "maps.kmz", replace(table, layers=shown), title=site.name),
     ]
-    maps = dict(outcome.ordered())
-    writers: tuple[Callable[[], Path], ...] = (
-        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, _about_maps(site), flown),
-        lambda: export.write_geotiff(folder / "maps.tif", all_joint),
-    )
-    for write in writers:
-        try:
-            written.append(write())
-        except UsageError as missing:
-            progress(str(missing))
+    try:
+        maps = dict(outcome.ordered())
+        written.append(write_netcdf(folder / "maps.nc", maps, site.frame, _about_maps(site), flown))
+    except UsageError as missing:
+        progress(str(missing))
     return written
-
-
-def _provenance() -> dict[str, str]:
-    return {"generated": utc_now(), "version": versions()["aerpaw-cmp"]}
 
 
 def _about_maps(site: Site) -> dict[str, str]:
@@ -822,7 +812,8 @@ def _about_maps(site: Site) -> dict[str, str]:
     about = file_attributes(
         title=site.name,
         source="ray tracing",
-        **_provenance(),
+        generated=utc_now(),
+        version=versions()["aerpaw-cmp"],
         comment="A missing level has no path. A rank of 0 is a code: no path.",
     )
     return about | ({"acknowledgement": site.credit} if site.credit else {})

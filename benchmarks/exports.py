@@ -1,6 +1,6 @@
 """Seconds, bytes and peak memory of each export of a long flight, each in a process of its own.
 
-    python benchmarks/exports.py [--samples 1000000] [--formats geojson,kmz,...]
+    python benchmarks/exports.py [--samples 1000000] [--formats kmz,netcdf]
 
 A made-up flight: one link with positions, four levels and a residual, random numbers with a seed. What is measured is
 the writing alone, in CPU time; the peak is that of the whole process, beside one that makes the samples and no file.

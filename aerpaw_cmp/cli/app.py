@@ -46,7 +46,7 @@ Json = Annotated[bool, Option("--json", help="Print one JSON object on standard 
 Force = Annotated[bool, Option("--force", help="Replace files that this tool did not write; never an input.")]
 Export = Annotated[
     list[str] | None,
-    Option(help="Also write the samples as geojson, kmz, netcdf or all; names joined by commas, or repeated."),
+    Option(help="Also write the samples as kmz, netcdf or all; names joined by commas, or repeated."),
 ]
 LogsRoot = Annotated[
     Path | None,

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import xarray
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.report.exports.formats import FORMATS
@@ -34,8 +35,8 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 def test_every_export_is_part_of_the_report(pair: tuple[Path, Path]) -> None:
     names = {path.name for path in (pair[0] / "exports").iterdir()}
-    assert names >= {"rss.geojson", "rank.geojson", "towers.geojson", "samples.kmz"}
-    assert len(FORMATS) == 3
+    assert names >= {"rss.nc", "rank.nc", "samples.kmz"}
+    assert len(FORMATS) == 2
     sums = (pair[0] / "SHA256SUMS").read_text(encoding="utf-8")
     page = (pair[0] / "report.html").read_text(encoding="utf-8")
     for name in names:
@@ -47,10 +48,10 @@ def test_every_export_is_part_of_the_report(pair: tuple[Path, Path]) -> None:
 
 def test_an_export_holds_the_samples_of_the_report(pair: tuple[Path, Path]) -> None:
     table = pd.read_csv(pair[0] / "rss.csv")
-    points = json.loads((pair[0] / "exports" / "rss.geojson").read_text(encoding="utf-8"))["features"]
-    residual = np.array([p["properties"]["residual_db"] for p in points], dtype=float)  # None is NaN
-    np.testing.assert_allclose(residual, table["residual_db"])
-    assert [p["properties"]["time"] for p in points] == table["time_utc"].tolist()
+    with xarray.open_dataset(pair[0] / "exports" / "rss.nc") as samples:
+        np.testing.assert_allclose(samples["residual_db"], table["residual_db"])
+        times = pd.to_datetime(table["time_utc"]).dt.tz_localize(None)
+        assert abs(samples["time"].values - times).max() <= np.timedelta64(1, "ms")
 
 
 def test_diff_of_two_runs_names_the_setting_and_the_levels(pair: tuple[Path, Path]) -> None:

@@ -13,7 +13,7 @@ from ...common.stages import Progress, logged
 if TYPE_CHECKING:
     from .points import Export
 
-FORMATS = ("geojson", "kmz", "netcdf")
+FORMATS = ("kmz", "netcdf")
 # By format: the modules that it needs besides the default installation.
 _NEEDS = {"netcdf": ("netCDF4", "xarray")}
 
@@ -31,8 +31,8 @@ def chosen_formats(names: str | Iterable[str]) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> chosen_formats(["netcdf,kmz", "geojson"])
-    ('geojson', 'kmz', 'netcdf')
+    >>> chosen_formats(["netcdf,kmz", "kmz"])
+    ('kmz', 'netcdf')
     """
     listed = [names] if isinstance(names, str) else names
     chosen = [part.strip().lower() for name in listed for part in name.split(",") if part.strip()]
@@ -82,11 +82,10 @@ def write_exports(export: Export, folder: Path, formats: Iterable[str], progress
     OSError
         If the disk does not take a file.
     """
-    from .geojson import write_geojson
     from .kmz import write_kmz
     from .netcdf import write_netcdf
 
-    writers = {"geojson": write_geojson, "kmz": write_kmz, "netcdf": write_netcdf}
+    writers = {"kmz": write_kmz, "netcdf": write_netcdf}
     place = folder / FOLDER
     written: list[Path] = []
     for name in formats:

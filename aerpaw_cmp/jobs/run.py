@@ -214,8 +214,7 @@ def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunO
     from ..report.content.flight_parts import report_data
     from ..report.exports.tables import metrics as metrics_of
     from ..report.pages.flight_folder import write_report
-    from .plan import report_stages
-    from .reporting.flight_run import run_flight
+    from .reporting.flight_run import report_stages, run_flight
     from .reporting.foliage_notes import foliage_notes
     from .reporting.ladder import recommended_text
     from .reporting.pose_paths import pose_paths
@@ -427,7 +426,7 @@ def run_map(
     from ..site.siteyaml import load_site
     from .mapping import coverage_map as mapping
     from .mapping.paper_table import paper_markdown, paper_rows
-    from .plan import map_stages
+    from .mapping.planned_map import map_stages
     from .prediction.sources import files_of, named_flights
     from .tasks.workers import open_workers
 
@@ -513,10 +512,10 @@ def run_campaign(
     from .campaigns.season import find_reports, with_season
     from .tasks.manifest import inputs_of_flights
 
-    stages = Stages(options.progress)
     campaign = load_campaign(path)
     inputs = [path, *inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)]
     folder = options.out or Path("reports") / campaign.campaign
+    stages = options.stages("campaign", inputs, folder)
     store = None if fresh else _outcomes_in(keep)
     note = f"finished tasks are kept in {store}, and the same command computes the rest" if store else "nothing is kept"
     with OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output, noting_interrupts(note):
@@ -550,31 +549,6 @@ def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
             target.write_text(
                 f"{failure.flight}, {failure.setting}: {failure.message}\n\n{failure.traceback}", encoding="utf-8"
             )
-
-
-def campaign_status(path: Path, options: RunOptions = DEFAULT, *, keep: Path | None = None, fresh: bool = False) -> Any:
-    """Status of a campaign: kept and still to do (:class:`~aerpaw_cmp.jobs.campaigns.campaign_plan.CampaignStatus`).
-
-    Parameters
-    ----------
-    path : Path
-    options : RunOptions
-    keep : Path, optional
-    fresh : bool
-        As for :func:`run_campaign`.
-
-    Returns
-    -------
-    CampaignStatus
-    """
-    from .campaigns import campaign_plan
-    from .campaigns.campaign import campaign_tasks, load_campaign
-    from .campaigns.campaign_tasks import outcome_store
-
-    campaign = load_campaign(path)
-    tasks, _, failures = campaign_tasks(campaign, path.parent, options.logs_root)
-    store = None if fresh else outcome_store(_outcomes_in(keep))
-    return campaign_plan.campaign_status(campaign.campaign, tasks, failures, store, workers=options.workers)
 
 
 def run_calibrate(

@@ -11,6 +11,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, run
+from aerpaw_cmp.jobs.campaigns.campaign_tasks import Task, digest_of, outcome_store
 from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.report.content.campaign import RankRow
@@ -338,18 +339,20 @@ def test_a_dry_run_says_what_is_kept(folder: Path, capsys: pytest.CaptureFixture
     capsys.readouterr()
     keep = ["--keep", str(folder / "outcomes")]
     assert main(["campaign", str(path), "--dry-run", "--json", "--workers", "2", *keep]) == 0
-    forecast = json.loads(capsys.readouterr().out)
-    assert unlisted("campaign --dry-run", forecast) == []
-    assert (forecast["tasks"], forecast["kept"], forecast["to_do"]) == (4, 2, 2)
-    assert {task["flight"] for task in forecast["to_do_tasks"]} == {"second"}
-    assert forecast["estimate_s"] > 0
-    assert main(["campaign", "--dry-run", str(path), *keep]) == 0
-    text = capsys.readouterr().out
-    assert "4 tasks, 2 kept" in text
-    assert "2 to do, about" in text
+    plan = json.loads(capsys.readouterr().out)
+    stages = {stage["name"]: stage for stage in plan["stages"]}
+    store = outcome_store(folder / "outcomes")
+    for label, setting in settings.items():
+        stage = stages[f"flights, {label}"]
+        assert stage["work"] == "2 tasks, 1 kept"
+        task = Task(folder / "first.yaml", "first", label, setting, None)
+        assert stage["seconds"] == pytest.approx(store.seconds(digest_of(task)) / 2)
     run(campaign, folder, keep=folder / "outcomes")
-    assert main(["campaign", str(path), "--dry-run", *keep]) == 0
-    assert "0 to do, nothing to compute" in capsys.readouterr().out
+    assert main(["campaign", str(path), "--dry-run", "--json", *keep]) == 0
+    again = json.loads(capsys.readouterr().out)["stages"]
+    assert [(stage["work"], stage["seconds"]) for stage in again[1:]] == [("2 tasks, 2 kept", 0.0)] * 2
+    assert main(["campaign", str(path), "--dry-run", "--fresh", "-o", str(folder / "new")]) == 0
+    assert "2 tasks, 0 kept" in capsys.readouterr().out
 
 
 def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:

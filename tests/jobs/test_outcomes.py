@@ -20,7 +20,7 @@ from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import sample
 from aerpaw_cmp.jobs.campaigns import campaign_tasks
-from aerpaw_cmp.jobs.campaigns.campaign_plan import campaign_status, compute, kept_outcomes
+from aerpaw_cmp.jobs.campaigns.campaign_plan import compute, kept_outcomes, planned_tasks
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Done, Order, Outcome, Task, carry_out, digest_of, outcome_store
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
 from aerpaw_cmp.jobs.tasks.workers import InProcess, Processes, Workers
@@ -201,9 +201,9 @@ def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkey
     first = run_tasks(tasks, InProcess(), keep=tmp_path)
     assert asked == ["f0", "f1", "f2", "f3"]
     assert first[3].failure is not None
-    status = campaign_status("c", tasks, [], outcome_store(tmp_path), workers=2)
-    assert (status.kept, status.to_do) == (3, 1)
-    assert status.estimate_s == pytest.approx(np.mean([s.seconds for s in status.states if s.stored]))
+    store = outcome_store(tmp_path)
+    (stage,) = planned_tasks(tasks, range(3), store, 1)
+    assert stage.seconds == pytest.approx(np.mean([store.seconds(digest_of(task)) for task in tasks[:3]]))
     again = run_tasks(tasks, InProcess(), keep=tmp_path)
     assert asked[4:] == ["f3"], "only the failure is tried again"
     assert all(equal(a, b) for a, b in zip(first[:3], again[:3], strict=True))

@@ -10,9 +10,8 @@ from typer import Argument, Option
 
 from ...common.counting import counted
 from ...common.errors import one_line
-from ...common.stages import duration
 from ...jobs.options import RunOptions
-from ..app import Force, Json, LogsRoot, Scheduler, Workers, command, output
+from ..app import DryRun, Force, Json, LogsRoot, Scheduler, Workers, command, output
 from ..shown import number, print_json, records, say, show, table
 
 
@@ -173,9 +172,7 @@ def campaign(
         Path | None, Option(help="Folder for task outcomes; a rerun computes missing outcomes only.")
     ] = None,
     fresh: Annotated[bool, Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
-    dry_run: Annotated[
-        bool, Option("--dry-run", help="List finished tasks, open tasks and the time estimate; compute nothing.")
-    ] = False,
+    dry_run: DryRun = False,
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a flight or a stated check failed.")] = False,
     force: Force = False,
     as_json: Json = False,
@@ -183,11 +180,9 @@ def campaign(
     """Many flights and settings, with what can be said only of several flights."""
     from ...jobs import run
 
-    options = RunOptions(out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say)
-    if dry_run:
-        status = run.campaign_status(campaign_yaml, options, keep=keep, fresh=fresh)
-        print_json(status.metrics()) if as_json else _print_status(status)
-        return 0
+    options = RunOptions(
+        out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say, dry=dry_run
+    )
     outcome = run.run_campaign(campaign_yaml, options, keep=keep, fresh=fresh)
     if as_json:
         print_json(outcome.metrics)
@@ -198,26 +193,6 @@ def campaign(
     if not (outcome.metrics["rss"] or outcome.metrics["rank"]):
         return 3
     return 1 if strict and outcome.failed_checks else 0
-
-
-# Tasks of a list on the terminal; --json has them all.
-_SHOWN = 20
-
-
-def _print_status(status: Any) -> None:
-    time = "no time was measured yet" if status.estimate_s is None else f"about {duration(status.estimate_s)}"
-    if not status.to_do:
-        time = "nothing to compute"
-    show(
-        f"{status.name}: {counted(len(status.states), 'task')}, {status.kept} kept in {status.keep}, "
-        f"{status.to_do} to do, {time} with {counted(status.workers, 'worker')}"
-    )
-    rows = [[s.task.flight, s.task.setting, s.trouble[:100]] for s in status.states if not s.stored]
-    if rows:
-        title = "To do" if len(rows) <= _SHOWN else f"To do: the first {_SHOWN} of {len(rows)}"
-        table(["flight", "setting", "trouble"], rows[:_SHOWN], title)
-    for failure in status.failures:
-        show(f"{failure.flight}: {failure.message}")
 
 
 def _print_campaign_summary(outcome: Any) -> None:

@@ -12,9 +12,9 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field
 
-from ...common.errors import InputError, UsageError
+from ...common.errors import InputError, UsageError, one_line
 from ...common.jsonable import named
-from ...common.stages import Stages
+from ...common.stages import PlannedStage, Stages
 from ...common.yamlfile import StrictModel, load_yaml
 from ...flight.gains.memory import load_with_learned
 from ...flight.overrides import Overrides, overridden
@@ -22,7 +22,7 @@ from ...flight.settings import FlightFile
 from ...report.content.campaign import CampaignData, Failure
 from ..options import DEFAULT, RunOptions
 from ..tasks.workers import open_workers
-from .campaign_plan import compute, kept_outcomes
+from .campaign_plan import compute, kept_outcomes, planned_tasks
 from .campaign_tasks import Task, counted_once, flight_data, outcome_store
 from .over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 
@@ -91,10 +91,12 @@ def run(
     tasks, files, failures = campaign_tasks(campaign, folder, logs_root)
     settings = campaign.settings or {_AS_WRITTEN: {}}
     store = None if keep is None else outcome_store(keep)
-    if store is not None:
-        store.check()
     with stages("flights"):
         outcomes, orders = kept_outcomes(tasks, store, progress)
+    unread = [PlannedStage(failure.flight, one_line(failure.message)) for failure in failures]
+    stages.checked(lambda: [*planned_tasks(tasks, outcomes, store, options.workers), *unread])
+    if store is not None:
+        store.check()
     inputs = _inputs_of(files, logs_root)
     with (
         open_workers(options.workers, options.scheduler if orders else None, paths=inputs, progress=progress) as crew,

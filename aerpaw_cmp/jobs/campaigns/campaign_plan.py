@@ -1,123 +1,54 @@
-"""Status of a campaign, what is kept and what is to do; tasks handed to workers, outcomes gathered."""
+"""Tasks of a campaign: what is kept and what is to do, handed to workers, outcomes gathered."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
-from typing import Any
-
-import numpy as np
 
 from ...common.counting import counted
 from ...common.errors import AerpawCmpError
-from ...common.jsonable import named
-from ...common.stages import Progress
+from ...common.stages import PlannedStage, Progress
 from ...report.content.campaign import Failure
 from ..tasks.outcomes import OutcomeStore
 from ..tasks.workers import Lost, Workers
 from .campaign_tasks import Done, Order, Outcome, Task, carry_out, digest_of, fitted_to
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TaskState:
-    """One task of a campaign before it runs.
-
-    ``seconds`` is what it cost, where it is stored; ``trouble`` says which input cannot be read.
-    """
-
-    task: Task
-    stored: bool = False
-    seconds: float | None = None
-    trouble: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class CampaignStatus:
-    """Answer of ``campaign --dry-run``.
-
-    ``estimate_s`` is the time of what is to do with ``workers`` tasks side by side: for every task the mean cost of
-    the kept tasks of its setting, else of all; None where nothing was measured yet.
-    """
-
-    name: str
-    keep: str
-    states: tuple[TaskState, ...]
-    failures: tuple[Failure, ...]
-    estimate_s: float | None
-    workers: int
-
-    @property
-    def kept(self) -> int:
-        """Tasks whose outcome is kept."""
-        return sum(state.stored for state in self.states)
-
-    @property
-    def to_do(self) -> int:
-        """Tasks that a run would compute."""
-        return len(self.states) - self.kept
-
-    def metrics(self) -> dict[str, Any]:
-        """For ``--json``."""
-        waiting = [state for state in self.states if not state.stored]
-        return {
-            "campaign": self.name,
-            "tasks": len(self.states),
-            **named(self, "keep kept to_do estimate_s workers"),
-            "to_do_tasks": [{**named(s.task, "flight setting"), "trouble": s.trouble or None} for s in waiting],
-            "failures": [named(failure, "flight setting message") for failure in self.failures],
-        }
-
-
-def campaign_status(
-    name: str, tasks: Sequence[Task], failures: Sequence[Failure], store: OutcomeStore | None, *, workers: int = 1
-) -> CampaignStatus:
-    """Status of a campaign: what is kept, what is to do and how long that may take; nothing is computed.
+def planned_tasks(
+    tasks: Sequence[Task], kept: Collection[int], store: OutcomeStore | None, workers: int
+) -> list[PlannedStage]:
+    """Tasks of each setting, for a dry run.
 
     Parameters
     ----------
-    name : str
-        Of the campaign.
     tasks : sequence of Task
-    failures : sequence of Failure
-        Flights whose files cannot be read.
+    kept : collection of int
+        Numbers of those whose outcome is kept.
     store : OutcomeStore, optional
-        None where nothing is kept.
+        Knows what they took.
     workers : int
-        Tasks side by side, for the time.
+        Tasks side by side.
 
     Returns
     -------
-    CampaignStatus
-        A state per task, and the time that what is left may take [s].
+    list of PlannedStage
+        One a setting. A task to do takes as long as the kept ones of its setting took on average, else as all of them;
+        None where none is kept.
     """
-    states = [TaskState(task=task) if store is None else _state(task, store) for task in tasks]
-    by_setting: dict[str, list[float]] = {}
-    for state in states:
-        if state.seconds is not None:
-            by_setting.setdefault(state.task.setting, []).append(state.seconds)
-    everything = [seconds for some in by_setting.values() for seconds in some]
-    estimate = None
-    if everything:
-        costs = [float(np.mean(by_setting.get(s.task.setting, everything))) for s in states if not s.stored]
-        estimate = max(sum(costs) / max(workers, 1), max(costs, default=0.0))
-    return CampaignStatus(
-        name=name,
-        keep="no place (--fresh)" if store is None else str(store.folder),
-        states=tuple(states),
-        failures=tuple(failures),
-        estimate_s=estimate,
-        workers=workers,
-    )
-
-
-def _state(task: Task, store: OutcomeStore) -> TaskState:
-    """Outcome and cost of a task, by what the store says of itself."""
-    try:
-        key = digest_of(task)
-    except (AerpawCmpError, OSError) as error:
-        return TaskState(task=task, trouble=str(error))
-    return TaskState(task=task, stored=store.has(key), seconds=store.seconds(key))
+    spent: dict[str, list[float]] = {}
+    for task in (tasks[number] for number in kept if store is not None):
+        assert store is not None
+        if (seconds := store.seconds(digest_of(task))) is not None:
+            spent.setdefault(task.setting, []).append(seconds)
+    every = [seconds for some in spent.values() for seconds in some]
+    stages = []
+    for setting in dict.fromkeys(task.setting for task in tasks):
+        numbers = [number for number, task in enumerate(tasks) if task.setting == setting]
+        left, known = len({*numbers} - {*kept}), spent.get(setting, every)
+        seconds = left * sum(known) / len(known) / workers if known else None
+        work = f"{counted(len(numbers), 'task')}, {len(numbers) - left} kept"
+        stages.append(PlannedStage(f"flights, {setting}", work, seconds if left else 0.0))
+    return stages
 
 
 def kept_outcomes(

@@ -9,7 +9,8 @@ from __future__ import annotations
 import dataclasses
 from dataclasses import dataclass
 
-from ...common.stages import Stages
+from ...common.counting import counted
+from ...common.stages import PlannedStage, Stages
 from ...compare.judge.ladder import series_rows
 from ...compare.result import FlightResult
 from ...flight.data import FlightData
@@ -89,3 +90,21 @@ def run_flight(
                 result = dataclasses.replace(result, ladder=tuple(row for of_series in rows for row in of_series))
     result = dataclasses.replace(result, next_step=next_step(data, result, climbed))
     return FlightRun(data=data, replays=replays, result=result, ladder=climbed)
+
+
+def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
+    """Stages of a report of a flight that was read, for its dry run; ``figures`` as for the report."""
+    n_rss, n_rank = (sum(len(item.time) for item in series) for series in (data.rss, data.rank))
+    samples, rt = f"{counted(n_rss, 'RSS sample')}, {counted(n_rank, 'rank sample')}", data.settings.rt
+    audited = min(rt.audit_links, n_rss + n_rank)
+    drawn = 0 if figures == "none" else len(data.rss) + len(data.rank)
+    clocked = bool(n_rss) and data.settings.rss.lag in ("estimate", "apply")
+    stages = {
+        "clocks": counted(len({series.tower for series in data.rss}), "receiver") if clocked else "",
+        "replay": f"{samples}, engine {rt.engine}",
+        "compare": samples,
+        "audit": f"{counted(audited, 'link')} by the other engine" if audited else "",
+        "ladder": "simpler and richer models" if n_rss and rt.engine == "image" else "",
+        "report": f"page, figures of {counted(drawn, 'channel')}",
+    }
+    return [PlannedStage(name, work) for name, work in stages.items() if work]

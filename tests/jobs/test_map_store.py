@@ -75,7 +75,7 @@ def test_a_store_holds_the_map_in_one_piece(tmp_path):
     assert outcome.tiles == {
         "store": str(tmp_path / "map.zarr"), "tiles": TILES, "positions": 153, "shown_every": 1,
     }  # fmt: skip
-    with xarray.open_zarr(tmp_path / "map.zarr", consolidated=False, chunks=None) as data:
+    with xarray.open_zarr(tmp_path / "map.zarr", consolidated=False) as data:
         at = data.isel(foliage=0, y=11, x=7)
         level = in_one_piece.maps["none"].rss("siso", "LW2")[0, 11 * 9 + 7]
         assert float(at["rss_siso"].sel(height=30.0)[1]) == pytest.approx(level, abs=0.006)

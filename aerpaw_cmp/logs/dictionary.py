@@ -171,7 +171,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("quality", "rss", (r"^link quality$",), "dB"),
     Quantity("SNR", "rss", (r"^link snr$",), "dB"),
     Quantity("rank", "rank", (
-        r"\b(pdsch rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b",
+        r"\b((pdsch|dl|nr|lte|[45]g|mimo|csi) rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b",
     ), none=(0.0,), can_be=(0.0, 16.0)),
     Quantity("RSRP", "rss", (
         r"\brs ?rp\b|\bss ?rsrp\b|\b(nrx)?rsrp\d{0,2}\b|\b(n|nb|nbr)\d{0,2}rsrp\b",
@@ -213,7 +213,7 @@ _NUMBER = re.compile(
 )
 # Another cell of a table, or the cell of another device, by its number or its order.
 _OTHER = re.compile(
-    r"\b((?:sim|dev(?:ice)?|modem|ue|phone|slot) ?\d{1,2})\b"
+    r"\b((?:sim|dev(?:ice)?|modem|ue|phone|slot) ?\d{1,2}|wi ?fi|wlan|ble|bluetooth|lw ?[1-5])\b"
     r"|\b(second|third|2nd|3rd|other|inter|intra|pscell|secondary)\b"
     r"|\b(?:cell|pci|rsrp|rsrq|rssi|sinr|e?arfcn) ?(\d{1,2})\b"
 )
@@ -265,7 +265,9 @@ def plain(name: str) -> str:
     return re.sub(r"[^a-z0-9]+", " ", name.lower().replace("\u200b", "")).strip()
 
 
-_BRACKET = re.compile(r"[\[(]([^\[\]()]{1,16})[\])]\s*$")
+_BRACKETS = re.compile(r"[\[(]([^\[\]()]{1,24})[\])]")
+_BRACKET = re.compile(_BRACKETS.pattern + r"\s*$")
+_CAMEL_UNIT = re.compile(r"(?<=[a-z])(Ft|Feet|Meters|Metres|Cm|Mm|Km|Rad|Deg|Degrees|Dbm|Mps|Mph)(?![a-z])")
 _A_UNIT = re.compile(r"(?!lte$|nr$|5g$|4g$|utc$|gps$|local$|dl$|ul$)[a-z\u00b5\u03bc%\u00b0]{1,7}(/[a-z]{1,3})?")
 
 
@@ -297,6 +299,8 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     row, text = next(hits, (None, ""))
     if row is None or row.role == "other":
         return None
+    if row.unit and unit in UNITS and (UNITS[unit][0] != row.unit) and row.role in ("position", "angle", "velocity"):
+        unit = ""  # 'Longitude (W)' counts no watts, 'vel_n_m_s' no metres
     rat = "nr" if _NR.search(text) else "lte" if _LTE.search(text) else ""
     digits = _NUMBER.search(re.sub(r"\b[45] ?g\b", "", text))
     number = next((group for group in digits.groups() if group), "0") if digits else "0"
@@ -308,24 +312,31 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
 
 
 def without_unit(name: str) -> tuple[str, str]:
-    """Plain name without the unit that it ends with, in brackets or not, and the unit in lower case or an empty text.
+    """Plain name without the unit in it, in brackets or not, and the unit in lower case or an empty text.
 
     Examples
     --------
     >>> without_unit("Height [ft]"), without_unit("rsrp_dbm"), without_unit("latE7"), without_unit("Time (EDT)")
     (('height', 'ft'), ('rsrp', 'dbm'), ('lat', 'e7'), ('time edt', 'edt'))
+    >>> without_unit("Altitude (ft) MSL"), without_unit("alt_ft_agl"), without_unit("altFt")
+    (('altitude msl', 'ft'), ('alt agl', 'ft'), ('alt', 'ft'))
     """
     unit, _zone, rest = in_brackets(name)
     if unit:
         return plain(rest) if is_unit(unit) else plain(name), unit
-    end = re.fullmatch(r"(.+?)(?: (\S+)|(?: ?1?)(e ?[67]))", plain(name))
-    if end is not None and (end[3] or end[2] in _SUFFIXES):
-        return end[1], (end[3] or end[2]).replace(" ", "")
-    return plain(name), ""
+    words = plain(_CAMEL_UNIT.sub(r" \1", name))
+    end = re.fullmatch(r"(.+?)(?: ?1?)(e ?[67])", words)
+    if end is not None:
+        return end[1], end[2].replace(" ", "")
+    inside = re.fullmatch(rf"(.+?)(?: in)? ({'|'.join(_SUFFIXES)})( (?!s\b).+)?", words)
+    return (inside[1] + (inside[3] or ""), inside[2]) if inside is not None else (plain(name), "")
 
 
 def in_brackets(name: str) -> tuple[str, str, str]:
-    """Unit and time zone in brackets at the end of a name, and the name without them."""
+    """Unit in brackets in a name, or what else is in brackets at its end, and the name without them."""
+    unit = next((inner for inner in _BRACKETS.finditer(name) if is_unit(inner[1])), None)
+    if unit is not None:
+        return unit[1].lower(), "", f"{name[: unit.start()]} {name[unit.end() :]}"
     written = _BRACKET.search(name)
     if written is None:
         return "", "", name
@@ -413,9 +424,9 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
 # Units of numbers that MAVLink writes as integers: of a table in decimals they are another program's.
 OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
-# Units that may end a name without brackets: 'alt_ft', 'rsrp_dbm'.
-_SUFFIXES = {"ft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps", "dbm",
-             "dbw", "mw", "uw", "nw", "e6", "e7", "cdeg", "kbps", "mbps", "db"}  # fmt: skip
+# Units that a name may have without brackets: 'alt_ft_agl', 'rsrp_dbm'.
+_SUFFIXES = ("ft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps", "dbm",
+             "dbw", "mw", "uw", "nw", "e6", "e7", "cdeg", "kbps", "mbps", "db")  # fmt: skip
 
 
 def is_unit(text: str) -> bool:

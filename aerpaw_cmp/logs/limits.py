@@ -69,7 +69,8 @@ _CLOCK_SET_NS = int(np.datetime64("2010-01-01", "ns").astype(np.int64))
 _FEW_ROWS = 3
 
 # Flags of rows that no comparison scores (`flight/scored.py`). The other flags void the doubtful value itself.
-UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports", "no_number", "unterminated_line")
+UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports", "no_number", "unterminated_line",
+            "marked_invalid")  # fmt: skip
 
 
 def check(result: ReadResult) -> ReadResult:

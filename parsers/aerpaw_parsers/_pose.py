@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Sequence
 
 import numpy as np
@@ -46,8 +47,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
             text = "a position on a grid (UTM, ECEF), which is not read: add columns of latitude and longitude"
             rows.warnings.append(f"column {sheet.names[grid]!r}: {text}")
         return None
-    angles = _signed(sheet, latitude, "NS"), _signed(sheet, longitude, "EW")
-    values: dict[str, AnyArray] = dict(zip(PLACE, angles, strict=False))
+    values: dict[str, AnyArray] = {key: sheet.numbers(i) for key, i in zip(PLACE, (latitude, longitude), strict=False)}
     lost = clean(rows, values)
     refuse_whole_degrees([sheet.names[latitude], sheet.names[longitude]], values)
     datum, height = _height(rows, sheet)
@@ -77,17 +77,6 @@ def refuse_whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> N
         raise _sheet.shifted(f"{names[coarse.index(True)]!r} has whole degrees alone", "positions")
 
 
-def _signed(sheet: _sheet.Sheet, column: int, letters: str) -> FloatArray:
-    """Angles, negative where a column of hemispheres behind them says S or W."""
-    angle = sheet.numbers(column)
-    if column + 1 == len(sheet.names):
-        return angle
-    side = np.array([text.upper() for text in sheet.texts(column + 1)])
-    if not np.isin(side, list(letters)).any() or not np.isin(side, [*letters, ""]).all():
-        return angle
-    return np.where(side == letters[1], -np.abs(angle), angle)
-
-
 def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
     """Put NaN for positions that cannot be (or 0, 0) into a dictionary of columns; their mask."""
     latitude, longitude = values["latitude_deg"], values["longitude_deg"]
@@ -114,10 +103,16 @@ def _height(rows: _rows.Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
     if datum == "unknown":
         known = sheet.program.datum if sheet.program is not None else ""
         rows.height_from, datum = ("program", known) if known else ("assumed", datum)
+        for i in (i for i, name in enumerate(sheet.plain) if _OF_DATUM.fullmatch(name)):
+            said = {dictionary.meaning(f"altitude {text}") for text in sheet.texts(i)}
+            if len(said) == 1 and (one := said.pop()) is not None and one.quantity.datum not in ("", "unknown"):
+                rows.height_from, datum = "written", one.quantity.datum
     height = sheet.numbers(column)
     return datum, _with_moved_home(rows, sheet, height) if datum == "take-off" else height
 
 
+# Columns that name the datum of the heights.
+_OF_DATUM = re.compile(r"(vertical )?(alt|altitude|height)? ?(ref|reference|type|datum|mode|frame)( frame)?")
 # Home moved where it is further than this from where it was [m]; an aircraft that is so much higher has taken off [m].
 MOVED_M, _OFF_M = 0.5, 2.0
 

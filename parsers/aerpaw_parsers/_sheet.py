@@ -17,6 +17,7 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
+import pandas as pd
 
 from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.errors import InputError
@@ -111,6 +112,9 @@ def _angle(text: str) -> tuple[float, str]:
     return -value if written[1] in ("S", "W") or text.startswith("-") else value, ""
 
 
+# 'Longitude (W)', 'lon_deg_W'; columns of such letters: 'lat_dir', 'lonRef', 'E/W'.
+_HEMISPHERE = re.compile(r"[^A-Za-z]([NSEW])[\])]?\s*$")
+_OF_SIDES = re.compile(r"dir|ref|hemi|lat|lon|\b[ns]\W*[ns]\b|\b[ew]\W*[ew]\b", re.IGNORECASE)
 _VALUE = re.compile(r"\s*[-+\[\"]?\d")
 # Units of cells that change nothing.
 _HARMLESS = ("%", "ms", "s", "Hz", "MHz", "kHz")
@@ -181,13 +185,13 @@ class Sheet:
         return [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
 
     def find(self, *quantities: str) -> int | None:
-        """The column that surest holds one of the quantities."""
+        """The column that surest holds one of the quantities; an empty one only where no other does."""
         known = [
-            (dictionary.rank_of(meaning.quantity, self.plain[i]), i)
+            (not any(cells[i].strip() for cells in self.cells), dictionary.rank_of(meaning.quantity, self.plain[i]), i)
             for i, meaning in enumerate(self.meanings)
             if meaning is not None and meaning.quantity.name in quantities
         ]
-        return min(known)[1] if known else None
+        return min(known)[2] if known else None
 
     def named(self, *names: str) -> int | None:
         """The first column of one of some plain names, as the file has them."""
@@ -293,13 +297,22 @@ class Sheet:
         return values
 
     def _angles(self, column: int, quantity: dictionary.Quantity, values: FloatArray) -> FloatArray:
-        """Positions that are no degrees, in degrees: MAVLink's integers, and NMEA's degrees and minutes."""
-        if quantity.role != "position" or dictionary.is_unit(self.unit(column)):
+        """Positions in degrees, of MAVLink's integers and NMEA's degrees and minutes too; west, south: negative."""
+        if quantity.role != "position":
             return values
-        form = dictionary.angle_form(values, quantity)
-        if form:
+        if not dictionary.is_unit(self.unit(column)) and (form := dictionary.angle_form(values, quantity)):
             self.notes[column] = f"column {self.names[column]!r}: no angle in degrees can be so large: read as {form}"
-        return dictionary.converted(values, form)
+            values = dictionary.converted(values, form)
+        positive, negative = "NS" if quantity.name == "latitude_deg" else "EW"
+        own = _HEMISPHERE.search(self.names[column])
+        if own is not None and own[1] in (positive, negative):
+            return -np.abs(values) if own[1] == negative else values
+        for i, name in enumerate(self.names):
+            letters = {cells[i].strip().upper() for cells in self.cells[:50]} - {""}
+            if letters and letters <= {positive, negative} and (i == column + 1 or _OF_SIDES.search(name)):
+                west = np.array([text.upper() == negative for text in self.texts(i)])
+                return np.where(west, -np.abs(values), values)
+        return values
 
     @cached_property
     def _has_points(self) -> bool:
@@ -529,8 +542,15 @@ def rows(
         inside[timed.at] = True
         timed_part = sheet.part(inside)
         sheet.row, sheet.cells, sheet._silent, sheet._numbers = timed_part.row, timed_part.cells, timed_part._silent, {}
-    if (counter := sheet.named("time millisecond")) not in (None, column):
+    if (counter := sheet.named("time millisecond", "millisecond", "milliseconds", "msec", "ms")) not in (None, column):
         _finer(timed, sheet.numbers(counter))
+    if (valid := sheet.named("valid", "is valid", "data valid")) is not None:
+        words = ("0", "0.0", "false", "no", "n", "invalid")
+        invalid = np.array([text.lower() in words for text in sheet.texts(valid)], dtype=bool)
+        timed.mark(invalid, "marked_invalid")
+        if invalid.any():
+            lines = counted(int(invalid.sum()), "row")
+            timed.warnings.append(f"column {sheet.names[valid]!r}: {lines} flagged marked_invalid; not scored")
     return timed
 
 
@@ -561,7 +581,16 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         zones = [_stamps.beside(text) for text in sheet.texts(beside)]
         texts = [f"{time} {own}".strip() for time, own in zip(texts, zones, strict=True)]
     gps = re.search(r"\bgps", name) is not None
-    return _stamps.read(texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps)
+    heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
+    first = _DAY_OR_MONTH.search(heads)
+    return _stamps.read(
+        texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps,
+        day_first=None if first is None else first[1].startswith("d"),
+    )  # fmt: skip
+
+
+# The order that a name gives: 'date (dd/mm/yyyy)'.
+_DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
 
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:
@@ -635,7 +664,8 @@ def _refuse_positions_beside(sheet: Sheet) -> None:
 def _is_angle(values: FloatArray) -> bool:
     """Check whether numbers are written as positions of one flight: of four decimals and more, and near each other."""
     known = values[np.isfinite(values)]
-    return bool(len(known) and np.ptp(known) < NEAR_DEG and (np.abs(known * 1e3 % 1 - 0.5) < 0.499999).mean() > 0.5)
+    near = len(known) and np.ptp(known) < NEAR_DEG and 1 < np.abs(known).max() <= 180
+    return bool(near and (np.abs(known * 1e3 % 1 - 0.5) < 0.499999).mean() > 0.5)
 
 
 def shifted(found: str, expected: str) -> InputError:
@@ -687,7 +717,11 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
         The name is empty where the table has one part.
     """
     columns = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name == key]
-    counted = {i: "device" if sheet.plain[i].startswith(("sim", "slot", "sub")) else key for i in columns}
+    marks = _tells_apart(rows, sheet) if key == "network" and not columns else None
+    if marks is not None:
+        columns = [marks]
+        rows.warnings.append(f"column {sheet.names[marks]!r} tells the rows of an instant apart: a series for each")
+    counted = {i: "device" if i == marks or sheet.plain[i].startswith(("sim", "slot", "sub")) else key for i in columns}
     values_of = {i: {text for text in sheet.texts(i) if _says(text, counted[i])} for i in columns}
     several = [i for i, values in values_of.items() if 1 < len(values) <= _MOST_PARTS]
     alone = {sheet.plain[i]: next(iter(values)) for i, values in values_of.items() if len(values) == 1}
@@ -703,6 +737,23 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
             about = rows.about | _about(alone | written)
             label = "_".join(_label(name, text) for name, text in written.items())
             yield label, replace(rows.part(where), about=about), sheet.part(where)
+
+
+def _tells_apart(rows: _rows.Rows, sheet: Sheet) -> int | None:
+    """The unknown column (a node, a beam, a direction) without which most instants have several rows; None if none."""
+    cells = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name in _CELL]
+    keys = pd.DataFrame({"time": rows.time, **{str(i): sheet.texts(i) for i in cells}})
+    if keys.duplicated().mean() < _REPEATED:
+        return None
+    for i, meaning in enumerate(sheet.meanings):
+        texts = pd.Series(sheet.texts(i) if meaning is None else [], dtype=object)
+        if 1 < texts.nunique() <= _MOST_MARKS and not keys.assign(mark=texts).duplicated().any():
+            return i
+    return None
+
+
+_CELL = ("PCI", "ARFCN", "technology", "device")
+_REPEATED, _MOST_MARKS = 0.3, 16
 
 
 def _about(written: dict[str, str]) -> dict[str, Attribute]:

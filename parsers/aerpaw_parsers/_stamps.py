@@ -97,7 +97,7 @@ def _month(word: str) -> int:
 class _Order:
     """Order of the three numbers of a date, decided for the whole column, and what was assumed for it."""
 
-    def __init__(self, texts: Iterable[str], name: str, *, european: bool) -> None:
+    def __init__(self, texts: Iterable[str], name: str, *, european: bool, day_first: bool | None = None) -> None:
         dates = [match for text in texts if (match := _match(text)) and "a" in match.re.groupindex]
         self.day_first, self.year_first = True, False
         self.warnings: list[str] = []
@@ -112,6 +112,9 @@ class _Order:
             return
         self.day_first = False
         if any(second > 12 for _, second in firsts) or self.year_first:
+            return
+        if day_first is not None:
+            self.day_first = day_first
             return
         date = _date_in_name(name)
         fits = [first for first in (True, False) if date and self._dated(dates[0], first) == date]
@@ -288,7 +291,7 @@ def beside(text: str) -> str:
 
 def read(
     texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, european: bool = False, zone: str = "",
-    gps: bool = False,
+    gps: bool = False, day_first: bool | None = None,
 ) -> tuple[str, AnyArray, list[str]]:  # fmt: skip
     """A column of times in any of the known forms.
 
@@ -304,6 +307,8 @@ def read(
         Of times without one: what the name of the column says.
     gps : bool
         Does the name of the column say that numbers are GPS time?
+    day_first : bool, optional
+        The order of dates that the name of the column gives.
 
     Returns
     -------
@@ -328,7 +333,7 @@ def read(
     if sum(_OF_DAY.fullmatch(text) is not None for text in filled) * 2 > len(filled):
         return _of_day(shown, options, zone)
     plain = [text for text in filled if not _COMMON.fullmatch(text)]
-    order = _Order(plain, options.file_name, european=european)
+    order = _Order(plain, options.file_name, european=european, day_first=day_first)
     warnings = order.warnings
     bare = [match for text in plain if (match := _match(text)) and match.groupdict().get("second") is None]
     if len(set(filled)) < len(filled) and 2 * len(bare) > len(filled):

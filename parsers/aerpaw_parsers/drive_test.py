@@ -113,11 +113,11 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
             others += [cell.columns[name] for name in twice]
             home.columns = {**cell.columns, **home.columns}
             del cells[(rat, role)]
-    named = {cell.rat for cell in cells.values()} - {""}
+    named, several = {cell.rat for cell in cells.values()} - {""}, len(cells) > 1
     for key, cell in list(cells.items()):
         if len(named) == 1 and not cell.serving:
             cell.rat = cell.rat or next(iter(named))
-        nameless = "pci" not in cell.columns and cell.place != "serving" and len(cells) > 1
+        nameless = "pci" not in cell.columns and cell.place != "serving" and several
         if "rsrp_dbm" not in cell.columns or nameless:
             others += cell.measured
             del cells[key]
@@ -255,7 +255,9 @@ def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     values, name = sheet.numbers(column), sheet.plain[column]
     if tower := _TOWER_SNR.fullmatch(name):
         return _rows.snr(rows, tower[1].upper(), values)
-    return _cells.named(rows, name, values, unit=sheet.unit_read(column), where=np.isfinite(values))
+    node = re.search(r"\blw ?([1-5])\b", name)
+    about = {"node": f"LW{node[1]}"} if node else None
+    return _cells.named(rows, name, values, unit=sheet.unit_read(column), where=np.isfinite(values), about=about)
 
 
 READER = Reader(

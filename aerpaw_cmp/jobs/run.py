@@ -401,7 +401,7 @@ def run_map(
     options: RunOptions = DEFAULT,
     *,
     flights: Sequence[Path] = (),
-    figures: str = "png",
+    figures: str = "none",
 ) -> JobOutcome:
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -413,8 +413,8 @@ def run_map(
     options : RunOptions
     flights : sequence of Path
         Flight files that correct the levels and ranks (:mod:`.predict`).
-    figures : {"png", "svg", "pdf", "all"}
-        Format of the figures.
+    figures : {"none", "png", "svg", "pdf", "all"}
+        Figures that are drawn as files, in a format or in all.
 
     Returns
     -------

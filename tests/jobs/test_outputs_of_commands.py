@@ -179,9 +179,6 @@ def test_a_limit_on_the_size_of_files_is_one_message(logs: Path) -> None:
 
 def test_a_map_that_fails_in_its_exports_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Exports were written in place: a cut maps.kmz stood under its final name."""
-    from aerpaw_cmp.report.figures import maps as maps_figures
-
-    monkeypatch.setattr(maps_figures, "figure_specs", lambda _data: [])  # drawing is the slow part
     out = tmp_path / "map"
     small = ["--spacing", "500", "--rss-altitude", "30", "--rank-altitude", "30", "-k", "10", "--foliage", "none"]
     command = ["map", *small, "--max-depth", "0", "--no-study", "-o", str(out)]

@@ -32,7 +32,7 @@ def data(maps_data):
 @pytest.fixture(scope="module")
 def driver(data, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.html"
-    path.write_text(maps_html.maps_page(data, [], ["metrics.json"]), encoding="utf-8")
+    path.write_text(maps_html.maps_page(data, ["metrics.json"]), encoding="utf-8")
     browser = start("--window-size=1440,1300")
     open_page(browser, path, READY)
     yield browser

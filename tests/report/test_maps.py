@@ -8,12 +8,7 @@ import pytest
 from aerpaw_cmp.report.content.maps import MapsData
 from aerpaw_cmp.report.figures import maps as maps_figures
 from aerpaw_cmp.report.kit import canvas
-from aerpaw_cmp.report.kit.canvas import Picture
 from aerpaw_cmp.report.pages import maps as maps_html
-
-
-def pictures(data):
-    return [Picture(p, {"svg": b"<svg/>"}) for p in maps_figures.figure_specs(data)]
 
 
 @pytest.fixture
@@ -24,11 +19,14 @@ def few_maps(maps_data):
 
 def test_files(few_maps, tmp_path):
     files = maps_html.write_maps(few_maps, tmp_path, "svg")
-    assert {file.suffix for file in files} == {".html", ".json", ".png", ".svg"}
+    assert {file.suffix for file in files} == {".html", ".json", ".svg"}
+    assert len(maps_html.write_maps(few_maps, tmp_path / "plain")) == 2  # none are drawn where nobody asks
     assert files[0].name == "map.html"
     page = files[0].read_text()
     names = {p.name for p in maps_figures.figure_specs(few_maps)}
-    assert all(f'id="figure-{name}"' in page for name in names)
+    assert {file.stem for file in files if file.suffix == ".svg"} == names
+    panels = [panel for plate in maps_figures.plates(few_maps) for panel in plate.panels]
+    assert page.count("data-plot=") == len(panels) > len(list(maps_figures.plates(few_maps))) > 3
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
     assert page.count("<script") == 2  # its data and its one script
     assert max(f.stat().st_size for f in files if f.suffix == ".svg") < 500_000
@@ -72,15 +70,26 @@ def _event(ax, east, north):
 
 def test_cdf_counts_positions_out_of_coverage_as_below(maps_data):
     maps = [m for m in maps_data.rss if m.antennas == "SISO"]
-    with canvas.style():
-        fig = maps_figures.cdfs(maps)
-    heights = sorted({layer.altitude_m for layer in maps})
-    assert len(heights) > 1
-    for ax, height in zip(fig.axes, heights, strict=True):
-        layers = [layer for layer in maps if layer.altitude_m == height]
-        for line, layer in zip(ax.get_lines(), layers, strict=True):
-            assert line.get_ydata()[0] == pytest.approx(1 - layer.coverage, abs=2 / layer.rss_dbm.size)
-            assert line.get_ydata()[-1] == 1.0
+    plate = next(maps_figures.plates(dataclasses.replace(maps_data, rss=maps)))
+    assert len(plate.panels) > 1
+    for title, content in plate.panels.items():
+        layers = [layer for layer in maps if f"{layer.altitude_m:g} m" == title]
+        for line, layer in zip(content["marks"], layers, strict=True):
+            assert line["y"][0] == pytest.approx(100 * (1 - layer.coverage), abs=200 / layer.rss_dbm.size)
+            assert line["y"][-1] == 100.0
+
+
+def test_shares_of_ranks_are_read_at_their_heights(maps_data):
+    members = [m for m in maps_data.rank if m.k == maps_data.rank[0].k]
+    bands = maps_figures.rank_shares(members)["marks"]
+    assert len(members) > 1
+    for member in members:
+        here = [int(np.flatnonzero(band["x"] <= member.altitude_m)[-1]) for band in bands]
+        shares = [band["high"][at] - band["low"][at] for band, at in zip(bands, here, strict=True)]
+        np.testing.assert_allclose(shares, 100 * np.asarray(member.share), atol=1e-9)
+    assert bands[0]["x"][0] >= 0.0
+    (lonely,) = {tuple(band["x"]) for band in maps_figures.rank_shares(members[:1])["marks"]}
+    assert lonely[0] < members[0].altitude_m < lonely[1]
 
 
 def test_borders_only_where_towers_share_the_area(maps_data):
@@ -114,7 +123,7 @@ def test_hostile_names_are_escaped(maps_data):
         errors=(dataclasses.replace(maps_data.errors[0], method=text, evaluation=text),),
         paper=(dataclasses.replace(maps_data.paper[0], what=text, figure=text),),
     )  # fmt: skip
-    page = maps_html.maps_page(data, pictures(data), [text])
+    page = maps_html.maps_page(data, [text])
     assert "alert(1)</script>" not in page
     assert page.count("<script") == 2
 
@@ -122,7 +131,7 @@ def test_hostile_names_are_escaped(maps_data):
 @pytest.mark.parametrize("missing", ["rss", "rank", "layers", "correlation", "errors", "paper", "borders_m"])
 def test_a_part_may_be_missing(maps_data, missing):
     data = dataclasses.replace(maps_data, **{missing: ()})
-    maps_html.maps_page(data, pictures(data), [])
+    maps_html.maps_page(data, [])
     json.dumps(maps_html.maps_metrics(data), allow_nan=False)
 
 
@@ -130,7 +139,7 @@ def test_nothing_at_all_and_nothing_covered(maps_data):
     empty = MapsData(
         title="t", name="n", site=maps_data.site, generated="", east_m=maps_data.east_m, north_m=maps_data.north_m
     )
-    maps_html.maps_page(empty, pictures(empty), [])
+    maps_html.maps_page(empty, [])
     dark = dataclasses.replace(maps_data.rss[0], rss_dbm=np.full_like(maps_data.rss[0].rss_dbm, np.nan), coverage=0.0)
     for spec in maps_figures.figure_specs(dataclasses.replace(empty, rss=(dark,))):
         canvas.render(spec)

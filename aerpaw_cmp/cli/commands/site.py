@@ -189,7 +189,10 @@ def map_(
         float | None,
         Option(help="Side of tiles written to a Zarr store [m]  [default: 128 positions, from 1e6 receivers on]"),
     ] = None,
-    figures: Annotated[Literal["png", "svg", "pdf", "all"], Option(help="Format of the figures.")] = "png",
+    figures: Annotated[
+        Literal["none", "png", "svg", "pdf", "all"],
+        Option(help="Figures as files beside the page: none, or all in one format or in every format."),
+    ] = "none",
     workers: Workers = 1,
     scheduler: Scheduler = None,
     dry_run: DryRun = False,

@@ -171,7 +171,7 @@ def _interpolation(outcome: MapOutcome) -> dict[str, str]:
 
 def paper_markdown(rows: Iterable[PaperRow]) -> str:
     """The rows as a Markdown table."""
-    lines = ["| where | what | paper | here | figure |", "| --- | --- | --- | --- | --- |"]
+    lines = ["| where | what | paper | here | figure (--figures png) |", "| --- | --- | --- | --- | --- |"]
     for row in rows:
         figure = f"`figures/{row.figure}.png`" if row.figure else ""
         lines.append(f"| {row.where} | {row.what} | {row.paper} | {row.ours} | {figure} |")

@@ -10,10 +10,13 @@ import numpy as np
 
 from ..content.campaign import CampaignData
 from ..kit.canvas import TOWER, FigureSpec, beyond, colour_bar, frame_around, plan_axes, subplots
-from .maps import COLOURS, MARKERS, grouped
+from .charts import COLOURS
+from .maps import grouped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+_MARKERS = "os^Dv<>P"
 
 
 def season_drift(data: CampaignData) -> Figure:
@@ -30,7 +33,7 @@ def season_drift(data: CampaignData) -> Figure:
         good = [r for r in rows if np.isfinite(r.offset_db) and (not dated or r.flight in data.season.started)]
         at = [np.datetime64(data.season.started[r.flight][:-1]) if dated else numbers[r.flight] + 1 for r in good]
         ax.plot(
-            np.array(at), [r.offset_db for r in good], linestyle="none", marker=MARKERS[number % len(MARKERS)],
+            np.array(at), [r.offset_db for r in good], linestyle="none", marker=_MARKERS[number % len(_MARKERS)],
             markersize=3.5, color=COLOURS[number % len(COLOURS)], alpha=0.7,
             label=link + slopes.get(link, ""),
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Charts that the script of a flight's page draws: marks over two axes, arrays beside plain values; a table of cells.
+"""Charts that the script of a page draws: marks over two axes, arrays beside plain values; a table of cells.
 
 A mark is a ``band`` (x, low, high), a ``line`` (x, y) or ``dots`` (x, y, and whiskers low to high). ``rows`` are names
 in place of an ordinate.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -17,16 +17,24 @@ from ...compare.judge.ladder import LadderRow
 from ...compare.level.detection import DetectionScore
 from ...compare.level.serving import ServingComparison
 from ...compare.result import RankResult
+from ...logs.records import has_wall_clock
 from ..content.against import AgainstSeries
 from ..content.flight import RANKS, ReportData, start_of
-from ..kit.canvas import seconds_since
+from ..kit.canvas import placed, seconds_since
 from ..words.flight import learned_on
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 # Means of a forecast along the flight: as many as a page can show.
 _FORECAST_COLUMNS = 600
 
-# Of rank 1 to 4, as on the page's map.
-_RANK_COLOURS = ("#440154", "#31688e", "#35b779", "#fde725")
+# Curves of a figure are told apart in grey, too.
+_LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
+COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
+
+# Of no path and rank 1 to 4, as on the page's map.
+RANK_COLOURS = ("#dddddd", "#440154", "#31688e", "#35b779", "#fde725")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -37,6 +45,33 @@ class Chart:
     title: str
     caption: str
     content: Mapping[str, Any]
+
+
+def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Charts of one kind by their titles as a figure, at most three in a row."""
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    fig, axes = placed((9.2, 0.6 + 3.2 * rows), rows, columns, gap_in=(0.7, 0.8))
+    for ax in axes.flat[len(panels) :]:
+        ax.set_visible(False)
+    for ax, (title, content) in zip(axes.flat, panels.items(), strict=False):
+        for number, mark in enumerate(content["marks"]):
+            look = {"color": mark.get("colour", COLOURS[number % len(COLOURS)]), "label": mark["name"]}
+            if mark["kind"] == "band":
+                ax.fill_between(mark["x"], mark["low"], mark["high"], linewidth=0, **look)
+            elif mark["kind"] == "line":
+                ax.plot(mark["x"], mark["y"], linestyle=_LINES[number % len(_LINES)], linewidth=1.3, **look)
+            else:
+                ax.plot(mark["x"], mark["y"], linestyle="none", marker="o", markersize=4, **look)
+        ax.set(title=title, xlabel=content["x"]["label"], ylabel=content["y"]["label"])
+        ax.set_ylim(*content["y"].get("ends", ax.get_ylim()))
+    curves = [ax.get_legend_handles_labels() for ax in axes.flat[: len(panels)]]
+    if all(names == curves[0][1] for _, names in curves):
+        fig.legend(*curves[0], loc="lower center", ncols=6)
+    else:
+        for ax in axes.flat[: len(panels)]:
+            ax.legend(loc="best", fontsize=7.5)
+    return fig
 
 
 def charts_of(data: ReportData) -> list[Chart]:
@@ -105,9 +140,8 @@ def _ladder(rows: Sequence[LadderRow]) -> dict[str, Any]:
 
 def _predicted(series: AgainstSeries) -> dict[str, Any]:
     """Levels over time with the band that was predicted."""
-    start = "" if series.start is None else str(series.start.astype("datetime64[ms]"))
     return {
-        "x": {"label": "" if start else "Time after the first sample [s]", "start": start},
+        "x": _time_axis(series.start),
         "y": {"label": "Level [dB]"},
         "marks": [
             {"kind": "band", "name": "90 %", "x": series.time_s, "low": series.low_db, "high": series.high_db},
@@ -115,6 +149,29 @@ def _predicted(series: AgainstSeries) -> dict[str, Any]:
             {"kind": "line", "name": "predicted", "x": series.time_s, "y": series.level_db},
         ],
     }
+
+
+def _time_axis(start: np.datetime64 | None) -> dict[str, str]:
+    """Abscissa in seconds after an instant, None where it is not known."""
+    begun = "" if start is None else str(start.astype("datetime64[ms]"))
+    return {"label": "" if begun else "Time after the first sample [s]", "start": begun}
+
+
+def flown(data: ReportData) -> list[Chart]:
+    """Measured and simulated levels of every channel of a flight over time, for the page of a map."""
+    start, caption = start_of(data), "Ray tracing is drawn less the offset of the channel."
+    known = start if has_wall_clock(start) else None
+    return [
+        Chart(section="flights", title=f"{data.flight}, {panel.name}", caption=caption, content={
+            "x": _time_axis(known), "y": {"label": f"RSS [{panel.unit}]"},
+            "marks": [
+                {"kind": kind, "name": name, "x": seconds_since(panel.time, start), "y": level}
+                for kind, name, level in (("dots", "measured", panel.measured_db),
+                                          ("line", "ray tracing", panel.simulated_dbm - panel.score.offset_db))
+            ],
+        })
+        for panel in data.rss if panel.score.n
+    ]  # fmt: skip
 
 
 def _detection(score: DetectionScore) -> dict[str, Any]:
@@ -147,7 +204,7 @@ def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
         "y": {"label": "Probability [%]", "ends": [0, 100]},
         "marks": [
             {"kind": "band", "name": f"rank {rank}", "x": at, "low": edges[:, i], "high": edges[:, i + 1],
-             "colour": _RANK_COLOURS[i]}
+             "colour": RANK_COLOURS[rank]}
             for i, rank in enumerate(RANKS)
         ],
     }  # fmt: skip

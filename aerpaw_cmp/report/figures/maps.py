@@ -1,9 +1,9 @@
-"""Figures of the `map` job: RSS and rank over the grid, distributions, correlation, errors of interpolation."""
+"""Figures and charts of the `map` job: RSS and rank over the grid, distributions, correlation, errors."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -15,7 +15,6 @@ from ...site.site import Site
 from ..content.flight import RANKS
 from ..content.maps import JOINT, Correlation, MapError, MapsData, RankMap, RssMap
 from ..kit.canvas import (
-    RANK_HATCH,
     TOWER,
     FigureSpec,
     beyond,
@@ -25,6 +24,7 @@ from ..kit.canvas import (
     rank_colour,
 )
 from ..names import k_key, safe_name
+from .charts import RANK_COLOURS, Chart, drawn
 from .flight import channel_specs
 
 if TYPE_CHECKING:
@@ -32,18 +32,9 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 T = TypeVar("T")
-LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
-MARKERS = "os^Dv<>P"
-COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
 MISSING: dict[str, Any] = {"facecolor": "#F2F2F2", "edgecolor": "#888888", "hatch": "//////", "linewidth": 0.0}
 # Maps side by side, at most.
 COLUMNS = 6
-
-
-def curve_style(number: int, *, marked: bool = False) -> dict[str, Any]:
-    """Colour and line of a curve, and its marker: told apart in grey, too."""
-    line = {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[(number + number // len(COLOURS)) % len(LINES)]}
-    return line | ({"marker": MARKERS[number % len(MARKERS)], "markersize": 5} if marked else {})
 
 
 def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
@@ -205,89 +196,114 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
     return fig
 
 
-def cdfs(maps: Sequence[RssMap]) -> Figure:
-    """Distribution of RSS per tower and jointly: a panel per height, positions out of coverage counted as below."""
-    panels = grouped(maps, lambda m: m.altitude_m)
-    fig, (axes,) = placed((9.2, 3.4), 1, len(panels), sharey=True, sharex=True)
-    for ax, (height, members) in zip(axes, panels.items(), strict=True):
-        for number, tower_map in enumerate(members):
-            level = np.sort(tower_map.rss_dbm[np.isfinite(tower_map.rss_dbm)])
-            missing = tower_map.rss_dbm.size - len(level)
-            share = (missing + np.arange(1, len(level) + 1)) / tower_map.rss_dbm.size
-            shown = spread_out(len(level), 400)  # steps of a four-hundredth cannot be seen
-            joint = tower_map.tower == JOINT
-            ax.plot(
-                level[shown], share[shown], **curve_style(number),
-                linewidth=2.0 if joint else 1.2,
-                label=f"tower {tower_map.tower}" if tower_map.tower.startswith("_") else tower_map.tower,
-            )  # fmt: skip
-        ax.set(title=f"{height:g} m", xlabel="RSS [dBm]", ylim=(0, 1.0))
-    axes[0].set_ylabel("Share of positions below")
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=6)
-    return fig
+def distribution(members: Sequence[RssMap]) -> dict[str, Any]:
+    """Distribution of RSS of each tower and jointly at one height, positions out of coverage counted as below."""
+    marks = []
+    for shown in members:
+        level = np.sort(shown.rss_dbm[np.isfinite(shown.rss_dbm)])
+        share = (shown.rss_dbm.size - len(level) + np.arange(1, len(level) + 1)) / shown.rss_dbm.size
+        some = spread_out(len(level), 400)  # steps of a four-hundredth cannot be seen
+        marks.append({"kind": "line", "name": shown.tower, "x": level[some], "y": 100.0 * share[some]})
+    return {"x": {"label": "RSS [dBm]"}, "y": {"label": "Positions below [%]", "ends": [0, 100]}, "marks": marks}
 
 
-def rank_shares(maps: Sequence[RankMap]) -> Figure:
-    """Shares of Z and rank 1 to 4 against height, a panel per K and learned receiver."""
-    panels = grouped(maps, lambda entry: entry.source)
-    fig, (axes,) = placed((9.2, 3.4), 1, len(panels), sharey=True)
-    for ax, (source, members) in zip(axes, panels.items(), strict=True):
-        at = np.arange(len(members))
-        share = 100 * np.array([member.share for member in members])
-        below = np.zeros(len(members))
-        for column, value in enumerate((0, *RANKS)):
-            face: Any = "white" if value == 0 else rank_colour(value)
-            hatch = "//////" if value == 0 else RANK_HATCH[value]
-            ax.bar(
-                at, share[:, column], 0.82, bottom=below, color=face, linewidth=0.5, hatch=hatch,
-                edgecolor="#777777" if value in (0, 1) else "black",
-                label="Z: out of coverage" if value == 0 else f"rank {value}",
-            )  # fmt: skip
-            below = below + share[:, column]
-        ax.set_xticks(at, [f"{member.altitude_m:g}" for member in members], fontsize=7)
-        ax.set(title=source, xlabel="Height [m]")
-        ax.grid(visible=False)
-    axes[0].set_ylabel("Share of positions [%]")
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=5)
-    return fig
+def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
+    """Shares of Z and rank 1 to 4 about each height, one upon the other."""
+    members = sorted(members, key=lambda member: member.altitude_m)
+    at = np.array([member.altitude_m for member in members])
+    half = np.diff(at) / 2.0 if len(at) > 1 else np.array([5.0])
+    sides = np.repeat([max(at[0] - half[0], 0.0), *(at[:-1] + half[: len(at) - 1]), at[-1] + half[-1]], 2)[1:-1]
+    share = 100.0 * np.array([member.share for member in members])
+    edges = np.repeat(np.column_stack([np.zeros(len(at)), share.cumsum(axis=1)]), 2, axis=0)
+    marks = [
+        {"kind": "band", "name": f"rank {rank}" if rank else "Z: out of coverage", "x": sides, "low": edges[:, rank],
+         "high": edges[:, rank + 1], "colour": RANK_COLOURS[rank]}
+        for rank in (0, *RANKS)
+    ]  # fmt: skip
+    return {"x": {"label": "Height [m]"}, "y": {"label": "Positions [%]", "ends": [0, 100]}, "marks": marks}
 
 
-def correlations(curves: Sequence[Correlation]) -> Figure:
-    """Correlation against distance and its model, a panel per kind, at most three in a row."""
-    columns = min(len(curves), 3)
-    rows = -(-len(curves) // columns)
-    fig, axes = placed((9.2, 0.2 + 3.0 * rows), rows, columns, gap_in=(0.7, 0.8), bottom_in=0.5)
-    for ax in axes.flat[len(curves) :]:
-        ax.set_visible(False)
-    for ax, curve in zip(axes.flat, curves, strict=False):
-        ax.plot(
-            curve.distance_m, curve.correlation, marker="o", markersize=5, linestyle="none", color="#0072B2",
-            label="data",
+def correlation(curve: Correlation) -> dict[str, Any]:
+    """Correlation against distance and its model."""
+    marks: list[Any] = [{"kind": "dots", "name": "data", "x": curve.distance_m, "y": curve.correlation}]
+    if curve.fit is not None:
+        name = curve.fit_label or "model"
+        marks.append({"kind": "line", "name": name, "x": curve.fit_distance_m, "y": curve.fit})
+    return {"x": {"label": "Distance [m]"}, "y": {"label": "Correlation"}, "marks": marks}
+
+
+def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
+    """MAE against height for every method; ``worst`` of all panels sets the scale."""
+    marks = []
+    for method, rows in grouped(sorted(members, key=lambda e: e.altitude_m), lambda e: e.method).items():
+        at, mae = np.array([[row.altitude_m, row.mae] for row in rows]).T
+        marks.append({"kind": "line", "name": method, "x": at, "y": mae})
+    y = {"label": "MAE of the rank", "ends": [0.0, 1.08 * worst if worst > 0 else 1.0]}
+    return {"x": {"label": "Height [m]"}, "y": y, "marks": marks}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plate:
+    """Panels of one kind: a figure as a file, and a chart of the page each; ``panels`` by their titles."""
+
+    name: str
+    section: str
+    title: str
+    caption: str
+    panels: Mapping[str, Mapping[str, Any]]
+
+    @property
+    def spec(self) -> FigureSpec:
+        """The figure."""
+        return FigureSpec(self.name, self.section, self.title, self.caption, partial(drawn, self.panels))
+
+    @property
+    def charts(self) -> list[Chart]:
+        """Charts of the page."""
+        return [
+            Chart(
+                section=self.section, title=f"{self.title}: {name}", caption="" if i else self.caption, content=content
+            )
+            for i, (name, content) in enumerate(self.panels.items())
+        ]
+
+
+def plates(data: MapsData) -> Iterator[Plate]:
+    """Distributions, shares, correlation and errors: all that is no map."""
+    for words, maps in grouped((*data.rss, *data.corrected), lambda m: f"{m.antennas}{_under(m.foliage)}").items():
+        yield Plate(
+            name=f"rss_cdf_{safe_name(words)}", section="rss", title=f"Distribution of RSS, {words}",
+            caption="Share of positions with an RSS below the value; a curve starts at its share of Z.",
+            panels={f"{at:g} m": distribution(some) for at, some in grouped(maps, lambda m: m.altitude_m).items()},
         )  # fmt: skip
-        if curve.fit is not None and curve.fit_distance_m is not None:
-            ax.plot(curve.fit_distance_m, curve.fit, color="#111111", linewidth=1.3, label=curve.fit_label or "model")
-        ax.set(title=curve.title, xlabel="Distance [m]", ylabel="Correlation")
-        ax.legend(loc="best", fontsize=7.5)
-    return fig
-
-
-def error_curves(errors: Sequence[MapError]) -> Figure:
-    """MAE against height for every method, a panel per K."""
-    panels = grouped(errors, lambda e: e.k)
-    fig, (axes,) = placed((9.2, 3.4), 1, len(panels), sharey=True)
-    for ax, (k, members) in zip(axes, panels.items(), strict=True):
-        for number, (method, rows) in enumerate(grouped(members, lambda e: e.method).items()):
-            rows = sorted(rows, key=lambda e: e.altitude_m)
-            ax.plot(
-                [entry.altitude_m for entry in rows], [entry.mae for entry in rows], **curve_style(number, marked=True),
-                linewidth=1.2, label=method,
-            )  # fmt: skip
-        ax.set(title=f"K = {k_key(k)}", xlabel="Height [m]")
-    worst = max((error.mae for error in errors if np.isfinite(error.mae)), default=1.0)
-    axes[0].set_ylim(0.0, 1.08 * worst if worst > 0 else 1.0)  # shared by all panels
-    axes[0].set_ylabel("Mean absolute error of the rank")
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="lower center", ncols=4)
-    return fig
+    for words, ranks in grouped(data.rank, lambda m: _under(m.foliage)).items():
+        yield Plate(
+            name="_".join(["rank_share", *([safe_name(words)] if words else [])]), section="rank",
+            title=f"Rank against height{words}", caption="Share of positions with each rank; Z is out of coverage.",
+            panels={source: rank_shares(some) for source, some in grouped(ranks, lambda m: m.source).items()},
+        )  # fmt: skip
+    for tower, ranks in grouped(data.corrected_rank, lambda m: m.tower).items():
+        yield Plate(
+            name=f"rank_share_learned_{safe_name(tower)}", section="rank",
+            title=f"Rank of {tower} against height, raw and corrected",
+            caption="Raw: share of positions with each rank of the traced channel, by K; Z is out of coverage. Learned "
+            "receiver: mean probability of each rank.",
+            panels={source: rank_shares(some) for source, some in grouped(ranks, lambda m: m.source).items()},
+        )  # fmt: skip
+    if data.correlation:
+        yield Plate(
+            name="correlation", section="kriging", title="Spatial correlation",
+            caption="Pearson correlation between positions against their distance, and the fitted model. "
+            + " ".join(f"{c.title}: {c.excluded} constant positions left out." for c in data.correlation),
+            panels={curve.title: correlation(curve) for curve in data.correlation},
+        )  # fmt: skip
+    for evaluation, errors in grouped(data.errors, lambda error: error.evaluation).items():
+        worst = max((error.mae for error in errors if np.isfinite(error.mae)), default=1.0)
+        yield Plate(
+            name=f"mae_{safe_name(evaluation)}", section="kriging", title=f"Error of interpolated rank, {evaluation}",
+            caption="Mean absolute error against height; lower is better.",
+            panels={f"K = {k_key(k)}": error_curves(some, worst) for k, some in grouped(errors, lambda e: e.k).items()},
+        )  # fmt: skip
 
 
 # --- all figures ---------------------------------------------------------------------------------
@@ -309,7 +325,7 @@ def figure_specs(data: MapsData) -> list[FigureSpec]:
         replace(spec, name=f"{spec.name}_{safe_name(flight.flight)}", title=f"{flight.flight}, {spec.title}")
         for flight in data.flights for spec in channel_specs(flight)
     ]  # fmt: skip
-    return [*_rss_specs(data), *flown, *_rank_specs(data), *_kriging_specs(data)]
+    return [*_rss_specs(data), *flown, *_rank_specs(data), *(plate.spec for plate in plates(data))]
 
 
 def _under(foliage: str) -> str:
@@ -328,12 +344,6 @@ def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
             "coverage. One colour scale for all RSS maps.",
             partial(rss_maps, data, maps, limits),
         )  # fmt: skip
-    for words, maps in grouped(levels, lambda m: f"{m.antennas}{_under(m.foliage)}").items():
-        yield FigureSpec(
-            f"rss_cdf_{safe_name(words)}", "rss", f"Distribution of RSS, {words}",
-            "Share of positions with an RSS below the value; a curve starts at its share of Z.",
-            partial(cdfs, maps),
-        )  # fmt: skip
 
 
 def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
@@ -342,37 +352,9 @@ def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
             f"rank_map_{safe_name(words)}", "rank", f"Rank, {words}", "The nearest tower serves. Hatched: no path.",
             partial(rank_grid, data, maps),
         )  # fmt: skip
-    for words, maps in grouped(data.rank, lambda m: _under(m.foliage)).items():
-        yield FigureSpec(
-            "_".join(["rank_share", *([safe_name(words)] if words else [])]), "rank", f"Rank against height{words}",
-            "Share of positions with each rank; Z is out of coverage.",
-            partial(rank_shares, maps),
-        )  # fmt: skip
     for tower, maps in grouped(data.corrected_rank, lambda m: m.tower).items():
         yield FigureSpec(
             f"rank_map_learned_{safe_name(tower)}", "rank", f"Rank of {tower}, corrected",
             "Most probable rank by the receiver that flights taught; all headings count alike.",
             partial(rank_grid, data, [m for m in maps if m.k is None]),
-        )  # fmt: skip
-        yield FigureSpec(
-            f"rank_share_learned_{safe_name(tower)}", "rank", f"Rank of {tower} against height, raw and corrected",
-            "Raw: share of positions with each rank of the traced channel, by K; Z is out of coverage. Learned "
-            "receiver: mean probability of each rank.",
-            partial(rank_shares, maps),
-        )  # fmt: skip
-
-
-def _kriging_specs(data: MapsData) -> Iterator[FigureSpec]:
-    if data.correlation:
-        yield FigureSpec(
-            "correlation", "kriging", "Spatial correlation",
-            "Pearson correlation between positions against their distance, and the fitted model. "
-            + " ".join(f"{c.title}: {c.excluded} constant positions left out." for c in data.correlation),
-            partial(correlations, data.correlation),
-        )  # fmt: skip
-    for evaluation, errors in grouped(data.errors, lambda error: error.evaluation).items():
-        yield FigureSpec(
-            f"mae_{safe_name(evaluation)}", "kriging", f"Error of interpolated rank, {evaluation}",
-            "Mean absolute error against height; lower is better.",
-            partial(error_curves, errors),
         )  # fmt: skip

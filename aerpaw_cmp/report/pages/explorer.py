@@ -63,7 +63,7 @@ def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS)
         "track": _track(data, start, arrays),
         "site": scene(data.site),
         "paths": [_paths(p, start) for p in data.paths],
-        "plots": [_packed(chart.content, arrays) for chart in charts],
+        "plots": [packed(chart.content, arrays) for chart in charts],
         "packed": arrays.content(),
     }
 
@@ -78,13 +78,13 @@ def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) 
     }
 
 
-def _packed(value: Any, arrays: PackedArrays) -> Any:
+def packed(value: Any, arrays: PackedArrays) -> Any:
     """A chart with its arrays in the page's block."""
     if isinstance(value, np.ndarray):
         return arrays.add(value, "f8" if value.max(initial=0.0) > 1e5 else "f4")
     if isinstance(value, dict):
-        return {key: _packed(each, arrays) for key, each in value.items()}
-    return [_packed(each, arrays) for each in value] if isinstance(value, list) else value
+        return {key: packed(each, arrays) for key, each in value.items()}
+    return [packed(each, arrays) for each in value] if isinstance(value, list) else value
 
 
 AXES = ("east", "north", "up")

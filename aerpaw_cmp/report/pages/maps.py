@@ -11,10 +11,10 @@ from ..content.flight import RANKS
 from ..content.made import about
 from ..content.maps import MapError, MapsData
 from ..figures import maps as maps_figures
+from ..figures.charts import flown
 from ..kit import canvas
-from ..kit.canvas import Picture
 from ..kit.files import json_text, merge, write_file
-from ..kit.page import by_section, embedded, rendered
+from ..kit.page import embedded, rendered
 from ..names import k_key
 from ..words.maps import first_words, notes, warnings
 from .maps_explorer import layer_numbers, page_layers, payload
@@ -72,9 +72,11 @@ def error_tables(
     return result
 
 
-def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
+def maps_page(data: MapsData, files: Sequence[str]) -> str:
     """The whole page."""
-    linked = payload(data) if data.rss or data.rank or data.layers else None
+    charts = [chart for plate in maps_figures.plates(data) for chart in plate.charts]
+    charts += [chart for flight in data.flights for chart in flown(flight)]
+    linked = payload(data, charts) if data.rss or data.rank or data.layers else None
     return rendered(
         "map",
         ("common.js", "map_explorer.js") if linked else (),
@@ -82,23 +84,20 @@ def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str])
         verdict=first_words(data),
         warnings=warnings(data),
         notes=notes(data),
-        sections=by_section(pictures),
+        charts=charts,
         coverage=coverage_table(data),
         errors=error_tables(data.errors),
-        names={picture.spec.name for picture in pictures},
         files=files,
         explorer=embedded(linked),
     )
 
 
-def write_maps(data: MapsData, folder: str | Path, drawn: str = "png") -> list[Path]:
-    """Write ``map.html``, ``metrics.json`` and ``figures/``; returns the files, the page first.
-
-    ``drawn`` is a format of the figures beside the page's PNG, or "all".
-    """
+def write_maps(data: MapsData, folder: str | Path, drawn: str = "none") -> list[Path]:
+    """Write ``map.html``, ``metrics.json`` and figures in one format, all or none; gives the files, the page first."""
     folder = Path(folder)
     written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
-    formats = canvas.FORMATS if drawn == "all" else tuple(dict.fromkeys(("png", drawn)))
-    pictures, files = canvas.write_figures(maps_figures.figure_specs(data), folder / "figures", formats)
-    page = write_file(folder / "map.html", maps_page(data, pictures, ["metrics.json"]))
+    specs = [] if drawn == "none" else maps_figures.figure_specs(data)
+    formats = canvas.FORMATS if drawn == "all" else (drawn,)
+    _, files = canvas.write_figures(specs, folder / "figures", formats)
+    page = write_file(folder / "map.html", maps_page(data, ["metrics.json"]))
     return [page, *written, *files]

@@ -15,12 +15,13 @@ from ...common.geodesy import SiteFrame
 from ...common.units import FloatArray
 from ..content.flight import RANKS
 from ..content.maps import JOINT, MapLayer, MapsData, RankMap, RssMap, at_height
+from ..figures.charts import Chart
 from ..figures.maps import grouped, half_width
 from ..kit.canvas import rank_colour
 from ..kit.packed import NONE, PackedArrays, step_for
 from ..kit.shapes import listed
 from ..names import k_key
-from .explorer import plan_of
+from .explorer import packed, plan_of
 
 # Base64 that the layers may take; beyond it layers of single towers are left out, then cells.
 MOST_BYTES = 4_000_000
@@ -91,12 +92,13 @@ def layer_numbers(layer: MapLayer) -> dict[str, Any]:
 # --- what the script gets ---------------------------------------------------------------------------------------------
 
 
-def payload(data: MapsData, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
+def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST_BYTES) -> dict[str, Any]:
     """Everything the script needs, as plain values, in at most about ``most_bytes`` of base64.
 
     Parameters
     ----------
     data : MapsData
+    charts : sequence of Chart
     most_bytes : int
         Where all layers need more, those of single towers but RSS are left out, then all of single towers, then
         every second (third, ...) cell of each row and column is kept; ``left_out`` says which.
@@ -110,7 +112,7 @@ def payload(data: MapsData, most_bytes: int = MOST_BYTES) -> dict[str, Any]:
     stride = 1
     while True:
         for words, chosen, every in tries:
-            content = _packed(data, chosen, every)
+            content = _packed(data, charts, chosen, every)
             if len(content["packed"]["data"]) <= most_bytes:
                 return content | {"left_out": words, "stride": every}
         stride += 1
@@ -122,7 +124,7 @@ def _is_joint(layer: MapLayer) -> bool:
     return layer.axes.get("Tower", JOINT) == JOINT
 
 
-def _packed(data: MapsData, layers: Sequence[MapLayer], stride: int) -> dict[str, Any]:
+def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer], stride: int) -> dict[str, Any]:
     arrays = PackedArrays()
     east, north = data.east_m[::stride], data.north_m[::stride]
     by_quantity = grouped(layers, lambda layer: layer.quantity)
@@ -138,6 +140,7 @@ def _packed(data: MapsData, layers: Sequence[MapLayer], stride: int) -> dict[str
         "flown": [listed(np.round(line, 1)) for line in data.flown_m],
         "joint": JOINT,
         "quantities": quantities,
+        "plots": [packed(chart.content, arrays) for chart in charts],
         "ramps": {"level": ramp("viridis"), "difference": ramp("RdBu_r")},
         "packed": arrays.content(),
     }  # fmt: skip

@@ -521,36 +521,7 @@
   });
   canvas.addEventListener("wheel", e => { if (!e.ctrlKey && !e.metaKey && document.activeElement !== canvas) return; e.preventDefault(); state.zoom = Math.min(30, Math.max(0.3, state.zoom * Math.exp(-e.deltaY * 0.0015))); later(drawMap); }, { passive: false });
 
-  // --- charts of the sections, from marks over two axes -----------------------------------------------------------------
-
-  const HUES = ["--measured", "--second", "--baseline", "--accent", "--ink", "--soft"];
-  function drawPlot(place) {
-    const spec = data.plots[place.dataset.plot], n = spec.rows ? spec.rows.length : 0;
-    if (!place.clientWidth) return;
-    if (n) place.style.height = `${30 * n + 50}px`;
-    const marks = spec.marks.map((m, i) => ({ ...m, hue: m.colour || css(HUES[i % HUES.length]), x: get(m.x), y: get(m.y), low: get(m.low), high: get(m.high) }));
-    const reach = lists => { let low = Infinity, high = -Infinity; for (const list of lists) for (const v of list || []) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); } return low < high ? [low, high] : [low - 1, low + 1]; };
-    const [west, east] = spec.x.ends || reach(marks.flatMap(m => n ? [m.x, m.low, m.high] : [m.x])), [south, north] = n ? [n - 0.4, -0.9] : spec.y.ends || reach(marks.flatMap(m => [m.y, m.low, m.high]));
-    const [p, w, h] = common.frame(place), x = { low: west, high: east, label: spec.x.label }, y = { low: south, high: north, label: n ? "" : spec.y.label };
-    if (spec.x.start) { const begun = Date.parse(spec.x.start + "Z") / 1000; x.marks = common.clockTicks(west, east, w / 110, begun); x.words = v => common.clockText(v + begun); }
-    if (n) y.marks = [];
-    const g = axes(p, w, h, x, y, n ? 14 : 50);
-    if (n) spec.rows.forEach((name, i) => { p.fillStyle = css(i === spec.chosen ? "--accent" : "--soft"); p.fillText(name + (i === spec.chosen ? " (recommended)" : ""), g.left + 4, g.Y(i - 0.35)); });
-    for (const m of marks) {
-      p.fillStyle = p.strokeStyle = m.hue; p.lineWidth = 1.4; p.globalAlpha = m.kind === "band" ? (m.colour ? 0.9 : 0.25) : 1; p.beginPath();
-      if (m.kind === "band") { for (let i = 0; i < m.x.length; i++) p.lineTo(g.X(m.x[i]), g.Y(m.high[i])); for (let i = m.x.length - 1; i >= 0; i--) p.lineTo(g.X(m.x[i]), g.Y(m.low[i])); p.fill(); }
-      else if (m.kind === "line") { for (let i = 0; i < m.x.length; i++) p.lineTo(g.X(m.x[i]), g.Y(m.y[i])); p.stroke(); }
-      else for (let i = 0; i < m.x.length; i++) {
-        const size = m.x.length > 200 ? 1.2 : 3.2, [a, b] = [g.X(m.x[i]), g.Y(m.y[i])];
-        p.fillRect(a - size, b - size, 2 * size, 2 * size);
-        if (m.low && Number.isFinite(m.low[i])) { p.moveTo(g.X(m.low[i]), b); p.lineTo(g.X(m.high[i]), b); p.stroke(); p.beginPath(); }
-      }
-      p.globalAlpha = 1;
-    }
-    place.parentElement.querySelector(".key").replaceChildren(...marks.map(m => { const s = document.createElement("span"), i = document.createElement("i"); i.textContent = "■ "; i.style.color = m.hue; s.append(i, m.name); return s; }), ...common.downloads(place, place.getAttribute("aria-label"), () => [["series", spec.x.label, n ? "row" : spec.y.label, "low", "high"],
-      ...marks.flatMap(m => Array.from(m.x, (x, i) => [m.name, x, n ? spec.rows[Math.round(m.y[i])] : m.y ? m.y[i] : null, ...[m.low, m.high].map(list => list ? list[i] : null)]))], () => drawPlot(place)));
-  }
-  for (const place of document.querySelectorAll("canvas[data-plot]")) common.whenResized(place, () => drawPlot(place));
+  common.plots(data.plots, get);
 
   let width = 0;
   new ResizeObserver(() => {

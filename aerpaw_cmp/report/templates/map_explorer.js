@@ -365,12 +365,13 @@
   });
   whenResized(root, () => { drawMap(); drawLegend(); drawProfile(); drawHistogram(); });
 
+  common.plots(data.plots, i => i === undefined ? null : arrays[i]);
   document.documentElement.classList.add("live");
   setQuantity(0);
   state.b = [...state.a];
   everything();
   window.mapExplorer = { state, data, statistics, layer, degrees, profile, column, cellAt, limits, point, line, setQuantity, setDifference, everything, shown: () => shown, labels: () => labels, project: () => project, ready: true };
-})().catch(error => { // an old browser without the means: the static figures stay
+})().catch(error => { // an old browser without the means: the tables stay
   document.documentElement.classList.remove("live");
   console.error(error);
 });

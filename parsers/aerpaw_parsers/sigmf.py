@@ -127,6 +127,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         raise InputError(
             "the SigMF meta file holds neither values nor positions, and its samples cannot be read",
             expected=f"measurement:values, core:rx_location, or {_data_name(options)!r} in the same folder",
+            cause="".join(dict.fromkeys(warnings)),
         )
     count = max(rows.lines for rows, _ in tables)
     read_lines = np.unique(np.concatenate([rows.row for rows, _ in tables])) + 1
@@ -192,7 +193,7 @@ def _powers(
     for capture, start, end in zip(captures, starts, [*starts[1:], len(samples)], strict=True):
         stamp = next((capture[key] for key in _TIMES if key in capture), None)
         if stamp is None:
-            warnings.append("captures without core:datetime are left out")
+            warnings.append("captures without core:datetime: when they were taken is unknown; they are left out")
             continue
         for at in range(start, end - size // 2, size):
             piece = samples[at : min(at + size, end)].astype(np.float64) - middle

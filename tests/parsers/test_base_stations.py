@@ -100,6 +100,9 @@ def test_power_of_sigmf_samples() -> None:
         assert (stream.frame["time"].diff().dropna().dt.total_seconds() == 0.02).all()
     with pytest.raises(InputError, match="samples cannot be read"):
         read("sigmf", json.dumps(meta).encode())
+    meta["captures"] = [{"core:sample_start": 0}]
+    with pytest.raises(InputError, match="when they were taken is unknown"):
+        read("sigmf", json.dumps(meta).encode(), options)
 
 
 def test_a_burst_says_its_frequency_and_needs_its_name() -> None:

@@ -45,13 +45,6 @@ def test_reasons_of_geometry(scenes):
             assert (why_not(faces, source, place, np.array([face])) == "") == (face in reflecting)
 
 
-def test_a_scene_of_triangles_is_no_error(scenes):
-    """Faces without a roof, and finite ones without a building: nothing is said that was not tested."""
-    faces = site_faces(scenes.site((Building("barn", box(20, -10, 30, 10), 15.0),)))
-    walls = faces.select(np.arange(5))  # the roof is left out
-    assert "triangles" in why_not(walls, np.array([0.0, 0, 10]), np.array([60.0, 0, 10]), np.zeros(0, int))
-
-
 def test_terms_and_places_of_paths_by_hand(scenes):
     """A tower with an upright dipole, ground, a wall 10 m west of it and a UAV to the north-east, 100 m off."""
     site = scenes.site((Building("hall", box(-20, -50, -10, 200), 60.0),))

@@ -263,8 +263,6 @@ def why_not(
         if far > tolerance:
             return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
     corners = np.concatenate([source_m[None], points[0], target_m[None]])
-    if not _prisms_only(faces):
-        return "hidden, or not found: scenes of triangles are not tested here"
     for solid in np.unique(faces.solid[faces.solid >= 0]):
         members = np.flatnonzero(faces.solid == solid)
         if Occlusion(faces.select(members), tolerance).segments(corners[:-1], corners[1:]).any():
@@ -291,13 +289,6 @@ def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArra
         points = vertices[0]
     face = obstacle(surfaces, np.concatenate([source_m[None], points, target_m[None]]), sequence)
     return "" if face is None else f"occluded by {surfaces.faces.label[face]}"
-
-
-def _prisms_only(faces: Faces) -> bool:
-    """Check whether what hides is a set of prisms, each with a roof, and faces without a building are whole planes."""
-    roofed = np.unique(faces.solid[(faces.normal[:, 2] == 1.0) & (faces.solid >= 0)])
-    bare = faces.solid < 0
-    return bool(np.isin(faces.solid[~bare], roofed).all() and np.isinf(faces.lower[bare]).all())
 
 
 def _metres(length: float) -> str:

@@ -11,14 +11,14 @@ import time
 from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from ... import __version__
 from ...common.content import content_digest
 from ...common.files import cache_folder, read_sealed, write_sealed
-from ...common.units import AnyArray, FloatArray, spread_out
+from ...common.jsonable import named
+from ...common.units import FloatArray, spread_out
 from ...common.versions import version
 from ..geometry.arrays import Link, Poses
 from ..geometry.paths import PathSet
@@ -116,8 +116,8 @@ def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Ru
     """
     depth = search.max_depth
     links = scene.links_to(poses)
-    extent = None if run.job is None else run.job.extent_m
-    if by_beams(scene, search, _links(scene, run)):
+    extent, count = (None, scene.excluded.size) if run.job is None else (run.job.extent_m, run.job.links)
+    if by_beams(scene, search, count):
         from ..search import beams as search_beams
         from ..search import prisms  # compiled: loaded where there are many faces
 
@@ -150,11 +150,6 @@ def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
     if state.kernels is None and switch() != "never":
         warn_once(state.reason)
     return state.kernels is not None
-
-
-def _links(scene: Scene, run: Run) -> int:
-    """Links of the whole job."""
-    return scene.excluded.size if run.job is None else run.job.links
 
 
 # ------------------------------------------------------------------------------------------------------- the cache
@@ -222,12 +217,6 @@ class PathCache:
 
     def load(self, key: str) -> tuple[PathSet, float] | None:
         """Paths and the seconds that their search took; None where there is no whole entry (see ``warnings``)."""
-        columns = self._columns(key)
-        if columns is None:
-            return None
-        return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
-
-    def _columns(self, key: str) -> dict[str, AnyArray] | None:
         place = self.folder / f"{key}.npz"
         try:
             entry = read_sealed(place, _SEAL)
@@ -239,13 +228,10 @@ class PathCache:
         if entry is None:
             return None
         with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
-            return {name: columns[name] for name in columns.files}
+            return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
 
     def save(self, key: str, paths: PathSet, seconds: float) -> None:
         """Write an entry; another process sees either nothing or all of it."""
-        self._write(key, {"seconds": np.float64(seconds), **{column: getattr(paths, column) for column in _COLUMNS}})
-
-    def _write(self, key: str, columns: dict[str, Any]) -> None:
         entry = io.BytesIO()
-        np.savez(entry, **columns)
+        np.savez(entry, seconds=np.float64(seconds), **named(paths, " ".join(_COLUMNS)))
         write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import warnings
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import sha256
@@ -23,7 +24,6 @@ from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from threading import Lock, Thread
 from types import ModuleType
 from typing import Any
 
@@ -208,37 +208,19 @@ def thread_count(threads: int | None) -> int:
 def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int | None) -> list[Any]:
     """``call`` of each part, results in order; kernels release the interpreter's lock.
 
-    The thread that asks works as well and takes the next part as the others do: a search of a thousand poses lasts some
-    milliseconds, and a pool is one to start and to wait for. No thread stays: what is forked later has none.
+    No thread stays: what is forked later has none.
     """
     parts = list(parts)
     count = min(thread_count(threads), len(parts))
     if count < 2:
         return [call(part) for part in parts]
-    results: list[Any] = [None] * len(parts)
-    faults: list[BaseException] = []
-    numbers, one_at_a_time = iter(range(len(parts))), Lock()
-
-    def work() -> None:
-        while not faults:
-            with one_at_a_time:
-                number = next(numbers, None)
-            if number is None:
-                return
-            try:
-                results[number] = call(parts[number])
-            except BaseException as error:  # of whatever thread: raised below
-                faults.append(error)
-
-    helpers = [Thread(target=work, daemon=True) for _ in range(count - 1)]
-    for helper in helpers:
-        helper.start()
-    work()
-    for helper in helpers:
-        helper.join()
-    if faults:
-        raise faults[0]
-    return results
+    with ThreadPoolExecutor(count) as pool:
+        waiting = [pool.submit(call, part) for part in parts]
+        try:
+            return [each.result() for each in waiting]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
 
 
 def column(values: AnyArray, kind: Any = np.float64) -> AnyArray:

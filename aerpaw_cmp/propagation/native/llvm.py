@@ -340,14 +340,6 @@ def _trials() -> tuple[Trial, ...]:
     return tuple(first_that_works(candidates(), _remembered_trial))
 
 
-def _llvm_library() -> Path | None:
-    """The newest LLVM that passed its trial on this machine, or None."""
-    trials = _trials()
-    if trials and trials[-1].ok and trials[-1].library:
-        return trials[-1].library.path
-    return None
-
-
 class SionnaMissingError(CheckError):
     """Sionna RT cannot be loaded on this machine: nothing but the audit and ``rt.engine: sionna`` needs it."""
 
@@ -365,12 +357,12 @@ def prepare_llvm() -> Path:
     SionnaMissingError
         If no usable LLVM is found; the message holds the line that installs one.
     """
-    path = _llvm_library()
-    if path is None:
-        line = INSTALL_AGAIN if sionna_fails(_trials()) else install_line()
-        raise SionnaMissingError(f"{explain(_trials())}. Mend it with: {line}")
-    os.environ[LIBRARY_VARIABLE] = str(path)
-    return path
+    trials = _trials()
+    if not trials or not trials[-1].ok or trials[-1].library is None:
+        line = INSTALL_AGAIN if sionna_fails(trials) else install_line()
+        raise SionnaMissingError(f"{explain(trials)}. Mend it with: {line}")
+    os.environ[LIBRARY_VARIABLE] = str(trials[-1].library.path)
+    return trials[-1].library.path
 
 
 def let_sionna_load() -> None:

@@ -81,7 +81,7 @@ def dataset(variables: Mapping[str, Any], attributes: Mapping[str, Any]) -> Any:
     UsageError
         If xarray is not installed.
     """
-    return _library("xarray").Dataset(dict(variables), attrs=dict(attributes))
+    return library("xarray").Dataset(dict(variables), attrs=dict(attributes))
 
 
 def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
@@ -96,7 +96,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
     UsageError
         If netCDF4 is not installed.
     """
-    book = _library("netCDF4").Dataset("data", "w", memory=1 << 20)
+    book = library("netCDF4").Dataset("data", "w", memory=1 << 20)
     data = data.copy()
     for name, variable in data.variables.items():
         if variable.dtype.kind in "OU":
@@ -108,7 +108,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
         variable.encoding = {"_FillValue": math.nan if missing else None, **deflated, **variable.encoding}
         if {*variable.dims} & {*grows}:
             variable.encoding["chunksizes"] = _chunk(variable, grows)
-    data.dump_to_store(_library("xarray.backends").NetCDF4DataStore(book), unlimited_dims=grows)
+    data.dump_to_store(library("xarray.backends").NetCDF4DataStore(book), unlimited_dims=grows)
     return book.close()
 
 
@@ -163,7 +163,7 @@ class GrowingNetcdf:
     def _append(self, data: Any) -> None:
         if self._book is None:
             self._sink.write(netcdf_bytes(data, self._grows))
-            self._book = _library("h5py").File(self._sink, "r+")
+            self._book = library("h5py").File(self._sink, "r+")
             for variable in self._book.values():
                 if "_FillValue" in variable.attrs and variable.attrs["_FillValue"][0] == 0:
                     del variable.attrs["_FillValue"]
@@ -197,11 +197,18 @@ def _stored(name: str, variable: Any) -> tuple[tuple[str, ...], AnyArray]:
     return (*variable.dims, f"{name}_length"), text.view("S1").reshape(*values.shape, -1)
 
 
-def _library(name: str) -> Any:
+def library(name: str) -> Any:
+    """A module of the extra ``geo``.
+
+    Raises
+    ------
+    UsageError
+        If it is not installed.
+    """
     try:
         return importlib.import_module(name)
     except ImportError as missing:
         raise UsageError(
-            f"NetCDF needs {missing.name}, which is not installed",
+            f"{missing.name} is not installed, which xarray's data sets and NetCDF need",
             expected="pip install 'aerpaw-cmp[geo]', or another format",
         ) from None

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ..common.cf import library
 from ..common.counting import counted
 from ..common.errors import UsageError, from_python
 from ..common.htmltable import html_table
@@ -27,7 +28,6 @@ from ..flight.settings import FlightFile
 from ..logs.flight_file import is_flight_file
 from ..logs.ingest import ingest
 from ..propagation.geometry.paths import PathSet
-from ..propagation.replay import require_xarray
 from ..site.site import Site
 from .options import RunOptions
 from .reporting.compare_flight import compare_flight
@@ -408,7 +408,7 @@ class Comparison:
         UsageError
             If xarray is not installed.
         """
-        xarray = require_xarray()
+        xarray = library("xarray")
         nodes = {}
         for item in self.result.rss:
             level = {"measured_db": item.measured_db, "calibrated_db": item.measured_db + item.score.offset_db}
@@ -453,7 +453,7 @@ def _node(series: Series) -> str:
 
 
 def _tree(nodes: Mapping[str, Any]) -> Any:
-    return require_xarray().DataTree.from_dict(nodes)
+    return library("xarray").DataTree.from_dict(nodes)
 
 
 def _new_axes() -> Any:

@@ -10,6 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ..common.cf import dataset
 from ..common.counting import counted
 from ..common.errors import UsageError
 from ..common.units import BoolArray, ComplexArray, FloatArray, db_from_power, wavelength_m
@@ -19,7 +20,7 @@ from .field.sum import Fields, Further, channel_matrices, mean_pair_power, rss_d
 from .geometry.arrays import Link, Poses
 from .geometry.paths import Faces, PathSet, Surfaces, legs
 from .options import Field, Run, Search
-from .path_table import KINDS, Ends, PathTable, frequency_responses, impulse_responses, path_table
+from .path_table import Ends, PathTable, frequency_responses, impulse_responses, path_table
 from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.terrain import on_terrain
@@ -129,7 +130,7 @@ class Replay:
             {
                 "pose": table.pose,
                 "tower": np.array(self.towers)[table.tower],
-                "kind": np.array(KINDS)[table.kind],
+                "kind": np.array(table.kinds)[table.kind],
                 "faces": np.array([*table.names, ""])[table.via],
                 "delay_s": table.delay_s,
                 "power_db": db_from_power(power),
@@ -160,32 +161,20 @@ class Replay:
         UsageError
             If xarray is not installed.
         """
-        xarray = require_xarray()
         level = {"units": "dBm", "long_name": "received power, coherent sum of the paths"}
         power = {"units": "dBm", "long_name": "received power, sum of the paths' powers"}
         ports = ("pose", "tower", "n_rx", "n_tx")
-        return xarray.Dataset(
+        return dataset(
             {
                 "rss_dbm": (("pose", "tower"), self.rss_dbm, level),
                 "rss_power_dbm": (("pose", "tower"), self.rss_power_dbm, power),
                 "has_path": (("pose", "tower"), self.has_path),
                 "h_real": (ports, self.h.real, {"units": "1"}),
                 "h_imag": (ports, self.h.imag, {"units": "1"}),
+                "tower": ("tower", list(self.towers)),
             },
-            coords={"tower": list(self.towers)},
-            attrs={"engine": self.engine, "seconds": self.seconds},
+            {"engine": self.engine, "seconds": self.seconds},
         )
-
-
-def require_xarray() -> Any:
-    """The module ``xarray``, or a :class:`UsageError` that says how to install it."""
-    try:
-        import xarray
-    except ImportError:
-        raise UsageError(
-            "xarray is not installed", expected="pip install 'aerpaw-cmp[geo]'", cause="to_xarray() needs it"
-        ) from None
-    return xarray
 
 
 def replay(

@@ -17,7 +17,6 @@ from aerpaw_cmp.propagation.check.field_audit import (
     _lacking,
     _level_error,
     _link_error,
-    _OwnPaths,
     _paths_against_sionna,
     _probe,
     against_sionna,
@@ -137,7 +136,7 @@ def test_coefficients_of_paths_are_compared_as_shares_of_the_strongest(planted: 
         turn = size / np.hypot(*(spots[1] - points[k, 0])[:2])
         c, s = np.cos(turn), np.sin(turn)
         gain[k] = np.array([[c, s], [-s, c]]) @ own[k]
-    theirs = _OwnPaths(gain, length, points)
+    theirs = Coefficients(dataclasses.replace(paths, vertices_m=points), gain, length)
     audit = _paths_against_sionna(paths, replayed, scene, few, probe, theirs, np.array([7, 5, 3, 1]))
     assert (audit.paths, audit.phases) == (len(paths), int((length < 300.0).sum()))
     assert 0 < audit.phases < audit.paths

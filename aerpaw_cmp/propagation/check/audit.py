@@ -156,7 +156,6 @@ def audit(
             fields = against_reference(
                 site, poses, replay, few_kinds, expected, ks=ks, max_depth=search.max_depth, complete=complete
             )
-        if site.scene is None:
             fields += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
         rayed = replace(search, samples=min(rays, _FIELD_SAMPLES))
         fields += against_sionna(

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -59,8 +59,8 @@ _SIONNA_MARGIN_M = 2e-3
 # Links per replay for the second implementation.
 REFERENCE_LINKS = 8
 
-# Patterns of this package that Sionna has too.
-_SIONNA_PATTERNS = {"iso": "iso", "hw_dipole": "hw_dipole", "tr38901": "tr38901"}
+# Patterns of this package that Sionna has too, under the same names.
+_SIONNA_PATTERNS = ("iso", "hw_dipole", "tr38901")
 
 
 @dataclass(frozen=True, slots=True)
@@ -223,14 +223,7 @@ class _OneLink:
 
     def sequence(self, path: int) -> tuple[Mirror, ...] | None:
         """The mirrors of a path of the replay, looked up in the site; None where the site has no such face."""
-        faces, vertices = self.replay.paths.faces[path], self.replay.paths.vertices_m[path]
-        mirrors = []
-        for face, vertex in zip(faces[faces >= 0].tolist(), vertices, strict=False):
-            mirror = _mirror_of(self.reference, self.replay.faces, face, vertex)
-            if mirror is None:
-                return None
-            mirrors.append(mirror)
-        return tuple(mirrors)
+        return _mirrors_of(self.reference, self.replay.faces, self.replay.paths, path)
 
     def paths_checked(self, max_depth: int, complete: bool) -> FieldAudit:
         """Paths that cannot exist, and paths that are not there."""
@@ -345,6 +338,14 @@ def _mirror_of(reference: Reference, faces: Faces, face: int, vertex: FloatArray
     return max(same, key=lambda m: m.margin(point)) if same else None
 
 
+def _mirrors_of(reference: Reference, faces: Faces, paths: PathSet, row: int) -> tuple[Mirror, ...] | None:
+    """The mirrors of a path, looked up in the site; None where the site has no such face."""
+    met = zip(paths.faces[row].tolist(), paths.vertices_m[row], strict=True)
+    mirrors = [_mirror_of(reference, faces, face, vertex) for face, vertex in met if face >= 0]
+    known = tuple(mirror for mirror in mirrors if mirror is not None)
+    return known if len(known) == len(mirrors) else None
+
+
 def _key(sequence: Sequence[Mirror]) -> tuple[tuple[float, ...], ...]:
     """Planes of a sequence: coplanar faces are one mirror."""
     return tuple(tuple(round(x, 6) + 0.0 for x in (*m.normal, m.offset_m)) for m in sequence)
@@ -423,7 +424,9 @@ def against_sionna(
     rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~_over_terrain(replay))
     ours = replace(replay.paths.select(rows), pose=place[replay.paths.pose[rows]])
     mine, matches = _matched(ours, replay.faces, theirs.paths, scene.faces)
-    own = _OwnPaths(theirs.gain[matches], theirs.length_m[matches], theirs.paths.vertices_m[matches])
+    own = replace(
+        theirs, paths=theirs.paths.select(matches), gain=theirs.gain[matches], length_m=theirs.length_m[matches]
+    )
     total = _paths_against_sionna(ours.select(mine), replay, scene, few, probe, own, chosen)
     if complete and site.dem is None and site.scene is None:
         lacking = np.setdiff1d(np.arange(len(theirs.paths)), matches)
@@ -482,16 +485,8 @@ def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Face
     return rows[:, 0], rows[:, 1]
 
 
-class _OwnPaths(NamedTuple):
-    """Coefficients (paths, 2, 2), lengths (paths,) [m] and reflection points (paths, depth, 3) of Sionna."""
-
-    gain: ComplexArray
-    length_m: FloatArray
-    vertices_m: FloatArray
-
-
 def _paths_against_sionna(
-    ours: PathSet, replay: Replay, scene: Scene, few: Poses, probe: Link, theirs: _OwnPaths, chosen: IntArray
+    ours: PathSet, replay: Replay, scene: Scene, few: Poses, probe: Link, theirs: Coefficients, chosen: IntArray
 ) -> FieldAudit:
     """Paths, row by row those of Sionna ``theirs``; ``chosen`` (poses,) numbers the poses in the replay."""
     count = len(ours)
@@ -538,7 +533,7 @@ def _paths_against_sionna(
 
 
 def _turned_by_float32(
-    ours: PathSet, faces: Faces, scene: Scene, spots: Poses, probe: Link, theirs: _OwnPaths
+    ours: PathSet, faces: Faces, scene: Scene, spots: Poses, probe: Link, theirs: Coefficients
 ) -> FloatArray:
     """Angles (paths,) [rad] by which the rounding of Sionna's reflection points turns polarisations.
 
@@ -548,9 +543,9 @@ def _turned_by_float32(
     mounts = np.stack([array.mount for array in probe.tower_arrays.values()])
     ends = scene.sources_m[ours.tower], spots.position_m
     reach = 4.0 * max(float(np.abs(np.concatenate(ends)).max()), 100.0)  # that of the ground's triangles
-    shift = np.nan_to_num(np.abs(theirs.vertices_m - ours.vertices_m)).max(axis=(1, 2), initial=0.0)
+    shift = np.nan_to_num(np.abs(theirs.paths.vertices_m - ours.vertices_m)).max(axis=(1, 2), initial=0.0)
     axes = [mounts[ours.tower][:, :, 2], (spots.rotation @ probe.uav_array.mount)[:, :, 2]]
-    both = (list(legs(ends[0], vertices, ends[1])) for vertices in (ours.vertices_m, theirs.vertices_m))
+    both = (list(legs(ends[0], vertices, ends[1])) for vertices in (ours.vertices_m, theirs.paths.vertices_m))
     total = np.zeros(len(ours))
     for step, ((start, end), (moved_start, moved_end)) in enumerate(zip(*both, strict=True)):
         normals = [faces.normal[ours.faces[:, k]] for k in (step - 1, step) if 0 <= k < ours.faces.shape[1]]
@@ -585,15 +580,9 @@ def _lacking(
     references = [Reference(site, name, expected.link, expected.loss) for name in replay.towers]
     for row in rows:
         reference = references[int(theirs.tower[row])]
-        sequence = []
-        for face, vertex in zip(theirs.faces[row].tolist(), theirs.vertices_m[row], strict=True):
-            if face >= 0:
-                sequence.append(_mirror_of(reference, faces, face, vertex))
-        if None in sequence:
-            doubtful += 1
-            continue
+        sequence = _mirrors_of(reference, faces, theirs, row)
         east, north, up = few.position_m[theirs.pose[row]].tolist()
-        exists = reference.verdict(sequence, (east, north, up), _SIONNA_MARGIN_M)  # type: ignore[arg-type]
+        exists = None if sequence is None else reference.verdict(sequence, (east, north, up), _SIONNA_MARGIN_M)
         missing += exists is True
         doubtful += exists is not True
     failures = (f"{counted(missing, 'path of Sionna is', 'paths of Sionna are')} missing",) if missing else ()

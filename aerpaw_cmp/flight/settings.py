@@ -34,6 +34,7 @@ from ..propagation.geometry.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
+from ..propagation.options import Diffraction
 from ..site.antenna.antennas import Isotropic
 from ..site.antenna.sphere_pattern import read_sphere_csv
 
@@ -336,7 +337,7 @@ class RtSettings(StrictModel):
 
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
-    diffraction: Literal["none", "edges"] = "none"
+    diffraction: Diffraction = "none"
     """Paths over one edge of a building, in H, levels and ranks."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""

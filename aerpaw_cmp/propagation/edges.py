@@ -67,6 +67,7 @@ class EdgePaths(Further):
     """
 
     kind: ClassVar[str] = "over an edge"
+    name: ClassVar[str] = "edge"
     missing: ClassVar[str] = (
         "diffraction over two edges, at the tips of edges, after a reflection off a wall, and with more than one "
         "reflection on a side"

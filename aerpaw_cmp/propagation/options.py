@@ -13,6 +13,8 @@ from ..common.units import BoolArray, FloatArray
 from .geometry.paths import PathSet
 
 Engine = Literal["image", "sionna"]
+# Values of ``rt.diffraction``; their searches stand in :data:`aerpaw_cmp.propagation.edges.DIFFRACTION`.
+Diffraction = Literal["none", "edges"]
 Samples = int | Literal["auto"]
 # ``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target.
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]

@@ -22,8 +22,8 @@ from .geometry.arrays import Link, Poses
 from .geometry.paths import Faces, PathSet, legs, sources_of
 from .options import Field
 
-# Codes of ``kind``.
-KINDS = ("line_of_sight", "reflection", "edge")
+# Codes of ``kind``; what else bends a path follows by its name.
+_KINDS = ("line_of_sight", "reflection", "edge")
 
 # Gains are those of the carrier: materials, patterns and foliage are not evaluated at other frequencies.
 WIDEST_BAND = 0.1
@@ -68,7 +68,7 @@ class PathTable:
     pose, tower, number : (paths,) int
         ``number`` counts the paths of a link.
     kind : (paths,) int
-        Of :data:`KINDS`.
+        Of ``kinds``.
     via : (paths,) int
         Which of ``names``: the faces from tower to UAV.
     gain : (paths, n_rx, n_tx) complex
@@ -81,7 +81,7 @@ class PathTable:
         A digit a corner from tower to UAV, 1 a reflection, 2 an edge; 0 is the line of sight.
     vertices_m : (paths, most, 3)
         Corners; NaN where unused.
-    names : tuple of str
+    names, kinds : tuple of str
     """
 
     pose: IntArray
@@ -96,6 +96,7 @@ class PathTable:
     turns: IntArray
     vertices_m: FloatArray
     names: tuple[str, ...]
+    kinds: tuple[str, ...]
 
     @property
     def most(self) -> int:
@@ -169,9 +170,10 @@ def path_table(
     PathTable
     """
     pieces, labels = [], (*faces.label, "")
+    kinds = list(dict.fromkeys([*_KINDS, *(item.name for item in contributions[1:])]))
     most = max(item.lines().vertices_m.shape[1] for item in contributions)
     for item in contributions:
-        lines = item.lines()
+        lines, code = item.lines(), 0 if isinstance(item, PathSet) else kinds.index(item.name)
         loss_db = ends.field.loss_db(lines, ends.sources_m, ends.poses.position_m)
         good = counts[lines.pose, lines.tower]
         good &= True if loss_db is None else np.isfinite(loss_db)
@@ -186,7 +188,7 @@ def path_table(
             {
                 "pose": item.pose,
                 "tower": item.tower,
-                "kind": np.minimum(lines.depth, 1 if isinstance(item, PathSet) else 2),
+                "kind": np.full(len(lines), code) if code else np.minimum(lines.depth, 1),
                 "via": codes[via.ravel()],
                 "gain": _gains(item, faces, ends, loss_db),
                 "length_m": sum(np.linalg.norm(end - start, axis=1) for start, end in away),
@@ -203,7 +205,7 @@ def path_table(
     columns = {name: value[order] for name, value in columns.items()}
     link = columns["pose"] * counts.shape[1] + columns["tower"]
     number = np.arange(len(link)) - np.searchsorted(link, link)
-    return PathTable(**columns, number=number, names=tuple(names))
+    return PathTable(**columns, number=number, names=tuple(names), kinds=tuple(kinds))
 
 
 def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> ComplexArray:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -14,7 +13,7 @@ from ..site.site import Site
 from ..site.siteyaml import load_site
 from .edges import diffracted
 from .geometry.arrays import Link, Poses
-from .options import Engine, Field, Loss, Samples, Search
+from .options import Diffraction, Engine, Field, Loss, Samples, Search
 from .replay import Replay, replay
 
 
@@ -27,7 +26,7 @@ def trace(
     *,
     loss: Loss | None = None,
     samples: Samples = "auto",
-    diffraction: Literal["none", "edges"] = "none",
+    diffraction: Diffraction = "none",
 ) -> Replay:
     """Paths, channel matrices and received power of poses at a site.
 

@@ -15,7 +15,7 @@ from aerpaw_cmp.propagation.drivers.parts import replay_in_parts
 from aerpaw_cmp.propagation.edges import over_edges
 from aerpaw_cmp.propagation.field.sum import Fields, Further
 from aerpaw_cmp.propagation.geometry.arrays import Link, Poses
-from aerpaw_cmp.propagation.geometry.paths import Faces, PathSet
+from aerpaw_cmp.propagation.geometry.paths import Faces, PathSet, sources_of
 from aerpaw_cmp.propagation.options import Field, Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
@@ -28,6 +28,7 @@ class Scattered(Further):
     """Paths by way of one mast, which scatters a thousandth of the amplitude into all directions."""
 
     kind: ClassVar[str] = "by a mast"
+    name: ClassVar[str] = "mast"
     missing: ClassVar[str] = "masts but one"
 
     pose: IntArray
@@ -47,11 +48,11 @@ class Scattered(Further):
     def fields(
         self, _faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
     ) -> Fields:
-        length = np.linalg.norm(sources_m[self.tower] - MAST_M, axis=1)
+        length = np.linalg.norm(sources_of(self, sources_m) - MAST_M, axis=1)
         length += np.linalg.norm(poses.position_m[self.pose] - MAST_M, axis=1)
         gain = 1e-3 * np.exp(-2j * np.pi * length / wavelength_m(link.carrier_hz)) / length
         gain = gain if loss_db is None else gain * 10 ** (-loss_db / 20)
-        h, power = np.zeros((len(poses), len(sources_m), 1, 1), complex), np.zeros((len(poses), len(sources_m)))
+        h, power = np.zeros((len(poses), len(link.tower_arrays), 1, 1), complex), np.zeros((len(poses), 1))
         np.add.at(h[..., 0, 0], (self.pose, self.tower), gain)
         np.add.at(power, (self.pose, self.tower), np.abs(gain) ** 2)
         return Fields(h, np.abs(gain) ** 2, power)
@@ -76,6 +77,9 @@ def test_it_is_in_h_in_both_levels_and_in_the_notes(case):
     assert more.h == pytest.approx(plain.h + added.h, abs=1e-15)
     assert (more.rss_power_dbm > np.nan_to_num(plain.rss_power_dbm, nan=-300.0)).all()
     assert "masts but one" in more.left_out
+    frame = more.paths_frame()
+    assert (frame.kind == "mast").sum() == len(masts)
+    assert frame[frame.kind == "mast"].faces.eq("").all()
 
 
 def test_it_loses_what_other_paths_lose(case):

@@ -61,6 +61,9 @@ def test_h_is_the_sum_of_the_gains(scenes, case, uav_transmits):
     result = replay(site, link, poses, Search(further=(over_edges,)), Field(lossy))
     table = result.path_table()
     assert set(np.unique(table.kind)) == {0, 1, 2}
+    assert (
+        (table.kind == 2) == (table.turns % 10 == 2) | (table.turns // 10 % 10 == 2)
+    ).all()  # an edge, whatever else
     assert not result.has_path.all()
     assert summed(table, result.h) == pytest.approx(result.h, rel=0, abs=1e-9 * np.abs(result.h).max())
     a, tau = result.cir()

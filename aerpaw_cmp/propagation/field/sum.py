@@ -58,11 +58,12 @@ class Fields:
 class Further(Rows):
     """Paths of a kind beside reflections, a row each: all that replays, their parts, drawings and words ask of them.
 
-    ``kind`` stands after "path" in words; ``missing`` is what of the kind is not modelled.
+    ``kind`` stands after "path" in words, ``name`` in tables; ``missing`` is what of the kind is not modelled.
     """
 
     __slots__ = ()
     kind: ClassVar[str]
+    name: ClassVar[str]
     missing: ClassVar[str]
 
     def lines(self) -> PathSet:
@@ -92,12 +93,12 @@ class Further(Rows):
     @property
     def touched(self) -> IntArray:
         """Faces (paths, n) that each path touches, from tower to UAV; -1 is none."""
-        raise NotImplementedError
+        return np.full((len(self.pose), 1), -1)
 
     @property
     def turns(self) -> IntArray:
-        """A digit for each corner (paths,), from tower to UAV: 1 a reflection, 2 an edge."""
-        raise NotImplementedError
+        """A digit for each corner (paths,), from tower to UAV: 1 a reflection, 2 an edge or what else bends a path."""
+        return 2 * self.lines().turns
 
 
 def fields_of(

@@ -4,6 +4,9 @@ A building is a prism: its footprint, cut into convex pieces, from its foot to i
 it runs inside a piece, deeper than a tolerance that only takes up rounding; so a touch of a wall, an edge, a corner or
 a roof cuts nothing, wherever it lies and whether or not the segment ends there. The inside of two buildings that touch
 is one: a segment that runs in the seam between them, outside both, is cut too.
+
+Triangles have a law of their own (:func:`.beams.segment_cut`): an open sheet has no inside, and a sheet's law decides
+198 of 3 984 segments of a grid about two boxes that touch otherwise, where they run along walls or in the seam.
 """
 
 from __future__ import annotations
@@ -91,10 +94,10 @@ class Occlusion:
         seams: list[tuple[IntArray, FloatArray, FloatArray, int, int]] = []
         for column, solid in enumerate(solids.tolist()):
             rows = np.flatnonzero(near[:, column] & ~result)
-            for number, planes in enumerate(self.pieces[solid]):
+            for number, (normal, offset) in enumerate(self.pieces[solid]):
                 if not len(rows):
                     break
-                before, after = _heights(planes, start[rows], end[rows])
+                before, after = start[rows] @ normal.T - offset, end[rows] @ normal.T - offset
                 enter, leave = _within(before, after, -self.tolerance_m)
                 hit = enter < leave
                 result[rows[hit]] = True
@@ -175,14 +178,6 @@ class Occlusion:
             if covered.all():
                 return True
         return False
-
-
-def _heights(
-    planes: tuple[FloatArray, FloatArray], start: FloatArray, end: FloatArray
-) -> tuple[FloatArray, FloatArray]:
-    """Heights (segments, planes) of the ends over the planes of a piece."""
-    normal, offset = planes
-    return start @ normal.T - offset, end @ normal.T - offset
 
 
 def _within(before: FloatArray, after: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:

@@ -22,7 +22,7 @@ from ...common.units import AnyArray, FloatArray
 from ...common.versions import tool_version, utc_now
 from ...propagation.drivers.parts import added_up
 from ...propagation.geometry.arrays import Poses
-from ...propagation.path_table import KINDS, PathTable, frequency_responses, impulse_responses
+from ...propagation.path_table import PathTable, frequency_responses, impulse_responses
 from ...propagation.replay import Replay
 
 _LINK, _PORTS = ("pose", "tower"), ("rx", "tx")
@@ -145,7 +145,8 @@ def channel_dataset(channel: Channel) -> Any:
         if values is not None:
             variables |= _variables(name, values, dimensions, *about)
     data = dataset(variables, _file(channel))
-    data.kind.attrs |= {"flag_values": np.arange(len(KINDS), dtype=np.int8), "flag_meanings": " ".join(KINDS)}
+    kinds = channel.table.kinds
+    data.kind.attrs |= {"flag_values": np.arange(len(kinds), dtype=np.int8), "flag_meanings": " ".join(kinds)}
     if channel.along.start is not None:
         start = str(channel.along.start).replace("T", " ")
         data.time.attrs |= {"long_name": f"since {start} UTC", "units": f"seconds since {start[:19]} UTC"}

@@ -18,7 +18,7 @@ from aerpaw_cmp.logs.text import lines as _lines
 
 _STAMP = rb"(?:\[?\d{4}-\d\d-\d\d[ T][0-9:.]{8,18}\]?[ ,]{1,2})"
 _UHD = re.compile(rb"\[(?:INFO|WARNING|ERROR)\] \[(?:UHD|B200|X300|MULTI_USRP|GPS|USRP|OV|CONFIG|AD936X|CORES)\]")
-_LEVELS = rb"(?i)g-?net ?track|\b(?:rsrp|rxlev|rscp|level)\b\W{0,20}-?\d{2,3}\b"
+_LEVELS = rb"(?i)g-?net ?track|\b(?:rsrp|rssi|rxlev|rscp|level)\b(?:\W|</?\w{1,20}>){0,20}-\d{2,3}\b"
 _TIMED = rb"(?i)\btime|<when>|\b\d\d:\d\d:\d\d\b"
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
 
@@ -119,6 +119,8 @@ _KINDS: tuple[tuple[str, str, tuple[_Test, ...]], ...] = (
     ("site_yaml", "a site: name it under 'site:' in flight.yaml", (rb"(?m)^origin:[^\0]*^towers:",)),
     ("own_export", "samples of a report of aerpaw-cmp: give the logs that it was made of (or '--map' its columns)",
      (rb"\A(?:\xef\xbb\xbf)?time_utc,time_s,tower,",)),
+    ("geojson_levels", "GeoJSON of levels: save its points as CSV",
+     (rb'"FeatureCollection"', rb'(?i)"(?:rsrp|rssi|rscp|rss_\w{1,8}|sinr|pci)"\s*:')),
     ("map", "a map: 'aerpaw-cmp site import' reads it",
      (rb'\A\s*(?:(?:<\?xml[^>]*>\s*)?<osm\b|\{[^\[]*"type"\s*:\s*"FeatureCollection"|\{[^\[]*"osm3s")',)),
 )  # fmt: skip

@@ -171,6 +171,11 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "NMEA of another sentence": (table("", "$GNGNS,14000{i}.00,3543.68,N,07841.76,W,AA,10,0.9,110.1,-33,,*5C"), InputError, "NMEA"),
     "GnssLogger": (
         "# Header\n# Fix,Provider,LatitudeDegrees,LongitudeDegrees\n" + "Fix,GPS,35.728,-78.696\n" * 4, InputError, "GnssLogger"),
+    "KML points with levels": (
+        "<kml><Placemark><TimeStamp><when>2025-06-10T14:00:00Z</when></TimeStamp><ExtendedData><Data name='RSRP'>"
+        "<value>-90</value></Data></ExtendedData></Placemark></kml>", InputError, "KML with levels"),
+    "GeoJSON of levels": (
+        '{"type":"FeatureCollection","features":[{"type":"Feature","properties":{"rsrp":-90}}]}', InputError, "of levels"),
     "JSON of a phone": (
         table("", '{{"time": 174956400{i}, "pci": 11, "rsrp": -9{i}, "lat": 35.728}}')[1:], InputError, "JSON records"),
     "a web page": ("<!DOCTYPE html><html><body>Log in</body></html>\n", InputError, "a web page"),

@@ -11,7 +11,6 @@ import re
 import zipfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 from xml.sax.saxutils import escape
 
@@ -20,6 +19,9 @@ import numpy as np
 from .errors import InputError, one_line
 from .units import FloatArray
 from .xmlfiles import named, plain
+
+# Of a legend.
+_DPI = 110
 
 # --- reading -------------------------------------------------------------------------------------------------------
 
@@ -191,42 +193,49 @@ def write_archive(path: Path, title: str, description: str, body: str, pictures:
 
 def list_legend(title: str, colours: Mapping[str, str], width: float = 2.6) -> bytes:
     """A list of colours by label as PNG, ``width`` inches wide."""
-    from matplotlib.patches import Patch
-
-    figure = _figure(title, width, 0.38 + 0.155 * len(colours))
-    patches = [Patch(color=c, label=n) for n, c in colours.items()]
-    figure.legend(handles=patches, loc="lower left", fontsize=8, frameon=False, borderaxespad=0.3, labelspacing=0.3)
-    return _png(figure)
+    sheet = _Sheet(title, width, 0.38 + 0.155 * len(colours))
+    for number, (label, colour) in enumerate(colours.items()):
+        top = round((0.28 + 0.155 * number) * _DPI)
+        sheet.pen.rectangle((6, top + 3, 28, top + 12), fill=colour)
+        sheet.write(38, top, label)
+    return sheet.png()
 
 
 def bar_legend(title: str, label: str, limits: tuple[float, float]) -> bytes:
-    """A colour bar as PNG."""
-    from matplotlib.cm import ScalarMappable
-    from matplotlib.colors import Normalize
+    """A colour bar as PNG; both ends hold what lies beyond."""
+    from matplotlib import colormaps
 
-    figure = _figure(title, 4.2, 0.9)
-    axes = figure.add_axes((0.08, 0.42, 0.84, 0.22))
-    bar = figure.colorbar(
-        ScalarMappable(Normalize(*limits), "viridis"), cax=axes, orientation="horizontal", extend="both"
-    )
-    bar.set_label(label, fontsize=8, labelpad=1)
-    bar.ax.tick_params(labelsize=8, pad=1)
-    return _png(figure)
-
-
-def _figure(title: str, width: float, height: float) -> Any:
-    """An empty legend, drawn without touching pyplot's state."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), dpi=110)
-    FigureCanvasAgg(figure)
-    figure.patch.set_alpha(0.9)
-    figure.suptitle(title, fontsize=9, y=0.98, va="top")
-    return figure
+    sheet, (low, high) = _Sheet(title, 4.2, 0.9), limits
+    left, wide = 30, sheet.picture.width - 60
+    for column, colour in enumerate(colormaps["viridis"](np.linspace(0.0, 1.0, wide), bytes=True)):
+        sheet.pen.line((left + column, 26, left + column, 46), fill=tuple(colour))
+    digits = max(0, int(np.ceil(1.0 - np.log10(high - low))))
+    for share in (0.0, 0.25, 0.5, 0.75, 1.0):
+        at, sign = left + share * (wide - 1), {0.0: "≤ ", 1.0: "≥ "}.get(share, "")
+        sheet.pen.line((at, 46, at, 50), fill="black")
+        sheet.write(at, 51, f"{sign}{low + share * (high - low):.{digits}f}", "ma")
+    sheet.write(sheet.picture.width / 2, 70, label, "ma")
+    return sheet.png()
 
 
-def _png(figure: Any) -> bytes:
-    buffer = io.BytesIO()
-    figure.canvas.print_png(buffer, metadata={"Software": "aerpaw-cmp"})  # savefig draws once more, unseen
-    return buffer.getvalue()
+class _Sheet:
+    """A white picture with a title, of a size in inches: matplotlib takes a tenth of a second for each."""
+
+    def __init__(self, title: str, width: float, height: float) -> None:
+        import matplotlib
+        from PIL import Image, ImageDraw, ImageFont
+
+        self.picture = Image.new("RGBA", (round(width * _DPI), round(height * _DPI)), (255, 255, 255, 230))
+        self.pen = ImageDraw.Draw(self.picture)
+        self._font = ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", 12)
+        self.write(self.picture.width / 2, 4, title, "ma")
+
+    def write(self, x: float, y: float, text: str, anchor: str = "la") -> None:
+        """Write one line of text at a point [pixel]."""
+        self.pen.text((x, y), text, fill="black", font=self._font, anchor=anchor)
+
+    def png(self) -> bytes:
+        """The file."""
+        buffer = io.BytesIO()
+        self.picture.save(buffer, "PNG")
+        return buffer.getvalue()

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from matplotlib.colors import to_rgb
 from PIL import Image
 
 from aerpaw_cmp.compare.result import RankResult, RssResult
@@ -203,7 +204,7 @@ def test_residual_sign_is_measured_minus_simulated(report_data):
 
 
 def test_grey_steps_of_the_ranks_are_apart():
-    grey = [np.dot(canvas.rank_colour(r)[:3], (0.299, 0.587, 0.114)) for r in (1, 2, 3, 4)]
+    grey = [np.dot(to_rgb(canvas.rank_colour(r)), (0.299, 0.587, 0.114)) for r in (1, 2, 3, 4)]
     assert min(np.diff(grey)) > 0.12
 
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...common.kml import CLASS_COLOURS
 from ...common.units import AnyArray
 from ...compare.judge.ladder import LadderRow
 from ...compare.level.detection import DetectionScore
@@ -32,9 +33,6 @@ _FORECAST_COLUMNS = 600
 # Curves of a figure are told apart in grey, too.
 _LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
 COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
-
-# Of no path and rank 1 to 4, as on the page's map.
-RANK_COLOURS = ("#dddddd", "#440154", "#31688e", "#35b779", "#fde725")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -204,7 +202,7 @@ def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
         "y": {"label": "Probability [%]", "ends": [0, 100]},
         "marks": [
             {"kind": "band", "name": f"rank {rank}", "x": at, "low": edges[:, i], "high": edges[:, i + 1],
-             "colour": RANK_COLOURS[rank]}
+             "colour": CLASS_COLOURS[rank]}
             for i, rank in enumerate(RANKS)
         ],
     }  # fmt: skip

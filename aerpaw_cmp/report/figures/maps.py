@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from ...common.kml import CLASS_COLOURS
 from ...common.units import FloatArray, spread_out
 from ...site.scenes import drawn_buildings
 from ...site.site import Site
@@ -24,7 +25,7 @@ from ..kit.canvas import (
     rank_colour,
 )
 from ..names import k_key, safe_name
-from .charts import RANK_COLOURS, Chart, drawn
+from .charts import Chart, drawn
 from .flight import channel_specs
 
 if TYPE_CHECKING:
@@ -217,7 +218,7 @@ def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
     edges = np.repeat(np.column_stack([np.zeros(len(at)), share.cumsum(axis=1)]), 2, axis=0)
     marks = [
         {"kind": "band", "name": f"rank {rank}" if rank else "Z: out of coverage", "x": sides, "low": edges[:, rank],
-         "high": edges[:, rank + 1], "colour": RANK_COLOURS[rank]}
+         "high": edges[:, rank + 1], "colour": CLASS_COLOURS[rank]}
         for rank in (0, *RANKS)
     ]  # fmt: skip
     return {"x": {"label": "Height [m]"}, "y": {"label": "Positions [%]", "ends": [0, 100]}, "marks": marks}

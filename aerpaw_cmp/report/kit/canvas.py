@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ...common.kml import CLASS_COLOURS
 from ...common.stages import Progress, logged
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray, spread_out
 from ...logs.records import has_wall_clock
@@ -519,11 +520,9 @@ def legend_below(ax: Axes, columns: int = 4) -> None:
         ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
 
 
-def rank_colour(rank: int) -> Any:
+def rank_colour(rank: int) -> str:
     """Colour of rank 1 to 4, from dark to light in even steps; black for the crosses of 0."""
-    from matplotlib import colormaps
-
-    return "black" if rank == 0 else colormaps["viridis"]((0.02, 0.38, 0.70, 1.0)[rank - 1])
+    return CLASS_COLOURS[rank] if rank else "black"
 
 
 # --- site ---------------------------------------------------------------------------------------

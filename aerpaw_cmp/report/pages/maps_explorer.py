@@ -141,7 +141,6 @@ def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer],
         "joint": JOINT,
         "quantities": quantities,
         "plots": [packed(chart.content, arrays) for chart in charts],
-        "ramps": {"level": ramp("viridis"), "difference": ramp("RdBu_r")},
         "packed": arrays.content(),
     }  # fmt: skip
 
@@ -203,22 +202,12 @@ def ends_of_scale(values: FloatArray, most: float) -> list[float]:
 
 def _class_colours(classes: Sequence[str]) -> list[str]:
     """A colour per class: those of ranks, else well apart in hue and lightness."""
-    from matplotlib.colors import to_hex
-
     if tuple(classes) == _RANK_CLASSES:
-        return ["", *(to_hex(rank_colour(rank)) for rank in RANKS)]
+        return ["", *(rank_colour(rank) for rank in RANKS)]
     if not classes:
         return []
     hues = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#555555")
     return [hues[number % len(hues)] for number in range(len(classes))]
-
-
-def ramp(name: str, colours: int = 128) -> str:
-    """A colour map of matplotlib as one string of six-digit colours."""
-    from matplotlib import colormaps
-    from matplotlib.colors import to_hex
-
-    return "".join(to_hex(colour)[1:] for colour in colormaps[name](np.linspace(0.0, 1.0, colours)))
 
 
 def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import to_hex
 from numpy.typing import ArrayLike
 
 from ...common.units import FloatArray, spread_out
@@ -17,7 +16,7 @@ from ..kit.canvas import rank_colour
 from ..kit.packed import PackedArrays, step_for
 from ..kit.shapes import listed
 from .explorer import plan_of
-from .maps_explorer import ends_of_scale, ramp
+from .maps_explorer import ends_of_scale
 
 # Values that a page holds; beyond them each group is thinned.
 MOST_VALUES = 1_500_000
@@ -95,8 +94,7 @@ def payload(
         "lines": [listed(np.round(np.asarray(line)[spread_out(len(line), 2000), :2], 1)) for line in lines],
         "rings": [listed(np.round(ring[:, :2], 1)) for ring in rings],
         "groups": [_group(group, arrays, total, ranges) for group in groups],
-        "ranks": {str(rank): to_hex(rank_colour(rank)) for rank in RANKS},
-        "ramps": {"level": ramp("viridis"), "spread": ramp("plasma")},
+        "ranks": {str(rank): rank_colour(rank) for rank in RANKS},
         "packed": arrays.content(),
     }
 

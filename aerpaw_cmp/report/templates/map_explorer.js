@@ -4,7 +4,7 @@
   const { at, css, number, cells, fill, frame, axes, ramp, quantile, later, whenResized } = common;
   const data = JSON.parse(at("explorer-data").textContent), arrays = await common.unpack(data.packed);
   const east = arrays[data.east], north = arrays[data.north], columns = east.length, rows = north.length;
-  const ramps = { level: ramp(data.ramps.level), difference: ramp(data.ramps.difference) };
+  const ramps = { level: ramp("viridis"), difference: ramp("RdBu_r") };
   const root = at("explorer"), canvas = at("map"), legend = at("legend");
   const edges = [east[0] - data.half[0], east[columns - 1] + data.half[0], north[0] - data.half[1], north[rows - 1] + data.half[1]];
   const state = { quantity: 0, a: [], b: [], difference: false, scale: "shared", cell: null, line: null, zoom: 1, east: 0, north: 0 };

@@ -3,7 +3,7 @@
 (async () => {
   const { at, css, number, cells, fill, frame, axes, later, polyline } = common;
   const data = JSON.parse(at("explorer-data").textContent), arrays = await common.unpack(data.packed);
-  const ramps = { level: common.ramp(data.ramps.level), spread: common.ramp(data.ramps.spread) };
+  const ramps = { level: common.ramp("viridis"), spread: common.ramp("plasma") };
   const canvas = at("map"), legend = at("legend"), chart = at("profile");
   const state = { group: 0, layer: 0, point: null, zoom: 1, east: 0, north: 0, turn: -Math.PI / 2, tilt: 0.6 };
   const group = () => data.groups[state.group], layer = () => group().layers[state.layer], sphere = () => group().around.length > 0;

@@ -558,7 +558,7 @@ def described(
         forms = (re.sub(form, word, bare) for form, word in words.items() if re.fullmatch(form, bare))
         common = next(forms, bare)
         what = meaning(name, None if common == bare else common)
-        unit = what.unit if what else in_brackets(name)[0]
+        unit = what.unit if what else without_unit(name)[1]
         if known and not unit:
             unit = known.units.get(bare, known.angles if what and what.quantity.role == "angle" else "")
         columns.append((what, unit, common))

@@ -181,7 +181,7 @@ class Sheet:
     @cached_property
     def meanings(self) -> list[dictionary.Meaning | None]:
         """Meaning of each column."""
-        said = {i: dictionary.Meaning(row, dictionary.in_brackets(self.names[i])[0]) for i, row in self.said.items()}
+        said = {i: dictionary.Meaning(row, dictionary.without_unit(self.names[i])[1]) for i, row in self.said.items()}
         return [what or said.get(i) for i, (what, *_) in enumerate(self._described[1])]
 
     def find(self, *quantities: str) -> int | None:

@@ -47,22 +47,39 @@ if _OF_ALL:
 # Files that take longest, by and large in that order.
 DEAREST = (
     "propagation/test_growth.py",  # compiles for half a minute where nothing is kept yet; the other worker needs it later
-    "jobs/test_campaign.py",
+    "field/test_learned_site.py",
     "test_field.py",  # the first that needs Sionna: by now one worker knows whether this machine's LLVM works
-    "report/test_figures.py",
-    "propagation/test_compiled.py",
+    "jobs/test_map_store.py",
     "parsers/test_law.py",
-    "jobs/test_coverage_map.py",
     "jobs/test_workers.py",
-    "propagation/test_sionna.py",
-    "report/test_browser.py",
-    "jobs/test_calibrate_rank.py",
+    "live/test_web_browser.py",
     "live/test_tap.py",
-    "report/test_diff.py",
-    "jobs/test_compare_flight.py",
-    "report/test_browser_map.py",
+    "jobs/test_training_logs.py",
+    "flight/test_clock.py",
+    "flight/test_draft.py",
+    "propagation/test_compiled.py",
+    "jobs/test_plan.py",
+    "test_published.py",
+    "report/test_figures.py",
+    "test_benchmarks.py",
+    "compare/test_locate.py",
+    "compare/test_direction_gain.py",
+    "test_examples.py",
+    "test_round_trip.py",
     "propagation/test_llvm.py",
 )
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Workers collect beginning at different files: each rewrites asserts of its own, and finds those of the others.
+
+    In one order, all would rewrite every file side by side where no bytecode is kept yet.
+    """
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "")
+    if worker and [Path(arg).name for arg in config.args] == config.getini("testpaths"):
+        files = [str(path) for path in sorted(Path(__file__).parent.rglob("test_*.py"))]
+        first = len(files) * int(worker[2:]) // int(os.environ["PYTEST_XDIST_WORKER_COUNT"])
+        config.args[:] = [*files[first:], *files[:first], *config.args[1:]]
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -113,6 +130,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
     A worker that begins its last file late would leave the others without work.
     """
+    items.sort(key=lambda item: item.path)
     for item in items:
         if item.get_closest_marker("field") and not REAL.is_dir():
             item.add_marker(pytest.mark.skip(reason="AERPAW_CMP_FIELD_DATA is not set: no real logs"))

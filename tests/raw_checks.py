@@ -7,7 +7,6 @@ Taken from this package are the settings and, per sample, which paths there are:
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import math
 from collections.abc import Mapping, Sequence
@@ -26,7 +25,6 @@ from aerpaw_cmp.flight.settings import LogSettings
 from aerpaw_cmp.logs.ingest import IngestedFile
 from aerpaw_cmp.propagation.check.field_audit import Expected
 from aerpaw_cmp.propagation.check.reference import Mirror, Reference
-from aerpaw_cmp.propagation.field.stands import over_stands
 from aerpaw_cmp.site.site import Tower
 from tests.raw_bytes import LOWEST_M, Log, Matrix, Pose, RawPath, Reading, east_north_m, level, read_log
 
@@ -42,13 +40,12 @@ _TOLERANCES = {
 
 @dataclass(slots=True)
 class Account:
-    """Worst difference by kind with its place, how many were compared and failed, and what could not be."""
+    """Worst difference by kind with its place, how many were compared, and how many failed."""
 
     count: dict[str, int] = field(default_factory=dict)
     worst: dict[str, tuple[float, str]] = field(default_factory=dict)
     failed: dict[str, int] = field(default_factory=dict)
     broken: list[str] = field(default_factory=list)
-    not_covered: list[str] = field(default_factory=list)
 
     def add(self, kind: str, difference: float, where: str, spare: float = 0.0) -> None:
         """One comparison; NaN is a failure, ``spare`` more than the tolerance is allowed."""
@@ -57,11 +54,6 @@ class Account:
         self.failed[kind] = self.failed.get(kind, 0) + (off > _TOLERANCES[kind][0] + spare)
         if off > self.worst.get(kind, (-1.0, ""))[0]:
             self.worst[kind] = (off, where)
-
-    def leave(self, text: str) -> None:
-        """Name what is not checked."""
-        if text not in self.not_covered:
-            self.not_covered.append(text)
 
     def most(self, kind: str) -> float:
         """Largest difference of a kind."""
@@ -92,18 +84,18 @@ def raw_checked(data: FlightData, replays: Sequence[Replayed], expected: Sequenc
     Returns
     -------
     Account
-        The numbers, what is out of tolerance, and what could not be checked.
+        The numbers, and what is out of tolerance.
     """
     account = Account()
-    logs = [_log(data, *pair, account) for pair in zip(data.settings.logs, data.files, strict=True)]
+    logs = [_log(data, *pair) for pair in zip(data.settings.logs, data.files, strict=True)]
     towers = _towers_checked(data, account)
-    path = _path(data, logs, account)
+    path = _path(data, logs)
     if path is not None:
         _track_checked(data, path, account)
     each = max(3, SAMPLES // max(len(data.rss), 1))
     for series, replayed, expectation in zip(data.rss, replays, expected, strict=False):
         rows = _spread(replayed, path, series, each)
-        reference = _reference(data, replayed, expectation, towers, series.tower, account)
+        reference = _reference(data, replayed, expectation, towers, series.tower)
         check = _Series(data=data, series=series, replayed=replayed, path=path, reference=reference, account=account)
         check.readings(logs, rows)
         check.poses_and_levels(rows)
@@ -115,37 +107,29 @@ def raw_checked(data: FlightData, replays: Sequence[Replayed], expected: Sequenc
 # ---------------------------------------------------------------- bytes
 
 
-def _log(data: FlightData, settings: LogSettings, file: IngestedFile, account: Account) -> Log | None:
-    """A log of the flight, read a second time; None with a word where it cannot be."""
+def _log(data: FlightData, settings: LogSettings, file: IngestedFile) -> Log | None:
+    """A log of the flight, read a second time; None where the flight file states its times or columns."""
     zone = "UTC" if settings.clock == "utc" else settings.timezone or data.settings.timezone
     content = (data.folder / settings.path).read_bytes()
     assert hashlib.sha256(content).hexdigest() == file.sha256, "the report names its inputs by their hash"
-    if zone is None or settings.time_origin or settings.columns:
-        account.leave(f"{settings.path} (the flight file states its times or columns)")
-        return None
-    with contextlib.suppress(ValueError, KeyError, IndexError, NotImplementedError):
-        if (log := read_log(content, zone)) is not None:
-            return log
-    account.leave(f"{settings.path} (a format that the second way does not know)")
-    return None
+    stated = zone is None or settings.time_origin or settings.columns
+    return None if stated else read_log(content, zone)
 
 
-def _path(data: FlightData, logs: Sequence[Log | None], account: Account) -> RawPath | None:
+def _path(data: FlightData, logs: Sequence[Log | None]) -> RawPath | None:
     """The flight between the rows of the first telemetry log."""
     for settings, file, log in zip(data.settings.logs, data.files, logs, strict=True):
         if not any(s.kind == "telemetry" and s.name not in settings.skip for s in file.result.streams):
             continue
         if log is None or not log.rows or settings.height_m is not None:
-            account.leave(f"the track, since {settings.path} has no rows for it")
             return None
         origin = data.site.frame.latitude_deg, data.site.frame.longitude_deg
         jumped = _flagged_us(file, "position_jump")
         rows = [row for row in log.rows if row.time_us not in jumped]
         takeoff_m = float(_site_file(data)["origin"].get("takeoff_ground_m", 0.0))
         path = RawPath(rows, origin, takeoff_m, lambda *at: float(data.site.ground_under_m(*np.array(at)[:, None])[0]))
-        if path.out_of_order or not path.rows:
-            account.leave("the track, whose rows are out of time order")
-            return None
+        assert path.rows
+        assert not path.out_of_order
         return path
     return None
 
@@ -191,12 +175,11 @@ def _towers_checked(data: FlightData, account: Account) -> dict[str, Tower]:
 
 
 def _reference(
-    data: FlightData, replayed: Replayed, expected: Expected, towers: Mapping[str, Tower], tower: str, account: Account
-) -> Reference | None:
-    """The second implementation of a link, with the tower where the second way has it; None where it cannot be."""
-    if replayed.tower_m is not None or tower not in towers:
-        account.leave(f"levels of {tower} (a node of the flight, or one that moves)")
-        return None
+    data: FlightData, replayed: Replayed, expected: Expected, towers: Mapping[str, Tower], tower: str
+) -> Reference:
+    """The second implementation of a link, with the tower where the second way has it."""
+    assert replayed.tower_m is None
+    assert tower in towers
     site = replace(data.site.under(data.settings.rt.foliage), towers={tower: towers[tower]})
     return Reference(site, tower, expected.link, expected.loss)
 
@@ -254,7 +237,7 @@ class _Series:
     series: RssSeries
     replayed: Replayed
     path: RawPath | None
-    reference: Reference | None
+    reference: Reference
     account: Account
 
     @property
@@ -275,8 +258,7 @@ class _Series:
                 continue  # a line that stands for repeated samples
             value = None if reading is None else _value(reading, series, settings)
             if reading is None or value is None:
-                account.leave(f"readings of {self.name} (no column of {settings.path} is known to be its level)")
-                return
+                raise AssertionError(f"no column of {settings.path} is known to be the level of {self.name}")
             if settings.node is not None and settings.node != series.tower and not settings.cells:
                 account.broken.append(f"{settings.path} is of {settings.node}, not of {series.tower}")
             stamp = int(series.time[row].astype("datetime64[us]").astype(np.int64))
@@ -300,7 +282,7 @@ class _Series:
             turn = _as_asked(pose, mode)
             ours = self.replayed.poses.rotation[at] if turn is not None else None
             _pose_checked(replace(pose, turn=turn), self.replayed.poses.position_m[at], ours, where, self.account)
-            if turn is not None and self.reference is not None:
+            if turn is not None:
                 self._level(self.reference, at, replace(pose, turn=turn), where)
 
     def _telemetry_us(self, row: int) -> float:
@@ -319,37 +301,24 @@ class _Series:
         grounds = np.zeros(len(mine), dtype=np.bool_)
         for n, row in enumerate(faces):
             grounds[n] = all(face < 0 or replay.faces.solid[face] < 0 for face in row.tolist())
-        if not len(mine) or not grounds.all() or (replay.paths.depth[mine] > 1).any():
-            self.account.leave("levels of samples with paths off walls (the second implementation has those)")
-            return
-        ends = np.array([reference.source]), np.zeros((1, 0, 3)), np.array([pose.place_m])
-        if reference.loss.model != "none" and over_stands(reference.site, *ends).any():
-            self.account.leave("levels of samples behind forests that are a medium")
-            return
+        assert len(mine)
+        assert grounds.all()
+        assert (replay.paths.depth[mine] <= 1).all()
         ground = next(m for m in reference.mirrors if m.solid < 0)
         paths = []
         for depth in replay.paths.depth[mine].tolist():
             sequence: tuple[Mirror, ...] = (ground,) * depth
             loss = reference.loss_db(sequence, pose.place_m)
-            if loss is None:
-                return
+            assert loss is not None
             paths.append((sequence, loss))
         assert pose.turn is not None
-        try:
-            h, power = reference.matrix(paths, pose.place_m, pose.turn)
-        except LookupError:
-            self.account.leave(f"levels over {reference.site.ground_material}")
-            return
+        h, power = reference.matrix(paths, pose.place_m, pose.turn)
         link = reference.link
         coherent = float((np.abs(h) ** 2).mean())
         for ours, value in ((replay.rss_dbm, coherent), (replay.rss_power_dbm, power)):
             ours_dbm = float(ours[at, 0])
             expected = 10 * math.log10(value) + link.transmit_power_dbm if value > 0 else -math.inf
-            if abs(expected - link.noise_floor_dbm) < 0.1:
-                continue
-            if expected < link.noise_floor_dbm:
-                self.account.add("simulated level", math.inf if math.isfinite(ours_dbm) else 0.0, where)
-                continue
+            assert expected > link.noise_floor_dbm + 0.1
             spare = 20 * math.log10(1 + 0.01 * math.sqrt(power / value)) if value < power else 0.0
             self.account.add("simulated level", abs(ours_dbm - expected), where, spare=spare)
 
@@ -391,7 +360,6 @@ def _rank_checked(
         some = spread_out(len(rows), SAMPLES // 4)
         names = [name for name in ("nr ri", "lte ri", "ri", "pdsch_rank") if readings and name in _names(log)]
         if not names or settings.ri_base == "zero":
-            account.leave(f"ranks of {settings.path}")
             continue
         for at in some.tolist():
             where, row = f"{settings.path}, rank sample {rows[at]}", int(rows[at])

@@ -166,17 +166,6 @@ def test_no_hostile_file_opens_or_shows_anything_but_itself(private: Path, tmp_p
         assert time.process_time() - begun < 30, name
 
 
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="inotify sees what is opened")
-def test_the_same_files_read_without_the_child_do_open_the_key(private: Path, tmp_path: Path) -> None:
-    """What the test above would see: HDF5 as it comes."""
-    watch = Watch(private)
-    for name in ("external_0.mat", "link_3.mat", "virtual_3.mat"):
-        (tmp_path / name).write_bytes(hostile(private)[name])
-        with h5py.File(tmp_path / name, "r") as book:
-            np.asarray(book["RSRP"])
-        assert set(watch.opened()) & {"key", "key.h5"}, name
-
-
 @pytest.mark.parametrize(
     ("name", "said"),
     [

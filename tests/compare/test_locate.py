@@ -93,7 +93,7 @@ def _flights(count: int, floor_db: float, bins: int = 75) -> Iterator[tuple[Leve
         yield LevelTrack(time, position, level, floor_db), truth
 
 
-@pytest.mark.parametrize(("floor_db", "count"), [(-np.inf, 12), (-62.0, 8)])
+@pytest.mark.parametrize(("floor_db", "count"), [(-np.inf, 8), (-62.0, 6)])
 def test_the_region_holds_the_node_nine_times_of_ten(floor_db: float, count: int) -> None:
     inside = 0
     for track, truth in _flights(count, floor_db, bins=40):

@@ -14,9 +14,10 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.outputs import changed_files, sealed
+from aerpaw_cmp.common.outputs import SUMS, changed_files, read_sums, sealed
 from aerpaw_cmp.flight.settings import load_flight
 from tests.geojson import collection, feature, polygon
+from tests.simulated import simulate
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -156,6 +157,45 @@ def test_a_bad_folder_is_told_before_the_computation(
     ):
         assert said in refused(capsys, logs.parent, *command, "-o", target)
     monkeypatch.undo()
+
+
+def tiny_flight(folder: Path) -> Path:
+    """Eight seconds of flight, one log of levels, one of ranks: a report of a few seconds."""
+    content = yaml.safe_load((SAMPLE / "flight.yaml").read_text())
+    content["flight"]["plan"] |= {
+        "waypoints": [{"east_m": -40, "north_m": 10, "height_m": 40}, {"east_m": 40, "north_m": 10, "height_m": 40}],
+        "bad_lines": 0,
+        "rss_interval_s": 0.2,
+        "clock_shift_s": {},
+    }
+    content["logs"] = [
+        log for log in content["logs"] if "USRP" not in log["path"] or log["path"].startswith("LW1/USRP1")
+    ]
+    content |= {"rt": {"engine": "image", "max_depth": 1, "audit_links": 0}, "rss": {"lag": "off"}}
+    (folder / "flight.yaml").write_text(yaml.safe_dump(content))
+    simulate(folder / "flight.yaml")
+    return folder / "flight.yaml"
+
+
+def test_a_report_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error inside the writing leaves the old set whole."""
+    from aerpaw_cmp.report.pages import flight as html
+
+    out = tmp_path / "reports" / "r"
+    command = ["report", str(tiny_flight(tmp_path)), "-o", str(out)]
+    assert main(command) == 0
+    before = digests(out)
+    assert set(read_sums(out) or ()) == set(before) - {SUMS}
+    assert changed_files(out) == []
+
+    def fail(*_: Any) -> str:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(html, "page", fail)  # the last file of the set
+        assert main(command) == 3
+    assert digests(out) == before
+    assert [path.name for path in out.parent.iterdir()] == ["r"]
 
 
 def test_a_limit_on_the_size_of_files_is_one_message(logs: Path) -> None:

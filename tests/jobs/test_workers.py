@@ -1,6 +1,5 @@
 """Workers of every kind give one result; what they lose, see or run differently is told."""
 
-import contextlib
 import json
 import os
 import socket
@@ -15,7 +14,7 @@ import pytest
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.jobs.tasks import workers
 from aerpaw_cmp.jobs.tasks.workers import open_workers
-from tests.jobs.worker_tasks import collected, dies
+from tests.jobs.worker_tasks import collected, dies, listening
 
 
 @pytest.fixture(scope="module")
@@ -78,31 +77,6 @@ def test_a_scheduler_without_tls_is_refused(seen: dict[str, Any]) -> None:
     assert "is not protected" in seen["cluster"]["plain"]
 
 
-def listening(_number: int) -> list[str]:
-    """Sockets on which this process, its parent or its siblings listen, as the kernel lists them."""
-    mine = set()
-    for process in (os.getpid(), *family(os.getppid())):
-        for link in Path(f"/proc/{process}/fd").iterdir():
-            with contextlib.suppress(OSError):
-                mine.add(str(link.readlink()))
-    sockets = []
-    for table in ("tcp", "tcp6", "udp", "udp6"):
-        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
-            row = line.split()
-            if f"socket:[{row[9]}]" in mine and (row[3] == "0A" or table.startswith("udp")):
-                sockets.append(f"{table} {row[1]}")
-    for line in Path("/proc/net/unix").read_text().splitlines()[1:]:
-        row = line.split()
-        if f"socket:[{row[6]}]" in mine and row[3] == "00010000":  # the flag of a socket that accepts
-            sockets.append(f"unix {row[-1]}")
-    return sockets
-
-
-def family(parent: int) -> list[int]:
-    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
-    return [parent, *map(int, children)]
-
-
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc lists sockets")
 def test_nothing_listens_while_workers_of_this_machine_work() -> None:
     results: dict[int, Any] = {}
@@ -122,7 +96,7 @@ def test_workers_end_with_their_parent_and_leave_nothing(tmp_path: Path) -> None
     script = (
         "import sys, time; sys.path[:0] = sys.argv[2:]\n"
         "from aerpaw_cmp.jobs.tasks.workers import open_workers\n"
-        "from tests.jobs.test_workers import sleeps\n"
+        "from tests.jobs.worker_tasks import sleeps\n"
         "if __name__ == '__main__':\n"
         "    with open_workers(2) as crew: crew.run(sleeps, [sys.argv[1]] * 2, print)\n"
     )
@@ -138,11 +112,6 @@ def test_workers_end_with_their_parent_and_leave_nothing(tmp_path: Path) -> None
     while any(Path(f"/proc/{process}").exists() for process in began):
         time.sleep(0.05)
     assert list((tmp_path / "tmp").iterdir()) == []
-
-
-def sleeps(folder: str) -> None:
-    Path(folder, str(os.getpid())).touch()
-    time.sleep(600)
 
 
 def test_a_scheduler_that_stays_away_or_never_was_is_one_message(seen: dict[str, Any]) -> None:

@@ -1,5 +1,6 @@
 """Tasks for workers of every kind, and what a crew makes of them."""
 
+import contextlib
 import os
 import signal
 import time
@@ -29,3 +30,33 @@ def collected(crew: Any, function: Any, items: list[Any]) -> list[Any]:
 
     crew.run(function, items, done)
     return [results[i] for i in range(len(items))]
+
+
+def listening(_number: int) -> list[str]:
+    """Sockets on which this process, its parent or its siblings listen, as the kernel lists them."""
+    mine = set()
+    for process in (os.getpid(), *family(os.getppid())):
+        for link in Path(f"/proc/{process}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                mine.add(str(link.readlink()))
+    sockets = []
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            row = line.split()
+            if f"socket:[{row[9]}]" in mine and (row[3] == "0A" or table.startswith("udp")):
+                sockets.append(f"{table} {row[1]}")
+    for line in Path("/proc/net/unix").read_text().splitlines()[1:]:
+        row = line.split()
+        if f"socket:[{row[6]}]" in mine and row[3] == "00010000":  # the flag of a socket that accepts
+            sockets.append(f"unix {row[-1]}")
+    return sockets
+
+
+def family(parent: int) -> list[int]:
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return [parent, *map(int, children)]
+
+
+def sleeps(folder: str) -> None:
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(600)

@@ -563,6 +563,24 @@ def test_no_interval_before_there_is_anything_to_judge_by():
 # the tap with a page -------------------------------------------------------------------------------------------
 
 
+def test_the_log_is_as_without_the_page(modem, tap, tools, tmp_path):
+    logs = []
+    for name in ("with", "without"):
+        sim = modem(link=tmp_path / name)
+        with tools.page_open(name == "with") as feed:
+            options = {} if feed is None else {"watch": lambda item, feed=feed: feed.put(0, item)}
+            session = tap(sim.port, folder=tmp_path / f"log-{name}", options=options)
+            session.wait(lambda sim=sim: len(sim.journal) > 60)
+            session.end()
+        records, bad = tools.records_of(tmp_path / f"log-{name}")
+        assert not bad
+        assert [record["n"] for record in records] == list(range(len(records)))
+        logs.append({(record["kind"], tuple(record)) for record in records})
+        (file,) = (tmp_path / f"log-{name}").iterdir()
+        assert file.name.startswith("tap_")
+    assert logs[0] == logs[1]
+
+
 def test_the_page_gets_every_answer_of_the_log(modem, tap, tools, tmp_path):
     sim, feed = modem(), Feed(["modem"])
     with WebServer(feed, tools.page, Address("127.0.0.1", 0)) as web:

@@ -162,7 +162,7 @@ def test_a_disk_that_is_full_anywhere_ends_in_its_own_error(tmp_path: Path, fail
     fill(enough, files)
     assert read_back(enough.getvalue(), tmp_path).equals(large)
     size = len(enough.getvalue())
-    for left in (0, 100, 3_000, *range(5_000, size, size // 12), size - 40, size - 1):
+    for left in (0, 100, 3_000, *range(5_000, size, size // 6), size - 40, size - 1):
         with pytest.raises(type(failure)) as caught:
             fill(_Full(left, failure), files)
         assert caught.value is failure

@@ -308,6 +308,17 @@ def test_infinite_loss_is_no_path(scenes):
     assert (result.h[0] == 0).all()
 
 
+def test_order_of_paths_does_not_matter(scenes):
+    site = scenes.site(towers=((0.0, 0.0, 10.0), (5.0, 5.0, 12.0)))
+    poses = random_poses(scenes, np.random.default_rng(2), np.full(20, 70.0))
+    link = comparison_link(scenes, site, Isotropic())
+    result = replay(site, link, poses)
+    mixed = result.paths.select(np.random.default_rng(3).permutation(len(result.paths)))
+    sources = np.array([tower.position_m for tower in site.towers.values()])
+    fields = field_module.channel_matrices(mixed, result.faces, sources, poses, link)
+    assert fields.h == pytest.approx(result.h, rel=1e-12, abs=1e-20)
+
+
 def test_power_sum_is_the_mean_over_random_phases(scenes):
     site = scenes.site()
     # half a wavelength of path difference passes many times over these poses

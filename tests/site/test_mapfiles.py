@@ -274,6 +274,9 @@ def test_false_is_no_building_and_the_way_out_is_named(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match="untagged areas as 'house'; expected one of building, forest, geofence"):
         read(tmp_path, polygon(square(0, 0)), untagged="house")
     assert len(read(tmp_path, polygon(square(0, 0)), untagged="building").buildings) == 1
+    for tags in ({"building": "no"}, {"natural": "scrub"}, {"razed:building": "yes"}):  # a tag that says what it is
+        with pytest.raises(InputError, match="left out"):
+            read(tmp_path, collection(feature(polygon(square(0, 0)), **tags)), untagged="building")
 
 
 def test_forests_far_outside_the_site_are_cut_off(tmp_path: Path) -> None:

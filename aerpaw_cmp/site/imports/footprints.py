@@ -191,7 +191,8 @@ def _sort(
     """Each outline of a file to the shapes of its kind; what has none is counted."""
     skipped: Counter[str] = Counter()
     for outline in content.outlines:
-        kind = kind_of(outline.tags) or untagged or ("geofence" if content.kind == "KML" else None)
+        bare = untagged if main_tag(outline.tags) == "untagged" else None
+        kind = kind_of(outline.tags) or bare or ("geofence" if content.kind == "KML" else None)
         if kind is None or (kind == "building" and below_ground(outline.tags)):
             skipped[main_tag(outline.tags) if kind is None else "building below the ground"] += 1
             continue

@@ -71,11 +71,20 @@ def below_ground(tags: Mapping[str, str]) -> bool:
 
 
 def main_tag(tags: Mapping[str, str]) -> str:
-    """The tag that tells most about an area of no known kind."""
-    for key in ("highway", "landuse", "natural", "waterway", "leisure", "amenity", "barrier", "boundary"):
-        if key in tags:
-            return f"{key}={tags[key]}"
-    return "untagged"
+    """The tag that tells most about an area of no known kind; ``untagged`` where none says what it is.
+
+    Examples
+    --------
+    >>> main_tag({"natural": "scrub"}), main_tag({"demolished:building": "yes"}), main_tag({"name": "A"})
+    ('natural=scrub', 'demolished:building=yes', 'untagged')
+    """
+    said = [key for key in _TELLING if key in tags] + [key for key in tags if key.endswith(":building")]
+    said += ["building"] if tags.get("building", "").lower() == "no" else []
+    return f"{said[0]}={tags[said[0]]}" if said else "untagged"
+
+
+_TELLING = ("highway", "landuse", "natural", "waterway", "leisure", "amenity", "barrier", "boundary", "man_made",
+            "power", "aeroway")  # fmt: skip
 
 
 def material_of(tags: Mapping[str, str]) -> str:

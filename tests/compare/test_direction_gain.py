@@ -8,7 +8,7 @@ from scipy.spatial.distance import cdist
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.compare.gains import direction_gain
-from aerpaw_cmp.compare.gains.direction_gain import PLACE_TERM, GainModel, LinkSamples, Term, chosen_fit, fit_gain
+from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term, chosen_fit, fit_gain
 from aerpaw_cmp.compare.gains.mount import fit_mounts
 from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
 
@@ -150,16 +150,6 @@ def test_gain_is_a_guess_where_no_flight_has_looked():
     assert fit.gain("mast", "LW1.A", flown)[1].mean() < 1.5
 
 
-def test_place_field_stays_apart_from_the_antennas():
-    places = lambda p: 4.0 * np.sin(p[:, 0] / 60.0)  # noqa: E731
-    flights = [dataclasses.replace(s, residual_db=s.residual_db + places(s.position_m)) for s in TRAIN]
-    fit = fit_gain(flights, dataclasses.replace(MODEL, terms=(*TERMS, PLACE_TERM)))
-    field = fit.predict(flights[0], ("place",))[0]
-    assert np.corrcoef(field, places(flights[0].position_m))[0, 1] > 0.7
-    total = fit.predict(flights[0])[0]
-    assert np.allclose(total, field + fit.predict(flights[0], ("body", "mast"))[0], atol=1e-9)
-
-
 @pytest.mark.parametrize(("planted_factor", "chosen"), [(1.0, 1.0), (0.3, 0.5)])
 def test_strength_of_the_towers_gains_is_the_likelier_and_all_scale_to_the_data(planted_factor, chosen):
     gains = {k: (lambda d, g=g, f=planted_factor if k != "uav" else 1.0: f * g(d)) for k, g in GAINS.items()}
@@ -297,7 +287,7 @@ def test_the_evidence_is_that_of_the_dense_covariance_at_any_noise():
 
 
 def test_antennas_without_a_shared_term_are_fits_of_their_own():
-    model = dataclasses.replace(MODEL, terms=(TERMS[1], PLACE_TERM))
+    model = dataclasses.replace(MODEL, terms=(TERMS[1], PAIR))
     both = fit_gain(TRAIN, model)
     alone = [fit_gain([s for s in TRAIN if s.channel == channel], model) for channel in "AB"]
     assert both.log_evidence == pytest.approx(sum(fit.log_evidence for fit in alone), rel=1e-9)

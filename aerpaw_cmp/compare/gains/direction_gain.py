@@ -1,11 +1,11 @@
 """Gain over direction at both ends of a link, learned from the residuals of several flights.
 
-``residual = offset + g_uav(body) + g_tower(mast) + g_pair(body, mast) [+ place] + own + noise``
+``residual = offset + g_uav(body) + g_tower(mast) + g_pair(body, mast) + own + noise``
 
 ``offset`` is free per flight, tower and channel. ``own`` is a nuisance of each flight and channel, correlated over
 place, so that the shadowing of one flight is not learned as antenna. The gains are Gaussian processes over directions:
 of the tower in the body, of the UAV at the mast, and of both together per channel (what the gain at one end does not
-explain without the other). A place field, if asked for, is one over positions and stays apart.
+explain without the other).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from ...common.errors import InputError, UsageError
 from ...common.gaussian import Factor, gaussian_kernel
 from ...common.units import BoolArray, FloatArray, IntArray
 
-Frame = Literal["body", "mast", "pair", "world", "place"]
+Frame = Literal["body", "mast", "pair"]
 _Sharing = Literal["all", "antenna"]
 
 # Prior of each offset in standard deviations of the noise: free in effect, and still a proper covariance.
@@ -132,13 +132,12 @@ class Term:
 
     Parameters
     ----------
-    frame : {"body", "mast", "pair", "world", "place"}
-        Its argument: direction of the tower in the body, of the UAV at the mast, both of these, the direction of the
-        tower in the world's axes at the UAV (a control: no antenna is fixed there), or the position.
+    frame : {"body", "mast", "pair"}
+        Its argument: direction of the tower in the body, of the UAV at the mast, or both of these.
     per : {"all", "antenna"}
         One function for all, or one per tower and channel.
     length : float
-        Chord on the unit sphere, or metres for a place.
+        Chord on the unit sphere.
     sd_db : float
         Standard deviation [dB].
     """
@@ -149,11 +148,9 @@ class Term:
     sd_db: float
 
 
-UAV_TERMS = (Term("body", "all", 1.0, 3.2),)
-TOWER_TERMS = (Term("mast", "antenna", 0.5, 3.4),)
-PAIR_TERMS = (Term("pair", "antenna", 0.35, 1.5),)
-ANTENNA_TERMS = UAV_TERMS + TOWER_TERMS + PAIR_TERMS
-PLACE_TERM = Term("place", "antenna", 60.0, 2.0)
+ANTENNA_TERMS = (
+    Term("body", "all", 1.0, 3.2), Term("mast", "antenna", 0.5, 3.4), Term("pair", "antenna", 0.35, 1.5)
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -192,11 +189,7 @@ def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
     """Argument of a term of this frame: (n, 3), or (n, 6) of both directions."""
     if frame == "pair":
         return np.concatenate([samples.at_uav, samples.at_tower], axis=1)
-    if frame == "body":
-        return samples.at_uav
-    if frame == "mast":
-        return samples.at_tower
-    return -samples.at_tower if frame == "world" else samples.position_m
+    return samples.at_uav if frame == "body" else samples.at_tower
 
 
 def _kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 from ...common.errors import InputError
 from ...common.geodesy import azimuth_rad
 from ...common.units import BoolArray, FloatArray, IntArray, spread_out, wrap_degrees
-from ..gains.direction_gain import GainFit, GainModel, LinkSamples, Term, chosen_fit, fit_gain
+from ..gains.direction_gain import GainFit, GainModel, LinkSamples, chosen_fit, fit_gain
 from ..gains.mount import GainOf, MountFit, fit_mounts
 from ..gains.spread import Spread, StatedSpread, fading_of, inside_shares
 from ..judge.ladder import log_distance_level_db
@@ -517,8 +517,3 @@ def wrong_way(observed: Sequence[Observed]) -> list[Observed]:
 
 def _with_uav(o: Observed, at_uav: FloatArray) -> Observed:
     return dataclasses.replace(o, samples=dataclasses.replace(o.samples, at_uav=at_uav))
-
-
-def only_terms(recipe: Recipe, terms: Sequence[Term]) -> Recipe:
-    """The recipe with other terms, and patterns only where an end is still learned."""
-    return dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, terms=tuple(terms)))

@@ -474,22 +474,15 @@ def _score_all(
 def _controls_of(
     observed: Sequence[Observed], recipe: Recipe, scores: tuple[Score, ...]
 ) -> dict[str, tuple[Score, ...]]:
-    """Simpler and wrong models, each flight left out in turn; ``scores`` are those of the recipe."""
+    """Wrong frames of the UAV's gain beside its body's, each flight left out; ``scores`` are those of the recipe."""
     if len(calibration.flights_of(observed)) < 2:
         return {}
-    left_out, only = calibration.flight_left_out, calibration.only_terms
-    bare = dataclasses.replace(recipe, patterns={})
-    controls = {
+    left_out, bare = calibration.flight_left_out, dataclasses.replace(recipe, patterns={})
+    return {
         "world frame at the UAV": left_out(calibration.world_frame(observed), bare),
         "heading turned the wrong way": left_out(calibration.wrong_way(observed), bare),
         "body frame, no patterns": left_out(observed, bare) if recipe.patterns else scores,
-        "UAV end only": left_out(observed, only(bare, direction_gain.UAV_TERMS)),
-        "tower end only": left_out(observed, only(bare, direction_gain.TOWER_TERMS)),
-        "field over places only": left_out(observed, only(bare, (direction_gain.PLACE_TERM,))),
     }
-    return controls | (
-        {"patterns with fitted mounts only": left_out(observed, only(recipe, ()))} if recipe.patterns else {}
-    )
 
 
 def _mount_warnings(learned: Learned) -> list[str]:

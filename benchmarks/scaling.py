@@ -160,8 +160,8 @@ def report(hours: float) -> dict[str, float]:
 
 def flights(count: int, workers: int = 1) -> dict[str, float]:
     """A campaign; its flights are simulated before."""
-    from aerpaw_cmp.jobs.options import RunOptions
     from aerpaw_cmp.jobs.run import run_campaign, run_simulate
+    from aerpaw_cmp.jobs.tasks.options import RunOptions
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

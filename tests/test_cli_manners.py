@@ -99,7 +99,7 @@ def test_json_of_the_commands_that_only_write_files(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from aerpaw_cmp.jobs import run
-    from aerpaw_cmp.jobs.options import JobOutcome
+    from aerpaw_cmp.jobs.tasks.options import JobOutcome
 
     written = JobOutcome(folder=Path(), files=(Path("a.txt"), Path("b.txt")))
     for name, line in (("run_site_show", ["site", "show"]), ("run_simulate", ["simulate", "plan.yaml"])):

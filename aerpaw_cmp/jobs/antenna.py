@@ -10,7 +10,7 @@ from ..common.outputs import OutputFile, is_sealed, sealed
 from ..flight.settings import AntennaSettings, load_pattern
 from ..site.antenna.antennas import MeasuredPattern
 from ..site.antenna.export import exported
-from .options import JobOutcome
+from .tasks.options import JobOutcome
 
 
 def run_antenna_export(

@@ -31,10 +31,10 @@ from ..propagation.path_table import check_band, subcarriers_hz, velocities_mps
 from ..report.exports.channel import FORMATS, STREAMED, Along, Channel, write_channel
 from ..report.exports.formats import chosen_formats
 from ..site.antenna.learned import BAND
-from .options import DEFAULT, JobOutcome, RunOptions
 from .prediction.sources import Source, memory_of
 from .prediction.where import TargetOptions, find_targets, target_files
 from .tasks.manifest import inputs_of_flight
+from .tasks.options import DEFAULT, JobOutcome, RunOptions
 
 _MOST_POSES = 10_000_000
 

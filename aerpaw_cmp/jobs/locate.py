@@ -30,8 +30,8 @@ from ..report.pages.locate import write_locate
 from ..site.antenna.antennas import MeasuredPattern
 from ..site.antenna.sphere_pattern import SpherePattern
 from ..site.site import Site
-from .options import DEFAULT, JobOutcome, RunOptions
 from .tasks.manifest import inputs_of_flight
+from .tasks.options import DEFAULT, JobOutcome, RunOptions
 
 # Name under which the link is built; antennas of ``link.rss.tower`` are those of the node.
 _NODE = "node"

@@ -29,8 +29,8 @@ from ..logs.flight_file import is_flight_file
 from ..logs.ingest import ingest
 from ..propagation.geometry.paths import PathSet
 from ..site.site import Site
-from .options import RunOptions
 from .reporting.compare_flight import compare_flight
+from .tasks.options import RunOptions
 
 # Tower and channel of an RSS series; tower and ``"rank"`` of a rank series.
 Series = tuple[str, str]

@@ -16,7 +16,7 @@ from ..common.files import cache_folder
 from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import PlannedStage, Stages
-from .options import DEFAULT, JobOutcome, RunOptions
+from .tasks.options import DEFAULT, JobOutcome, RunOptions
 
 _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
 

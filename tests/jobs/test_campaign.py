@@ -13,7 +13,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, run
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Task, digest_of, outcome_store
 from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
-from aerpaw_cmp.jobs.options import RunOptions
+from aerpaw_cmp.jobs.tasks.options import RunOptions
 from aerpaw_cmp.report.content.campaign import RankRow
 from tests.jobs.campaign_rows import rss_row
 from tests.json_page import unlisted

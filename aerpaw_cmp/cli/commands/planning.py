@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from typer import Argument, Option
 
 from ...common.counting import counted
-from ...jobs.options import RunOptions
+from ...jobs.tasks.options import RunOptions
 from ..app import DryRun, Flights, Force, Json, LogsRoot, command, output
 from ..shown import print_files, print_json, records, say, show, warn_all
 

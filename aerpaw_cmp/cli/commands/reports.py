@@ -10,7 +10,7 @@ from typer import Argument, Option
 
 from ...common.counting import counted
 from ...common.errors import one_line
-from ...jobs.options import RunOptions
+from ...jobs.tasks.options import RunOptions
 from ..app import DryRun, Force, Json, LogsRoot, Scheduler, Workers, command, output
 from ..shown import number, print_json, records, say, show, table
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from typer import Argument, Option
 
 from ...common.errors import UsageError
-from ...jobs.options import RunOptions
+from ...jobs.tasks.options import RunOptions
 from ..app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
 from ..shown import print_files, print_json, say, show, table
 

@@ -20,7 +20,7 @@ from ...flight.gains.memory import load_with_learned
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile
 from ...report.content.campaign import CampaignData, Failure
-from ..options import DEFAULT, RunOptions
+from ..tasks.options import DEFAULT, RunOptions
 from ..tasks.workers import open_workers
 from .campaign_plan import compute, kept_outcomes, planned_tasks
 from .campaign_tasks import Task, counted_once, flight_data, outcome_store

@@ -18,7 +18,7 @@ from ...site.inputs import inputs_of_site
 from ...site.mesh_scenes.mitsuba import TriangleScene
 from ...site.scenes import GROUND_SHARE, bounds, ground_share, placed_scene
 from ...site.siteyaml import SceneModel, SiteModel, build_site, load_site, site_model
-from ..options import JobOutcome
+from ..tasks.options import JobOutcome
 
 _LOCAL_NOTE = "this site has no georeference: latitude and longitude count from (0, 0), and no log of a flight fits it"
 

@@ -30,7 +30,7 @@ from ...report.pages.plan import PlanPage, plan_metrics, write_plan
 from ...site.imports.outlines import MAX_CROSSINGS, is_tangled
 from ...site.site import Site
 from ..learning.calibrate import learned_antennas, observe
-from ..options import DEFAULT, JobOutcome, RunOptions
+from ..tasks.options import DEFAULT, JobOutcome, RunOptions
 from .predict import site_of
 from .sources import NamedFlight, files_of, named_flights, sources_of
 from .where import TargetOptions, Targets, find_targets, level_samples, target_files

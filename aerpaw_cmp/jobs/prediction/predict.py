@@ -35,7 +35,7 @@ from ...site.site import Site
 from ...site.siteyaml import load_site
 from ..learning.calibrate import learned_antennas, observe
 from ..learning.calibrate_rank import FittedReceiver, RankSamples, read_receiver
-from ..options import DEFAULT, JobOutcome, RunOptions
+from ..tasks.options import DEFAULT, JobOutcome, RunOptions
 from .sources import (
     Flown,
     Memory,

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..common.stages import Plan, Progress, Stages, logged
+from ...common.stages import Plan, Progress, Stages, logged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -23,7 +23,7 @@ from aerpaw_cmp.compare.level.rss import local_mean_db
 from aerpaw_cmp.propagation.geometry.arrays import rotation_from_yaw_pitch_roll
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
-RECIPE = Recipe(model=MODEL, rotation=lambda *_: np.eye(3), mount=False)
+RECIPE = Recipe(MODEL)
 
 
 def observed(flight: str, offset_db: float = 0.0, seed: int = 0) -> Observed:
@@ -118,12 +118,8 @@ def test_levels_below_the_floor_of_a_receiver_teach_no_gain() -> None:
 
 
 @pytest.mark.parametrize("floor_db", [None, -90.0])
-@pytest.mark.parametrize("mount", [True, False])
-def test_pattern_and_learned_gain_together_are_the_planted_gain(floor_db: float | None, mount: bool) -> None:
+def test_pattern_and_learned_gain_together_are_the_planted_gain(floor_db: float | None) -> None:
     """The gain is learned on top of the pattern as mounted, whatever part of the levels the pattern explains."""
-
-    def turn(yaw: float, pitch: float, roll: float) -> np.ndarray:
-        return rotation_from_yaw_pitch_roll(*np.radians([yaw, pitch, roll]))
 
     def pattern(direction: np.ndarray) -> np.ndarray:
         return 6.0 * direction[:, 0] ** 2 + 2.0 * direction[:, 1]
@@ -131,12 +127,12 @@ def test_pattern_and_learned_gain_together_are_the_planted_gain(floor_db: float 
     def flown(flight: str, seed: int) -> LinkSamples:
         s = observed(flight, seed=seed).samples
         floor = None if floor_db is None else np.full(len(s), floor_db)
-        level = s.residual_db + pattern(s.at_tower @ turn(70.0 if mount else 0.0, 0.0, 0.0))
+        level = s.residual_db + pattern(s.at_tower @ rotation_from_yaw_pitch_roll(np.radians(70.0), 0.0, 0.0))
         return dataclasses.replace(s, residual_db=level, floor_db=floor)
 
-    recipe = Recipe(model=MODEL, rotation=turn, patterns={"LW1.USRP1": pattern}, mount=mount)
+    recipe = Recipe(MODEL, {"LW1.USRP1": pattern})
     learned = calibration.learn([flown("a", 1), flown("b", 2)], recipe)
-    assert set(learned.mounts) == ({"LW1.USRP1"} if mount else set())
+    assert set(learned.mounts) == {"LW1.USRP1"}
     other = flown("c", 3)
     error = other.residual_db - learned.mean(other)
     assert error.std() < 0.8 < 2.0 < other.residual_db.std()

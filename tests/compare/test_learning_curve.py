@@ -10,7 +10,7 @@ from aerpaw_cmp.compare.learning.calibration import Observed, Recipe, learn
 from aerpaw_cmp.compare.learning.learning_curve import CurvePoint, learning_curve, with_one_more
 from tests.compare.test_direction_gain import GAINS, planted
 
-RECIPE = Recipe(GainModel((Term("body", "all", 0.5, 2.5), Term("mast", "antenna", 0.4, 3.0))), lambda *_: np.eye(3))
+RECIPE = Recipe(GainModel((Term("body", "all", 0.5, 2.5), Term("mast", "antenna", 0.4, 3.0))))
 
 
 def observed(flights: int) -> list[Observed]:

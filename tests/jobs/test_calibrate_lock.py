@@ -21,7 +21,7 @@ from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks, lock_words
 from aerpaw_cmp.site.antenna.learned import Entry, LearnedLock, LearnedSeries, read_learned, remember
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
-RECIPE = Recipe(model=MODEL, rotation=lambda *_: np.eye(3), mount=False)
+RECIPE = Recipe(MODEL)
 HALF_DB, PER_DB, SENT_DBM, REFERENCE_DB = -95.0, 0.4, 40.0, 80.0
 
 

@@ -1,4 +1,8 @@
-"""Mounts of antennas of known pattern: azimuth and tilt of all ends of several flights at once."""
+"""Mounts of antennas of known pattern: azimuths of all ends of several flights at once.
+
+Pitch and roll are 0: on dataset 12 tilts fitted on one flight (up to 20 degrees) raised the error of the other from
+3.53 to 4.00 dB.
+"""
 
 from __future__ import annotations
 
@@ -30,10 +34,10 @@ class MountFit:
 
     Parameters
     ----------
-    azimuth_deg, pitch_deg, roll_deg : float
-        Of the most probable mount, as ``yaw_deg``, ``pitch_deg``, ``roll_deg`` of flight.yaml.
-    azimuth_sd_deg, tilt_sd_deg : float
-        Circular standard deviation of azimuth; of tilt at the best azimuth (0 where it was not fitted).
+    azimuth_deg : float
+        Of the most probable mount, as ``yaw_deg`` of flight.yaml.
+    azimuth_sd_deg : float
+        Circular standard deviation.
     probability : (azimuths,)
         Posterior over ``grid_deg``.
     identified : bool
@@ -41,10 +45,7 @@ class MountFit:
     """
 
     azimuth_deg: float
-    pitch_deg: float
-    roll_deg: float
     azimuth_sd_deg: float
-    tilt_sd_deg: float
     grid_deg: FloatArray
     probability: FloatArray
     identified: bool
@@ -54,13 +55,13 @@ class MountFit:
 GainOf = Callable[[FloatArray], FloatArray]
 
 
-def fit_mounts(
-    series: Sequence[LinkSamples],
-    patterns: Mapping[str, GainOf],
-    rotation: Callable[[float, float, float], FloatArray],
-    *,
-    tilt: bool = False,
-) -> dict[str, MountFit]:
+def turned(azimuth_deg: float) -> FloatArray:
+    """Mount (3, 3) of an antenna whose front looks that way, counter-clockwise from above."""
+    c, s = np.cos(np.radians(azimuth_deg)), np.sin(np.radians(azimuth_deg))
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def fit_mounts(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf]) -> dict[str, MountFit]:
     """Mounts of antennas with a pattern, all at once.
 
     Parameters
@@ -69,11 +70,6 @@ def fit_mounts(
         Residuals against free space.
     patterns : mapping of str to callable
         Key ``uav`` and the antennas at towers that have a pattern; others count as isotropic.
-    rotation : callable
-        ``(yaw, pitch, roll)`` in degrees to the mount (3, 3).
-    tilt : bool
-        Fit pitch and roll too. Off, they are 0: on dataset 12 tilts fitted on one flight (up to 20 degrees) raise the
-        error of the other from 3.53 to 4.00 dB.
 
     Returns
     -------
@@ -82,35 +78,20 @@ def fit_mounts(
     Notes
     -----
     ``log p = -|y - u - t|^2 / (2 s^2)`` is a quadratic form of columns computed once. Azimuths of
-    tower antennas are optimised for each azimuth of the UAV; tilts follow at the best azimuths, within 20 degrees.
+    tower antennas are optimised for each azimuth of the UAV.
     """
     grid = np.arange(0.0, 360.0, STEP_DEG)
-    turned = {name: [(a, 0.0, 0.0) for a in grid] for name in patterns}
-    forms = _quadratic_forms(series, patterns, rotation, turned)
-    chosen, probability = _best_together(forms)
-    span = np.arange(-20.0, 21.0, 5.0) if tilt else np.zeros(1)
-    tilts = [(float(p), float(r)) for p in span for r in span]
-    tilted = {name: [(float(grid[chosen[name]]), p, r) for p, r in tilts] for name in patterns}
-    tilt_index, weight = _best_together(_quadratic_forms(series, patterns, rotation, tilted))
-    return {
-        name: _mount(grid, probability[name], tilted[name][tilt_index[name]], weight[name], np.asarray(tilts))
-        for name in patterns
-    }
+    chosen, probability = _best_together(_quadratic_forms(series, patterns, grid))
+    return {name: _mount(grid, probability[name], float(grid[chosen[name]])) for name in patterns}
 
 
-def _mount(
-    grid: FloatArray, probability: FloatArray, best: tuple[float, float, float], tilt: FloatArray, tilts: FloatArray
-) -> MountFit:
+def _mount(grid: FloatArray, probability: FloatArray, best_deg: float) -> MountFit:
     phasor = complex((probability * np.exp(1j * np.radians(grid))).sum())
     spread = np.degrees(np.sqrt(-2.0 * np.log(min(max(abs(phasor), 1e-9), 1.0))))
-    apart = np.abs(wrap_degrees(grid - best[0]))
-    mean = tilt @ tilts
+    apart = np.abs(wrap_degrees(grid - best_deg))
     return MountFit(
-        azimuth_deg=best[0],
-        pitch_deg=best[1],
-        roll_deg=best[2],
+        azimuth_deg=best_deg,
         azimuth_sd_deg=float(max(spread, (grid[1] - grid[0]) / np.sqrt(12.0))),
-        tilt_sd_deg=float(np.sqrt(tilt @ ((tilts - mean) ** 2).sum(axis=1) / 2.0)),
         grid_deg=grid,
         probability=probability,
         identified=bool(probability[apart > 45.0].sum() < 0.05),
@@ -125,29 +106,21 @@ class _Forms:
     columns: Mapping[str, slice]
 
 
-def _quadratic_forms(
-    series: Sequence[LinkSamples],
-    patterns: Mapping[str, GainOf],
-    rotation: Callable[[float, float, float], FloatArray],
-    mounts: Mapping[str, Sequence[tuple[float, float, float]]],
-) -> _Forms:
-    columns, start = {}, 1
-    for name in patterns:
-        columns[name] = slice(start, start + len(mounts[name]))
-        start += len(mounts[name])
+def _quadratic_forms(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf], grid: FloatArray) -> _Forms:
+    columns = {name: slice(1 + i * len(grid), 1 + (i + 1) * len(grid)) for i, name in enumerate(patterns)}
+    mounts = [turned(azimuth) for azimuth in grid]
 
     def candidates(samples: LinkSamples) -> FloatArray:
         """Target and candidates (bins, q) of a series."""
         good = samples.part(np.isfinite(samples.residual_db) & np.isfinite(samples.at_uav).all(axis=1))
         bins = good.binned(BIN_S)
-        out = np.zeros((len(bins), start))
+        out = np.zeros((len(bins), 1 + len(patterns) * len(grid)))
         out[:, 0] = bins.residual_db
         for name, pattern in patterns.items():
             if name not in ("uav", samples.antenna):
                 continue
             direction = bins.at_uav if name == "uav" else bins.at_tower
-            for column, angles in zip(range(*columns[name].indices(start)), mounts[name], strict=True):
-                out[:, column] = pattern(direction @ rotation(*angles))
+            out[:, columns[name]] = np.stack([pattern(direction @ mount) for mount in mounts], axis=1)
         return np.asarray(out - out.mean(axis=0), dtype=np.float64)
 
     rows = np.concatenate([candidates(s) for s in series])

@@ -14,7 +14,7 @@ from ...common.errors import InputError
 from ...common.geodesy import azimuth_rad
 from ...common.units import BoolArray, FloatArray, IntArray, spread_out, wrap_degrees
 from ..gains.direction_gain import GainFit, GainModel, LinkSamples, chosen_fit, fit_gain
-from ..gains.mount import GainOf, MountFit, fit_mounts
+from ..gains.mount import GainOf, MountFit, fit_mounts, turned
 from ..gains.spread import Spread, StatedSpread, fading_of, inside_shares
 from ..judge.ladder import log_distance_level_db
 from ..level.detection import floored_fit
@@ -75,17 +75,10 @@ class Recipe:
         Terms and where their strengths start.
     patterns : mapping of str to callable
         Gain of measured patterns in the device frame: ``uav`` and antennas (``tower.channel``); may be empty.
-    rotation : callable
-        ``(yaw, pitch, roll)`` [deg] to a mount (3, 3).
-    mount, tilt : bool
-        Fit the azimuth, and pitch and roll, of antennas with a pattern.
     """
 
     model: GainModel
-    rotation: Callable[[float, float, float], FloatArray]
     patterns: Mapping[str, GainOf] = field(default_factory=dict)
-    mount: bool = True
-    tilt: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,8 +110,7 @@ class Learned:
         if pattern is None:
             return np.zeros(len(direction))
         mount = self.mounts.get(name)
-        angles = (0.0, 0.0, 0.0) if mount is None else (mount.azimuth_deg, mount.pitch_deg, mount.roll_deg)
-        return pattern(direction @ self.recipe.rotation(*angles))
+        return pattern(direction if mount is None else direction @ turned(mount.azimuth_deg))
 
     def patterns_db(self, samples: LinkSamples) -> FloatArray:
         """Gain (n,) of the measured patterns of both ends."""
@@ -169,7 +161,7 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None
     """
     names = ["uav", *dict.fromkeys(s.antenna for s in series)]
     patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
-    mounts = fit_mounts(series, patterns, recipe.rotation, tilt=recipe.tilt) if patterns and recipe.mount else {}
+    mounts = fit_mounts(series, patterns) if patterns else {}
     bare = Learned(recipe, recipe.model, mounts, None)
     if not recipe.model.terms:
         return bare

@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -31,7 +31,6 @@ from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...flight.settings import AntennaSettings, load_pattern
 from ...flight.training import counted_once, flight_logs, marks_of
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
-from ...propagation.geometry.arrays import rotation_from_yaw_pitch_roll
 from ...report.words.calibration import sentences
 from ...site.antenna.learned import LearnedLock, Source
 from .calibrate_lock import learned_locks, lock_words
@@ -50,21 +49,12 @@ class PatternsSettings(StrictModel):
     """By ``tower.channel``, where they differ."""
 
 
-class FitSettings(StrictModel):
-    """Selection of what is learned."""
-
-    mount: Literal["azimuth", "tilt", "none"] = "azimuth"
-    """Of antennas with a pattern."""
-    bin_s: Annotated[float, Field(gt=0, le=60)] = 4.0
-
-
 class CalibrationFile(StrictModel):
     """The whole calibration.yaml."""
 
     calibration: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
     flights: Annotated[list[str], Field(min_length=1)]
     patterns: PatternsSettings = PatternsSettings()
-    fit: FitSettings = FitSettings()
     source: Source = Source()
     """Title, DOI and licence of the flights' data, and their airframe: kept beside what a site remembers."""
     rank: RankFitSettings | None = None
@@ -367,14 +357,9 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float, floa
 # --- what is learned -----------------------------------------------------------------------------------------------
 
 
-def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
-    """Mount (3, 3) from the angles of flight.yaml."""
-    return rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, pitch_deg, roll_deg]))
-
-
 def learned_antennas(train: Sequence[direction_gain.LinkSamples]) -> Learned:
     """Antennas of both ends from means over the bins of a correction, with the model's own strengths to start from."""
-    return calibration.learn(train, Recipe(model=direction_gain.GainModel(bin_s=BIN_S), rotation=rotation))
+    return calibration.learn(train, Recipe(direction_gain.GainModel(bin_s=BIN_S)))
 
 
 def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
@@ -386,13 +371,7 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
         chosen = settings.patterns.towers.get(antenna, settings.patterns.tower)
         if chosen is not None:
             patterns[antenna] = gain_of(chosen, folder)
-    return Recipe(
-        model=direction_gain.GainModel(bin_s=settings.fit.bin_s),
-        rotation=rotation,
-        patterns=patterns,
-        mount=settings.fit.mount != "none",
-        tilt=settings.fit.mount == "tilt",
-    )
+    return Recipe(direction_gain.GainModel(), patterns)
 
 
 def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:

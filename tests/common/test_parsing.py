@@ -136,7 +136,6 @@ OWN = {
     "propagation/native/llvm.py": "the answer of a child",
     "propagation/engine/engines.py": "sealed by this user",
     "propagation/check/reference.py": "tables that the run has read",
-    "jobs/reporting/audit_cache.py": "sealed by this user",
     "site/relief/surface.py": "bytes of its own arguments",
     "jobs/reporting/audit_flight.py": "tables that the run has read",
 }

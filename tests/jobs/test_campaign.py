@@ -346,7 +346,7 @@ def test_a_dry_run_says_what_is_kept(folder: Path, capsys: pytest.CaptureFixture
         stage = stages[f"flights, {label}"]
         assert stage["work"] == "2 tasks, 1 kept"
         task = Task(folder / "first.yaml", "first", label, setting, None)
-        assert stage["seconds"] == pytest.approx(store.seconds(digest_of(task)) / 2)
+        assert stage["seconds"] == pytest.approx(store.load(digest_of(task)).seconds / 2)
     run(campaign, folder, keep=folder / "outcomes")
     assert main(["campaign", str(path), "--dry-run", "--json", *keep]) == 0
     again = json.loads(capsys.readouterr().out)["stages"]

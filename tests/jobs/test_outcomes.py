@@ -21,7 +21,7 @@ from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import sample
 from aerpaw_cmp.jobs.campaigns import campaign_tasks
 from aerpaw_cmp.jobs.campaigns.campaign_plan import compute, kept_outcomes, planned_tasks
-from aerpaw_cmp.jobs.campaigns.campaign_tasks import Done, Order, Outcome, Task, carry_out, digest_of, outcome_store
+from aerpaw_cmp.jobs.campaigns.campaign_tasks import Order, Outcome, Task, carry_out, digest_of, outcome_store
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
 from aerpaw_cmp.jobs.tasks.workers import InProcess, Processes, Workers
 from aerpaw_cmp.report.content.campaign import Failure
@@ -162,7 +162,7 @@ def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path
     assert repr(again.rank) == repr(first.rank)
     assert [row.rmse_db for row in again.rss] == [row.rmse_db for row in first.rss]
     assert np.array_equal(again.rss[0].measured_db, first.rss[0].measured_db, equal_nan=True)
-    assert outcome_store(tmp_path).seconds(key) > 0
+    assert again.seconds > 0
 
 
 def test_a_key_is_of_everything_that_matters_and_of_nothing_else(flight: Path) -> None:
@@ -201,9 +201,8 @@ def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkey
     first = run_tasks(tasks, InProcess(), keep=tmp_path)
     assert asked == ["f0", "f1", "f2", "f3"]
     assert first[3].failure is not None
-    store = outcome_store(tmp_path)
-    (stage,) = planned_tasks(tasks, range(3), store, 1)
-    assert stage.seconds == pytest.approx(np.mean([store.seconds(digest_of(task)) for task in tasks[:3]]))
+    (stage,) = planned_tasks(tasks, dict(enumerate(first[:3])), 1)
+    assert stage.seconds == pytest.approx(np.mean([outcome.seconds for outcome in first[:3]]))
     again = run_tasks(tasks, InProcess(), keep=tmp_path)
     assert asked[4:] == ["f3"], "only the failure is tried again"
     assert all(equal(a, b) for a, b in zip(first[:3], again[:3], strict=True))
@@ -228,9 +227,9 @@ def test_a_new_name_or_place_in_the_list_computes_nothing(
 
 def test_a_worker_that_sees_other_files_fails_the_task(flight: Path) -> None:
     task = Task(flight, "f", "a", {}, None)
-    done = carry_out(Order(task=task, key="0" * 64))
-    assert done.outcome.failure is not None
-    assert "sees other inputs" in done.outcome.failure.message
+    outcome = carry_out(Order(task=task, key="0" * 64))
+    assert outcome.failure is not None
+    assert "sees other inputs" in outcome.failure.message
 
 
 def test_a_log_that_changes_is_read_again_by_a_worker_that_lives_on(flight: Path, tmp_path: Path) -> None:
@@ -282,12 +281,12 @@ def test_after_sigkill_only_what_is_missing_is_computed(
     assert all(equal(outcome, outcome_of(float(i))) for i, outcome in enumerate(outcomes))
 
 
-def lethal(order: Order) -> Done:
+def lethal(order: Order) -> Outcome:
     """Ends its worker: once where a file says so, always for the task called poison."""
     task = order.task
     if task.flight == "poison" or (task.flight == "f1" and not _happened(task)):
         os.kill(os.getpid(), signal.SIGKILL)
-    return Done(outcome=outcome_of(float(task.flight[1:])))
+    return outcome_of(float(task.flight[1:]))
 
 
 def _happened(task: Task) -> bool:

@@ -94,7 +94,7 @@ def run(
     with stages("flights"):
         outcomes, orders = kept_outcomes(tasks, store, progress)
     unread = [PlannedStage(failure.flight, one_line(failure.message)) for failure in failures]
-    stages.checked(lambda: [*planned_tasks(tasks, outcomes, store, options.workers), *unread])
+    stages.checked(lambda: [*planned_tasks(tasks, outcomes, options.workers), *unread])
     if store is not None:
         store.check()
     inputs = _inputs_of(files, logs_root)

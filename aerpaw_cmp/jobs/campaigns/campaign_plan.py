@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 
 from ...common.counting import counted
@@ -11,35 +11,18 @@ from ...common.stages import PlannedStage, Progress
 from ...report.content.campaign import Failure
 from ..tasks.outcomes import OutcomeStore
 from ..tasks.workers import Lost, Workers
-from .campaign_tasks import Done, Order, Outcome, Task, carry_out, digest_of, fitted_to
+from .campaign_tasks import Order, Outcome, Task, carry_out, digest_of, fitted_to
 
 
-def planned_tasks(
-    tasks: Sequence[Task], kept: Collection[int], store: OutcomeStore | None, workers: int
-) -> list[PlannedStage]:
-    """Tasks of each setting, for a dry run.
+def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: int) -> list[PlannedStage]:
+    """Tasks of each setting, for a dry run; ``kept`` outcomes stand by the numbers of their tasks.
 
-    Parameters
-    ----------
-    tasks : sequence of Task
-    kept : collection of int
-        Numbers of those whose outcome is kept.
-    store : OutcomeStore, optional
-        Knows what they took.
-    workers : int
-        Tasks side by side.
-
-    Returns
-    -------
-    list of PlannedStage
-        One a setting. A task to do takes as long as the kept ones of its setting took on average, else as all of them;
-        None where none is kept.
+    A task to do takes as long as the kept ones of its setting took on average, else as all of them; unknown where
+    none is kept. ``workers`` do so many side by side.
     """
     spent: dict[str, list[float]] = {}
-    for task in (tasks[number] for number in kept if store is not None):
-        assert store is not None
-        if (seconds := store.seconds(digest_of(task))) is not None:
-            spent.setdefault(task.setting, []).append(seconds)
+    for number, outcome in kept.items():
+        spent.setdefault(tasks[number].setting, []).append(outcome.seconds)
     every = [seconds for some in spent.values() for seconds in some]
     stages = []
     for setting in dict.fromkeys(task.setting for task in tasks):
@@ -96,18 +79,16 @@ def compute(
     """
     numbers, total, failed = list(orders), len(outcomes) + len(orders), 0
 
-    def take(place: int, result: Done | Lost) -> None:
+    def take(place: int, result: Outcome | Lost) -> None:
         nonlocal failed
         order = orders[numbers[place]]
         if isinstance(result, Lost):
             task = order.task
-            lost = Failure(flight=task.flight, setting=task.setting, message=result.message)
-            result = Done(outcome=Outcome(failure=lost))
-        failure = result.outcome.failure
-        if store is not None and order.key is not None and failure is None:
-            store.save(order.key, result.outcome, result.seconds)
-        outcomes[numbers[place]] = fitted_to(order.task, result.outcome)
-        failed += failure is not None
+            result = Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=result.message))
+        if store is not None and order.key is not None and result.failure is None:
+            store.save(order.key, result)
+        outcomes[numbers[place]] = fitted_to(order.task, result)
+        failed += result.failure is not None
         progress(f"flights\t{len(outcomes)} of {total} done, {failed} failed", len(outcomes) / total)
 
     if orders:

@@ -47,11 +47,12 @@ class Task:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Rows of one task, or why there are none."""
+    """Rows of one task, or why there are none, and what it cost [s]."""
 
     rss: tuple[RssRow, ...] = ()
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
+    seconds: float = 0.0
 
 
 def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Outcome]:
@@ -166,15 +167,7 @@ class Order:
     key: str | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Done:
-    """Answer of a worker, and what it cost [s]."""
-
-    outcome: Outcome
-    seconds: float = 0.0
-
-
-def carry_out(order: Order) -> Done:
+def carry_out(order: Order) -> Outcome:
     """Run a task; what runs in worker processes of every kind.
 
     The key is computed anew here: a worker that sees another file or runs other code fails the task instead of
@@ -184,12 +177,12 @@ def carry_out(order: Order) -> Done:
     try:
         same = order.key is None or digest_of(task) == order.key
     except (AerpawCmpError, OSError) as error:
-        return Done(outcome=_failed(task, f"an input can no longer be read: {error}", error))
+        return _failed(task, f"an input can no longer be read: {error}", error)
     if not same:
-        return Done(outcome=_not_the_same(task))
+        return _not_the_same(task)
     start = time.perf_counter()
     outcome = run_task(task)
-    return Done(outcome=outcome, seconds=time.perf_counter() - start)
+    return dataclasses.replace(outcome, seconds=time.perf_counter() - start)
 
 
 def _not_the_same(task: Task) -> Outcome:
@@ -238,7 +231,8 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
         )
 
     failure = outcome.failure and dataclasses.replace(outcome.failure, flight=task.flight, setting=task.setting)
-    return Outcome(
+    return dataclasses.replace(
+        outcome,
         rss=tuple(map(row, outcome.rss)),
         rank=tuple(dataclasses.replace(item, flight=task.flight, setting=task.setting) for item in outcome.rank),
         failure=failure,

@@ -15,10 +15,13 @@ from typing import Any
 
 import numpy as np
 
+from ...common.content import content_digest
 from ...common.counting import counted
+from ...common.files import cache_folder
 from ...common.jsonable import named
 from ...common.stages import Progress, logged
 from ...common.units import AnyArray, FloatArray, spread_out
+from ...common.versions import library_versions, utc_now
 from ...compare.level.field_difference import FieldAudit
 from ...compare.result import AuditResult, EngineResult
 from ...flight.data import FlightData
@@ -33,9 +36,10 @@ from ...propagation.drivers.moving import site_with_tower_at
 from ...propagation.geometry.arrays import Poses
 from ...propagation.native.llvm import SionnaMissingError
 from ...propagation.options import Field, Run, Search
+from ...propagation.replay import PER_LINK
 from ...propagation.search.sionna import free_memory
 from ...site.site import Site
-from .audit_cache import entry_of, read_audit, write_audit
+from ..tasks.outcomes import OutcomeStore, code_digest
 
 # Logged attitudes that are turned into rotations a second time.
 _ATTITUDE_ROWS = 200
@@ -103,12 +107,27 @@ def _audit_or_read(
     """The audit, kept by its inputs; read, unless it is to be made anew, where this machine has it."""
     if not data.settings.rt.advanced.cache:
         return _audit(data, replays, progress)
-    entry = entry_of(data, replays)
-    known = None if anew else read_audit(entry)
+    store, key = OutcomeStore(cache_folder("audits"), AuditResult), _content_of(data, replays)
+    known: AuditResult | None = None if anew else store.load(key)
     if known is None and (made := _audit(data, replays, progress)) is not None:
-        write_audit(entry, made)
+        store.save(key, dataclasses.replace(made, read_from_cache_of=utc_now()[:10]))
         return made
     return known
+
+
+# Keys of flight.yaml that an audit reads.
+_SETTINGS = {"rt", "link", "rank", "antennas", "towers"}
+
+
+def _content_of(data: FlightData, replays: Sequence[Replayed]) -> str:
+    """SHA-256 of all that an audit looks at: libraries, code, site, logs, settings and replays."""
+    settings = data.settings.model_dump(mode="json", include=_SETTINGS)
+    seen = [
+        (r.poses, r.tower_m, *(getattr(r.replay, name) for name in ("towers", "faces", "contributions", *PER_LINK)))
+        for r in replays
+    ]
+    logs = [file.sha256 for file in data.files]
+    return content_digest(library_versions(), code_digest(), settings, data.site, logs, seen)
 
 
 def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:

@@ -1,4 +1,4 @@
-"""Outcomes of a campaign's tasks, kept by what they depend on: nothing finished is computed twice."""
+"""Outcomes of a campaign's tasks and audits, kept by what they depend on: nothing finished is computed twice."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import dataclasses
 import hashlib
 import io
 import json
-import math
 import os
 from collections.abc import Iterable, Mapping
 from functools import cache
@@ -19,14 +18,14 @@ import numpy as np
 from pydantic import ConfigDict, TypeAdapter
 
 from ...common.errors import InputError, UsageError, parsing
-from ...common.files import atomic_path, seal, unseal
+from ...common.files import read_sealed, write_sealed
 from ...common.jsonable import named
 from ...common.units import AnyArray
 from ...flight.settings import FlightFile
 from .manifest import digest_of, other_inputs
 
 # Raised whenever the form of an entry changes.
-LAYOUT = 7
+LAYOUT = 8
 
 _SEAL = b"aerpaw-cmp outcome"
 
@@ -36,7 +35,7 @@ READERS = "aerpaw_cmp.readers"
 
 
 class OutcomeStore:
-    """Results of tasks by key: ``<key>.npz``, sealed by the digest of its content, and what it cost in ``<key>.s``.
+    """Records by key: ``<key>.npz``, sealed by the digest of its content.
 
     Parameters
     ----------
@@ -61,7 +60,8 @@ class OutcomeStore:
         """UsageError where nothing can be kept in the folder, before anything runs."""
         probe = self.folder / f".probe-{os.getpid()}"
         try:
-            self._write(probe.name, b"")
+            self.folder.mkdir(parents=True, exist_ok=True)
+            probe.touch()
             probe.unlink()
         except OSError as error:
             raise UsageError(
@@ -70,20 +70,15 @@ class OutcomeStore:
                 cause="a disk that is full or read-only, or a file in the way",
             ) from None
 
-    def _write(self, name: str, content: bytes) -> None:
-        self.folder.mkdir(parents=True, exist_ok=True)
-        with atomic_path(self.folder / name) as part:
-            part.write_bytes(content)
-
     def load(self, key: str) -> Any | None:
         """The outcome of a key, or None where there is no sound entry."""
         file = self.folder / f"{key}.npz"
         try:
-            content = unseal(file.read_bytes(), _SEAL)
-        except OSError:
-            return None
+            content = read_sealed(file, _SEAL)
         except ValueError:
             self.warnings.append(f"a damaged outcome was not used, its task is computed anew: {file}")
+            return None
+        if content is None:
             return None
         try:
             with parsing(file, any_shape=True), np.load(io.BytesIO(content), allow_pickle=False) as parts:
@@ -93,27 +88,14 @@ class OutcomeStore:
             self.warnings.append(f"an outcome that this tool did not write was not used: {file}")
             return None
 
-    def save(self, key: str, outcome: Any, seconds: float = 0.0) -> None:
-        """Write an entry whole or not at all, then its cost; nothing where the disk does not take it."""
+    def save(self, key: str, outcome: Any) -> None:
+        """Write an entry whole or not at all; nothing where the disk does not take it."""
         arrays = _Arrays()
         text = json.dumps(_plain(outcome, arrays), default=lambda number: number.item())
         content = np.frombuffer(text.encode(), dtype=np.uint8)
         entry = io.BytesIO()
         np.savez(entry, content=content, **arrays.by_name)  # type: ignore[arg-type]
-        with contextlib.suppress(OSError):
-            self._write(f"{key}.npz", seal(entry.getvalue(), _SEAL))
-            self._write(f"{key}.s", f"{seconds:.3f}\n".encode())
-
-    def seconds(self, key: str) -> float | None:
-        """Cost of an outcome; None where it is not known."""
-        with contextlib.suppress(OSError, ValueError):
-            seconds = float((self.folder / f"{key}.s").read_bytes())
-            return seconds if math.isfinite(seconds) else None
-        return None
-
-    def has(self, key: str) -> bool:
-        """Check whether there is an entry."""
-        return (self.folder / f"{key}.npz").is_file()
+        write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)
 
 
 # Key of the name of an array, in its place in the JSON.

@@ -64,7 +64,7 @@ def share_of(progress: Progress, text: str) -> Callable[[float], None]:
     return step
 
 
-_MEASURED = "seconds that reading took, and that a coarse map or kept tasks tell; a stage with a dash was not tried"
+_MEASURED = "seconds that reading took, and that kept tasks tell; of a stage with a dash none are known"
 
 
 @dataclass(frozen=True, slots=True)

@@ -426,7 +426,6 @@ def run_map(
     from ..site.siteyaml import load_site
     from .mapping import coverage_map as mapping
     from .mapping.paper_table import paper_markdown, paper_rows
-    from .mapping.planned_map import map_stages
     from .prediction.sources import files_of, named_flights
     from .tasks.workers import open_workers
 
@@ -438,7 +437,7 @@ def run_map(
     folder = options.out or Path("reports") / f"map-{Path(site).stem}"
     stages = options.stages("map", inputs, folder)
     with OutputFolder(folder, job="map", inputs=inputs, force=options.force) as output:
-        stages.checked(lambda: map_stages(place, settings, len([flight.load(options.logs_root) for flight in known])))
+        stages.checked(lambda: mapping.map_stages(place, settings, [f.load(options.logs_root) for f in known]))
         file = [Path(site).absolute()] if Path(site).is_file() else []
         with open_workers(options.workers, options.scheduler, paths=file, progress=progress) as crew:
             outcome = mapping.make_maps(

@@ -368,15 +368,6 @@ def test_the_command_in_tiles(tmp_path, monkeypatch, capsys, blank_pictures):
     assert (tmp_path / "out" / "map.html").is_file()
 
 
-def test_the_plan_of_tiles_tries_some_of_them(tmp_path):
-    from aerpaw_cmp.jobs.plan import map_stages
-
-    maps = next(stage for stage in map_stages(load_site(SITE), SETTINGS) if stage.name == "maps in tiles")
-    assert maps.work == "8 tiles of 5 x 5 positions"
-    assert maps.seconds > 0
-    assert not list(tmp_path.iterdir())
-
-
 def test_flights_and_tiles_are_refused_before_anything_runs():
     from aerpaw_cmp.jobs import run
 

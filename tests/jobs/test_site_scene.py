@@ -125,15 +125,6 @@ def flown(room: Path, tmp_path: Path) -> Path:
     return tmp_path / "flight.yaml"
 
 
-def test_a_flight_and_a_map_of_a_scene_are_planned_by_a_trial(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    for command in (["report", str(flown)], ["map", str(flown.with_name("site.yaml")), "--spacing", "20"]):
-        capsys.readouterr()
-        assert main([*command, "--dry-run", "--json", "--quiet"]) == 0
-        stages = json.loads(capsys.readouterr().out)["stages"]
-        assert len(stages) > 1
-        assert all(stage["seconds"] > 0.0 for stage in stages if stage["name"].startswith("maps, foliage"))
-
-
 @pytest.mark.sionna
 @pytest.mark.usefixtures("sionna")
 def test_a_report_of_a_scene_is_audited_and_its_paths_explained(

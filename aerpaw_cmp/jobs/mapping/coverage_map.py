@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
 from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache, partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from ...common.counting import counted
 from ...common.errors import InputError, UsageError, noting_interrupts
 from ...common.jsonable import named
 from ...common.outputs import file_digest
-from ...common.stages import Progress, Stages, share_of
+from ...common.stages import PlannedStage, Progress, Stages, share_of
 from ...common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, db_from_power, finite_mean, wavelength_m
 from ...common.versions import utc_now, versions
 from ...compare.rank import singular_values
@@ -502,6 +502,21 @@ def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
     chosen = {key: str(value) for key, value in asdict(settings).items() if key not in without}
     files = [file_digest(file)[:12] for file in inputs_of_site(site)]
     return {"site": files, **chosen, "program": code_digest()[:12]}
+
+
+def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[PlannedStage]:
+    """Stages of a map, for its dry run."""
+    grid = Grid.over_area(place.area_m, settings.spacing_m)
+    heights, tile = {*settings.rss_altitudes_m, *settings.rank_altitudes_m}, settings.tile_cells(grid)
+    sides = {"position": len(grid), "height": len(heights), "tower": len(place.towers)}
+    work = f"{counted(math.prod(sides.values()), 'link')}: {', '.join(counted(n, name) for name, n in sides.items())}"
+    stages = {
+        "maps": work + (f", in tiles of {tile} x {tile} positions" if tile else ""),
+        "correct, compare": counted(len(flights), "flight") if flights else "",
+        "study": "correlation and interpolation" if settings.study and not tile else "",
+        "export, page": f"layers of {counted(len(settings.foliage), 'foliage mode')}",
+    }
+    return [PlannedStage(name, what) for name, what in stages.items() if what]
 
 
 def study_maps(outcome: MapOutcome, stages: Stages) -> None:

@@ -8,13 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from ..common.counting import counted
 from ..common.errors import InputError, UsageError
 from ..common.jsonable import json_object, named
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..compare.gains.spread import NO_SPREAD, Spread
-from ..compare.learning.locate import FEWEST, UNKNOWN, LevelModel, LevelTrack, NodeEstimate, locate
+from ..compare.learning.locate import UNKNOWN, LevelModel, LevelTrack, NodeEstimate, locate
 from ..flight.data import check_place, choose_site, is_ratio, read_logs, site_place
 from ..flight.drafting.draft import receiver_floor_db
 from ..flight.drafting.node import Placer
@@ -70,13 +69,6 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
         with stages("locate"):
             floor = LOCK_FLOOR_DB if is_sounder_power(level) else receiver_floor_db([level])
             track = Placer(site, vehicle).levels(level, -np.inf if floor is None else floor, uav, node)
-            if len(track.level_db) < FEWEST:
-                raise InputError(
-                    f"{counted(len(track.level_db), 'bin')} of 4 s with a level and a position above 5 m",
-                    expected=f"{FEWEST}",
-                    cause="a short flight, or logs of two flights",
-                    path=flight,
-                )
             estimate = locate(track, model=UNKNOWN if node is None else _model_of(node))
         assumed = "unknown, one gain over the elevation" if node is None else f"{node.name}, learned on other flights"
         ends = f"Antenna of the UAV: {'unknown' if uav is None else uav.name}. Antenna of the node: {assumed}."

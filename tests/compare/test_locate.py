@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal, norm
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare.learning import locate as locating
 from aerpaw_cmp.compare.learning.locate import LevelTrack, fit_places, level_track, locate
@@ -145,7 +146,7 @@ def test_a_node_far_away_is_said_to_be_at_the_edge_or_anywhere() -> None:
 
 def test_too_few_levels_are_refused() -> None:
     time, position = _lawnmower(20)
-    with pytest.raises(ValueError, match="19 levels"):
+    with pytest.raises(InputError, match="19 bins"):
         locate(LevelTrack(time[:19], position[:19], np.zeros(19)))
     assert locate(LevelTrack(time, position, np.zeros(20))).radius90_m > 300.0  # levels that say nothing
 

@@ -13,6 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...common.counting import counted
+from ...common.errors import InputError
 from ...common.geodesy import elevation_rad
 from ...common.units import BoolArray, FloatArray, unmasked
 
@@ -400,7 +402,7 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = 
 
     Raises
     ------
-    ValueError
+    InputError
         Too few levels.
 
     Notes
@@ -410,7 +412,11 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = 
     from scipy.special import logsumexp
 
     if len(track.level_db) < FEWEST:
-        raise ValueError(f"{len(track.level_db)} levels: a search for a node wants {FEWEST}")
+        raise InputError(
+            f"{counted(len(track.level_db), 'bin')} of 4 s with a level and a position above 5 m",
+            expected=f"{FEWEST}",
+            cause="a short flight, or logs of two flights",
+        )
     grid = _grid(track)
     places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
     evidence = fit_places(track, places, model).evidence + _log_prior(places)

@@ -53,26 +53,21 @@ class Scene:
                 expected="one of " + ", ".join(site.towers),
                 cause="a typing error",
             )
-        surfaces = surfaces_of(site)
+        surfaces, towers = surfaces_of(site), [site.towers[name] for name in names]
+        sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
+        excluded = inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
         if surfaces is not None:
-            sources = np.array([site.towers[name].position_m for name in names]).reshape(-1, 3)
-            excluded = inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
             usable = np.ones((len(names), len(surfaces)), dtype=np.bool_)
             return cls(surfaces.faces, sources, usable, excluded, surfaces)
         faces = site_faces(site, names)
-        towers = [site.towers[name] for name in names]
-        sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
         ground = np.array([tower.ground_m for tower in towers])
         is_ground = faces.solid < 0
         usable = ~is_ground[None, :] | (faces.offset_m[None, :] == ground[:, None])
-        up = poses.position_m[:, 2]
         # a pose below a tower's own plane but above the lowest ground, or above the terrain's, is no buried pose
         lowest = np.minimum(ground, 0.0)[:, None]
         if site.dem is not None:
             lowest = np.fmin(lowest, site.dem.ground_m(*poses.position_m[:, :2].T))
-        buried = up[None, :] < lowest
-        excluded = buried | inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
-        return cls(faces, sources, usable, excluded)
+        return cls(faces, sources, usable, excluded | (poses.position_m[:, 2] < lowest))
 
     def links_to(self, poses: Poses) -> Links:
         """Ends of the links from the towers to the poses."""
@@ -127,10 +122,6 @@ def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
     rotation has no field.
     """
     towers = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
-    if len(poses) and len(towers) and np.isfinite(poses.position_m).all() and np.isfinite(poses.rotation).all():
-        low, high = poses.position_m.min(axis=0), poses.position_m.max(axis=0)
-        if (np.hypot.reduce(np.maximum(np.abs(low - towers), np.abs(high - towers)), axis=1) <= REACH_M).any():
-            return poses, []  # the usual flight, decided by its box
     known = np.isfinite(poses.position_m).all(axis=1)
     turned = np.isfinite(poses.rotation).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):

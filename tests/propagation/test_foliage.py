@@ -278,9 +278,9 @@ def test_crowns_at_the_edges_of_the_grid_are_found_from_all_sides(monkeypatch):
 @pytest.mark.parametrize("low", [2.0, 5.0])
 def test_a_level_line_lies_within_a_slab_up_to_its_faces(low):
     at, step = np.array([low - 1e-12, low, low + 1.0, low + 3.0, low + 3.0 + 1e-12]), np.zeros(5)
-    first, last = foliage._slab(at, step, low, low + 3.0)
+    first, last = foliage.slab(at, step, low, low + 3.0)
     assert (last >= first).tolist() == [False, True, True, True, False]
-    first, last = foliage._slab(np.array([0.0, 10.0, 0.0, 3.0]), np.array([10.0, -10.0, 1.0, 1.0]), 2.0, 5.0)
+    first, last = foliage.slab(np.array([0.0, 10.0, 0.0, 3.0]), np.array([10.0, -10.0, 1.0, 1.0]), 2.0, 5.0)
     np.testing.assert_allclose(first, [0.2, 0.5, 1.0 + 1.0, 0.0])
     np.testing.assert_allclose(last, [0.5, 0.8, 1.0, 1.0])
 

@@ -200,6 +200,8 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
         Paths that one has and the other lacks, errors of the level [dB], links in coverage of one alone, and ranks
         that differ.
     """
+    from ...compare.rank import channel_rank
+
     ours, theirs = (keys.keys() for keys in _keys_of_both(replay, reference, chosen))
     level, level_reference = replay.rss_dbm[chosen], reference.rss_dbm
     covered = np.isfinite(level) & np.isfinite(level_reference)
@@ -211,14 +213,10 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
         rss_max_error_db=float(error.max()) if error.size else float("nan"),
         rss_rms_error_db=float(np.sqrt((error**2).mean())) if error.size else float("nan"),
         coverage_differs=int((replay.has_path[chosen] != reference.has_path).sum()),
-        rank_disagreement=_rank_disagreement(replay.h[chosen], reference.h, ks),
+        rank_disagreement={
+            float(k): float(np.mean(channel_rank(replay.h[chosen], k) != channel_rank(reference.h, k))) for k in ks
+        },
     )
-
-
-def _rank_disagreement(h: object, reference: object, ks: Sequence[float]) -> dict[float, float]:
-    from ...compare.rank import channel_rank
-
-    return {float(k): float(np.mean(channel_rank(h, k) != channel_rank(reference, k))) for k in ks}  # type: ignore[arg-type]
 
 
 def extra_rows(replay: Replay, reference: Replay, chosen: IntArray) -> IntArray:

@@ -160,12 +160,8 @@ def _scene_of(
     moved_site = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
     several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
     some = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
-    return (
-        moved_site,
-        several,
-        some,
-        None if len(names) == 1 else np.arange(len(names))[:, None] == block.place[None, :],
-    )
+    links = None if len(names) == 1 else np.arange(len(names))[:, None] == block.place[None, :]
+    return moved_site, several, some, links
 
 
 def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:

@@ -375,7 +375,7 @@ class CrownIndex:
     def _within_heights(self, start_m: FloatArray, end_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Share of each segment (first, last) that lies between the lowest base and the highest top."""
         low, high = self._bodies[:, 2].min(), self._bodies[:, 3].max()
-        return _slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
+        return slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
 
     def _sum(
         self, start: FloatArray, end: FloatArray, first: FloatArray, last: FloatArray, pieces: IntArray
@@ -421,8 +421,21 @@ class CrownIndex:
         return piece, self._members[slot]
 
 
-def _slab(at: FloatArray, step: FloatArray, low: AnyArray, high: AnyArray) -> tuple[FloatArray, FloatArray]:
-    """Interval of t in [0, 1] with ``low <= at + t step <= high``; first > last when there is none."""
+def slab(
+    at: FloatArray, step: FloatArray, low: AnyArray | float, high: AnyArray | float
+) -> tuple[FloatArray, FloatArray]:
+    """Interval of t in [0, 1] with ``low <= at + t step <= high``.
+
+    Parameters
+    ----------
+    at, step : (n,)
+    low, high : (n,) or float
+
+    Returns
+    -------
+    first, last : (n,)
+        first > last where there is none.
+    """
     with np.errstate(divide="ignore", invalid="ignore"):
         at_low, at_high = (low - at) / step, (high - at) / step
     level = step == 0
@@ -438,7 +451,7 @@ def _chord_share(start: FloatArray, move: FloatArray, bodies: FloatArray, shape:
     The side of a body is a quadric, ``A t^2 + 2 B t + C <= 0`` along the segment.
     """
     base, top, radius = bodies[:, 2], bodies[:, 3], bodies[:, 4]
-    first, last = _slab(start[:, 2], move[:, 2], base, top)
+    first, last = slab(start[:, 2], move[:, 2], base, top)
     east, north = start[:, 0] - bodies[:, 0], start[:, 1] - bodies[:, 1]
     a = move[:, 0] ** 2 + move[:, 1] ** 2
     b = east * move[:, 0] + north * move[:, 1]

@@ -18,7 +18,7 @@ import shapely
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...site.site import Forest, Site
 from ..geometry.paths import legs
-from .foliage import FoliageModel, NoFoliage, Opaque
+from .foliage import FoliageModel, NoFoliage, Opaque, slab
 from .knife_edges import Profile, deygout_db
 
 # Loss per metre between trunks over that in crowns: assumed.
@@ -227,12 +227,7 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
 
 def _between(share: FloatArray, up: FloatArray, rise: FloatArray, low: float, high: float) -> FloatArray:
     """Part of the way (pieces,) that runs between two heights."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        at = np.sort(np.stack([(low - up) / rise, (high - up) / rise], axis=1), axis=1)
-    level = rise == 0.0
-    inside = np.where((up > low) & (up < high), np.inf, -np.inf)
-    first = np.where(level, -inside, at[:, 0])
-    last = np.where(level, inside, at[:, 1])
+    first, last = slab(up, rise, low, high)
     return np.asarray(np.maximum(np.minimum(share[:, 1], last) - np.maximum(share[:, 0], first), 0.0))
 
 

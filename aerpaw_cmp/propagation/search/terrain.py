@@ -18,7 +18,7 @@ import numpy as np
 from ...common.units import BoolArray, FloatArray, IntArray
 from ...site.relief.dem import Dem
 from ..geometry.paths import Faces, Links, PathSet, joined, legs
-from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, images_of, trace_back
+from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, images_of, searched_links, trace_back
 from .occlusion import Occlusion
 
 # ``solid`` of the tangent planes of the terrain; that of a tower's level ground is -1.
@@ -72,7 +72,7 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
     """
     ground = np.append(faces.solid < 0, False)
     once = ground[paths.faces].any(axis=1)  # never twice: no face of a prism looks down
-    pose, tower = _linked(links)
+    pose, tower = np.nonzero(searched_links(links).T)
     unknown = np.zeros((len(links.targets_m), len(links.sources_m)), dtype=np.bool_)
     for some, _, height in dem.profiles(links.sources_m[tower], links.targets_m[pose]):
         unknown[pose[some], tower[some]] = np.isnan(height).any(axis=0)
@@ -100,16 +100,6 @@ def on_terrain(dem: Dem, faces: Faces, links: Links, paths: PathSet, wavelength_
     same, shaped, more = candidates.followed(dem, faces, links, wavelength_m)
     stays[same[_clear(dem, faces, links, paths.select(same), wavelength_m)]] = True
     return OnTerrain(paths.select(stays), shaped, more, int(unknown.sum()))
-
-
-def _linked(links: Links) -> tuple[IntArray, IntArray]:
-    """Pose and tower of each link that may have a path."""
-    apart = np.linalg.norm(links.targets_m[:, None] - links.sources_m, axis=2)
-    good = apart > MINIMUM_LENGTH_M  # not where a place is unknown
-    if links.excluded is not None:
-        good &= ~links.excluded.T
-    pose, tower = np.nonzero(good)
-    return pose, tower
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -73,19 +74,46 @@ def file_attributes(title: str, source: str, generated: str, version: str, comme
     }
 
 
-def dataset(variables: Mapping[str, Any], attributes: Mapping[str, Any]) -> Any:
-    """An ``xarray.Dataset`` of variables: (dimensions, values, attributes) by name.
+@dataclass(frozen=True, slots=True)
+class Variable:
+    """A variable of a file; ``encoding`` may hold ``_FillValue`` and what netCDF4 takes to deflate it."""
 
-    Raises
-    ------
-    UsageError
-        If xarray is not installed.
+    dims: tuple[str, ...]
+    values: AnyArray
+    attrs: dict[str, Any] = field(default_factory=dict)
+    encoding: Mapping[str, Any] = field(default_factory=dict)
+
+
+class Dataset:
+    """Variables by name and attributes, as an ``xarray.Dataset`` has them; xarray takes a second to load.
+
+    Parameters
+    ----------
+    variables : mapping
+        Dimensions (one alone may be its name), values, attributes and encoding, by name.
+    attributes : mapping
+        Of the file.
     """
-    return library("xarray").Dataset(dict(variables), attrs=dict(attributes))
+
+    def __init__(self, variables: Mapping[str, Sequence[Any]], attributes: Mapping[str, Any]) -> None:
+        self.attrs, self.variables = dict(attributes), dict[str, Variable]()
+        for name, (dims, values, *rest) in variables.items():
+            self.variables[name] = Variable((dims,) if isinstance(dims, str) else dims, np.asarray(values), *rest)
+
+    def to_xarray(self) -> Any:
+        """The same as an ``xarray.Dataset``.
+
+        Raises
+        ------
+        UsageError
+            If xarray is not installed.
+        """
+        columns = {n: (v.dims, v.values, v.attrs, dict(v.encoding)) for n, v in self.variables.items()}
+        return library("xarray").Dataset(columns, attrs=self.attrs)
 
 
 def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
-    """A NetCDF-4 file of an ``xarray.Dataset``, made in memory: HDF5 ends the process where a disk is full.
+    """A NetCDF-4 file of a :class:`Dataset`, made in memory: HDF5 ends the process where a disk is full.
 
     Arrays are deflated; text becomes characters in UTF-8, which every reader of CF takes. A variable with NaN has it as
     ``_FillValue``; another has none, unless its ``encoding`` says so. ``grows`` are dimensions without a limit, the
@@ -97,28 +125,37 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
         If netCDF4 is not installed.
     """
     book = library("netCDF4").Dataset("data", "w", memory=1 << 20)
-    data = data.copy()
+    book.setncatts(data.attrs)
     for name, variable in data.variables.items():
-        if variable.dtype.kind in "OU":
-            width = {"chunksizes": (64,) * (variable.ndim + 1)} if {*variable.dims} & {*grows} else {}
-            variable.encoding |= {"dtype": "S1", "char_dim_name": f"{name}_length", **width}
-            continue
-        missing = variable.dtype.kind == "f" and bool(variable.isnull().any())
-        deflated = {"zlib": True, "complevel": 4, "shuffle": variable.dtype.itemsize > 1} if variable.ndim else {}
-        variable.encoding = {"_FillValue": math.nan if missing else None, **deflated, **variable.encoding}
-        if {*variable.dims} & {*grows}:
-            variable.encoding["chunksizes"] = _chunk(variable, grows)
-    data.dump_to_store(library("xarray.backends").NetCDF4DataStore(book), unlimited_dims=grows)
+        dims, values = _stored(name, variable)
+        for dim, size in zip(dims, values.shape, strict=True):
+            if dim not in book.dimensions:
+                book.createDimension(dim, None if dim in grows else size)
+        encoding: dict[str, Any] = (
+            {"zlib": True, "complevel": 4, "shuffle": values.dtype.itemsize > 1} if values.ndim else {}
+        )
+        attributes = dict(variable.attrs)
+        if values.dtype.kind == "S":
+            encoding, attributes["_Encoding"] = {}, "utf-8"
+        elif values.dtype.kind == "f" and np.isnan(values).any():
+            encoding["_FillValue"] = math.nan
+        encoding |= variable.encoding
+        if {*dims} & {*grows}:
+            encoding["chunksizes"] = (64,) * len(dims) if values.dtype.kind == "S" else _chunk(dims, values, grows)
+        made = book.createVariable(name, values.dtype, dims, fill_value=encoding.pop("_FillValue", None), **encoding)
+        made.set_auto_maskandscale(False)
+        made.setncatts(attributes)
+        made[...] = values
     return book.close()
 
 
-def _chunk(variable: Any, grows: Sequence[str]) -> tuple[int, ...]:
+def _chunk(dims: Sequence[str], values: AnyArray, grows: Sequence[str]) -> tuple[int, ...]:
     """Shape of a chunk: one along a dimension that grows, a power of two of at most a MiB along the first of them."""
-    sizes = {name: 1 if name in grows else size for name, size in variable.sizes.items()}
-    step = max(
-        1, min(variable.sizes.get(grows[0], 1), (1 << 20) // (variable.dtype.itemsize * math.prod(sizes.values())))
-    )
-    return tuple(1 << (step.bit_length() - 1) if name == grows[0] else size for name, size in sizes.items())
+    sizes = dict(zip(dims, values.shape, strict=True))
+    fixed = math.prod(size for name, size in sizes.items() if name not in grows)
+    step = max(1, min(sizes.get(grows[0], 1), (1 << 20) // max(values.dtype.itemsize * fixed, 1)))
+    first = 1 << (step.bit_length() - 1)
+    return tuple(first if name == grows[0] else 1 if name in grows else size for name, size in sizes.items())
 
 
 class GrowingNetcdf:
@@ -156,7 +193,7 @@ class GrowingNetcdf:
                 self._stream.close()
 
     def append(self, data: Any) -> None:
-        """Write the next ``xarray.Dataset``: variables and dimensions as the first."""
+        """Write the next :class:`Dataset`: variables and dimensions as the first."""
         with held():  # an interrupt inside a call of HDF5 would leave it with a half-made file
             self._append(data)
 
@@ -194,7 +231,7 @@ def _stored(name: str, variable: Any) -> tuple[tuple[str, ...], AnyArray]:
     if values.dtype.kind not in "OU":
         return variable.dims, values
     text = np.char.encode(values.astype(str), "utf-8")
-    return (*variable.dims, f"{name}_length"), text.view("S1").reshape(*values.shape, -1)
+    return (*variable.dims, f"{name}_length"), text.view("S1").reshape(*values.shape, text.dtype.itemsize)
 
 
 def library(name: str) -> Any:

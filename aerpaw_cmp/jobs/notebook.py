@@ -249,7 +249,7 @@ class Flight:
         from .channel import ChannelOptions, channel_parts
 
         (channel,) = channel_parts(self.data, ChannelOptions(**options), in_memory=True)
-        return channel_dataset(channel)
+        return channel_dataset(channel).to_xarray()
 
     def plot(self, axes: Any = None) -> Any:
         """Draw the trajectory with the towers, seen from above, on matplotlib axes (default: new ones); give them."""

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from ..common.cf import DB, DBM, dataset, netcdf_bytes, site_crs
+from ..common.cf import DB, DBM, Dataset, netcdf_bytes, site_crs
 from ..common.geodesy import SiteFrame
 from ..common.units import AnyArray, FloatArray
 from .grid import Layer
@@ -51,7 +51,7 @@ def write_netcdf(
     Raises
     ------
     UsageError
-        If xarray or netCDF4 is not installed.
+        If netCDF4 is not installed.
     """
     target = Path(path)
     target.write_bytes(netcdf_bytes(maps_dataset(maps, frame, about, further)))
@@ -60,8 +60,8 @@ def write_netcdf(
 
 def maps_dataset(
     maps: Mapping[str, MapResult], frame: SiteFrame, about: Mapping[str, str], further: Sequence[Layer] = ()
-) -> Any:
-    """Maps as an ``xarray.Dataset`` with dimensions foliage, tower, k, height, y, x.
+) -> Dataset:
+    """Maps as variables with dimensions foliage, tower, k, height, y, x.
 
     Parameters
     ----------
@@ -76,7 +76,7 @@ def maps_dataset(
 
     Returns
     -------
-    xarray.Dataset
+    Dataset
     """
     first = next(iter(maps.values()))
     variables = {**_places(first, frame), **_levels(maps), **_ranks(maps)}
@@ -99,7 +99,7 @@ def maps_dataset(
                 plane.astype(np.float32),
                 {**attributes, "coordinates": "latitude longitude"},
             )
-    return dataset(variables, about)
+    return Dataset(variables, about)
 
 
 def _text(dimension: str, names: Mapping[str, Any] | Sequence[str], meaning: str) -> _Variable:

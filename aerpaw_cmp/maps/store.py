@@ -101,7 +101,7 @@ class TileStore:
             It is no store of this tool, or a damaged one.
         """
         self._frame, self._about = frame, about
-        skeleton = self._skeleton(maps_dataset(empty, frame, about))
+        skeleton = self._skeleton(maps_dataset(empty, frame, about).to_xarray())
         with explained_os_errors(self.path):
             there = os.path.lexists(self.path) and not (self.path.is_dir() and not any(self.path.iterdir()))
             if there and self._is_other_job(skeleton):

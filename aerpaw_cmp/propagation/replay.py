@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.cf import dataset
+from ..common.cf import Dataset
 from ..common.counting import counted
 from ..common.errors import UsageError
 from ..common.units import BoolArray, ComplexArray, FloatArray, db_from_power, wavelength_m
@@ -164,7 +164,7 @@ class Replay:
         level = {"units": "dBm", "long_name": "received power, coherent sum of the paths"}
         power = {"units": "dBm", "long_name": "received power, sum of the paths' powers"}
         ports = ("pose", "tower", "n_rx", "n_tx")
-        return dataset(
+        return Dataset(
             {
                 "rss_dbm": (("pose", "tower"), self.rss_dbm, level),
                 "rss_power_dbm": (("pose", "tower"), self.rss_power_dbm, power),
@@ -174,7 +174,7 @@ class Replay:
                 "tower": ("tower", list(self.towers)),
             },
             {"engine": self.engine, "seconds": self.seconds},
-        )
+        ).to_xarray()
 
 
 def replay(

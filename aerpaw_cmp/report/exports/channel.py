@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from ...common.cf import GrowingNetcdf, dataset, file_attributes
+from ...common.cf import Dataset, GrowingNetcdf, file_attributes
 from ...common.counting import counted
 from ...common.jsonable import named
 from ...common.provenance import KEY
@@ -132,26 +132,21 @@ class Channel:
         return None if values is None else self.table.by_link(values, self.replay.has_path.shape, fill)
 
 
-def channel_dataset(channel: Channel) -> Any:
-    """The channel as an ``xarray.Dataset``: paths by (path, pose, tower), H and levels by (pose, tower).
-
-    Raises
-    ------
-    UsageError
-        xarray is not installed.
-    """
+def channel_dataset(channel: Channel) -> Dataset:
+    """The channel as variables: paths by (path, pose, tower), H and levels by (pose, tower)."""
     variables: dict[str, Any] = {}
     for name, values, dimensions, *about in _quantities(channel):
         if values is not None:
             variables |= _variables(name, values, dimensions, *about)
-    data = dataset(variables, _file(channel))
+    data = Dataset(variables, _file(channel))
     kinds = channel.table.kinds
-    data.kind.attrs |= {"flag_values": np.arange(len(kinds), dtype=np.int8), "flag_meanings": " ".join(kinds)}
+    described = {name: variable.attrs for name, variable in data.variables.items()}
+    described["kind"] |= {"flag_values": np.arange(len(kinds), dtype=np.int8), "flag_meanings": " ".join(kinds)}
     if channel.along.start is not None:
         start = str(channel.along.start).replace("T", " ")
-        data.time.attrs |= {"long_name": f"since {start} UTC", "units": f"seconds since {start[:19]} UTC"}
+        described["time"] |= {"long_name": f"since {start} UTC", "units": f"seconds since {start[:19]} UTC"}
     if channel.level_db is not None:
-        data.level_db.attrs["comment"] = f"unit: {channel.level_unit}"
+        described["level_db"]["comment"] = f"unit: {channel.level_unit}"
     return data
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.cf import WGS84, dataset, file_attributes, netcdf_bytes
+from ...common.cf import WGS84, Dataset, file_attributes, netcdf_bytes
 from .points import LABELS, PLACES, Column, Export, Points
 
 # Stands for a missing code in NetCDF; attribute ``_FillValue``.
@@ -27,8 +27,8 @@ def write_netcdf(export: Export, folder: Path) -> list[Path]:
     return paths
 
 
-def _points_dataset(export: Export, points: Points) -> Any:
-    """The samples of one kind as an ``xarray.Dataset`` with dimensions trajectory (links) and obs."""
+def _points_dataset(export: Export, points: Points) -> Dataset:
+    """The samples of one kind as variables with dimensions trajectory (links) and obs."""
     links = list(points.links())
     texts = {
         "link": ("flight, tower and channel", [f"{f} {f'{t} {c}'.strip()}" for f, t, c, _ in links]),
@@ -64,7 +64,7 @@ def _points_dataset(export: Export, points: Points) -> Any:
         version=export.attributes.get("version", ""),
         comment=" ".join(export.remarks),
     )
-    return dataset(variables, {**about, "featureType": "trajectory"})
+    return Dataset(variables, {**about, "featureType": "trajectory"})
 
 
 def _seconds(export: Export, times: Any) -> tuple[Any, dict[str, str]]:

@@ -12,7 +12,7 @@ import pandas as pd
 from numpy.typing import ArrayLike
 
 from ...common.cells import guarded
-from ...common.cf import dataset, file_attributes, netcdf_bytes
+from ...common.cf import Dataset, file_attributes, netcdf_bytes
 from ...common.errors import UsageError
 from ...common.jsonable import json_object, named
 from ...site.site import Site
@@ -123,7 +123,7 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
     return written, []
 
 
-def _dataset(data: PredictionPage) -> Any:
+def _dataset(data: PredictionPage) -> Dataset:
     """Points along one dimension, towers and channels along another."""
     series = data.series
     names, first = [name for name, _ in series], series[0][1]
@@ -142,7 +142,7 @@ def _dataset(data: PredictionPage) -> Any:
         str(data.versions.get("aerpaw-cmp", "")),
         data.verdict,
     )
-    return dataset(variables, about)
+    return Dataset(variables, about)
 
 
 def _groups(data: PredictionPage) -> Iterator[Places]:

@@ -508,18 +508,24 @@ def run_campaign(
     from ..report.words.campaign import warnings
     from .campaigns.campaign import load_campaign
     from .campaigns.campaign import run as run_all
-    from .campaigns.season import find_reports, with_season
+    from .campaigns.season import find_reports, soundings, with_season
     from .tasks.manifest import inputs_of_flights
 
     campaign = load_campaign(path)
-    inputs = [path, *inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)]
+    sounded = [(options.logs_root or path.parent) / name for name in campaign.soundings]
+    flights = inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)
+    inputs = [path, *sounded, *flights]
     folder = options.out or Path("reports") / campaign.campaign
     stages = options.stages("campaign", inputs, folder)
     store = None if fresh else _outcomes_in(keep)
     note = f"finished tasks are kept in {store}, and the same command computes the rest" if store else "nothing is kept"
-    with OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output, noting_interrupts(note):
+    with (
+        OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output,
+        noting_interrupts(note),
+    ):
         data = run_all(campaign, path.parent, options, keep=store, stages=stages)
-        data = with_season(data, find_reports(data.flights, folder, [folder.parent, Path("reports")]))
+        reports = find_reports(data.flights, folder, [folder.parent, Path("reports")])
+        data = with_season(data, reports, soundings(sounded, campaign.timezone) if sounded else ())
         with stages("report"), output.filling() as place:
             finished = replace(data, stages_s=dict(stages.seconds))
             write_campaign(finished, place)

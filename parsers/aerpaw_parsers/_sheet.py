@@ -11,10 +11,9 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 import pandas as pd
@@ -726,17 +725,20 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
     several = [i for i, values in values_of.items() if 1 < len(values) <= _MOST_PARTS]
     alone = {sheet.plain[i]: next(iter(values)) for i, values in values_of.items() if len(values) == 1}
     if not several:
-        yield "", replace(rows, about=rows.about | _about(alone)), sheet
+        yield "", replace(rows, about=rows.about | identities(alone)), sheet
         return
     # rows that name none are one part, whatever they write
-    texts = [np.array([text if text in values_of[i] else "" for text in sheet.texts(i)], dtype=object) for i in several]
-    for values in product(*[dict.fromkeys(column.tolist()) for column in texts]):
-        where = np.all([column == value for column, value in zip(texts, values, strict=True)], axis=0)
-        if where.any():
-            written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if text}
-            about = rows.about | _about(alone | written)
-            label = "_".join(_label(name, text) for name, text in written.items())
-            yield label, replace(rows.part(where), about=about), sheet.part(where)
+    texts = [[text if text in values_of[i] else "" for text in sheet.texts(i)] for i in several]
+    rows_of: dict[tuple[str, ...], list[int]] = {}
+    for row, values in enumerate(zip(*texts, strict=True)):
+        rows_of.setdefault(values, []).append(row)
+    for values, mine in rows_of.items():
+        where = np.zeros(len(sheet), dtype=bool)
+        where[mine] = True
+        written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if text}
+        about = rows.about | identities(alone | written)
+        label = "_".join(_label(name, text) for name, text in written.items())
+        yield label, replace(rows.part(where), about=about), sheet.part(where)
 
 
 def _tells_apart(rows: _rows.Rows, sheet: Sheet) -> int | None:
@@ -756,7 +758,7 @@ _CELL = ("PCI", "ARFCN", "technology", "device")
 _REPEATED, _MOST_MARKS = 0.3, 16
 
 
-def _about(written: dict[str, str]) -> dict[str, Attribute]:
+def identities(written: Mapping[str, str]) -> dict[str, Attribute]:
     """Attributes of a part: its identities as written, a frequency in Hz."""
     about: dict[str, Attribute] = {}
     for name, text in written.items():

@@ -3,7 +3,8 @@
 ``[2025-01-01 12:00:00.000000] 0000014      -35.401386``: arrival time, **octal** byte offset of the sample
 (four bytes each), value in dB re full scale. ``*`` stands for samples equal to the one before; a last line may
 hold an offset only. With no signal the power is 20 log10(FLT_MIN) minus the gain, about -790 dB.
-Writer: AERPAW ``startGNURadio-ChannelSounder-RX.sh``.
+Writer: AERPAW ``startGNURadio-ChannelSounder-RX.sh``. Its nightly soundings between towers name the link in the file's
+name: ``LW1:LW2:3235751:3.32G:0:2026-06-01_02_00_05:power_log.txt`` (transmitter or ``null``, receiver, radio, channel).
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from aerpaw_cmp.logs.records import KEPT_REJECTED, ReadResult, Stream
 from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import make_frames as _frames
+
+from . import _sheet
 
 _STAMP = 28  # "[" + 26 characters of time + "]"
 _VALUE = 16  # od -f: right-aligned in sixteen columns
@@ -314,8 +317,16 @@ def _stream(
         options, channel=name, unit=options.unit or ("dB" if ratio else "dB re full scale"),
         quantity="SNR" if name.lower() == "snr" else None, repeated_samples=len(repeats.line),
     )  # fmt: skip
+    if link := _SOUNDING.match(options.file_name):
+        attributes |= _sheet.identities({key: text for key, text in link.groupdict().items() if text != "null"})
     return Stream("rss", name, frame, attributes)
 
+
+# A file's name of the nightly soundings between towers.
+_SOUNDING = re.compile(
+    r"(?P<transmitter>\w+):(?P<receiver>\w+):(?P<receiver_serial_number>\w+):(?P<receiver_frequency>[\w.]+)"
+    r":(?P<receiver_channel>\d):\d{4}-"
+)
 
 READER = Reader(
     name="sounder_log", title="GNU Radio channel sounder power, quality or SNR log (od text)", kinds=("rss",),

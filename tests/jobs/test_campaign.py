@@ -21,6 +21,7 @@ from tests.simulated import planned, simulate, write_yaml
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
+CASES = Path(__file__).parents[1] / "parsers" / "cases" / "logs"
 YAW_DEG = 110.0
 OFFSETS_DB = {"first": 12.3, "second": 9.1}
 FADING_DB = 1.0
@@ -135,9 +136,16 @@ def test_broken_flights_are_rows_with_their_message(summary: dict[str, Any], fol
     assert page.rstrip().endswith("</html>")
 
 
+def test_a_campaign_of_soundings_alone_needs_no_flight_and_one_of_nothing_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "night.csv").write_text((CASES / "aerpaw_monitoring.csv").read_text())
+    assert main(["campaign", str(write_yaml(tmp_path / "c.yaml", {"campaign": "c", "soundings": ["night.csv"]}))]) == 0
+    (tmp_path / "n.yaml").write_text("campaign: n\n")
+    assert main(["campaign", str(tmp_path / "n.yaml")]) == 2
+
+
 def test_every_figure_is_there(summary: dict[str, Any], folder: Path) -> None:
     figures = folder / "whole_out" / "figures"
-    expected = {"season_drift", "season_places"}
+    expected = {"season_nodes", "season_places"}
     assert {p.stem for p in figures.glob("*.png")} == expected
 
 

@@ -1,4 +1,4 @@
-"""A season from the rows of a campaign: held-out errors against brute force, planted drift and hill found again."""
+"""A season from the rows of a campaign: held-out errors against brute force, a planted hill found again."""
 
 import dataclasses
 import json
@@ -7,8 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.jobs.campaigns.season import drifts, find_reports, rank_settings, with_season
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.jobs.campaigns.season import find_reports, rank_settings, soundings, with_season
 from benchmarks import fabricated
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(scope="module")
@@ -53,25 +56,6 @@ def test_settings_that_share_no_flight_have_no_difference(data):
     assert ranking[1].verdict == "no interval"
 
 
-def test_the_planted_drift_is_found(data):
-    drift = [d for d in data.season.drift if d.setting == "setting 02"]
-    assert len(drift) == 4
-    assert all(d.slope_ci95_db[0] - 1 < fabricated.DRIFT_DB_PER_30_DAYS < d.slope_ci95_db[1] + 1 for d in drift)
-    assert sum(d.slope_ci95_db[0] < fabricated.DRIFT_DB_PER_30_DAYS < d.slope_ci95_db[1] for d in drift) >= 3
-
-
-def test_three_flights_whose_rounded_offsets_lie_on_a_line_are_not_certain():
-    rows = [
-        dataclasses.replace(r, simulated_dbm=r.simulated_dbm + shift, offset_db=0.1 * i)
-        for i, (r, shift) in enumerate(
-            zip(fabricated.season(8, 1, 1, 1, seed=1).rss[:3], (0.0, 0.02, -0.03), strict=True)
-        )
-    ]
-    started = {r.flight: r.start_ns for r in rows}
-    (drift,) = drifts(rows, started)
-    assert drift.slope_ci95_db[1] - drift.slope_ci95_db[0] > 0.1
-
-
 def test_the_planted_hill_lies_where_it_was_put(data):
     """Mean residual of all links by place: highest near (200 m, 300 m), north not flipped, east not exchanged."""
     everything = data.season.places
@@ -98,12 +82,36 @@ def test_one_flight_has_its_own_errors_only(data):
 def test_relative_clocks_have_no_date(data):
     bare = with_season(dataclasses.replace(data, rss=tuple(dataclasses.replace(r, start_ns=0) for r in data.rss)))
     assert bare.season.started == {}
-    assert np.isnan(bare.season.drift[0].slope_db_per_30_days)
-    assert bare.season.drift[0].spread_db > 0
+    assert all(set(node.night) <= set(data.flights) for node in bare.season.nodes)
 
 
 def test_a_campaign_without_levels(data):
     assert with_season(dataclasses.replace(data, rss=())).season.ranking == ()
+
+
+def test_soundings_between_towers_show_a_radio_that_lost_a_decibel_last_night(tmp_path: Path):
+    """Names and lines as AERPAW's nightly script writes them; ``null`` is the noise without a transmitter."""
+    rng, towers = np.random.default_rng(3), ("LW1", "LW2", "LW3", "LW4", "LW5")
+    for night in range(1, 16):
+        weather = rng.normal()
+        for sent in ("null", *towers):
+            for received in towers:
+                lost = 1.0 if (received, night) == ("LW2", 15) else 0.0
+                level = -30.0 + weather - lost + rng.normal(0.0, 0.1)
+                for kind in ("power", "quality"):
+                    name = f"{sent}:{received}:3235{received[2]}:3.32G:0:2026-06-{night:02}_02_00_05:{kind}_log.txt"
+                    line = f"[2026-06-{night:02} 02:00:07.000000] 0000004 {level if kind == 'power' else 3.0:15.6f}\n"
+                    if sent != received:
+                        (tmp_path / name).write_text(line)
+    nodes = soundings([tmp_path], "America/New_York")
+    assert len(nodes) == 10
+    (stepped,) = (node for node in nodes if node.steps)
+    assert (stepped.node, stepped.night[-1]) == ("3320 MHz, LW2 32352:0 receives", "2026-06-15")
+    (step,) = stepped.steps
+    assert (step.night, step.shown) == ("2026-06-15", "2026-06-15")
+    assert step.step_ci95_db[0] < 1.0 < step.step_ci95_db[1]  # lost level: more is added
+    with pytest.raises(InputError, match="no log names transmitter and receiver"):
+        soundings([ROOT / "sample_logs" / "LW1"], "America/New_York")
 
 
 def test_reports_are_found_by_their_flight(tmp_path: Path):

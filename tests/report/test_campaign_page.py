@@ -56,7 +56,7 @@ def test_hostile_names_stay_text(data):
 
 def test_figures_of_a_season_are_few_and_can_be_drawn(data):
     specs = list(campaign_figures.figure_specs(data))
-    assert [p.name for p in specs] == ["season_drift", "season_places"]
+    assert [p.name for p in specs] == ["season_nodes", "season_places"]
     for spec in specs:
         assert canvas.render(spec, ("png",)).formats["png"][:4] == b"\x89PNG"
 

@@ -190,7 +190,7 @@ def campaign(
         _print_campaign_summary(outcome)
     for check in outcome.failed_checks:
         say.warn(f"failed: {check}")
-    if not (outcome.metrics["rss"] or outcome.metrics["rank"]):
+    if not (outcome.metrics["rss"] or outcome.metrics["rank"] or outcome.metrics["season"]["nodes"]):
         return 3
     return 1 if strict and outcome.failed_checks else 0
 
@@ -204,4 +204,6 @@ def _print_campaign_summary(outcome: Any) -> None:
     heads = {"setting": "setting", "flight": "flight", "tower": "tower", "K": "k:g"}
     numbers = {"total variation": "total_variation:.3f", "agreement": "agreement:.2f", "kappa": "kappa:.2f"}
     records(m["rank"], heads | numbers, "Rank")
+    for sentence in m["season"]["steps"]:
+        show(sentence)
     show(f"report: {outcome.folder / 'campaign.html'}")

@@ -1,4 +1,4 @@
-"""Results of a season of flights: offsets from other flights, differences between settings, drift over the dates."""
+"""Results of a season of flights: offsets from other flights, differences between settings."""
 
 from __future__ import annotations
 
@@ -137,53 +137,3 @@ def verdict_of(difference: MeanOfFlights) -> Verdict:
     if not np.isfinite(difference.low):
         return "no interval"
     return "worse" if difference.low > 0 else "not significant"
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Trend:
-    """A line through values over dates: ``slope`` per 30 days with its 95 % interval, ``scatter`` about the line."""
-
-    n: int
-    slope: float
-    low: float
-    high: float
-    scatter: float
-
-
-# Slopes are per so many days.
-_DAYS = 30.0
-
-
-def trend(days: ArrayLike, values: ArrayLike) -> Trend:
-    """Least-squares line of one value per flight over its date.
-
-    Parameters
-    ----------
-    days : (f,)
-        Date of each flight, NaN where it is not known.
-    values : (f,)
-
-    Returns
-    -------
-    Trend
-        NaN below :data:`FEWEST_FLIGHTS` flights or where all have one date.
-
-    Examples
-    --------
-    >>> found = trend([0.0, 30.0, 60.0, 90.0], [1.0, 2.0, 3.0, 4.0])
-    >>> round(found.slope, 6), round(found.scatter, 6)
-    (1.0, 0.0)
-    """
-    from scipy.special import stdtrit
-
-    when, level = unmasked(days), unmasked(values)
-    dated = np.isfinite(when) & np.isfinite(level)
-    t, y = when[dated] / _DAYS, level[dated]
-    if len(t) < FEWEST_FLIGHTS or np.ptp(t) <= 0:
-        return Trend(n=len(t), slope=np.nan, low=np.nan, high=np.nan, scatter=np.nan)
-    t = t - t.mean()
-    slope = float(t @ (y - y.mean()) / (t @ t))
-    residual = y - y.mean() - slope * t
-    scatter = float(np.sqrt(residual @ residual / (len(t) - 2)))
-    reach = float(stdtrit(len(t) - 2.0, 0.975)) * scatter / float(np.sqrt(t @ t))
-    return Trend(n=len(t), slope=slope, low=slope - reach, high=slope + reach, scatter=scatter)

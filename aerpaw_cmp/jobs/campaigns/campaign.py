@@ -35,7 +35,9 @@ class CampaignFile(StrictModel):
 
     campaign: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
     title: str | None = None
-    flights: Annotated[list[str], Field(min_length=1)]
+    flights: list[str] = Field(default_factory=list)
+    soundings: list[str] = Field(default_factory=list)
+    timezone: str | None = None  # of soundings with local times
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
     calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
     repeatability: RepeatSettings = RepeatSettings()
@@ -49,7 +51,10 @@ def load_campaign(path: Path) -> CampaignFile:
     UsageError
         As :func:`aerpaw_cmp.common.yamlfile.load_yaml`.
     """
-    return load_yaml(path, CampaignFile)
+    campaign = load_yaml(path, CampaignFile)
+    if not campaign.flights + campaign.soundings:
+        raise UsageError("no flights and no soundings", expected="flights: [FLIGHT.yaml, ...]", path=path)
+    return campaign
 
 
 # --- all of it --------------------------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""A season's numbers from the rows of a campaign: held-out errors, ranking of settings, drift, residuals by place."""
+"""Numbers of a season from the rows of a campaign: held-out errors, ranking, steps of offsets, residuals by place."""
 
 from __future__ import annotations
 
@@ -11,20 +11,25 @@ from typing import Any
 from urllib.parse import quote
 
 import numpy as np
+import pandas as pd
 
 from ...common.errors import InputError, parsing
 from ...common.files import LARGEST_TABLE, read_bounded
 from ...common.units import FloatArray
 from ...compare.judge import season
+from ...compare.judge.steps import NodeOffset, node_offsets, stepped
 from ...compare.statistics.passes import cell_means
+from ...logs.ingest import ingest
+from ...logs.readers import ReadOptions
 from ...logs.records import has_wall_clock
-from ...report.content.campaign import CampaignData, Drift, PlaceMap, RssRow, Season, SettingRank
+from ...report.content.campaign import CampaignData, PlaceMap, RssRow, Season, SettingRank
 
-_DAY_NS = 86_400e9
 _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 
 
-def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) -> CampaignData:
+def with_season(
+    data: CampaignData, reports: Mapping[str, str] | None = None, sounded: Sequence[NodeOffset] = ()
+) -> CampaignData:
     """The campaign with held-out errors in its rows and what they say over the season.
 
     Parameters
@@ -32,11 +37,13 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
     data : CampaignData
     reports : mapping of str to str, optional
         Address of the report of a flight, against the campaign's folder.
+    sounded : sequence of NodeOffset
+        Of soundings between towers (:func:`soundings`), in place of the offsets of the flights.
     """
     rows = _held_out_rows(data.rss)
     data = dataclasses.replace(data, rss=tuple(rows))
     if not rows:
-        return dataclasses.replace(data, season=Season(reports=dict(reports or {})))
+        return dataclasses.replace(data, season=Season(reports=dict(reports or {}), nodes=tuple(sounded)))
     started = _started_of(rows)
     order = sorted(data.flights, key=lambda name: (name not in started, started.get(name, 0)))
     links = list(dict.fromkeys(row.link for row in rows))
@@ -50,7 +57,7 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
             held_out=any(np.isfinite(row.held_out_rmse_db) for row in rows),
             started={name: _iso(ns) for name, ns in started.items()},
             ranking=tuple(ranking),
-            drift=tuple(drifts(rows, started)),
+            nodes=tuple(sounded) or _flown(data.reference_rows, order, started),
             places=_place_map(data.reference_rows, data.cell_m),
             reports=dict(reports or {}),
         ),
@@ -157,32 +164,59 @@ def _paired(errors: Mapping[str, Any], base: Mapping[str, Any], flights: Sequenc
     return np.array(differences)
 
 
-def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
-    """Own offset, before rounding, of every setting, tower and channel over the dates of the flights."""
-    groups: dict[tuple[str, str, str], list[RssRow]] = {}
-    for row in rows:
-        if np.isfinite(row.offset_db):
-            groups.setdefault((row.setting, row.tower, row.channel), []).append(row)
-    fitted = []
-    for (setting, tower, channel), members in groups.items():
-        days = [started.get(row.flight, np.nan) / _DAY_NS for row in members]
-        # not the offsets themselves: three flights whose rounded offsets lie on a line would have no uncertainty
-        exact = np.array([row.moments.mean_db for row in members])
-        offsets = np.array([row.offset_db for row in members])
-        line = season.trend(days, exact)
-        fitted.append(
-            Drift(
-                setting=setting,
-                tower=tower,
-                channel=channel,
-                n=line.n,
-                slope_db_per_30_days=line.slope,
-                slope_ci95_db=(line.low, line.high),
-                scatter_db=line.scatter,
-                spread_db=float(offsets.std(ddof=1)) if len(offsets) > 1 else float("nan"),
-            )
-        )
-    return fitted
+# --- steps of offsets -------------------------------------------------------------------------------------------------
+
+
+def _flown(rows: Sequence[RssRow], order: Sequence[str], started: Mapping[str, int]) -> tuple[NodeOffset, ...]:
+    """Offset of each tower and channel over the flights, less what all share on a flight, and its steps."""
+    known = {(row.flight, row.link): row.moments.mean_db for row in rows}
+    links = list(dict.fromkeys(row.link for row in rows))
+    offsets = np.array([[known.get((flight, link), np.nan) for link in links] for flight in order])
+    dates = [_iso(started[flight]) if flight in started else flight for flight in order]
+    nodes = node_offsets(offsets, [("", link) for link in links])
+    return tuple(stepped(name.removesuffix(" receives"), dates, values, len(nodes)) for name, values in nodes.items())
+
+
+def soundings(paths: Sequence[Path], timezone: str | None) -> tuple[NodeOffset, ...]:
+    """Offset of each radio of the towers, night by night (UTC), from soundings between them.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Logs, their folders, or a flight file of ``ingest -o``. Streams that name transmitter and receiver count.
+    timezone : str, optional
+        Of logs with local times.
+
+    Raises
+    ------
+    InputError
+        No log names a link.
+    """
+    levels = []
+    for file in ingest(paths, options=ReadOptions(timezone=timezone)):
+        for stream in file.result.streams:
+            link = stream.attributes
+            if stream.kind == "rss" and link.get("unit") != "dB" and {"transmitter", "receiver"} <= link.keys():
+                night = stream.frame["time"].dt.strftime("%Y-%m-%d")
+                ends = {end: _radio(link, end) for end in ("transmitter", "receiver")}
+                by_night = stream.frame["rss_db"].groupby(night).median()
+                levels.append(pd.DataFrame({**ends, "band": link.get("frequency_hz"), "offset": -by_night}))
+    if not levels:
+        raise InputError("no log names transmitter and receiver", expected="soundings", path=paths[0])
+    table = pd.concat(levels).rename_axis("night").reset_index()
+    nights = sorted(table["night"].unique())
+    nodes: dict[str, FloatArray] = {}
+    for band, part in table.groupby("band", dropna=False):
+        wide = part.pivot_table("offset", "night", ["transmitter", "receiver"], aggfunc="median").reindex(nights)
+        name = f"{band / 1e6:.0f} MHz, " if np.isfinite(band) else ""
+        nodes |= {name + node: values for node, values in node_offsets(wide.to_numpy(), list(wide.columns)).items()}
+    return tuple(stepped(node, nights, values, len(nodes)) for node, values in nodes.items())
+
+
+def _radio(link: Mapping[str, Any], end: str) -> str:
+    """Tower, serial number and channel of one end of a link, where the log has them."""
+    serial, channel = link.get(f"{end}_serial_number"), link.get(f"{end}_channel")
+    return str(link[end]) + (f" {serial}" if serial else "") + (f":{channel}" if channel else "")
 
 
 # --- places -----------------------------------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ...common.units import FloatArray, IntArray
+from ...compare.judge.steps import NodeOffset
 from ...compare.offset import Moments, difference_moments
 from ...compare.statistics.intervals import Interval
 from ...site.site import Site
@@ -233,24 +234,6 @@ class SettingRank:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drift:
-    """Own offset of one setting, tower and channel over the dates of the flights.
-
-    ``spread_db`` is the standard deviation of the offsets, ``scatter_db`` that about the line; NaN where there are
-    fewer than three dated flights.
-    """
-
-    setting: str
-    tower: str
-    channel: str
-    n: int
-    slope_db_per_30_days: float
-    slope_ci95_db: Interval
-    scatter_db: float
-    spread_db: float
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class PlaceMap:
     """Mean residual of cells of the plan over flights, towers and channels.
 
@@ -274,7 +257,8 @@ class Season:
         First instant of a flight, UTC, ISO 8601; none for logs with relative times.
     ranking : tuple of SettingRank
         Over all links, best first, then for each link where there are several.
-    drift : tuple of Drift
+    nodes : tuple of NodeOffset
+        Of the first setting, or of soundings between towers.
     places : PlaceMap, optional
         Of the first setting.
     reports : mapping of str to str
@@ -284,7 +268,7 @@ class Season:
     held_out: bool = False
     started: Mapping[str, str] = field(default_factory=dict)
     ranking: tuple[SettingRank, ...] = ()
-    drift: tuple[Drift, ...] = ()
+    nodes: tuple[NodeOffset, ...] = ()
     places: PlaceMap | None = None
     reports: Mapping[str, str] = field(default_factory=dict)
 

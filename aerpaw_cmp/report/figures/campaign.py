@@ -11,35 +11,31 @@ import numpy as np
 from ..content.campaign import CampaignData
 from ..kit.canvas import TOWER, FigureSpec, beyond, colour_bar, frame_around, plan_axes, subplots
 from .charts import COLOURS
-from .maps import grouped
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_MARKERS = "os^Dv<>P"
+# Nodes of a figure: those that step first, then those that vary most.
+_NODES_SHOWN = 12
 
 
-def season_drift(data: CampaignData) -> Figure:
-    """Own offset of every flight over its date, the first setting, a colour and marker per tower and channel."""
+def season_nodes(data: CampaignData) -> Figure:
+    """Offset of nodes over the dates, less what all share; steps as bars of their intervals."""
     fig, ax = subplots((9.2, 3.6))
-    dated = len(data.season.started) >= len(data.flights) / 2 and len(data.season.started) > 1
-    numbers = {name: number for number, name in enumerate(data.flights)}
-    slopes = {
-        f"{d.tower} {d.channel}".strip(): f", {d.slope_db_per_30_days:+.1f} dB per 30 days"
-        for d in data.season.drift
-        if d.setting == data.reference and np.isfinite(d.slope_db_per_30_days)
-    }
-    for number, (link, rows) in enumerate(grouped(data.reference_rows, lambda r: r.link).items()):
-        good = [r for r in rows if np.isfinite(r.offset_db) and (not dated or r.flight in data.season.started)]
-        at = [np.datetime64(data.season.started[r.flight][:-1]) if dated else numbers[r.flight] + 1 for r in good]
-        ax.plot(
-            np.array(at), [r.offset_db for r in good], linestyle="none", marker=_MARKERS[number % len(_MARKERS)],
-            markersize=3.5, color=COLOURS[number % len(COLOURS)], alpha=0.7,
-            label=link + slopes.get(link, ""),
-        )  # fmt: skip
-    ax.set_xlabel("Start of the flight (UTC)" if dated else "Number of the flight in the campaign")
-    ax.set_ylabel("Offset [dB]")
-    ax.tick_params(axis="x", labelsize=8, rotation=20 if dated else 0)
+    order = sorted(data.season.nodes, key=lambda node: (not node.steps, -np.ptp(node.offset_db or (0.0,))))
+    dates = sorted({night for node in data.season.nodes for night in node.night})
+    for number, node in enumerate(order[:_NODES_SHOWN]):
+        colour = COLOURS[number % len(COLOURS)]
+        at = [dates.index(night) for night in node.night]
+        ax.plot(at, node.offset_db, marker=".", linewidth=0.6, color=colour, alpha=0.7, label=node.node)
+        for step in node.steps:
+            middle, where = node.offset_db[node.night.index(step.shown)], dates.index(step.shown)
+            reach = (step.step_ci95_db[1] - step.step_ci95_db[0]) / 2.0
+            ax.errorbar(where, middle, yerr=reach, color=colour, capsize=4, linewidth=1.6)
+    shown = np.unique(np.linspace(0, len(dates) - 1, 8).round().astype(int))
+    ax.set_xticks(shown, [dates[i] for i in shown], rotation=20)
+    ax.tick_params(axis="x", labelsize=8)
+    ax.set_ylabel("Offset against its median [dB]")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return fig
 
@@ -76,13 +72,13 @@ def season_places(data: CampaignData) -> Figure:
 
 def figure_specs(data: CampaignData) -> Iterator[FigureSpec]:
     """Figures of the season, where the campaign has numbers for them."""
-    if not data.season.over_all():
-        return
-    yield FigureSpec(
-        "season_drift", "season", "Offsets over the season",
-        f"Each flight's own offset under “{data.reference}”, by tower and channel.",
-        partial(season_drift, data),
-    )  # fmt: skip
+    if any(len(node.night) > 1 for node in data.season.nodes):
+        yield FigureSpec(
+            "season_nodes", "season", "Offsets over the season",
+            "Offset of each node over the dates, less what all nodes share (weather, a transmitter). A bar: the 95 % "
+            f"interval of a step. Of more than {_NODES_SHOWN} nodes those that step, then those that vary most.",
+            partial(season_nodes, data),
+        )  # fmt: skip
     if data.season.places is not None:
         yield FigureSpec(
             "season_places", "season", "Where the simulation errs, over all flights",

@@ -64,7 +64,8 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "table": f"{_PAIR_TABLE}.csv" if data.repeats else None,
         },
         "season": {
-            **named(data.season, "held_out started ranking drift"),
+            **named(data.season, "held_out started ranking nodes"),
+            "steps": words.step_words(data),
             "cells": 0 if data.season.places is None else len(data.season.places.cells),
         },
         **about(data),

@@ -68,7 +68,7 @@ def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
 
 def headline(data: CampaignData) -> list[str]:
     """The result in a few sentences."""
-    out = _ranked_words(data)
+    out = [*step_words(data), *_ranked_words(data)]
     for setting in data.settings:
         moved = [t for t in data.rank_transfers if t.setting == setting]
         if moved:
@@ -89,6 +89,26 @@ def headline(data: CampaignData) -> list[str]:
         else:
             out.append("No two flights pass the same places within the radius, so there is no repeatability floor.")
     return out
+
+
+def step_words(data: CampaignData) -> list[str]:
+    """Steps of offsets that the last date shows, and how small ones it can show."""
+    judged = [node for node in data.season.nodes if np.isfinite(node.smallest_db)]
+    if not judged:
+        return []
+    last = max(node.night[-1] for node in judged)
+    steps = [(node.node, step) for node in judged for step in node.steps if last == step.shown and not step.back]
+    out = [
+        f"On {last} the offset of {name} steps by {step.step_db:+.1f} dB "
+        f"(95 %: {step.step_ci95_db[0]:+.1f} to {step.step_ci95_db[1]:+.1f} dB)."
+        for name, step in steps
+    ] or [f"No offset steps on {last}, the last date."]
+    smallest = max(judged, key=lambda node: node.smallest_db)
+    return [
+        *out,
+        f"A step of {smallest.smallest_db:.1f} dB shows on its first date with a probability of 90 % (the largest such "
+        f"step, at {smallest.node}). At most 1 date in 100 shows a false step.",
+    ]
 
 
 def _ranked_words(data: CampaignData) -> list[str]:

@@ -1,0 +1,106 @@
+"""Offsets of nodes over the nights of a season: planted gains and steps are given back, chance is not.
+
+python -m tests.compare.test_steps SEASONS        prints the shares over so many simulated seasons of soundings
+"""
+
+import sys
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.judge.steps import NodeOffset, node_offsets, stepped
+
+NIGHTS, FIRST = 100, 30
+RADIOS = [f"LW{tower}:{channel}" for tower in range(1, 6) for channel in (0, 1)]
+LINKS = [(a, b) for a in RADIOS for b in RADIOS if a[:3] != b[:3]]
+
+
+def test_gains_of_both_ends_are_given_back_without_the_weather_and_past_a_blocked_link() -> None:
+    rng = np.random.default_rng(1)
+    gain = {name: np.zeros(20) for end in ("transmits", "receives") for name in (f"{r} {end}" for r in RADIOS)}
+    gain["LW2:0 transmits"][12:] += 3.0
+    gain["LW4:1 receives"][7] -= 2.0
+    offsets = np.array([gain[f"{a} transmits"] + gain[f"{b} receives"] for a, b in LINKS]).T
+    offsets = offsets + rng.normal(0.0, 9.0, len(LINKS)) + rng.normal(0.0, 2.0, (20, 1))  # links and weather
+    offsets[3, 5] += 40.0  # a truck
+    offsets[9, [1, 30, 31]] = np.nan
+    measured = node_offsets(offsets, LINKS)
+    assert measured.keys() == gain.keys()
+    for name, expected in gain.items():
+        assert measured[name] - measured[name][0] == pytest.approx(expected, abs=0.1), name
+
+
+def test_a_node_without_links_on_a_night_has_no_offset_and_one_receiver_keeps_its_weather() -> None:
+    offsets = np.array([[1.0, 2.0, np.nan], [1.0, 2.0, 4.0], [1.0, 4.0, 4.0]])
+    three = node_offsets(offsets, [("UAV", "LW1"), ("UAV", "LW2"), ("UAV", "LW3")])
+    assert np.isnan(three["LW3 receives"][0])
+    assert three["LW2 receives"][2] == pytest.approx(2.0)
+    alone = node_offsets(offsets[:, :1] + [[0], [1], [5]], [("UAV", "LW1")])
+    assert alone["LW1 receives"] == pytest.approx([-1.0, 0.0, 4.0])
+
+
+def _one(values: np.ndarray) -> NodeOffset:
+    return stepped("LW1", [f"{night:03}" for night in range(len(values))], values, 10)
+
+
+def test_a_step_shows_the_same_night_a_night_of_rain_comes_back_and_few_nights_show_nothing() -> None:
+    values = 0.1 * np.sin(2.4 * np.arange(40.0))
+    step = _one(values + np.where(np.arange(40) >= 25, 1.0, 0.0)).steps
+    assert [(s.night, s.shown, s.back) for s in step] == [("025", "025", "")]
+    assert step[0].step_ci95_db[0] < 1.0 < step[0].step_ci95_db[1]
+    rain = _one(values + np.where(np.arange(40) == 25, -1.0, 0.0)).steps
+    assert [(s.night, s.shown, s.back) for s in rain] == [("025", "025", "026")]
+    assert not _one(values).steps
+    few = _one(np.array([0.0, np.nan, 0.1, 0.0, 9.0]))
+    assert (few.night, few.steps) == (("000", "002", "003", "004"), ())
+    assert np.isnan(few.smallest_db)
+
+
+def test_the_smallest_step_that_is_stated_shows_nine_times_in_ten() -> None:
+    rng = np.random.default_rng(3)
+    shown = false = 0
+    for _ in range(200):
+        before = rng.normal(0.0, 0.2, 50)
+        quiet = _one(before)
+        false += len(quiet.steps)
+        last = before[-1 - len(quiet.steps) :].mean() if quiet.steps else before.mean()
+        after = _one(np.append(before, last + quiet.smallest_db + rng.normal(0.0, 0.2)))
+        shown += any(s.shown == "050" for s in after.steps)
+    assert 0.84 < shown / 200 < 0.96
+    assert false < 12  # one node of ten, 40 nights each: eight at one in a hundred
+
+
+def seasons(count: int, link_sd_db: float, seed: int, step_db: float = 1.0) -> dict[str, float]:
+    """Shares over seasons of soundings between ten radios with one step each; 2 % of the links missing."""
+    rng, same, soon, held, false, sd = np.random.default_rng(seed), 0, 0, 0, 0, []
+    night = [f"{number:03}" for number in range(NIGHTS)]
+    for _ in range(count):
+        offsets = rng.normal(0.0, 8.0, len(LINKS)) + rng.normal(0.0, 1.0, (NIGHTS, 1))
+        offsets = offsets + rng.normal(0.0, link_sd_db, offsets.shape)
+        radio, at, end = RADIOS[rng.integers(10)], int(rng.integers(FIRST, NIGHTS - 10)), int(rng.integers(2))
+        offsets[at:] += step_db * np.array([link[end] == radio for link in LINKS])
+        offsets[rng.random(offsets.shape) < 0.02] = np.nan
+        for name, values in node_offsets(offsets, LINKS).items():
+            node = stepped(name, night, values, 2 * len(RADIOS))
+            right = name == f"{radio} {('transmits', 'receives')[end]}"
+            mine = [s for s in node.steps if right and abs(int(s.night) - at) < 2 and int(s.shown) < at + 7][:1]
+            same += sum(int(s.shown) == at for s in mine)
+            soon += sum(int(s.shown) < at + 3 for s in mine)
+            held += sum(s.step_ci95_db[0] <= step_db <= s.step_ci95_db[1] for s in mine)
+            false += len(node.steps) - len(mine)
+            sd += [node.sd_db] if right else []
+    return {
+        "same night": same / count, "within three": soon / count, "interval holds": held / max(soon, 1),
+        "false in 100 nights": 100.0 * false / count / (NIGHTS - 10), "sd of the node [dB]": float(np.mean(sd)),
+    }  # fmt: skip
+
+
+def test_steps_of_a_decibel_show_the_same_night_and_false_ones_are_rare() -> None:
+    shares = seasons(12, 0.35, seed=4)
+    assert shares["same night"] >= 0.9
+    assert shares["false in 100 nights"] < 1.5  # of 2 000 seasons: see the command above
+
+
+if __name__ == "__main__":
+    for link_sd_db in (0.3, 0.4, 0.5, 0.8):
+        sys.stdout.write(f"{link_sd_db}: {seasons(int(sys.argv[1]), link_sd_db, seed=int(1000 * link_sd_db))}\n")

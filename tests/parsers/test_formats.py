@@ -68,21 +68,6 @@ def test_all_generations_of_telemetry_agree(data: bytes) -> None:
         assert np.allclose(first[["pitch_deg", "yaw_deg", "roll_deg"]].astype(float), np.degrees([0.1, 1.5, -0.05]))
 
 
-def test_attitude_is_there_where_the_format_has_it() -> None:
-    for data, present in (
-        (samples.FILES["vehicle_out/ten_fields"], True),
-        (samples.FILES["vehicle_out/eleven_fields"], True),
-        (samples.FILES["vehicle_out/nine_fields"], False),
-    ):
-        assert read("vehicle_out", data).streams[0].frame["yaw_deg"].notna().iloc[0] == present
-
-
-def test_velocity_is_north_east_down() -> None:
-    first = read("vehicle_out", samples.FILES["vehicle_out/ten_fields"]).streams[0].frame.iloc[0]
-    names = ["velocity_north_mps", "velocity_east_mps", "velocity_down_mps"]
-    assert first[names].tolist() == [1.0, 2.0, -0.5]
-
-
 @pytest.mark.parametrize(
     ("longitude", "latitude", "altitude", "fix", "flag"),
     [
@@ -113,13 +98,6 @@ def test_counts_of_a_vehicle_have_their_digits(index: str, fix: str, rows: int) 
     good = "2,-78,35,1,48.1,2025-03-02 10:00:00.250000,3,12\n"
     row = f"{index},-78,35,1,48.1,2025-03-02 10:00:00.250000,{fix},12\n"
     assert by_name("vehicle_out").read((good + row).encode(), OPTIONS).accepted == 1 + rows
-
-
-def test_no_fix_is_flagged_and_has_no_position() -> None:
-    row = read("vehicle_out", samples.FILES["vehicle_out/ten_fields"]).streams[0].frame.iloc[1]
-    assert row["flag"] == "no_fix"
-    assert row[["latitude_deg", "longitude_deg", "altitude_m"]].isna().all()
-    assert row["yaw_deg"] == pytest.approx(np.degrees(1.5)), "the attitude does not need a fix"
 
 
 def test_zero_attitude_is_flagged_and_unknown_where_it_is_all_there_is() -> None:

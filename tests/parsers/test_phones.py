@@ -100,13 +100,6 @@ def test_a_rank_that_is_none_says_why(written: str, flag: str) -> None:
     assert rank.frame["flag"].tolist() == [flag]
 
 
-def test_g_nettrack_neighbours_are_not_the_serving_cell() -> None:
-    result = read("drive_test", samples.FILES["drive_test/g_nettrack"])
-    serving = next(series for series in result.streams if series.attributes.get("pci") == 42)
-    assert serving.frame["rss_db"].tolist() == [-95.0, -96.0]
-    assert serving.frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00")
-
-
 def test_g_nettrack_pro_rssi_is_beside_its_level_and_steps_are_none() -> None:
     rows = samples.FILES["drive_test/g_nettrack_pro"].splitlines(keepends=True)
     result = read("drive_test", b"".join([*rows[:2], rows[1].replace(b"|-70|", b"|17|").replace(b"00.00|", b"00.02|")]))
@@ -122,25 +115,6 @@ def test_columns_in_any_order(columns: object) -> None:
     usual, reordered = read("drive_test", samples.FILES["drive_test/nemo"]), read("drive_test", turned)
     for name in ("lte_pci110", "lte_pci22", "phone"):
         pd.testing.assert_frame_equal(stream(usual, name).frame, stream(reordered, name).frame)
-
-
-def test_the_same_pose_from_every_program() -> None:
-    """One flight state, written by four programs in their own units."""
-    airdata = read("pose_csv", samples.FILES["pose_csv/airdata"]).streams[0].frame
-    feet = airdata.iloc[0]
-    assert feet["altitude_m"] == pytest.approx(3.048)
-    assert feet["velocity_north_mps"] == pytest.approx(4.4704)
-    assert (feet["yaw_deg"], feet["pitch_deg"], feet["satellites"]) == (90.0, -1.5, 14)
-    assert airdata["time"].tolist() == [pd.Timestamp("2025-03-02T15:00:00.9"), pd.Timestamp("2025-03-02T15:00:01")], (
-        "datetime(utc) has whole seconds, time(millisecond) their fractions"
-    )
-    dji = read("pose_csv", samples.FILES["pose_csv/dji"]).streams[0].frame.iloc[0]
-    assert dji["altitude_m"] == pytest.approx(9.99744)
-    assert dji["time"] == pd.Timestamp("2025-03-02T15:00:00.250"), "local"
-    own = read("vehicle_out", samples.FILES["vehicle_out/ten_fields"]).streams[0].frame.iloc[0]
-    converted = read("pose_csv", samples.FILES["pose_csv/converted"]).streams[0].frame.iloc[0]
-    for name in ("time", "latitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "velocity_east_mps", "fix"):
-        assert converted[name] == own[name], name
 
 
 def test_milliseconds_beyond_any_time_stamp_are_left_out() -> None:

@@ -223,14 +223,6 @@ def pooled_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
     }
 
 
-def remembering(rng: np.random.Generator, n: int, samples: float) -> np.ndarray:
-    """Unit-variance AR(1)."""
-    keep = np.exp(-1.0 / samples)
-    noise = rng.normal(size=n)
-    noise[0] /= np.sqrt(1 - keep**2)
-    return np.sqrt(1 - keep**2) * lfilter([1], [1, -keep], noise)
-
-
 def rank_truth(mix: float) -> dict[str, float]:
     """Agreement, kappa, total variation and first bar of two thresholded unit normals with correlation ``mix``."""
     edges = np.concatenate([[-8.0], CUTS, [8.0]])
@@ -254,12 +246,12 @@ def rank_truth(mix: float) -> dict[str, float]:
 
 def rank_coverage(flights: int, n: int, memory: float, replicates: int) -> dict[str, float]:
     rng = np.random.default_rng(int(memory * 10) + n + 1)
-    mix = 0.8
+    mix, process = 0.8, Shadowing(n, (float(np.exp(-1.0 / memory)),))
     truth = rank_truth(mix)
     hits = dict.fromkeys(truth, 0)
     for _ in range(flights):
-        measured = remembering(rng, n, memory)
-        simulated = mix * measured + np.sqrt(1 - mix**2) * remembering(rng, n, memory)
+        measured, other = process.sequences(rng, 2)
+        simulated = mix * measured + np.sqrt(1 - mix**2) * other
         fit = compare_ranks(
             np.searchsorted(CUTS, measured) + 1.0, np.searchsorted(CUTS + 0.3, simulated) + 1.0, replicates=replicates
         )

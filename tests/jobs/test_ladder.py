@@ -14,6 +14,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.yamledit import edited
 from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.flight.data import load_data
+from aerpaw_cmp.flight.drafting.remembered import offered
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_changes
@@ -144,6 +145,20 @@ def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64) -> 
     path = flight(folder)
     path.write_text(path.read_text().replace("file: lake_wheeler", "file: mine.yaml"), encoding="utf-8")
     return path
+
+
+@pytest.mark.parametrize(("taught", "own", "fits"), [("ROVER", "NODE", True), ("LW2", "NODE", False)])
+def test_a_node_of_the_flight_is_offered_what_rovers_of_others_taught(
+    taught: str, own: str, fits: bool, tmp_path: Path
+) -> None:
+    path = remembering(tmp_path, 3.5)
+    index = tmp_path / "mine.learned" / "learned.yaml"
+    index.write_text(index.read_text().replace("tower: LW1", f"tower: {taught}"))
+    node = "{latitude_deg: 35.7275, longitude_deg: -78.6962, antenna_height_m: 1.5}"
+    text = path.read_text(encoding="utf-8").replace("LW1", own)
+    path.write_text(f"{text}\ntowers: {{{own}: {node}}}\n", encoding="utf-8")
+    settings = offered(load_data(load_flight(path), tmp_path))
+    assert (settings is not None and f"{own}.A" in settings.antennas) == fits
 
 
 @pytest.mark.parametrize(("learned_db", "chosen"), [(3.5, True), (5.5, False)])

@@ -343,7 +343,8 @@ def _named(name: str, shown: Sequence[_Models], gain: float) -> Cause:
     value, low, high = trial.estimate
     return Cause(
         name=name,
-        sentence=f"Likely cause at {where}: {trial.sentence}; RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
+        sentence=f"Likely cause at {where}: {trial.sentence}; "
+        f"1-s RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
         next_step=trial.next_step,
         estimate=value,
         ci95=(low, high),
@@ -659,7 +660,7 @@ def _lock(e: LevelEvidence) -> Iterator[Trial]:
     if e.locked is not None and (lost := e.locked < 0.5).any():
         yield Trial(
             name="lock", cost=0.0, clipped=lost,
-            sentence=f"the receiver had lost its lock in {100 * lost.mean():.0f} % of the seconds",
+            sentence=f"the receiver had no lock in {100 * lost.mean():.0f} % of the seconds",
             next_step="trust the error with the floor",
         )  # fmt: skip
 

@@ -227,7 +227,9 @@ def offered(data: FlightData) -> FlightFile | None:
     series = [(s.tower, s.channel, data.files[int(number)].result.reader)
               for s in data.rss for number in np.unique(s.log)]  # fmt: skip
     try:
-        known = propose(learned.read_learned(data.site_place), str(Path(site).with_suffix("")), series)
+        own = frozenset(data.settings.towers)  # as the rovers of other flights were: placed by their own flight
+        nodes = Nodes(placed=own, fixed=[name for name in data.site.towers if name not in own])
+        known = propose(learned.read_learned(data.site_place), str(Path(site).with_suffix("")), series, nodes)
     except (InputError, UsageError):
         return None
     if len(known.antennas) < 2:

@@ -85,8 +85,16 @@ def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]
 
 
 @pytest.mark.sionna
-def test_bench_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_bench_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     """Of the two numbers of samples that ``--quick`` asks for, one is run: the rows are of the same kinds."""
+    of = {"tower": "T", "channel": "A", "n": 9, "recommended": False, "elsewhere_db": None}
+    better = {"rmse_heldout_db": 3.0, "difference_to_best_db": 0.0, "difference_to_best_ci95_db": [0.0, 0.0]}
+    unscored = dict.fromkeys(("rmse_heldout_db", "difference_to_best_db")) | {
+        "difference_to_best_ci95_db": [None, None]
+    }
+    ladder = [{"model": "line", "seconds": 0.0, **of, **unscored}, {"model": "rays", "seconds": 0.5, **of, **better}]
+    report = {"flight": "f", "inputs": [], "versions": {}, "settings": {}, "rss": {}, "rank": {}, "ladder": ladder}
+    (tmp_path / "metrics.json").write_text(json.dumps(report))
     real = bench.run_bench
 
     def one_of_them(*, samples: tuple[int, ...], **asked: Any) -> dict[str, Any]:
@@ -94,9 +102,10 @@ def test_bench_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
         return real(samples=samples[1:], **asked)
 
     monkeypatch.setattr(bench, "run_bench", one_of_them)
-    result = json.loads(out_of(capsys, "bench", "--quick", "--poses", "6", "--json"))
+    result = json.loads(out_of(capsys, "bench", "--quick", "--poses", "6", "--json", "--report", tmp_path))
     wanted = {"engine", "samples", "arrays", "depth", "seconds", "links_per_s", "peak_mib", "missing_paths"}
     wanted |= {"extra_paths", "rss_max_error_db", "rss_rms_error_db", "rank_disagreement"}
+    assert result["ladder"] == [{"model": "rays", "seconds": 0.5, "rmse_heldout_db": 3.0, "knee": True}]
     rows = result["replay"]["rows"]
     assert all(wanted <= set(row) for row in rows)
     assert {row["arrays"] for row in rows} == {"float64", "synthetic", "explicit"}

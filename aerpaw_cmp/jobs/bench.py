@@ -8,6 +8,7 @@ import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
@@ -15,10 +16,12 @@ from shapely import affinity
 from shapely.geometry import Point, box
 
 from ..common.counting import counted
+from ..common.errors import parsing
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import named
 from ..common.stages import Progress, begin_peak, logged, peak_mib
 from ..common.units import ComplexArray, FloatArray, IntArray, spread_out, wavelength_m
+from ..compare.judge.ladder import LadderRow, costs
 from ..compare.rank import channel_rank
 from ..propagation.check.audit import RANK_K, Difference, compare
 from ..propagation.field.sum import mean_pair_power, rss_dbm
@@ -56,6 +59,7 @@ def run_bench(
     poses: int = 200,
     samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
     ratios: bool = True,
+    report: Path | None = None,
     progress: Progress = logged,
 ) -> dict[str, Any]:
     """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
@@ -68,13 +72,16 @@ def run_bench(
         Rays per tower of the sionna engine.
     ratios : bool
         Compare with the peers, too.
+    report : Path, optional
+        Folder of a report, whose ladder of models is a table, too.
     progress : Progress
 
     Returns
     -------
     dict
-        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
+        ``conditions``, ``replay.rows``, ``ratios``, ``details`` and, of a report, ``ladder``.
     """
+    ladder = {} if report is None else {"ladder": _costs(report)}
     site, link, some = random_scene(poses)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
     measured = _against_peers(progress) if ratios else {}
@@ -84,7 +91,26 @@ def run_bench(
         "replay": {"rows": rows},
         "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None},
         "details": measured,
+        **ladder,
     }
+
+
+def _costs(report: Path) -> list[Row]:
+    """Time against error of the models of a report's ladder."""
+    from .diff_reports import read_metrics
+
+    file = report / "metrics.json"
+    rows = read_metrics(file, report).get("ladder") or []
+    nothing = {"rmse_heldout_db": np.nan, "difference_to_best_db": np.nan}
+    with parsing(file, "metrics.json of a report", "an edited file", any_shape=True):
+        models = [
+            LadderRow(**{
+                **row, **{key: value for key, value in nothing.items() if row[key] is None},
+                "difference_to_best_ci95_db": tuple(np.array(row["difference_to_best_ci95_db"], dtype=float)),
+            })
+            for row in rows
+        ]  # fmt: skip
+    return [named(at, "model seconds rmse_heldout_db knee") for at in costs(models)]
 
 
 def _against_peers(progress: Progress) -> dict[str, Any]:

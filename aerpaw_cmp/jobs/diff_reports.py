@@ -87,7 +87,7 @@ def _read_report(place: Path) -> ReadReport:
     InputError
         With what was found, what was expected, and the likely cause.
     """
-    metrics = _metrics(place / "metrics.json", place)
+    metrics = read_metrics(place / "metrics.json", place)
     files = {kind: place / f"{kind}.csv" for kind in ("rss", "rank")}
     rss, rank = (_table(files[kind], kind, columns) for kind, columns in (("rss", RSS_COLUMNS), ("rank", RANK_COLUMNS)))
     changed = [name for name in changed_files(place) if name in ("metrics.json", "rss.csv", "rank.csv")]
@@ -102,7 +102,8 @@ def _read_report(place: Path) -> ReadReport:
     )
 
 
-def _metrics(file: Path, named: Path) -> dict[str, Any]:
+def read_metrics(file: Path, named: Path) -> dict[str, Any]:
+    """The numbers of a report, ``named`` by its folder or by the file itself."""
     if not file.is_file():
         foreign = next((n for n in ("campaign.json", "diff.json") if (named / n).is_file()), None)
         raise InputError(

@@ -1,11 +1,15 @@
 """Ladder of models on planted truths."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.judge.ladder import (
+    LadderRow,
     Rung,
     climb,
+    costs,
     held_out_error_db,
     held_out_lines,
     log_distance_level_db,
@@ -172,3 +176,25 @@ def test_a_missing_level_or_place_leaves_the_line_of_the_others() -> None:
     assert np.isnan(level).tolist() == (distance == 0.0).tolist()
     x = 10.0 * np.log10(distance[~good & (distance > 0.0)])
     assert np.polyfit(x, level[~good & (distance > 0.0)], 1)[0] == pytest.approx(-2.5, abs=0.1)
+
+
+def test_the_knee_is_the_fastest_model_that_no_series_tells_from_the_best() -> None:
+    """Of four models: a fast one that one channel rules out, the knee, the best, and a slow one as good."""
+    rows = [
+        LadderRow(
+            model=model, tower="T", channel=channel, rmse_heldout_db=rmse, n=n, seconds=seconds, recommended=False,
+            difference_to_best_db=rmse - 3.0, difference_to_best_ci95_db=(rmse - 3.0 - half, rmse - 3.0 + half),
+        )
+        for model, seconds, half, errors in (
+            ("line", 0.0, 0.5, (3.2, 5.0)), ("flat", 0.4, 0.5, (3.3, 3.4)), ("rich", 2.0, 0.0, (3.0, 3.0)),
+            ("dear", 9.0, 0.5, (3.1, 3.1)),
+        )
+        for channel, n, rmse in zip("AB", (100, 300), errors, strict=True)
+    ]  # fmt: skip
+    points = {at.model: at for at in costs(rows)}
+    assert [model for model, at in points.items() if at.knee] == ["flat"]
+    assert points["line"].rmse_heldout_db == pytest.approx(np.sqrt((100 * 3.2**2 + 300 * 5.0**2) / 400))
+    # without an interval nothing says that it is as good
+    unknown = [dataclasses.replace(row, difference_to_best_ci95_db=(np.nan, np.nan)) for row in rows]
+    assert [at.model for at in costs(unknown) if at.knee] == ["rich"]
+    assert costs([]) == []

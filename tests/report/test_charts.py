@@ -56,7 +56,8 @@ def test_a_ladder_has_a_dot_for_each_score_and_whiskers_of_the_difference(report
         for model, channel, rmse in (("free space", "A", 5.0), ("free space", "B", 6.0), ("rich", "A", 3.0),
                                      ("rich", "B", np.nan))
     ]  # fmt: skip
-    (chart,) = charts_of(dataclasses.replace(report_data, ladder=tuple(rows)))
+    chart, cost = charts_of(dataclasses.replace(report_data, ladder=tuple(rows)))
+    assert [mark["name"] for mark in cost.content["marks"]] == ["free space"]  # the other is not scored on both
     first, second = chart.content["marks"]
     assert (chart.content["rows"], chart.content["chosen"]) == (["free space", "rich"], 1)
     np.testing.assert_allclose(first["x"], [5.0, 3.0])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 from typer import Option
@@ -18,20 +19,22 @@ from ..shown import print_json, records, say, show
     examples=[
         "aerpaw-cmp bench --quick",
         "aerpaw-cmp bench --poses 500 --json",
+        "aerpaw-cmp bench --quick --report reports/flight",
     ],
 )
 def bench(
     poses: Annotated[int, Option(min=2, help="Poses of the flight that is replayed.")] = 200,
     quick: Annotated[bool, Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
+    report: Annotated[Path | None, Option(help="Folder of a report: what accuracy costs on its flight, too.")] = None,
     as_json: Json = False,
 ) -> None:
     """Speed against error on this machine."""
     from ...jobs import bench as job
 
     if quick:
-        result = job.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, progress=say)
+        result = job.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, report=report, progress=say)
     else:
-        result = job.run_bench(poses=poses, progress=say)
+        result = job.run_bench(poses=poses, report=report, progress=say)
     if as_json:
         print_json(result)
         return
@@ -45,6 +48,10 @@ def bench(
         "RSS error dB max": "rss_max_error_db:.2g", "rms": "rss_rms_error_db:.2g", "rank disagreement per K": "ranks",
     }  # fmt: skip
     records(rows, columns, f"Speed against error ({_conditions(result['conditions'])})")
+    costs = [{**row, "knee": "knee" if row["knee"] else ""} for row in result.get("ladder", ())]
+    if costs:
+        columns = {"model": "model", "s": "seconds:.3g", "RMSE dB": "rmse_heldout_db:.2f", "": "knee"}
+        records(costs, columns, "What accuracy costs on the flight of the report")
     for name, ratio in result["ratios"].items():
         show(f"{name}: {ratio:.3g} times")
 

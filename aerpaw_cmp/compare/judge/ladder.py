@@ -223,6 +223,45 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[Ladd
     return rows
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelCost:
+    """A scored model over all series: its seconds, its RMSE on held-out segments [dB], and whether it is the knee.
+
+    The knee is the fastest model that no series tells from the best one.
+    """
+
+    model: str
+    seconds: float
+    rmse_heldout_db: float
+    knee: bool
+
+
+def costs(rows: Sequence[LadderRow]) -> list[ModelCost]:
+    """Time against error of the models that are scored on every series on which any is."""
+    scored: dict[str, list[LadderRow]] = {}
+    for row in rows:
+        if np.isfinite(row.rmse_heldout_db):
+            scored.setdefault(row.model, []).append(row)
+    most = max(map(len, scored.values()), default=0)
+    scored = {model: of for model, of in scored.items() if len(of) == most}
+    as_good = [
+        model for model, of in scored.items()
+        if all(row.difference_to_best_db <= 0.0 or row.difference_to_best_ci95_db[0] <= 0.0 for row in of)
+    ]  # fmt: skip
+    knee = min(as_good, key=lambda model: scored[model][0].seconds, default=None)
+    return [
+        ModelCost(
+            model=model,
+            seconds=of[0].seconds,
+            rmse_heldout_db=float(
+                np.sqrt(np.average([row.rmse_heldout_db**2 for row in of], weights=[row.n for row in of]))
+            ),
+            knee=model == knee,
+        )
+        for model, of in scored.items()
+    ]
+
+
 def held_out_error_db(
     measured_db: FloatArray, level_db: FloatArray, keep: BoolArray, blocks: int = _BLOCKS,
     place: IntArray | None = None, regressor_db: FloatArray | None = None,

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...common.kml import CLASS_COLOURS
 from ...common.units import AnyArray
-from ...compare.judge.ladder import LadderRow
+from ...compare.judge.ladder import LadderRow, ModelCost, costs
 from ...compare.level.detection import DetectionScore
 from ...compare.level.serving import ServingComparison
 from ...compare.result import RankResult
@@ -94,6 +94,12 @@ def charts_of(data: ReportData) -> list[Chart]:
             "same samples.",
             content=_ladder(data.ladder),
         ))  # fmt: skip
+        charts.append(Chart(
+            section="ladder", title="What does accuracy cost?",
+            caption="RMSE over all series against the seconds of the whole flight. Knee: the fastest model that no "
+            "series tells from the best.",
+            content=_costs(costs(data.ladder)),
+        ))  # fmt: skip
     charts += [
         Chart(
             section="forecast", title=f"{rank.tower}: rank forecast along the flight",
@@ -134,6 +140,16 @@ def _ladder(rows: Sequence[LadderRow]) -> dict[str, Any]:
     ]  # fmt: skip
     chosen = next((models.index(row.model) for row in rows if row.recommended), -1)
     return {"rows": models, "chosen": chosen, "x": {"label": "RMSE on held-out segments [dB]"}, "marks": marks}
+
+
+def _costs(models: Sequence[ModelCost]) -> dict[str, Any]:
+    """A dot for each model."""
+    marks = [
+        {"kind": "dots", "name": f"{at.model} (knee)" if at.knee else at.model, "x": np.array([at.seconds]),
+         "y": np.array([at.rmse_heldout_db])}
+        for at in models
+    ]  # fmt: skip
+    return {"x": {"label": "Seconds"}, "y": {"label": "RMSE on held-out segments [dB]"}, "marks": marks}
 
 
 def _predicted(series: AgainstSeries) -> dict[str, Any]:

@@ -12,7 +12,7 @@ import numpy as np
 from ...common.counting import counted
 from ...common.units import AnyArray, Printed
 from ...compare.flight_verdict import lock_lost, pooled_db
-from ...compare.judge.ladder import LadderRow
+from ...compare.judge.ladder import LadderRow, costs
 from ...compare.level.detection import DetectionScore
 from ...compare.level.rss import ErrorSpan
 from ...compare.result import BASELINE_TITLE, AuditResult, FlightVerdict, RankResult, RssResult
@@ -274,6 +274,10 @@ def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     text = f"Cross-validated RMSE: {', '.join(compared)}."
     if least in (BASELINE_TITLE["log_distance"], BASELINE_TITLE["constant"]):
         text += f" The {least}, which replays nothing, has the smallest error of all models."
+    if knee := next((at for at in costs(rows) if at.knee), None):
+        text += (
+            f" \u201c{knee.model}\u201d ({knee.seconds:.2g} s) is the fastest model that no series tells from the best."
+        )
     how = "the simplest replay within one standard error of the best replay"
     if best.elsewhere_db is not None:
         how = "the best on other flights ({:.1f} dB, free space {:.1f} dB)".format(*best.elsewhere_db)

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+import yaml
 
 from aerpaw_cmp.__main__ import main
 from tests.test_cli_bad_input import FLIGHT, GOOD_POWER, GOOD_TELEMETRY
@@ -38,61 +39,11 @@ FILES = {
     "route.kml": "<kml></kml>\n",
     "scores.csv": "a,b\n1,2\n",
 }
-COMMANDS = {
-    "no such command": "reprot flight.yaml",
-    "no argument": "report; explain flight.yaml; diff one; predict; site import; calibrate; simulate",
-    "unknown option": "report flight.yaml --quickly; ingest --zone UTC; tap --prot; bench --fast",
-    "bad option value": (
-        "report flight.yaml --figures few; report flight.yaml --audit some; report flight.yaml --export geojsn; "
-        "ingest . --timezone New_York; map lake_wheeler --spacing 0; map lake_wheeler --rss-altitude -3; "
-        "map lake_wheeler --foliage autumn; map lake_wheeler --tile-m 1; explain flight.yaml --tower LW9 --time 5; "
-        "explain flight.yaml --tower LW1 --time noon; predict lake_wheeler --with flight.yaml --height high; "
-        "plan sphere; tap log --ri-hz 0 --duration 1 --wait 0; "
-        "campaign campaign.yaml --workers 0; bench --poses none; site show nowhere; "
-        "site export lake_weeler -o scene"
-    ),
-    "missing file": (
-        "ingest gone.txt; report gone.yaml; report no_log.yaml; explain gone.yaml --tower LW1 --time 5; "
-        "simulate gone.yaml; calibrate gone.yaml; calibrate calibration.yaml; campaign gone.yaml; "
-        "report flihgt.yaml; diff gone other; "
-        "predict gone.kml --with flight.yaml; plan gone.kml --site lake_wheeler; map gone.yaml; "
-        "report flight.yaml --with gone.yaml; report flight.yaml --against gone; site import gone.osm -o site.yaml"
-    ),
-    "wrong type of file": (
-        "report .; report damaged.txt; simulate vehicleOut.txt; calibrate flight.yaml; campaign flight.yaml; "
-        "diff . .; predict vehicleOut.txt --with calibration.yaml; map damaged.txt; "
-        "site import notes.txt -o site.yaml; plan route.kml --site lake_wheeler; "
-        "report flight.yaml --against .; report flight.yaml --with flight.yaml"
-    ),
-    "bad YAML": (
-        "report syntax.yaml; simulate syntax.yaml; calibrate syntax.yaml; campaign syntax.yaml; map syntax.yaml; "
-        "explain syntax.yaml --tower LW1 --time 5"
-    ),
-    "unknown key": "report key.yaml; simulate key.yaml; campaign campaign_key.yaml; calibrate calibration_key.yaml",
-    "wrong value": "report type.yaml; report zone.yaml",
-    "damaged log": "ingest damaged.txt; ingest empty.txt; report damaged.yaml",
-    "output exists": (
-        "report flight.yaml -o page; ingest vehicleOut.txt power_log.txt --timezone America/New_York -o notes.txt; "
-        "map lake_wheeler -o page; site export lake_wheeler -o page; sample -o page; "
-        "campaign campaign.yaml -o page; calibrate calibration.yaml -o notes.txt; diff page page; "
-        "predict lake_wheeler --with flight.yaml -o page"
-    ),
-    "disk takes nothing": (
-        "report flight.yaml -o /proc/nothing/page; ingest vehicleOut.txt --timezone America/New_York -o /dev/full; "
-        "sample -o /proc/nothing; site export lake_wheeler -o /proc/nothing"
-    ),
-    "no port, no network": (
-        "tap /dev/ttyNOTHING --duration 1 --wait 0 -o log; tap --web 999.1.1.1:80 --duration 1 --wait 0 -o log; "
-        "map lake_wheeler --scheduler nowhere"
-    ),
-}
-
-
 # Commands of each kind of fault that the page shows.
 ON_PAGE = 3
 
 # Command lines that meet each kind of fault.
-KINDS = {kind: lines.split("; ") for kind, lines in COMMANDS.items()}
+KINDS: dict[str, list[str]] = yaml.safe_load(Path(__file__).with_name("messages.yaml").read_text(encoding="utf-8"))
 
 
 @contextlib.contextmanager

@@ -40,13 +40,17 @@ class Case:
     refused: str = ""
 
 
+def written(name: str) -> dict[str, Any]:
+    """A table beside this module."""
+    content = Path(__file__).with_name(f"{name}.yaml").read_bytes()
+    table: dict[str, Any] = yaml.load(content, getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+    return table
+
+
 def written_cases() -> dict[str, Case]:
     """Those of ``truth.yaml``."""
-    table = yaml.load(
-        (Path(__file__).with_name("truth.yaml")).read_bytes(), getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-    )
     out = {}
-    for name, case in table.items():
+    for name, case in written("truth").items():
         data = samples.FILES[case.pop("sample")] if "sample" in case else case.pop("text")
         options = replace(LOCAL, time_origin=case.pop("time_origin", None))
         out[name] = Case(case.pop("file", name), data, case.pop("streams"), options=options, **case)
@@ -198,82 +202,17 @@ def test_what_a_file_says_comes_out(case: Case) -> None:
 
 @dataclass(frozen=True)
 class Form:
-    """A format of one row per instant: what stands above the rows, a row, and the column that ``v`` must come out in.
+    """A format of one row per instant, as ``forms.yaml`` describes it."""
 
-    ``t`` is the wall clock (local, or UTC where ``utc``), ``s`` the seconds of the epoch, ``ms`` its milliseconds.
-    """
-
-    head: str
     row: str
     stream: str
     column: str
+    head: str = ""
     utc: bool = False
     name: str = "log.txt"
 
 
-LOG2CSV = "Number,Time,Longitude,Latitude,Altitude,Voltage,Battery Level,Fix,Number of Satellites\n"
-RANKS, ENB = "rank", "| 31.5 12.5 40 15 38k"
-FORMS = {
-    "vehicle_out, 10 fields": Form(
-        "", '{i},-78.7,35.73,{v}.5,"(0.1,1.5,0.1)","(0.0,5.0,0.1)",48.1,{t},4,18\n', "vehicle", "altitude_m"
-    ),
-    "vehicle_out, 9 fields, titled": Form(
-        LOG2CSV.replace("Time,", ""), "{i},-78.7,35.73,{v}.5,48.1,90,{t},4,18\n", "vehicle", "altitude_m"
-    ),
-    "vehicle_out, 8 fields, UTC": Form(
-        "", "{i},-78.7,35.73,{v}.5,48.1,{t}+00:00,4,18\n", "vehicle", "altitude_m", utc=True
-    ),
-    "pose_csv, columns turned": Form(
-        "Heading (deg),Height above takeoff,Longitude,LATITUDE,Timestamp\n", "90,{v}.5,-78.7,35.73,{t}\n", "vehicle", "altitude_m"
-    ),
-    "pose_csv, UTC by the column's name": Form(
-        "Export of a flight\n\nLat;Lon;Rel Alt;datetime(utc)\n", "35,73;-78,7;{v},5;{t}\n", "vehicle", "altitude_m", utc=True
-    ),
-    "vehicle_log": Form(
-        "", '[{t}] Current location is {{"lat": 35.73, "lon": -78.7, "alt": {v}.5}}\n', "vehicle", "altitude_m"
-    ),
-    "gpx": Form(
-        "<gpx>\n", '<trkpt lat="35.73" lon="-78.7"><ele>{v}.5</ele><course>{v}</course><time>{t}Z</time></trkpt>\n',
-        "track", "above the first", utc=True,
-    ),
-    "sounder_log": Form("", "[{t}] {i:07o} {v:15d}.5\n", "power", "level", name="x_power_log.txt"),
-    "aadm_snr": Form("time,snr_lw3\n", "{t},{v}.5\n", "LW3", "level"),
-    "controller_log": Form(
-        "", "[{t}] [Controller-->UAV] SNR:\n[{t}] 2:{v}.5\n[{t}] [Controller-->UAV] Download:\n[{t}] 2:99.5\n", "LW2", "level"
-    ),
-    "quectel_csv": Form(
-        "OK\n", '{t},"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",24,{v},12,5\n', "nr5g_csi", RANKS
-    ),
-    "quectel_ri": Form(
-        "ID,Time and date,Longitude,Latitude,Altitude,NR RI\n", "{i},{t},-78.7,35.73,30.1,{v}\n", "nr5g_csi", RANKS
-    ),
-    "quectel_console": Form(
-        "", '{t}\n|    |----+\n|  0 | +QNWCFG: "nr5g_csi" | 24 | {v} | 12 | 5 |\n', "nr5g_csi", RANKS
-    ),
-    "srsenb_log": Form(
-        "[2025-01-01 00:00:00.000000] rat rnti  cqi  ri  mcs  brate ok nok (%)\n",
-        "[{t}] lte   46   11   {v}    2   3.7k   14    0   0% " + ENB + "\n", "srsenb", RANKS,
-    ),
-    "srsue_log": Form(
-        "[2025-01-01 00:00:00.000000] cc pci rsrp pl cfo | mcs snr\n",
-        "[{t}]   0    7   -{v}   61 -4.3k |   0   25   1.0   4.5k    0%  1.6 |  23  83k  19M\n", "lte_pci7", "-level",
-    ),
-    "srsran_gnb": Form(
-        "[2025-01-01 00:00:00.000000]  pci rnti | cqi ri mcs\n",
-        "[{t}]   1 4601 |  15   {v}   28    17M  908    0   0%    44k |  26.7 -21.2\n", "gnb", RANKS,
-    ),
-    "srsran_json": Form(
-        "", '{{"timestamp": {s}, "ue_list": [{{"pci": 1, "rnti": 5, "dl_ri": {v}}}]}}\n', "gnb", RANKS, utc=True
-    ),
-    "oai_log": Form("", "[{t}] [NR_MAC] UE 1f4d: CQI 15, RI {v}, PMI (14,1)\n", "oai", RANKS),
-    "pawprints": Form(
-        "", '{{"abs_time": 1, "companion_abs_time": {ms}, "cells": [{{"technology": "4G_LTE", "rsrp": -{v}, "pci": 7}}]}}\n',
-        "lte_pci7", "-level", utc=True,
-    ),
-    "drive_test, two carriers": Form(
-        "Timestamp,PCI,EARFCN,RSRP (dBm),N1 PCI,N1 EARFCN,N1 RSRP\n", "{t},7,1300,-{v},7,2850,-99\n", "pci7_arfcn1300", "-level"
-    ),
-}  # fmt: skip
+FORMS = {name: Form(**form) for name, form in written("forms").items()}
 NEW_YORK = ZoneInfo("America/New_York")
 INSTANTS = {
     "morning": datetime(2025, 3, 2, 10, tzinfo=NEW_YORK),
@@ -289,7 +228,7 @@ COLUMNS = {
 }  # fmt: skip
 
 
-def written(form: Form, begin: datetime) -> tuple[str, list[np.datetime64]]:
+def file_of(form: Form, begin: datetime) -> tuple[str, list[np.datetime64]]:
     """The file, and the instants of its rows."""
     text, instants = form.head, []
     for i, v in enumerate(VALUES):
@@ -308,7 +247,7 @@ def written(form: Form, begin: datetime) -> tuple[str, list[np.datetime64]]:
 @pytest.mark.parametrize("name", FORMS)
 def test_every_format_at_every_kind_of_time(name: str, when: str) -> None:
     form = FORMS[name]
-    text, instants = written(form, INSTANTS[when])
+    text, instants = file_of(form, INSTANTS[when])
     options = replace(LOCAL, file_name=form.name)
     for data in (text.encode(), b"\r\n" + text.replace("\n", "\r\n").encode()):
         reader = identify(data)

@@ -447,7 +447,8 @@ def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     logs_root : Path, optional
         Where logs and antenna files resolve, in place of ``folder``.
     """
-    return gather(settings, folder, read_logs(settings, folder, logs_root), logs_root)
+    files = read_logs(settings, folder, logs_root)
+    return gather(settings, folder, files, logs_root)
 
 
 def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:

@@ -1,7 +1,7 @@
 """Independent tasks on workers: here, in processes of this machine, or on a Dask cluster; one function, one result.
 
-Tasks are functions of small records (paths, settings, hashes) that can be pickled. A lost worker costs what it was
-doing: that task runs again, a last time alone, and only one that loses its worker even then is :class:`Lost`.
+Tasks are functions of small records (paths, settings, hashes) that can be pickled. A lost worker costs what was
+being done: that runs again, alone, and only a task that loses its worker even then is :class:`Lost`.
 
 Processes of this machine are talked to by pipes that only they and this process hold: nothing listens. A scheduler and
 its workers unpickle what they are sent, and so run code for whoever reaches them: only TLS is spoken with them.
@@ -13,17 +13,18 @@ import contextlib
 import logging
 import multiprocessing
 import os
-import pickle
 import platform
 import signal
 import threading
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import CancelledError
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ProcessPoolExecutor
+from concurrent.futures import wait as wait_for
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from multiprocessing import get_context
-from multiprocessing.connection import Connection, wait
+from multiprocessing.connection import wait
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -37,9 +38,6 @@ Task = Callable[[Any], Any]
 
 # Gets the number of an item and the result of its task, or :class:`Lost`.
 _OnResult = Callable[[int, Any], None]
-
-# A task in work when a worker is lost is tried again; after so many tries once more, alone.
-_TRIES = 2
 
 # Time for a scheduler to answer, after which one without a worker is spoken of, and between counts of workers.
 CONNECT_S, NO_WORKER_S, COUNT_EVERY_S = 10.0, 30.0, 2.0
@@ -80,104 +78,70 @@ class InProcess:
 
 
 class Processes:
-    """Processes of this machine, each with a pipe of its own; one that ends is known, and another takes its place."""
+    """Processes of this machine; where one ends, others take the place of all, and what was in work runs alone."""
 
     def __init__(self, count: int) -> None:
         self.count = count
 
     def run(self, function: Task, items: Sequence[Any], on_result: _OnResult) -> None:  # noqa: D102
-        with contextlib.ExitStack() as stack:
-            crew = [stack.enter_context(_Worker(function)) for _ in range(min(self.count, len(items)))]
-            tries: Counter[int] = Counter()
-            killed = _through(crew, items, deque(range(len(items))), tries, on_result)
-            for number in killed:  # a last time, so that none pays for its neighbour
-                if _through(crew[:1], items, deque([number]), tries, on_result):
+        waiting = deque(range(len(items)))
+        while waiting:
+            for number in self._through(function, items, waiting, on_result):  # alone: none pays for its neighbour
+                if self._through(function, items, deque([number]), on_result):
                     on_result(number, _ENDED)
 
-
-def _through(
-    crew: Sequence[_Worker], items: Sequence[Any], waiting: deque[int], tries: Counter[int], on_result: _OnResult
-) -> list[int]:
-    """Run some tasks; gives those that lost their worker too often."""
-    killed: list[int] = []
-    active: dict[Connection, tuple[_Worker, int]] = {}
-    while waiting or active:
-        for worker in [entry for entry in crew if entry.pipe not in active][: len(waiting)]:
-            number = waiting.popleft()
-            worker.send(items[number])
-            active[worker.pipe] = worker, number
-        for pipe in wait(list(active)):
-            assert isinstance(pipe, Connection)
-            worker, number = active.pop(pipe)
-            try:
-                succeeded, content = pickle.loads(pipe.recv_bytes())
-            except (EOFError, OSError):
-                worker.start_anew()
-                tries[number] += 1
-                (waiting if tries[number] < _TRIES else killed).append(number)
-            else:
-                on_result(number, content if succeeded else Lost(f"its worker process ended: {content}"))
-    return killed
-
-
-class _Worker:
-    """A process that runs a function of what it is sent, as a context; killed where the block is left by an error."""
-
-    def __init__(self, function: Task) -> None:
-        self._function = function
-        self._start()
-
-    def _start(self) -> None:
-        # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
-        context, folder = get_context("spawn"), os.getcwd()  # noqa: PTH109
-        self.pipe, child_end = context.Pipe()
-        self._process = context.Process(target=_serve, args=(child_end, self._function, folder), daemon=True)  # type: ignore[attr-defined]
-        # a new interpreter looks for modules in its folder first: a stranger's, it may be, with a multiprocessing.py
-        os.chdir(Path(os.__file__).parent)
+    def _through(self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
+        """Run what waits, ``count`` at a time, until none is left or a process ends; gives the tasks in work then."""
+        active: dict[Future[Any], int] = {}
+        with _away() as folder:
+            # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
+            pool = ProcessPoolExecutor(min(self.count, len(waiting)), get_context("spawn"), _begin, (folder,))
         try:
-            self._process.start()
+            while waiting or active:
+                while waiting and len(active) < self.count:
+                    with _away():
+                        future = pool.submit(function, items[waiting[0]])
+                    active[future] = waiting.popleft()
+                ready = wait_for(active, return_when=FIRST_COMPLETED).done
+                for future in sorted(ready, key=lambda f: isinstance(f.exception(), BrokenProcessPool)):
+                    try:
+                        result = future.result()
+                    except BrokenProcessPool:
+                        raise
+                    except Exception as error:
+                        result = Lost(f"its worker process ended: {str(error).strip() or type(error).__name__}")
+                    on_result(active.pop(future), result)
+        except BrokenProcessPool:
+            return list(active.values())
         finally:
-            os.chdir(folder)
-        child_end.close()
-
-    def send(self, item: Any) -> None:
-        with contextlib.suppress(OSError):  # one that has ended is seen where its answer is awaited
-            self.pipe.send((item,))
-
-    def start_anew(self) -> None:
-        self._end(kill=True)
-        self._start()
-
-    def __enter__(self) -> _Worker:
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
-        self._end(kill=kind is not None)
-
-    def _end(self, *, kill: bool) -> None:
-        with contextlib.suppress(OSError):
-            self.pipe.send(None)
-        if not kill:
-            self._process.join(5.0)
-        self._process.kill()
-        self._process.join()
-        self.pipe.close()
+            if active:  # no task is waited for
+                for process in multiprocessing.active_children():
+                    process.kill()
+            pool.shutdown(cancel_futures=True)
+        return []
 
 
-def _serve(pipe: Connection, function: Task, folder: str) -> None:
-    """Answer in a folder until the pipe says no more, or is closed: the process that holds its other end is gone."""
+@contextlib.contextmanager
+def _away() -> Iterator[Path]:
+    """Start processes elsewhere: a new interpreter looks for modules in its folder, and a stranger's may hold some.
+
+    Yields the folder that one comes back to.
+    """
+    folder = Path.cwd()
+    os.chdir(Path(os.__file__).parent)
+    try:
+        yield folder
+    finally:
+        os.chdir(folder)
+
+
+def _begin(folder: Path) -> None:
+    """Begin a process: in the folder of the first one, ending with it, and deaf to Ctrl-C, which is for that one."""
     os.chdir(folder)
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the first process
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
     for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
         signal.signal(number, signal.SIG_DFL)
     threading.Thread(target=_follow_parent, daemon=True).start()
-    with contextlib.suppress(EOFError, OSError):
-        while (order := pipe.recv()) is not None:
-            try:
-                answer = pickle.dumps((True, function(*order)))
-            except Exception as error:
-                answer = pickle.dumps((False, str(error).strip() or type(error).__name__))
-            pipe.send_bytes(answer)
 
 
 def _follow_parent() -> None:

@@ -26,7 +26,7 @@ def next_step(data: FlightData, result: FlightResult, climbed: FlightLadder | No
     if any(panel.further.trained_on for panel in result.series):
         return None
     if climbed is not None and climbed.recommended is not None:
-        return "`report --recommend FILE` writes a model that is significantly better"
+        return "`report --recommend FILE` writes settings significantly better than these"
     if result.rss and not data.settings.antennas:
         return "`aerpaw-cmp calibrate` with two flights of this site"
     return None

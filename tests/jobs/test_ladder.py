@@ -12,10 +12,12 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.yamledit import edited
+from aerpaw_cmp.compare.judge.causes import Cause
 from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.remembered import offered
 from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.reporting.advice import unrivalled
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_changes
 from aerpaw_cmp.site.antenna.learned import Entry, Errors, LearnedSeries, folder_of, remember
@@ -251,3 +253,18 @@ def test_a_gain_that_no_page_could_show_is_no_advice(share: float, gains: bool) 
     ladder = SimpleNamespace(recommended=0, rungs=(0, 1), error_db=([share * error_db], [error_db]))
     assert paired_difference(share * error_db, error_db).verdict == "better"
     assert climber._is_better(ladder) == gains  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("name", "explained_db", "stays"), [("blocked", 0.4, False), ("blocked", 0.9, True), ("lock", 0.4, True)]
+)
+def test_a_loss_over_directions_is_no_cause_where_another_model_explains_as_much(
+    name: str, explained_db: float, stays: bool
+) -> None:
+    """The recommended model gains 0.7 dB on the flight as set."""
+    cause = Cause(name=name, sentence="", next_step="", rmse_db=3.4, rmse_with_db=3.4 - explained_db)
+    ladder = SimpleNamespace(recommended=0, rmse_db=(3.0, 5.0, 3.7))
+    climbed: Any = SimpleNamespace(recommended=Model(), ladder=ladder)
+    assert (unrivalled(cause, climbed) is cause) == stays
+    climbed.recommended = None
+    assert unrivalled(cause, climbed) is cause

@@ -589,6 +589,9 @@ def _tower(e: LevelEvidence) -> Iterator[Trial]:
 
 _CATCH_ALL = "pattern"
 
+# Functions of direction alone: they also take up what a wrong model leaves.
+OF_DIRECTION = frozenset({"blocked", _CATCH_ALL})
+
 _PATTERN = {
     "isotropic": (
         "the antenna pattern of the UAV",

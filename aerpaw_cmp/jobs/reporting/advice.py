@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
+from ...compare.judge.causes import OF_DIRECTION, Cause
 from ...compare.result import FlightResult
 from ...flight.data import FlightData
 from .ladder import FlightLadder
+
+
+def unrivalled(cause: Cause | None, climbed: FlightLadder | None) -> Cause | None:
+    """The likely cause; None of a function of direction where the recommended model gains as much as it does."""
+    if cause is None or cause.name not in OF_DIRECTION or climbed is None or climbed.recommended is None:
+        return cause
+    at, rmse_db = climbed.ladder.recommended, climbed.ladder.rmse_db
+    assert at is not None
+    return None if rmse_db[-1] - rmse_db[at] >= cause.rmse_db - cause.rmse_with_db else cause
 
 
 def next_step(data: FlightData, result: FlightResult, climbed: FlightLadder | None) -> str | None:

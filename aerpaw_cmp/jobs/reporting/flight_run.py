@@ -15,7 +15,7 @@ from ...compare.judge.ladder import series_rows
 from ...compare.result import FlightResult
 from ...flight.data import FlightData
 from ...flight.replay import FlightReplay, replay_flight
-from .advice import next_step
+from .advice import next_step, unrivalled
 from .audit_flight import audit_replays
 from .compare_flight import compare_flight
 from .ladder import FlightLadder, flight_ladder
@@ -88,6 +88,7 @@ def run_flight(
             if climbed is not None:
                 rows = (series_rows(climbed.ladder, index, name) for index, name in enumerate(climbed.names))
                 result = dataclasses.replace(result, ladder=tuple(row for of_series in rows for row in of_series))
+    result = dataclasses.replace(result, likely_cause=unrivalled(result.likely_cause, climbed))
     result = dataclasses.replace(result, next_step=next_step(data, result, climbed))
     return FlightRun(data=data, replays=replays, result=result, ladder=climbed)
 

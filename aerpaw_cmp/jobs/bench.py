@@ -20,10 +20,9 @@ from ..common.errors import parsing
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import named
 from ..common.stages import Progress, begin_peak, logged, peak_mib
-from ..common.units import ComplexArray, FloatArray, IntArray, spread_out, wavelength_m
+from ..common.units import ComplexArray, IntArray, spread_out, wavelength_m
 from ..compare.judge.ladder import LadderRow, costs
-from ..compare.rank import channel_rank
-from ..propagation.check.audit import RANK_K, Difference, compare
+from ..propagation.check.audit import RANK_K, Difference, channels_differ, compare
 from ..propagation.field.sum import mean_pair_power, rss_dbm
 from ..propagation.geometry.arrays import (
     Link,
@@ -219,24 +218,11 @@ class _Case:
 
         channels(_take(poses, slice(rays.batch)))
         h, spent = _measured(lambda: channels(poses))
-        difference = self._difference(h, rss_dbm(mean_pair_power(h), self.link.transmit_power_dbm), chosen)
+        level = rss_dbm(mean_pair_power(h), self.link.transmit_power_dbm)
+        expected = self.reference.h[chosen], self.reference.rss_dbm[chosen]
+        apart = channels_differ((h, level), expected, RANK_K)  # paths are not compared
+        difference = Difference(missing_paths=-1, extra_paths=-1, reference_paths=0, **apart)
         return self._row(difference, spent, poses=len(chosen), engine="sionna", samples=samples, arrays=kind)
-
-    def _difference(self, h: ComplexArray, level: FloatArray, chosen: IntArray) -> Difference:
-        """Levels and ranks of some poses against the reference; paths are not compared."""
-        expected = self.reference.rss_dbm[chosen]
-        covered = np.isfinite(level) & np.isfinite(expected)
-        error = np.abs(level[covered] - expected[covered])
-        parted = {k: channel_rank(h, k) != channel_rank(self.reference.h[chosen], k) for k in RANK_K}
-        return Difference(
-            missing_paths=-1,
-            extra_paths=-1,
-            reference_paths=0,
-            rss_max_error_db=float(error.max(initial=0.0)) if error.size else float("nan"),
-            rss_rms_error_db=float(np.sqrt((error**2).mean())) if error.size else float("nan"),
-            coverage_differs=int((np.isfinite(level) != np.isfinite(expected)).sum()),
-            rank_disagreement={float(k): float(np.mean(differs)) for k, differs in parted.items()},
-        )
 
     def _row(self, difference: Difference, spent: Mapping[str, Any], poses: int | None = None, **about: Any) -> Row:
         plain: dict[str, Any] = {"engine": "image", "samples": None, "arrays": "float64", "depth": _DEPTH}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.units import IntArray, spread_out
+from ...common.units import ComplexArray, FloatArray, IntArray, spread_out
 from ...compare.level.field_difference import FieldAudit
 from ...site.site import Site
 from ..geometry.arrays import Link, Poses
@@ -200,23 +200,30 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
         Paths that one has and the other lacks, errors of the level [dB], links in coverage of one alone, and ranks
         that differ.
     """
-    from ...compare.rank import channel_rank
-
     ours, theirs = (keys.keys() for keys in _keys_of_both(replay, reference, chosen))
-    level, level_reference = replay.rss_dbm[chosen], reference.rss_dbm
-    covered = np.isfinite(level) & np.isfinite(level_reference)
-    error = np.abs(level[covered] - level_reference[covered])
     return Difference(
         missing_paths=len(theirs - ours),
         extra_paths=len(ours - theirs),
         reference_paths=len(theirs),
-        rss_max_error_db=float(error.max()) if error.size else float("nan"),
-        rss_rms_error_db=float(np.sqrt((error**2).mean())) if error.size else float("nan"),
-        coverage_differs=int((replay.has_path[chosen] != reference.has_path).sum()),
-        rank_disagreement={
-            float(k): float(np.mean(channel_rank(replay.h[chosen], k) != channel_rank(reference.h, k))) for k in ks
-        },
+        **channels_differ((replay.h[chosen], replay.rss_dbm[chosen]), (reference.h, reference.rss_dbm), ks),
     )
+
+
+def channels_differ(
+    channels: tuple[ComplexArray, FloatArray], reference: tuple[ComplexArray, FloatArray], ks: Sequence[float]
+) -> dict[str, Any]:
+    """Differences of H and levels (poses, towers) [dBm] from those of a reference, as :class:`Difference` has them."""
+    from ...compare.rank import channel_rank
+
+    (h, level), (reference_h, expected) = channels, reference
+    covered = np.isfinite(level) & np.isfinite(expected)
+    error = np.abs(level[covered] - expected[covered])
+    return {
+        "rss_max_error_db": float(error.max()) if error.size else float("nan"),
+        "rss_rms_error_db": float(np.sqrt((error**2).mean())) if error.size else float("nan"),
+        "coverage_differs": int((np.isfinite(level) != np.isfinite(expected)).sum()),
+        "rank_disagreement": {float(k): float(np.mean(channel_rank(h, k) != channel_rank(reference_h, k))) for k in ks},
+    }
 
 
 def extra_rows(replay: Replay, reference: Replay, chosen: IntArray) -> IntArray:

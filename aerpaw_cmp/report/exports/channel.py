@@ -138,8 +138,16 @@ def channel_dataset(channel: Channel) -> Dataset:
     for name, values, dimensions, *about in _quantities(channel):
         if values is not None:
             variables |= _variables(name, values, dimensions, *about)
-    data = Dataset(variables, _file(channel))
-    kinds = channel.table.kinds
+    link, kinds = channel.replay.ends.link, channel.table.kinds
+    written = file_attributes(
+        title=f"Channel along {channel.along.name}, link {channel.link}",
+        source="ray tracing along a flight",
+        generated=utc_now(),
+        version=tool_version(),
+        comment=" ".join(channel.warnings),
+    )
+    ends = {"transmitter": "UAV" if link.uav_transmits else "tower", "trained_on": " ".join(channel.trained_on)}
+    data = Dataset(variables, {**written, **named(link, "carrier_hz transmit_power_dbm"), **ends})
     described = {name: variable.attrs for name, variable in data.variables.items()}
     described["kind"] |= {"flag_values": np.arange(len(kinds), dtype=np.int8), "flag_meanings": " ".join(kinds)}
     if channel.along.start is not None:
@@ -199,24 +207,6 @@ def _variables(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: s
     missing: Any = {"i": values.dtype.type(-1), "f": np.nan}.get(values.dtype.kind)
     of_links = dimensions[: len(_PATH)] == _PATH or dimensions == _LINK
     return {name: (dimensions, values, about, {"_FillValue": missing} if of_links else {})}
-
-
-def _file(channel: Channel) -> dict[str, Any]:
-    about = file_attributes(
-        title=f"Channel along {channel.along.name}, link {channel.link}",
-        source="ray tracing along a flight",
-        generated=utc_now(),
-        version=tool_version(),
-        comment=" ".join(channel.warnings),
-    )
-    link = channel.replay.ends.link
-    return {
-        **about,
-        "carrier_hz": link.carrier_hz,
-        "transmit_power_dbm": link.transmit_power_dbm,
-        "transmitter": "UAV" if link.uav_transmits else "tower",
-        "trained_on": " ".join(channel.trained_on),
-    }
 
 
 # --- files ---------------------------------------------------------------------------------------------------------

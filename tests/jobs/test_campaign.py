@@ -138,7 +138,8 @@ def test_broken_flights_are_rows_with_their_message(summary: dict[str, Any], fol
 
 def test_a_campaign_of_soundings_alone_needs_no_flight_and_one_of_nothing_is_refused(tmp_path: Path) -> None:
     (tmp_path / "night.csv").write_text((CASES / "aerpaw_monitoring.csv").read_text())
-    assert main(["campaign", str(write_yaml(tmp_path / "c.yaml", {"campaign": "c", "soundings": ["night.csv"]}))]) == 0
+    campaign = write_yaml(tmp_path / "c.yaml", {"campaign": "c", "soundings": ["night.csv"]})
+    assert main(["campaign", str(campaign), "-o", str(tmp_path / "out")]) == 0
     (tmp_path / "n.yaml").write_text("campaign: n\n")
     assert main(["campaign", str(tmp_path / "n.yaml")]) == 2
 

@@ -8,6 +8,7 @@ are rasterised and long lines thinned (extremes kept), so that an SVG stays smal
 from __future__ import annotations
 
 import io
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -529,11 +530,12 @@ def rank_colour(rank: int) -> str:
 
 
 def draw_credit(ax: Axes, site: Site) -> None:
-    """Name whose map is drawn, in small type in a corner."""
+    """Name whose map is drawn, in small type in a corner: in lines, as panels beside each other may be narrow."""
     if site.credit:
         ax.text(
-            0.995, 0.005, site.credit, transform=ax.transAxes, ha="right", va="bottom", fontsize=5, color="#444444",
-            zorder=7, gid="credit", bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.6},
+            0.995, 0.005, textwrap.fill(site.credit, 20), transform=ax.transAxes, ha="right", va="bottom", fontsize=5,
+            color="#444444", zorder=7, gid="credit",
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.6},
         )  # fmt: skip
 
 

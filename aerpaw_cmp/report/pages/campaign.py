@@ -155,8 +155,17 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
         written.append(
             write_file(folder / f"{_PAIR_TABLE}.csv", guarded(pairs).to_csv(index=False, lineterminator="\n"))
         )
+    if data.season.nodes:
+        nodes = pd.DataFrame(
+            [[n.node, *date] for n in data.season.nodes for date in zip(n.night, n.offset_db, strict=True)]
+        )
+        columns = ["node", "date", "offset_db"]
+        text = guarded(nodes.set_axis(columns, axis=1)).to_csv(index=False, lineterminator="\n")
+        written.append(write_file(folder / "offsets.csv", text))
     tables = [path.name for path in written]
-    drawn, pictures = canvas.write_figures(list(campaign_figures.figure_specs(data)), folder / "figures")
+    drawn, pictures = canvas.write_figures(
+        list(campaign_figures.figure_specs(data)), folder / "figures", ("svg", "png")
+    )
     written += pictures
     page = write_file(folder / "campaign.html", campaign_page(data, drawn, tables))
     return [page, *written]

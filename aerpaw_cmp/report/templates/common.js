@@ -45,18 +45,18 @@ const common = (() => {
     return [pen, w, h];
   }
 
-  // whose map it is, in the lower right corner
-  function credit(pen, right, bottom, text) {
-    if (!text) return;
-    pen.save(); pen.font = "10px system-ui, sans-serif"; pen.textAlign = "right"; pen.lineWidth = 3;
-    pen.strokeStyle = css("--paper"); pen.strokeText(text, right - 4, bottom - 4); pen.fillStyle = css("--soft"); pen.fillText(text, right - 4, bottom - 4);
-    pen.restore();
-  }
-
-  // names of points inside an area [left, top, right, bottom]: beside their points, clear of its edges and of each other
-  function names(pen, area, points, font = "bold 12px system-ui, sans-serif") {
+  // names of points inside an area [left, top, right, bottom]: beside their points, clear of its edges, of each other
+  // and of whose map it is (credit), in the lower right corner
+  function names(pen, area, points, credit = "", font = "bold 12px system-ui, sans-serif") {
     const [left, top, right, bottom] = area, placed = [], high = 13;
-    pen.save(); pen.font = font; pen.lineWidth = 3; pen.textAlign = "left"; pen.lineJoin = "round";
+    pen.save(); pen.lineWidth = 3; pen.textAlign = "left"; pen.lineJoin = "round";
+    if (credit) {
+      pen.font = "10px system-ui, sans-serif";
+      const x = right - 4 - pen.measureText(credit).width, y = bottom - 4;
+      pen.strokeStyle = css("--paper"); pen.strokeText(credit, x, y); pen.fillStyle = css("--soft"); pen.fillText(credit, x, y);
+      placed.push([x, y - 10, right, bottom, ""]);
+    }
+    pen.font = font;
     for (const { text, at, colour, halo, alpha } of points) {
       if (!(at[0] >= left && at[0] <= right && at[1] >= top && at[1] <= bottom)) continue;
       const wide = pen.measureText(text).width;
@@ -68,7 +68,7 @@ const common = (() => {
       pen.globalAlpha = alpha ?? 1; pen.strokeStyle = halo; pen.strokeText(text, x, y); pen.fillStyle = colour; pen.fillText(text, x, y);
     }
     pen.restore();
-    return placed;
+    return placed.filter(place => place[4]);
   }
 
   function ticks(low, high, most = 5) { // three at least
@@ -248,5 +248,5 @@ const common = (() => {
     for (const place of document.querySelectorAll("canvas[data-plot]")) whenResized(place, () => drawPlot(place));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, credit, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, downloads, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar, plots };
+  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, downloads, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar, plots };
 })();

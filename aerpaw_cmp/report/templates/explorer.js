@@ -369,10 +369,9 @@
       polyline([foot, top], css("--accent"), 3);
       polygon([[top[0], top[1] - 6], [top[0] - 5, top[1] + 4], [top[0] + 5, top[1] + 4]], css("--accent"), null);
     }
-    common.credit(pen, w, h - KEY, data.site.credit);
     drawPaths(tower);
     const own = data.site.towers.filter(t => t.name === tower), others = data.site.towers.filter(t => t.name !== tower);
-    labels = common.names(pen, [0, 0, w, h - KEY], [...own, ...others].map(t => ({ text: t.name, at: project(standing(t)[1]), colour: css(t.name === tower ? "--accent" : "--soft"), halo: css("--paper") })));
+    labels = common.names(pen, [0, 0, w, h - KEY], [...own, ...others].map(t => ({ text: t.name, at: project(standing(t)[1]), colour: css(t.name === tower ? "--accent" : "--soft"), halo: css("--paper") })), data.site.credit);
     pen.restore();
     drawKey(c, w, h);
   }

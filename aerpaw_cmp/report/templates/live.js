@@ -359,8 +359,7 @@
       const [x, y] = project(t.at[0], t.at[1]), own = t.name === scene.tower;
       polygon(pen, [[x, y - 9], [x - 7, y + 6], [x + 7, y + 6]], css(own ? "--accent" : "--soft"), css("--paper"));
     }
-    common.credit(pen, w, h, scene.site.credit);
-    common.names(pen, [0, 0, w, h], scene.site.towers.map(t => ({ text: t.name, at: project(t.at[0], t.at[1]), colour: css(t.name === scene.tower ? "--accent" : "--ink"), halo: css("--halo") })), "bold 13px system-ui, sans-serif");
+    common.names(pen, [0, 0, w, h], scene.site.towers.map(t => ({ text: t.name, at: project(t.at[0], t.at[1]), colour: css(t.name === scene.tower ? "--accent" : "--ink"), halo: css("--halo") })), scene.site.credit, "bold 13px system-ui, sans-serif");
     pen.restore();
     drawKey(pen, w, full, kind);
     const offset = state.modems[state.chosen].now.offset_db;

@@ -123,8 +123,7 @@
       const own = !tower || tower === data.joint || tower === t.name;
       common.tower(pen, project.x(t.at[0]), project.y(t.at[1]), own ? 1 : 0.35);
     }
-    common.credit(pen, w - 16, h - 32, data.site.credit);
-    labels = common.names(pen, [46, 8, w - 16, h - 32], data.site.towers.map(t => ({ text: t.name, at: [project.x(t.at[0]), project.y(t.at[1])], colour: "#8f0f18", halo: "#fff", alpha: !tower || tower === data.joint || tower === t.name ? 1 : 0.35 })));
+    labels = common.names(pen, [46, 8, w - 16, h - 32], data.site.towers.map(t => ({ text: t.name, at: [project.x(t.at[0]), project.y(t.at[1])], colour: "#8f0f18", halo: "#fff", alpha: !tower || tower === data.joint || tower === t.name ? 1 : 0.35 })), data.site.credit);
     if (state.cell) {
       const [r, c] = state.cell, x = project.x(east[c] - data.half[0]), y = project.y(north[r] + data.half[1]), wide = 2 * data.half[0] * project.scale, high = 2 * data.half[1] * project.scale;
       pen.strokeStyle = "#000"; pen.lineWidth = 3; pen.strokeRect(x, y, wide, high); pen.strokeStyle = "#F0C000"; pen.lineWidth = 1.6; pen.strokeRect(x, y, wide, high);

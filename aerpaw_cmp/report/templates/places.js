@@ -47,8 +47,7 @@
     for (const ring of data.rings) { path(ring, true); pen.strokeStyle = css("--soft"); pen.lineWidth = 1.2; pen.setLineDash([6, 4]); pen.stroke(); pen.setLineDash([]); }
     for (const line of data.lines) { path(line); pen.strokeStyle = css("--paper"); pen.lineWidth = 2.6; pen.stroke(); pen.strokeStyle = css("--ink"); pen.lineWidth = 1.1; pen.stroke(); }
     for (const t of data.site.towers) common.tower(pen, project.x(t.at[0]), project.y(t.at[1]));
-    common.credit(pen, area[2], area[3], data.site.credit);
-    labels = common.names(pen, area, data.site.towers.map(t => ({ text: t.name, at: [project.x(t.at[0]), project.y(t.at[1])], colour: css("--accent"), halo: css("--paper") })));
+    labels = common.names(pen, area, data.site.towers.map(t => ({ text: t.name, at: [project.x(t.at[0]), project.y(t.at[1])], colour: css("--accent"), halo: css("--paper") })), data.site.credit);
     mark(pen); pen.restore();
     common.planAxes(pen, project, w, h);
   }

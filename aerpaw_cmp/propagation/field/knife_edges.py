@@ -20,12 +20,6 @@ class Profile(NamedTuple):
     share: FloatArray
     intrusion_m: FloatArray
 
-    def parameter(self, wavelength_m: float) -> FloatArray:
-        """Parameter nu (samples, links) of each sample as the one edge of its line."""
-        return _parameter(
-            self.intrusion_m, self.share * self.length_m, (1.0 - self.share) * self.length_m, wavelength_m
-        )
-
 
 def knife_edge_db(nu: FloatArray) -> FloatArray:
     """Loss of one knife edge [dB] by its parameter nu; 0 below -0.78.
@@ -56,7 +50,8 @@ def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
     ``C = (6 - A + A_e) cos(alpha)``, with A_e the loss of the side's edge alone on the direct line and
     ``cos(alpha)^2 = d_1 d_34 / (d_12 d_234)``; neither term is negative.
     """
-    (length_m, share, intrusion_m), nu = profile, profile.parameter(wavelength_m)
+    length_m, share, intrusion_m = profile
+    nu = _parameter(intrusion_m, share * length_m, (1.0 - share) * length_m, wavelength_m)
     main, link = nu.argmax(axis=0), np.arange(len(length_m))
     total = first = knife_edge_db(nu[main, link])
     known = np.isfinite(nu[main, link])

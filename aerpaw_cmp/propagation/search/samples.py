@@ -26,18 +26,10 @@ MOST = 2_560_000
 
 @dataclass(frozen=True, slots=True)
 class Choice:
-    """Rays per tower and why; ``paths`` are those of the last pilot.
-
-    Parameters
-    ----------
-    samples : int
-    reason : str
-    paths : PathSet
-    """
+    """Rays per tower and why."""
 
     samples: int
     reason: str
-    paths: PathSet
 
 
 def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) -> Choice:
@@ -63,7 +55,7 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
         paths = pilot(samples)
         if set(plane_keys(paths, plane)) == set(plane_keys(before, plane)):
             words = f"{samples // _FACTOR:,} and {samples:,} rays a tower found the same {counted(len(paths), 'path')}"
-            return Choice(samples, f"{words} at {counted(poses, 'pose')}".replace(",", " "), paths)
+            return Choice(samples, f"{words} at {counted(poses, 'pose')}".replace(",", " "))
         before = paths
     words = f"{samples:,} rays a tower still found other paths than {samples // _FACTOR:,} at {counted(poses, 'pose')}"
-    return Choice(samples, words.replace(",", " "), before)
+    return Choice(samples, words.replace(",", " "))

@@ -120,9 +120,7 @@ def print_plan(plan: Any, as_json: bool = False) -> None:
         print_json(plan.as_dict())
         return
     rows = [[stage.name, stage.work, number(stage.seconds, "{:.1f}")] for stage in plan.stages]
-    rows.append(["all", "", f"{plan.seconds:.0f} and what has a dash"])
     table(["stage", "work", "s"], rows, f"{plan.job}, not run")
-    show(plan.as_dict()["measured"])
     show(f"reads {counted(len(plan.inputs), 'file')}; would write {plan.output}")
 
 

@@ -64,12 +64,9 @@ def share_of(progress: Progress, text: str) -> Callable[[float], None]:
     return step
 
 
-_MEASURED = "seconds that reading took, and that kept tasks tell; of a stage with a dash none are known"
-
-
 @dataclass(frozen=True, slots=True)
 class PlannedStage:
-    """A stage: what it works on, and seconds, None where they cannot be told beforehand."""
+    """A stage: what it works on, and seconds that it took, or will by what kept tasks took; None where unknown."""
 
     name: str
     work: str
@@ -95,11 +92,6 @@ class Plan:
     output: Path
     stages: tuple[PlannedStage, ...] = ()
 
-    @property
-    def seconds(self) -> float:
-        """Of all stages that can be told."""
-        return sum(stage.seconds or 0.0 for stage in self.stages)
-
     def as_dict(self) -> dict[str, Any]:
         """The plan as JSON can hold it."""
         return {
@@ -107,9 +99,6 @@ class Plan:
             "inputs": [str(path) for path in self.inputs],
             "output": str(self.output),
             "stages": [asdict(stage) for stage in self.stages],
-            "seconds": self.seconds,
-            "not_estimated": [stage.name for stage in self.stages if stage.seconds is None],
-            "measured": _MEASURED,
         }
 
 

@@ -41,8 +41,7 @@ def test_a_planned_report_names_its_links_and_poses_and_writes_nothing(
     assert work["replay"] == "1\N{NARROW NO-BREAK SPACE}310 RSS samples, 655 rank samples, engine image"
     assert list(work) == ["read", "clocks", "replay", "compare", "ladder", "report"]
     assert plan["output"] == "reports/sample1"
-    assert plan["seconds"] == pytest.approx(sum(stage["seconds"] or 0.0 for stage in plan["stages"]))
-    assert plan["not_estimated"] == list(work)[1:]
+    assert [stage["name"] for stage in plan["stages"] if stage["seconds"] is None] == list(work)[1:]
     audited = planned(capsys, "report", file, "--logs-root", SAMPLE, "--audit", "50", "--figures", "none")
     assert "audit" in {stage["name"] for stage in audited["stages"]}
     assert "figures of 0 channels" in audited["stages"][-1]["work"]

@@ -122,7 +122,7 @@ def shell(shell_name: str, words: str) -> subprocess.CompletedProcess[str]:
 @pytest.mark.parametrize(
     ("words", "offered"),
     [("aerpaw-cmp rep", "report"), ("aerpaw-cmp site s", "show"), ("aerpaw-cmp report --qui", "--quiet"),
-     ("aerpaw-cmp map --engine s", "sionna")],
+     ("aerpaw-cmp explain --engine s", "sionna")],
 )  # fmt: skip
 def test_tab_offers_commands_options_and_values_and_loads_nothing_heavy(words: str, offered: str) -> None:
     done = shell("bash", words)

@@ -95,7 +95,7 @@ def test_a_command_of_the_documentation_would_run(where: str) -> None:
 @pytest.mark.parametrize(
     "line",
     ["aerpaw-cmp report flight.yaml --audits none", "aerpaw-cmp reprot x", "aerpaw-cmp site import map.osm",
-     "aerpaw-cmp map --engine magic", "python benchmarks/ingest.py --no-such-thing", "python benchmarks/nothing.py",
+     "aerpaw-cmp map --figures magic", "python benchmarks/ingest.py --no-such-thing", "python benchmarks/nothing.py",
      "pytest tests/nothing.py", "make nothing"],
 )  # fmt: skip
 def test_a_wrong_command_would_be_seen(line: str) -> None:

@@ -8,7 +8,7 @@ lines from a tower to a wall and on to the tile. So a building counts if it come
 - the hull of tower and wall, or of wall and the part of the tile in its beam, for each wall whose beam from the
   mirrored tower may meet the tile.
 
-With more reflections, terrain, a scene of triangles or cast rays every building is kept.
+With more reflections, terrain or a scene of triangles every building is kept.
 """
 
 from __future__ import annotations
@@ -123,13 +123,11 @@ class Reach:
     budget : Budget
     max_depth : int
         Reflections that are followed.
-    every : bool
-        Keep all buildings, as with cast rays.
     """
 
-    def __init__(self, site: Site, budget: Budget, *, max_depth: int, every: bool = False) -> None:
+    def __init__(self, site: Site, budget: Budget, *, max_depth: int) -> None:
         self.site, self._range_m, self._depth = site, budget.range_m, max_depth
-        self._every = every or max_depth > 1 or site.dem is not None or site.scene is not None or not site.buildings
+        self._every = max_depth > 1 or site.dem is not None or site.scene is not None or not site.buildings
         footprints = shapely.envelope([building.footprint for building in site.buildings])
         places = [tower.position_m[:2] for tower in site.towers.values()]
         spans = (site.area_m, np.ravel(places), shapely.bounds(footprints).ravel())

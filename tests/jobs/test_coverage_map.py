@@ -275,7 +275,6 @@ def test_a_missing_library_costs_its_own_file_alone(site, tmp_path, monkeypatch)
     [
         (["--foliage", "leafy"], "leafy"),
         (["--spacing", "5000"], "no cell"),
-        (["--engine", "magic"], "magic"),
         (["--quick", "--rank-altitude", "30"], "rank height"),
     ],
 )

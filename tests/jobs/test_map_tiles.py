@@ -116,12 +116,6 @@ def test_a_tile_that_only_the_border_of_a_beam_touches_keeps_what_stands_on_that
     assert [len(some) for some in labels] == [1, 0]
 
 
-def test_sionna_in_tiles_keeps_every_building():
-    site = town(12)
-    reach = mapping.SiteChannels(site, settings(engine="sionna")).reach
-    assert reach.of(np.array([[0.0, 0.0, 2.0], [10.0, 10.0, 2.0]])).buildings == site.buildings
-
-
 def test_a_tower_that_is_left_out_of_a_tile_reaches_no_position_of_it():
     site = town(20, side_m=4000.0)
     free = in_one_piece(site, settings(spacing_m=200.0))[0]["none"]

@@ -46,7 +46,7 @@ from ...propagation.field.stands import stand_loss_db
 from ...propagation.field.sum import channel_matrices, rss_dbm
 from ...propagation.geometry.arrays import Link, Poses, linear_array, single_element
 from ...propagation.geometry.paths import PathSet
-from ...propagation.options import Engine, Job, Run, Search
+from ...propagation.options import Job, Run, Search
 from ...propagation.replay import Replay, replay
 from ...report.content import maps as page
 from ...report.content.flight import ReportData
@@ -90,7 +90,7 @@ class MapSettings:
         40 dBm are the paper's 10 W.
     elements, element_spacing : int, float
         Of the linear arrays at both ends, along north; spacing in wavelengths.
-    engine, samples, max_depth
+    max_depth : int
         Of the replay.
     neighbours, radius_m : int, float
         M and r0 of the interpolators; the radius grows with a spacing above the paper's, so that M are in reach.
@@ -114,8 +114,6 @@ class MapSettings:
     transmit_power_dbm: float = 40.0
     elements: int = 4
     element_spacing: float = 0.5
-    engine: Engine = "image"
-    samples: int = 1_000_000
     max_depth: int = 2
     neighbours: int = 20
     radius_m: float = 150.0
@@ -184,8 +182,7 @@ class SiteChannels:
             gain_db=float(db_from_power(settings.elements)),
             floor_dbm=THERMAL_NOISE_DBM_HZ,
         )
-        cast = settings.engine != "image"
-        self.reach = Reach(site, budget, max_depth=settings.max_depth, every=cast)
+        self.reach = Reach(site, budget, max_depth=settings.max_depth)
         self.paths = 0
         self._ready: dict[tuple[str, bytes], job.Evaluation] = {}
         self._take_site(site)
@@ -249,7 +246,7 @@ class SiteChannels:
             nothing = job.Evaluation(none, none, none, np.empty((n, 0, s.elements)))
             return dict.fromkeys(s.foliage, self._for_all_towers(nothing))
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (n, 3, 3)))
-        search = Search(s.engine, max_depth=s.max_depth, samples=s.samples)
+        search = Search(max_depth=s.max_depth)
         links = n * len(self.site.towers)
         run = Run(job=Job(self.reach.extent_m, links, links))
         replayed = replay(self.site, self.siso, poses, search, run=run)

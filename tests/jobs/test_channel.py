@@ -91,20 +91,7 @@ def short_parts(monkeypatch):
     monkeypatch.setattr("aerpaw_cmp.jobs.channel._PART_BYTES", 20_000)
 
 
-ALONG = [
-    "--link",
-    "rank",
-    "--step",
-    "2",
-    "--tower",
-    "LW1",
-    "--tower",
-    "LW2",
-    "--bandwidth",
-    "20e6",
-    "--subcarriers",
-    "8",
-]
+ALONG = "--link rank --step 2 --tower LW1 --tower LW2 --bandwidth 20e6 --subcarriers 8"
 
 
 def test_a_file_of_many_parts_is_that_of_one(written, folder, short_parts, monkeypatch, cf_faults):
@@ -112,10 +99,18 @@ def test_a_file_of_many_parts_is_that_of_one(written, folder, short_parts, monke
     replayed = channel.replay_poses
     monkeypatch.setattr(channel, "replay_poses", lambda *a, **k: (sizes.append(len(a[3])), replayed(*a, **k))[1])
     out = folder / "parts"
-    assert (
-        main(["channel", str(folder / "plan.yaml"), "-o", str(out), *ALONG, "--format", "netcdf", "--format", "csv"])
-        == 0
-    )
+    line = [
+        "channel",
+        str(folder / "plan.yaml"),
+        "-o",
+        str(out),
+        *ALONG.split(),
+        "--format",
+        "netcdf",
+        "--format",
+        "csv",
+    ]
+    assert main(line) == 0
     assert len(sizes) > 3
     assert sum(sizes) == 16
     with xarray.open_dataset(out / "channel.nc") as book:
@@ -143,7 +138,7 @@ def test_a_disk_that_fills_on_the_way_ends_in_one_line(folder, short_parts, caps
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (90_000, hard))  # the first parts fit
     try:
-        assert main(["channel", str(folder / "plan.yaml"), "-o", str(tmp_path / "out"), *ALONG]) == 3
+        assert main(["channel", str(folder / "plan.yaml"), "-o", str(tmp_path / "out"), *ALONG.split()]) == 3
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert "cannot be written (File too large)" in capsys.readouterr().err

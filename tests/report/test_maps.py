@@ -7,6 +7,7 @@ import pytest
 
 from aerpaw_cmp.report.content.maps import MapsData
 from aerpaw_cmp.report.figures import maps as maps_figures
+from aerpaw_cmp.report.figures.charts import flown
 from aerpaw_cmp.report.kit import canvas
 from aerpaw_cmp.report.pages import maps as maps_html
 
@@ -143,3 +144,14 @@ def test_nothing_at_all_and_nothing_covered(maps_data):
     dark = dataclasses.replace(maps_data.rss[0], rss_dbm=np.full_like(maps_data.rss[0].rss_dbm, np.nan), coverage=0.0)
     for spec in maps_figures.figure_specs(dataclasses.replace(empty, rss=(dark,))):
         canvas.render(spec)
+
+
+def test_a_flight_on_the_map_shows_its_levels_over_time(maps_data, report_data):
+    page = maps_html.maps_page(dataclasses.replace(maps_data, flights=(report_data,)), [])
+    panels = [panel for panel in report_data.rss if panel.score.n]
+    assert panels
+    assert all(f"{report_data.flight}, {panel.name}" in page for panel in panels)
+    (chart, *_) = flown(report_data)
+    measured, traced = chart.content["marks"]
+    np.testing.assert_array_equal(measured["y"], panels[0].measured_db)
+    np.testing.assert_array_equal(traced["y"], panels[0].simulated_dbm - panels[0].score.offset_db)

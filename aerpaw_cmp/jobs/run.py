@@ -515,6 +515,7 @@ def run_campaign(
     sounded = [(options.logs_root or path.parent) / name for name in campaign.soundings]
     flights = inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)
     inputs = [path, *sounded, *flights]
+    nodes = soundings(sounded, campaign.timezone) if sounded else ()
     folder = options.out or Path("reports") / campaign.campaign
     stages = options.stages("campaign", inputs, folder)
     store = None if fresh else _outcomes_in(keep)
@@ -525,7 +526,7 @@ def run_campaign(
     ):
         data = run_all(campaign, path.parent, options, keep=store, stages=stages)
         reports = find_reports(data.flights, folder, [folder.parent, Path("reports")])
-        data = with_season(data, reports, soundings(sounded, campaign.timezone) if sounded else ())
+        data = with_season(data, reports, nodes)
         with stages("report"), output.filling() as place:
             finished = replace(data, stages_s=dict(stages.seconds))
             write_campaign(finished, place)

@@ -200,7 +200,7 @@ def soundings(paths: Sequence[Path], timezone: str | None) -> tuple[NodeOffset, 
                 night = stream.frame["time"].dt.strftime("%Y-%m-%d")
                 ends = {end: _radio(link, end) for end in ("transmitter", "receiver")}
                 by_night = stream.frame["rss_db"].groupby(night).median()
-                levels.append(pd.DataFrame({**ends, "band": link.get("frequency_hz"), "offset": -by_night}))
+                levels.append(pd.DataFrame({**ends, "band": link.get("frequency_hz", np.nan), "offset": -by_night}))
     if not levels:
         raise InputError("no log names transmitter and receiver", expected="soundings", path=paths[0])
     table = pd.concat(levels).rename_axis("night").reset_index()

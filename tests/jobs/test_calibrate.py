@@ -129,7 +129,6 @@ def test_bad_input_is_one_message(folder: Path, capsys: pytest.CaptureFixture[st
     write_yaml(folder / "high.yaml", high)
     assert "3.3 and 3.7 GHz" in refusal(folder, capsys, base | {"flights": ["first.yaml", "high.yaml"]})
     assert "gone.yaml" in refusal(folder, capsys, base | {"flights": ["first.yaml", "gone.yaml"]}, 3)
-    assert "fit.mount" in refusal(folder, capsys, base | {"fit": {"mount": "free"}})
 
 
 def test_a_misspelt_site_gets_no_memory(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

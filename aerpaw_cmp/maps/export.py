@@ -176,10 +176,11 @@ def _picture(grid: Grid, layer: Layer, low: float, high: float) -> bytes:
     """PNG with a block of pixels per cell: viewers that smooth must not mix classes."""
     from matplotlib.image import imsave
 
-    cells = grid.raster(_colours(layer, low, high))[::-1]  # pictures begin in the north
+    colours = (255 * _colours(layer, low, high)).round().astype(np.uint8)
+    cells = grid.raster(colours)[::-1]  # pictures begin in the north
     pixels = np.repeat(np.repeat(cells, PIXELS_PER_CELL, axis=0), PIXELS_PER_CELL, axis=1)
     buffer = io.BytesIO()
-    imsave(buffer, np.ascontiguousarray((255 * pixels).round().astype(np.uint8)), format="png")
+    imsave(buffer, np.ascontiguousarray(pixels), format="png")
     return buffer.getvalue()
 
 

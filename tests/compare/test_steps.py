@@ -86,7 +86,7 @@ def seasons(count: int, link_sd_db: float, seed: int, step_db: float = 1.0) -> d
             mine = [s for s in node.steps if right and abs(int(s.night) - at) < 2 and int(s.shown) < at + 7][:1]
             same += sum(int(s.shown) == at for s in mine)
             soon += sum(int(s.shown) < at + 3 for s in mine)
-            held += sum(s.step_ci95_db[0] <= step_db <= s.step_ci95_db[1] for s in mine)
+            held += sum(int(s.shown) < at + 3 and s.step_ci95_db[0] <= step_db <= s.step_ci95_db[1] for s in mine)
             false += len(node.steps) - len(mine)
             sd += [node.sd_db] if right else []
     return {

@@ -3,12 +3,15 @@
 import base64
 import dataclasses
 import json
+import re
 import zlib
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.report import kit
 from aerpaw_cmp.report.content.maps import JOINT, MapLayer
 from aerpaw_cmp.report.kit.packed import NONE
 from aerpaw_cmp.report.kit.page import as_json
@@ -83,12 +86,12 @@ def test_a_page_keeps_its_size_whatever_the_grid(maps_data):
         rank=tuple(dataclasses.replace(m, rank=np.kron(m.rank, np.ones((3, 3), int))) for m in maps_data.rank),
         layers=(), east_m=np.linspace(-535, 535, 108), north_m=np.linspace(-1060, 1060, 213),
     )  # fmt: skip
-    complete = map_explorer.payload(fine, 10**9)
+    complete = map_explorer.payload(fine, most_bytes=10**9)
     size = len(complete["packed"]["data"])
-    without = map_explorer.payload(fine, size - 1)
+    without = map_explorer.payload(fine, most_bytes=size - 1)
     assert without["left_out"] == "layers of single towers"
     assert without["stride"] == 1
-    small = map_explorer.payload(fine, size // 40)
+    small = map_explorer.payload(fine, most_bytes=size // 40)
     assert len(small["packed"]["data"]) <= size // 40
     assert small["stride"] > 1
     assert f"every {small['stride']}." in small["left_out"]
@@ -128,8 +131,9 @@ def test_one_cell_and_absurd_values(maps_data):
 def test_level_colours_rise_evenly_in_lightness():
     """CIE L* of the level scale grows by nearly equal steps; the difference scale is lightest at zero."""
     lightness = {}
+    script = (Path(kit.__file__).parents[1] / "templates/common.js").read_text(encoding="utf-8")
     for name in ("viridis", "RdBu_r"):
-        text = map_explorer.ramp(name)
+        text = re.search(rf'{name}: "([0-9a-f]+)"', script)[1]
         rgb = np.array([[int(text[i + k : i + k + 2], 16) for k in (0, 2, 4)] for i in range(0, len(text), 6)]) / 255
         linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
         y = linear @ [0.2126, 0.7152, 0.0722]

@@ -74,7 +74,7 @@ READERS_OF_WHOLE_FILES: dict[str, dict[str, Any]] = {
     "site.antenna.sphere_pattern.read_sphere_csv": {},
     "site.antenna.antennas.read_gain_grid": {"variable": "rad_pat"},
     "jobs.learning.calibrate_rank.read_receiver": {},
-    "jobs.diff_reports._metrics": {"named": Path()},
+    "jobs.diff_reports.read_metrics": {"named": Path()},
 }
 
 

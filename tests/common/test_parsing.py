@@ -126,7 +126,6 @@ OWN = {
     "common/native.py": "the child, whose every exception becomes a message",
     "common/yamlfile.py": "settings: errors of their own, at the line",
     "compare/statistics/memory.py": "a packaged table",
-    "jobs/bench.py": "made by the benchmark",
     "flight/marks.py": "text that is compared, never parsed",
     "flight/training.py": "any file is asked for its head; what cannot be read names no log",
     "logs/files/archives.py": "inside ingest and map files; its own list of what archives raise",

@@ -38,6 +38,7 @@ def _mostly(pattern: bytes) -> _Test:
     return lambda head: _lines.mostly(head, re.compile(pattern))
 
 
+_JSON_LEVELS = rb'(?i)"(?:rsrp|rssi|rscp|rss_\w{1,8}|sinr|pci)"\s*:'
 _TEXT, _KML, _MAT = _not(rb"\0"), kml.is_kml, rb"\A" + matfile.MAGIC
 
 
@@ -120,9 +121,10 @@ _KINDS: tuple[tuple[str, str, tuple[_Test, ...]], ...] = (
     ("own_export", "samples of a report of aerpaw-cmp: give the logs that it was made of (or '--map' its columns)",
      (rb"\A(?:\xef\xbb\xbf)?time_utc,time_s,tower,",)),
     ("geojson_levels", "GeoJSON of levels: save its points as CSV",
-     (rb'"FeatureCollection"', rb'(?i)"(?:rsrp|rssi|rscp|rss_\w{1,8}|sinr|pci)"\s*:')),
+     (rb'"FeatureCollection"', _JSON_LEVELS)),
     ("map", "a map: 'aerpaw-cmp site import' reads it",
-     (rb'\A\s*(?:(?:<\?xml[^>]*>\s*)?<osm\b|\{[^\[]*"type"\s*:\s*"FeatureCollection"|\{[^\[]*"osm3s")',)),
+     (rb'\A\s*(?:(?:<\?xml[^>]*>\s*)?<osm\b|\{[^\[]*"type"\s*:\s*"FeatureCollection"|\{[^\[]*"osm3s")',
+      _not(_JSON_LEVELS))),
 )  # fmt: skip
 
 

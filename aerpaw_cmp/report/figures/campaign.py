@@ -52,8 +52,9 @@ def season_places(data: CampaignData) -> Figure:
     extent = np.array([first[0], last[0], first[1], last[1]]) * data.cell_m
     fig, ax = subplots((7.0, 5.0))
     ax.set_facecolor("#F4F4F4")
+    # no grey in it: a grey middle would turn dark on a dark page, between two light neighbours
     mesh = ax.imshow(
-        image, origin="lower", extent=tuple(extent), cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="none",
+        image, origin="lower", extent=tuple(extent), cmap="Spectral_r", vmin=-reach, vmax=reach, interpolation="none",
         zorder=2,
     )  # fmt: skip
     known = {} if data.site is None else data.site.towers

@@ -743,6 +743,8 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
 
 def _tells_apart(rows: _rows.Rows, sheet: Sheet) -> int | None:
     """The unknown column (a node, a beam, a direction) without which most instants have several rows; None if none."""
+    if pd.Series(rows.time).duplicated().mean() < _REPEATED:  # most tables: no column of theirs is read for it
+        return None
     cells = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name in _CELL]
     keys = pd.DataFrame({"time": rows.time, **{str(i): sheet.texts(i) for i in cells}})
     if keys.duplicated().mean() < _REPEATED:

@@ -107,7 +107,7 @@ def step_words(data: CampaignData) -> list[str]:
     return [
         *out,
         f"A step of {smallest.smallest_db:.1f} dB shows on its first date with a probability of 90 % (the largest such "
-        f"step, at {smallest.node}). At most 1 date in 100 shows a false step.",
+        f"step, at {smallest.node}). About 1 date in 100 shows a false step.",
     ]
 
 

@@ -1,6 +1,7 @@
 """Workers of every kind give one result; what they lose, see or run differently is told."""
 
 import json
+import multiprocessing
 import os
 import socket
 import subprocess
@@ -45,6 +46,22 @@ def test_a_killed_worker_costs_its_task_one_more_try(seen: dict[str, Any], tmp_p
     for killed in (seen["cluster"]["killed"], here):
         assert "worker process ended" in killed[5]
         assert killed[:5] + killed[6:] == [i * i for i in range(8) if i != 5]
+
+
+def test_an_interrupt_ends_no_process_of_the_caller() -> None:
+    own = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(120,))
+    own.start()
+    try:
+        with pytest.raises(KeyboardInterrupt):
+            workers.Processes(2).run(time.sleep, [0.0, 60.0], interrupted)
+        assert own.is_alive()
+        assert multiprocessing.active_children() == [own]
+    finally:
+        own.kill()
+
+
+def interrupted(_number: int, _result: object) -> None:
+    raise KeyboardInterrupt
 
 
 def test_workers_run_no_module_that_lies_in_the_working_folder(tmp_path: Path) -> None:

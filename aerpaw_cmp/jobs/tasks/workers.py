@@ -93,6 +93,7 @@ class Processes:
     def _through(self, function: Task, items: Sequence[Any], waiting: deque[int], on_result: _OnResult) -> list[int]:
         """Run what waits, ``count`` at a time, until none is left or a process ends; gives the tasks in work then."""
         active: dict[Future[Any], int] = {}
+        others = multiprocessing.active_children()  # of the program that called from Python
         with _away() as folder:
             # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
             pool = ProcessPoolExecutor(min(self.count, len(waiting)), get_context("spawn"), _begin, (folder,))
@@ -115,7 +116,7 @@ class Processes:
             return list(active.values())
         finally:
             if active:  # no task is waited for
-                for process in multiprocessing.active_children():
+                for process in set(multiprocessing.active_children()).difference(others):
                     process.kill()
             pool.shutdown(cancel_futures=True)
         return []

@@ -38,6 +38,7 @@ def main(arguments: list[str]) -> int:
     """Run the command line and give its exit code; ``__main__`` turns exceptions into messages."""
     say.quiet = False
     try:
+        # click would print errors and exit by itself
         result = _program()(args=arguments, prog_name="aerpaw-cmp", standalone_mode=False)
     except Interrupted as interrupted:
         raise interrupted.error from None

@@ -31,6 +31,7 @@ from .shown import print_plan, say
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
+# no rich markup: "[default: ...]" is text; no pretty exceptions: __main__ turns them into messages
 app = typer.Typer(
     no_args_is_help=True,
     rich_markup_mode=None,
@@ -135,6 +136,7 @@ def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
         say.quiet = quiet
         for option, value in arguments.items():
             for number in value if isinstance(value, (list, tuple)) else (value,):
+                # click reads 'nan' as a number, and no comparison with a least or largest value refuses it
                 if isinstance(number, float) and not math.isfinite(number):
                     raise UsageError(f"--{option.replace('_', '-')} {number}", expected="a finite number")
         try:

@@ -111,6 +111,7 @@ SCHEMA = 1
 
 def print_json(value: dict[str, Any]) -> None:
     """One object on standard output, which begins with the version of its schema."""
+    # NaN is no JSON, and a browser refuses all of it: whoever calls makes null of it
     print(json.dumps({"schema": SCHEMA, **value}, indent=1, allow_nan=False), flush=True)
 
 
@@ -145,8 +146,10 @@ def table(columns: list[str], rows: list[list[str]], title: str | None = None, w
 
     rows = [[one_line(cell) for cell in row] for row in rows]
     columns, title = [one_line(name) for name in columns], title and one_line(title)
+    # without a terminal rich takes 80 columns
     console = Console(width=width if width or sys.stdout.isatty() else 160)
     needs = [max(map(cell_len, [*name.split(), *(row[i] for row in rows)])) for i, name in enumerate(columns)]
+    # 3: a border, and a blank on either side of a cell
     roomy = sum(max(need, cell_len(name)) + 3 for need, name in zip(needs, columns, strict=True)) < console.width
     if sum(min(need, _FIXED) + 3 for need in needs) + 1 > console.width:
         _paragraphs(columns, rows, title, console.width)
@@ -155,6 +158,7 @@ def table(columns: list[str], rows: list[list[str]], title: str | None = None, w
     for column, need in zip(columns, needs, strict=True):
         table.add_column(column, overflow="fold", width=None if roomy or need > _FIXED else need)
     for row in rows:
+        # rich takes [words] for styles, also those of a log
         table.add_row(*[cell.replace("[", r"\[") for cell in row])
     console.print(table)
 

@@ -6,6 +6,7 @@ import re
 from typing import Any
 
 # also behind a semicolon: where that parts cells, what follows begins a cell
+# and an apostrophe of the log itself: unguarded() would take it for one of ours
 _BEGINNING = re.compile(r"(^|;)(?=[=+\-@\t\r'])")
 _GUARDED = re.compile(r"(^|;)'")
 
@@ -18,6 +19,7 @@ def guarded(table: Any) -> Any:
     guarded_columns = {}
     for name in table.columns:
         if table[name].dtype.kind == "O" or str(table[name].dtype).startswith("str"):
+            # by distinct word: a million rows hold a few names
             words = [word for word in table[name].unique() if isinstance(word, str) and _BEGINNING.search(word)]
             if words:
                 texts = table[name].astype(object)

@@ -132,6 +132,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
             if dim not in book.dimensions:
                 book.createDimension(dim, None if dim in grows else size)
         encoding: dict[str, Any] = (
+            # shuffling sorts the bytes of numbers by their weight; single bytes have none
             {"zlib": True, "complevel": 4, "shuffle": values.dtype.itemsize > 1} if values.ndim else {}
         )
         attributes = dict(variable.attrs)
@@ -143,6 +144,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
         if {*dims} & {*grows}:
             encoding["chunksizes"] = (64,) * len(dims) if values.dtype.kind == "S" else _chunk(dims, values, grows)
         made = book.createVariable(name, values.dtype, dims, fill_value=encoding.pop("_FillValue", None), **encoding)
+        # the values are as the file shall hold them: netCDF4 would take them for physical ones and scale them
         made.set_auto_maskandscale(False)
         made.setncatts(attributes)
         made[...] = values

@@ -13,4 +13,5 @@ def counted(number: int, noun: str, plural: str = "") -> str:
     >>> counted(1, "row is", "rows are"), counted(2, "row is", "rows are")
     ('1 row is', '2 rows are')
     """
+    # a narrow blank at which no line breaks: a comma is the decimal sign of many readers
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}".replace(",", "\N{NARROW NO-BREAK SPACE}")

@@ -255,6 +255,7 @@ def from_python(public: _T) -> _T:
             refused = re.fullmatch(r"\w+\.__init__(\(\) got an unexpected keyword argument .*)", str(error))
             raise TypeError(function.__name__ + refused[1]) if refused else error from None
         except AttributeError as error:
+            # names that fit() makes end in an underscore: one that the object itself lacks says what to do
             if error.obj is not (arguments or (None,))[0] or not (error.name or "").endswith("_"):
                 raise
             raise UsageError(f"{function.__qualname__} before fit()", expected="fit() first") from None

@@ -79,6 +79,7 @@ def clear_cache() -> tuple[int, int]:
     folder, files, size = cache_folder(), 0, 0
     for place, below, names in os.walk(folder):  # follows no link
         if Path(place) == folder:
+            # AERPAW_CMP_CACHE may name a folder with other things: only ours are entered
             below[:] = sorted({"llvm", "outcomes", "audits", "compiled"}.intersection(below))
         for path in (Path(place, name) for name in names):
             if _ENTRY.fullmatch(path.relative_to(folder).as_posix()) and not path.is_symlink():
@@ -122,6 +123,7 @@ def atomic_path(target: Path) -> Iterator[Path]:
     OSError
         If the folder is missing, full or not writable.
     """
+    # a name has at most 255 bytes, and mkstemp adds its own
     prefix = f".{target.name[:40]}."
     _clear_old_parts(target.parent, prefix)
     handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")
@@ -168,6 +170,7 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
         size = os.fstat(file.fileno()).st_size
         chunks: list[bytes] = []
         total = 0
+        # counted too: pipes, devices and files of /proc say that they have 0 bytes
         while size <= most and total <= most and (chunk := file.read(_CHUNK)):
             chunks.append(chunk)
             total += len(chunk)
@@ -245,6 +248,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 def plain_mode() -> int:
     """Rights of an ordinary new file."""
+    # the mask can be read by setting it alone
     mask = os.umask(0)
     os.umask(mask)
     return 0o666 & ~mask

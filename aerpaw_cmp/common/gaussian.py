@@ -56,6 +56,7 @@ class Factor:
         from scipy.linalg import LinAlgError, cholesky
 
         try:
+            # one NaN or infinity makes the sum one; a mask of the matrix would cost an eighth of its memory
             if not np.isfinite(covariance.sum()):
                 raise ValueError("numbers that are not finite")
             # the transpose is the same matrix in the order that LAPACK works on
@@ -108,6 +109,7 @@ class Factor:
         """``C^-1``, at a third of what solving for the unit matrix takes."""
         from scipy.linalg.lapack import dpotri
 
+        # LAPACK fills one triangle and leaves what was in the other
         triangle = np.tril(dpotri(self.lower, lower=True)[0])
         return np.asarray(triangle + np.tril(triangle, -1).T)
 
@@ -171,6 +173,7 @@ def determining(
         at, known = int(remaining.argmax()), rows[: len(chosen)]
         rows[len(chosen)] = (kernel(points[at : at + 1], points)[0] - known[:, at] @ known) / math.sqrt(remaining[at])
         remaining = np.maximum(remaining - rows[len(chosen)] ** 2, 0.0)
+        # exactly: rounding would leave a rest, and the same point be taken twice
         remaining[at] = 0.0
         chosen.append(at)
     return np.array(chosen, dtype=np.int64)

@@ -22,8 +22,6 @@ def input_files(settings: BaseModel, path: Path, logs_root: Path | None = None) 
 def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str, Path]]:
     """Dotted key, text and place of every value that names a file."""
     for key, text in _texts(content, ""):
-        if not text or "\0" in text:
-            continue
         for root in roots:
             # most texts name nothing: a Path is made of those that do
             if os.path.isfile(os.path.join(root, text)):  # noqa: PTH113, PTH118  never raises

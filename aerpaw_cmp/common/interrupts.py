@@ -89,6 +89,7 @@ def noted() -> Iterator[None]:
             raise
         raise KeyboardInterrupt from error
     finally:
+        # a second signal would break off the clearing
         _set(SIGNALS, signal.SIG_IGN, _note)
         _clear()
         _signalled = False
@@ -123,6 +124,7 @@ def _clear() -> None:
 def _watched() -> Iterator[None]:
     """Let a second thread look after signals that the first one does not hear."""
     read, write = os.pipe()
+    # set_wakeup_fd refuses a descriptor that could block the handler
     os.set_blocking(write, False)
     before = signal.set_wakeup_fd(write, warn_on_full_buffer=False)
     ended = threading.Event()
@@ -132,6 +134,7 @@ def _watched() -> Iterator[None]:
     finally:
         ended.set()
         signal.set_wakeup_fd(before)
+        # the other thread reads the end of the pipe, and goes
         os.close(write)
 
 
@@ -140,7 +143,9 @@ def _watch(signals: int, ended: threading.Event) -> None:
     while number := os.read(signals, 1):
         if not ended.wait(PATIENCE_S) and not _signalled and signal.getsignal(number[0]) is _note:
             _clear()
+            # not print: the stuck thread may hold the lock of the stream
             os.write(2, f"aerpaw-cmp: {said(number[0])} in a long calculation; its output was not written\n".encode())
+            # sys.exit would end this thread alone
             os._exit(SIGNALLED + number[0])
     os.close(signals)
 

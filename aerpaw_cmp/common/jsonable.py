@@ -33,6 +33,7 @@ def json_safe(value: Any) -> Any:
     >>> json_safe({"rmse_db": float("nan"), 10: np.array([1, 2])})
     {'rmse_db': None, '10': [1, 2]}
     """
+    # is_dataclass is true of the class as well, which has no values
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return json_safe(fields_of(value))
     if isinstance(value, Mapping):
@@ -40,7 +41,9 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, np.ndarray):
         return _listed(value)
     if isinstance(value, (list, tuple, set, frozenset)):
+        # a set of words has another order in each process
         return [json_safe(item) for item in (sorted(value) if isinstance(value, (set, frozenset)) else value)]
+    # before the integers: True is one of them
     if isinstance(value, (bool, np.bool_)):
         return bool(value)
     if isinstance(value, (int, np.integer)):

@@ -26,12 +26,14 @@ _DPI = 110
 # --- reading -------------------------------------------------------------------------------------------------------
 
 # A named value, and the first place of a shape, on a line of a log.
+# repeats have ends: a line of a stranger may be megabytes long, and each start would search all of it
 DATA = re.compile(rb'<Data name="([A-Za-z][A-Za-z0-9 _-]{0,39})">\s{0,40}<value>([^<]{0,200})</value>')
 POINT = re.compile(rb"<coordinates>\s{0,40}(-?[\d.]{1,20}),(-?[\d.]{1,20})(?:,(-?[\d.]{1,20}))?")
 
 
 def is_kml(head: bytes) -> bool:
     """Check whether a file begins as KML."""
+    # a declaration, comments and a licence may stand before it
     return b"<kml" in head[:2048]
 
 
@@ -93,6 +95,7 @@ def xml_text(text: str) -> str:
 def coordinates(longitude: FloatArray, latitude: FloatArray, up_m: FloatArray | float = 0.0) -> list[str]:
     """Places (n,) as KML writes them; a height below or unknown is 0."""
     up = np.broadcast_to(np.maximum(np.nan_to_num(up_m), 0.0), np.shape(longitude))
+    # 1e-7 degree is a centimetre
     return [f"{a:.7f},{b:.7f},{h:.1f}" for a, b, h in zip(longitude, latitude, up, strict=True)]
 
 
@@ -209,6 +212,7 @@ def bar_legend(title: str, label: str, limits: tuple[float, float]) -> bytes:
     left, wide = 30, sheet.picture.width - 60
     for column, colour in enumerate(colormaps["viridis"](np.linspace(0.0, 1.0, wide), bytes=True)):
         sheet.pen.line((left + column, 26, left + column, 46), fill=tuple(colour))
+    # as many decimals as show a tenth of the span
     digits = max(0, int(np.ceil(1.0 - np.log10(high - low))))
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         at, sign = left + share * (wide - 1), {0.0: "≤ ", 1.0: "≥ "}.get(share, "")

@@ -72,6 +72,7 @@ def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
     # isolated, and with the paths of this process: the working folder may be a stranger's, with a numpy.py in it
     command = [sys.executable, "-I", "-c", _CHILD, kind, *(path for path in sys.path if path)]
     try:
+        # limits of the processor's time do not end a child that only waits
         child = subprocess.run(command, input=data, capture_output=True, timeout=2 * SECONDS, check=False, env=_ENVIRON)
     except subprocess.TimeoutExpired:
         raise InputError(f"the file cannot be read within {2 * SECONDS} s", cause="a damaged file") from None
@@ -93,6 +94,7 @@ def _unpacked(content: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
 
 def main(kind: str) -> None:
     """Read a file from standard input and write its arrays to standard output."""
+    # first: after the rights have gone, no library could be loaded
     reader = READERS[kind]()
     data = sys.stdin.buffer.read()
     give_up_rights()

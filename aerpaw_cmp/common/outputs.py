@@ -206,6 +206,7 @@ class OutputFile:
         place = self._place
         assert place is not None, "used as a context"
         with explained_os_errors(self.named):
+            # a copy: closing the stream would close what holds the lock
             with os.fdopen(os.dup(place.descriptor), "r+b") as stream:
                 if callable(content):
                     content(stream)
@@ -456,6 +457,7 @@ def _make_folders(folder: Path, created: list[Path]) -> None:
 
 def _remove_folders(created: list[Path]) -> None:
     """Remove folders made for a run that failed, where nothing is in them."""
+    # deepest first: a parent is empty only then
     for place in reversed(created):
         with contextlib.suppress(OSError):
             place.rmdir()
@@ -513,6 +515,7 @@ class _Place:
                         self.part.mkdir()
                     descriptor = os.open(self.part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
                 else:
+                    # no link is followed: in a shared folder somebody may have put one there; private until it is done
                     descriptor = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
             except FileNotFoundError as error:
                 if not self.part.parent.is_dir():
@@ -592,6 +595,7 @@ def _lock(descriptor: int) -> bool:
     except ImportError:
         return True
     except OSError as error:
+        # every other failure is of a disk without locks, and no reason to refuse
         return error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
     return True
 
@@ -602,6 +606,7 @@ def _clear(part: Path, *, keep: bool = False) -> None:
     A place with ``.unfinished`` was being filled: all in it is ours. Without it, it is the set that was replaced, and
     ours is what its list names. Both signs go last, so that a killed run can be gone on with.
     """
+    # os.walk goes through mounts, and unlink would empty the disk behind one
     if _mounted_below(part):
         raise OSError(errno.EXDEV, "a file system is mounted there", str(part))
     signs = [part / _UNFINISHED, part / SUMS]
@@ -649,8 +654,10 @@ def _names_swapped(first: Path, second: Path) -> bool:
     library = ctypes.CDLL(None, use_errno=True)
     names = os.fsencode(first), os.fsencode(second)
     if sys.platform == "darwin":
+        # 2: RENAME_SWAP
         function, arguments = getattr(library, "renamex_np", None), (*names, 2)
     else:
+        # -100: AT_FDCWD, names from the working folder; 2: RENAME_EXCHANGE
         function, arguments = getattr(library, "renameat2", None), (-100, names[0], -100, names[1], 2)
     if function is None:
         return False
@@ -663,6 +670,7 @@ def _names_swapped(first: Path, second: Path) -> bool:
 
 
 def _sync_tree(folder: Path) -> None:
+    # deepest first: a name is on the disk after what it names
     for parent, _, names in os.walk(folder, topdown=False):
         for name in names:
             if not Path(parent, name).is_symlink():

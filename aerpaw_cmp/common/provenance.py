@@ -12,6 +12,7 @@ from collections.abc import Iterable
 # Of YAML and JSON files; in front of a colon in the comments of a table.
 KEY, MARKS = "trained_on", "marks"
 
+# one pattern for a YAML list of either style, an array of JSON and the comment of a table
 _LIST = re.compile(KEY + r"""["']?[ \t]*:[\s\["',-]*((?:[0-9a-f]{64}[\s"',#-]*)+)""")
 _DIGEST = re.compile(r"[0-9a-f]{64}")
 _MARKS = re.compile(MARKS + r"""["']?[ \t]*:[\s\["',-]*((?:[0-9a-f.]{100,}[\s"',#-]*)+)""")

@@ -33,6 +33,7 @@ logging.getLogger("aerpaw_cmp").addHandler(logging.NullHandler())
 def logged(text: str, fraction: float | None = None, /) -> None:
     """Progress of what Python calls: INFO, shares DEBUG, on the logger of its room, such as ``aerpaw_cmp.flight``."""
     frame = sys._getframe(1)
+    # common speaks for the room that called it
     while frame.f_back is not None and not re.match(r"aerpaw_cmp\.(?!common)", frame.f_globals["__name__"]):
         frame = frame.f_back
     room = ".".join(frame.f_globals["__name__"].split(".")[:2])

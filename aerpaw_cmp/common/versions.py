@@ -39,6 +39,7 @@ def commit() -> str:
     if not (package.parent / ".git").exists():
         return ""
     release = f"v{__version__}"
+    # --long counts the commits behind a tag also where there are none, so that the answer has one form
     ask = ["git", "-C", str(package.parent), "describe", "--tags", "--always", "--long", "--abbrev=7"]
     try:
         told = subprocess.run(
@@ -47,6 +48,7 @@ def commit() -> str:
     except (OSError, subprocess.SubprocessError):
         return UNKNOWN
     answer = told.stdout.strip()
+    # a release is its tag, clean: nothing behind it and no ".dirty"
     return "" if answer.startswith(f"{release}-0-g") and "." not in answer[len(release) :] else answer.split("-g")[-1]
 
 

@@ -64,6 +64,7 @@ def _edited(text: str, path: KeyPath, value: Any) -> str:
         at = keys.index(key)
         if depth < len(path) - 1:
             node = node.value[at][1]
+    # a block that loses its last key would read as null
     if value is None and len(keys) == 1 and depth:
         return _edited(text, path[:-1], {})
     if value is None:
@@ -74,6 +75,7 @@ def _edited(text: str, path: KeyPath, value: Any) -> str:
 
 def _flow(value: Any) -> str:
     """A value on one line."""
+    # a width that nothing reaches: a broken line would need the indent of its place; a bare word ends in "..." there
     line: str = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, allow_unicode=True, width=10**6)
     return line.removesuffix("\n").removesuffix("\n...")
 

@@ -169,6 +169,7 @@ def _read_text(path: Path) -> str:
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path=path) from None
     try:
+        # editors of Windows begin UTF-8 with a byte order mark
         return data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         line = data.count(b"\n", 0, error.start) + 1
@@ -202,6 +203,7 @@ def _parse(text: str, path: str | Path | None) -> _Document:
         mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
         problem = getattr(error, "problem", None) or str(error).splitlines()[0]
         cause = "tabs cannot indent in YAML; use blanks" if _tab_indents(text, mark) else None
+        # PyYAML's word for control characters
         if "unacceptable" in problem:
             cause = "a log, or another binary file, in place of the settings"
         raise UsageError(
@@ -324,6 +326,7 @@ def _plain_value(text: str) -> Any:
     """Value of an unquoted scalar by the core schema of YAML 1.2."""
     if text in _WORDS:
         return _WORDS[text]
+    # Python takes quadratic time for long integers and refuses them from 4 300 digits on: they become floats
     if _INT.match(text) and len(text) < 40:
         return int(text)
     if _HEX.match(text) and len(text) < 40:

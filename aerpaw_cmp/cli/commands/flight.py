@@ -84,6 +84,7 @@ def _nothing_compared(metrics: Mapping[str, Any]) -> int:
     from ...compare.statistics.memory import FEWEST
 
     channels = [m for channels in metrics["rss"].values() for m in channels.values()]
+    # a channel left out because its antenna was learned on this log is no failure
     most = max([m["n"] for m in (*channels, *metrics["rank"].values())], default=0)
     if most >= FEWEST or any(m.get("trained_on") for m in channels):
         return 0

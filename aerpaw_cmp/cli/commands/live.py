@@ -115,6 +115,7 @@ class StatusLine:
 
         head = f"{name}: " if name else ""
         if now.message:
+            # "\r\033[K": back to the beginning of the line, and clear it
             print(("\r\033[K" if self._terminal else "") + one_line(head + now.message), file=sys.stderr, flush=True)
         self._lines[name] = one_line(head + format_status(now))
         if self._enabled and self._terminal:

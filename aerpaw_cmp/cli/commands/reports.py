@@ -191,6 +191,7 @@ def campaign(
     for check in outcome.failed_checks:
         say.warn(f"failed: {check}")
     if not (outcome.metrics["rss"] or outcome.metrics["rank"] or outcome.metrics["season"]["nodes"]):
+        # no flight could be compared: their inputs are at fault, whatever the settings
         return 3
     return 1 if strict and outcome.failed_checks else 0
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -67,12 +66,7 @@ PAPER_BIEXPONENTIAL = BiExponential(0.2932, -0.0508, 0.7057, -0.001, 0.0153)
 STARTS = 6
 
 
-def fit_biexponential(
-    distance_m: ArrayLike,
-    correlation: ArrayLike,
-    *,
-    weights: ArrayLike | None = None,
-) -> BiExponential:
+def fit_biexponential(distance_m: ArrayLike, correlation: ArrayLike) -> BiExponential:
     """Least-squares bi-exponential by variable projection, with c1 and c3 of at least 0 and c1 + c3 of at most 1.
 
     Source: arXiv 2502.10324 eq. 14.
@@ -85,8 +79,6 @@ def fit_biexponential(
     ----------
     distance_m, correlation : (n,)
         The points; NaN pairs do not count.
-    weights : (n,), optional
-        Such as the number of pairs of each bin; the paper's fit has none. ``rmse`` is weighted likewise.
 
     Returns
     -------
@@ -108,7 +100,7 @@ def fit_biexponential(
     ----------
     .. [1] Golub and Pereyra, Inverse Problems 19 (2003) R1, doi:10.1088/0266-5611/19/2/201
     """
-    problem = _Projection.of(distance_m, correlation, weights)
+    problem = _Projection.of(distance_m, correlation)
     if len(problem.d) < 4:
         single = problem.single()
         return problem.result(single, f"{counted(len(problem.d), 'point')} for four coefficients")
@@ -122,32 +114,29 @@ class _Projection:
 
     d: FloatArray
     y: FloatArray
-    root_weight: FloatArray
     log_rates: tuple[float, float]
 
     @classmethod
-    def of(cls, distance_m: ArrayLike, correlation: ArrayLike, weights: ArrayLike | None) -> _Projection:
-        """The problem of one curve: pairs without a number or a weight take no part."""
+    def of(cls, distance_m: ArrayLike, correlation: ArrayLike) -> _Projection:
+        """The problem of one curve: pairs without a number take no part."""
         d = unmasked(distance_m).ravel()
         y = unmasked(correlation).ravel()
-        w = np.ones_like(d) if weights is None else unmasked(weights).ravel()
-        if not (d.shape == y.shape == w.shape):
-            raise UsageError(f"{d.size} distances, {y.size} correlations and {w.size} weights")
-        good = np.isfinite(d) & np.isfinite(y) & (w > 0) & (d >= 0)
-        d, y, w = d[good], y[good], w[good]
+        if d.shape != y.shape:
+            raise UsageError(f"{d.size} distances and {y.size} correlations")
+        good = np.isfinite(d) & np.isfinite(y) & (d >= 0)
+        d, y = d[good], y[good]
         if len(d) < 2 or not d.max() > 0:
             raise UsageError(
                 f"{counted(len(d), 'usable point')} for a curve", expected="at least two, at different distances"
             )
         slow, fast = 1e-6 / d.max(), 10.0 / d[d > 0].min()  # flat over the data; gone at the first bin
-        return cls(d, y, np.sqrt(w / w.mean()), (float(np.log(slow)), float(np.log(fast))))
+        return cls(d, y, (float(np.log(slow)), float(np.log(fast))))
 
     def amplitudes(self, log_rates: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Best bounded amplitudes (..., 2) and weighted residuals (..., n) for logarithms of rates (..., 2)."""
-        basis = np.exp(-np.exp(log_rates)[..., None, :] * self.d[:, None]) * self.root_weight[:, None]
-        target = self.y * self.root_weight
-        candidates = _candidate_amplitudes(basis, target)
-        residual = (basis[..., None, :, :] @ candidates[..., :, :, None])[..., 0] - target
+        """Best bounded amplitudes (..., 2) and residuals (..., n) for logarithms of rates (..., 2)."""
+        basis = np.exp(-np.exp(log_rates)[..., None, :] * self.d[:, None])
+        candidates = _candidate_amplitudes(basis, self.y)
+        residual = (basis[..., None, :, :] @ candidates[..., :, :, None])[..., 0] - self.y
         pick = np.argmin((residual**2).sum(axis=-1), axis=-1)[..., None, None]
         chosen = np.take_along_axis(candidates, pick, axis=-2)[..., 0, :]
         return chosen, np.take_along_axis(residual, pick, axis=-2)[..., 0, :]
@@ -184,17 +173,23 @@ class _Projection:
         return np.asarray((ahead - behind).T / 2e-5)
 
     def single(self) -> float:
-        """Logarithm of the rate of the best single exponential."""
-        return least_on_axis(self._single_cost, self.log_rates, 1e-13)
+        """Logarithm of the rate of the best single exponential: the best of 200, refined between its neighbours."""
+        from scipy.optimize import minimize_scalar
+
+        axis = np.linspace(*self.log_rates, 200)
+        best = int(np.argmin([self._single_cost(a) for a in axis]))
+        bracket = (axis[max(best - 1, 0)], axis[min(best + 1, len(axis) - 1)])
+        fit = minimize_scalar(self._single_cost, bounds=bracket, method="bounded", options={"xatol": 1e-13})
+        return float(fit.x)
 
     def _single_amplitude(self, log_rate: float) -> float:
-        basis = np.exp(-np.exp(log_rate) * self.d) * self.root_weight
-        amplitude = float(basis @ (self.y * self.root_weight) / max(basis @ basis, TINY))
+        basis = np.exp(-np.exp(log_rate) * self.d)
+        amplitude = float(basis @ self.y / max(basis @ basis, TINY))
         return min(max(amplitude, 0.0), 1.0)
 
     def _single_cost(self, log_rate: float) -> float:
         curve = self._single_amplitude(log_rate) * np.exp(-np.exp(log_rate) * self.d)
-        return float((((curve - self.y) * self.root_weight) ** 2).sum())
+        return float(((curve - self.y) ** 2).sum())
 
     def result(self, log_rate: float, message: str) -> BiExponential:
         """One exponential as a degenerate pair: c1 = 0."""
@@ -212,7 +207,7 @@ class _Projection:
         cost_single = self._single_cost(single)
         c1, c3 = (float(a) for a in amplitude)
         c2, c4 = (-float(rate) for rate in np.exp(log_rates))
-        scale = 1e-20 * float(((self.y * self.root_weight) ** 2).sum())
+        scale = 1e-20 * float((self.y**2).sum())
         # Bayesian information criterion: two more coefficients must pay for themselves
         gain = n * np.log((cost_single + scale) / (cost + scale)) - 2 * np.log(n)
         reasons = []
@@ -256,13 +251,3 @@ def _candidate_amplitudes(basis: FloatArray, target: FloatArray) -> FloatArray:
 def _clipped(right: FloatArray, square: FloatArray) -> FloatArray:
     """Minimum over [0, 1] of square * x^2 - 2 * right * x."""
     return np.asarray(np.clip(right / np.maximum(square, TINY), 0.0, 1.0))
-
-
-def least_on_axis(cost: Callable[[float], float], ends: tuple[float, float], tolerance: float) -> float:
-    """Place of the least cost between two ends: the best of 200, then refined between its neighbours."""
-    from scipy.optimize import minimize_scalar
-
-    axis = np.linspace(*ends, 200)
-    best = int(np.argmin([cost(a) for a in axis]))
-    bracket = (axis[max(best - 1, 0)], axis[min(best + 1, len(axis) - 1)])
-    return float(minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": tolerance}).x)

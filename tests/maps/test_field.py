@@ -34,7 +34,7 @@ def rss_flight():
 def fitted(points, values):
     """Curve through bins of 30 m; samples closer than half a bin share one fade and would hide the nugget."""
     bins = field_correlation(points, values, maximum_m=300.0)
-    return fit_biexponential(bins.mean_distance_m[1:], bins.correlation[1:], weights=bins.pairs[1:])
+    return fit_biexponential(bins.mean_distance_m[1:], bins.correlation[1:])
 
 
 @pytest.mark.parametrize(("first", "second"), [(1, 3), (3, 1)])
@@ -66,4 +66,4 @@ def test_measured_rss_neighbours_give_it_away():
     assert (near.rmse < 3.0).all(), "dB"
     assert (near.rmse < 0.5 * blocked.rmse).all()
     assert (blocked.rmse < spread).all()
-    assert blocked.unpredicted.sum() == 0
+    assert (blocked.n == len(points)).all()

@@ -1,8 +1,7 @@
 """Quality of an interpolator: the paper's leave-one-out, and tests in which neighbours do not give the answer away.
 
 Errors are in the unit of the field (rank, dB). Rank is not rounded: the paper's MAE (section VII-C) compares the
-interpolated number. A position without a value (NaN, out of coverage) is not scored; a position with a value but
-without an estimate is counted as ``unpredicted`` and not averaged in.
+interpolated number. A position without a value (NaN, out of coverage) or without an estimate is not scored.
 """
 
 from __future__ import annotations
@@ -42,15 +41,12 @@ class Score:
         Mean absolute, root mean square and mean (estimate - value) error; NaN where nothing was scored.
     n : ndarray of int
         Scored positions.
-    unpredicted : ndarray of int
-        Positions with a value but no estimate.
     """
 
     mae: FloatArray
     rmse: FloatArray
     bias: FloatArray
     n: IntArray
-    unpredicted: IntArray
 
 
 def score(values: ArrayLike, estimate: ArrayLike) -> Score:
@@ -74,7 +70,6 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
         np.sqrt(mean(error**2)),
         mean(error),
         np.asarray(n, dtype=np.int64),
-        np.asarray((known & ~scored).sum(axis=0), dtype=np.int64),
     )
 
 

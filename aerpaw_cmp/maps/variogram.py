@@ -27,18 +27,9 @@ from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError, from_python
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
-from .biexponential import PAPER_BIEXPONENTIAL, BiExponential, fit_biexponential
-
-__all__ = [
-    "PAPER_BIEXPONENTIAL",
-    "BiExponential",
-    "BinnedCorrelation",
-    "Variogram",
-    "field_correlation",
-    "fit_biexponential",
-    "vector_correlation",
-    "vertical_correlation",
-]
+from .biexponential import PAPER_BIEXPONENTIAL as PAPER_BIEXPONENTIAL
+from .biexponential import BiExponential as BiExponential
+from .biexponential import fit_biexponential as fit_biexponential
 
 # Positions per block of the pair products; bounds the memory to BLOCK x positions.
 BLOCK = 256
@@ -70,8 +61,6 @@ class BinnedCorrelation:
         Positions that took part.
     excluded_constant : int
         Positions (or fields) left out because all their values are equal: their correlation is undefined.
-    excluded_missing : int
-        Positions (or fields) left out because of NaN.
     """
 
     distance_m: FloatArray
@@ -80,7 +69,6 @@ class BinnedCorrelation:
     pairs: IntArray
     positions: int
     excluded_constant: int
-    excluded_missing: int
 
 
 def vector_correlation(
@@ -120,7 +108,7 @@ def vector_correlation(
         )
     else:
         bins = _bin_pairs(points[varying], _PairwisePearson(data[varying], _MINIMUM_COMMON), width_m, maximum_m)
-    return BinnedCorrelation(*bins, int(varying.sum()), int(constant.sum()), int(lacking.sum()))
+    return BinnedCorrelation(*bins, int(varying.sum()), int(constant.sum()))
 
 
 def field_correlation(
@@ -155,7 +143,7 @@ def field_correlation(
     centred = np.where(present, data - filled.sum(axis=0) / np.maximum(count, 1), 0.0)
     scaled = centred / np.sqrt((centred**2).sum(axis=0) / np.maximum(count, 1))
     bins = _bin_pairs(points, _mean_product(scaled, present), width_m, maximum_m)
-    return BinnedCorrelation(*bins, int(present.any(axis=1).sum()), int(constant.sum()), int(lacking.sum()))
+    return BinnedCorrelation(*bins, int(present.any(axis=1).sum()), int(constant.sum()))
 
 
 def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorrelation:
@@ -195,7 +183,7 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
     n = int(np.floor(gap.max(initial=0.0) / _HEIGHT_BIN_M + 0.5)) + 1
     sums = _Sums(n, _HEIGHT_BIN_M)
     sums.add(np.repeat(gap, fields), value.ravel())
-    return BinnedCorrelation(*sums.means(), levels, excluded, 0)
+    return BinnedCorrelation(*sums.means(), levels, excluded)
 
 
 # --- pairs ----------------------------------------------------------------------------------------------------------

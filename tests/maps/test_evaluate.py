@@ -51,7 +51,6 @@ def test_score_closed_form():
     assert result.rmse.tolist() == [np.sqrt(5.0), 2.0]
     assert result.bias.tolist() == [-1.0, -2.0]
     assert result.n.tolist() == [2, 1]
-    assert result.unpredicted.tolist() == [0, 1]
     nothing = evaluate.score([np.nan], [1.0])
     assert np.isnan(nothing.mae)
     with pytest.raises(UsageError, match="shape"):

@@ -250,7 +250,10 @@ def serial_check(device: str, description: str = "") -> Check:
     port = f"{device} {description}".strip()
     if not os.access(device, os.R_OK | os.W_OK):
         return Check(
-            "Serial", "warn", f"{port}: not allowed", f"sudo usermod -aG {_group(device)} $USER, then log in anew"
+            "Serial",
+            "warn",
+            f"{port}: not allowed",
+            f"sudo usermod -aG {_group(device)} $USER, then log in anew",
         )
     if busy := holders(device):
         stop = "sudo systemctl stop ModemManager" if any("ModemManager" in name for name in busy) else "stop it"

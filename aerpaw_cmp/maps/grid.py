@@ -219,15 +219,6 @@ def _bisector_segment(
     return np.stack([middle + low * along, middle + high * along])
 
 
-def class_shares(rank: ArrayLike, highest: int = 4) -> FloatArray:
-    """Shares of the classes Z (0), 1, ..., ``highest`` among ranks; shape (highest + 1,), sum 1; NaN does not count."""
-    values = unmasked(rank)
-    counts = np.bincount(values[np.isfinite(values)].astype(np.int64), minlength=highest + 1)
-    if len(counts) > highest + 1:
-        raise ValueError(f"rank {len(counts) - 1} exceeds the highest class {highest}")
-    return np.asarray(counts / max(counts.sum(), 1))
-
-
 def class_names(highest: int = 4) -> tuple[str, ...]:
     """Names of the rank classes: ``Z``, ``1``, ..."""
     return (OUT_OF_COVERAGE, *(str(rank) for rank in range(1, highest + 1)))
@@ -256,7 +247,3 @@ class Layer:
     unit: str
     title: str
     classes: tuple[str, ...] = ()
-
-    def __post_init__(self) -> None:
-        if not self.name.replace("_", "").isalnum():
-            raise ValueError(f"layer name {self.name!r} holds more than letters, digits and underscores")

@@ -26,7 +26,6 @@ from .grid import (
     Grid,
     Layer,
     class_names,
-    class_shares,
     serving_tower,
     voronoi_borders,
 )
@@ -122,8 +121,7 @@ class MapResult:
     def rank_shares(self, tower: str | None = None) -> FloatArray:
         """Shares (altitudes, K, 1 + highest rank) of the classes Z, 1, 2, ... (the paper's rank distributions)."""
         rank = self.ranks(tower)
-        shares = [[class_shares(rank[a, k], HIGHEST_RANK) for k in range(rank.shape[1])] for a in range(rank.shape[0])]
-        return np.array(shares).reshape(*rank.shape[:2], HIGHEST_RANK + 1)
+        return np.stack([(rank == number).mean(axis=-1) for number in range(HIGHEST_RANK + 1)], axis=-1)
 
     def coverage(self, antennas: Antennas = "mimo", tower: str | None = None) -> FloatArray:
         """Probability of coverage per RSS altitude: share of positions with a path."""
@@ -186,7 +184,6 @@ def map_job(
         for start in range(0, n, chunk):
             part = slice(start, min(start + chunk, n))
             evaluated = evaluate(positions[part], names)
-            _check(evaluated, part.stop - part.start, t)
             if height in at["rss"]:
                 row = at["rss"].index(height)
                 rss[:, row, :, part] = np.stack(evaluated.levels).swapaxes(1, 2)
@@ -232,12 +229,6 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
     return np.stack([np.where(covered, strongest - db_from_power(sigma[..., i] ** 2), np.nan) for i in (1, -1)])
 
 
-def _check(evaluated: Evaluation, n: int, towers: int) -> None:
-    shapes = (*(level.shape for level in evaluated.levels), evaluated.singular_values.shape[:2])
-    if set(shapes) != {(n, towers)}:
-        raise ValueError(f"the engine returned shapes {shapes} for {n} positions and {towers} towers")
-
-
 @dataclass(frozen=True, slots=True)
 class FoliageDifference:
     """Effect of foliage on the joint maps.
@@ -259,9 +250,6 @@ class FoliageDifference:
 
 def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDifference:
     """Compare two runs over the same grid, altitudes and K."""
-    for name in ("rss_altitudes_m", "rank_altitudes_m", "ks", "tower_names"):
-        if getattr(without, name) != getattr(foliage, name):
-            raise UsageError(f"the two maps differ in {name}")
     clear, shaded = without.rss(), foliage.rss()
     before, after = without.ranks().astype(np.int64), foliage.ranks().astype(np.int64)
     return FoliageDifference(

@@ -192,7 +192,7 @@ def _stacked(
         Dimensions, values, attributes.
     """
     joint = "tower" not in between
-    planes = np.stack([_plane(result, part) for result, part in zip(maps.values(), values, strict=True)])
+    planes = np.stack([v.reshape(*v.shape[:-1], *m.grid.shape) for m, v in zip(maps.values(), values, strict=True)])
     numbers = planes.astype(np.int8) if "flag_values" in attributes else np.round(planes, 2).astype(np.float32)
     described = {
         **attributes,
@@ -201,11 +201,6 @@ def _stacked(
         "grid_mapping": "crs",
     }
     return ("foliage", *between, *_PLANE), numbers, described
-
-
-def _plane(maps: MapResult, values: AnyArray) -> AnyArray:
-    """The last axis, positions in index order, as y and x."""
-    return np.asarray(values).reshape(*values.shape[:-1], *maps.grid.shape)
 
 
 def _codes(meanings: Sequence[str], long_name: str) -> dict[str, Any]:

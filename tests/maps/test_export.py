@@ -114,8 +114,6 @@ def test_wrong_layers_are_a_bug():
         over(GRID, [LAYERS[0], LAYERS[0]])
     with pytest.raises(ValueError, match="shape"):
         over(GRID, [Layer("a", np.zeros(3), "1", "a")])
-    with pytest.raises(ValueError, match="layer name"):
-        Layer("a b", np.zeros(3), "1", "a")
 
 
 def test_colours_span_the_middle_96_percent():

@@ -9,7 +9,6 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.maps.grid import (
     Grid,
     class_names,
-    class_shares,
     serving_tower,
     voronoi_borders,
 )
@@ -105,9 +104,5 @@ def test_collinear_and_coincident_towers_have_borders_or_none():
     assert voronoi_borders([[0.0, 0.0]], AREA) == ()
 
 
-def test_out_of_coverage_is_a_class_and_never_a_number():
-    rank = np.array([0, 1, 1, 2, 4])
-    assert class_shares(rank).tolist() == [0.2, 0.4, 0.2, 0.0, 0.2]
+def test_out_of_coverage_is_a_class_of_its_own():
     assert class_names() == ("Z", "1", "2", "3", "4")
-    with pytest.raises(ValueError, match="exceeds"):
-        class_shares([5])

@@ -94,7 +94,9 @@ def package_checks() -> Iterator[Check]:
     """Sionna RT, Mitsuba and Dr.Jit are installed, in the versions that Sionna RT pins."""
     pins: dict[str, str] = {}
     try:
+        # read from what is installed: another sionna-rt pins other versions of Mitsuba and Dr.Jit
         for requirement in metadata.requires("sionna-rt") or []:
+            # a requirement without an exact version leaves an empty pin, which no version fails
             name, _, exact = requirement.partition("==")
             pins[name.strip()] = exact.strip()
     except metadata.PackageNotFoundError:
@@ -133,6 +135,7 @@ def llvm_checks() -> Iterator[Check]:
 
 def _gpu_check() -> Check:
     """Mitsuba variant that a replay would use; a GPU is tried the same way as LLVM, in a child process."""
+    # a container may have the driver without its command line tool
     if shutil.which("nvidia-smi") is None and not Path("/proc/driver/nvidia").exists():
         return Check("GPU", "ok", "none found: replays use llvm_ad_mono_polarized")
     trial = llvm.try_variant("cuda_ad_mono_polarized")
@@ -144,6 +147,7 @@ def _gpu_check() -> Check:
 
 def _cores_check() -> Check:
     """Processor cores that this process may use."""
+    # a container or taskset may grant fewer cores than the machine has
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return Check("CPU", "ok", f"{counted(cores, 'core')}, {platform.machine()}")
 
@@ -152,11 +156,13 @@ def available_memory_bytes(root: Path = Path("/")) -> int | None:
     """Memory that can still be had: the kernel's estimate, or the control group's limit when that is lower."""
     try:
         lines = (root / "proc/meminfo").read_text().splitlines()
+        # not MemFree: what the kernel caches of files is given back when a program asks
         available = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
     except (OSError, StopIteration, ValueError, IndexError):
         return None
     group = root / "sys/fs/cgroup"
     try:
+        # names of control groups of version 2; under version 1 the machine's own number stands
         limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
         if limit != "max":
             available = min(available, int(limit) - int(used))
@@ -188,9 +194,11 @@ def _disk_check(folder: Path) -> Check:
 def cache_check(folder: Path) -> Check:
     """The folder of cached paths and kernels can be written to."""
     remedy = "set AERPAW_CMP_CACHE to a folder that you may write to"
+    # not made before the first run: until then its nearest parent decides
     existing = next((place for place in (folder, *folder.parents) if place.exists()), folder)
     if not existing.is_dir():
         return Check("Cache", "warn", f"{existing} is not a folder", remedy)
+    # a folder without the right to enter refuses new files, whatever its right to write says
     if not os.access(existing, os.W_OK | os.X_OK):
         return Check("Cache", "warn", f"{folder} cannot be written to", remedy)
     return Check("Cache", "ok", str(folder))
@@ -230,6 +238,7 @@ def serial_checks() -> Iterator[Check]:
         what = "pyserial is not installed" if not _importable("serial") else f"pyserial cannot be loaded ({error})"
         yield Check("Serial", "fail", what, "make setup")
         return
+    # ttyS* are sockets of the main board, listed whether or not anything is plugged in
     ports = sorted(port for port in list_ports.comports() if port.vid is not None or "ttyS" not in port.device)
     if not ports:
         yield Check("Serial", "ok", "no USB serial port: plug the modem in to use 'aerpaw-cmp tap'")
@@ -250,12 +259,14 @@ def serial_check(device: str, description: str = "") -> Check:
     port = f"{device} {description}".strip()
     if not os.access(device, os.R_OK | os.W_OK):
         return Check(
+            # the kernel gives a new group to new logins alone
             "Serial",
             "warn",
             f"{port}: not allowed",
             f"sudo usermod -aG {_group(device)} $USER, then log in anew",
         )
     if busy := holders(device):
+        # it opens every port of a new modem by itself, and reads away the answers to ours
         stop = "sudo systemctl stop ModemManager" if any("ModemManager" in name for name in busy) else "stop it"
         return Check("Serial", "warn", f"{port}: held by {', '.join(busy)}", stop)
     return Check("Serial", "ok", port)
@@ -263,6 +274,7 @@ def serial_check(device: str, description: str = "") -> Check:
 
 def _group(device: str) -> str:
     try:
+        # dialout on Debian, uucp on Arch: the owner says which
         return Path(device).group()
     except (OSError, KeyError, NotImplementedError):
         return "dialout"

@@ -11,6 +11,7 @@ from ..common.counting import counted
 from ..common.errors import UsageError
 from ..common.units import FloatArray, unmasked
 
+# Below any sum of squares that data give: where all vanishes, a quotient is 0 and not NaN.
 TINY = 1e-300
 
 
@@ -143,10 +144,12 @@ class _Projection:
 
     def double(self) -> FloatArray:
         """Logarithms of the two best rates, the faster first."""
+        # on the paper's bins neighbouring rates differ by a factor of 1.5
         axis = np.linspace(*self.log_rates, 48)
         first, second = np.triu_indices(len(axis), 1)
         grid = np.column_stack([axis[second], axis[first]])
         cost = (self.amplitudes(grid)[1] ** 2).sum(axis=1)
+        # roughly from each start, to the last digit from the best alone
         refined = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(cost)[:STARTS]])
         valley = refined[np.argmin((self.amplitudes(refined)[1] ** 2).sum(axis=1))]
         return np.sort(self._search(valley, 1e-15))[::-1]
@@ -168,6 +171,7 @@ class _Projection:
 
     def _slopes(self, log_rates: FloatArray) -> FloatArray:
         """Central differences (n, 2) of the residuals over the logarithms of the rates, all at once."""
+        # about the cube root of float64's precision: the step of least error of a central difference
         steps = 1e-5 * np.eye(2)
         ahead, behind = self.amplitudes(log_rates + np.stack([steps, -steps]))[1]
         return np.asarray((ahead - behind).T / 2e-5)
@@ -193,6 +197,7 @@ class _Projection:
 
     def result(self, log_rate: float, message: str) -> BiExponential:
         """One exponential as a degenerate pair: c1 = 0."""
+        # with c1 = 0 any c2 gives the same curve; this one keeps c2 <= c4
         rate = -float(np.exp(log_rate))
         rmse = float(np.sqrt(self._single_cost(log_rate) / len(self.d)))
         return BiExponential(
@@ -207,6 +212,7 @@ class _Projection:
         cost_single = self._single_cost(single)
         c1, c3 = (float(a) for a in amplitude)
         c2, c4 = (-float(rate) for rate in np.exp(log_rates))
+        # where both curves meet every point the ratio must be 1, not 0 by 0
         scale = 1e-20 * float((self.y**2).sum())
         # Bayesian information criterion: two more coefficients must pay for themselves
         gain = n * np.log((cost_single + scale) / (cost + scale)) - 2 * np.log(n)
@@ -215,6 +221,7 @@ class _Projection:
             reasons.append("one exponential describes the data as well (BIC)")
         if min(abs(c1), abs(c3)) < 1e-3 * max(abs(c1), abs(c3), 1e-300):
             reasons.append("one of the two amplitudes vanishes")
+        # rates within 5 %: one exponential in two parts
         if log_rates[0] - log_rates[1] < 0.05:
             reasons.append("the two rates coincide")
         if log_rates[0] > self.log_rates[1] - 1e-3:
@@ -240,6 +247,7 @@ def _candidate_amplitudes(basis: FloatArray, target: FloatArray) -> FloatArray:
     none, slope = np.zeros_like(p), _clipped(p - q + c - b, a - 2 * b + c)
     edges = [(none, _clipped(q, c)), (_clipped(p, a), none), (slope, 1.0 - slope)]
     determinant = a * c - b * b
+    # equal rates make both columns one: any split of the amplitude is as good
     regular = determinant > 1e-14 * a * c + TINY
     safe = np.where(regular, determinant, 1.0)
     first, second = (c * p - b * q) / safe, (a * q - b * p) / safe

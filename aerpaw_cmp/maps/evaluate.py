@@ -59,6 +59,7 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
         raise UsageError(f"values of shape {truth.shape}, estimates of shape {guess.shape}")
     known = np.isfinite(truth)
     scored = known & np.isfinite(guess)
+    # NaN times zero is NaN: what does not count must leave the sums before they are made
     error = np.where(scored, guess - np.where(known, truth, 0.0), 0.0)
     n = scored.sum(axis=0)
 
@@ -110,6 +111,7 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     if not block_m > 0:
         raise UsageError(f"blocks of {block_m} m", expected="a positive length")
     points = unmasked(points_m)
+    # a position on a seam must not change its block by rounding
     cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / block_m + 1e-9).astype(np.int64)
     _, block = np.unique(cell, axis=0, return_inverse=True)
     data = unmasked(values)
@@ -117,6 +119,7 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     estimate = np.full_like(flat, np.nan)
     for number in np.unique(block):
         test = block.ravel() == number
+        # one block that holds everything leaves nothing to learn from: it stays unscored
         if not test.all():
             estimate[test], _ = model.fit(points[~test], flat[~test]).predict(points[test])
     return score(data, estimate.reshape(data.shape))

@@ -68,6 +68,7 @@ class MapLayers:
         """Longitude and latitude (n, 2) [deg] of points east and north, to 1 cm."""
         points = np.asarray(points_m, dtype=np.float64)
         latitude, longitude = self.frame.to_geographic(points[:, 0], points[:, 1])
+        # 1e-7 degrees are 11 mm of latitude
         return np.asarray(np.round(np.column_stack([longitude, latitude]), 7), dtype=np.float64)
 
     def towers_of(self, border: Border) -> list[str]:
@@ -92,6 +93,7 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
         "longitude_deg": np.round(longitude, 9),
         **{layer.name: layer.values for layer in maps.layers},
     }
+    # names of towers may be a stranger's, and a spreadsheet runs a cell that begins with =
     target = Path(path)
     guarded(pd.DataFrame(table)).to_csv(target, index=False, lineterminator="\n")
     return target
@@ -108,6 +110,7 @@ def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and r
         kml.folder(
             layer.title,
             f"legends/{layer.name}.png",
+            # KML writes alpha, blue, green, red: c0 lets a quarter of the imagery through
             f"<GroundOverlay><name>map</name><visibility>{int(number == 0)}</visibility><color>c0ffffff</color>"
             f"<Icon><href>maps/{layer.name}.png</href></Icon><LatLonBox>{box}</LatLonBox></GroundOverlay>",
             visible=number == 0,
@@ -163,11 +166,13 @@ def _colours(layer: Layer, low: float, high: float) -> AnyArray:
         colours = to_rgba_array(_class_palette(layer))
         return np.where((number == 0)[:, None] & (layer.classes[0] == "Z"), grey, colours[number])
     values = np.asarray(layer.values, dtype=np.float64)
+    # a ratio to a singular value of zero is infinite: the top of the scale, not a hole in the map
     share = np.clip((np.nan_to_num(values, nan=low, posinf=high, neginf=low) - low) / (high - low), 0, 1)
     return np.where(np.isnan(values)[:, None], grey, colormaps["viridis"](share))
 
 
 def _class_palette(layer: Layer) -> list[str]:
+    # the first colour is the grey of Z: no class with a channel may have it
     start = 0 if layer.classes[0] == "Z" else 1
     return [CLASS_COLOURS[start + i % (len(CLASS_COLOURS) - start)] for i in range(len(layer.classes))]
 

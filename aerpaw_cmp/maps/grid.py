@@ -18,6 +18,7 @@ from ..common.units import AnyArray, FloatArray, IntArray, unmasked
 # Horizontal interval d_rx of the UAV positions.
 PAPER_SPACING_M = 30.0
 
+# A digit too few in the spacing would ask for 1e8 positions and days of replays.
 _MAXIMUM_CELLS_A_SIDE = 10_000
 
 # How plots and tables name a position without any path.
@@ -82,6 +83,7 @@ class Grid:
                     expected=f"at most {_MAXIMUM_CELLS_A_SIDE}",
                     cause="a spacing with too few digits",
                 )
+            # what is left over is shared by both sides: the grid stays in the middle of the area
             axes.append((low + high) / 2 + spacing_m * (np.arange(cells) - (cells - 1) / 2))
         return cls(np.asarray(axes[0], dtype=np.float64), np.asarray(axes[1], dtype=np.float64), float(spacing_m))
 
@@ -105,6 +107,7 @@ class Grid:
     @property
     def points_m(self) -> FloatArray:
         """Positions (n, 2), east and north [m], in index order."""
+        # north is the slow axis: the paper counts along a row from west to east, then goes north
         north, east = np.meshgrid(self.north_m, self.east_m, indexing="ij")
         return np.column_stack([east.ravel(), north.ravel()])
 
@@ -125,6 +128,7 @@ class Grid:
         column = np.floor((points[..., 0] - self.east_m[0]) / self.spacing_m + 0.5)
         row = np.floor((points[..., 1] - self.north_m[0]) / self.spacing_m + 0.5)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        # outside, row and column may be NaN, which no integer is
         return np.where(inside, np.where(inside, row, 0) * columns + np.where(inside, column, 0), -1).astype(np.int64)
 
 
@@ -193,6 +197,7 @@ def _bisector_segment(
     """Part (2, 2) of the bisector of towers a and b that is their border, or None."""
     between = towers[b] - towers[a]
     length = float(np.hypot(*between))
+    # two towers on one mast have no bisector
     if length < 1e-6:
         return None
     middle = (towers[a] + towers[b]) / 2
@@ -207,6 +212,7 @@ def _bisector_segment(
             bounds.append(float(towers[c] @ towers[c] - towers[a] @ towers[a] - 2 * middle @ (towers[c] - towers[a])))
     low, high = -np.inf, np.inf
     for slope, bound in zip(slopes, bounds, strict=True):
+        # the bisector runs along this bound: all of it is inside, or none
         if abs(slope) < 1e-12:
             if bound < 0:
                 return None
@@ -214,6 +220,7 @@ def _bisector_segment(
             high = min(high, bound / slope)
         else:
             low = max(low, bound / slope)
+    # three areas that meet in a point: a corner, no border
     if high - low < 1e-9:
         return None
     return np.stack([middle + low * along, middle + high * along])

@@ -32,6 +32,7 @@ from .kriging import coverage_patterns
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+# Targets whose samples are stacked at once; bounds the memory.
 CHUNK = 512
 
 
@@ -74,11 +75,13 @@ def makima(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
 
 def _makima_tangents(slope: FloatArray) -> FloatArray:
     """Tangents (..., m, fields) from slopes (..., m - 1, fields), m >= 3."""
+    # Akima's two further slopes at each end: those of a parabola through the last samples
     before = 2 * slope[..., :1, :] - slope[..., 1:2, :]
     after = 2 * slope[..., -1:, :] - slope[..., -2:-1, :]
     padded = np.concatenate(
         [2 * before - slope[..., :1, :], before, slope, after, 2 * after - slope[..., -1:, :]], axis=-2
     )
+    # the term with the sum is MATLAB's: Akima's own weights overshoot where data turn flat
     weight = np.abs(np.diff(padded, axis=-2)) + np.abs(padded[..., 1:, :] + padded[..., :-1, :]) / 2
     left, right = weight[..., 2:, :], weight[..., :-2, :]
     total = left + right
@@ -131,12 +134,14 @@ def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
         right[..., end, :] = (
             (near + 2 * span)[..., None] * far[..., None] * slope[..., a, :] + near[..., None] ** 2 * slope[..., b, :]
         ) / span[..., None]
+    # dense, since NumPy solves a stack of small systems at once and SciPy's banded solver one at a time
     return np.asarray(np.linalg.solve(system, right))
 
 
 def _hermite(x: FloatArray, y: FloatArray, tangent: FloatArray, at: FloatArray) -> FloatArray:
     """Piecewise cubic Hermite at one abscissa per row; the end pieces continue outside."""
     m = x.shape[-1]
+    # clipped: beyond the data the end piece is continued, as interp1 with 'extrap' does
     piece = np.clip((x <= at[..., None]).sum(axis=-1) - 1, 0, m - 2)[..., None]
     left, right = np.take_along_axis(x, piece, -1), np.take_along_axis(x, piece + 1, -1)
     low, high = piece[..., None], piece[..., None] + 1
@@ -144,6 +149,7 @@ def _hermite(x: FloatArray, y: FloatArray, tangent: FloatArray, at: FloatArray) 
     t0, t1 = np.take_along_axis(tangent, low, -2)[..., 0, :], np.take_along_axis(tangent, high, -2)[..., 0, :]
     h = right - left
     u = (at[..., None] - left) / h
+    # by differences from the left sample, so that equal samples come back to the last digit
     rise = y1 - y0
     return np.asarray(y0 + u * (h * t0 + u * (3 * rise - h * (2 * t0 + t1) + u * (h * (t0 + t1) - 2 * rise))))
 
@@ -283,6 +289,7 @@ class InverseDistance(_Local):
         ratio = near.distance_m[:, :1] / np.where(at, 1.0, near.distance_m)
         weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**2)
         weight /= weight.sum(axis=1, keepdims=True)
+        # relative to one sample, so that equal values stay equal
         first = near.values[:, :1]
         return np.asarray(first[:, 0] + (weight[:, :, None] * (near.values - first)).sum(axis=1))
 
@@ -309,6 +316,7 @@ class ServingTowerMean:
         towers = len(np.asarray(self.towers_m))
         self.total_ = np.zeros((towers, self.values_.shape[1]))
         self.count_ = np.zeros_like(self.total_)
+        # not +=, which adds once where an index repeats
         np.add.at(self.total_, self.tower_, np.where(finite, self.values_, 0.0))
         np.add.at(self.count_, self.tower_, finite)
         return self

@@ -30,10 +30,13 @@ from .grid import (
     voronoi_borders,
 )
 
+# Section VII: ranks at 3 m as well, to highlight what blocks there; levels at three of the other heights.
 PAPER_RSS_ALTITUDES_M = (30.0, 70.0, 110.0)
 PAPER_RANK_ALTITUDES_M = (3.0, *(float(h) for h in range(30, 111, 10)))
 PAPER_KS = (10.0, 100.0, 1000.0)
+# Positions of one call: H of five towers with 4 x 4 elements takes 2.6 MB of them.
 CHUNK = 2048
+# Four elements at each end of the paper's maps: no matrix of theirs has more.
 HIGHEST_RANK = 4
 # Largest ratio of singular values that is drawn and exported: values below 1e-9 of the largest are rounding.
 RATIO_LIMIT_DB = 180.0
@@ -132,6 +135,7 @@ class MapResult:
             if tower not in self.tower_names:
                 raise UsageError(f"unknown tower {tower!r}", expected=f"one of {', '.join(self.tower_names)}")
             return np.asarray(values[..., self.tower_names.index(tower), :])
+        # both indices are arrays of positions: each takes the value of its own serving tower
         return np.asarray(values[..., self.serving, np.arange(len(self.grid))])
 
 
@@ -176,10 +180,12 @@ def map_job(
     at = {"rss": tuple(map(float, rss_altitudes_m)), "rank": tuple(map(float, rank_altitudes_m))}
     t, n = len(names), len(grid)
     rss = np.full((3, len(at["rss"]), t, n), np.nan)
+    # zero is out of coverage, so what no engine fills in has no channel
     rank = np.zeros((len(at["rank"]), len(ks), t, n), dtype=np.int8)
     ratio = np.full((2, len(at["rank"]), t, n), np.nan)
     heights = sorted({*at["rss"], *at["rank"]})
     for step, height in enumerate(heights):
+        # height by height: the engine's memory is that of one, however many there are
         positions = grid.positions_m(height)
         for start in range(0, n, chunk):
             part = slice(start, min(start + chunk, n))
@@ -189,6 +195,7 @@ def map_job(
                 rss[:, row, :, part] = np.stack(evaluated.levels).swapaxes(1, 2)
             if height in at["rank"]:
                 row = at["rank"].index(height)
+                # from (position, tower, K) to (K, tower, position)
                 rank[row, :, :, part] = np.moveaxis(
                     rank_of_singular_values(evaluated.singular_values, ks), (0, 1, 2), (2, 1, 0)
                 )
@@ -223,8 +230,10 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
     """sigma_1 / sigma_2 and sigma_1 / sigma_last (2, n, t) [dB]."""
     sigma = np.nan_to_num(singular_values)
     covered = sigma[..., 0] > 0
+    # one element at an end: there is no second value, and the ratio of the first to itself is 1
     if sigma.shape[-1] < 2:
         return np.where(covered, 0.0, np.full((2, *covered.shape), np.nan))
+    # a later value of zero stays: its ratio is infinite, which plots and files cut at RATIO_LIMIT_DB
     strongest = db_from_power(np.where(covered, sigma[..., 0], 1.0) ** 2)
     return np.stack([np.where(covered, strongest - db_from_power(sigma[..., i] ** 2), np.nan) for i in (1, -1)])
 
@@ -255,6 +264,7 @@ def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDiffere
     return FoliageDifference(
         clear - shaded,
         np.isfinite(clear) & ~np.isfinite(shaded),
+        # a link that foliage takes away is counted in ``lost``: as a fall to rank 0 it would count twice
         np.where((before > 0) & (after > 0), after - before, 0),
     )
 
@@ -300,9 +310,11 @@ def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
 
 def _label(tower: str | None) -> tuple[str, str]:
     """Give the parts of a layer's name and title that speak of a tower."""
+    # names of layers become columns, files in the KMZ and variables of NetCDF
     return (re.sub(r"\W", "_", tower), f", {tower}") if tower else ("joint", ", nearest tower")
 
 
 def _in_name(number: float, digits: int = 3) -> str:
     """030 for 30, 12p5 for 12.5."""
+    # padded with zeros, so that layers sorted by name are sorted by height
     return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")

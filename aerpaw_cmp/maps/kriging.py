@@ -44,6 +44,7 @@ from . import neighbours as choose
 # Correlation as a function of distance [m]; vectorised.
 Correlation = Callable[[FloatArray], FloatArray]
 
+# Of float64's sixteen digits a solution then keeps six.
 CONDITION_LIMIT = 1e10
 # Sum of magnitudes beyond which an estimate is said to be doubtful; correlations that fall from 0 on stay below 3.
 LARGEST_WEIGHTS = 100.0
@@ -165,6 +166,7 @@ class OrdinaryKriging:
             )
         if np.isinf(fields).any():
             raise UsageError("an infinite sample value", expected="finite values, NaN where out of coverage")
+        # remembered, so that estimates come back in the shape that the values had
         self._one_field = fields.ndim == 1
         fields = fields[:, None] if self._one_field else fields
         self.points_m_, self.values_, self.place_ = _merge_places(points, fields)
@@ -226,6 +228,7 @@ class OrdinaryKriging:
         """Estimate and variance (targets, fields); ``place`` is the one that each target must not use."""
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
         variance = np.full_like(estimate, np.nan)
+        # fields with values at the same places share one set of weights, as the 27 ranks of a map do
         for covered, columns in coverage_patterns(self.values_):
             skip = None if place is None else choose.renumbered(covered)[place]
             rule = self._weights(self.points_m_[covered], targets, skip)
@@ -249,6 +252,7 @@ class OrdinaryKriging:
         order, coordinates = choose.in_strips(targets, CHUNK), np.ascontiguousarray(samples.T)
         for m in np.unique(count[count > 0]):
             same = order[count[order] == m]
+            # asked anew for each m: the work of a system grows with its cube
             kernels = triangles_for(len(same), m)
             for start in range(0, len(same), CHUNK):
                 rows = same[start : start + CHUNK]
@@ -282,6 +286,7 @@ class OrdinaryKriging:
         gamma = 1.0 - np.asarray(self.correlation(np.sqrt(square)), dtype=np.float64)
         if not np.isfinite(gamma).all():
             raise UsageError("the correlation is not finite at some distance", expected="a number at every distance")
+        # a correlation above 1, by rounding or by its author, counts as 1
         return np.asarray(np.maximum(gamma, 0.0))
 
     def _between(self, samples: FloatArray, near: IntArray) -> Callable[[slice], FloatArray]:
@@ -293,6 +298,7 @@ class OrdinaryKriging:
         number = np.zeros(len(samples), dtype=np.int64)
         number[near] = 1
         used = np.flatnonzero(number)
+        # a table of all pairs would be larger than what is asked of it
         if len(used) ** 2 > len(first) * near.shape[1]:
             places = samples.T[:, near]
             return lambda some: self._semivariance(places[:, :, some][:, second] - places[:, :, some][:, first])
@@ -322,6 +328,7 @@ class OrdinaryKriging:
                 hard = start + np.flatnonzero(~sound)
                 w, v, r = _solve_doubtful(_square(between[:, ~sound], m), right.T[~sound])
                 weight[:, hard], variance[hard], regularised[hard] = w.T, v, r
+        # beside a sample the true variance is 0, and rounding lies on either side of it
         variance = np.maximum(variance, 0.0)
         at = here.any(axis=0)  # the solution is known there; rounding must not blur it
         weight[:, at], variance[at] = here[:, at], 0.0
@@ -354,11 +361,13 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
     """
     m, t = to_target.shape
     factor, inverse = np.empty((m + 2, m, t)), np.zeros((m, m, t))  # two rows more: L^-1 c and L^-1 1
+    # a slice of ``gamma`` is one column of the lower triangle, in the order of _between
     end = 0
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # NaN where C is no covariance
         for j in range(m):
             start, end = end, end + m - 1 - j
             column, known = factor[j:, j], factor[j, :j]
+            # C has ones on its diagonal; the last row is the right-hand side of ones
             column[0] = column[-1] = 1.0
             np.subtract(1.0, gamma[start:end], out=column[1:-2])
             np.subtract(1.0, to_target[j], out=column[-2])
@@ -370,6 +379,7 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
         of_target, of_ones = factor[m], factor[m + 1]
         multiplier = (1.0 - (of_target * of_ones).sum(axis=0)) / (of_ones**2).sum(axis=0)
         weight = np.einsum("kit,kt->it", inverse, of_target + multiplier * of_ones)
+        # they add up to 1 by construction: this takes out rounding alone
         weight /= weight.sum(axis=0)
         sound = m * np.einsum("kit,kit->t", inverse, inverse) < SOUND_CONDITION
         return weight, (weight * to_target).sum(axis=0) + multiplier, sound
@@ -379,6 +389,7 @@ def _solve_doubtful(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArra
     """Weights (t, m), normalised variance (t,), near-singular flag (t,) of systems (t, m, m) that may be singular."""
     weight, lagrange, fine = _solve_bordered(gamma, to_target)
     variance = (weight * to_target).sum(axis=1) + lagrange
+    # a covariance gives no negative variance; what lies below by more than rounding shows that it is none
     fine &= (variance >= -1e-9) & _is_definite(gamma)
     if not fine.all():
         weight[~fine] = _solve_reduced(gamma[~fine], to_target[~fine])
@@ -403,8 +414,10 @@ def _solve_bordered(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArra
         # one singular system fails the whole batch; the reduced form serves all of it
         return np.zeros((t, m)), np.zeros(t), np.zeros(t, dtype=bool)
     with np.errstate(all="ignore"):  # what overflows here is not fine, and is solved again
+        # in the 1-norm, the largest column sum, which costs no decomposition
         condition = np.abs(system).sum(axis=1).max(axis=1) * np.abs(inverse).sum(axis=1).max(axis=1)
         solution = inverse @ right
+        # one step of refinement gives back digits that an explicit inverse loses
         solution += inverse @ (right - system @ solution)
     fine = condition < CONDITION_LIMIT
     return solution[:, :m, 0], solution[:, m, 0], fine
@@ -421,9 +434,11 @@ def _solve_reduced(gamma: FloatArray, to_target: FloatArray) -> FloatArray:
     spread = _contrasts(gamma)
     right = basis @ (gamma.mean(axis=2) - to_target)[:, :, None]
     level, direction = np.linalg.eigh((spread + spread.transpose(0, 2, 1)) / 2)
+    # a direction weaker than the most negative one, an impossible variance, is not told from error
     strong = level > np.maximum(np.maximum(level[:, -1:], 1e-300) / CONDITION_LIMIT, -level[:, :1])
     along = (direction.transpose(0, 2, 1) @ right)[:, :, 0]
     along = np.where(strong, along / np.where(strong, level, 1.0), 0.0)
+    # the equal weights solve the constraint; the basis holds what may be added without breaking it
     return np.asarray(1.0 / m + (direction @ along[:, :, None])[:, :, 0] @ basis)
 
 
@@ -458,6 +473,7 @@ def _apply(rule: Weights, values: FloatArray) -> FloatArray:
 
     used = rule.index >= 0
     start = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
+    # sparse: each target uses some 20 of thousands of samples
     matrix = csr_array((rule.weight[used], rule.index[used], start), shape=(len(used), len(values)))
     # relative to one value of the field: a constant field comes back exactly although weights sum to 1 +- 1e-16
     reference = _reference(values)
@@ -489,6 +505,7 @@ def coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]
 def _merge_places(points: FloatArray, fields: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
     """Distinct places in order of appearance, mean of their values, and the place of each sample."""
     _, first, place = np.unique(np.round(points / choose.TIE_M), axis=0, return_index=True, return_inverse=True)
+    # np.unique sorts by coordinate; places stay in the order in which their samples came
     order = np.argsort(first)
     rank = np.empty_like(order)
     rank[order] = np.arange(len(order))
@@ -512,6 +529,7 @@ def _same_geometry(offset_m: FloatArray) -> tuple[IntArray | slice, IntArray | s
     alone = slice(None), slice(None)
     if len(np.unique(np.round(offset_m[:, 0].sum(axis=0) / choose.TIE_M))) == t:
         return alone  # scattered samples: seen at a tenth of the cost
+    # integers compare exactly, and a nanometre takes up the rounding of coordinates of kilometres
     offset = np.round(offset_m.reshape(-1, t) / _SHARE_M).astype(np.int64)
     # one number tells a target: the sum with random odd factors, modulo 2^64
     factors = np.random.default_rng(0).integers(1, 2**62, len(offset), dtype=np.int64) | 1

@@ -74,6 +74,7 @@ def nearest(
     if len(samples_m) == 0 or len(targets_m) == 0:
         return chosen
     tree = cKDTree(samples_m)
+    # one more than wanted: only its distance tells whether a tie goes on beyond the last
     least = m + 1 + (skip is not None)
     candidates = least
     order = in_strips(targets_m, CHUNK)
@@ -142,10 +143,12 @@ def _fill_nearest(
     """Fill the rows ``todo`` from so many ``candidates``; the rows for which a tie reaches the last candidate."""
     samples_m, m = tree.data, chosen.index.shape[1]
     candidates = min(candidates, len(samples_m))
+    # a list of ranks, for a plain 1 would drop an axis; the bound itself would be left out by the tree
     distance, who = tree.query(targets_m[todo], k=np.arange(1, candidates + 1), distance_upper_bound=radius_m + TIE_M)
     last = _in_micrometres(distance[:, -1])
     exhausted = (candidates == len(samples_m)) | ~np.isfinite(last)
     if skip is not None:
+        # asked for and taken out, for a tree without it would have to be built for every target
         excluded = who == skip[todo, None]
         distance[excluded] = np.inf
         # the sample left out goes to the end, the order of the others stays
@@ -155,6 +158,7 @@ def _fill_nearest(
     tied = (ring[:, 1:] == ring[:, :-1]) & np.isfinite(ring[:, 1:])
     rows = np.flatnonzero(tied.any(axis=1))
     if len(rows):
+        # where there is no further neighbour the tree answers with the number of samples, which is no row
         numbers = np.where(np.isfinite(distance[rows]), who[rows], 0)
         order = _tie_order(distance[rows], numbers, samples_m, targets_m[todo[rows]])
         distance[rows], who[rows] = (np.take_along_axis(a[rows], order, axis=1) for a in (distance, who))
@@ -215,6 +219,7 @@ def _random_within(
     for start in range(0, len(targets_m), AT_ONCE):
         part = slice(start, start + AT_ONCE)
         pairs = cKDTree(targets_m[part]).sparse_distance_matrix(tree, radius_m + TIE_M, output_type="ndarray")
+        # the tree's own order may change with its version, and a draw must not
         pairs = pairs[np.lexsort((pairs["j"], pairs["i"]))]
         target, sample, far = pairs["i"], pairs["j"], pairs["v"]
         # one number per pair in a fixed order: the stream does not depend on the chunk
@@ -224,6 +229,7 @@ def _random_within(
             target, sample, far, draw = target[keep], sample[keep], far[keep], draw[keep]
         order = np.lexsort((draw, target))
         target, sample, far = target[order], sample[order], far[order]
+        # the place of each pair in the run of its target
         rank = np.arange(len(target)) - np.searchsorted(target, target)
         drawn = rank < m
         index[start + target[drawn], rank[drawn]] = sample[drawn]

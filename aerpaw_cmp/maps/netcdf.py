@@ -84,6 +84,7 @@ def maps_dataset(
     for layer in further:
         plane = first.grid.raster(np.asarray(layer.values))
         if layer.classes:
+            # rank_1, not 1: beside flag_values a bare number would be taken for a value
             codes = tuple(f"rank_{c}" if c.isdigit() else c for c in layer.classes)
             variables[layer.name] = _PLANE, plane.astype(np.int8), _codes(codes, layer.title)
         else:
@@ -103,6 +104,7 @@ def maps_dataset(
 
 
 def _text(dimension: str, names: Mapping[str, Any] | Sequence[str], meaning: str) -> _Variable:
+    # objects become strings of variable length; an array of characters would need an axis of its own
     return (dimension,), np.array(list(names), dtype=object), {"long_name": meaning}
 
 
@@ -128,6 +130,7 @@ def _places(maps: MapResult, frame: SiteFrame) -> dict[str, _Variable]:
     for name, degrees, unit in (("latitude", latitude, "degrees_north"), ("longitude", longitude, "degrees_east")):
         attributes = {"standard_name": name, "long_name": f"WGS84 {name}", "units": unit}
         variables[name] = _PLANE, maps.grid.raster(degrees), attributes
+    # an attribute of NetCDF cannot be null
     crs = {name: value for name, value in site_crs(frame).to_cf().items() if value is not None}
     variables["crs"] = (), np.array(0, dtype=np.int32), {**crs, "long_name": "site frame"}
     serving = _codes(maps.tower_names, "nearest tower, which serves here")
@@ -192,7 +195,9 @@ def _stacked(
         Dimensions, values, attributes.
     """
     joint = "tower" not in between
+    # the last axis, positions in index order, as y and x
     planes = np.stack([v.reshape(*v.shape[:-1], *m.grid.shape) for m, v in zip(maps.values(), values, strict=True)])
+    # levels as float32 hold 0.01 dB exactly enough and halve the file
     numbers = planes.astype(np.int8) if "flag_values" in attributes else np.round(planes, 2).astype(np.float32)
     described = {
         **attributes,

@@ -74,6 +74,7 @@ class TileStore:
                 "zarr is not installed, and a map in tiles is a Zarr store",
                 expected="pip install 'aerpaw-cmp[geo]' with Python 3.11 or newer, or a larger --spacing",
             ) from None
+        # through JSON and back: as it will be read again, where tuples are lists
         self.path, self.tiling, self._zarr, self._job = path, tiling, zarr, json.loads(json.dumps(job))
         self._force, self.damaged = force, 0
 
@@ -115,12 +116,14 @@ class TileStore:
                     shutil.rmtree(self.path, ignore_errors=True)
                 raise
             missing = [number for number in range(len(self.tiling)) if not self._is_kept(number)]
+            # r+ makes nothing and removes nothing
             self._group = self._zarr.open_group(self.path, mode="r+", zarr_format=3)
         return missing
 
     def _skeleton(self, like: Any) -> dict[str, bytes]:
         """The files of a store without tiles, by their names below its folder; its own metadata first."""
         grid, tiles = self.tiling.grid, self.tiling.shape
+        # made in memory first: Zarr itself then opens no folder that a stranger may have filled
         files: dict[str, Any] = {}
         memory = self._zarr.storage.MemoryStore(files)
         self._planes = [name for name, variable in like.variables.items() if {"y", "x"} <= {*variable.dims}]
@@ -233,6 +236,7 @@ class TileStore:
         digest = hashlib.sha256()
         for name, place in self._chunks(number):
             content = place.read_bytes() if place.exists() else b""
+            # with its length, so that bytes cannot move from one chunk into the next unseen
             digest.update(f"{name} {len(content)} ".encode() + content)
         return digest.digest()
 
@@ -274,6 +278,7 @@ class TileStore:
             self._group[_PATHS][divmod(number, self.tiling.shape[1])] = paths
             entry = self._entry(number)
             entry.parent.mkdir(parents=True, exist_ok=True)
+            # last: a tile is there when its entry is, and a run killed before computes it again
             write_whole(entry, self._digest(number))
 
     def read(self, empty: Mapping[str, MapResult], step: int) -> dict[str, MapResult]:

@@ -15,6 +15,7 @@ from .interpolate import IndexInterpolation, InverseDistance, ServingTowerMean
 from .job import MapResult
 from .kriging import OrdinaryKriging
 
+# The paper's nine altitudes of interpolation begin here; its 3 m are for blockage alone.
 LOWEST_M = 30.0
 
 
@@ -82,12 +83,14 @@ def interpolation_study(
         The correlation and its fit, scores of every interpolator.
     """
     points = grid.points_m
+    # bins as wide as the grid's step, as the paper's are: narrower ones would be empty
     correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m)
     fit = _curve(correlation)
     models: dict[str, evaluate.Predictor] = {
         "Kriging": OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed),
         "makima": IndexInterpolation("makima", grid, neighbours, radius_m, selection=selection, seed=seed),
         "spline": IndexInterpolation("spline", grid, neighbours, radius_m, selection=selection, seed=seed),
+        # of one sample the weight is 1 at any distance
         "nearest": InverseDistance(1, radius_m),
         "inverse distance": InverseDistance(neighbours, radius_m),
         "serving-tower mean": ServingTowerMean(towers_m),
@@ -99,5 +102,6 @@ def interpolation_study(
 def _curve(correlation: variogram.BinnedCorrelation) -> variogram.BiExponential:
     if np.isfinite(correlation.correlation[1:]).any():
         return variogram.fit_biexponential(correlation.distance_m, correlation.correlation)
+    # Kriging needs some curve, and says that it is not one of these data
     reason = "no two positions have varying rank vectors: the paper's curve stands in"
     return replace(variogram.PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)

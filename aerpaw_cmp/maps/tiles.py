@@ -164,6 +164,7 @@ class Reach:
         at, tile = tower.position_m[:2], _box(box_m[:, :2])
         lines = [shapely.linestrings(np.vstack([at, tile])[None])]
         if self._depth:
+            # walls alone: seen from above, a path over ground or roof lies on the line between its ends
             lit = self._mirrors.toward(tower.position_m, box_m)
             lit = lit[self._is_wall[lit]]
             lines += [self._way_in(at, lit), self._way_out(at, lit, tile)]
@@ -186,6 +187,7 @@ class Reach:
         image = at - 2.0 * height[:, None] * normal
         slack = along * (NEAR_M / length)[:, None]
         ray = np.stack([ends[:, 0] - slack, ends[:, 1] + slack], axis=1) - image[:, None]
+        # far behind the tile's farthest corner: the beam's far end must not cut into it
         far = 100.0 * np.abs(image[:, None] - tile).sum(axis=2).max(initial=0.0)
         reach = far / np.maximum(np.linalg.norm(ray, axis=2, keepdims=True), NEAR_M)
         beam = shapely.polygons(np.concatenate([image[:, None] + ray, (image[:, None] + ray * reach)[:, ::-1]], axis=1))

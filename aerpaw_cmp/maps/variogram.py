@@ -34,10 +34,13 @@ from .biexponential import fit_biexponential as fit_biexponential
 # Positions per block of the pair products; bounds the memory to BLOCK x positions.
 BLOCK = 256
 
+# Bins as wide as d_rx (section VI-A), and distances up to 500 m (section VII-C).
 _PAPER_WIDTH_M = 30.0
 _PAPER_MAXIMUM_M = 500.0
+# The paper's step between altitudes.
 _HEIGHT_BIN_M = 10.0
 # Fewest components that a pair of positions must share where some are missing.
+# Of two any pair correlates by plus or minus 1.
 _MINIMUM_COMMON = 3
 
 
@@ -101,6 +104,7 @@ def vector_correlation(
     constant = ~lacking & _is_constant(data, present)
     varying = ~(lacking | constant)
     if present[varying].all():
+        # without gaps one product of unit vectors gives all correlations of a block
         unit = data[varying] - data[varying].mean(axis=1, keepdims=True)
         unit /= np.sqrt((unit**2).sum(axis=1, keepdims=True))
         bins = _bin_pairs(
@@ -180,6 +184,7 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
         excluded += int((~usable).sum())
         table = _PairwisePearson(np.where(usable[:, None], rows, np.nan), 2)(np.arange(levels), np.arange(levels))
         value[:, field] = table[first, second]
+    # half-way goes up, as in every bin
     n = int(np.floor(gap.max(initial=0.0) / _HEIGHT_BIN_M + 0.5)) + 1
     sums = _Sums(n, _HEIGHT_BIN_M)
     sums.add(np.repeat(gap, fields), value.ravel())
@@ -267,8 +272,10 @@ class _PairwisePearson:
         vary_x = square_x - sum_x**2 / safe
         vary_y = square_y - sum_y**2 / safe
         covary = x @ y - sum_x * sum_y / safe
+        # a variance this small beside the squares it is a difference of is their rounding
         good = (n >= self.minimum_common) & (vary_x > 1e-12 * square_x) & (vary_y > 1e-12 * square_y)
         scale = np.sqrt(np.where(good, vary_x * vary_y, 1.0))
+        # rounding takes equal vectors beyond 1
         return np.where(good, np.clip(covary / scale, -1.0, 1.0), np.nan)
 
 
@@ -322,6 +329,7 @@ def _bin_pairs(
     if not (width_m > 0 and maximum_m >= width_m and np.isfinite(maximum_m)):
         raise UsageError(f"bins of {width_m} m up to {maximum_m} m", expected="0 < width <= maximum, both finite")
     sums = _Sums(int(np.floor(maximum_m / width_m + 1e-9)) + 1, width_m)
+    # half a bin beyond the last one's middle; the micrometre lets in pairs at exactly that distance
     reach = min(maximum_m, width_m * (len(sums.pairs) - 0.5)) + 1e-6
     for rows, columns in _blocks_within(points, reach):
         distance = np.hypot(
@@ -339,6 +347,7 @@ def _blocks_within(points: FloatArray, reach_m: float) -> Iterator[tuple[IntArra
     north = points[order, 1]
     for start in range(0, len(order), BLOCK):
         rows = order[start : start + BLOCK]
+        # rows of a block lie side by side in north, so their columns are one run
         low = np.searchsorted(north, points[rows, 1].min() - reach_m)
         high = np.searchsorted(north, points[rows, 1].max() + reach_m, side="right")
         yield rows, order[low:high]

@@ -281,46 +281,6 @@ def _kappa(observed: float, first: IntArray, second: IntArray) -> float:
     return (observed - chance) / (1.0 - chance) if chance < 1.0 - 1e-12 else float("nan")
 
 
-def shift_test(measured: ArrayLike, simulated: ArrayLike, *, minimum_shift: int | None = None) -> float:
-    """p-value of the agreement by pose against unrelated sequences of the same memory.
-
-    Parameters
-    ----------
-    measured, simulated : array_like, (n,)
-        In time order. Pairs where one does not exist are left out first.
-    minimum_shift : int, optional
-        Shifts below this (and above n minus this) are too near to the real alignment to be unrelated; by default
-        the longer block length of the two.
-
-    Returns
-    -------
-    float
-        Share of circular shifts that agree at least as well, the real one included. NaN below 8 pairs, where no
-        shift is long enough, or where a sequence is constant (every shift agrees the same).
-
-    Notes
-    -----
-    A circular shift keeps both histograms and both autocorrelations and breaks only the alignment (Harris 2020,
-    arXiv:2012.06862). All shifts at once: one FFT correlation per rank. As the histograms stay, the test of kappa
-    is the same test.
-    """
-    measured_rank, simulated_rank = _pairs(measured, simulated)
-    n = len(measured_rank)
-    if n < 8 or np.ptp(measured_rank) == 0 or np.ptp(simulated_rank) == 0:
-        return float("nan")
-    near = minimum_shift or max(
-        autocorrelation(measured_rank).block_length, autocorrelation(simulated_rank).block_length
-    )
-    near = int(np.clip(near, 1, n // 4))
-    matches = np.zeros(n)
-    for rank in np.intersect1d(measured_rank, simulated_rank):
-        spectrum = np.fft.rfft(measured_rank == rank) * np.conj(np.fft.rfft(simulated_rank == rank))
-        matches += np.fft.irfft(spectrum, n)
-    count = np.round(matches)
-    apart = count[near : n - near + 1]
-    return float((1 + np.sum(apart >= count[0])) / (1 + len(apart)))
-
-
 def histogram_test(measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES) -> float:
     """p-value of the total variation between both histograms, when blocks of the pair are swapped at random.
 
@@ -637,8 +597,8 @@ class RankFit:
         Against the measurement, each with a 95 % interval.
     confusion : (5, 5) int
         Rows measured, columns simulated, 0 first (does not exist).
-    p_agreement, p_histogram : float
-        Of :func:`shift_test` and :func:`histogram_test`.
+    p_histogram : float
+        Of :func:`histogram_test`.
     """
 
     histogram: FloatArray
@@ -653,7 +613,6 @@ class RankFit:
     wasserstein: float
     wasserstein_ci95: Interval
     confusion: IntArray
-    p_agreement: float
     p_histogram: float
 
 
@@ -807,7 +766,6 @@ def compare_ranks(measured: ArrayLike, simulated: ArrayLike, *, replicates: int 
         wasserstein=move,
         wasserstein_ci95=bounds[3],
         confusion=confusion_matrix(measured_rank, simulated_rank),
-        p_agreement=shift_test(measured_rank, simulated_rank),
         p_histogram=histogram_test(measured_rank, simulated_rank, replicates=replicates),
     )
 

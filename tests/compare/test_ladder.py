@@ -15,7 +15,6 @@ from aerpaw_cmp.compare.judge.ladder import (
     log_distance_level_db,
     places_of,
     series_rows,
-    stretches_of,
 )
 
 
@@ -29,6 +28,11 @@ def wave(n, seed, sd=1.0):
     white = np.random.default_rng(seed).normal(size=n + 50)
     kernel = np.exp(-np.arange(50) / 10.0)
     return sd * np.convolve(white, kernel / np.sqrt((kernel**2).sum()), "valid")[:n]
+
+
+def along(count):
+    """Places on a line, one after the other: cells of places are stretches of time."""
+    return np.column_stack([np.arange(float(count)), np.zeros(count)])
 
 
 def planted(n=2000):
@@ -45,7 +49,8 @@ def test_truth_is_best_and_recommended_over_what_adds_nothing():
     truth, measured = planted()
     flat = np.full(len(truth), -80.0)
     useless = truth + wave(len(truth), 8, 0.3)
-    ladder = climb([measured], [np.arange(2000.0)], [rung("flat", flat), rung("truth", truth), rung("more", useless)])
+    ladder = climb([measured], [np.arange(2000.0)], [rung("flat", flat), rung("truth", truth), rung("more", useless)],
+                   [along(2000)])  # fmt: skip
     assert ladder.rungs[ladder.recommended].model == "truth"
     assert ladder.rmse_db[1] == pytest.approx(2.0, abs=0.3)
     rows = ladder_rows(ladder, [("LW1", "A")])
@@ -57,20 +62,20 @@ def test_truth_is_best_and_recommended_over_what_adds_nothing():
 def test_a_worse_model_is_never_recommended_for_being_simple():
     truth, measured = planted()
     worse = truth + wave(len(truth), 5, 3.0)
-    ladder = climb([measured], [np.arange(2000.0)], [rung("worse", worse), rung("truth", truth)])
+    ladder = climb([measured], [np.arange(2000.0)], [rung("worse", worse), rung("truth", truth)], [along(2000)])
     assert ladder.recommended == ladder.best == 1
 
 
 def test_offset_of_a_stretch_comes_from_the_others_only():
     measured, level = np.arange(80.0), np.zeros(80)
-    keep = np.ones(80, dtype=bool)
-    error = held_out_error_db(measured, level, keep)
+    keep, place = np.ones(80, dtype=bool), np.repeat(np.arange(8), 10)
+    error = held_out_error_db(measured, level, keep, place)
     changed = measured.copy()
     changed[:10] += 100.0  # the first stretch
-    again = held_out_error_db(changed, level, keep)
+    again = held_out_error_db(changed, level, keep, place)
     np.testing.assert_allclose(again[:10] - error[:10], 100.0)
-    assert stretches_of(80).tolist() == np.repeat(np.arange(8), 10).tolist()
-    assert held_out_error_db(measured, level + 33.0, keep) == pytest.approx(error)
+    assert places_of(along(80)).tolist() == place.tolist()
+    assert held_out_error_db(measured, level + 33.0, keep, place) == pytest.approx(error)
 
 
 def test_models_are_scored_on_the_samples_that_all_have():
@@ -79,7 +84,8 @@ def test_models_are_scored_on_the_samples_that_all_have():
     holes[100:200] = np.nan
     deaf = np.full(len(truth), np.nan)
     deaf[:50] = -80.0
-    ladder = climb([measured], [np.arange(2000.0)], [rung("truth", truth), rung("holes", holes), rung("deaf", deaf)])
+    ladder = climb([measured], [np.arange(2000.0)], [rung("truth", truth), rung("holes", holes), rung("deaf", deaf)],
+                   [along(2000)])  # fmt: skip
     rows = ladder_rows(ladder, [("LW1", "A")])
     assert [r.n for r in rows] == [1900, 1900, 0]  # a model without levels does not take the samples of the others
     assert not np.isfinite(rows[2].rmse_heldout_db)
@@ -90,13 +96,13 @@ def test_two_channels_share_one_recommendation():
     truth, measured = planted()
     levels = {"flat": np.full(len(truth), -80.0), "truth": truth}
     rungs = [Rung(model=name, level_db=(level, level), seconds=1.0) for name, level in levels.items()]
-    ladder = climb([measured, measured - 20.0], [np.arange(2000.0)] * 2, rungs)
+    ladder = climb([measured, measured - 20.0], [np.arange(2000.0)] * 2, rungs, [along(2000)] * 2)
     rows = ladder_rows(ladder, [("LW1", "A"), ("LW1", "B")])
     assert [(r.channel, r.model) for r in rows if r.recommended] == [("A", "truth"), ("B", "truth")]
 
 
 def test_nothing_measured_recommends_nothing():
-    ladder = climb([np.full(10, np.nan)], [np.arange(10.0)], [rung("flat", np.zeros(10))])
+    ladder = climb([np.full(10, np.nan)], [np.arange(10.0)], [rung("flat", np.zeros(10))], [along(10)])
     assert ladder.recommended is None
     assert ladder_rows(ladder, [("LW1", "A")])[0].n == 0
 
@@ -110,12 +116,13 @@ def test_a_place_that_is_visited_twice_is_left_out_as_a_whole():
     np.testing.assert_array_equal(place[:400], place[400:][::-1])
     level = np.where((position[:, 0] > 400) & (position[:, 0] <= 500), 8.0, 0.0)  # one place alone
     everywhere = np.ones(800, bool)
-    here = held_out_error_db(level, np.zeros(800), everywhere, place=place)[level > 0]
+    here = held_out_error_db(level, np.zeros(800), everywhere, place)[level > 0]
     assert here == pytest.approx(8.0)
     # in stretches of time the way back tells the way out
-    assert held_out_error_db(level, np.zeros(800), everywhere)[level > 0].mean() < 7.5
+    in_time = np.repeat(np.arange(8), 100)
+    assert held_out_error_db(level, np.zeros(800), everywhere, in_time)[level > 0].mean() < 7.5
     ladder = climb([level], [np.arange(800.0)], [Rung(model="m", level_db=(np.zeros(800),), seconds=0.0)],
-                   position_m=[position])  # fmt: skip
+                   [position])  # fmt: skip
     assert ladder.error_db[0][0][level > 0] == pytest.approx(8.0)
     assert len(places_of(np.zeros((3, 2)))) == 3
     assert len(places_of(np.zeros((0, 2)))) == 0
@@ -143,7 +150,7 @@ def test_a_log_distance_line_finds_its_slope_and_is_never_the_recommended_replay
         Rung(model="line", level_db=(zeros,), seconds=0.0, regressor_db=(range_db,)),
         Rung(model="free space", level_db=(-2.0 * range_db,), seconds=0.0),
     ]
-    ladder = climb([measured], [np.arange(800.0)], rungs, position_m=[position])
+    ladder = climb([measured], [np.arange(800.0)], rungs, [position])
     constant, line, free = ladder.rmse_db
     assert line == pytest.approx(1.0, abs=0.1)
     assert constant > free > 3.0

@@ -1,7 +1,7 @@
 """Ladder of models, to find what a scene needs: scored on stretches of the flight that had no part in their offset.
 
 Each rung is a prediction of the same samples by a model with one thing more than another. A flight is cut into
-places, or into stretches of time; the offset of a model is fitted without one and scored on it, in turn. Models are
+places; the offset of a model is fitted without one and scored on it, in turn. Models are
 compared on the same samples by paired differences, and the simplest one within one standard error of the best is
 recommended: what a flight cannot show to help is not worth having (Breiman, Friedman, Olshen, Stone 1984, section
 3.4.3: the 1 SE rule).
@@ -17,7 +17,7 @@ import numpy as np
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..statistics.intervals import NO_INTERVAL, Interval, PairedDifference, paired_difference
 
-# Places or stretches that a flight is cut into.
+# Places that a flight is cut into: a power of two, made by halving.
 _BLOCKS = 8
 
 # A model that has no level at more than a fifth of the samples cannot be compared with the others.
@@ -90,11 +90,6 @@ class Ladder:
     """RMSE of the recommended model and of free space on other flights, where these chose it [dB]."""
 
 
-def stretches_of(samples: int, blocks: int = _BLOCKS) -> IntArray:
-    """Stretch of each sample (n,): equally many neighbouring samples each."""
-    return np.asarray(np.arange(samples) * blocks // max(samples, 1), dtype=np.int64)
-
-
 def places_of(position_m: FloatArray, blocks: int = _BLOCKS) -> IntArray:
     """Place of each sample (n,): cells of equally many samples, made by halving along the longer side of the plan.
 
@@ -136,9 +131,11 @@ def _halves(cell: IntArray, position_m: FloatArray) -> tuple[IntArray, IntArray]
 
 
 def climb(
-    measured_db: Sequence[FloatArray], time_s: Sequence[FloatArray], rungs: Sequence[Rung], *, blocks: int = _BLOCKS,
-    position_m: Sequence[FloatArray] | None = None,
-) -> Ladder:  # fmt: skip
+    measured_db: Sequence[FloatArray],
+    time_s: Sequence[FloatArray],
+    rungs: Sequence[Rung],
+    position_m: Sequence[FloatArray],
+) -> Ladder:
     """Score the rungs of a ladder, given from the simplest to the most complex model.
 
     Parameters
@@ -149,10 +146,8 @@ def climb(
         Orders the errors of all series, so that channels that share their instants share their blocks [s].
     rungs : sequence of Rung
         Simplest first: ties go to the earlier one.
-    blocks : int
-        Places or stretches, of equally many samples.
-    position_m : sequence of (n, 3), optional
-        Where each sample was taken: places are left out (:func:`places_of`). Without, stretches of time.
+    position_m : sequence of (n, 3)
+        Where each sample was taken: places are left out (:func:`places_of`).
 
     Returns
     -------
@@ -161,12 +156,10 @@ def climb(
     enough = [_covers(measured_db, rung) for rung in rungs]
     shared = [_shared(m, [r.level_db[i] for r, ok in zip(rungs, enough, strict=True) if ok])
               for i, m in enumerate(measured_db)]  # fmt: skip
-    places = [None] * len(shared) if position_m is None else [
-        places_of(p[keep], blocks) for p, keep in zip(position_m, shared, strict=True)
-    ]  # fmt: skip
+    places = [places_of(p[keep]) for p, keep in zip(position_m, shared, strict=True)]
     errors = tuple(
         tuple(
-            held_out_error_db(m, level, keep, blocks, block, x) if ok else np.full(len(m), np.nan)
+            held_out_error_db(m, level, keep, block, x) if ok else np.full(len(m), np.nan)
             for m, level, keep, block, x in zip(
                 measured_db, rung.level_db, shared, places, rung.regressor_db or [None] * len(shared), strict=True
             )
@@ -263,10 +256,13 @@ def costs(rows: Sequence[LadderRow]) -> list[ModelCost]:
 
 
 def held_out_error_db(
-    measured_db: FloatArray, level_db: FloatArray, keep: BoolArray, blocks: int = _BLOCKS,
-    place: IntArray | None = None, regressor_db: FloatArray | None = None,
-) -> FloatArray:  # fmt: skip
-    """Measured minus predicted (n,), each stretch with the offset of all the others [dB]; NaN where not ``keep``.
+    measured_db: FloatArray,
+    level_db: FloatArray,
+    keep: BoolArray,
+    place: IntArray,
+    regressor_db: FloatArray | None = None,
+) -> FloatArray:
+    """Measured minus predicted (n,), each place with the offset of all the others [dB]; NaN where not ``keep``.
 
     Parameters
     ----------
@@ -274,10 +270,8 @@ def held_out_error_db(
         Levels in time order [dB].
     keep : (n,) bool
         Samples that count.
-    blocks : int
-        Stretches of equal length.
-    place : (kept samples,) int, optional
-        The block of each sample that counts, in place of stretches of time.
+    place : (kept samples,) int
+        Of each sample that counts, below :data:`_BLOCKS`.
     regressor_db : (n,), optional
         Has a slope that is fitted together with the offset, on the same samples.
 
@@ -288,16 +282,16 @@ def held_out_error_db(
 
     Examples
     --------
-    >>> held_out_error_db(np.array([1.0, 1.0, 3.0, 3.0]), np.zeros(4), np.ones(4, bool), blocks=2).tolist()
+    >>> place = np.array([0, 0, 1, 1])
+    >>> held_out_error_db(np.array([1.0, 1.0, 3.0, 3.0]), np.zeros(4), np.ones(4, bool), place).tolist()
     [-2.0, -2.0, 2.0, 2.0]
     """
     rows = np.flatnonzero(keep)
     difference = measured_db[rows] - level_db[rows]
-    stretch = stretches_of(len(rows), blocks) if place is None else place
     x = np.zeros(len(rows)) if regressor_db is None else regressor_db[rows]
-    offset, slope = held_out_lines(difference, x, stretch, blocks)
+    offset, slope = held_out_lines(difference, x, place, _BLOCKS)
     error = np.full(len(measured_db), np.nan)
-    error[rows] = difference - offset[stretch] - slope[stretch] * x
+    error[rows] = difference - offset[place] - slope[place] * x
     return error
 
 
@@ -330,9 +324,7 @@ def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: i
         return (sy - slope * sx) / count - slope * centre, slope
 
 
-def log_distance_level_db(
-    measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray, blocks: int = _BLOCKS
-) -> FloatArray:
+def log_distance_level_db(measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray) -> FloatArray:
     """Log-distance level (n,) about its mean [dB], each place by the slope of the other places.
 
     The offset is left to the comparison, as for every other model. NaN where no distance is known.
@@ -343,8 +335,6 @@ def log_distance_level_db(
         Level [dB] and distance of the ends [m]; NaN is left out of the fit.
     position_m : (n, 3)
         See :func:`places_of`.
-    blocks : int
-        Places.
 
     Returns
     -------
@@ -358,8 +348,8 @@ def log_distance_level_db(
     if not finite.any():
         return level
     centred = x - x[finite].mean()
-    place = places_of(position_m[finite], blocks)
-    slope = held_out_lines(measured_db[finite], centred[finite], place, blocks)[1]
+    place = places_of(position_m[finite])
+    slope = held_out_lines(measured_db[finite], centred[finite], place, _BLOCKS)[1]
     overall = held_out_lines(measured_db[finite], centred[finite], np.zeros(int(finite.sum()), np.int64), 2)[1][1]
     level[np.isfinite(centred)] = overall * centred[np.isfinite(centred)]
     level[finite] = slope[place] * centred[finite]

@@ -264,7 +264,7 @@ class _Climber:
             self._measured,
             [s.time_s for s in self._series],
             rungs,
-            position_m=[s.replayed.poses.position_m[s.picked] for s in self._series],
+            [s.replayed.poses.position_m[s.picked] for s in self._series],
         )
 
     # the stages: what may be added to the best model so far

@@ -18,6 +18,7 @@ from ..common.outputs import OutputFolder, changed_files
 from ..common.provenance import KEY
 from ..common.units import FloatArray
 from ..compare.judge import report_difference
+from ..compare.statistics.intervals import pooled_difference
 from ..report.content.diff import Entry, InputEntry, ReportDiff, ReportSide
 from ..report.names import RANK_COLUMNS, RSS_COLUMNS, links_of
 
@@ -189,7 +190,7 @@ def _compare_reports(first: ReadReport, second: ReadReport) -> ReportDiff:
         versions=tuple(_entries(first.metrics["versions"], second.metrics["versions"])),
         levels=tuple(levels),
         ranks=tuple(_ranks(first, second)),
-        pooled=report_difference.pooled_difference(residuals) if residuals else None,
+        pooled=pooled_difference(residuals) if residuals else None,
         links_first_only=tuple(alone[0]),
         links_second_only=tuple(alone[1]),
         remarks=(*first.remarks, *second.remarks, *_learned_here(first, second)),
@@ -272,7 +273,7 @@ def _values(table: Any, name: str) -> FloatArray:
     return np.asarray(table[name], dtype=np.float64)
 
 
-# Instants [s] of the common samples of a link, and both residuals.
+# Instants [s] of the common samples of a link, and the residuals of the second and of the first report.
 _Residuals = tuple[FloatArray, FloatArray, FloatArray]
 
 
@@ -299,7 +300,7 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[report_differenc
         first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
         offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, their_numbers)]
         scored = [int(table["residual_db"].notna().sum()) for table in tables]
-        residuals.append((_instants(a), first[2], second[2]))
+        residuals.append((_instants(a), second[2], first[2]))  # second minus first
         differences.append(
             report_difference.level_difference(
                 tower, channel, overlap, first, second,

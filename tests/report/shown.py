@@ -10,8 +10,9 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.compare.judge.ladder import LadderRow
-from aerpaw_cmp.compare.judge.report_difference import Overlap, level_difference, pooled_difference
+from aerpaw_cmp.compare.judge.report_difference import Overlap, level_difference
 from aerpaw_cmp.compare.learning.calibration import Score
+from aerpaw_cmp.compare.statistics.intervals import pooled_difference
 from aerpaw_cmp.report.content.calibration import CalibrationData
 from aerpaw_cmp.report.content.diff import Entry, ReportDiff, ReportSide
 from aerpaw_cmp.report.pages import calibration as calibration_html
@@ -101,7 +102,7 @@ def diff(_: Fixture) -> str:
         ReportDiff(
             first=sides_of[0], second=sides_of[1], settings=(Entry(key="rt.max_depth", first=2, second=1),), inputs=(),
             versions=(), levels=(level,), ranks=(),
-            pooled=pooled_difference([(time, first, second)]),
+            pooled=pooled_difference([(time, second, first)]),
             links_first_only=(), links_second_only=(), remarks=(),
         )
     )  # fmt: skip

@@ -10,7 +10,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.outputs import OutputFolder
-from aerpaw_cmp.compare.judge.report_difference import pooled_difference
+from aerpaw_cmp.compare.statistics.intervals import pooled_difference
 from aerpaw_cmp.jobs.diff_reports import run_diff
 from aerpaw_cmp.report.pages.diff import diff_page, verdict
 from aerpaw_cmp.report.pages.flight_folder import write_report
@@ -186,7 +186,8 @@ def test_links_are_pooled_by_what_each_adds_at_an_instant():
     rng = np.random.default_rng(8)
     time, links, truth = np.arange(3000) * 0.1, [], []
     for before, after in ((2.0, 3.0), (4.0, 3.5)):
-        links.append((time, rng.normal(0, before, 3000), rng.normal(0, after, 3000)))
+        first, second = (rng.normal(0, sd, 3000) for sd in (before, after))
+        links.append((time, second, first))
         truth.append(after**2 - before**2)
     pooled = pooled_difference(links)
     low, high = pooled.mean_square_ci95_db2

@@ -6,7 +6,7 @@ better. Errors of both share the measurement and most of the model, so they are 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -147,31 +147,6 @@ def _largest(values: FloatArray) -> float:
 
 def _changed(first: float, second: float) -> Changed:
     return Changed(first=first, second=second, difference=second - first)
-
-
-def pooled_difference(links: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> statistics.PairedDifference:
-    """RMSE of the second report against the first over all links, each link about its own offset.
-
-    Parameters
-    ----------
-    links : sequence of three (n,)
-        Instants [s] of the common samples of a link, and the residuals of both reports there [dB]; NaN takes no part.
-
-    Notes
-    -----
-    Samples are put in order of time over all links, so that what the links share at an instant stands together.
-    """
-    time, errors, other_errors = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
-    for instants, first, second in links:
-        finite = np.isfinite(first) & np.isfinite(second)
-        if finite.any():
-            time.append(instants[finite])
-            errors.append(first[finite] - first[finite].mean())
-            other_errors.append(second[finite] - second[finite].mean())
-    order = np.argsort(np.concatenate(time), kind="stable")
-    return statistics.paired_difference(
-        np.concatenate(other_errors)[order], np.concatenate(errors)[order], free_offset=False
-    )
 
 
 def rank_difference(

@@ -227,7 +227,6 @@ def pooled_moments(
     moments: Mapping[tuple[str, str, str], Moments],
     per: Pooling = "link",
     *,
-    step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> dict[tuple[str, str, str], OffsetFit]:
     """One offset per tower, channel, flight, link or for everything.
@@ -238,8 +237,8 @@ def pooled_moments(
         Of all sequences.
     per : {"link", "tower", "channel", "flight", "all"}
         Which sequences share an offset.
-    step_db, span_db : float, (float, float)
-        Grid of the search [dB].
+    span_db : (float, float)
+        Span of the search [dB].
 
     Returns
     -------
@@ -251,7 +250,7 @@ def pooled_moments(
     The best shared offset is the mean difference over all pairs, rounded to the grid and kept within it: the mean of
     the means, weighted by the pairs. RMSE^2(o) = variance + (mean - o)^2 of each sequence.
     """
-    axes, grid = _GROUP[per], offset_grid(step_db, span_db)
+    axes, grid = _GROUP[per], offset_grid(span_db=span_db)
     groups: dict[Hashable, list[tuple[str, str, str]]] = {}
     for key in moments:
         groups.setdefault(tuple(key[axis] for axis in axes), []).append(key)
@@ -263,7 +262,7 @@ def pooled_moments(
             continue
         total = sum(item.n for item in filled)
         mean = filled[0].mean_db + sum((item.mean_db - filled[0].mean_db) * (item.n / total) for item in filled)
-        best = nearest_offset(grid, mean, step_db)
+        best = nearest_offset(grid, mean)
         offset, at_edge = float(grid[best]), best in (0, len(grid) - 1)
         for key in members:
             sequence = moments[key]

@@ -342,11 +342,11 @@ class KCurve:
     k: FloatArray
     agreement: FloatArray
     total_variation: FloatArray
-    best_k_agreement: float
-    best_k_interval: Interval
-    best_k_total_variation: float
-    best_k_total_variation_interval: Interval
-    at_edge: bool
+    best_k_agreement: float = float("nan")
+    best_k_interval: Interval = NO_INTERVAL
+    best_k_total_variation: float = float("nan")
+    best_k_total_variation_interval: Interval = NO_INTERVAL
+    at_edge: bool = False
 
 
 # Samples times K that are resampled at once: bounds memory on flights of hours, and changes no digit.
@@ -385,16 +385,7 @@ def k_curve(
     ri, profile = ri[paired].astype(np.int64), profile[paired]
     if not len(ri):
         nothing = np.full(len(grid), np.nan)
-        return KCurve(
-            k=grid,
-            agreement=nothing,
-            total_variation=nothing,
-            best_k_agreement=float("nan"),
-            best_k_interval=NO_INTERVAL,
-            best_k_total_variation=float("nan"),
-            best_k_total_variation_interval=NO_INTERVAL,
-            at_edge=False,
-        )
+        return KCurve(k=grid, agreement=nothing, total_variation=nothing)
     ranks = np.stack([rank_from_singular_values(profile, value).astype(np.int8) for value in grid], axis=1)
     equal = ranks == ri[:, None]
     known = autocorrelation(equal.mean(axis=1))

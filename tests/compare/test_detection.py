@@ -10,7 +10,6 @@ from aerpaw_cmp.compare.level.detection import (
     DetectionForecast,
     aligned_quality,
     floored_fit,
-    floored_offset,
     learn_detection,
     score_detection,
 )
@@ -31,7 +30,7 @@ def _flight(offset_db: float = -40.0, n: int = 6000) -> tuple[FloatArray, FloatA
 
 def test_the_probability_is_calibrated_and_beats_the_constant() -> None:
     time, measured, simulated, detected = _flight()
-    score = score_detection(time, measured, simulated, detected, floor_db=FLOOR)
+    score = score_detection(time, measured, simulated, detected, floor_db=FLOOR, free_space_db=simulated)
     assert score is not None
     truth = expit((simulated + 40.0 - FLOOR) / 3.0)
     best = float(np.mean((truth - detected) ** 2))
@@ -50,7 +49,7 @@ def test_the_probability_is_calibrated_and_beats_the_constant() -> None:
 def test_a_level_that_says_nothing_gains_nothing() -> None:
     time, measured, simulated, detected = _flight()
     shuffled = np.random.default_rng(1).permutation(simulated)
-    score = score_detection(time, measured, shuffled, detected, floor_db=FLOOR)
+    score = score_detection(time, measured, shuffled, detected, floor_db=FLOOR, free_space_db=shuffled)
     assert score is not None
     assert score.brier > 0.98 * score.constant_brier
 
@@ -60,13 +59,13 @@ def test_the_floored_offset_is_that_of_a_search_by_hand(offset_db: float) -> Non
     random = np.random.default_rng(4)
     simulated = random.normal(-50.0, 15.0, 400)
     measured = np.maximum(simulated - offset_db + random.normal(0.0, 3.0, 400), FLOOR)
-    fit = floored_offset(measured, simulated, floor_db=FLOOR, span_db=(-60.0, 40.0), step_db=0.1)
+    fit = floored_fit(measured, simulated, FLOOR)
     grid = np.arange(-600, 401) / 10.0
     by_hand = [np.sqrt(np.mean((measured - np.maximum(simulated - o, FLOOR)) ** 2)) for o in grid]
     assert fit.rmse_db == pytest.approx(min(by_hand), abs=1e-9)
     assert fit.offset_db == pytest.approx(grid[int(np.argmin(by_hand))])
     assert fit.at_edge is False
-    free = floored_offset(measured, simulated, floor_db=-500.0, span_db=(-60.0, 40.0), step_db=0.1)
+    free = floored_fit(measured, simulated, -500.0)
     assert free.offset_db == pytest.approx(np.mean(simulated - measured), abs=0.051)
     assert free.rmse_db == pytest.approx(np.sqrt(np.mean((simulated - measured - free.offset_db) ** 2)))
 
@@ -90,7 +89,7 @@ def test_other_flights_teach_when_the_receiver_locks() -> None:
     time, measured = np.arange(5000.0), np.where(detected, level, -30.0)
     for shift_db, least, most in ((0.0, 0.0, 0.003), (10.0, 0.05, 1.0)):  # nothing is fitted on this flight
         moved = DetectionForecast(level_db=forecast.level_db + shift_db, per_db=forecast.per_db, share=forecast.share)
-        score = score_detection(time, measured, level, detected, floor_db=-65.0, forecast=moved)
+        score = score_detection(time, measured, level, detected, floor_db=-65.0, free_space_db=level, forecast=moved)
         assert score is not None
         assert score.learned_on == "other flights"
         assert least < score.brier - float(np.mean((truth - detected) ** 2)) < most
@@ -144,7 +143,7 @@ def test_every_score_is_that_by_hand(learned: bool) -> None:
 def test_fifty_of_either_outcome_are_enough(rare: int) -> None:
     level, few = np.linspace(-90.0, -40.0, 300), np.arange(300) >= 300 - rare
     for detected in (few, ~few):
-        scored = score_detection(np.arange(300.0), level, level, detected, floor_db=-80.0)
+        scored = score_detection(np.arange(300.0), level, level, detected, floor_db=-80.0, free_space_db=level)
         assert (scored is not None) == (rare == 50)
     learned = learn_detection([(level, few), (level[:0], few[:0])])
     assert (learned is not None) == (rare == 50)

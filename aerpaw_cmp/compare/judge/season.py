@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...common.units import FloatArray, unmasked
-from ..offset import SPAN_DB, STEP_DB, nearest_offset, offset_grid
+from ..offset import SPAN_DB, nearest_offset, offset_grid
 from ..statistics.intervals import autocorrelation
 
 # Fewer flights than this give no interval of a mean over flights.
@@ -21,9 +21,7 @@ _MANY_FLIGHTS = 20
 Verdict = Literal["first", "worse", "not significant", "no interval"]
 
 
-def left_out_offsets(
-    n: ArrayLike, mean_db: ArrayLike, *, step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
-) -> FloatArray:
+def left_out_offsets(n: ArrayLike, mean_db: ArrayLike, *, span_db: tuple[float, float] = SPAN_DB) -> FloatArray:
     """Offset [dB] of each flight from the samples of all others.
 
     Parameters
@@ -32,8 +30,8 @@ def left_out_offsets(
         Samples of each flight.
     mean_db : (f,)
         Mean of simulated minus measured [dB]; NaN where n = 0.
-    step_db, span_db : float, (low, high)
-        Grid of the offsets.
+    span_db : (low, high)
+        Of the offsets.
 
     Returns
     -------
@@ -53,12 +51,12 @@ def left_out_offsets(
     count, mean = unmasked(n), unmasked(mean_db)
     total = np.where(count > 0, count * np.nan_to_num(mean), 0.0)
     other_samples = count.sum() - count
-    grid = offset_grid(step_db, span_db)
+    grid = offset_grid(span_db=span_db)
     result = np.full(len(count), np.nan)
     for i in np.flatnonzero(other_samples > 0):
         # summed anew: the difference of two large sums would lose what one short flight says
         mean_of_others = np.delete(total, i).sum() / other_samples[i]
-        result[i] = grid[nearest_offset(grid, float(mean_of_others), step_db)]
+        result[i] = grid[nearest_offset(grid, float(mean_of_others))]
     return result
 
 

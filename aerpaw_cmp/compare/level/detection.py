@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.units import BoolArray, FloatArray, IntArray
-from ..offset import STEP_DB, OffsetFit, offset_grid
+from ..offset import OffsetFit, offset_grid
 from ..ranks.forecast import brier_losses, log_losses
 from ..ranks.receiver import out_of_group
 from ..statistics.intervals import NO_INTERVAL, Interval, spread_interval
@@ -138,7 +138,7 @@ def score_detection(
     detected: BoolArray,
     *,
     floor_db: float,
-    free_space_db: FloatArray | None = None,
+    free_space_db: FloatArray,
     forecast: DetectionForecast | None = None,
 ) -> DetectionScore | None:
     """Score of a log in two parts; None where either outcome is rare.
@@ -151,7 +151,7 @@ def score_detection(
     detected : (n,) bool
     floor_db : float
         Floor of the measurement.
-    free_space_db : (n,), optional
+    free_space_db : (n,)
         Level of free space, for comparison.
     forecast : DetectionForecast, optional
         Learned on other flights, of ``simulated_db``; without, each segment is forecast from the others.
@@ -172,7 +172,6 @@ def score_detection(
         stated = np.stack([1.0 - (p := forecast.probability(simulated)), p], axis=1)
     constant = np.tile([1.0 - detected.mean(), detected.mean()], (len(time), 1))
     fit = floored_fit(measured, simulated, floor_db)
-    free = simulated if free_space_db is None else free_space_db[finite]
     residual = measured - np.maximum(simulated - fit.offset_db, floor_db)
     return DetectionScore(
         floor_db=floor_db,
@@ -185,7 +184,7 @@ def score_detection(
         offset_db=fit.offset_db,
         rmse_db=fit.rmse_db,
         rmse_ci95_db=spread_interval(residual[np.argsort(time, kind="stable")]),
-        free_space_rmse_db=floored_fit(measured, free, floor_db).rmse_db,
+        free_space_rmse_db=floored_fit(measured, free_space_db[finite], floor_db).rmse_db,
         detected_rmse_db=float(np.sqrt(np.mean(residual[detected] ** 2))),
         reliability=_reliability(stated[:, 1], detected),
         learned_on="held-out segments" if forecast is None else "other flights",
@@ -203,47 +202,24 @@ def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> Fl
 
 
 def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> OffsetFit:
-    """:func:`floored_offset` within 60 dB of the median above the floor; pairs (n,) with a NaN do not count."""
+    """Offset of least RMSE where both sides count as no lower than the floor; pairs (n,) with a NaN do not count.
+
+    It is added to the measurement, and lies within 60 dB of the median above the floor.
+    """
     finite = np.isfinite(measured_db) & np.isfinite(simulated_db)
-    measured, simulated = np.maximum(measured_db[finite], floor_db), simulated_db[finite]
+    order = np.flatnonzero(finite)[np.argsort(simulated_db[finite])]
+    measured, simulated = np.maximum(measured_db[order], floor_db), simulated_db[order]
     above = measured > floor_db
     middle = float(np.median((simulated - measured)[above])) if above.any() else 0.0
-    span = (middle - _SPAN_DB, middle + _SPAN_DB)
-    return floored_offset(measured, simulated, floor_db=floor_db, span_db=span, step_db=STEP_DB)
-
-
-def floored_offset(
-    measured_db: FloatArray,
-    simulated_db: FloatArray,
-    *,
-    floor_db: float,
-    span_db: tuple[float, float],
-    step_db: float,
-) -> OffsetFit:
-    """Offset of least RMSE where both sides count as no lower than the floor.
-
-    Parameters
-    ----------
-    measured_db, simulated_db : (n,)
-        Finite pairs [dB]; the measurement no lower than the floor.
-    floor_db, span_db, step_db : float
-
-    Returns
-    -------
-    OffsetFit
-        The offset is added to the measurement.
-    """
-    grid = offset_grid(step_db, span_db)
-    order = np.argsort(simulated_db)
-    simulated, measured = simulated_db[order], measured_db[order]
+    grid = offset_grid(span_db=(middle - _SPAN_DB, middle + _SPAN_DB))
     # below the floor a prediction counts as the floor: the first k of the order, the others move with the offset
     low = np.concatenate([[0.0], np.cumsum((measured - floor_db) ** 2)])
     difference = simulated - measured
     first, second = (np.concatenate([[0.0], np.cumsum(difference**power)]) for power in (1, 2))
     k = np.searchsorted(simulated, grid + floor_db, side="right")
     n = len(measured)
-    above = (second[n] - second[k]) - 2.0 * grid * (first[n] - first[k]) + (n - k) * grid**2
-    mse = np.maximum(low[k] + above, 0.0) / n
+    moved = (second[n] - second[k]) - 2.0 * grid * (first[n] - first[k]) + (n - k) * grid**2
+    mse = np.maximum(low[k] + moved, 0.0) / n
     best = int(mse.argmin())
     return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), n, best in (0, len(grid) - 1))
 

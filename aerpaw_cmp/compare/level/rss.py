@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike
 from ...common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray, db_from_power, power_from_db, unmasked
-from ..offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve
+from ..offset import SPAN_DB, OffsetFit, grid_offset, identifiable_range, offset_curve
 from ..statistics.intervals import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals
 
 # Two channels of one receiver "part" where they differ by more than this [dB].
@@ -101,7 +101,6 @@ def compare_rss(
     *,
     baselines: Mapping[str, ArrayLike] | None = None,
     posed: ArrayLike | None = None,
-    step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> RssComparison:
     """Compare a measured with a simulated sequence of levels.
@@ -118,7 +117,7 @@ def compare_rss(
         Levels of simpler models at the same poses [dB].
     posed : array_like of bool, (n,), optional
         Whether the pose of the sample is known. A sample without a pose is not out of coverage.
-    step_db, span_db : float, (float, float)
+    span_db : (float, float)
         Offset search.
 
     Returns
@@ -137,8 +136,8 @@ def compare_rss(
     use = has_pose & np.isfinite(measured) & np.isfinite(simulated)
     order = np.flatnonzero(use)[np.argsort(time[use], kind="stable")]
     m, s = measured[order], simulated[order]
-    fit = grid_offset(m, s, step_db=step_db, span_db=span_db)
-    offsets, curve = offset_curve(m, s, step_db=step_db, span_db=span_db)
+    fit = grid_offset(m, s, span_db=span_db)
+    offsets, curve = offset_curve(m, s, span_db=span_db)
     simple = {name: _levels(levels) for name, levels in (baselines or {}).items()}
     return RssComparison(
         **named(fit, "offset_db rmse_db n at_edge"),
@@ -149,9 +148,7 @@ def compare_rss(
         correlation=correlation(m, s),
         intervals=error_intervals(m, s),
         identifiable_db=identifiable_range(offsets, curve),
-        baselines={
-            name: grid_offset(m, level[order], step_db=step_db, span_db=span_db) for name, level in simple.items()
-        },
+        baselines={name: grid_offset(m, level[order], span_db=span_db) for name, level in simple.items()},
         baseline_intervals={name: _rmse_interval(m, level[order]) for name, level in simple.items()},
         residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
     )
@@ -274,7 +271,6 @@ def averaged_fits(
     simulations: Mapping[str, ArrayLike],
     averages: Mapping[str, Callable[[FloatArray], FloatArray]],
     *,
-    step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> dict[str, dict[str, OffsetFit]]:
     """Simulations against the measurement, both sides averaged alike.
@@ -287,7 +283,7 @@ def averaged_fits(
         Levels by name, such as "coherent", "power_sum" or "local_mean".
     averages : mapping of str to callable
         Means of levels (n,), NaN where either side has none, such as :func:`local_mean_db`.
-    step_db, span_db
+    span_db : (float, float)
         Offset search.
 
     Returns
@@ -302,8 +298,7 @@ def averaged_fits(
         finite = np.isfinite(measured) & np.isfinite(simulated)
         sides = [np.where(finite, side, np.nan) for side in (measured, simulated)]
         result[name] = {
-            average: grid_offset(*(mean(side) for side in sides), step_db=step_db, span_db=span_db)
-            for average, mean in averages.items()
+            average: grid_offset(*(mean(side) for side in sides), span_db=span_db) for average, mean in averages.items()
         }
     return result
 
@@ -382,8 +377,6 @@ class ErrorSpan:
         Samples.
     mean_db : float
         Mean residual; positive: measured stronger than simulated.
-    worst_db : float
-        The residual of largest magnitude.
     position_m : tuple of float
         Mean east, north, up of the span [m]; empty if no positions were given.
     geometry : mapping of str to float
@@ -394,7 +387,6 @@ class ErrorSpan:
     end_s: float
     n: int
     mean_db: float
-    worst_db: float
     position_m: tuple[float, ...]
     geometry: Mapping[str, float] = field(default_factory=dict)
 
@@ -451,15 +443,13 @@ def error_spans(
     for a, b in pairwise(bounds):  # per span, not per sample
         if sign[a] == 0:
             continue
-        part = r[a:b]
         centre = () if place is None else tuple(float(v) for v in place[a:b].mean(axis=0))
         spans.append(
             ErrorSpan(
                 start_s=float(t[a]),
                 end_s=float(t[b - 1]),
                 n=int(b - a),
-                mean_db=float(part.mean()),
-                worst_db=float(part[np.argmax(np.abs(part))]),
+                mean_db=float(r[a:b].mean()),
                 position_m=centre,
                 geometry={name: _typical(values[a:b]) for name, values in where.items()},
             )

@@ -82,15 +82,37 @@ class Recipe:
 
 
 @dataclass(frozen=True, slots=True)
-class Learned:
+class Mounted:
+    """Measured patterns by name, and the mounts that were fitted of those that a flight used."""
+
+    patterns: Mapping[str, GainOf]
+    mounts: Mapping[str, MountFit]
+
+    def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
+        """Gain (n,) of a measured pattern as mounted, towards directions (n, 3) of body or mast; 0 without one."""
+        pattern = self.patterns.get(name)
+        if pattern is None:
+            return np.zeros(len(direction))
+        mount = self.mounts.get(name)
+        return pattern(direction if mount is None else direction @ turned(mount.azimuth_deg))
+
+    def patterns_db(self, samples: LinkSamples) -> FloatArray:
+        """Gain (n,) of the measured patterns of both ends."""
+        return self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
+
+
+@dataclass(frozen=True, slots=True)
+class Learned(Mounted):
     """The outcome of :func:`learn`."""
 
-    recipe: Recipe
-    model: GainModel
-    mounts: Mapping[str, MountFit]
-    fit: GainFit | None
-    fading: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    fit: GainFit
+    fading: Mapping[str, tuple[float, float]]
     """Of each antenna: :func:`~aerpaw_cmp.compare.gains.spread.fading_of` the flights that were learned from."""
+
+    @property
+    def model(self) -> GainModel:
+        """Terms and strengths of the fit."""
+        return self.fit.model
 
     def spread(self, antenna: str) -> Spread:
         """Spread of a level at an antenna besides the standard deviation of the gain."""
@@ -104,25 +126,10 @@ class Learned:
             bin_s=model.bin_s,
         )
 
-    def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
-        """Gain (n,) of a measured pattern as mounted, towards directions (n, 3) of body or mast; 0 without one."""
-        pattern = self.recipe.patterns.get(name)
-        if pattern is None:
-            return np.zeros(len(direction))
-        mount = self.mounts.get(name)
-        return pattern(direction if mount is None else direction @ turned(mount.azimuth_deg))
-
-    def patterns_db(self, samples: LinkSamples) -> FloatArray:
-        """Gain (n,) of the measured patterns of both ends."""
-        return self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
-
     def predict(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
         """Gain of both ends and its standard deviation (n,) [dB], about a mean that the offset takes."""
-        known = self.patterns_db(samples)
-        if self.fit is None:
-            return known, np.zeros(len(known))
         gain, sd = self.fit.predict(samples)
-        return known + gain, sd
+        return self.patterns_db(samples) + gain, sd
 
     def mean_error(self, samples: LinkSamples) -> float:
         """Mean of measured minus :meth:`mean` [dB]; NaN without a sample that has both."""
@@ -131,8 +138,7 @@ class Learned:
 
     def mean(self, samples: LinkSamples) -> FloatArray:
         """The gain of :meth:`predict` alone, along a flight in the order of time."""
-        known = self.patterns_db(samples)
-        return known if self.fit is None else known + _mean_along(self.fit, samples)
+        return self.patterns_db(samples) + _mean_along(self.fit, samples)
 
 
 # A UAV hardly turns within this time [s].
@@ -161,17 +167,14 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None
     """
     names = ["uav", *dict.fromkeys(s.antenna for s in series)]
     patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
-    mounts = fit_mounts(series, patterns) if patterns else {}
-    bare = Learned(recipe, recipe.model, mounts, None)
-    if not recipe.model.terms:
-        return bare
-    residuals = [dataclasses.replace(s, residual_db=s.residual_db - bare.mean(s)) for s in series]
+    mounted = Mounted(recipe.patterns, fit_mounts(series, patterns) if patterns else {})
+    residuals = [dataclasses.replace(s, residual_db=s.residual_db - mounted.patterns_db(s)) for s in series]
     fit = chosen_fit(residuals, recipe.model) if model is None else fit_gain(residuals, model)
     if any(s.floor_db is not None for s in series):  # once more; another time changes nothing on flights left out
-        fit = fit_gain([_at_floor(s, bare.mean(s), fit) for s in series], fit.model)
+        fit = fit_gain([_at_floor(s, mounted.patterns_db(s), fit) for s in series], fit.model)
     antennas = dict.fromkeys(s.antenna for s in series)
     fading = {name: fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
-    return Learned(recipe, fit.model, mounts, fit, fading)
+    return Learned(recipe.patterns, mounted.mounts, fit, fading)
 
 
 def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
@@ -352,13 +355,12 @@ def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[
         fitted = score(o, gain)
         if fitted is None:
             continue
-        if learned.fit is not None:
-            some = spread_out(len(gain), _SPREAD_SAMPLES)
-            stated = StatedSpread(
-                gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
-            )
-            error = o.samples.residual_db - gain - fitted.offset_db
-            fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
+        some = spread_out(len(gain), _SPREAD_SAMPLES)
+        stated = StatedSpread(
+            gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
+        )
+        error = o.samples.residual_db - gain - fitted.offset_db
+        fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
         shared = math.hypot(fitted.rmse_db, fitted.offset_db - offsets[o.samples.antenna])
         yield dataclasses.replace(fitted, rmse_shared_offset_db=shared)
 

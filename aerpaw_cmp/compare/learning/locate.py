@@ -205,14 +205,10 @@ def _features(track: LevelTrack, places: FloatArray, model: LevelModel) -> tuple
         model.elevation_sd_db * np.sin(elevation) ** 2,
         0.5 * model.elevation_sd_db * np.cos(4.0 * elevation),
     ]
-    mean = _middle(track) - 10.0 * model.slope * decades
+    mean = 0.5 * float(track.level_db.max() + track.level_db.min()) - 10.0 * model.slope * decades
     if track.airframe_db is not None:
         mean = mean + track.airframe_db(-ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9))
     return mean, np.stack(columns, axis=-1)
-
-
-def _middle(track: LevelTrack) -> float:
-    return 0.5 * float(track.level_db.max() + track.level_db.min())
 
 
 def _fit(
@@ -334,12 +330,6 @@ class Regions:
         east, north = np.meshgrid(self.east_m - place_m[0], self.north_m - place_m[1], indexing="ij")
         return _within(np.column_stack([east.ravel(), north.ravel()]), self.share.ravel(), part)
 
-    def holds(self, place_m: ArrayLike, part: float = 0.9) -> bool:
-        """Check whether a place lies in the region that holds a part of the posterior."""
-        away = [np.abs(axis - x) for axis, x in zip((self.east_m, self.north_m), unmasked(place_m), strict=False)]
-        cell = tuple(int(distance.argmin()) for distance in away)
-        return bool(max(distance.min() for distance in away) <= _CELL_M and self.holding(part)[cell])
-
 
 def _within(step_m: FloatArray, share: FloatArray, part: float) -> float:
     """Length of steps (n, 2) within which lies a part of their shares (n,)."""
@@ -381,11 +371,6 @@ class NodeEstimate:
     anywhere: float
     at_edge: bool
     regions: Regions
-
-    def __contains__(self, place_m: ArrayLike) -> bool:
-        """Check whether a place lies within the 90 % region."""
-        step = unmasked(place_m)[:2] - self.place_m[:2]
-        return bool(np.hypot(*step) <= self.radius90_m)
 
 
 def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = UNKNOWN) -> NodeEstimate:

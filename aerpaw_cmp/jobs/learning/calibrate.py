@@ -106,7 +106,6 @@ class Calibration:
     @property
     def fit(self) -> direction_gain.GainFit:
         """The learned gain over direction: every ``fit.gain`` has one."""
-        assert self.learned.fit is not None
         return self.learned.fit
 
     @property

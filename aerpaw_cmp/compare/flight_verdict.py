@@ -20,6 +20,7 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
     rows = [dict(panel.further.compared_with) for panel in panels]
     for name in dict.fromkeys(name for row in rows for name in row):
         members = [i for i, row in enumerate(rows) if name in row]
+        # a log that was copied to another channel counts once
         measured = [panels[i].measured_db.tobytes() for i in members]
         for i, pair in zip(members, corrected([rows[i][name] for i in members], measured), strict=True):
             rows[i][name] = pair

@@ -261,6 +261,7 @@ def pooled_moments(
             fits |= dict.fromkeys(members, _NO_FIT)
             continue
         total = sum(item.n for item in filled)
+        # about the first mean: sums of levels near -90 dB would lose the digits that decide a tie
         mean = filled[0].mean_db + sum((item.mean_db - filled[0].mean_db) * (item.n / total) for item in filled)
         best = nearest_offset(grid, mean)
         offset, at_edge = float(grid[best]), best in (0, len(grid) - 1)

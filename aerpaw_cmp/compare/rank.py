@@ -64,6 +64,7 @@ def singular_values(h: ArrayLike) -> FloatArray:
     step = max(1, _CHUNK // max(1, rows * columns))
     for start in range(0, len(flat), step):
         part = flat[start : start + step]
+        # one matrix with NaN would make NumPy give up the whole batch
         good = np.isfinite(part).all(axis=(1, 2))
         result[start : start + step][good] = np.linalg.svd(_scaled(part[good]), compute_uv=False)
     return result.reshape(*lead, min(rows, columns))
@@ -220,6 +221,7 @@ def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
     3.0
     """
     step = np.cumsum(unmasked(first) - unmasked(second))
+    # the last step is the sum of all shares: 0 but for rounding
     return float(np.abs(step[:-1]).sum())
 
 
@@ -228,6 +230,7 @@ def _both(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray
     ranks = _ranks(measured), _ranks(simulated)
     if ranks[0].shape != ranks[1].shape:
         raise ValueError(f"measured has {ranks[0].size} ranks, simulated {ranks[1].size}: they must be pairs")
+    # no report (NaN) compares as False, and becomes 0
     first, second = (np.where(rank >= 1, rank, 0).astype(np.int64) for rank in ranks)
     return first, second
 
@@ -278,6 +281,7 @@ def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
 
 def _kappa(observed: float, first: IntArray, second: IntArray) -> float:
     chance = float((first / first.sum()) @ (second / second.sum()))
+    # two equal constants: 0 / 0
     return (observed - chance) / (1.0 - chance) if chance < 1.0 - 1e-12 else float("nan")
 
 
@@ -307,6 +311,7 @@ def histogram_test(measured: ArrayLike, simulated: ArrayLike, *, replicates: int
     sums = np.add.reduceat(difference, np.arange(0, len(measured_rank), length), axis=0)
     signs = np.random.default_rng(SEED).integers(0, 2, (replicates, len(sums))) * 2.0 - 1.0
     swapped = np.abs(signs @ sums).sum(axis=1)
+    # less a little: equal exchanges sum in another order
     return float((1 + np.sum(swapped >= np.abs(sums.sum(axis=0)).sum() - 1e-9)) / (1 + replicates))
 
 
@@ -381,11 +386,13 @@ def k_curve(
     grid = k_grid() if k is None else unmasked(k)
     ri = _ranks(measured)
     profile = unmasked(sigma)
+    # whether there is a channel does not depend on K
     paired = (ri >= 1) & (rank_from_singular_values(profile, 10.0) >= 1)
     ri, profile = ri[paired].astype(np.int64), profile[paired]
     if not len(ri):
         nothing = np.full(len(grid), np.nan)
         return KCurve(k=grid, agreement=nothing, total_variation=nothing)
+    # a byte each: there are 118 K for each sample of a long flight
     ranks = np.stack([rank_from_singular_values(profile, value).astype(np.int8) for value in grid], axis=1)
     equal = ranks == ri[:, None]
     known = autocorrelation(equal.mean(axis=1))
@@ -422,6 +429,7 @@ def _middle_of_best(curves: FloatArray, k: FloatArray) -> FloatArray:
     later = np.arange(curves.shape[1]) >= first[:, None]
     over = ~top & later
     end = np.where(over.any(axis=1), np.argmax(over, axis=1), curves.shape[1]) - 1
+    # the middle on the logarithmic scale on which K is tried
     return np.asarray(np.sqrt(k[first] * k[end]))
 
 
@@ -479,6 +487,7 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike) -> IntArray:
     power = sigma**2
     total = power.sum(axis=-1, keepdims=True)
     with np.errstate(invalid="ignore", divide="ignore"):
+        # 0 / 0 without a channel, which is not alive below
         gain = matrix.shape[-1] * matrix.shape[-2] * power / total
     snr = power_from_db(sinr_db)
     shape = np.broadcast_shapes(gain.shape[:-1], snr.shape)
@@ -844,6 +853,7 @@ def _explored(a: IntArray, b: IntArray) -> bool:
 
     Agreement forgets sooner than the ranks do, but a rank that a short flight never met is in no resample of it.
     """
+    # a constant has no memory to be judged by
     return all(autocorrelation(ranks).enough or not np.ptp(ranks) for ranks in (a, b))
 
 
@@ -861,6 +871,7 @@ def _pair_intervals(
         drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates))
         value = values[len(intervals)]
         intervals.append(
+            # agreement is a share: at 0 and 1, where all resamples are alike, Wilson's interval still has a width
             share_interval(value, float(drawn.std()), known)
             if not intervals
             else interval(value, drawn, known, bounds=bounds)
@@ -880,6 +891,7 @@ def _pair_statistics(
     agree, chance = float(equal.mean()), float(p @ q)
     by_chance = first @ q + second @ p
     beyond_chance = max(1.0 - chance, 1e-12)
+    # the slope of an absolute value is its sign
     apart = np.sign(np.cumsum(p - q))
 
     def move(means: FloatArray) -> FloatArray:

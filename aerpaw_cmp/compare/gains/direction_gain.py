@@ -109,6 +109,7 @@ class LinkSamples:
         if not finite.any():
             return self.part(finite)
         part = self.part(finite)
+        # from the first sample: the bins of a log do not depend on where it was cut
         _, member = np.unique(np.floor((part.time_s - part.time_s[0]) / width_s).astype(np.int64), return_inverse=True)
         means: dict[str, Any] = {name: _bin_means(getattr(part, name), member) for name in _ARRAYS}
         for name in ("at_uav", "at_tower"):
@@ -463,6 +464,7 @@ def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArra
         model=model,
         rows=tuple(rows),
         log_evidence=factor.log_likelihood(target),
+        # the offset of each series takes a degree of freedom
         common_scale=math.sqrt(max(misfit / max(len(target) - len(rows), 1), 1e-6)),
         _weights=weights,
         _factor=factor,
@@ -501,6 +503,7 @@ def _binned_series(series: Sequence[LinkSamples], model: GainModel) -> tuple[Gai
     if not binned:
         raise InputError("no sample has a level and a direction", expected="RSS with positions and attitude")
     antennas = [s.antenna for s in binned]
+    # antenna after antenna: what they do not share is zeros in blocks
     return model, sorted(binned, key=lambda s: antennas.index(s.antenna))
 
 

@@ -87,10 +87,12 @@ def fit_mounts(series: Sequence[LinkSamples], patterns: Mapping[str, GainOf]) ->
 
 def _mount(grid: FloatArray, probability: FloatArray, best_deg: float) -> MountFit:
     phasor = complex((probability * np.exp(1j * np.radians(grid))).sum())
+    # circular standard deviation, as of a wrapped normal distribution
     spread = np.degrees(np.sqrt(-2.0 * np.log(min(max(abs(phasor), 1e-9), 1.0))))
     apart = np.abs(wrap_degrees(grid - best_deg))
     return MountFit(
         azimuth_deg=best_deg,
+        # no finer than the grid: the standard deviation of a uniform step
         azimuth_sd_deg=float(max(spread, (grid[1] - grid[0]) / np.sqrt(12.0))),
         grid_deg=grid,
         probability=probability,
@@ -121,6 +123,7 @@ def _quadratic_forms(series: Sequence[LinkSamples], patterns: Mapping[str, GainO
                 continue
             direction = bins.at_uav if name == "uav" else bins.at_tower
             out[:, columns[name]] = np.stack([pattern(direction @ mount) for mount in mounts], axis=1)
+        # the offset of each flight and channel is free
         return np.asarray(out - out.mean(axis=0), dtype=np.float64)
 
     rows = np.concatenate([candidates(s) for s in series])

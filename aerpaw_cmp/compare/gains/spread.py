@@ -84,6 +84,7 @@ class Spread:
         words = [] if line is None else line[1].split()
         try:
             return cls(**{name: float(value) for name, value in zip(words[::2], words[1::2], strict=True)})
+        # a line that somebody changed: as of a file that states no spread
         except (TypeError, ValueError):
             return None
 

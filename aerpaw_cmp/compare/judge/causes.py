@@ -380,7 +380,9 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
         if not isinstance(value, np.ndarray):
             return value
         if name not in _ANGLES:
+            # what the log does not say counts as in lock and served: a gap is no trouble
             return mean(np.nan_to_num(value, nan=1.0) if name in ("locked", "serving") else value)
+        # the mean of 359 and 1 degrees is 0
         turn = np.exp(1j * np.radians(value))
         return np.degrees(np.angle(mean(turn.real) + 1j * mean(turn.imag)))
 
@@ -462,6 +464,7 @@ def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb:
         gram = white.T @ white
         power, axes = np.linalg.eigh(gram[1:, 1:])
         power, along = np.maximum(power, 0.0), axes.T @ gram[1:, 0]
+        # directions of the coefficients that the samples do not tell
         fixed = power > 1e-9 * power[-1]
         left = max(float(gram[0, 0] - (along[fixed] ** 2 / power[fixed]).sum()), n * _LEAST_VARIANCE)
         # each coefficient that the samples tell takes a degree of freedom
@@ -763,6 +766,7 @@ _LIMITS = {
 
 def _shift(residual: FloatArray, masks: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Shift by each mask (m, n), its standard error, and the log likelihood that it gains; offset fitted."""
+    # what the sample before does not foretell: slow fading then is no shift
     y = residual[1:] - phi * residual[:-1]
     x = masks[:, 1:] - phi * masks[:, :-1]
     y, x = y - y.mean(), x - x.mean(axis=1, keepdims=True)

@@ -195,6 +195,7 @@ def _agreement_change(first: IntArray, second: IntArray) -> tuple[Changed, Chang
     (columns, influence), (other_columns, other_influence) = (kappa_parts(*pairs.T) for pairs in (first, second))
     joined, width = np.column_stack([columns, other_columns]), columns.shape[1]
 
+    # one resample for both reports: what they share cancels in the difference
     def change(of: list[float], influence: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> Changed:
         known = statistics.autocorrelation(influence)
         drawn = statistics.bootstrap_means(joined, known.block_length)

@@ -125,6 +125,7 @@ def mean_of_flights(values: ArrayLike) -> MeanOfFlights:
     independent = float(n)
     if n >= _MANY_FLIGHTS and np.ptp(array) > 0:
         known = autocorrelation(array).n_effective
+        # no fewer than an interval asks for: with one, Student's t has no degree of freedom
         independent = float(np.clip(known, FEWEST_FLIGHTS, n)) if np.isfinite(known) else independent
     reach = float(stdtrit(independent - 1.0, 0.975)) * float(array.std(ddof=1)) / independent**0.5
     return MeanOfFlights(n=n, mean=mean, low=mean - reach, high=mean + reach)

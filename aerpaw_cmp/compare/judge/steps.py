@@ -90,10 +90,12 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
     design = np.array([[float(link[end] == name) for end, name in columns] for link in links])
     weight = known.astype(float)
     for _ in range(5):
+        # a node without a link in a night has an empty row, and no offset below
         normal = np.einsum("tl,li,lj->tij", weight, design, design) + 1e-9 * np.eye(len(columns))
         fitted = np.linalg.solve(normal, ((weight * change) @ design)[..., None])[..., 0]
         residual = np.abs(change - fitted @ design.T)
         scale = 1.4826 * _median(np.where(known, residual, np.nan), 1)
+        # a scale of 0 (all links agree) lets every link count in full
         weight = known * np.minimum(1.0, _HUBER * scale / np.maximum(residual, 1e-12) + (scale <= 0.0))
     fitted = np.where(known.astype(float) @ design > 0.0, fitted, np.nan)
     alone = fitted.copy()
@@ -183,6 +185,7 @@ def stepped(node: str, night: Sequence[str], offset_db: FloatArray, nodes: int) 
             step, reach, alone = earlier.step_to(nights)
             if alone >= chance / nodes:
                 continue
+            # back at the old level after a night or two: one event, not two steps
             if before is not None and len(earlier.values) < 3 and before.step_to([value])[2] >= chance / nodes:
                 steps[-1] = replace(steps[-1], back=night[known[last]])
                 here, before = replace(before, values=[*before.values, value]), None

@@ -106,6 +106,7 @@ def _shifts(
     for i, chance, effect, ends in _each_alone(np.log([errors_db[name] for name in names])):
         low, high = np.exp(ends)
         ratio = Verdict(cause="outlying error", effect=math.exp(effect), interval=(low, high), where=names[i])
+        # a flight that errs less than the others is no trouble
         yield _Shift(chance if effect > 0.0 else math.nan, ratio)
     about: dict[str, list[float]] = {}
     for link, of in offsets_db.items():
@@ -113,6 +114,7 @@ def _shifts(
         values = np.array([of[name] for name in flown_here])
         for name, value in zip(flown_here, values - values.mean() if len(flown_here) else values, strict=True):
             about.setdefault(name, []).append(float(value))
+        # two flights on either side at least: one alone is an outlying flight, not a step
         for k in range(2, len(flown_here) - 1):
             chance, effect, ends = _split(values, np.arange(len(flown_here)) >= k)
             where = f"{link} from {flown_here[k]}"
@@ -138,6 +140,7 @@ def _split(values: FloatArray, inside: BoolArray) -> tuple[float, float, Interva
     within, without = values[inside], values[~inside]
     effect = float(within.mean() - without.mean())
     square = float(((within - within.mean()) ** 2).sum() + ((without - without.mean()) ** 2).sum()) / freedom
+    # flights may be equal to the last digit, as copies are
     error = math.sqrt(max(square, 1e-12) * (1.0 / n + 1.0 / (len(values) - n)))
     reach = float(stdtrit(freedom, 0.975)) * error
     return 2.0 * float(stdtr(freedom, -abs(effect) / error)), effect, (effect - reach, effect + reach)

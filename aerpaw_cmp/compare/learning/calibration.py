@@ -307,6 +307,7 @@ MOST_GROUPS = 6
 def groups_of(flights: Sequence[str]) -> list[list[str]]:
     """Flights that are left out together: each alone, or spread over :data:`MOST_GROUPS` groups."""
     count = min(len(flights), MOST_GROUPS)
+    # every so many: flights of one day are learned from and predicted
     return [list(flights[i::count]) for i in range(count)]
 
 
@@ -361,6 +362,7 @@ def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[
         )
         error = o.samples.residual_db - gain - fitted.offset_db
         fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
+        # the mean square about another offset is the variance and the square of their difference
         shared = math.hypot(fitted.rmse_db, fitted.offset_db - offsets[o.samples.antenna])
         yield dataclasses.replace(fitted, rmse_shared_offset_db=shared)
 
@@ -446,6 +448,7 @@ def parts_left_out(
 def altitude_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
     """The commonest height of the scored flight, and all other heights."""
     height = scored.samples.position_m[:, 2]
+    # to a metre: of heights to the centimetre none would be the commonest
     heights, count = np.unique(np.round(height), return_counts=True)
     cruise = float(heights[count.argmax()])
     mine = np.abs(height - cruise) < _CRUISE_M
@@ -480,6 +483,7 @@ def _angular(mine: FloatArray, sources: FloatArray, count: int, guard_deg: float
 def route_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
     """Stretches of the scored flight in time, with a guard; other flights count whole."""
     time = scored.samples.time_s
+    # a little longer: the last sample lies in the last stretch
     edges = np.linspace(time.min(), time.max() + 1e-6, STRETCHES + 1)
     out = []
     for low, high in itertools.pairwise(edges):
@@ -503,6 +507,7 @@ def wrong_way(observed: Sequence[Observed]) -> list[Observed]:
     out = []
     for o in observed:
         body = o.samples.at_uav
+        # the azimuth in the body is bearing less heading: this is bearing plus heading
         turned = 2.0 * azimuth_rad(-o.samples.at_tower) - azimuth_rad(body)
         across = np.hypot(body[:, 0], body[:, 1])
         out.append(_with_uav(o, np.stack([across * np.cos(turned), across * np.sin(turned), body[:, 2]], axis=1)))

@@ -167,6 +167,7 @@ def between_blocks_db(channel: Channel) -> float:
     """Standard deviation of what a base leaves, between blocks of :data:`BLOCK_M` [dB]; 0 for a single block."""
     cell = np.floor(channel.rows.position_m[:, :2] / BLOCK_M).astype(np.int64)
     member = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    # equal blocks: a hover counts no more than a pass
     means = np.bincount(member, weights=channel.left_db) / np.bincount(member)
     return float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
 
@@ -314,6 +315,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
     held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
     crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*errors)) for key, errors in held_out.items()}
     sure = [key for key in held_out if key[1] == OFF or mean_interval(crps_difference(held_out, key))[1] < 0.0]
+    # to a thousandth of a decibel, then in the order in which they are preferred
     best = min(sure or crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
     flights = tuple(dict.fromkeys(s.flight for s in series))
     predictor = bases[best[0]](series)
@@ -382,6 +384,7 @@ def by_degree(predictor: Predictor) -> Predictor:
         cells = np.zeros(len(samples), dtype=np.int64)
         for ray in (samples.at_tower, samples.at_uav):
             for angle in (azimuth_rad(ray), elevation_rad(ray)):
+                # one integer for both directions, to a degree
                 cells = 361 * cells + np.round(np.degrees(angle)).astype(np.int64) + 180
         degrees, first, member = np.unique(cells, return_index=True, return_inverse=True)
         keys, values = known.get(samples.antenna, (np.zeros(0, dtype=np.int64), np.zeros((2, 0))))

@@ -154,6 +154,7 @@ class _Apart:
         return cls(
             across,
             up,
+            # the product of equal unit vectors may round above 1
             np.maximum(2.0 - 2.0 * inner, 0.0),
             np.abs(rows.time_s[..., :, None] - columns.time_s[..., None, :]),
             (rows.flight[..., :, None] == columns.flight[..., None, :]).astype(np.float64),
@@ -435,6 +436,7 @@ def fit_field(
             total, slope = total - value_nat, slope - gradient
         return total, slope
 
+    # by their logarithms: strengths and lengths are positive, and count by their ratios
     limits = [(math.log(BOUNDS[name][0]), math.log(BOUNDS[name][1])) for name in names]
     first = np.clip([math.log(getattr(start, name)) for name in names], *np.array(limits).T)
     best = minimize(misfit, first, jac=True, bounds=limits, method="L-BFGS-B", options={"maxiter": 40})

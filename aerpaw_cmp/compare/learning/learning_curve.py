@@ -72,6 +72,7 @@ def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurveP
             for scored in filter(None, (score(o, learned.mean(o.samples)) for o in targets)):
                 key = scored.flight, f"{scored.tower}.{scored.channel}"
                 errors[size].setdefault(key, []).append((scored.rmse_db, scored.rmse_4s_db))
+    # the same series at every number: else a curve may fall because a hard flight left it
     common = set.intersection(*(set(each) for each in errors.values()))
     if not common:
         return ()

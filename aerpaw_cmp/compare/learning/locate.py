@@ -197,6 +197,7 @@ def _features(track: LevelTrack, places: FloatArray, model: LevelModel) -> tuple
     """Mean (m, n) of the level before one was seen, and what coefficients of unit variance add (m, n, 4)."""
     ray = track.position_m[None] - places[:, None]
     across = np.hypot(ray[..., 0], ray[..., 1])
+    # of 100 m; nearer than a metre no law of the distance holds
     decades = np.log10(np.maximum(np.hypot(across, ray[..., 2]), 1.0) / 100.0)
     elevation = elevation_rad(ray)
     columns = [
@@ -315,6 +316,7 @@ class Regions:
         """Connected parts of the region that holds a part of the posterior, the likeliest first."""
         from scipy.ndimage import label
 
+        # cells that touch at a corner are of one region
         marks, count = label(self.holding(part), structure=np.ones((3, 3)))
         out = []
         for number in range(1, count + 1):
@@ -416,6 +418,7 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = 
     share = np.exp(log_share - logsumexp(log_share))
     apart = np.hypot(*(places[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1))
     density = np.exp(-0.5 * (apart / SYSTEMATIC_M) ** 2) @ share
+    # rounded: a place and its mirror image differ in the last digit alone
     best = int(np.lexsort((-share, -density.round(12)))[0])
     regions = Regions.of(places, share)
     heights = [h for h in _HEIGHTS_M if share[places[:, 2] == h].sum() > 0.05]

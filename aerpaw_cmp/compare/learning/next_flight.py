@@ -54,6 +54,7 @@ class Known:
         dict of str to (targets,)
             Of antennas and field, without nuisance and noise of a later flight, which no route lowers.
         """
+        # any levels: how well places will be known does not depend on them
         planned = [dataclasses.replace(s, flight=_PLANNED, residual_db=np.zeros(len(s))) for s in route]
         rows = [*self.series, *planned]
         fit = fit_gain(rows, self.model) if rows else None

@@ -57,6 +57,7 @@ class Ahead:
     @property
     def interval_db(self) -> tuple[FloatArray, FloatArray]:
         """90 % interval of one sample (m,) each."""
+        # 1.645: the 95 % point of the normal distribution
         return self.level_db - 1.645 * self.sd_db, self.level_db + 1.645 * self.sd_db
 
 
@@ -165,6 +166,7 @@ class RouteAhead:
         factor = Factor.of(matrix)
         middle = value.mean(axis=0)
         white = factor.whiten(value - middle)
+        # a level that has not changed yet would make every interval a point
         scale = np.maximum((white**2).sum(axis=0) / known, 1e-2)
         targets = _rows(place, time_s)
         mean, explained = factor.condition(covariance(model, targets, rows), white)
@@ -176,6 +178,7 @@ class RouteAhead:
         """The rest of the route from where the UAV is."""
         if len(self._bins.level) < LEAST:
             return None
+        # onwards and not far: where a route crosses itself, the nearest point may be of its other leg
         window = slice(self._reached, self._reached + max(50, len(self.route_m) // 10))
         self._reached += int(np.linalg.norm(self.route_m[window] - place, axis=1).argmin())
         index = np.arange(self._reached, len(self.route_m))

@@ -165,6 +165,7 @@ def score_detection(
     measured = np.maximum(np.nan_to_num(measured_db[finite], nan=floor_db), floor_db)
     if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
         return None
+    # as ranks 1 and 2: the regression of ranks serves here, too
     outcome = detected.astype(np.int64) + 1
     if forecast is None:
         stated = _held_out(time, simulated, outcome)
@@ -219,6 +220,7 @@ def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: flo
     k = np.searchsorted(simulated, grid + floor_db, side="right")
     n = len(measured)
     moved = (second[n] - second[k]) - 2.0 * grid * (first[n] - first[k]) + (n - k) * grid**2
+    # differences of large sums may fall a little below 0
     mse = np.maximum(low[k] + moved, 0.0) / n
     best = int(mse.argmin())
     return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), n, best in (0, len(grid) - 1))

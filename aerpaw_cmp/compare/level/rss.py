@@ -435,6 +435,7 @@ def error_spans(
     smooth = _window_sums(r, first, last) / (last - first)
     limit = 1.5 * float(np.sqrt(np.mean(r**2))) if threshold_db is None else threshold_db
     sign = np.where(smooth > limit, 1, np.where(smooth < -limit, -1, 0))
+    # a gap longer than the window parts a stretch: nobody knows what was between
     cut = (np.diff(sign) != 0) | (np.diff(t) > max(window_s, 1e-9))
     bounds = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
     where = {name: np.asarray(values)[ok] for name, values in (context or {}).items()}
@@ -454,6 +455,7 @@ def error_spans(
                 geometry={name: _typical(values[a:b]) for name, values in where.items()},
             )
         )
+    # a stretch of one sample has no duration, and still counts
     spans.sort(key=lambda span: -abs(span.mean_db) * np.sqrt(span.end_s - span.start_s + 1e-3))
     return spans[:largest]
 
@@ -526,6 +528,7 @@ def channel_difference(
             n=0, mean_db=nan, std_db=nan, correlation=nan, share_parted=nan, interval_std_db=NO_INTERVAL, spans=[]
         )
     difference = first - second
+    # the channels of a receiver have gains of their own
     mean = float(difference[ok].mean())
     residual = difference - mean
     spans = error_spans(

@@ -161,6 +161,7 @@ def score_forecast(
     log, log_constant = log_losses(p, rank), log_losses(flat, rank)
     columns = np.column_stack([log, log - log_constant, p, rank == choice, reported, chosen]).astype(np.float64)
     pair_columns = columns[:, -1 - 2 * MAX_RANK :]  # agreement and the two ranks, as kappa takes them
+    # one set of resamples serves all numbers: the longest memory is safe for each
     memory = max((autocorrelation(c) for c in (pair_columns[:, 0], *columns[:, :2].T)), key=lambda m: m.block_length)
     drawn = bootstrap_means(columns, memory.block_length, replicates=replicates)
     drawn_p, drawn_pair = drawn[:, 2 : 2 + MAX_RANK], drawn[:, 2 + MAX_RANK :]

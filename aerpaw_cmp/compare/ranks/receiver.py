@@ -103,6 +103,7 @@ def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s:
     """
     order = np.argsort(time_s, kind="stable")
     time, centre = time_s[order], time_s + shift_s
+    # an instant at an end of the interval counts, whatever its rounding
     low = np.searchsorted(time, centre - 0.5 * average_s - 1e-9)
     high = np.searchsorted(time, centre + 0.5 * average_s + 1e-9, side="right")
     after = np.searchsorted(time, centre).clip(0, len(time) - 1)
@@ -240,6 +241,7 @@ def _design(x: FloatArray) -> FloatArray:
 
 
 def _softmax(score: FloatArray) -> FloatArray:
+    # less the largest: exp would overflow
     e = np.exp(score - _over_ranks(np.maximum, score)[..., None])
     return np.asarray(e / _over_ranks(np.add, e)[..., None])
 
@@ -301,6 +303,7 @@ def _fit_multinomial(
     target = one_hot(rank) * weight[:, None]
     ridge = np.full(width, penalty)
     ridge[0] = 1e-3 * penalty
+    # half a report more: a rank that nobody reported starts at a finite constant
     start = np.log((target.sum(axis=0) + 0.5) / (weight.sum() + 0.5 * MAX_RANK))
     coefficient = np.zeros((*lead, MAX_RANK, width))
     coefficient[..., 0] = start - start.mean()
@@ -322,6 +325,7 @@ def _fit_multinomial(
         gradient = np.swapaxes(p * weight[:, None] - target, -1, -2) @ design + ridge * coefficient
         hessian = _hessian(design, transposed, p, weight, ridge)
         flat = gradient.reshape(*lead, MAX_RANK * width, 1)
+        # as a matrix of one column: NumPy 2 takes a stack of vectors for one matrix
         step = np.linalg.solve(hessian, flat)[..., 0].reshape(coefficient.shape)
         damping = np.ones((*lead, 1, 1))
         for _halving in range(12):
@@ -383,6 +387,7 @@ def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
     the nearest to none at equal kappa.
     """
     commonest = int(np.bincount(rank).argmax())
+    # those near none first: a further one must be better to be taken
     exponents = sorted(np.arange(-3, 13) / 10.0, key=abs)
     best, weights = -np.inf, np.ones(MAX_RANK)
     ranks = np.arange(1, MAX_RANK + 1)
@@ -553,6 +558,7 @@ def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> flo
 
 def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
     z = _standardised(x)
+    # a rough likelihood is enough to leave candidates out
     weights = _fit_multinomial(z, rank, np.ones(len(rank)), _CHOICE_PENALTY, steps=6)
     p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
     return np.array([log_losses(item, rank).mean() for item in p])

@@ -26,7 +26,9 @@ def certain_rank(h: ComplexArray, k: float) -> tuple[IntArray, BoolArray]:
 
     Matrices without a channel, with an entry that is not finite, or of an extreme scale are never certain.
     """
+    # along the shorter side: the Gram matrix is smaller, and its other eigenvalues are zeros
     x = np.moveaxis(h, 0, 2) if h.shape[2] <= h.shape[1] else np.transpose(h, (2, 1, 0))
+    # matrices along the last axis: each step is one pass over memory
     x = np.ascontiguousarray(x)
     with np.errstate(all="ignore"):  # what is not finite is not certain
         gram = np.einsum("kit,kjt->ijt", x.conj(), x)
@@ -38,6 +40,7 @@ def certain_rank(h: ComplexArray, k: float) -> tuple[IntArray, BoolArray]:
         rank, other_growth = _positive_pivots(gram, threshold * (1.0 - _GUARD))
         certain = (above == rank) & (trace > 1e-200) & (trace < 1e200) & (np.abs(step) < _GUARD * largest)
         certain &= 16.0 * np.finfo(np.float64).eps * np.maximum(growth, other_growth) < _GUARD * threshold
+    # the largest singular value counts by definition
     return np.maximum(rank, 1), certain
 
 

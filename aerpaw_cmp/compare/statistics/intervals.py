@@ -103,6 +103,7 @@ def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
     """Biased autocovariance at lags 0 .. ``lags`` (by FFT); values (n,) without NaN."""
     x = unmasked(values)
     n = len(x)
+    # twice the length: the transform takes the sequence for a circle
     size = 1 << (2 * n - 1).bit_length()
     spectrum = np.fft.rfft(x - x.mean(), size)
     return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2, size)[: lags + 1] / n)
@@ -192,6 +193,7 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
         by_window, width, window_reach = _flat_top(covariance, n)
         by_decay, decay_reach = _exponential(covariance, n)
         # the window's own sum holds the hidden part width / n times over
+        # a window nearly as long as the flight (infinite) says that it is worth one sample
         by_window = (by_window - width * hidden) / (1.0 - width / n) if width < 0.8 * n else np.inf
         long_run, reach = max(by_window, by_decay), max(window_reach, decay_reach)
         if long_run >= n * covariance[0]:
@@ -494,6 +496,7 @@ def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_of
         bounds = squares[0] / scale, squares[1] / scale
         if bounds[0] <= 0.0 <= bounds[1] and (bounds[0] < -other_rmse or bounds[1] > rmse):
             bounds = NO_INTERVAL
+        # one standard deviation of a normal distribution on either side: heavy tails do not count
         spread = float(0.5 * np.diff(np.quantile(drawn, [0.1587, 0.8413]))[0]) / scale
         chance = 2.0 * min(float(np.mean(drawn <= 0.0)), float(np.mean(drawn >= 0.0)), 0.5)
     return PairedDifference(
@@ -601,6 +604,7 @@ def share_interval(share: float, spread: float, known: Autocorrelation) -> Inter
     """
     if not known.enough or not np.isfinite(share):
         return NO_INTERVAL
+    # 1.96: the 97.5 % point of the normal distribution, which Wilson's interval takes
     variance = spread**2 * known.half_width**2 / 1.959964**2
     size = known.n_effective if variance <= 0 else share * (1 - share) / variance
     size = float(np.clip(size, 1.0, known.n))

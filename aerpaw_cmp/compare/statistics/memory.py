@@ -129,6 +129,7 @@ def cosine_terms(values: FloatArray) -> Terms:
     every = dct(values - values.mean(), norm="ortho")[1:] / np.sqrt(n)
     count = int(_FEWER[(n - 1) // 2 >= _FEWER].max())
     fast = np.square(every[count:])
+    # Satterthwaite's: a normal term to the fourth power is on average three times its variance squared
     freedom = max(3.0 * float(fast.sum()) ** 2 / max(float((fast * fast).sum()), 1e-300), 1.0)
     return Terms(every[:count], float(fast.sum()), freedom)
 
@@ -138,6 +139,7 @@ def likelihoods(slow: FloatArray) -> tuple[FloatArray, FloatArray]:
     known = memories(slow.shape[-1])
     square = np.square(slow @ known.whiten.swapaxes(1, 2)).sum(axis=-1).T
     log = known.log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
+    # over the likeliest: the likelihoods themselves leave the range of numbers
     return np.exp(log - log.max(axis=-1, keepdims=True)), square
 
 
@@ -159,6 +161,7 @@ def _picked(slow: FloatArray, kind: Kind) -> tuple[IntArray, FloatArray]:
     likelihood, square = likelihoods(slow)
     running = np.cumsum(likelihood * weights(kind))
     uniform, chi_squared, *_ = _random(len(slow))
+    # a chance near 1 may round to the whole sum
     index = np.minimum(np.searchsorted(running, uniform * running[-1]), len(running) - 1)
     return index, square[index] / chi_squared
 

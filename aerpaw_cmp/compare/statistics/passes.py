@@ -127,12 +127,14 @@ class _Places:
 
     def partners(self, other: _Places, radius_m: float, within_deg: float | None) -> tuple[IntArray, IntArray]:
         """Numbers, in both passes, of samples and the nearest ones of the other pass; headings agree."""
+        # only what lies in the other's box can pair: most flights of a season end here
         near = np.flatnonzero(
             ((self.position_m >= other.low - radius_m) & (self.position_m <= other.high + radius_m)).all(axis=1)
         )
         if not len(near):
             return near, near
         distance, nearest = other.tree.query(self.position_m[near], distance_upper_bound=radius_m)
+        # the tree answers infinity where nothing is near enough
         paired = np.isfinite(distance)
         rows, nearest_rows = near[paired], nearest[paired]
         if within_deg is not None and self.heading_deg is not None and other.heading_deg is not None:
@@ -254,6 +256,7 @@ def cell_means(
     """
     cells = np.floor(position_m[good, :2] / cell_m).astype(np.int64)
     cell, which = np.unique(cells, axis=0, return_inverse=True)
+    # NumPy 2.0 gives it two dimensions
     which = which.reshape(-1)
     count = np.maximum(np.bincount(which, minlength=len(cell)), 1)
     residual = np.bincount(which, weights=residual_db[good], minlength=len(cell)) / count

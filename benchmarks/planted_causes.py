@@ -148,13 +148,11 @@ def level(tower: Array, place: Array, turns: Array, pattern: Antenna | None) -> 
     return np.asarray(gain - 20 * np.log10(np.linalg.norm(tower - place, axis=1)))
 
 
-def situation(troubles: tuple[str, ...], draw: np.random.Generator) -> LevelEvidence:
-    """A flight with some troubles, each of which changes the level by :data:`LEAST_DB` at least."""
-    return situation_with_truth(troubles, draw)[0]
+def situation(troubles: tuple[str, ...], draw: np.random.Generator) -> tuple[LevelEvidence, LevelEvidence]:
+    """A flight with some troubles, each of which changes the level by :data:`LEAST_DB` at least, and its truth.
 
-
-def situation_with_truth(troubles: tuple[str, ...], draw: np.random.Generator) -> tuple[LevelEvidence, LevelEvidence]:
-    """:func:`situation`, and the same with the level without noise as predicted, and what was clipped out of lock."""
+    The truth is the same flight with the level without noise as predicted, and what was clipped out of lock.
+    """
     while True:
         evidence, truth, effects = drawn(troubles, draw)
         if all(effect >= LEAST_DB for effect in effects):
@@ -296,7 +294,7 @@ def run(flights: int, seed: int) -> list[tuple[tuple[str, ...], str]]:
     """Planted and named causes of some flights."""
     results = []
     for number, troubles in enumerate(plans(flights, seed)):
-        cause = flight_cause([situation(troubles, np.random.default_rng([seed, number]))])
+        cause = flight_cause([situation(troubles, np.random.default_rng([seed, number]))[0]])
         results.append((troubles, NONE if cause is None else cause.name))
     return results
 
@@ -306,7 +304,7 @@ def oracle(flights: int, seed: int, margins: tuple[float, ...]) -> dict[float, t
     leads = []
     for number, troubles in enumerate(plans(flights, seed)):
         if troubles:
-            seen, truth = map(causes._binned, situation_with_truth(troubles, np.random.default_rng([seed, number])))
+            seen, truth = map(causes._binned, situation(troubles, np.random.default_rng([seed, number])))
             if seen is None or truth is None:
                 leads.append(-np.inf)
                 continue

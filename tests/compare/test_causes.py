@@ -172,7 +172,7 @@ def test_situations_of_the_benchmark_are_named() -> None:
     wrong = []
     for number in range(12):
         planted = () if number % 4 == 0 else (TROUBLES[number % len(TROUBLES)],)
-        name = _named(situation(planted, np.random.default_rng([11, number])))
+        name = _named(situation(planted, np.random.default_rng([11, number]))[0])
         wrong += [(planted, name)] if name not in (planted or (NONE,)) else []
     assert len(wrong) <= 2, wrong
     assert sum(name != NONE for _, name in wrong) <= 1, wrong

@@ -454,6 +454,7 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
         gain_db=-100.0,
         per_db=0.1,
         share=0.7,
+        locked_db=-50.0,
         locked_per_db=0.8,
         locked_sd_db=7.0,
         lost_db=-27.0,
@@ -469,11 +470,11 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
     score = SimpleNamespace(residual_db=np.array([2.0, 4.0, -9.0]), offset_db=-5.0)
     stated = StatedSpread(gain_sd_db=np.ones(3), spread=NO_SPREAD)
     parts = compared._with_lock(case, score, stated).lock
-    # path gains 10, 0 and -10 dB from -100: the two in lock lie 5 dB about their middle, a fifth of that counts
+    # path gains 10, 0 and -10 dB from -100; in lock it measured -43 and -51, 1 dB below what others did at these gains
     assert parts.locked_db == pytest.approx([3.0 - 1.0, 3.0 + 1.0, 3.0 + 3.0])
-    assert parts.probability == pytest.approx(1.0 / (1.0 + np.exp([-1.0, 0.0, 1.0])))
+    assert parts.probability == pytest.approx(1.0 / (1.0 + np.exp([-0.9, 0.1, 1.1])))
     assert parts.lost_db == pytest.approx(
-        [-27.0 + shift - 5.0 + level for shift, level in ((5, 50), (0, 60), (-5, 70))]
+        [-27.0 + shift - 5.0 + level for shift, level in ((4.5, 50), (-0.5, 60), (-5.5, 70))]
     )
     assert (parts.locked_sd_db, parts.lost_sd_db) == (7.0, 8.0)
     case.series.locked = None

@@ -168,6 +168,14 @@ def test_a_flown_route_is_scored_by_what_was_said(said):
     assert scores["rmse_db"] == pytest.approx(np.sqrt(np.mean(error**2)))
     assert scores["coverage_90"] == np.mean(np.abs(error) <= 4.935)
     assert against.metrics()["sentence"].startswith("Predicted before this flight: RMSE")
+    sure = against.series[0].scores
+    frame = pd.read_csv(said[1] / "prediction.csv")
+    away = {"p_lock": 0.999, "locked_db": frame["level_db"] + 20, "lost_db": frame["level_db"] - 20}
+    frame.assign(**away, locked_sd_db=1.0, lost_sd_db=1.0).to_csv(said[1] / "prediction.csv", index=False)
+    (scores,) = score_against(*said).scores.values()  # nearly always 20 dB above what was measured
+    assert scores["coverage_50"] == scores["coverage_95"] == 0.0
+    assert scores["log_score"] > 100.0 > sure["log_score"]
+    assert scores["crps_db"] > 5.0 > sure["crps_db"]
 
 
 def test_a_neighbour_stands_for_the_rank_of_a_point(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -114,11 +114,16 @@ class LostLock:
     locked_sd_db: float
     lost_sd_db: float
 
+    @property
+    def parts(self) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
+        """Share, mean error and standard deviation (each (n,)) in lock, then without."""
+        one, share = np.ones(len(self.probability)), self.probability
+        lost = 1.0 - share, self.lost_db, self.lost_sd_db * one
+        return [(share, self.locked_db, self.locked_sd_db * one), lost]
+
     def sd_db(self, about_db: FloatArray) -> FloatArray:
         """Root mean square (n,) of the error about a prediction that is this much higher (n,) [dB]."""
-        locked = (self.locked_db - about_db) ** 2 + self.locked_sd_db**2
-        lost = (self.lost_db - about_db) ** 2 + self.lost_sd_db**2
-        return np.asarray(np.sqrt(self.probability * locked + (1.0 - self.probability) * lost))
+        return np.asarray(np.sqrt(sum(share * ((mean - about_db) ** 2 + sd**2) for share, mean, sd in self.parts)))
 
     def quantile_db(self, share: float) -> FloatArray:
         """Error (n,) below which a share of the samples lies, to a hundredth of a dB."""
@@ -127,12 +132,16 @@ class LostLock:
         reach = 6.0 * max(self.locked_sd_db, self.lost_sd_db)
         low = np.minimum(self.locked_db, self.lost_db) - reach
         high = np.maximum(self.locked_db, self.lost_db) + reach
-        for _ in range(16):
+        for _ in range(16):  # no closed form: each step halves what is left of some 130 dB
             middle = 0.5 * (low + high)
-            below = self.probability * ndtr((middle - self.locked_db) / self.locked_sd_db)
-            below += (1.0 - self.probability) * ndtr((middle - self.lost_db) / self.lost_sd_db)
+            below = sum(p * ndtr((middle - mean) / sd) for p, mean, sd in self.parts)
             low, high = np.where(below < share, middle, low), np.where(below < share, high, middle)
         return np.asarray(0.5 * (low + high))
+
+    def log_score(self, error_db: FloatArray) -> float:
+        """Mean of minus the logarithm of the density at errors (n,) [nat]."""
+        density = sum(p / sd * np.exp(-0.5 * ((error_db - mean) / sd) ** 2) for p, mean, sd in self.parts)
+        return float(-np.log(density / np.sqrt(2.0 * np.pi)).mean())
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -166,11 +175,8 @@ class StatedSpread:
         Of a mixture of normal distributions in closed form (Grimit, Gneiting, Berrocal and Johnson 2006,
         doi:10.1256/qj.05.235).
         """
-        zero, lock = np.zeros(len(error_db)), self.lock
-        parts = [(zero + 1.0, zero, self.total_db)] if lock is None else [
-            (lock.probability, zero + lock.locked_db, zero + lock.locked_sd_db),
-            (1.0 - lock.probability, lock.lost_db, zero + lock.lost_sd_db),
-        ]  # fmt: skip
+        one = np.ones(len(error_db))
+        parts = [(one, 0.0 * one, self.total_db)] if self.lock is None else self.lock.parts
 
         def distance(mean: FloatArray, sd: FloatArray) -> FloatArray:
             return np.asarray(crps_normal(mean, sd) + sd / np.sqrt(np.pi))

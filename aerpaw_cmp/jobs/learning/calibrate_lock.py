@@ -116,6 +116,9 @@ def _learned(
 # Of a receiver that always writes the same level without lock.
 _LEAST_SD_DB = 0.5
 
+# Width of the central 90 % of a normal distribution, over its standard deviation.
+_CENTRAL = 3.29
+
 
 def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
     """Lines of the level over path gain in lock and without, and the spread about each."""
@@ -126,8 +129,9 @@ def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
         gain, level = (np.concatenate(values) for values in zip(*each, strict=True))
         alike = np.concatenate([np.full(len(g), len(g) ** -0.5) for g, _ in each])  # each flight of the same weight
         slope, middle = np.polyfit(gain, level, 1, w=alike)
-        about = float(np.mean([np.var(m - slope * g) for g, m in each]))
-        sd = np.sqrt(about) if in_lock else (level - middle - slope * gain).std()
+        # in lock fades are rare and deep: the spread of the central 90 %, or the band of 90 % holds more
+        central = np.mean([np.ptp(np.quantile(m - slope * g, (0.05, 0.95))) for g, m in each]) / _CENTRAL
+        sd = central if in_lock else (level - middle - slope * gain).std()
         numbers |= {f"{name}_db": middle, f"{name}_per_db": slope, f"{name}_sd_db": max(sd, _LEAST_SD_DB)}
     return {name: round(float(value), 3) for name, value in numbers.items()}
 

@@ -14,6 +14,7 @@ from ...common.files import LARGEST_TABLE, read_bounded
 from ...common.geodesy import bearing_deg
 from ...common.provenance import KEY, MARKS
 from ...common.units import FloatArray, IntArray
+from ...compare.gains.spread import LostLock
 from ...compare.learning.calibration import Observed
 from ...compare.ranks.forecast import ForecastScore, score_forecast
 from ...flight.data import FlightData
@@ -23,7 +24,7 @@ from ...report.content.against import Against, AgainstSeries
 from ...report.words.prediction import against_words
 from ..learning.calibrate import observe
 from ..learning.calibrate_rank import RankSamples, rank_samples
-from .predict import RANKS
+from .predict import P_LOCK, RANKS
 
 # A sample is scored by the nearest predicted point within these distances whose nose differs by less.
 NEAR_M, _NEAR_UP_M, _TURNED_DEG = 30.0, 15.0, 45.0
@@ -90,16 +91,30 @@ def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
     if near.sum() < FEWEST:
         return None
     predicted, s = part.iloc[index[near]], finite.samples.part(near)
+
+    def column(name: str) -> FloatArray:
+        return np.asarray(predicted[name], dtype=np.float64)
+
+    level_db, lock = column("level_db"), None
+    if P_LOCK in predicted and predicted[P_LOCK].notna().all():
+        lock = LostLock(
+            probability=column(P_LOCK),
+            locked_db=column("locked_db") - level_db,
+            lost_db=column("lost_db") - level_db,
+            locked_sd_db=float(column("locked_sd_db")[0]),
+            lost_sd_db=float(column("lost_sd_db")[0]),
+        )
     return AgainstSeries(
         name=f"{s.tower} {s.channel}",
         time_s=s.time_s,
         measured_db=s.residual_db + finite.free_space_db[near],
-        level_db=predicted["level_db"].to_numpy(np.float64),
-        sd_db=predicted["sd_db"].to_numpy(np.float64),
-        low_db=predicted["q05_db"].to_numpy(np.float64),
-        high_db=predicted["q95_db"].to_numpy(np.float64),
+        level_db=level_db,
+        lock=lock,
+        sd_db=column("sd_db"),
+        low_db=column("q05_db"),
+        high_db=column("q95_db"),
         share_near=float(near.mean()),
-        common_db=predicted["slow_sd_db"].to_numpy(np.float64) if "slow_sd_db" in predicted else 0.0,
+        common_db=column("slow_sd_db") if "slow_sd_db" in predicted else 0.0,
         start=finite.start,
     )
 

@@ -427,7 +427,9 @@ def _stated(model: Flown | Memory, antenna: str, level_db: AnyArray, slow_db: An
     low, middle, high = (lock.quantile_db(share) for share in (0.5 - 0.5 * BAND, 0.5, 0.5 + 0.5 * BAND))
     sd = lock.sd_db(middle)  # with and without lock differ for longer than 4 s
     ends = {"level_db": level_db + middle, "sd_db": sd, "q05_db": level_db + low, "q95_db": level_db + high}
-    return ends | {"slow_sd_db": sd, P_LOCK: lock.probability}
+    parts = {"locked_db": level_db + lock.locked_db, "lost_db": level_db + lock.lost_db}
+    spreads = {f"{name}_sd_db": np.full(len(sd), getattr(lock, f"{name}_sd_db")) for name in ("locked", "lost")}
+    return ends | {"slow_sd_db": sd, P_LOCK: lock.probability} | parts | spreads
 
 
 def _levels(

@@ -185,11 +185,15 @@ def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | Non
     locked = (series.locked == 1.0) & np.isfinite(error_db)
     if lock is None or not locked.any():
         return stated
-    above_db = case.levels.simulated_db - series.link.transmit_power_dbm - lock.gain_db
+    simulated_db = case.levels.simulated_db
+    above_db = simulated_db - series.link.transmit_power_dbm - lock.gain_db
+    expected_db = lock.locked_db + lock.locked_per_db * above_db + score.offset_db - simulated_db
+    # a flight that is stronger in lock than others at the same path gain loses its lock later, too
+    own_db = (error_db - expected_db)[locked].mean()
     parts = LostLock(
-        probability=_forecast(series, lock).probability(case.levels.simulated_db),
-        locked_db=error_db[locked].mean() + (lock.locked_per_db - 1.0) * (above_db - above_db[locked].mean()),
-        lost_db=lock.lost_db + lock.lost_per_db * above_db + score.offset_db - case.levels.simulated_db,
+        probability=_forecast(series, lock).probability(simulated_db + own_db),
+        locked_db=expected_db + own_db,
+        lost_db=lock.lost_db + lock.lost_per_db * (above_db + own_db) + score.offset_db - simulated_db,
         locked_sd_db=lock.locked_sd_db,
         lost_sd_db=lock.lost_sd_db,
     )

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ...common.units import FloatArray
+from ...compare.gains.spread import NO_SPREAD, LostLock, StatedSpread, inside_shares
 from ...compare.judge.entries import LevelSeries, level_scores
 from ...compare.judge.verdicts import Verdict, stated_errors
 from ...compare.ranks.forecast import ForecastScore
@@ -28,31 +29,30 @@ class AgainstSeries(LevelSeries):
     common_db: FloatArray | float = 0.0
     """Part of ``sd_db`` that the whole flight may share."""
 
+    lock: LostLock | None = None
+    """In place of ``sd_db``, of a receiver that loses its lock."""
+
     @property
     def stated(self) -> Verdict:
         """True if the errors are as large as was stated."""
         return replace(stated_errors(self.error_db, self.sd_db, self.common_db), where=self.name)
 
-    def coverage(self, share: float) -> float:
-        """Share of samples inside the interval that is to hold so many."""
-        from scipy.special import ndtri
-
-        half = float(ndtri(0.5 + 0.5 * share)) * self.sd_db
-        return float(np.mean(np.abs(self.error_db) <= half))
-
     @property
     def scores(self) -> dict[str, float]:
         """Scores as predicted; ``own_offset_rmse_db`` about the mean of the flight."""
-        return {
+        as_stated = StatedSpread(gain_sd_db=self.sd_db, spread=NO_SPREAD, lock=self.lock)
+        scores = {
             **level_scores([self]),
             "bias_db": self.bias_db,
             "own_offset_rmse_db": float(self.error_db.std()),
-            "coverage_50": self.coverage(0.5),
+            **{name.replace("inside", "coverage"): s for name, s in inside_shares(self.error_db, as_stated).items()},
             "coverage_90": float(np.mean((self.measured_db >= self.low_db) & (self.measured_db <= self.high_db))),
-            "coverage_95": self.coverage(0.95),
             "mean_sd_db": float(self.sd_db.mean()),
             "share_near": self.share_near,
         }
+        if self.lock is not None:
+            scores |= {"crps_db": as_stated.crps_db(self.error_db), "log_score": self.lock.log_score(self.error_db)}
+        return scores
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

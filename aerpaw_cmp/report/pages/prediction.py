@@ -130,7 +130,8 @@ def _dataset(data: PredictionPage) -> Dataset:
     variables: dict[str, Any] = {"series": ("series", np.array(names), {"long_name": "tower and channel"})}
     for name, unit in (("time_s", "s"), ("east_m", "m"), ("north_m", "m"), ("height_m", "m"), ("yaw_deg", "degree")):
         variables[name] = ("point", first[name].to_numpy(np.float64), {"units": unit})
-    for name in ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db", "p_serving", "p_lock"):
+    ends = ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db")
+    for name in (*ends, "p_serving", "p_lock", "locked_db", "locked_sd_db", "lost_db", "lost_sd_db"):
         if name in first:
             values = np.stack([part[name].to_numpy(np.float32) for _, part in series])
             variables[name] = (("series", "point"), values, {"units": "dB" if name.endswith("_db") else "1"})

@@ -75,12 +75,11 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("time", "time", (
         r"^time utc usec$", r"^time (edt|est|cdt|cst|mdt|mst|pdt|pst|cest|cet|bst|utc|gmt)$",
         r"^(measured|recorded|logged|sampled|seen) at$",
-        r"^(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| us| iso| unix)?$",
-        r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s| us)?$",
-        r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| local| epoch)?$",
-        r"^time ?millisecond$",
-        r"^(rel|relative|elapsed) ?time( ms| s)?$", r"^elapsed$", r"^time boot ms$", r"^(epoch|unix)( ms| s)?$",
-        r"^utc$", r"^t$",
+        r"^(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| us| ns| iso| unix)?$",
+        r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s| us| ns)?$",
+        r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| ns| local| epoch)?$",
+        r"^time ?millisecond$", r"^(rel|relative|elapsed) ?time( ms| s| us| ns)?$", r"^elapsed$", r"^time boot ms$",
+        r"^(epoch|unix)( ms| s| us| ns)?$", r"^utc$", r"^t$",
         r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
     )),
     Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$", r"^(datum|fecha)$")),
@@ -89,7 +88,11 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("gps_seconds", "time", (
         r"^(gps ?)?(tow|i ?tow|seconds? of week|week seconds?|sow|gps seconds?)( s| ms)?$", r"^gms$",
     ), "s"),
-    # where
+    # where; the places of a home, of a tower or of the one who flies are not the aircraft's
+    Quantity("elsewhere", "other", (
+        r"\b(home|ref|reference|origin|tower|cell|site|station|bs|base|enb|gnb|target|waypoint|wp|pilot|operator|gcs|rc"
+        r"|destination|take ?off|launch)\b.* (lat|latitude|lon|lng|long|longitude)\b",
+    )),
     Quantity("latitude_deg", "position", (
         r"^(osd |gps )?(lat|latitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67])?$", r" (lat|latitude)( deg)?$",
         r"^(breite|breitengrad|latitud)( deg)?$",
@@ -117,7 +120,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("altitude_m", "height", (
         r"(\b|altitude|alt|height|h)(amsl|msl|asl)\b", r"sea ?level", r"\borthometric\b|^alt(itude)? (gps|geoid)$",
         r"^osd alt", r"^gps " + _UP[2:],
-        r"^(ele|elevation)( m| ft| feet| meters)?$",
+        r"^(ele|elev|elevation)( m| ft| feet| meters)?$",
     ), "m", can_be=(-1000.0, 20_000.0), datum="sea level"),
     Quantity("altitude_m", "height", (
         r"ellips", r"\b(hae|wgs ?84)\b",
@@ -150,7 +153,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     # who
     Quantity("device", "identity", (
         r"^(device|phone|modem|ue|vehicle|drone|uav|logger|serial|client|user|robot|rover|aircraft|tail|host"
-        r"|interface|mac|bssid|gps|gps receiver)"
+        r"|interface|mac|bssid|gps|gps receiver|instance)"
         r"( ?(id|name|no|num|number|sn|serial|index|instance|port|model|address))?$",
         r"^(imei|imsi|sys ?id|system ?id|comp ?id|component ?id)$",
         r"^(receiver|rx)( ?(id|name|channel|port|antenna|serial number))?$",
@@ -176,8 +179,8 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("RSRP", "rss", (
         r"\brs ?rp\b|\bss ?rsrp\b|\b(nrx)?rsrp\d{0,2}\b|\b(n|nb|nbr)\d{0,2}rsrp\b",
     ), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0, 255.0), can_be=(-60.0, 3.0)),
-    Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", can_be=_DB),
+    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0, 99.0, 255.0), can_be=(-60.0, 3.0)),
+    Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", none=(99.0, 255.0), can_be=_DB),
     Quantity("RSSI", "rss", (r"\brssi\d{0,2}\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RSCP", "rss", (r"\brscp\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RxLev", "rss", (r"\brx ?lev\b",), "dBm", none=(0.0,), can_be=_DBM),
@@ -401,7 +404,7 @@ def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
 UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     **{word: ("m", _times(factor)) for word, factor in (
         ("ft", 0.3048), ("feet", 0.3048), ("foot", 0.3048), ("m", 1.0), ("meter", 1.0), ("meters", 1.0),
-        ("metres", 1.0), ("cm", 0.01), ("mm", 1e-3), ("km", 1e3), ("yd", 0.9144), ("in", 0.0254),
+        ("metres", 1.0), ("dm", 0.1), ("cm", 0.01), ("mm", 1e-3), ("km", 1e3), ("yd", 0.9144), ("in", 0.0254),
         ("inch", 0.0254), ("inches", 0.0254))},
     **{word: ("m/s", _times(factor)) for word, factor in (
         ("mph", 0.44704), ("m/s", 1.0), ("mps", 1.0), ("km/h", 1 / 3.6), ("kmh", 1 / 3.6), ("kph", 1 / 3.6),
@@ -502,10 +505,10 @@ PROGRAMS: tuple[Program, ...] = (
              units={"timestamp": "us", "alt": "mm", "lat": "e7", "lon": "e7"}),
     _program("PX4", "timestamp,timestamp sample", "timestamp,delta alt", datum="sea level", units={"timestamp": "us"},
              angles="rad"),
-    _program("MAVLink", "time boot ms", "rollspeed", datum="sea level", angles="rad", units=_MAVLINK_UNITS,
-             words={r"satellites visible": "satellites", r"voltage battery": "battery voltage"}),
+    _program("MAVLink", "time boot ms", "rollspeed", "satellites visible,eph", datum="sea level", angles="rad",
+             units=_MAVLINK_UNITS, words={r"satellites visible": "satellites", r"voltage battery": "battery voltage"}),
     _program("ArduPilot", "timeus", "gcrs,spd", "lat,lng,q1,q2", "desroll,roll", datum="sea level", angles="deg",
-             words={r"status": "fix"}),
+             words={r"status": "fix", r"i": "instance"}),
     AERPAW_MAT,
     _program("aerpawlib", "gpsfix,numberofsatellites", "gpsfix,batteryvolts", "numberofsatellites,batteryvolts",
              "volt,number of satellite", "voltage,number of satellites", "volt,number of satellites", datum="take-off"),

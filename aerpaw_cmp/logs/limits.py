@@ -126,7 +126,7 @@ class _Check:
         self._near_in_time()
         if kind == "rss":
             self._two_levels()
-        self._at_a_site_if_exchanged()
+        self._at_a_site_if_otherwise()
         bad, sentence = jumps_of(replace(self.stream, frame=self.frame))
         if bad.any():
             self.frame = _marked(self.frame, bad, FLAG, [name for name in PLACE if name in self.frame.columns])
@@ -166,16 +166,22 @@ class _Check:
         fits = (latitude > 90.0) & (latitude <= 180.0) & (longitude <= 90.0)
         return "; are latitude and longitude exchanged?" if fits.all() else ""
 
-    def _at_a_site_if_exchanged(self) -> None:
-        """Say where positions that can be would lie at a site of AERPAW with their angles exchanged."""
+    def _at_a_site_if_otherwise(self) -> None:
+        """Say where positions that can be would lie at a site of AERPAW, were they written otherwise."""
         if not {*PLACE[:2]} <= set(self.frame.columns):
             return
         place = self.frame[[*PLACE[:2]]].median().to_numpy(dtype=np.float64)
-        if (np.abs(np.array(SITES_DEG) - place[::-1]) < NEAR_DEG).all(axis=1).any():
-            self._said.append(
-                f"{self._what}: the positions lie at latitude {place[0]:.3f}, longitude {place[1]:.3f}; "
-                "exchanged they lie at a site of AERPAW: are latitude and longitude exchanged?"
-            )
+        for how, other in (
+            ("latitude and longitude exchanged", place[::-1]),
+            ("western longitudes without their sign", place * [1, -1]),
+            ("they radians", np.degrees(place)),
+            ("they 1e-6 deg", place * 10),  # read as 1e-7 deg, as MAVLink writes integers
+        ):
+            if (np.abs(np.array(SITES_DEG) - other) < NEAR_DEG).all(axis=1).any():
+                self._said.append(
+                    f"{self._what}: the positions lie at latitude {place[0]:.3f}, longitude {place[1]:.3f}; "
+                    f"otherwise they lie at a site of AERPAW: are {how}?"
+                )
 
     def _within_ports(self) -> None:
         """No rank is above the number of ports that the log itself tells."""

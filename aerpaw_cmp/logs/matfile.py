@@ -222,6 +222,8 @@ def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) ->
 def _rows(values: _Element, shape: tuple[int, ...], order: str) -> AnyArray:
     """Rows of a character matrix as text, trailing blanks removed."""
     encoding = _ENCODINGS.get(values.kind)
+    if len(shape) > 2 and math.prod(shape) == shape[0] * shape[-1]:
+        shape = shape[0], shape[-1]  # SciPy writes a column of texts with a dimension more
     if encoding is None or len(shape) != 2:
         raise _damaged("characters of an unknown kind")
     if encoding != "utf-8":

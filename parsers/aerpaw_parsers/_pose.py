@@ -47,6 +47,9 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
             text = "a position on a grid (UTM, ECEF), which is not read: add columns of latitude and longitude"
             rows.warnings.append(f"column {sheet.names[grid]!r}: {text}")
         return None
+    alike = sheet.alike(latitude)
+    if len(alike) > 1:
+        rows.warnings.append(f"several columns of positions ({', '.join(alike)}): {alike[0]!r} was read, a guess")
     values: dict[str, AnyArray] = {key: sheet.numbers(i) for key, i in zip(PLACE, (latitude, longitude), strict=False)}
     lost = clean(rows, values)
     refuse_whole_degrees([sheet.names[latitude], sheet.names[longitude]], values)

@@ -92,9 +92,9 @@ def _number(text: str) -> tuple[float, str]:
         return np.nan, ""
 
 
-# 35.728 N; 35 43.68 N; degrees, minutes and seconds with their marks.
-_MARKS = "[\u00b0'\u2032\u2033\"dms ]"
-_ANGLE = re.compile(rf"[-+]?[\d.]+(?:{_MARKS}{{1,3}}[\d.]+){{0,2}}{_MARKS}{{0,3}}([NSEW]?)")
+# 35.728 N; N 35 43.68; degrees, minutes and seconds with their marks or colons.
+_MARKS = "[\u00b0'\u2032\u2033\"dms: ]"
+_ANGLE = re.compile(rf"([NSEW]?) ?[-+]?[\d.]+(?:{_MARKS}{{1,3}}[\d.]+){{0,2}}{_MARKS}{{0,3}}([NSEW]?)")
 
 
 def _angle(text: str) -> tuple[float, str]:
@@ -108,7 +108,7 @@ def _angle(text: str) -> tuple[float, str]:
     except ValueError:
         return np.nan, ""
     value = sum(part / 60**i for i, part in enumerate(parts))
-    return -value if written[1] in ("S", "W") or text.startswith("-") else value, ""
+    return -value if {*written.groups()} & {"S", "W"} or text.startswith("-") else value, ""
 
 
 # 'Longitude (W)', 'lon_deg_W'; columns of such letters: 'lat_dir', 'lonRef', 'E/W'.
@@ -192,6 +192,13 @@ class Sheet:
         ]
         return min(known)[2] if known else None
 
+    def alike(self, column: int) -> list[str]:
+        """Names of the columns that hold the quantity of one as surely as that, in the order of the table."""
+        what = self.meanings[column]
+        both = [(i, other) for i, other in enumerate(self.meanings) if what is not None and other is not None]
+        rank = {i: dictionary.rank_of(other.quantity, self.plain[i]) for i, other in both}
+        return [self.names[i] for i, place in rank.items() if place == rank[column]]
+
     def named(self, *names: str) -> int | None:
         """The first column of one of some plain names, as the file has them."""
         return next((self._own.index(name) for name in names if name in self._own), None)
@@ -267,9 +274,11 @@ class Sheet:
         return self._numbers[column]
 
     def _parsed(self, column: int, texts: list[str]) -> FloatArray:
+        meaning = self.meanings[column]
         if self._has_points and _are_thousands(texts):
             texts = [text.replace(",", "") for text in texts]
-        meaning = self.meanings[column]
+        elif meaning is not None and meaning.quantity.role == "cell" and self.has_decimal_commas:
+            texts = [text.replace(".", "") for text in texts]  # an EARFCN of 2.300 is no fraction
         reads = _angle if meaning is not None and meaning.quantity.role == "position" else _number
         counts = Counter(texts)  # tables repeat themselves
         parsed = {text: reads(text) for text in counts}
@@ -302,6 +311,9 @@ class Sheet:
         if not dictionary.is_unit(self.unit(column)) and (form := dictionary.angle_form(values, quantity)):
             self.notes[column] = f"column {self.names[column]!r}: no angle in degrees can be so large: read as {form}"
             values = dictionary.converted(values, form)
+        if quantity.name == "longitude_deg" and 180 < np.nanmax(values, initial=0.0) <= 360 and np.nanmin(values) >= 0:
+            self.notes[column] = f"column {self.names[column]!r}: longitudes of 0 .. 360 deg: read as -180 .. 180"
+            values = np.where(values > 180, values - 360.0, values)
         positive, negative = "NS" if quantity.name == "latitude_deg" else "EW"
         own = _HEMISPHERE.search(self.names[column])
         if own is not None and own[1] in (positive, negative):
@@ -315,8 +327,10 @@ class Sheet:
 
     @cached_property
     def _has_points(self) -> bool:
-        """Check whether the first row has a decimal point: then no comma of the table is a decimal one."""
-        return bool(self.cells) and any(_DECIMAL_POINT.fullmatch(cell.strip()) for cell in self.cells[0])
+        """Check whether the first row has a decimal point and no comma that parts no thousands: no comma is decimal."""
+        first = [cell.strip() for cell in self.cells[0]] if self.cells else []
+        commas = [cell for cell in first if _DECIMAL_COMMA.fullmatch(cell)]
+        return any(_DECIMAL_POINT.fullmatch(cell) for cell in first) and all(map(_THOUSANDS.fullmatch, commas))
 
     @cached_property
     def has_decimal_commas(self) -> bool:
@@ -369,10 +383,28 @@ def cut(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> Sheet
     below = ~lines.blank
     below[: at + 1] = False
     numbers = np.flatnonzero(below).tolist()
-    table = _Table(list(names), [*range(at + 1)])
+    group = [text.strip() for text in split_row(lines.raw(at - 1), separator)] if at else []
+    table = _Table(_unlike(names, group), [*range(at + 1)])
     for i, fields in _fitted([(i, split_row(lines.raw(i), separator)) for i in numbers], names):
         table.add(i, fields)
     return table.sheet(lines, numbers[-1] if numbers else at)
+
+
+def _kind_of(name: str) -> tuple[str, str, str] | None:
+    what = dictionary.meaning(name)
+    return None if what is None or what.indirect else (what.quantity.name, what.rat, what.place)
+
+
+def _unlike(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:
+    """Names of a header without any twice: with the words of merged cells above them in front, else numbered."""
+    counts, before = Counter(names), Counter[str]()
+    unlike, above = [], ""
+    for i, name in enumerate(names):
+        before[name] += 1
+        above = (group[i] or above) if len(group) == len(names) else ""
+        alone = not name or counts[name] == 1 or not (above or before[name] > 1)
+        unlike.append(name if alone else f"{above} {name}" if above else f"{name} {before[name]}")
+    return unlike
 
 
 class _Table:
@@ -405,6 +437,7 @@ class _Table:
 
     def _is_units(self, texts: list[str]) -> bool:
         """Check whether the line below the names has their units, which become parts of the names."""
+        texts = [text.strip("[]()") for text in texts]
         filled = [text for text in texts if text]
         units = sum(dictionary.is_unit(text) or text in _HARMLESS for text in filled)
         if self._row or len(texts) != len(self.names) or len(filled) < 2 or 2 * units <= len(filled):
@@ -414,6 +447,7 @@ class _Table:
 
     def _is_header(self, texts: list[str]) -> bool:
         """Check whether a line is a header, of the same columns or of others; what follows is read under it."""
+        texts = _unlike(texts)
         bare = [dictionary.without_unit(text) for text in texts]
         both = zip(bare, texts, strict=True)
         known = [name in self._known or dictionary.meaning(text) is not None for (name, _), text in both]
@@ -423,7 +457,10 @@ class _Table:
         for j, name in enumerate(self.names):
             spare.setdefault(dictionary.without_unit(name)[0], []).append(j)
         self._place, self._unit, self._turned = [], [], True
+        of = {_kind_of(own): dictionary.without_unit(own)[0] for own in reversed(self.names)}
         for (name, unit), text in zip(bare, texts, strict=True):
+            if not spare.get(name) and spare.get(synonym := of.get(_kind_of(text), "")):
+                name = synonym  # the table of another program goes on: 'Timestamp' is 'time' here
             if not spare.get(name):
                 spare[name] = [len(self.names)]
                 self.names.append(text)
@@ -716,10 +753,12 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
         The name is empty where the table has one part.
     """
     columns = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name == key]
-    marks = _tells_apart(rows, sheet) if key == "network" and not columns else None
+    marks = None if key != "network" else _names_cells(sheet)
+    if marks is None and not columns and (key == "network" or (key == "device" and _in_two_places(rows, sheet))):
+        marks = _tells_apart(rows, sheet)
     if marks is not None:
-        columns = [marks]
-        rows.warnings.append(f"column {sheet.names[marks]!r} tells the rows of an instant apart: a series for each")
+        columns.append(marks)
+        rows.warnings.append(f"column {sheet.names[marks]!r} tells the rows apart: a series for each of its values")
     counted = {i: "device" if i == marks or sheet.plain[i].startswith(("sim", "slot", "sub")) else key for i in columns}
     values_of = {i: {text for text in sheet.texts(i) if _says(text, counted[i])} for i in columns}
     several = [i for i, values in values_of.items() if 1 < len(values) <= _MOST_PARTS]
@@ -739,6 +778,28 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
         about = rows.about | identities(alone | written)
         label = "_".join(_label(name, text) for name, text in written.items())
         yield label, replace(rows.part(where), about=about), sheet.part(where)
+
+
+def _in_two_places(rows: _rows.Rows, sheet: Sheet) -> bool:
+    """Check whether rows of one instant often have several positions."""
+    column, time = sheet.find("latitude_deg"), pd.Series(rows.time)
+    if column is None or (repeated := time.duplicated().mean()) < _REPEATED:
+        return False
+    return bool(repeated - pd.DataFrame({"time": time, "at": sheet.texts(column)}).duplicated().mean() > _REPEATED)
+
+
+def _names_cells(sheet: Sheet) -> int | None:
+    """The column that says whose level a row holds where no PCI does: tower, number of a cell, carrier; else None."""
+    if sheet.find("PCI") is not None:
+        return None
+    known = (i for i, words in enumerate(sheet.plain) if sheet.meanings[i] is None and _OF_A_CELL.fullmatch(words))
+    return next((i for i in known if 1 < len({*sheet.texts(i)} - {""}) <= _MOST_MARKS), None)
+
+
+_OF_A_CELL = re.compile(
+    r"(tower|node|site|base ?station|bs|[eg]nb|cell|sector|e?ci|nci|[en]?cgi|channel|port|antenna|pol(ari[sz]ation)?"
+    r"|freq(uency)?|band) ?(id|identity|name|no|idx|index|[mgk]?hz)?"
+)
 
 
 def _tells_apart(rows: _rows.Rows, sheet: Sheet) -> int | None:
@@ -764,11 +825,12 @@ def identities(written: Mapping[str, str]) -> dict[str, Attribute]:
     """Attributes of a part: its identities as written, a frequency in Hz."""
     about: dict[str, Attribute] = {}
     for name, text in written.items():
-        value = _SI.fullmatch(text)
-        if "freq" in name and value is not None and (value[2] or float(value[1]) > 1e6):
-            about["frequency_hz"] = float(value[1]) * {"k": 1e3, "M": 1e6, "G": 1e9, None: 1.0}[value[2]]
+        value, unit = _SI.fullmatch(text), re.search(r"\b[kmg](?=hz$)", name)
+        if "freq" in name and value is not None and (value[2] or unit or float(value[1]) > 1e6):
+            si = value[2] or (unit[0] if unit else "")
+            about["frequency_hz"] = float(value[1]) * {"k": 1e3, "m": 1e6, "g": 1e9, "": 1.0}[si.lower()]
         else:
-            about[name.replace(" ", "_")] = text
+            about["node" if name in ("tower", "site") else name.replace(" ", "_")] = text
     return about
 
 

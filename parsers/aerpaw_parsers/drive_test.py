@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
@@ -26,6 +27,7 @@ from . import _cells, _pose, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri
 _TOWER_SNR = re.compile(r"snr (lw\d)")
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
 _NO, _YES = ("false", "0", "no"), ("true", "1", "yes")
+_NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected", "monitored")
 
 
 def is_header(names: list[str]) -> bool:
@@ -144,7 +146,7 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> pd.DataFrame:
 def _idle(sheet: _sheet.Sheet) -> BoolArray:
     """Rows of tables with a cell a row whose cell does not serve."""
     idle = np.zeros(len(sheet), dtype=bool)
-    for name, words in (("serving", _NO), ("neighbouring", _YES)):
+    for name, words in (("serving", _NO), ("neighbouring", _YES), ("technology", _NEIGHBOURS)):
         if (column := sheet.find(name)) is not None:
             idle |= np.array([text.lower() in words for text in sheet.texts(column)], dtype=bool)
     return idle
@@ -244,11 +246,19 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
 
 def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     ri = sheet.numbers(column)
-    flag = rows.flag.copy()
-    values = {"rank": _rows.ranks(ri, flag, none=ri == 0, means=True), "ri_raw": ri}
-    name = re.sub(r"\W+", "_", sheet.plain[column])
+    flag, zero = rows.flag.copy(), _FROM_ZERO.search(sheet.plain[column]) is not None
+    values = {"rank": _rows.ranks(ri + zero, flag, none=(ri == 0) & (not zero), means=True), "ri_raw": ri}
+    name, cqi = re.sub(r"\W+", "_", sheet.plain[column]), sheet.find("CQI")
+    idle = 0 if cqi is None or zero else int(((ri == 0) & (sheet.numbers(cqi) > 0)).sum())
+    if 2 * idle > len(ri):
+        text = f"0 beside a CQI in {counted(idle, 'row')}, read as no report: do its ranks count from 0?"
+        rows.warnings.append(f"column {sheet.names[column]!r}: {text} Then give it with --map and --ri-base zero")
     source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"
-    return rows.stream("rank", name, values, where=np.isfinite(ri), flag=flag, ri_base="one", source=source)
+    base = "zero" if zero else "one"
+    return rows.stream("rank", name, values, where=np.isfinite(ri), flag=flag, ri_base=base, source=source)
+
+
+_FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero)\b")
 
 
 def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:

@@ -29,6 +29,8 @@ from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
+from . import _pose
+
 _TELEMETRY = (
     *("mX", "mY", "mZ", "mRoll", "mPitch", "mYaw", "mSpeedX", "mSpeedY", "mSpeedZ", "mVz"),
     *("lat_s", "lon_s", "height_s", "ori_s"),
@@ -82,7 +84,7 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
             valid = valid & right
         else:
             epoch = _numeric(table[name], name)
-            valid = np.isfinite(epoch) & (epoch > 0) & (epoch < 9.2e9)
+            valid = np.isfinite(epoch) & (epoch > _LEAST_S) & (epoch < 9.2e9)
             # double precision resolves 2.4e-7 s here: microseconds are what the file can hold
             wall = np.round(np.where(valid, epoch, 0) * 1e6).astype(np.int64) * 1000
         if valid.any() or name in _EPOCHS:
@@ -95,6 +97,8 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
     raise InputError("the MATLAB file has no clock", expected=f"a variable {clocks}", cause="not a flight")
 
 
+# Less are day numbers of MATLAB, or seconds of a computer whose clock was never set.
+_LEAST_S = 1e8
 # Clock of files that have none.
 _COUNTED = "row number"
 
@@ -170,6 +174,8 @@ def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream |
         values["altitude_m"] = height
     if "height_s" not in table and "lat_s" in table:
         values["altitude_m"] = np.full(len(rows), np.nan)
+    if _pose.are_radians({name: values[name] for name in _pose.ANGLES if name in values}):
+        rows.warnings.append(_pose.small_angles(_pose.ANGLES))
     flag, lost = rows.flag.copy(), np.zeros(len(rows), dtype=bool)
     place = [name for name in ("latitude_deg", "longitude_deg", "altitude_m") if name in values]
     for i, name in enumerate(place):

@@ -36,14 +36,16 @@ def sniff(head: bytes) -> bool:
 
 def _points(data: bytes) -> list[tuple[int, dict[bytes, bytes]]]:
     """Place and values of each whole point."""
-    points = []
+    points: list[tuple[int, dict[bytes, bytes], bool]] = []
     for point in _POINT.finditer(data):
         if _START.search(point[2]):
             continue  # torn: the next point begins inside
         values = dict(_ATTRIBUTE.findall(point[1]))
         values |= dict(_INSIDE.findall(point[2]))
-        points.append((point.start(), values))
-    return points
+        points.append((point.start(), values, b"trkpt" in point[0]))
+    tracked = any(of_track for *_, of_track in points)
+    # beside a track, points of the way and of a route are places that somebody marked
+    return [(at, values) for at, values, of_track in points if of_track or not tracked]
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -85,7 +87,8 @@ def _stream(rows: _rows.Rows, name: str) -> Stream | None:
 
 def _torn(lines: _lines.Lines, data: bytes, row: object) -> list[RejectedLine]:
     """Lines on which a point begins that is not whole."""
-    begun = np.unique(lines.number_at(start.start() for start in _START.finditer(data)))
+    starts = [start for start in _START.finditer(data) if b"<trkpt" not in data or b"trkpt" in start[0]]
+    begun = np.unique(lines.number_at(start.start() for start in starts))
     return lines.reject_all(np.setdiff1d(begun, np.asarray(row)), "a point without position or time (torn?)")
 
 

@@ -15,7 +15,7 @@ from aerpaw_cmp.readers import dictionary
 from . import _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, vehicle_out
 
 _LIKE_A_LEVEL = re.compile(
-    r"^lw ?[1-5]$|^value$"
+    r"^lw ?[1-5]$|^value$|\b(asu|csq)\b"
     r"|^(?!.*(batt|volt|throttle|gps)).*(\b(rx|received?) ?power|signal|\bdb(m|fs)?\b|\brss\b|strength)"
 )
 

@@ -227,6 +227,7 @@ def _samples(
     stored = np.dtype((">" if kind.endswith("_be") else "<") + code)
     shape = (min(max(_integer(common.get("core:num_channels")), 1), 64), 2 if kind.startswith("c") else 1)
     frame_bytes = stored.itemsize * shape[0] * shape[1]
+    data = data[: len(data) - max(_integer(common.get("core:trailing_bytes")), 0)]
     for capture in sorted(captures, key=lambda item: _integer(item.get("core:sample_start"))):
         begin = _integer(capture.get("core:sample_start")) * frame_bytes
         data = data[:begin] + data[begin + max(_integer(capture.get("core:header_bytes")), 0) :]

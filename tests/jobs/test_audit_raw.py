@@ -1,16 +1,18 @@
 """The audit from raw bytes is silent on a right flight; benchmarks/outside_faults.py plants faults under it."""
 
+import csv
 import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.replay import replay_flight
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.audit_flight import expectations
-from aerpaw_cmp.propagation.check.reference import gain_table
+from aerpaw_cmp.propagation.check.reference import Pattern
 from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv, sphere_csv, sphere_grid, unit_mean_gain
 from tests.raw_checks import Account, raw_checked
 
@@ -114,6 +116,40 @@ def test_the_take_off_ground_carries_the_ranks_too(flight: Path) -> None:
     assert series.position_m is not None
     place, valid = data.poses_at(series.time).position_m, data.poses_at(series.time).valid
     assert series.position_m[valid][:, 2] == pytest.approx(place[valid][:, 2], abs=1e-6)
+
+
+def gain_table(data: bytes) -> Pattern:
+    """Field of an antenna table a second time: cubic splines of the amplitude, solved with Fourier transforms."""
+    lines = [line for line in data.decode("utf-8-sig").splitlines() if line.strip() and line[0] != "#"]
+    gains = {}
+    for cells in list(csv.reader(lines))[1:]:
+        gains[round(float(cells[0]) % 360, 6), round(float(cells[1]), 6)] = float(cells[2])
+    azimuths = sorted({azimuth for azimuth, _ in gains})
+    elevations = sorted({elevation for _, elevation in gains}, reverse=True)
+    amplitude = np.array([[10 ** (gains[azimuth, up] / 20) for azimuth in azimuths] for up in elevations])
+    amplitude[[0, -1]] = np.sqrt((amplitude[[0, -1]] ** 2).mean(axis=1, keepdims=True))  # a pole is one direction
+    over = np.roll(amplitude[-2:0:-1], len(azimuths) // 2, axis=1)  # beyond the pole, on the opposite meridian
+    knots = np.concatenate([amplitude, over])
+    for axis in (0, 1):  # B-splines through the knots: c[k-1] + 4 c[k] + c[k+1] = 6 y[k], on a circle
+        n = knots.shape[axis]
+        response = ((4 + 2 * np.cos(2 * np.pi * np.arange(n) / n)) / 6).reshape((-1, 1) if axis == 0 else (1, -1))
+        knots = np.fft.ifft(np.fft.fft(knots, axis=axis) / response, axis=axis).real
+    return lambda theta, phi: (complex(max(_spline_at(knots, theta, phi), 0.0)), 0j)
+
+
+def _spline_at(knots: FloatArray, theta_rad: float, phi_rad: float) -> float:
+    rows, row_weights = _taps(theta_rad, knots.shape[0])
+    columns, column_weights = _taps(phi_rad, knots.shape[1])
+    return float(row_weights @ knots[np.ix_(rows, columns)] @ column_weights)
+
+
+def _taps(angle_rad: float, count: int) -> tuple[list[int], FloatArray]:
+    """The four knots about an angle on a circle, and their cubic weights."""
+    at = angle_rad % (2 * math.pi) / (2 * math.pi) * count
+    first = math.floor(at)
+    t = at - first
+    weights = [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]
+    return [(first + k) % count for k in (-1, 0, 1, 2)], np.array(weights) / 6
 
 
 def test_a_table_of_gain_is_looked_up_alike_everywhere(tmp_path: Path) -> None:

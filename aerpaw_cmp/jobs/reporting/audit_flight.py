@@ -7,7 +7,6 @@ of them, so that a fault in between is seen.
 from __future__ import annotations
 
 import dataclasses
-import gzip
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -27,7 +26,7 @@ from ...compare.result import AuditResult, EngineResult
 from ...flight.data import FlightData
 from ...flight.gains.losses import path_loss
 from ...flight.replay import Replayed, attitude_rotation, part_of
-from ...flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
+from ...flight.settings import ArraySettings, LinkSettings, RtSettings, load_pattern
 from ...logs.ingest import IngestedFile
 from ...propagation.check import reference
 from ...propagation.check.audit import Audit, Second, audit
@@ -254,24 +253,13 @@ def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> 
     """An array of flight.yaml, laid out a second time."""
     positions = reference.layout_positions(settings.layout, wavelength, settings.elements, settings.positions_m)
     slants = settings.slant_deg if isinstance(settings.slant_deg, list) else [settings.slant_deg]
-    pattern = _pattern(settings.antenna, folder, reference.C_MPS / wavelength)
+    pattern = scalar_pattern(load_pattern(settings.antenna, folder, reference.C_MPS / wavelength))
     return reference.ExpectedArray(
         positions_m=positions,
         slants_deg=tuple(slants * len(positions) if len(slants) == 1 else slants),
         patterns=(pattern,) * len(positions),
         mount=reference.turned(settings.yaw_deg, settings.pitch_deg, settings.roll_deg),
     )
-
-
-def _pattern(settings: AntennaSettings, folder: Path, carrier_hz: float) -> reference.Pattern:
-    """A formula or a table of gain a second time; other antenna files are taken as the replay reads them."""
-    if settings.model in reference.PATTERNS:
-        return reference.PATTERNS[settings.model]
-    if settings.model == "sphere":
-        content = (folder / str(settings.file)).read_bytes()
-        return reference.gain_table(gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content)
-    pattern: reference.Pattern = scalar_pattern(load_pattern(settings, folder, carrier_hz))
-    return pattern
 
 
 # --- attitude --------------------------------------------------------------------------------------------------------

@@ -105,8 +105,6 @@ class Second:
         Singular-value ratios of the rank comparison.
     reference_links : int
         Poses that the second implementation computes.
-    complete : bool
-        Whether the replay claims to have every path.
     known : dict
         Sionna's own coefficients by what they depend on: channels with one tower and track share them.
     """
@@ -116,7 +114,6 @@ class Second:
     expected: Expected | None = None
     ks: Sequence[float] = RANK_K
     reference_links: int = REFERENCE_LINKS
-    complete: bool = True
     known: dict[str, Any] = field(default_factory=dict)
 
 
@@ -133,7 +130,7 @@ def audit(
     replay : Replay
         The result to check.
     search, field, run
-        As given to the replay; a power cut leaves the same paths out, and none is claimed to be complete.
+        As given to the replay.
     second : Second
         The other engine, how many links, and what the second implementation checks.
 
@@ -141,7 +138,6 @@ def audit(
     -------
     Audit
     """
-    complete = second.complete
     chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
     engine: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
     search = replace(search, engine=engine)
@@ -153,14 +149,10 @@ def audit(
         fields = FieldAudit(not_covered=("the second implementation: it knows prisms, no scene of triangles",))
         if site.scene is None:
             few_kinds = spread_over_paths(replay, chosen, second.reference_links)
-            fields = against_reference(
-                site, poses, replay, few_kinds, expected, ks=ks, max_depth=search.max_depth, complete=complete
-            )
+            fields = against_reference(site, poses, replay, few_kinds, expected, ks=ks, max_depth=search.max_depth)
             fields += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
         rayed = replace(search, samples=min(rays, _FIELD_SAMPLES))
-        fields += against_sionna(
-            site, link, poses, replay, chosen, expected, rayed, complete=complete, known=second.known
-        )
+        fields += against_sionna(site, link, poses, replay, chosen, expected, rayed, known=second.known)
     return Audit(
         field=fields,
         engine=replay.engine,

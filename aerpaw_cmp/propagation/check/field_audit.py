@@ -113,7 +113,6 @@ def against_reference(
     *,
     ks: Sequence[float],
     max_depth: int,
-    complete: bool = True,
 ) -> FieldAudit:
     """A few links of a replay computed a second time.
 
@@ -126,8 +125,6 @@ def against_reference(
     expected : Expected
     ks : sequence of float
     max_depth : int
-    complete : bool
-        Whether the replay claims to have every path (nothing left out as irrelevant).
 
     Returns
     -------
@@ -148,7 +145,7 @@ def against_reference(
                 total += FieldAudit(not_covered=(_STANDS if stands else _ON_TERRAIN,))
                 continue
             link = _OneLink(reference=reference, replay=replay, poses=poses, row=int(row), tower=number, mine=mine)
-            total += link.paths_checked(max_depth, complete and site.dem is None)
+            total += link.paths_checked(max_depth, site.dem is None)
             try:
                 total += link.field_checked(ks)
             except LookupError as error:
@@ -383,8 +380,6 @@ def against_sionna(
     chosen: IntArray,
     expected: Expected,
     search: Search,
-    *,
-    complete: bool = True,
     known: dict[str, Any] | None = None,
 ) -> FieldAudit:
     """Each path's power, phase and polarisation against what Sionna itself computes.
@@ -401,8 +396,6 @@ def against_sionna(
         Arrays and loss as the settings say, read a second time.
     search : Search
         Depth, rays and batch of Sionna's search.
-    complete : bool
-        Whether the replay claims to have every path.
     known : dict, optional
         What Sionna answered before, by what it was asked.
 
@@ -428,7 +421,7 @@ def against_sionna(
         theirs, paths=theirs.paths.select(matches), gain=theirs.gain[matches], length_m=theirs.length_m[matches]
     )
     total = _paths_against_sionna(ours.select(mine), replay, scene, few, probe, own, chosen)
-    if complete and site.dem is None and site.scene is None:
+    if site.dem is None and site.scene is None:
         lacking = np.setdiff1d(np.arange(len(theirs.paths)), matches)
         total += _lacking(site, replay, theirs.paths, scene.faces, lacking, few, expected)
     return replace(total, not_covered=covered)

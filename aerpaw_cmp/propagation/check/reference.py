@@ -3,14 +3,13 @@
 Written from the recommendations, not from the rest of this package, and sharing no code with it: rotations as
 products of three turns, arrays from their published layout, constants of ITU-R P.2040-4 and P.833 a second time,
 reflection by components across and along the plane of incidence, paths by trying every sequence of faces against the
-footprints, chords in crowns by bisection, tables of gain by periodic splines solved with Fourier transforms. What it is
-given is the site, the settings and the poses. Other antenna files are taken from the replay as they are.
+footprints, chords in crowns by bisection. What it is given is the site, the settings and the poses. Patterns of
+antennas are taken from the replay as they are: Sionna's own judge the formulas, and tests the tables.
 """
 
 from __future__ import annotations
 
 import cmath
-import csv
 import itertools
 import math
 from collections.abc import Callable, Iterator, Sequence
@@ -144,75 +143,6 @@ def layout_positions(
         return ((0.0, q, q), (0.0, q, -q), (0.0, -q, q), (0.0, -q, -q))
     n = 1 if layout == "single" else elements
     return tuple((0.0, wavelength / 2 * ((n - 1) / 2 - k), 0.0) for k in range(n))
-
-
-def isotropic(_theta: float, _phi: float) -> tuple[complex, complex]:
-    """Unit gain, along theta."""
-    return 1.0 + 0j, 0j
-
-
-def half_wave_dipole(theta: float, _phi: float) -> tuple[complex, complex]:
-    """2.15 dBi along z, Balanis eq. 4-84; the gain is 4 / Cin(2 pi)."""
-    sine = math.sin(theta)
-    if abs(sine) < 1e-9:
-        return 0j, 0j
-    return complex(math.sqrt(1.6409223769845851) * math.cos(math.pi / 2 * math.cos(theta)) / sine), 0j
-
-
-def tr38901(theta: float, phi: float) -> tuple[complex, complex]:
-    """TR 38.901 table 7.3-1, 8 dBi."""
-    t, p = math.degrees(theta), (math.degrees(phi) + 180) % 360 - 180
-    down = min(min(12 * ((t - 90) / 65) ** 2, 30) + min(12 * (p / 65) ** 2, 30), 30)
-    return complex(10 ** ((8 - down) / 20)), 0j
-
-
-def gain_table(data: bytes) -> Pattern:
-    """Field of an antenna table ``azimuth_deg,elevation_deg,gain_dbi,...``: cubic splines of the amplitude.
-
-    Parameters
-    ----------
-    data : bytes
-        Of the file, unpacked; comment lines begin with #.
-
-    Returns
-    -------
-    callable
-        ``(theta_rad, phi_rad) -> (E_theta, E_phi)``; all of it in E_theta.
-    """
-    lines = [line for line in data.decode("utf-8-sig").splitlines() if line.strip() and line[0] != "#"]
-    gains = {}
-    for cells in list(csv.reader(lines))[1:]:
-        gains[round(float(cells[0]) % 360, 6), round(float(cells[1]), 6)] = float(cells[2])
-    azimuths = sorted({azimuth for azimuth, _ in gains})
-    elevations = sorted({elevation for _, elevation in gains}, reverse=True)
-    amplitude = np.array([[10 ** (gains[azimuth, up] / 20) for azimuth in azimuths] for up in elevations])
-    amplitude[[0, -1]] = np.sqrt((amplitude[[0, -1]] ** 2).mean(axis=1, keepdims=True))  # a pole is one direction
-    over = np.roll(amplitude[-2:0:-1], len(azimuths) // 2, axis=1)  # beyond the pole, on the opposite meridian
-    knots = np.concatenate([amplitude, over])
-    for axis in (0, 1):  # B-splines through the knots: c[k-1] + 4 c[k] + c[k+1] = 6 y[k], on a circle
-        n = knots.shape[axis]
-        response = ((4 + 2 * np.cos(2 * np.pi * np.arange(n) / n)) / 6).reshape((-1, 1) if axis == 0 else (1, -1))
-        knots = np.fft.ifft(np.fft.fft(knots, axis=axis) / response, axis=axis).real
-    return lambda theta, phi: (complex(max(_spline_at(knots, theta, phi), 0.0)), 0j)
-
-
-def _spline_at(knots: FloatArray, theta_rad: float, phi_rad: float) -> float:
-    rows, row_weights = _taps(theta_rad, knots.shape[0])
-    columns, column_weights = _taps(phi_rad, knots.shape[1])
-    return float(row_weights @ knots[np.ix_(rows, columns)] @ column_weights)
-
-
-def _taps(angle_rad: float, count: int) -> tuple[list[int], FloatArray]:
-    """The four knots about an angle on a circle, and their cubic weights."""
-    at = angle_rad % (2 * math.pi) / (2 * math.pi) * count
-    first = math.floor(at)
-    t = at - first
-    weights = [(1 - t) ** 3, 3 * t**3 - 6 * t**2 + 4, -3 * t**3 + 3 * t**2 + 3 * t + 1, t**3]
-    return [(first + k) % count for k in (-1, 0, 1, 2)], np.array(weights) / 6
-
-
-# By their names in flight.yaml.
-PATTERNS: dict[str, Pattern] = {"iso": isotropic, "dipole": half_wave_dipole, "tr38901": tr38901}
 
 
 def permittivity(name: str, carrier_hz: float) -> tuple[complex, float | None] | None:

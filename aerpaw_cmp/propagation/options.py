@@ -114,13 +114,10 @@ class Run:
         ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
     job : Job, optional
         What the poses are a part of.
-    threads : int, optional
-        Of compiled code (default: the cores this process may use).
     progress : callable, optional
         Called with the share done.
     """
 
     cache_dir: str | Path | None = None
     job: Job | None = None
-    threads: int | None = None
     progress: Progress | None = None

@@ -193,7 +193,7 @@ def replay(
     field : Field
         Further losses of the paths.
     run : Run
-        Cache, threads, progress.
+        Cache, progress.
 
     Returns
     -------
@@ -337,7 +337,7 @@ def _evaluated(
     paths = contributions[0]
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
     work = 0 if run.job is None else run.job.pairs
-    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads, work=work)
+    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, work=work)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True

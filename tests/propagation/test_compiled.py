@@ -28,7 +28,6 @@ from aerpaw_cmp.propagation.geometry.arrays import Array, Poses, tower_compariso
 from aerpaw_cmp.propagation.geometry.faces import site_faces
 from aerpaw_cmp.propagation.geometry.paths import Links
 from aerpaw_cmp.propagation.native import compiled
-from aerpaw_cmp.propagation.options import Run
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.search import mirror as image
@@ -93,14 +92,14 @@ def with_patterns(link, patterns, **changes):
     return dataclasses.replace(link, tower_arrays=dict.fromkeys(link.tower_arrays, tower), uav_array=uav, **changes)
 
 
-def both(monkeypatch, case, link, loss_db=None, **options):
+def both(monkeypatch, case, link, loss_db=None):
     site, _, poses, paths = case
     scene = Scene.of(site, link, poses)
     arguments = (paths, scene.faces, scene.sources_m, poses, link, loss_db)
     monkeypatch.setenv(compiled.SWITCH, "never")
     numpy = field_sum.channel_matrices(*arguments)
     monkeypatch.setenv(compiled.SWITCH, "always")
-    return numpy, field_sum.channel_matrices(*arguments, **options), scene
+    return numpy, field_sum.channel_matrices(*arguments), scene
 
 
 def bound(case, link, scene, gain):
@@ -162,7 +161,8 @@ def test_threads_and_chunks_change_no_bit(monkeypatch, case):
     fields = []
     for chunk, threads in ((10_000, 1), (7, 1), (7, 3), (64, 2)):
         monkeypatch.setattr(field_sum, "PATHS_PER_PART", chunk)
-        fields.append(both(monkeypatch, case, link, threads=threads)[1])
+        monkeypatch.setattr(compiled, "thread_count", lambda threads=threads: threads)
+        fields.append(both(monkeypatch, case, link)[1])
     for other in fields[1:]:
         assert np.array_equal(other.h, fields[0].h)
         assert np.array_equal(other.path_power, fields[0].path_power)
@@ -242,7 +242,7 @@ def same_paths(first, second):
 
 def searched(faces, sources, targets, usable=None, excluded=None, **options):
     mirrors = image.find_paths(faces, Links(sources, targets, usable, excluded), **options)
-    beams = prisms.find_paths(faces, Links(sources, targets, usable, excluded), Run(threads=2), **options)
+    beams = prisms.find_paths(faces, Links(sources, targets, usable, excluded), **options)
     same_paths(mirrors, beams)
     return beams
 
@@ -304,7 +304,11 @@ def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case, 
     monkeypatch.setattr(replay_module, "LEVELS_AT_ONCE", 7)
     site, link, poses, _ = case
     link = dataclasses.replace(link, noise_floor_dbm=-58.0)
-    serial, threaded = (replay(site, link, poses, run=Run(threads=threads)) for threads in (1, 3))
+    replays = []
+    for threads in (1, 3):
+        monkeypatch.setattr(compiled, "thread_count", lambda threads=threads: threads)
+        replays.append(replay(site, link, poses))
+    serial, threaded = replays
     assert 0 < np.isnan(serial.rss_dbm).sum() < serial.rss_dbm.size
     np.testing.assert_array_equal(serial.has_path, np.isfinite(serial.rss_dbm))
     assert not serial.h[~serial.has_path].any()
@@ -569,5 +573,3 @@ def test_wrong_settings_are_named(monkeypatch):
     monkeypatch.setenv(compiled.SWITCH, "sometimes")
     with pytest.raises(UsageError, match="AERPAW_CMP_COMPILED=sometimes"):
         compiled.kernels_for(1)
-    with pytest.raises(UsageError, match="0 threads"):
-        compiled.thread_count(0)

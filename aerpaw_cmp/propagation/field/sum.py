@@ -128,7 +128,6 @@ def channel_matrices(
     link: Link,
     loss_db: FloatArray | None = None,
     *,
-    threads: int | None = None,
     work: int = 0,
 ) -> Fields:
     """Channel matrices of a path set.
@@ -146,8 +145,6 @@ def channel_matrices(
     link : Link
     loss_db : (paths,), optional
         Further loss of each path, such as foliage.
-    threads : int, optional
-        Of compiled code (default: the cores this process may use); results do not depend on it.
     work : int, optional
         Element pairs of all links of the job that this call is a part of; decides whether compiled code is worth
         loading (:mod:`aerpaw_cmp.propagation.native.compiled`).
@@ -191,7 +188,8 @@ def channel_matrices(
         first = np.flatnonzero(np.diff(key, prepend=-1))
         h[key[first]] = np.add.reduceat(amplitude.view(np.complex128)[..., 0], first, axis=0)
 
-    compiled.in_threads(run, parts_between_poses(ordered.pose), 1 if kernels is None else threads)
+    threads = 1 if kernels is None else compiled.thread_count()
+    compiled.in_threads(run, parts_between_poses(ordered.pose), threads)
     if order is not None:
         power[order] = power.copy()
     matrices = h.reshape(len(poses), len(arrays), uavs, ports)

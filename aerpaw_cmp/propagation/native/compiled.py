@@ -193,25 +193,21 @@ def warn_once(reason: str) -> None:
     warnings.warn(f"{reason}: the job runs in NumPy, up to ten times slower", RuntimeWarning, stacklevel=4)
 
 
-def thread_count(threads: int | None) -> int:
-    """Threads to use: as asked, else the cores that this process may use."""
-    if threads is not None:
-        if threads < 1:
-            raise UsageError(f"{threads} threads", expected="at least 1")
-        return threads
+def thread_count() -> int:
+    """Threads to use: the cores that this process may use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on macOS and Windows
         return os.cpu_count() or 1
 
 
-def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int | None) -> list[Any]:
+def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int) -> list[Any]:
     """``call`` of each part, results in order; kernels release the interpreter's lock.
 
     No thread stays: what is forked later has none.
     """
     parts = list(parts)
-    count = min(thread_count(threads), len(parts))
+    count = min(threads, len(parts))
     if count < 2:
         return [call(part) for part in parts]
     with ThreadPoolExecutor(count) as pool:

@@ -20,7 +20,7 @@ import numpy as np
 from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
 from ..geometry.paths import BoxTree, Links, PathSet, Surfaces
-from ..native.compiled import in_threads, thread_count
+from ..native import compiled
 from ..native.numba_options import kernel, part
 from ..options import Progress, Run
 from .boxtree import DEEPEST, box_missed, box_outside, box_tree, next_leaf, within_planes
@@ -96,7 +96,7 @@ def grow_paths(
     surfaces : Surfaces
     links : Links
     run : Run
-        Threads and progress.
+        Progress.
     max_depth : int
         0 to 3.
     beams : bool
@@ -114,7 +114,7 @@ def grow_paths(
     """
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
-    towers, threads = len(links.sources_m), thread_count(run.threads)
+    towers, threads = len(links.sources_m), compiled.thread_count()
     pieces: list[PathSet] = []
     rules = _rules(surfaces, max_depth, solids=solids, beams=beams, shadows=shadows)
     for tower, poses, search in _searches(surfaces, links, rules):
@@ -205,7 +205,7 @@ class _Search:
         levels: list[_Level] = []
         followed = 0
         for some, size in _chunks(first, threads):
-            levels += in_threads(self.follow, some, threads)
+            levels += compiled.in_threads(self.follow, some, threads)
             followed += size
             share(followed / len(first))
         return levels
@@ -810,15 +810,3 @@ def try_out() -> None:
     free = _direct(_Solids(tree, triangle, tree), np.zeros(3), np.array([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]), rules)
     if free.tolist() != [False, True]:
         raise RuntimeError(f"compiled code sees {free.tolist()} where one of two points is hidden")
-
-
-__all__ = [
-    "Rules",
-    "grow_paths",
-    "in_face",
-    "obstacle",
-    "reflection_points",
-    "segment_cut",
-    "try_out",
-    "without_coincident",
-]

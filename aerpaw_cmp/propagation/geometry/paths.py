@@ -156,7 +156,6 @@ class Surfaces:
         Convex outline of each face, in its plane; the last corner is repeated.
     convex : (faces,) bool
         Faces that fill their outline.
-    area_m2 : (faces,)
     plane : (faces,) int
         Faces of one number lie in one plane.
     tree, face_tree : BoxTree
@@ -172,7 +171,6 @@ class Surfaces:
     flat_m: FloatArray
     window_m: FloatArray
     convex: BoolArray
-    area_m2: FloatArray
     plane: IntArray
     tree: BoxTree
     face_tree: BoxTree

@@ -7,6 +7,7 @@ or overlap in one plane, of whatever shape, share that plane, so that a reflecti
 from __future__ import annotations
 
 import numpy as np
+import shapely
 
 from ...common.counting import counted
 from ...common.errors import InputError
@@ -93,7 +94,6 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
         flat_m=np.ascontiguousarray(flat),
         window_m=window,
         convex=convex,
-        area_m2=face_area,
         plane=plane,
         tree=box_tree(corners.min(axis=1), corners.max(axis=1)),
         face_tree=face_tree,
@@ -222,71 +222,15 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
 def _windows(
     flat: FloatArray, first: IntArray, area: FloatArray, base: FloatArray, along: FloatArray, across: FloatArray
 ) -> tuple[FloatArray, BoolArray]:
-    """Convex outlines (faces, 8, 3) and which faces fill theirs."""
-    outline, convex = _outlines(flat, first, area)
+    """Convex outlines (faces, 8, 3), counter-clockwise round the normal, and which faces fill theirs."""
+    owner = np.repeat(np.arange(len(area)), 3 * np.diff(first))
+    hull = shapely.simplify(shapely.convex_hull(shapely.multipoints(flat.reshape(-1, 2), indices=owner)), 1e-7)
+    corners = shapely.get_num_coordinates(hull) - 1
+    convex = (corners <= WINDOW) & (np.abs(shapely.area(hull) - area) <= 1e-6 * area)
+    hull[corners > WINDOW] = shapely.oriented_envelope(hull[corners > WINDOW])
+    point, face = shapely.get_coordinates(shapely.orient_polygons(hull), return_index=True)
+    start = np.searchsorted(face, np.arange(len(area) + 1))
+    last = start[1:] - np.where(shapely.get_type_id(hull) == shapely.GeometryType.POLYGON, 2, 1)
+    outline = point[np.minimum(start[:-1, None] + np.arange(WINDOW), last[:, None])]
     window = base[:, None] + outline[..., :1] * along[:, None] + outline[..., 1:] * across[:, None]
-    return np.ascontiguousarray(window), convex
-
-
-@kernel
-def _outlines(flat, first, area):  # type: ignore[no-untyped-def]
-    outline = np.empty((len(first) - 1, WINDOW, 2))
-    convex = np.zeros(len(first) - 1, np.bool_)
-    for f in range(len(first) - 1):
-        points = flat[first[f] : first[f + 1]].copy().reshape(-1, 2)
-        hull = _hull(points)
-        inside = 0.0
-        for k in range(len(hull)):
-            a, b = hull[k - 1], hull[k]
-            inside += 0.5 * (a[0] * b[1] - a[1] * b[0])
-        # overlapping triangles of one face could add up to its outline by chance: only exact fits count
-        convex[f] = len(hull) <= WINDOW and len(hull) >= 3 and abs(inside - area[f]) <= 1e-6 * inside
-        if len(hull) > WINDOW or len(hull) < 3:
-            hull = _rectangle(points, hull)
-        for k in range(WINDOW):
-            outline[f, k] = hull[min(k, len(hull) - 1)]
-    return outline, convex
-
-
-@kernel
-def _hull(points):  # type: ignore[no-untyped-def]
-    """Convex hull, counter-clockwise, without corners that turn by less than 0.1 um (Andrew, 1979)."""
-    order = np.argsort(points[:, 1])
-    order = order[np.argsort(points[order, 0], kind="mergesort")]
-    n = len(order)
-    hull = np.empty((2 * n + 1, 2))
-    k = 0
-    base = 0
-    for step in range(2 * n):
-        if step == n:  # there and back: the lower side, then the upper one
-            k -= 1
-            base = k
-        p = points[order[step] if step < n else order[2 * n - 1 - step]]
-        while k >= base + 2:
-            ax, ay = hull[k - 1, 0] - hull[k - 2, 0], hull[k - 1, 1] - hull[k - 2, 1]
-            bx, by = p[0] - hull[k - 2, 0], p[1] - hull[k - 2, 1]
-            if ax * by - ay * bx > 1e-7 * np.sqrt(bx * bx + by * by):
-                break
-            k -= 1
-        hull[k] = p
-        k += 1
-    return hull[: k - 1].copy()
-
-
-@kernel
-def _rectangle(points, hull):  # type: ignore[no-untyped-def]
-    """Rectangle along the longest side of the hull, round all points."""
-    best, axis = -1.0, np.array([1.0, 0.0])
-    for k in range(len(hull)):
-        side = hull[k] - hull[k - 1]
-        size = np.sqrt(side[0] ** 2 + side[1] ** 2)
-        if size > best and size > 0.0:
-            best, axis = size, side / size
-    low_a, high_a, low_b, high_b = np.inf, -np.inf, np.inf, -np.inf
-    for p in points:
-        a, b = p[0] * axis[0] + p[1] * axis[1], -p[0] * axis[1] + p[1] * axis[0]
-        low_a, high_a, low_b, high_b = min(low_a, a), max(high_a, a), min(low_b, b), max(high_b, b)
-    result = np.empty((4, 2))
-    for k, (a, b) in enumerate(((low_a, low_b), (high_a, low_b), (high_a, high_b), (low_a, high_b))):
-        result[k, 0], result[k, 1] = a * axis[0] - b * axis[1], a * axis[1] + b * axis[0]
-    return result
+    return np.ascontiguousarray(window), np.asarray(convex)

@@ -87,7 +87,6 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
         flat_m=np.ascontiguousarray(flat),
         window_m=np.ascontiguousarray(outline[:, np.minimum(np.arange(WINDOW), 3)]),
         convex=(faces.solid >= 0) & np.array([polygon is None for polygon in faces.polygon], dtype=np.bool_),
-        area_m2=np.zeros(len(faces)),
         plane=planes_of(faces),
         tree=box_tree(obstacles.min(axis=1), obstacles.max(axis=1)),
         face_tree=box_tree(lower, upper),

@@ -11,7 +11,8 @@ centimetres where a crown shades metres.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Literal, Protocol
 
 import numpy as np
@@ -231,7 +232,7 @@ def foliage_loss_db(
     index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
     depth = foliage_depth_m(source_m, vertices_m, target_m, index)
     if isinstance(model, Opaque):
-        depth = depth + foliage_depth_m(source_m, vertices_m, target_m, index.trunks())
+        depth = depth + foliage_depth_m(source_m, vertices_m, target_m, index.trunks)
     return model.loss_db(depth)
 
 
@@ -296,31 +297,24 @@ class CrownIndex:
     def __init__(self, trees: Trees, shape: Shape = "cone") -> None:
         self.trees = trees
         self.shape: Shape = shape
-        self._trunks: CrownIndex | None = None
         base = trees.ground_m + trees.crown_base_m
         top = trees.ground_m + trees.height_m
-        self._set(base, top, trees.crown_diameter_m / 2)
-
-    def trunks(self) -> CrownIndex:
-        """The trunks of the same trees, as cylinders from the ground to the crown."""
-        if self._trunks is None:
-            index = CrownIndex.__new__(CrownIndex)
-            index.trees, index.shape, index._trunks = self.trees, "cylinder", None
-            ground = self.trees.ground_m
-            index._set(ground, ground + self.trees.crown_base_m, self.trees.trunk_diameter_m / 2)
-            self._trunks = index
-        return self._trunks
-
-    def _set(self, base_m: FloatArray, top_m: FloatArray, radius_m: FloatArray) -> None:
-        solid = (radius_m > 0) & (top_m > base_m)
+        radius = trees.crown_diameter_m / 2
+        solid = (radius > 0) & (top > base)
         #: columns: east, north, base, top, radius
-        self._bodies = np.stack(
-            [self.trees.east_m[solid], self.trees.north_m[solid], base_m[solid], top_m[solid], radius_m[solid]], axis=-1
-        )
+        self._bodies = np.stack([trees.east_m, trees.north_m, base, top, radius], axis=-1)[solid]
         if not np.isfinite(self._bodies).all():
             raise UsageError("a tree has a position or size that is not a number")
         if len(self._bodies):
             self._build_grid()
+
+    @cached_property
+    def trunks(self) -> CrownIndex:
+        """The trunks of the same trees, as cylinders from the ground to the crown."""
+        of = self.trees
+        none = np.zeros(len(of))
+        stems = replace(of, height_m=of.crown_base_m, crown_base_m=none, crown_diameter_m=of.trunk_diameter_m)
+        return CrownIndex(stems, "cylinder")
 
     def _build_grid(self) -> None:
         """Lists, per cell, the bodies within reach of any point of the cell (compressed rows)."""

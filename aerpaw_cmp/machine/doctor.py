@@ -258,13 +258,8 @@ def serial_check(device: str, description: str = "") -> Check:
     """One port: present, allowed, free."""
     port = f"{device} {description}".strip()
     if not os.access(device, os.R_OK | os.W_OK):
-        return Check(
-            # the kernel gives a new group to new logins alone
-            "Serial",
-            "warn",
-            f"{port}: not allowed",
-            f"sudo usermod -aG {_group(device)} $USER, then log in anew",
-        )
+        remedy = f"sudo usermod -aG {_group(device)} $USER, then log in anew"
+        return Check("Serial", "warn", f"{port}: not allowed", remedy)
     if busy := holders(device):
         # it opens every port of a new modem by itself, and reads away the answers to ours
         stop = "sudo systemctl stop ModemManager" if any("ModemManager" in name for name in busy) else "stop it"

@@ -67,18 +67,11 @@ def _faces(grounds: tuple[float, ...], ground_material: str, buildings: tuple[Bu
     """Faces of ground planes and buildings; kept, for a replay in parts asks again with each part."""
     faces = [_ground(height, ground_material, len(grounds) > 1) for height in grounds]
     for index, building in enumerate(buildings):
-        faces.extend(_building_faces(building, index))
+        for part in _parts(building.footprint):
+            faces += [*_walls(building, part, index), _roof(building, part, index)]
     columns: dict[str, Any] = dict(zip(_Face._fields, zip(*faces, strict=True), strict=True))
     numbers = {name: np.array(columns[name]) for name in _Face._fields if name not in ("material", "label", "polygon")}
     return Faces(**(columns | numbers))
-
-
-def _building_faces(building: Building, solid: int) -> tuple[_Face, ...]:
-    """Walls and roof."""
-    faces: list[_Face] = []
-    for part in _parts(building.footprint):
-        faces += [*_walls(building, part, solid), _roof(building, part, solid)]
-    return tuple(faces)
 
 
 def _ground(height_m: float, material: str, several: bool) -> _Face:

@@ -218,7 +218,9 @@ def _prisms(
     foot = np.minimum.reduceat(np.where(level, np.inf, faces.lower[rows, 1]), starts)
     foot[np.isposinf(foot)] = -np.inf  # no walls
     roofs = rows[level]
-    pieces = _convex(_footprints(faces, roofs))
+    footprints = _footprints(faces, roofs)
+    convex = _is_convex(footprints).tolist()
+    pieces = [(part,) if fills else convex_pieces(part) for part, fills in zip(footprints, convex, strict=True)]
     times = [len(some) for some in pieces]
     solid = np.repeat(number[level], times)
     flat = [piece for some in pieces for piece in some]
@@ -235,12 +237,6 @@ def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
     point, owner = shapely.get_coordinates(polygons, return_index=True)
     axes = np.stack([faces.along[roofs, :2], faces.across[roofs, :2]], axis=1)
     return np.asarray(shapely.set_coordinates(polygons, np.einsum("ni,nij->nj", point, axes[owner])))
-
-
-def _convex(footprints: AnyArray) -> list[tuple[Polygon, ...]]:
-    """The convex pieces of each footprint."""
-    convex = _is_convex(footprints).tolist()
-    return [(part,) if fills else convex_pieces(part) for part, fills in zip(footprints, convex, strict=True)]
 
 
 @lru_cache(maxsize=4096)

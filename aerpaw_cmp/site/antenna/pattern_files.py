@@ -58,38 +58,21 @@ def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> M
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
     if any(line.replace(" ", "").startswith(",".join(COLUMNS[:3])) for line in text.splitlines()[:100]):
         return read_sphere_csv(path)
-    pattern = _of_any_kind(text, path, carrier_hz)
-    pattern.trained_on, pattern.marks = trained_on(text), marks(text)
-    return pattern
-
-
-def _of_any_kind(text: str, path: Path, carrier_hz: float | None) -> MeasuredPattern:
-    """The pattern of a file of any kind.
-
-    Parameters
-    ----------
-    text : str
-    path : Path
-    carrier_hz : float or None
-        As :func:`read_pattern_file`.
-
-    Returns
-    -------
-    MeasuredPattern
-    """
-    name = path.stem
     if _PLANET.search(text):
         carrier = _FREQUENCY.search(text)
-        return _from_cuts(_planet(text, path), name, path, float(carrier[1]) * 1e6 if carrier else None)
-    if _PHI_CUT.search(text):
-        return _great_circle(text, name, path, carrier_hz)
-    if _GAIN_TABLE.search(text):
+        pattern = _from_cuts(_planet(text, path), path.stem, path, float(carrier[1]) * 1e6 if carrier else None)
+    elif _PHI_CUT.search(text):
+        pattern = _great_circle(text, path.stem, path, carrier_hz)
+    elif _GAIN_TABLE.search(text):
         raise InputError(
             "peak gain over frequency, without directions",
             expected="a pattern of the same antenna, such as SA-1400-5900_F3300.txt",
             path=path,
         )
-    return read_pattern_text(path)
+    else:
+        pattern = read_pattern_text(path)
+    pattern.trained_on, pattern.marks = trained_on(text), marks(text)
+    return pattern
 
 
 def _planet(text: str, path: Path) -> dict[str, FloatArray]:

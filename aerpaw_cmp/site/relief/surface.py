@@ -83,7 +83,7 @@ class Surface:
         for drawn in draws:
             off = self.height_m - self.level_m
             prior = np.zeros(len(place))
-            if drawn is not None:  # what was drawn, corrected by what the points say of it
+            if drawn is not None:
                 waves = self._waves(drawn)
                 prior = waves.on_grid(across, along).ravel()
                 off = off + drawn.normal(0.0, self.error_m) - waves(self.place_m)

@@ -258,6 +258,7 @@ def serial_check(device: str, description: str = "") -> Check:
     """One port: present, allowed, free."""
     port = f"{device} {description}".strip()
     if not os.access(device, os.R_OK | os.W_OK):
+        # the kernel gives a new group to new logins alone
         remedy = f"sudo usermod -aG {_group(device)} $USER, then log in anew"
         return Check("Serial", "warn", f"{port}: not allowed", remedy)
     if busy := holders(device):

@@ -45,9 +45,11 @@ _SHARPEST = 1e-6
 _LEAST_WAVELENGTHS = 0.5
 
 # How far beside an edge point the air on both of its faces is looked for.
+# Far above the rounding of coordinates at 1 km, far below the gap between two walls of a map.
 _PROBE_M = 1e-3
 
 # Pairs of edge and pose that are looked at together; paths whose field is evaluated together.
+# Both bound the memory; no result depends on them.
 LINKS_AT_ONCE, PATHS_AT_ONCE = 200_000, 4096
 
 
@@ -84,6 +86,7 @@ class EdgePaths(Further):
 
     def lines(self) -> PathSet:
         """The same polylines without faces."""
+        # legs() wants the corners in use first; their order stays, for the sort is stable
         used = np.isfinite(self.vertices_m).all(axis=2)
         first = np.argsort(~used, axis=1, kind="stable")
         vertices = np.take_along_axis(self.vertices_m, first[..., None], axis=1)
@@ -103,6 +106,7 @@ class EdgePaths(Further):
 
     def words(self, faces: Faces) -> list[str]:
         """Corners of each path, from tower to UAV."""
+        # an index of -1 then takes the empty word at the end
         label = (*faces.label, "")  # of -1, no face
         edges = zip(self.wedge.tolist(), self.vertices_m[:, 1].tolist(), strict=True)
         middle = (f"edge of {label[f]} and {label[n]} at {', '.join(f'{x:.1f}' for x in at)} m" for (f, n), at in edges)
@@ -136,8 +140,10 @@ class EdgePaths(Further):
             if loss_db is not None:
                 amplitude *= amplitude_from_db(-loss_db[part])[:, None, None]
             first = np.flatnonzero(np.diff(key[part], prepend=-1))
+            # paths are sorted by link, and a part ends between poses: no link is written twice
             h[key[part][first]] = np.add.reduceat(amplitude, first, axis=0)
             path_power[part] = (np.abs(amplitude) ** 2).mean(axis=(1, 2))
+        # the matrix is (receiver, transmitter): reciprocity makes the other direction its transpose
         matrices = np.ascontiguousarray(h.swapaxes(1, 2)) if link.uav_transmits else h
         power = np.bincount(key, weights=path_power, minlength=len(h)).astype(np.float64)
         return Fields(matrices.reshape(*shape, *matrices.shape[1:]), path_power, power.reshape(shape))
@@ -177,6 +183,7 @@ def over_edges(scene: Scene, poses: Poses, link: Link) -> EdgePaths:
     none = np.zeros(0, np.int64)
     pieces = [EdgePaths(none, none, np.zeros((0, 2), np.int64), np.zeros((0, 2), np.int64), np.zeros((0, 3, 3)))]
     for tower in range(len(sources)):
+        # -1: no reflection on that side
         grounds = [-1, *np.flatnonzero(scene.usable[tower] & (faces.solid < 0)).tolist()]
         rows = np.flatnonzero(known & ~scene.excluded[tower])
         for ground in itertools.product(grounds, grounds) if len(search.edges) else ():
@@ -226,6 +233,7 @@ class Edges(NamedTuple):
 
         Upright corners begin at the highest of the level grounds where their wall begins lower.
         """
+        # walls reach below the ground, where a corner bends nothing
         ground_m = max(0.0, float(faces.offset_m[faces.solid == -1].max(initial=0.0)))
         least_m = _LEAST_WAVELENGTHS * wavelength
         solids = np.unique(faces.solid[faces.solid >= 0])
@@ -252,6 +260,7 @@ def _of_solid(
     faces: Faces, solid: int, ground_m: float, least_m: float
 ) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
     """Start, end and faces of each edge, so that the outward normal of face 0 and the direction are as in Edges."""
+    # faces of one building alone: an edge between two buildings that touch is in neither's list
     members = np.flatnonzero(faces.solid == solid)
     walls = [int(i) for i in members if faces.normal[i, 2] == 0.0]
     roofs = {float(faces.offset_m[i]): int(i) for i in members if faces.normal[i, 2] == 1.0}
@@ -259,6 +268,7 @@ def _of_solid(
     first = {_corner(faces, wall, 0): wall for wall in walls}
     for wall in walls:
         top, low = faces.upper[wall, 1], max(float(faces.lower[wall, 1]), ground_m)
+        # neither its rim nor its corner is an edge in the sense of an asymptotic law
         if top - low <= least_m:
             continue
         near, far = (_point(faces, wall, end, top) for end in (0, 1))
@@ -266,6 +276,7 @@ def _of_solid(
             # t lies in the wall, pointing down: t x normal points along the wall
             rows.append((far, near, (wall, roofs[top])))
         following = first.get(_corner(faces, wall, 1))
+        # the wall turns left: at an inner corner the air is on the hollow side, and nothing bends round it
         if following is not None and np.cross(faces.along[wall], faces.along[following])[2] > np.sin(_SHARPEST):
             # t lies in the wall, away from the corner
             rows.append((_point(faces, wall, 1, low), _point(faces, wall, 1, top), (wall, following)))
@@ -281,6 +292,7 @@ def _point(faces: Faces, wall: int, end: int, height_m: float) -> FloatArray:
 def _corner(faces: Faces, wall: int, end: int) -> tuple[float, float]:
     """Corner of the footprint, to the tenth of a millimetre, as a key."""
     point = _point(faces, wall, end, 0.0)
+    # both walls compute the corner from their own plane, so the last digits differ
     return round(float(point[0]), 4), round(float(point[1]), 4)
 
 
@@ -292,20 +304,24 @@ class _Search:
         self.hiding = Occlusion(faces, scene_tolerance_m(faces, sources_m, targets_m))
         numbers = np.unique(faces.solid[faces.solid >= 0])
         solid = np.searchsorted(numbers, faces.solid[edges.face[:, 0]])
+        # twice the probe, so that every building which a probe may enter is seen
         low = np.minimum(edges.start_m, edges.end_m) - 2.0 * _PROBE_M
         high = np.maximum(edges.start_m, edges.end_m) + 2.0 * _PROBE_M
         touch = (self.hiding.low[None] <= high[:, None]) & (self.hiding.high[None] >= low[:, None])
         near = np.asarray(touch.all(axis=2))
+        # an edge touches its own building always
         near[np.arange(len(edges)), solid] = False
         # another building may touch a face of these
         self.doubtful = np.asarray(near.any(axis=1))
         axis_n = np.cross(edges.along, edges.normal_n)
+        # along each face, and a tenth out of it: a probe in the plane itself would graze its own wall
         self.sides = np.stack([edges.face_axis + 0.1 * edges.normal, axis_n + 0.1 * edges.normal_n], axis=1)
 
     def of_tower(
         self, tower: int, source_m: FloatArray, targets_m: FloatArray, poses: IntArray, ground: tuple[int, int]
     ) -> list[EdgePaths]:
         """Paths of one tower with the given ground reflections before and after the edge."""
+        # mirrored in their ground, so that each bent leg is straight
         images = (source_m, targets_m[poses])
         source, ends = (p if g < 0 else self.faces.mirrored(g, p) for g, p in zip(ground, images, strict=True))
         at_source, near = (part[:, 0] for part in self._round_edges(source[None]))
@@ -314,6 +330,7 @@ class _Search:
         for first in range(0, len(poses), step):
             some = ends[first : first + step]
             at_target, far = (part[lit].T for part in self._round_edges(some))
+            # Keller's cone unrolled: both legs have one angle with the edge where the unfolded line crosses it
             at = at_source[lit] + (at_target - at_source[lit]) * (near[lit] / (near[lit] + far))
             row, column = np.nonzero((at >= 0.0) & (at <= self.edges.length_m[lit]) & (far >= 0.0))
             edge, pose = lit[column], poses[first + row]
@@ -345,8 +362,10 @@ class _Search:
         point, good = vertices_m[:, 1], np.ones(len(edge), np.bool_)
         for index, spot, end in zip(ground, (vertices_m[:, 0], vertices_m[:, 2]), (source_m, target_m), strict=True):
             if index >= 0:
+                # an edge that lies in the ground has no reflection between it and the ground
                 good &= (self.faces.height_m(index, point) > NEAREST_M) & (self.faces.height_m(index, end) > 0.0)
                 rows = np.flatnonzero(good)
+                # a ground plane has no end, but the planes of terrain have
                 good[rows] = inside(self.faces, np.full(len(rows), index), spot[rows], 0.0)
         good[good] &= self._exposed(edge[good], point[good])
         for start, end in legs(source_m, vertices_m, target_m):
@@ -358,6 +377,7 @@ class _Search:
         good = np.ones(len(edge), dtype=np.bool_)
         rows = np.flatnonzero(self.doubtful[edge])
         for side in (0, 1):
+            # from half-way on: the first half may still lie in the rounding of the edge itself
             step = _PROBE_M * self.sides[edge[rows], side]
             good[rows] &= ~self.hiding.segments(points_m[rows] + 0.5 * step, points_m[rows] + step)
         return good
@@ -368,6 +388,7 @@ class _Search:
         axes = np.stack([edges.along, edges.face_axis, edges.normal, edges.normal_n])
         start = (axes * edges.start_m).sum(axis=2)
         along, down, up, up_n = axes @ points_m.T - start[..., None]
+        # out of both faces' fronts at once is inside the wedge, where no wave is
         far = np.hypot(down, up)
         return along, np.where((far >= NEAREST_M) & ((up >= 0.0) | (up_n >= 0.0)), far, -1.0)
 
@@ -425,6 +446,7 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     wavelength = wavelength_m(link.carrier_hz)
     wave_number, table = 2.0 * np.pi / wavelength, FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
     face_0, face_n = paths.wedge.T
+    # axes of the edge as rows: places below become (along, down face 0, out of it)
     along, face_axis, exterior = wedge_axes(faces.normal[face_0], faces.normal[face_n])
     frame, point = np.stack([along, face_axis, faces.normal[face_0]], axis=1), paths.vertices_m[:, 1]
     ends = _ends(paths, faces, table, sources_m, poses, link)
@@ -433,6 +455,7 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
     rise = place[1][0] - place[0][0]
     total = np.hypot(near + far, rise)
     sine, cosine = (near + far) / total, rise / total
+    # 0 lies in face 0; behind it the angle runs on to the exterior angle, not to minus pi
     phi_in, phi_out = (np.mod(np.arctan2(up, down), 2.0 * np.pi) for _, down, up in place)
     distance, materials = wave_number * near * far / total, (tuple(table[face].T) for face in (face_0, face_n))
     bb, bp, pp = wedge(phi_in, phi_out, cosine, exterior, distance, *materials)
@@ -459,6 +482,7 @@ def _ends(
 ) -> tuple[_End, _End]:
     """Source and target of each path, mirrored where their leg is bent."""
     arrays, uav = list(link.tower_arrays.values()), link.uav_array
+    # transposed: rows of the axes are what the laws take
     mounts = np.stack([array.mount.T for array in arrays])
     axes = np.einsum("nij,jk->nki", poses.rotation[paths.pose], uav.mount)
     places, slants = np.stack([a.positions_m.T for a in arrays]), np.stack([a.slant_parts for a in arrays])
@@ -470,6 +494,7 @@ def _ends(
     for side, (centre, turned, place, slant) in enumerate(rows):
         ground = paths.ground[:, side]
         bounced = ground >= 0
+        # a normal of zero mirrors nothing, so all paths go through one formula
         normal = np.where(bounced[:, None], faces.normal[ground], 0.0)
         offset = np.where(bounced, faces.offset_m[ground], 0.0)
         centre = centre - 2.0 * ((centre * normal).sum(axis=1) - offset)[:, None] * normal
@@ -484,6 +509,7 @@ def _patterns(
 ) -> tuple[ComplexArray, ComplexArray]:
     """E_theta and E_phi (paths, elements) of one end's elements ``toward`` directions (paths, 3) of the centres."""
     count = len(arrays[0])
+    # one by one broadcasts against every path and element
     if all(plain(array.patterns) for array in arrays):
         return np.ones((1, 1), complex), np.zeros((1, 1), complex)
     fields = np.empty((len(paths), 4, count))
@@ -507,12 +533,14 @@ def _round_edge(
     toward, normal = parts_of(way), parts_of(end.normal)
     mirror = coefficients(dyads.incidence(toward, normal), parts_of(end.face))
     slant_cosine, slant_sine = end.slants[:, 0], end.slants[:, 1]
+    # the pattern is that of the centre's direction; each element keeps its own slant
     e_theta, e_phi = dyads.slant_rotation(*pattern, slant_cosine, slant_sine)
     beta: ComplexArray = np.zeros(1, complex)
     phi: ComplexArray = np.zeros(1, complex)
     for unit, field in (((1.0, 0.0), e_theta), ((0.0, 1.0), e_phi)):
         wave = dyads.field_vector(rows_of(end.axes), tuple(sign * part for part in toward), *unit)  # type: ignore[arg-type]
         re, im = dyads.reflected(wave, (0.0, 0.0, 0.0), toward, normal, *mirror)
+        # the dyad is evaluated for all and taken where a ground bounced: a leg that is straight keeps its wave
         after = np.hstack(re) + 1j * np.hstack(im)
         vector = np.where(end.bounced[:, None], after, np.hstack(wave))
         beta = beta + field * (vector * flat).sum(axis=1)[:, None]

@@ -43,6 +43,7 @@ class Search:
     """
 
     engine: Engine = "image"
+    # As in the paper's ray tracing.
     max_depth: int = 2
     samples: Samples = "auto"
     batch: int = 50
@@ -73,6 +74,7 @@ class Field:
         Sources are (towers, 3), or (poses, 1, 3) of a tower that moves.
         """
         if self.loss is not None and sources_m.ndim == 3:
+            # a loss looks its source up by tower: here each pose has its own
             paths, sources_m = replace(paths, tower=paths.pose), sources_m[:, 0]
         return None if self.loss is None else self.loss(paths, sources_m, targets_m)
 
@@ -97,6 +99,7 @@ class Job:
     def of(cls, points_m: FloatArray, links: int, pairs: int) -> Job:
         """The box of the points (n, 3) that are known."""
         known = points_m[np.isfinite(points_m).all(axis=1)]
+        # two corners say as much of the tolerance as all points do
         return cls(np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known, links, pairs)
 
 

@@ -23,6 +23,7 @@ from .geometry.paths import Faces, PathSet, legs, sources_of
 from .options import Field
 
 # Codes of ``kind``; what else bends a path follows by its name.
+# Their numbers stand in files of channels: new kinds go behind them.
 _KINDS = ("line_of_sight", "reflection", "edge")
 
 # Gains are those of the carrier: materials, patterns and foliage are not evaluated at other frequencies.
@@ -131,6 +132,7 @@ class PathTable:
         -------
         (paths,)
         """
+        # zero stands for a tower that stands
         tower = np.broadcast_to(unmasked(tower_mps), velocity_mps.shape)
         closing = np.einsum("ni,ni->n", velocity_mps[self.pose], self.at_uav)
         closing += np.einsum("ni,ni->n", tower[self.pose], self.at_tower)
@@ -176,11 +178,13 @@ def path_table(
         lines, code = item.lines(), 0 if isinstance(item, PathSet) else kinds.index(item.name)
         loss_db = ends.field.loss_db(lines, ends.sources_m, ends.poses.position_m)
         good = counts[lines.pose, lines.tower]
+        # a path that loses everything is no path of the table, though it stays in the search's list
         good &= True if loss_db is None else np.isfinite(loss_db)
         item, lines, loss_db = item.select(good), lines.select(good), None if loss_db is None else loss_db[good]
         unique, via = np.unique(item.touched, axis=0, return_inverse=True)
         texts = [", ".join(labels[i] for i in row if i >= 0) for row in unique.tolist()]
         codes = np.array([names.setdefault(text, len(names)) for text in texts], dtype=np.int64)
+        # centres of the arrays: delays and directions are one a path, gains one a pair
         places = sources_of(lines, ends.sources_m), lines.vertices_m, ends.poses.position_m[lines.pose]
         away = list(legs(*places))
         back = next(legs(places[2], lines.vertices_m[:, ::-1], places[0]))  # from the UAV
@@ -188,6 +192,7 @@ def path_table(
             {
                 "pose": item.pose,
                 "tower": item.tower,
+                # however many reflections: their number stands in ``turns``
                 "kind": np.full(len(lines), code) if code else np.minimum(lines.depth, 1),
                 "via": codes[via.ravel()],
                 "gain": _gains(item, faces, ends, loss_db),
@@ -201,6 +206,7 @@ def path_table(
             }
         )
     columns = {name: np.concatenate([piece[name] for piece in pieces]) for name in pieces[0]}
+    # the last key is the first to count
     order = np.lexsort((columns["length_m"], columns["tower"], columns["pose"]))
     columns = {name: value[order] for name, value in columns.items()}
     link = columns["pose"] * counts.shape[1] + columns["tower"]
@@ -213,6 +219,7 @@ def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> C
     pieces, order = [], []
     for tower, (name, array) in enumerate(ends.link.tower_arrays.items()):
         rows = np.flatnonzero(item.tower == tower)
+        # each path at a pose of its own: H of that pose is then its gain, by the one law there is
         some, own, link = item.select(rows), np.arange(len(rows)), replace(ends.link, tower_arrays={name: array})
         poses = Poses(ends.poses.position_m[some.pose], ends.poses.rotation[some.pose])
         places, lost = sources_of(some, ends.sources_m)[:, None], None if loss_db is None else loss_db[rows]
@@ -279,6 +286,7 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
     check_band(float(np.ptp(offsets)) if len(offsets) else 0.0, ends.link.carrier_hz)
     links = len(ends.poses), len(ends.link.tower_arrays)
     h = np.zeros((*links, *table.gain.shape[1:], len(offsets)), dtype=np.complex128)
+    # a loop over the paths of a link: an array of all poses, paths and frequencies may not fit
     for number in range(table.most):  # one path a link: no row is added to twice
         rows = np.flatnonzero(table.number == number)
         phase = np.exp(-2j * np.pi * table.delay_s[rows][:, None] * offsets)
@@ -304,6 +312,7 @@ def subcarriers_hz(bandwidth_hz: float, count: int) -> FloatArray:
     >>> subcarriers_hz(4.0, 4).tolist()
     [-2.0, -1.0, 0.0, 1.0]
     """
+    # as np.fft.fftshift orders them: with an even count the lowest has no partner
     return np.asarray((np.arange(count) - count // 2) * (bandwidth_hz / count))
 
 

@@ -26,6 +26,7 @@ from .search import mirror
 from .search.terrain import on_terrain
 
 # Poses of which levels are made at once.
+# H of so many poses stays in a processor's cache between its two sums.
 LEVELS_AT_ONCE = 1024
 
 # Arrays (poses, towers, ...) of a replay.
@@ -104,6 +105,7 @@ class Replay:
     @property
     def left_out(self) -> list[str]:
         """Sentences on what was not modelled."""
+        # what was counted and never met needs no sentence
         return [str(item) for item in self.omitted if 0 not in item.counts[:1]]
 
     def __repr__(self) -> str:
@@ -209,6 +211,7 @@ def replay(
         raise UsageError(f"unknown engine {search.engine!r}", expected="'image' or 'sionna'")
     poses, notes = within_reach(site, poses)
     scene = Scene.of(site, link, poses)
+    # links of a moving tower with its other places: excluded as if an end were buried
     if search.links is not None:
         scene = replace(scene, excluded=scene.excluded | ~search.links)
     notes += buried_towers(site, link)
@@ -216,7 +219,9 @@ def replay(
     choice = chosen_samples(scene, link, poses, search, cache)
     search = search if choice is None else replace(search, samples=choice.samples)
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
+    # a damaged entry is said in the report: the numbers are right, the time is not
     notes += map(Omission, cache.warnings) if cache else []
+    # on the scene before terrain changed it: these paths reflect off level ground
     further = further_paths(site, scene, link, poses, search, field)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
     result = _evaluated(scene, link, poses, (paths, *(some for some, _ in further)), search, field, run, further)
@@ -254,10 +259,12 @@ def passed(
     """
     scene, level, shaped, notes = _shaped_ground(site, scene, link, poses, paths)
     clear = _clear_of_terrain(site, scene, poses, level)
+    # asked of level paths alone: those over shaped ground were asked when they were made
     lost = int((~clear).sum())
     notes += [Omission("paths end at the terrain of the elevation model", (lost, len(level)))]
     paths = level.select(clear) if lost else level
     if len(shaped):
+        # None: planes of terrain that touch are no repeated faces
         paths = mirror.merge([paths, shaped], search.max_depth, None)
     return scene, paths, notes
 
@@ -298,6 +305,7 @@ def _shaped_ground(
         return scene, paths, paths.select(slice(0, 0)), []
     terrain = on_terrain(site.dem, scene.faces, scene.links_to(poses), paths, wavelength_m(link.carrier_hz))
     words = "links over ground that the elevation model does not know: level ground reflects there"
+    # tangent planes serve the one path that they were made for
     more = np.zeros((len(scene.usable), len(terrain.faces) - len(scene.faces)), dtype=np.bool_)
     scene = replace(scene, faces=terrain.faces, usable=np.concatenate([scene.usable, more], axis=1))
     return scene, terrain.level, terrain.shaped, [Omission(words, (terrain.unknown,))]
@@ -339,9 +347,11 @@ def _evaluated(
     work = 0 if run.job is None else run.job.pairs
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, work=work)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
+    # a blocked path adds zero to H; only the flag tells it from one that fades
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
     for _, item in further:
+        # path_power stays that of the reflections: each kind keeps its own
         fields = Fields(fields.h + item.h, fields.path_power, fields.power + item.power)
         has_path |= item.power > 0.0
     level_dbm, power_dbm = _levels(fields, has_path, link)
@@ -371,6 +381,7 @@ def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray
         power_dbm[part] = rss_dbm(fields.power[part], sent, floor)
         above_floor = np.isfinite(level_dbm[part])
         if not above_floor.all():
+            # below the floor a receiver knows no channel, so no rank may be taken of it
             h[part][~above_floor] = 0.0
         has_path[part] &= above_floor
     return level_dbm, power_dbm

@@ -55,6 +55,7 @@ class Scene:
             )
         surfaces, towers = surfaces_of(site), [site.towers[name] for name in names]
         sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
+        # said beforehand: the search would follow every face for a link that cannot exist
         excluded = inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
         if surfaces is not None:
             usable = np.ones((len(names), len(surfaces)), dtype=np.bool_)
@@ -62,10 +63,12 @@ class Scene:
         faces = site_faces(site, names)
         ground = np.array([tower.ground_m for tower in towers])
         is_ground = faces.solid < 0
+        # each tower sees its own ground plane alone; walls and roofs are everybody's
         usable = ~is_ground[None, :] | (faces.offset_m[None, :] == ground[:, None])
         # a pose below a tower's own plane but above the lowest ground, or above the terrain's, is no buried pose
         lowest = np.minimum(ground, 0.0)[:, None]
         if site.dem is not None:
+            # fmin, not minimum: beyond the model (NaN) the plane decides
             lowest = np.fmin(lowest, site.dem.ground_m(*poses.position_m[:, :2].T))
         return cls(faces, sources, usable, excluded | (poses.position_m[:, 2] < lowest))
 
@@ -80,6 +83,7 @@ def surfaces_of(site: Site) -> Surfaces | None:
         return None
     scene = site.scene
     for building in site.buildings:
+        # triangles hide and reflect by one law: prisms beside them would need the other
         scene = added(scene, *building_mesh(building), building.name, material(building.material).name)
     return _merged(scene)
 
@@ -99,6 +103,7 @@ def _merged(scene: TriangleScene) -> Surfaces:
 
 
 # Poses further than this from every tower [m] are no poses of the site.
+# Radio horizon of a UAV at 600 m; a row at 0, 0 degrees lies thousands of kilometres off.
 REACH_M = 100_000.0
 
 
@@ -125,8 +130,10 @@ def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
     known = np.isfinite(poses.position_m).all(axis=1)
     turned = np.isfinite(poses.rotation).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
+        # tower by tower: an array of all pairs would grow with both
         far = np.ones(len(poses), dtype=np.bool_)
         for place in towers:
+            # hypot does not overflow where squares of 1e200 would
             far &= ~(np.hypot.reduce(poses.position_m - place, axis=1) <= REACH_M)
     far &= known
     bad = far | ~turned
@@ -138,6 +145,7 @@ def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
     ]
     counted = [(int(mask.sum()), f"{what}: no path was searched for them") for mask, what in reasons]
     position = np.where(bad[:, None], np.nan, poses.position_m)
+    # any rotation: nothing is evaluated there, but NaN would warn in every product
     rotation = np.where(bad[:, None, None], np.eye(3), poses.rotation)
     return Poses(position, rotation), [Omission(what, (count,)) for count, what in counted]
 
@@ -147,6 +155,7 @@ def buried_towers(site: Site, link: Link) -> list[Omission]:
     lines = []
     names = list(link.tower_arrays)
     places = np.array([site.towers[name].position_m for name in names]).reshape(-1, 3)
+    # one building after the other, for the name: asked of buried towers alone
     for number in np.flatnonzero(inside_solids(site, places)):
         name = names[number]
         for building in site.buildings:

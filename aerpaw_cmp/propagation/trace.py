@@ -75,6 +75,7 @@ def trace(
     place = site if isinstance(site, Site) else load_site(site)
     search = Search(engine, max_depth=max_depth, samples=samples, further=diffracted(diffraction))
     if isinstance(poses, Poses):
+        # a masked value is a missing one: NaN, not the number under the mask
         poses = Poses(unmasked(poses.position_m), unmasked(poses.rotation))
     else:
         poses = _level(poses)

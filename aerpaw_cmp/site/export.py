@@ -76,6 +76,7 @@ def _comment(site: Site) -> str:
     text = f"{site.name}: x east, y north, z up [m] from {frame.latitude_deg:.8f}, {frame.longitude_deg:.8f}" + (
         f"; {site.credit}" if site.credit else ""
     )
+    # two hyphens would end the XML comment
     return text.replace("--", "- -")
 
 
@@ -114,6 +115,7 @@ def _write_ply(mesh: Mesh, path: Path) -> None:
         f"element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
         f"element face {len(triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
     )
+    # packed, as PLY wants it: a count of one byte, then three indices
     faces = np.empty(len(triangles), dtype=[("n", "u1"), ("i", "<i4", 3)])
     faces["n"], faces["i"] = 3, triangles
     path.write_bytes(head.encode() + vertices.astype("<f4").tobytes() + faces.tobytes())

@@ -36,6 +36,7 @@ def site_files(name: str, folder: Path) -> Iterator[tuple[str, str, Path]]:
         yield text, f"site: {key}", place
 
 
+# by size and time, too: a site that is edited between two tasks is read again
 @lru_cache(maxsize=16)
 def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> SiteModel:
     """A site file as checked; a campaign asks for the same one with every task."""

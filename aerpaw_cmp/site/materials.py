@@ -62,6 +62,7 @@ class Material:
         low, high, *_ = self.band
         if low <= frequency_ghz <= high:
             return self.band
+        # constants of the nearest frequency in the table, as a line to paste
         edge = low if frequency_ghz < low else high
         near = stated_name(self.relative_permittivity(edge * 1e9).real, self.conductivity_s_per_m(edge * 1e9), None)
         raise UsageError(
@@ -133,6 +134,7 @@ def material(name: str) -> Material:
     plain, _, numbers = name.partition(" with ")
     if numbers:
         return _stated(plain, numbers, name)
+    # Sionna, Blender and people write one name in three ways
     key = name.strip().lower().replace("-", "_").replace(" ", "_").removeprefix("itu_")
     if key not in _TABLE:
         near = difflib.get_close_matches(key, _TABLE, n=1, cutoff=0.4)
@@ -147,6 +149,7 @@ def material(name: str) -> Material:
 
 def _stated(plain: str, numbers: str, name: str) -> Material:
     """A material whose name says its numbers."""
+    # permittivity and conductivity of a material of the table follow from the carrier
     allowed = {"thickness"} if plain != CONSTANT else {"thickness", "permittivity", "conductivity"}
     try:
         values = {key: float(value) for key, value in (word.split("=") for word in numbers.split())}

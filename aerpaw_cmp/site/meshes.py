@@ -36,6 +36,7 @@ def building_mesh(building: Building) -> Mesh:
         vertices.append(np.column_stack([np.tile(line, (2, 1)), np.repeat([low, high], n)]))
         a = np.arange(n)
         b = (a + 1) % n
+        # the outer ring runs counter-clockwise, so these corners do so seen from outside
         walls = np.concatenate([np.stack([a, b, b + n], axis=1), np.stack([a, b + n, a + n], axis=1)])
         triangles.append(walls + count)
         count += 2 * n
@@ -43,6 +44,7 @@ def building_mesh(building: Building) -> Mesh:
     roof = np.stack([np.asarray(part.exterior.coords)[:3, :2] for part in parts])
     flat = roof.reshape(-1, 2)
     edge, other_edge = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
+    # the triangulation promises no sense, and a roof must look up
     turn = edge[:, 0] * other_edge[:, 1] < edge[:, 1] * other_edge[:, 0]
     order = np.arange(len(flat)).reshape(-1, 3)
     order[turn] = order[turn][:, ::-1]

@@ -85,6 +85,7 @@ def placed_scene(
 def with_ground(scene: TriangleScene, name: str) -> TriangleScene:
     """The scene on a level rectangle at its lowest point, which reaches far beyond it."""
     low, high = bounds(scene)
+    # so far that no reflection between points of the scene falls off its edge
     reach = _PLANE_MARGIN * float(max(*(high - low)[:2], 100.0))
     corners = [(low[0] - reach, low[1] - reach), (high[0] + reach, low[1] - reach)]
     corners += [(high[0] + reach, high[1] + reach), (low[0] - reach, high[1] + reach)]
@@ -132,6 +133,7 @@ def ground_share(scene: TriangleScene) -> float:
     corners = scene.vertices_m[scene.triangles]
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     size = np.linalg.norm(across, axis=1)
+    # either side up: files turn triangles as they like
     level = corners[np.abs(across[:, 2]) > LEVEL * np.maximum(size, 1e-300)]
     low, high = bounds(scene)
     return float(shapely.union_all(shapely.polygons(level[:, :, :2])).area / (high - low)[:2].prod())
@@ -168,6 +170,7 @@ def without_traps(
         corners = scene.vertices_m[scene.triangles[scene.shape == number]]
         low, high = corners.min(axis=(0, 1)), corners.max(axis=(0, 1))
         for tower, place in antennas_m.items():
+            # the box first: most meshes are nowhere near an antenna
             if np.any(place < low - _TOUCHES_M) or np.any(place > high + _TOUCHES_M):
                 continue
             inside = _encloses(corners, place)
@@ -179,6 +182,7 @@ def without_traps(
                     "mirror"
                 )
     green = np.array([name == CROWN for name in scene.materials])
+    # thin cylinders: they shade centimetres, and a convex outline of them would be a wood
     trunk = green & np.array(["trunk" in name.lower() for name in scene.shapes])
     woods = [wood for number in np.flatnonzero(green & ~trunk).tolist() for wood in _media(scene, number)]
     if green.any():
@@ -193,6 +197,7 @@ def without_traps(
 def _encloses(corners_m: FloatArray, place_m: FloatArray) -> bool:
     """Check whether a point lies in a mesh of triangles (n, 3, 3): lines upward meet it an odd number of times."""
     across = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    # area vectors of a closed mesh add up to zero
     if np.linalg.norm(across.sum(axis=0)) > 1e-3 * np.linalg.norm(across, axis=1).sum():
         return False  # open, such as terrain
     votes = 0
@@ -218,6 +223,7 @@ def _media(scene: TriangleScene, number: int) -> Iterator[Forest]:
         low, high = float(mine[..., 2].min()), float(mine[..., 2].max())
         if outline.geom_type != "Polygon" or not high > low:
             continue
+        # sixths of determinants about any point: the divergence theorem
         volume = abs(float(np.linalg.det(mine - mine.mean(axis=(0, 1))).sum())) / 6.0
         yield Forest(
             name=scene.shapes[number] if index == 0 else f"{scene.shapes[number]} ({index + 1})", area=outline,
@@ -264,6 +270,7 @@ def _outlines(scene: TriangleScene) -> tuple[Building, ...]:
             simple = outline.simplify(_DRAWN_SIMPLER_M)
             if mine.size and simple.geom_type == "Polygon" and _DRAWN_M2 < simple.area < _GROUND_PART * ground_m2:
                 outlines.append((scene.shapes[shape], simple, float(mine.max())))
+    # the largest only: a browser draws no hundred thousand prisms
     outlines = sorted(outlines, key=lambda drawn: -drawn[1].area)[:_DRAWN_MOST]
     # down to the lowest corner of anything under it: roofs are often shapes of their own
     feet = np.array([top for *_, top in outlines])

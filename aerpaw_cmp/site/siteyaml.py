@@ -169,6 +169,7 @@ class PolygonModel(StrictModel):
             shape = Polygon(_ring_from_degrees(self.polygon_deg or [], frame, self.name))
         if problem := _problem(shape):
             raise UsageError(f"the polygon of '{self.name}' {problem}")
+        # one order of corners: equal outlines are equal, and their names of walls with them
         return shapely.normalize(shape)
 
 
@@ -414,6 +415,7 @@ _HEIGHTS_AGREE_M = 5.0
 
 def _disagreements(model: SiteModel, towers: Mapping[str, Tower], dem: Dem | None) -> list[str]:
     """Sentences on grounds that the file states and its elevation model contradicts."""
+    # a surface through points contradicts none of its own points
     if dem is None or model.dem is None:
         return []
     pairs = []
@@ -446,6 +448,7 @@ def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[s
 
 def extent_m(model: SiteModel, frame: SiteFrame) -> Area:
     """East and north that maps of the site cover: ``area_m``, else 500 m around the towers."""
+    # without a note each time, which build_site makes once
     positions = []
     for name, tower in model.towers.items():
         chosen = _chosen_position(name, tower, model.coordinates, frame, [])
@@ -461,6 +464,7 @@ def _outlines(models: list[OutlineT], key: str, frame: SiteFrame) -> Iterator[tu
 
 
 def _dem(model: SiteModel, frame: SiteFrame, folder: Path) -> Dem | None:
+    # said at that key: the file has no 'dem' whose line could be shown
     if model.tower_ground == "dem" and model.dem is None:
         with _at("tower_ground"):
             raise UsageError("tower_ground is 'dem', but there is no elevation model", expected="the key 'dem'")
@@ -517,6 +521,7 @@ def _check_tower(tower: Tower, area: Area | None, frame: SiteFrame) -> None:
     """A tower kilometres off is a slip of the pen, not a site."""
     away = math.hypot(tower.east_m, tower.north_m)
     if area is not None:
+        # a large map may have its origin in a corner
         away = min(away, math.hypot(_outside(tower.east_m, *area[:2]), _outside(tower.north_m, *area[2:])))
     if not away <= _FAR_TOWER_M:
         raise UsageError(
@@ -534,6 +539,7 @@ def _why_far(tower: Tower, frame: SiteFrame) -> str:
         ("the sign of the longitude is wrong: west is negative", (latitude, -longitude)),
         ("the sign of the latitude is wrong: south is negative", (-latitude, longitude)),
     ):
+        # swapped, a latitude may be none
         if abs(position[0]) <= 90 and float(np.hypot(*frame.to_local(*position))) <= _FAR_TOWER_M:
             return cause
     return "a digit is wrong, or it belongs to another site"
@@ -611,6 +617,7 @@ def _chosen_position(
 ) -> PositionModel:
     if model.latitude_deg is not None and model.longitude_deg is not None:
         return PositionModel(latitude_deg=model.latitude_deg, longitude_deg=model.longitude_deg, source=model.source)
+    # the first that the file names is the one that its author trusts
     key = next(iter(model.positions)) if source_name is None else source_name
     if key not in model.positions:
         raise UsageError(f"tower '{name}' has no position '{key}'", expected="one of " + ", ".join(model.positions))
@@ -639,6 +646,7 @@ def _trees(
     notes: list[str],
 ) -> tuple[Trees, Trees]:
     """Trees that stand for themselves, and those of stands, which only opaque foliage sees."""
+    # nothing is placed inside houses or on masts
     clear = shapely.union_all(
         [building.footprint for building in buildings]
         + [Point(tower.east_m, tower.north_m).buffer(MAST_CLEARANCE_M) for tower in towers.values()]
@@ -669,6 +677,7 @@ def _single(models: list[SingleTreeModel], sizes: TreeSizes) -> Trees:
     drawn = trees_at(east, north, sizes)
 
     def own(name: str) -> FloatArray:
+        # NaN is "as of all trees"
         stated = np.array([np.nan if (size := getattr(m, name)) is None else size for m in models], dtype=np.float64)
         return np.where(np.isnan(stated), getattr(drawn, name), stated)
 
@@ -691,6 +700,7 @@ def _checked_area(area: Area | None, east: Sequence[float], north: Sequence[floa
 
 
 def _check_near(points_m: list[tuple[float, float]], name: str) -> None:
+    # before polygons are made: coordinates of a map grid are valid outlines, elsewhere
     away = max(math.hypot(*point) for point in points_m)
     if away > _FAR_POLYGON_M:
         raise UsageError(

@@ -105,6 +105,7 @@ def place_trees(
     by one (random sequential addition), but whole batches are decided at once.
     """
     area = forest.area if keep_clear is None else shapely.difference(forest.area, keep_clear)
+    # of the name, not of the order: a forest that is added leaves the others' trees where they are
     random = np.random.default_rng([seed, zlib.crc32(forest.name.encode())])
     points = _scatter(area, wanted_trees(forest, keep_clear), forest.minimum_spacing_m, random)
     return trees_at(points[:, 0], points[:, 1], sizes)
@@ -130,6 +131,7 @@ def _scatter(area: BaseGeometry, count: int, spacing_m: float, random: np.random
     shapely.prepare(area)
     east_min, north_min, east_max, north_max = area.bounds
     low, span = np.array([east_min, north_min]), np.array([east_max - east_min, north_max - north_min])
+    # of the bounding box: so many darts are thrown that about enough hit
     share = area.area / max(float(span.prod()), 1e-300)
     stalled = 0
     while len(placed) < count and stalled < _STALLED_ROUNDS:
@@ -141,6 +143,7 @@ def _scatter(area: BaseGeometry, count: int, spacing_m: float, random: np.random
                 darts = darts[cKDTree(placed).query(darts, distance_upper_bound=spacing_m)[0] >= spacing_m]
             darts = darts[_first_come(darts, spacing_m)]
         added = darts[:missing]
+        # random packing ends near half of the area: the last trees would take for ever
         stalled = stalled + 1 if len(added) < 1e-3 * count else 0
         placed = np.concatenate([placed, added])
     return placed
@@ -150,6 +153,7 @@ def _first_come(points: FloatArray, spacing_m: float) -> BoolArray:
     """Mask of the points (n, 2) that stay when each is refused by any earlier kept one closer than ``spacing_m``."""
     keep = np.zeros(len(points), dtype=bool)
     open_ = np.ones(len(points), dtype=bool)
+    # strictly closer: two trees at exactly the spacing both stand
     pairs = cKDTree(points).query_pairs(np.nextafter(spacing_m, 0), output_type="ndarray") if len(points) else None
     if pairs is None or not len(pairs):
         return open_

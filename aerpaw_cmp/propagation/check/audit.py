@@ -141,11 +141,13 @@ def audit(
     chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
     engine: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
     search = replace(search, engine=engine)
+    # on few poses, for the other engine is a hundred times slower
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     checked = run_replay(site, link, few, search, Field(field.loss), run)
     rays = checked.samples or (_FIELD_SAMPLES if search.samples == "auto" else search.samples)
     fields, ks, expected = None, second.ks, second.expected
     if expected is not None:
+        # open sheets need a law of their own, which the second implementation lacks
         fields = FieldAudit(not_covered=("the second implementation: it knows prisms, no scene of triangles",))
         if site.scene is None:
             few_kinds = spread_over_paths(replay, chosen, second.reference_links)
@@ -162,6 +164,7 @@ def audit(
         seconds=replay.seconds,
         samples=max(checked.samples, replay.samples),
         samples_reason=checked.samples_reason or replay.samples_reason,
+        # read from the cache it took no time: what its search once took is the honest number
         reference_seconds=checked.seconds + (checked.search_seconds if checked.from_cache else 0.0),
     )
 
@@ -211,6 +214,7 @@ def channels_differ(
     covered = np.isfinite(level) & np.isfinite(expected)
     error = np.abs(level[covered] - expected[covered])
     return {
+        # NaN where nothing was compared: a zero would say that all agrees
         "rss_max_error_db": float(error.max()) if error.size else float("nan"),
         "rss_rms_error_db": float(np.sqrt((error**2).mean())) if error.size else float("nan"),
         "coverage_differs": int((np.isfinite(level) != np.isfinite(expected)).sum()),
@@ -241,5 +245,6 @@ def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> _Keys:
     place[chosen] = np.arange(len(chosen))
     index = np.flatnonzero(place[replay.paths.pose] >= 0)
     paths = replay.paths.select(index)
+    # faces in one plane are one mirror, and engines may name either
     keys = plane_keys(replace(paths, pose=place[paths.pose]), planes)
     return dict(zip(keys, index.tolist(), strict=True))

@@ -117,6 +117,7 @@ def explain_paths(
     for row in range(len(paths)):
         recorded: list[tuple[str, AnyArray]] = []
         single = paths.select(np.array([row]))
+        # the link has that tower alone, whatever its number in the replay
         columns = geometry(replace(single, tower=np.zeros(1, np.int64)), faces, table, source_m[None], poses, link)
         ends = pattern_ends(columns, elements, link)
         field = amplitudes(columns, elements, ends, wavelength, lambda *step: recorded.append(step))  # noqa: B023
@@ -162,10 +163,12 @@ def _explained(
     waves = [value for name, value in recorded if name == "wave"]
     spreading = next(value for name, value in recorded if name == "spreading") ** 2
     uav = next(value for name, value in recorded if name == "uav")
+    # spreading and the UAV's pattern multiply powers; what is left to the received power is polarisation
     powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, (field**2).sum(axis=1)]
     mean = np.array([1.0, *(float(power.mean()) for power in powers)])
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = db_from_power(mean[1:]) - db_from_power(mean[:-1])
+    # after a step to nothing the next ones change nothing, where 0 / 0 would be NaN
     steps = np.where(mean[1:] > 0.0, steps, np.where(mean[:-1] > 0.0, -np.inf, 0.0))
     depth = int(path.depth[0])
     names = [
@@ -180,6 +183,7 @@ def _explained(
     corners = np.concatenate([source_m[None], path.vertices_m[0, :depth], target_m[None]])
     legs = np.diff(corners, axis=0)
     lengths = np.linalg.norm(legs, axis=1)
+    # as seen from the UAV, towards where the wave comes from
     departure, arrival = legs[0], -legs[-1]
     bounces = tuple(
         _bounce(faces, int(path.faces[0, i]), corners[i + 1], legs[i], link, terms[f"reflection {i + 1}"])
@@ -214,6 +218,7 @@ def _bounce(faces: Faces, face: int, point: FloatArray, leg: FloatArray, link: L
         east_m=float(point[0]),
         north_m=float(point[1]),
         up_m=float(point[2]),
+        # rounding takes the cosine of normal incidence beyond 1
         incidence_deg=float(np.degrees(np.arccos(min(cosine, 1.0)))),
         te_db=float(db_from_amplitude(abs(te))),
         tm_db=float(db_from_amplitude(abs(tm))),
@@ -254,15 +259,18 @@ def why_not(
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
     images = images_of(faces, sequence[None], source_m[None])
+    # on whole planes, so that how far a point misses its face can be said in metres
     planes = Faces(faces.normal, faces.offset_m, faces.material, faces.label)  # every face a whole plane
     points, ahead = trace_back(planes, sequence[None], images, target_m[None], tolerance)
     if not ahead[0]:
         return "an end or an image lies behind a face: it has no reflection point"
     for step, face in enumerate(sequence):
         far = _outside_m(faces, int(face), points[0, step])
+        # the first face that is missed: later points follow from it and would mislead
         if far > tolerance:
             return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
     corners = np.concatenate([source_m[None], points[0], target_m[None]])
+    # building by building, to name the one in the way
     for solid in np.unique(faces.solid[faces.solid >= 0]):
         members = np.flatnonzero(faces.solid == solid)
         if Occlusion(faces.select(members), tolerance).segments(corners[:-1], corners[1:]).any():
@@ -280,6 +288,7 @@ def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArra
     points = np.zeros((0, 3))
     if len(sequence):
         ends = source_m[None], target_m[None]
+        # sides first, wherever the points lie; then whether they lie in their faces
         _, _, ahead = reflection_points(surfaces, sequence[None], *ends, edge_m=1e9)
         if not ahead[0]:
             return "the ends of a reflection lie on two sides of its face"
@@ -292,6 +301,7 @@ def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArra
 
 
 def _metres(length: float) -> str:
+    # a miss below a centimetre must not read as 0.00 m
     return f"{length:.2f} m" if length >= 0.01 else f"{length:.1e} m"
 
 
@@ -308,6 +318,7 @@ def _outside_m(faces: Faces, face: int, point: FloatArray) -> float:
 
 def simple_paths(replay: Replay) -> list[tuple[str, IntArray]]:
     """The paths one looks for first: line of sight and the reflection at each ground of the scene."""
+    # endless planes: those of terrain are bounded, and made for one link
     grounds = np.flatnonzero((replay.faces.solid < 0) & np.isinf(replay.faces.lower).all(axis=1))
     return [
         ("line of sight", np.zeros(0, dtype=np.int64)),

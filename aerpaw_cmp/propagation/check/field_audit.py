@@ -48,6 +48,7 @@ _PHASE_TOLERANCE_RAD = 0.01
 _PHASE_RANGE_M = 300.0
 
 # Coherent RSS of a link of near paths [dB].
+# Ten times what float32 leaves of a sum of near paths, and below what any measurement sees.
 _LINK_TOLERANCE_DB = 0.1
 
 # Of H against the second implementation, relative to the root of the links' mean path power; both are float64.
@@ -57,6 +58,7 @@ _EXACT_TOLERANCE = 1e-6
 _SIONNA_MARGIN_M = 2e-3
 
 # Links per replay for the second implementation.
+# Of some 0.1 s each: the second implementation takes one element pair after the other.
 REFERENCE_LINKS = 8
 
 # Patterns of this package that Sionna has too, under the same names.
@@ -82,6 +84,7 @@ class Expected:
 
 def expected_array(array: Array) -> ExpectedArray:
     """An array's own numbers."""
+    # one pattern stands for all elements
     patterns = array.patterns * len(array) if len(array.patterns) == 1 else array.patterns
     return ExpectedArray(
         tuple((float(x), float(y), float(z)) for x, y, z in array.positions_m),
@@ -141,6 +144,7 @@ def against_reference(
         for row in chosen:
             mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
             stands = in_woods[mine].any()
+            # it knows level ground and no medium: saying so is better than a false failure
             if beyond[mine].any() or stands:
                 total += FieldAudit(not_covered=(_STANDS if stands else _ON_TERRAIN,))
                 continue
@@ -148,6 +152,7 @@ def against_reference(
             total += link.paths_checked(max_depth, site.dem is None)
             try:
                 total += link.field_checked(ks)
+            # a material outside its own table of P.2040
             except LookupError as error:
                 total += FieldAudit(not_covered=(f"the material {error.args[0]} at this carrier",))
     return total
@@ -231,6 +236,7 @@ class _OneLink:
         gap = math.dist(self.target, self.reference.source)
         # a pose is beyond reach where it is so from every tower, not from this one alone
         nearest = min(math.dist(self.target, tower.position_m) for tower in self.reference.site.towers.values())
+        # buried, in the near field, or beyond reach: the replay must have no path there
         nowhere = self.target[2] < min(ground, 0.0) or gap < 0.01 or nearest > 1e5
         for path in self.mine:
             sequence = self.sequence(path)
@@ -241,7 +247,9 @@ class _OneLink:
         if phantom:
             failures.append(f"{self.name}: {counted(phantom, 'path')} that cannot exist")
         if complete and not nowhere:
+            # None: too many sequences to try; what is there is still judged
             for sequence in self.reference.sequences(self.target, max_depth) or ():
+                # only what exists beyond doubt can be missing
                 if self.reference.verdict(sequence, self.target) and (key := _key(sequence)) not in keys:
                     missing += 1
                     keys.add(key)
@@ -269,12 +277,14 @@ class _OneLink:
         """H, RSS and rank of the replay against those of so many paths with their sum of powers."""
         link, ours, failures = self.reference.link, self.replay.h[self.row, self.tower], []
         over = _decibel(float((np.abs(h) ** 2).mean())) + link.transmit_power_dbm - link.noise_floor_dbm
+        # so near to the floor that rounding decides whether there is a channel
         if abs(over) < 1e-3:
             return FieldAudit(doubtful=1)
         if over < 0:  # below the receiver's floor: no channel
             h = np.zeros_like(h)
         if ours.shape != h.shape:
             return FieldAudit(failures=(f"{self.name}: H is {ours.shape}, expected {h.shape}",))
+        # of the powers, not of H: in a fade H is small, and its error is not
         size = math.sqrt(power) or 1e-30
         under = _decibel(power) + link.transmit_power_dbm < link.noise_floor_dbm
         error = float(np.abs(ours - h).max()) / size
@@ -282,6 +292,7 @@ class _OneLink:
             failures.append(f"{self.name}: H differs by {error:.2g} of its size")
         worst, level_of_h = 0.0, float((np.abs(h) ** 2).mean())
         for level, value in ((self.replay.rss_dbm, level_of_h), (self.replay.rss_power_dbm, 0.0 if under else power)):
+            # both levels: the coherent one from H, the other from the powers
             off = _level_error(float(level[self.row, self.tower]), value, link.transmit_power_dbm, size)
             if off > 1e-3:
                 failures.append(f"{self.name}: RSS differs by {off:.2g} dB")
@@ -302,6 +313,7 @@ def _another_rank(ours: ComplexArray, expected: ComplexArray, ks: Sequence[float
     sigma = np.linalg.svd(expected, compute_uv=False)
     if not sigma[0] > 0:
         return any(int(channel_rank(ours, k)) for k in ks)
+    # a singular value at the threshold counts or not by its last digit
     clear = [k for k in ks if not (np.abs(sigma * k / sigma[0] - 1.0) < 1e-4).any()]
     return any(int(channel_rank(ours, k)) != int((sigma > sigma[0] / k).sum()) for k in clear)
 
@@ -325,6 +337,7 @@ def _mirror_of(reference: Reference, faces: Faces, face: int, vertex: FloatArray
     normal, offset = faces.normal[face], float(faces.offset_m[face])
     solid = int(faces.solid[face])
     point = tuple(vertex.tolist())
+    # by plane and building, not by number: numbers are the replay's own
     same = [
         m
         for m in reference.mirrors
@@ -361,6 +374,7 @@ def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
     picked: list[int] = []
     met: set[tuple[int, ...]] = set()
     candidates = list(kinds)
+    # greedily, the pose that meets most faces not yet met; exact covers are not needed
     while len(picked) < count:
         best = max(candidates, key=lambda row: (len(kinds[row] - met), len(kinds[row])))
         picked.append(best)
@@ -434,6 +448,7 @@ def _own(
     from ..search.sionna import Rays, own_coefficients
 
     arrays, cross = list(probe.tower_arrays.items()), np.array([0.0, np.pi / 2])
+    # the slant of an element is a rotation, so two crossed elements answer for every slant
     upright = replace(
         probe,
         tower_arrays={name: replace(array, slant_rad=cross) for name, array in arrays},
@@ -458,6 +473,7 @@ def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
         if first.name not in _SIONNA_PATTERNS:
             unasked.append(f"the antenna pattern '{first.name}' (Sionna is asked with isotropic elements)")
             first = Isotropic()
+        # two crossed elements hold all of the polarisation
         slants = array.slant_rad[0] + np.array([0.0, np.pi / 2])
         return Array(np.zeros((2, 3)), slants, (first,), array.mount)
 
@@ -486,14 +502,17 @@ def _paths_against_sionna(
     if not count:
         return FieldAudit()
     # each path alone: a pose of its own
+    # H of a pose with one path is that path's coefficient
     alone = replace(ours, pose=np.arange(count))
     spots = Poses(few.position_m[ours.pose], few.rotation[ours.pose])
     h = channel_matrices(alone, replay.faces, scene.sources_m, spots, probe).h[np.arange(count), ours.tower]
     turn = (h * theirs.gain.conj()).sum(axis=(1, 2))
+    # a coefficient of zero has no phase
     turn = np.where(turn == 0.0, 1.0, turn)
     phase, near = np.abs(np.angle(turn)), theirs.length_m < _PHASE_RANGE_M
     # float32 has no digits for a weak entry: all count as shares of the path's strongest
     strongest = np.abs(theirs.gain).max(axis=(1, 2))
+    # phases are compared apart: over 1 km float32 has lost them
     aligned = h * (turn.conj() / np.abs(turn))[:, None, None]
     share = np.abs(aligned - theirs.gain).max(axis=(1, 2)) / np.where(strongest > 0.0, strongest, 1.0)
     power = 20.0 * np.log10(1.0 + share)
@@ -501,6 +520,7 @@ def _paths_against_sionna(
     rss = _link_error(ours, h, theirs.gain, near, len(few), len(replay.towers))
     failures = []
     for error, bad, unit in (
+        # not share > allowed: so NaN is a failure, too
         (power, ~(share <= allowed), "dB"),
         (phase, near & ~(phase <= _PHASE_TOLERANCE_RAD), "rad"),
     ):
@@ -535,6 +555,7 @@ def _turned_by_float32(
     """
     mounts = np.stack([array.mount for array in probe.tower_arrays.values()])
     ends = scene.sources_m[ours.tower], spots.position_m
+    # as search.sionna builds its ground: coordinates so large round a reflection point
     reach = 4.0 * max(float(np.abs(np.concatenate(ends)).max()), 100.0)  # that of the ground's triangles
     shift = np.nan_to_num(np.abs(theirs.paths.vertices_m - ours.vertices_m)).max(axis=(1, 2), initial=0.0)
     axes = [mounts[ours.tower][:, :, 2], (spots.rotation @ probe.uav_array.mount)[:, :, 2]]
@@ -561,6 +582,7 @@ def _link_error(
         sums.append((np.abs(total) ** 2).mean(axis=(1, 2)))
     alone = np.bincount(link, weights=(np.abs(h) ** 2).mean(axis=(1, 2)), minlength=poses * towers)
     all_near = np.bincount(link, weights=~near, minlength=poses * towers) == 0
+    # 20 dB below its paths a link is in a fade, which a phase error of 0.01 fills
     good = all_near & (sums[1] > 0.01 * alone) & (alone > 0)
     return float(np.abs(10 * np.log10(sums[0][good] / sums[1][good])).max(initial=0.0))
 
@@ -575,6 +597,7 @@ def _lacking(
         reference = references[int(theirs.tower[row])]
         sequence = _mirrors_of(reference, faces, theirs, row)
         east, north, up = few.position_m[theirs.pose[row]].tolist()
+        # with a wider margin: what 2 mm decide may differ in float32
         exists = None if sequence is None else reference.verdict(sequence, (east, north, up), _SIONNA_MARGIN_M)
         missing += exists is True
         doubtful += exists is not True

@@ -30,6 +30,7 @@ _Wave = tuple[complex, complex, complex]
 Pattern = Callable[[float, float], tuple[complex, complex]]
 
 C_MPS = 299_792_458.0
+# CODATA 2018, typed a second time as all constants of this file are.
 _EPS0 = 8.8541878128e-12
 
 # Paths that a change of the geometry by this much makes or breaks are not judged.
@@ -134,6 +135,7 @@ def layout_positions(
     -------
     tuple of (3,)
     """
+    # as written, in the order of the ports
     if layout == "custom":
         return tuple((float(p[0]), float(p[1]), float(p[2])) for p in positions_m or ())
     if layout == "tower_comparison":  # arXiv 2502.10324 VII-D: 60 mm, 1.68 m, 60 mm, the first port leftmost
@@ -141,6 +143,7 @@ def layout_positions(
     q = wavelength / 4
     if layout == "uav_comparison":  # 2 x 2, column by column from the left, the upper one first
         return ((0.0, q, q), (0.0, q, -q), (0.0, -q, q), (0.0, -q, -q))
+    # the first port leftmost, which is +y looking along x
     n = 1 if layout == "single" else elements
     return tuple((0.0, wavelength / 2 * ((n - 1) / 2 - k), 0.0) for k in range(n))
 
@@ -267,6 +270,7 @@ class Mirror:
         """Distance of a point of the plane from the edges of the face [m]; positive inside, negative outside."""
         if self.roof is not None:
             spot = Point(p[0], p[1])
+            # holes have boundaries too
             edge = float(self.roof.boundary.distance(spot))
             return edge if self.roof.covers(spot) else -edge
         if self.solid < 0:
@@ -280,6 +284,7 @@ def _edges(part: shapely.Polygon) -> Iterator[tuple[tuple[float, ...], tuple[flo
     for hole, ring in enumerate((part.exterior, *part.interiors)):
         points = list(ring.coords)
         for a, b in itertools.pairwise(points if ring.is_ccw is (hole == 0) else points[::-1]):
+            # a map may repeat a corner
             if a[:2] != b[:2]:
                 yield a, b
 
@@ -288,8 +293,10 @@ def _mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
     """Ground of the tower, then walls and roof of each building."""
     mirrors = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
     for number, building in enumerate(site.buildings):
+        # as the replay's walls, so that planes and edges can be compared
         foot, top = min(building.base_m, 0.0) - 0.5, building.base_m + building.height_m
         footprint = building.footprint if building.footprint.is_valid else shapely.make_valid(building.footprint)
+        # repairing a ring that crosses itself may leave lines and points
         for part in shapely.get_parts(footprint):
             if part.geom_type != "Polygon" or part.area <= 0:
                 continue
@@ -333,11 +340,14 @@ class Blocks:
         """
         shadow = LineString([a[:2], b[:2]])
         for number, building in enumerate(self._site.buildings):
+            # a segment ends on its own wall: grown, that building would cut it always
             grown = -MARGIN_M / 10 if number in spared else grow_m
             top = building.base_m + building.height_m + grown
+            # passes over the roof, whatever lies below
             if min(a[2], b[2]) >= top or not self._near(number, a, b):
                 continue
             shape = self._shape(number, grown)
+            # an upright segment has no shadow to intersect
             if shadow.length < 1e-9:
                 if shape.contains(Point(a[:2])):
                     return True
@@ -442,7 +452,9 @@ class Reference:
         levels = [(rows, images)]
         for depth in range(max_depth):
             height = images[:, -1] @ self._planes.normal.T - self._planes.offset_m
+            # the source may stand on a face; an image may not
             facing = height > (0.0 if depth else -MARGIN_M)
+            # a face twice in a row would send the ray back into itself
             if depth:
                 facing[np.arange(len(rows)), rows[:, -1]] = False
             past, mirror = np.nonzero(facing)
@@ -463,6 +475,7 @@ class Reference:
             with np.errstate(divide="ignore", invalid="ignore"):
                 at = image - (behind / through)[:, None] * (at - image)
             inside = (at >= planes.low_m[face] - _SLACK_M) & (at <= planes.high_m[face] + _SLACK_M)
+            # nearly in the plane the point is anywhere: such a sequence is left to the verdict
             good &= (np.abs(through) < MARGIN_M) | (inside.all(axis=1) & (through > 0.0))
         return good
 
@@ -481,6 +494,7 @@ class Reference:
             return False
         strict = loose = False
         for step, (a, b) in enumerate(itertools.pairwise(points)):
+            # mirrors at both ends of this segment
             spared = tuple(m.solid for m in sequence[max(0, step - 1) : step + 1])
             loose = loose or self.blocks.cut(a, b, -margin_m, spared)
             if loose:
@@ -516,10 +530,12 @@ class Reference:
             image = mirror.mirrored(image)
         way = _plus(end, image, -1.0)
         length = math.sqrt(_dot(way, way))
+        # two elements at one place: no direction
         if length == 0:
             return 0j
         rays = [_unit(way)]
         for mirror in reversed(sequence):
+            # back from the UAV: the last ray is known, each earlier one is its mirror image
             rays.insert(0, _plus(rays[0], mirror.normal, -2.0 * _dot(mirror.normal, rays[0])))
         wave = element_wave(tower, tx, tower.mount, rays[0])
         for mirror, ray, onward in zip(sequence, rays[:-1], rays[1:], strict=True):
@@ -527,7 +543,9 @@ class Reference:
         received = element_wave(uav, rx, uav_turn, (-rays[-1][0], -rays[-1][1], -rays[-1][2]))
         wavelength = C_MPS / self.link.carrier_hz
         coupling = sum(a * b for a, b in zip(received, wave, strict=True))
+        # nobody receives more than was sent: free space has no near field
         spreading = min(1.0, wavelength / (4 * math.pi * length))
+        # whole cycles are taken off before the exponential: 1 km are 11 000 of them at 3.4 GHz
         return coupling * spreading * cmath.exp(-2j * math.pi * math.fmod(length / wavelength, 1.0))
 
     def _reflected(self, mirror: Mirror, wave: _Wave, ray: Vector, onward: Vector) -> _Wave:
@@ -566,6 +584,7 @@ class Reference:
                 trunks += crown_depth_m(self.site.trees, a, b, trunks=True)
         if self.loss.model == "opaque":
             touched = depth + trunks
+            # a chord of a micrometre is there or not by rounding
             return None if 0 < touched < 1e-6 else (math.inf if touched else total)
         return total + foliage_db(self.loss, depth, self.link.carrier_hz)
 
@@ -581,6 +600,7 @@ class Reference:
         for mirror, (a, b) in zip(sequence, itertools.pairwise(points), strict=False):
             if _is_ground(mirror):
                 sine = abs(b[2] - a[2]) / math.dist(a, b)
+                # the field falls by exp(-g / 2), so the power by exp(-g): 4.34 dB for each g
                 total += 10 * math.log10(math.e) * (4 * math.pi * sigma * sine / wavelength) ** 2
         return total
 
@@ -592,6 +612,7 @@ class Reference:
         h = np.zeros((uav, tower), dtype=np.complex128)
         power = 0.0
         for sequence, loss in paths:
+            # of the amplitude, so half of the decibels of a power
             factor = 0.0 if math.isinf(loss) else 10 ** (-loss / 20)
             amplitudes = np.array(
                 [[factor * self.pair(sequence, t, u, target, turn) for t in range(tower)] for u in range(uav)]
@@ -651,6 +672,7 @@ def element_wave(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -
     """
     back: Matrix = tuple(zip(*turn, strict=True))  # type: ignore[assignment]
     x, y, z = _times(back, ray)
+    # not acos(z), which has half of the digits near the poles
     theta, phi = math.atan2(math.hypot(x, y), z), math.atan2(y, x)
     e_theta, e_phi = array.patterns[number](theta, phi)
     slant = math.radians(array.slants_deg[number])
@@ -669,6 +691,7 @@ def _bounces(sequence: Sequence[Mirror], source: Vector, target: Vector) -> list
         images.append(mirror.mirrored(images[-1]))
     points = [target]
     for mirror, image in zip(reversed(sequence), reversed(images[1:]), strict=True):
+        # the image lies behind the mirror, the next point before it
         ahead, behind = mirror.height(points[0]), -mirror.height(image)
         if ahead + behind <= 0:
             return None
@@ -683,6 +706,7 @@ def _bounces(sequence: Sequence[Mirror], source: Vector, target: Vector) -> list
 def foliage_db(loss: ExpectedLoss, depth_m: float, carrier_hz: float) -> float:
     """ITU-R P.833 woodland or Weissberger; leafless trees attenuate 1/1.2 of it."""
     if loss.model == "weissberger":
+        # Weissberger's models are of trees in leaf
         f = (carrier_hz / 1e9) ** 0.284 / (1.0 if loss.in_leaf else 1.2)
         return float(f * (0.45 * depth_m if depth_m <= 14 else 1.33 * depth_m**0.588))
     gamma, largest = _p833(carrier_hz / 1e6)
@@ -732,6 +756,7 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -
     radius = (trees.trunk_diameter_m if trunks else trees.crown_diameter_m) / 2
     flat = step[0] ** 2 + step[1] ** 2
     east, north = trees.east_m - start[0], trees.north_m - start[1]
+    # seen from above first: most trees are nowhere near the segment
     near = np.clip((east * step[0] + north * step[1]) / flat, 0, 1) if flat > 0 else np.zeros(len(trees))
     close = np.hypot(east - near * step[0], north - near * step[1]) < radius
     close &= (min(a[2], b[2]) < top) & (max(a[2], b[2]) > base) & (radius > 0) & (top > base)
@@ -747,6 +772,7 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -
         return np.asarray(np.maximum(np.maximum(low - up, up - high), side - reach))
 
     left, right, ratio = np.zeros(len(rows)), np.ones(len(rows)), (math.sqrt(5) - 1) / 2
+    # 0.618 to the power of 70 is 2e-15: to rounding
     for _ in range(70):
         near_left, near_right = right - ratio * (right - left), left + ratio * (right - left)
         lower = outside(near_left) < outside(near_right)
@@ -754,6 +780,7 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -
     middle = (left + right) / 2
     inside = outside(middle) < 0
     ends = []
+    # from the middle, which is inside, to either end
     for edge in (0.0, 1.0):
         within, beyond = middle, np.full(len(rows), edge)
         for _ in range(50):

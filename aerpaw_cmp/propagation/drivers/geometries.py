@@ -29,6 +29,7 @@ from ..geometry.paths import Faces, PathSet
 # How the ground ray is added to the direct one.
 Ground = Literal["coherent", "power_sum"]
 
+# The default ground of a site; its strength is what the search fits.
 _GROUND_MATERIAL = "itu_medium_dry_ground"
 
 
@@ -137,12 +138,14 @@ def singular_values_of(
     the mean of ``H H^H`` over a band in which the ground ray takes all phases against the direct one.
     """
     runs = [(mount, list(run)) for mount, run in groupby(geometries, lambda g: g.mount_deg)]
+    # two rays, and both slants at either end: four pairs for one
     work = 2 * len(runs) * len(poses) * 4 * len(tower) * len(uav)
     for mount, run in runs:
         turned = dataclasses.replace(uav, mount=np.asarray(rotation_from_yaw_pitch_roll(*map(np.radians, mount))))
         fields = basis_fields(tower, tower_m, turned, poses, carrier_hz, any(g.ground for g in run), work)
         for g in run:
             at_uav, at_tower = slant_basis(g.uav_slant_deg), slant_basis(g.tower_slant_deg).T
+            # two small products instead of a field for each slant
             los, ground = (at_uav @ field @ at_tower for field in fields)
             ground *= g.ground
             yield np.linalg.svd(los + ground, compute_uv=False) if g.sum == "coherent" else _of_power_sum(los, ground)
@@ -194,6 +197,7 @@ def basis_fields(
     index, zero = np.arange(n), np.zeros(n, dtype=np.int64)
     fields = []
     for depth in (0, 1) if with_ground else (0,):
+        # the reflection point is NaN: the field asks for images alone, never for points
         path = PathSet(index, zero, zero + depth, np.full((n, 1), depth - 1), np.full((n, 1, 3), np.nan))
         fields.append(channel_matrices(path, faces, np.asarray(tower_m)[None, :], poses, link, work=work).h[:, 0])
     return fields[0], fields[1] if with_ground else np.zeros_like(fields[0])
@@ -202,6 +206,7 @@ def basis_fields(
 def _both_slants(array: Array) -> Array:
     return dataclasses.replace(
         array,
+        # port by port, vertical before horizontal, as slant_basis reads them
         positions_m=np.repeat(array.positions_m, 2, axis=0),
         slant_rad=np.tile([0.0, np.pi / 2.0], len(array)),
         patterns=array.patterns if len(array.patterns) == 1 else tuple(p for p in array.patterns for _ in range(2)),

@@ -45,6 +45,7 @@ class _Block:
 def _blocks(sources_m: FloatArray) -> Iterator[_Block]:
     """Poses in blocks, in the order in which their places first occur."""
     unique, first, member = np.unique(sources_m, axis=0, return_index=True, return_inverse=True)
+    # unique sorts places by coordinate; blocks follow the flight
     order = np.argsort(first)
     rank = np.empty(len(order), dtype=np.int64)
     rank[order] = np.arange(len(order))
@@ -140,6 +141,7 @@ def replay_moving(
         moved_site, several, some, links = _scene_of(site, link, name, poses, block)
         return _of_one_tower(replay(moved_site, several, some, replace(search, links=links), field, run), name, block)
 
+    # lazily: a block is traced when it is put in, so one scene is alive at a time
     result = in_turn([block.rows for block in blocks], map(of, blocks), progress)
     return replace(result, ends=Ends(link, poses, sources_m[:, None], field))
 
@@ -155,11 +157,13 @@ def _scene_of(
     site: Site, link: Link, name: str, poses: Poses, block: _Block
 ) -> tuple[Site, Link, Poses, BoolArray | None]:
     """Site, link and poses of a block, each place a tower; which links count."""
+    # one place keeps the tower's own name, so that it is replayed as a fixed tower is
     names = [name] if len(block.places_m) == 1 else [f"{name}@{i}" for i in range(len(block.places_m))]
     towers = {n: _moved(site, site.towers[name], n, at) for n, at in zip(names, block.places_m, strict=True)}
     moved_site = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
     several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
     some = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
+    # each place has links to its own poses alone: all others would be searched for nothing
     links = None if len(names) == 1 else np.arange(len(names))[:, None] == block.place[None, :]
     return moved_site, several, some, links
 

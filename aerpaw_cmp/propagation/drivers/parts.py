@@ -39,6 +39,7 @@ def replay_in_parts(
         return replay(site, link, poses, search, field, run)
     links = len(poses) * len(link.tower_arrays)
     pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
+    # each part would count from 0 to 1 again
     progress, run = run.progress, replace(run, progress=None, job=Job.of(poses.position_m, links, pairs))
 
     def of(at: IntArray) -> Replay:
@@ -76,6 +77,7 @@ def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
     columns = {name: [getattr(part, name) for part in parts] for name in PER_LINK}
     parts.clear()
     arrays: dict[str, Any] = {}
+    # one array at a time, whose parts are freed before the next: the peak is one array more
     for name in PER_LINK:
         values = columns.pop(name)
         arrays[name] = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
@@ -88,6 +90,7 @@ def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
     """Paths of all parts as one set: their poses are numbered as in the flight, and in order."""
     numbered = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]  # type: ignore[type-var]
     paths = numbered[0].one_after_another(numbered)
+    # stable: within a pose the order by tower, depth and faces stays
     return paths.select(np.argsort(paths.pose, kind="stable")) if (np.diff(paths.pose) < 0).any() else paths
 
 
@@ -112,6 +115,7 @@ def _shared(first: Faces, second: Faces) -> int:
     same &= first.offset_m[:count] == second.offset_m[:count]
     # faces of two buildings may lie in one plane, and are two
     same &= np.array([a == b for a, b in zip(first.label, second.label, strict=False)], dtype=np.bool_)
+    # argmin of booleans is the first that differs
     return count if same.all() else int(np.argmin(same))
 
 

@@ -36,6 +36,7 @@ def path_cache(search: Search, run: Run) -> PathCache | None:
     """Cache of a replay, None where there is none."""
     folder = run.cache_dir
     if folder is None:
+        # the image engine is faster than reading its paths back
         if search.engine != "sionna":
             return None
         folder = cache_folder()
@@ -64,6 +65,7 @@ def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache
     few = Poses(poses.position_m[some], poses.rotation[some])
 
     def pilot(samples: int) -> PathSet:
+        # through the cache, or each report would cast the pilots anew
         return search_or_read(part, link, few, replace(search, samples=samples), Run(), cache)[0]
 
     return enough_samples(pilot, scene.faces, len(some))
@@ -142,6 +144,7 @@ def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
         return True
     if search.max_depth < 2:
         return False
+    # few faces: worth it for a job of many links only
     if len(scene.faces) <= MANY_FACES:
         return links > 0 and beams_for(links, len(scene.faces))
     if find_spec("numba") is None:
@@ -209,9 +212,11 @@ class PathCache:
         faces, surfaces = scene.faces, scene.surfaces
         decides: list[object] = [__version__, LAYOUT, sorted({"engine": search.engine, **search.rays}.items())]
         if search.engine == "sionna":
+            # another version of its tracer may find other paths; the image engine's are exact
             decides += [[version(name) for name in ("sionna-rt", "mitsuba", "drjit")], carrier_hz, faces.material]
         columns = (faces.normal, faces.offset_m, faces.along, faces.lower, faces.upper, faces.solid)
         mesh = None if surfaces is None else (surfaces.corners_m, surfaces.first)
+        # which links and mirrors count changes what is found, not only where they are
         links = (scene.sources_m, scene.usable, scene.excluded, targets_m)
         return content_digest(decides, faces.polygon, columns, mesh, links)
 
@@ -227,6 +232,7 @@ class PathCache:
             return None
         if entry is None:
             return None
+        # never pickled: an entry of a shared folder must not run code
         with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
             return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
 

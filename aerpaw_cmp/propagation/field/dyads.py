@@ -43,7 +43,9 @@ def smaller(a: Number, b: Number) -> Number:
 
 def sine_cosine(turns: Number) -> tuple[Number, Number]:
     """Sine and cosine of an angle in turns, within 1 ulp of the angle's part of a turn (polynomials of fdlibm)."""
+    # to half a turn either way, without a call that keeps a loop from vector instructions
     turns = turns - ((turns + _ROUND) - _ROUND)
+    # within an eighth of a turn the polynomials hold
     quarter = (4.0 * turns + _ROUND) - _ROUND
     x = (turns - 0.25 * quarter) * (2.0 * np.pi)
     z = x * x
@@ -53,6 +55,7 @@ def sine_cosine(turns: Number) -> tuple[Number, Number]:
     tail = -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)
     tail = -1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * tail)
     cosine = 1.0 - (0.5 * z - z * z * (4.16666666666666019037e-02 + z * tail))
+    # in the quarters up and down, sine and cosine change places
     odd = quarter * quarter == 1.0
     sine_there, cosine_there = select(odd, cosine, sine), select(odd, sine, cosine)
     return (
@@ -101,6 +104,7 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
     y = place_m[1] + uav_offset[1] - (image_m[1] + tower_offset[1])
     z = place_m[2] + uav_offset[2] - (image_m[2] + tower_offset[2])
     length = np.sqrt(x * x + y * y + z * z)
+    # both branches are evaluated: the divisor must not be zero
     scale = select(length > 0.0, 1.0 / larger(length, 1e-300), 0.0)
     return x * scale, y * scale, z * scale, length
 
@@ -143,6 +147,7 @@ def field_vector(m: Rotation, toward: Vector, e_theta: Number, e_phi: Number) ->
     """
     x, y, z = turned(m, toward)
     across = np.sqrt(x * x + y * y)
+    # at a pole phi means nothing; 0 is what atan2(0, 0) gives a pattern
     off_pole = across > 0.0
     scale = select(off_pole, 1.0 / larger(across, 1e-300), 0.0)
     cosine, sine = select(off_pole, x * scale, 1.0), y * scale
@@ -176,6 +181,7 @@ def reflected(
     """
     (x, y, z), (n0, n1, n2) = toward, normal
     s0, s1, s2 = y * n2 - z * n1, z * n0 - x * n2, x * n1 - y * n0
+    # at normal incidence s is zero, and so is te + tm, which multiplies it
     scale = 1.0 / larger(s0 * s0 + s1 * s1 + s2 * s2, 1e-300)
     q_re, q_im = (te_re + tm_re) * scale, (te_im + tm_im) * scale
     a = s0 * re[0] + s1 * re[1] + s2 * re[2]
@@ -197,6 +203,7 @@ def reflected(
 
 def spreading(cycles: Number) -> Number:
     """``lambda / (4 pi L)`` of a length in wavelengths, at most 1: nobody receives more than was sent."""
+    # where two elements meet the length is zero: infinity becomes 1
     return smaller(1.0, 1.0 / (4.0 * np.pi * cycles))
 
 
@@ -219,6 +226,7 @@ def received(wave_re: Vector, wave_im: Vector, uav_re: Vector, uav_im: Vector, c
     (a0, a1, a2), (b0, b1, b2), (g0, g1, g2), (h0, h1, h2) = wave_re, wave_im, uav_re, uav_im
     re = g0 * a0 + g1 * a1 + g2 * a2 - (h0 * b0 + h1 * b1 + h2 * b2)
     im = g0 * b0 + g1 * b1 + g2 * b2 + (h0 * a0 + h1 * a1 + h2 * a2)
+    # e^{-j 2 pi cycles}: the sine enters with a minus
     sine, cosine = sine_cosine(cycles)
     amplitude = spreading(cycles)
     return amplitude * (re * cosine + im * sine), amplitude * (im * cosine - re * sine)

@@ -29,6 +29,7 @@ Shape = Literal["cone", "cylinder"]
 LEAFLESS_FACTOR = 1 / 1.2
 
 _PIECE_M = 8.0  # paths are looked up in pieces of this length
+# Of the order of a crown's radius, so that a cell lists few crowns.
 _CELL_M = 4.0
 _MAX_CELLS = 4_000_000
 _PAIRS_AT_ONCE = 1_500_000  # of a piece and a body; about 150 MB of temporary arrays
@@ -262,6 +263,7 @@ def foliage_depth_m(
     for start, end in reversed([*legs(source, vertices, target)]):
         moved = (start != end).any(axis=1)
         depth[moved] += index.chords_m(start[moved], end[moved])
+    # legs() takes a missing corner for one not used; a missing end is no path
     depth[~(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))] = np.nan
     return depth
 
@@ -280,6 +282,7 @@ def crown_index(trees: Trees) -> CrownIndex:
 
 def _same(first: Trees, second: Trees) -> bool:
     """Check whether two sets of trees are equal to the last digit."""
+    # by value: each task of a campaign loads the site anew
     return all(np.array_equal(getattr(first, of.name), getattr(second, of.name)) for of in fields(Trees))
 
 
@@ -319,9 +322,11 @@ class CrownIndex:
     def _build_grid(self) -> None:
         """Lists, per cell, the bodies within reach of any point of the cell (compressed rows)."""
         centre, widest = self._bodies[:, :2], float(self._bodies[:, 4].max())
+        # a piece is looked up by its middle, so half of it must be within reach
         reach = widest + _PIECE_M / 2
         low = centre.min(axis=0) - reach
         span = centre.max(axis=0) + reach - low
+        # a wood of square kilometres must not ask for more cells than memory holds
         self._cell_m = max(_CELL_M, math.sqrt(float(span.prod()) / _MAX_CELLS))
         self._low, self._shape2 = low, (span / self._cell_m).astype(np.int64) + 1
         home = ((centre - low) / self._cell_m).astype(np.int64)
@@ -329,6 +334,7 @@ class CrownIndex:
         around = np.arange(-steps, steps + 1)
         offset = np.stack(np.meshgrid(around, around, indexing="ij"), axis=-1).reshape(-1, 2)
         body, cell = [], []
+        # cell by cell around each crown, all crowns at once
         for shift in offset:
             at = home + shift
             corner = low + at * self._cell_m
@@ -343,6 +349,7 @@ class CrownIndex:
         cells, bodies = np.concatenate(cell), np.concatenate(body)
         order = np.argsort(cells, kind="stable")
         self._members = bodies[order]
+        # members of cell k lie from row[k] to row[k + 1]
         self._row = np.zeros(int(self._shape2.prod()) + 1, dtype=np.int64)
         np.cumsum(np.bincount(cells, minlength=len(self._row) - 1), out=self._row[1:])
 
@@ -351,11 +358,13 @@ class CrownIndex:
         total = np.zeros(len(start_m))
         if not len(self._bodies) or not len(start_m):
             return total
+        # most of a flight is above all trees: those parts are never looked up
         first, last = self._within_heights(start_m, end_m)
         along = np.hypot(end_m[:, 0] - start_m[:, 0], end_m[:, 1] - start_m[:, 1])
         live = np.flatnonzero(last >= first)  # NaN compares false
         pieces = np.ceil((last - first)[live] * along[live] / _PIECE_M).clip(1).astype(np.int64)
         ends = np.cumsum(pieces)
+        # by the fullest cell, so that no batch outgrows its memory
         at_once = max(_PAIRS_AT_ONCE // max(int(np.diff(self._row).max()), 1), 1)
         begin = 0
         while begin < len(live):
@@ -390,6 +399,7 @@ class CrownIndex:
         square = step_east * step_east + step_north * step_north
         nearest = np.divide(east * step_east + north * step_north, square, out=low.copy(), where=square > 0)
         np.clip(nearest, low, last[owner], out=nearest)
+        # which piece that point lies in: others meet the crown too, and would count it twice
         turn = np.divide(nearest - low, wide, out=np.zeros_like(low), where=wide > 0).astype(np.int64)
         east -= nearest * step_east
         north -= nearest * step_north
@@ -452,6 +462,7 @@ def _chord_share(start: FloatArray, move: FloatArray, bodies: FloatArray, shape:
     c = east**2 + north**2
     if shape == "cone":  # r = slope (top - up)
         slope, below = radius / (top - base), start[:, 2] - top
+        # below zero where the segment rises steeper than the cone's side
         a = a - (slope * move[:, 2]) ** 2
         b = b - slope**2 * below * move[:, 2]
         c = c - (slope * below) ** 2
@@ -464,6 +475,7 @@ def _quadric_share(
     a: FloatArray, b: FloatArray, c: FloatArray, first: FloatArray, last: FloatArray, rise: FloatArray
 ) -> FloatArray:
     """Length of {t in [first, last]: a t^2 + 2 b t + c <= 0}, for the part of a double cone below its apex."""
+    # a quarter of the usual discriminant, since the middle term is 2 b
     root2 = b * b - a * c
     # q avoids the cancellation of -b + sqrt(...); a = 0 (parallel to the cone's side) gives one root at infinity
     q = -(b + np.copysign(np.sqrt(np.maximum(root2, 0.0)), b))

@@ -35,6 +35,7 @@ def half_space(cosine: Any, eta_re: Any, eta_im: Any) -> tuple[Any, Any, Any, An
     te_re, te_im, tm_re, tm_im, root_re, root_im
     """
     # the root without cancellation; its imaginary part has the sign of eta's, so that the refracted wave decays
+    # eta less the squared sine of incidence
     a = eta_re - (1.0 - cosine * cosine)
     t = np.sqrt(0.5 * (np.sqrt(a * a + eta_im * eta_im) + np.abs(a)))
     q = eta_im / larger(2.0 * t, 1e-300)
@@ -85,6 +86,7 @@ def slab(r_re: Any, r_im: Any, echo_re: Any, echo_im: Any) -> tuple[Any, Any]:
 
 def returned(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
     """The echo of a slab, 0 of a half-space, whose thickness is infinite."""
+    # infinity times the root would be NaN before it is thrown away
     finite = np.isfinite(thickness)
     e_re, e_im = echo(select(finite, thickness, 0.0), root_re, root_im)
     return select(finite, e_re, 0.0), select(finite, e_im, 0.0)
@@ -106,6 +108,7 @@ def reflection(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
 def coefficients(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
     """TE and TM coefficients (re, im each) of faces: the Fresnel coefficients that NumPy's field takes."""
     eta_re, eta_im, thickness = material
+    # bare ground has no second face: its echo of zero need not be computed
     if np.any(np.isfinite(thickness)):
         return reflection(cosine, material)
     return half_space(cosine, eta_re, eta_im)[:4]
@@ -159,6 +162,7 @@ class FaceMaterials:
         eta = {name: face.relative_permittivity(carrier_hz) for name, face in known.items()}
         thick = {name: np.inf if face.thickness_m is None else face.thickness_m for name, face in known.items()}
         return cls(
+            # the last entry answers for -1, the padding of short paths
             np.array([*(eta[name] for name in faces.material), 2.0 + 0j], dtype=np.complex128),
             np.array([*(thick[name] for name in faces.material), np.inf], dtype=np.float64),
         )

@@ -96,7 +96,9 @@ def geometry(
         normal = normals[:, step]  # zero where there is no face: nothing is mirrored
         offset = np.where(sequence[:, step] >= 0, faces.offset_m[sequence[:, step]], 0.0)
         image = image - 2.0 * ((image * normal).sum(axis=1) - offset)[:, None] * normal
+        # earlier faces are mirrored too: seen from the last image they lie elsewhere
         for vectors in (frame, normals[:, :step]):
+            # in place: frame and normals are copies made above
             vectors -= 2.0 * np.einsum("nij,nj->ni", vectors, normal)[..., None] * normal[:, None, :]
     # the poses between the first and the last of these paths: a part of a flight turns no other array
     first, last = paths.pose.min(initial=len(poses)), paths.pose.max(initial=0)
@@ -153,6 +155,7 @@ def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: d
     theta, phi = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)  # arccos would lose half of the digits at the poles
     fields = np.empty((len(theta), 4, theta.shape[1]))
     patterns = array.patterns if len(array.patterns) > 1 else array.patterns * len(array)
+    # elements often share one pattern object: it is asked once for all of them
     for pattern in {id(p): p for p in patterns}.values():
         pairs = np.flatnonzero([patterns[e] is pattern for e in element])
         e_theta, e_phi = pattern.field(theta[:, pairs], phi[:, pairs])

@@ -83,8 +83,10 @@ def _radiate(
             e_theta, e_phi = dyads.slant_rotation(1.0, 0.0, slant[0, first + p], slant[1, first + p])
             toward = sign * w[_X + p], sign * w[_Y + p], sign * w[_Z + p]
             put(w, out + p, dyads.field_vector(m, toward, e_theta, e_phi))
+        # the imaginary half: an isotropic element radiates none
         w[out + 3 * LANES : out + 6 * LANES] = 0.0
         return
+    # real parts, then imaginary ones: the law is linear in the field
     for half in range(2):
         for p in range(pairs):
             q = first + p
@@ -101,6 +103,7 @@ def _reflect(w: FloatArray, pairs: int, normal: Any, eta_re: float, eta_im: floa
         te_re, te_im, tm_re, tm_im, root_re, root_im = fresnel.half_space(cosine, eta_re, eta_im)
         w[_TE + p], w[_TE + LANES + p], w[_TM + p], w[_TM + LANES + p] = te_re, te_im, tm_re, tm_im
         w[_ROOT + p], w[_ROOT + LANES + p] = root_re, root_im
+    # one test a face, outside the loop over pairs
     if math.isfinite(thickness):
         for p in range(pairs):
             e_re, e_im = fresnel.echo(thickness, w[_ROOT + p], w[_ROOT + LANES + p])
@@ -120,6 +123,7 @@ def _fill(
     g: Geometry, elements: Elements, e_tower: FloatArray, e_uav: FloatArray, wavelength: float, out: FloatArray
 ) -> None:
     """Amplitudes (paths, pairs, 2)."""
+    # one workspace a call: it stays in the first cache
     w, total = np.empty(ROWS * LANES), out.shape[1]
     for path in range(len(out)):
         image, place, tower = vector(g.image_m[path]), vector(g.place_m[path]), g.tower[path]
@@ -164,6 +168,7 @@ def amplitudes(g: Geometry, elements: Elements, ends: Ends, wavelength: float) -
     """
     out = np.empty((len(g.depth), elements.tower_m.shape[2], 2))
     none = np.empty((1, 0, out.shape[1]))
+    # a read-only or sliced column would be compiled for anew
     columns = Geometry._make(np.require(column, requirements=["C", "W"]) for column in g)
     _fill(columns, elements, *(none if e is None else e for e in ends), wavelength, out)
     return out

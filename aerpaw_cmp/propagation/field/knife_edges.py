@@ -26,12 +26,14 @@ def knife_edge_db(nu: FloatArray) -> FloatArray:
 
     Source: ITU-R P.526-15 eq. 31.
     """
+    # far below -0.78 the root of x squared loses all digits beside x
     x = np.maximum(nu, -0.78) - 0.1
     return np.where(nu > -0.78, np.maximum(6.9 + 20.0 * np.log10(np.sqrt(x * x + 1.0) + x), 0.0), 0.0)
 
 
 def _parameter(height_m: FloatArray, before_m: FloatArray, after_m: FloatArray, wavelength_m: float) -> FloatArray:
     """Parameter nu of edges; -inf at the ends of a line and where the height is unknown."""
+    # an edge at an end has no distance to it, and nu would be infinite
     inner = (before_m > 0.0) & (after_m > 0.0) & np.isfinite(height_m)
     product = np.where(inner, before_m * after_m, 1.0)
     nu = np.where(inner, height_m, 0.0) * np.sqrt(2.0 * np.abs(before_m + after_m) / (wavelength_m * product))
@@ -55,8 +57,10 @@ def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
     main, link = nu.argmax(axis=0), np.arange(len(length_m))
     total = first = knife_edge_db(nu[main, link])
     known = np.isfinite(nu[main, link])
+    # without an edge any place does: its loss is zero
     at, top = np.where(known, share[main, link], 0.5), np.where(known, intrusion_m[main, link], 0.0)
     for way, place in ((share, at), (1.0 - share, 1.0 - at)):
+        # above the line from the end to the top of the main edge
         height = intrusion_m - top * way / place
         side = _parameter(height, way * length_m, (place - way) * length_m, wavelength_m)
         edge = side.argmax(axis=0)

@@ -24,8 +24,10 @@ from .knife_edges import Profile, deygout_db
 # Loss per metre between trunks over that in crowns: assumed.
 TRUNKS = 0.3
 # First Fresnel radii by which a ray clears a knife edge without loss.
+# At 0.55 of the first Fresnel radius nu is -0.78, where the knife edge's loss begins.
 _CLEAR = 0.55
 
+# Seen from above an upright segment is a point, which crosses no area; shifted by so much it does.
 _UPRIGHT_M = 1e-6
 # Of a segment and a side of a stand; about 100 MB of temporary arrays.
 _PAIRS_AT_ONCE = 1_000_000
@@ -146,6 +148,7 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
     stands = [forest for forest in site.forests if forest.height_m is not None]
     if not stands:
         return
+    # bounding boxes alone: what crosses is decided below, exactly
     tree = shapely.STRtree([stand.area for stand in stands])
     moved = np.flatnonzero(
         np.isfinite(start_m).all(axis=1) & np.isfinite(end_m).all(axis=1) & (start_m != end_m).any(axis=1)
@@ -163,6 +166,7 @@ def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_
                 continue
             rows = moved[some[crossing]]
             start, end = start_m[rows], end_m[rows]
+            # under the middle of each piece, since a canopy follows the ground
             ground = np.full(len(piece), stands[number].base_m)
             if site.dem is not None:
                 middle = start[piece, :2] + share.mean(axis=1, keepdims=True) * (end - start)[piece, :2]
@@ -181,13 +185,16 @@ def _corners(stand: Forest) -> tuple[FloatArray, IntArray]:
 def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArray) -> tuple[IntArray, FloatArray]:
     """Pieces of lines (k, 2) inside rings of corners: their lines (n,), and where they begin and end (n, 2)."""
     way = end - start
+    # on which side of each line a corner lies
     left = way[:, :1] * (corner[:, 1] - start[:, 1:]) - way[:, 1:] * (corner[:, 0] - start[:, :1]) > 0
     crosses = left[:, 1:] != left[:, :-1]  # a corner belongs to one of its sides alone
+    # from one ring to the next there is no side
     crosses[:, last] = False
     line, edge = np.nonzero(crosses)
     (east, north), (side_east, side_north) = (corner[edge] - start[line]).T, (corner[edge + 1] - corner[edge]).T
     way_east, way_north = way[line].T
     share = (east * side_north - north * side_east) / (way_east * side_north - way_north * side_east)
+    # an odd number of sides behind the start: it begins inside
     inside = np.bincount(line[share <= 0.0], minlength=len(way)) % 2 == 1
     line, share = line[between := (share > 0.0) & (share < 1.0)], share[between]
     order, count = np.lexsort([share, line]), np.bincount(line, minlength=len(way))
@@ -207,6 +214,7 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
     np.minimum.at(enter, crossing.piece, crossing.share[:, 0])
     np.maximum.at(leave, crossing.piece, crossing.share[:, 1])
     np.maximum.at(top, crossing.piece, crossing.height_m + crossing.ground_m)
+    # neither end in the canopy: only then are there ways over and around it
     lower = np.zeros(count)
     outside = ((enter > 1e-9) | (source[:, 2] > top)) & ((leave < 1.0 - 1e-9) | (target[:, 2] > top))
     ways = [] if isinstance(model, Opaque) else list(_detours(stand, source, target, enter, leave, top))
@@ -217,10 +225,13 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
     depth_m = crossing.depth_m(lower)
     through = model.loss_db(depth_m)
     if stand.evergreen_share and not isinstance(model, Opaque):
+        # a mean of decibels, not of powers: the share is one of trees along each way, not of ways
         through = through + stand.evergreen_share * (in_leaf.loss_db(depth_m) - through)
     if not ways:
         return through
+    # as powers: nobody knows the edge of a canopy to a wavelength
     power = sum(10.0 ** (-deygout_db(detour, wavelength_m) / 10.0) for detour in ways)
+    # as shares that are lacking: so a detour of full power leaves no loss, and none leaves all
     blocked = (1.0 - 10.0 ** (-through / 10.0)) * (1.0 - np.where(outside, np.minimum(power, 1.0), 0.0))
     return np.asarray(-10.0 * np.log10(1.0 - blocked))
 

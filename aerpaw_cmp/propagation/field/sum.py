@@ -116,6 +116,7 @@ def fields_of(
     -------
     Fields
     """
+    # reflections are no Further: they are the one kind that every engine finds
     evaluate = channel_matrices if isinstance(paths, PathSet) else type(paths).fields
     return evaluate(paths, faces, sources_m, poses, link, loss_db)
 
@@ -169,7 +170,9 @@ def channel_matrices(
     evaluate = amplitudes if kernels is None else kernels.amplitudes
     elements, wavelength = Elements.of(link), wavelength_m(link.carrier_hz)
     table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
+    # a link's paths side by side: reduceat adds runs
     order = _by_link(paths, len(arrays))
+    # mostly they are sorted, and a copy of a long flight is dear
     ordered = paths if order is None else paths.select(order)
     if paths.terrain_db.any():
         loss_db = paths.terrain_db if loss_db is None else loss_db + paths.terrain_db
@@ -186,11 +189,13 @@ def channel_matrices(
         power[part] = np.einsum("npc,npc->n", amplitude, amplitude) / (ports * uavs)
         key = some.pose * len(arrays) + some.tower
         first = np.flatnonzero(np.diff(key, prepend=-1))
+        # pairs of reals seen as complex numbers: no copy
         h[key[first]] = np.add.reduceat(amplitude.view(np.complex128)[..., 0], first, axis=0)
 
     threads = 1 if kernels is None else compiled.thread_count()
     compiled.in_threads(run, parts_between_poses(ordered.pose), threads)
     if order is not None:
+        # back to the order in which the caller has the paths
         power[order] = power.copy()
     matrices = h.reshape(len(poses), len(arrays), uavs, ports)
     matrices = np.ascontiguousarray(matrices.swapaxes(2, 3)) if link.uav_transmits else matrices
@@ -228,6 +233,7 @@ def amplitudes(
     pairs = elements.tower_m.shape[2]
     out = np.empty((len(g.depth), pairs, 2))
     step = max(1, PAIRS_PER_CHUNK // pairs)
+    # all of one depth at once: no step is evaluated for paths that have fewer
     for depth in np.unique(g.depth):
         rows = np.flatnonzero(g.depth == depth)
         for start in range(0, len(rows), step):
@@ -266,6 +272,7 @@ def _vectors(
         return dyads.field_vector(m, toward, *dyads.slant_rotation(1.0, 0.0, cosine, sine)), (0.0, 0.0, 0.0)
     theta_re, theta_im, phi_re, phi_im = fields.swapaxes(0, 1)
     re = dyads.field_vector(m, toward, *dyads.slant_rotation(theta_re, phi_re, cosine, sine))
+    # most patterns are real, and half of the work is then zero
     if not (theta_im.any() or phi_im.any()):
         return re, (0.0, 0.0, 0.0)
     return re, dyads.field_vector(m, toward, *dyads.slant_rotation(theta_im, phi_im, cosine, sine))
@@ -279,6 +286,7 @@ def pattern_ends(g: Geometry, elements: Elements, link: Link) -> Ends:
     """Pattern fields (paths, 4, pairs) of both ends along the paths; None where all are 1 along theta."""
     arrays, uav = list(link.tower_arrays.values()), link.uav_array
     plain_towers, plain_uav = all(plain(array.patterns) for array in arrays), plain(uav.patterns)
+    # 1 along theta needs no table of directions
     if plain_towers and plain_uav:
         return None, None
     x, y, z, _ = directions(g, elements)
@@ -341,6 +349,7 @@ def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float
 
 def mean_pair_power(h: ComplexArray) -> FloatArray:
     """Mean over the last two axes of ``|h|^2``; tiny and huge channels neither vanish nor overflow."""
+    # the square of a complex number's size is the sum of two squares: no root is taken
     parts = np.ascontiguousarray(h).view(np.float64).reshape(*h.shape[:-2], 2 * h.shape[-2] * h.shape[-1])
     pairs = max(parts.shape[-1] // 2, 1)
     with np.errstate(over="ignore", under="ignore"):

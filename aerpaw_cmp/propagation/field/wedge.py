@@ -60,6 +60,7 @@ def wedge(
     shadow = edge_term(np.pi + less, exterior, distance) + edge_term(np.pi - less, exterior, distance)
     at_n, at_0 = edge_term(np.pi + more, exterior, distance), edge_term(np.pi - more, exterior, distance)
     upright, across = obliquity(phi_in, phi_out, exterior)
+    # of grazing incidence, which is the cosine from the normal that Fresnel's formulas take
     sine = upright * np.sqrt(1.0 - cos_beta * cos_beta)
     # from face n both the angles and the edge run the other way, which leaves the matrix as it is
     te, tm = 0.0, 0.0
@@ -69,6 +70,7 @@ def wedge(
     # angle between the edge-fixed basis and the plane of incidence, whose unit normal is sigma
     askew = cos_beta * upright  # as across, times the sine of incidence: -(sigma . phi) and -(sigma . beta)
     size = across * across + askew * askew
+    # along the edge itself both are zero: any plane of incidence will do
     weight = 1.0 / np.where(size == 0.0, 1.0, size)
     along, mixed, sideways = np.where(size == 0.0, 1.0, across * across * weight), across * askew * weight, askew**2
     sideways = sideways * weight
@@ -102,6 +104,7 @@ def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> 
     """
     less = phi_out - phi_in
     up, down = (np.abs(np.sin((np.pi + turn) / (2.0 * exterior))) for turn in (less, -less))
+    # source and target exchange up and down: the smaller and the larger do not
     near, far = np.minimum(up, down), np.maximum(up, down)
     # at the shadow boundary both go to 0; their ratio to the exterior angle over pi
     ratio = np.where(near < 1e-9, exterior, np.abs(np.cos(less / 2.0)) / np.maximum(near, 1e-9))
@@ -125,10 +128,12 @@ def edge_term(angle: FloatArray, exterior: FloatArray, distance: FloatArray) -> 
     (...) complex
     """
     turns = angle / (2.0 * np.pi * exterior)
+    # to the nearest boundary: -0.5 and 0.5 are the same angle
     turns = turns - np.floor(turns + 0.5)
     above, below = np.abs(np.sin(np.pi * turns * exterior)), np.sin(np.pi * turns)
     # on the boundary itself the ray that grazes the edge counts as seen, so the limit is that of the lit side
     ratio = np.where(below == 0.0, exterior, above / np.where(below == 0.0, 1.0, below))
+    # w of a root, not F of a square: wofz keeps its digits at zero and far away
     reach = np.sqrt(2.0 * distance)
     return np.asarray(transition(reach * above) * np.cos(np.pi * turns) * reach * ratio)
 

@@ -61,6 +61,7 @@ class Array:
     @property
     def slant_parts(self) -> FloatArray:
         """Cosines and sines (2, elements) of the slants: the vertical and the horizontal part of each element."""
+        # model 2 of TR 38.901: a slanted element is this sum of a vertical and a horizontal one
         return np.stack([np.cos(self.slant_rad), np.sin(self.slant_rad)])
 
 
@@ -125,6 +126,7 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
         unmasked(pitch_rad),
         unmasked(roll_rad),
     )
+    # written out: one pass over a whole flight, where a product of three turns makes three
     ca, sa = np.cos(yaw), np.sin(yaw)
     cb, sb = np.cos(pitch), np.sin(pitch)
     cg, sg = np.cos(roll), np.sin(roll)
@@ -167,6 +169,7 @@ _TOWER_PORTS_M = (0.0, 0.060, 1.740, 1.800)
 
 
 def _centred_line(along_m: FloatArray) -> FloatArray:
+    # across the boresight, which is x
     positions = np.zeros((len(along_m), 3))
     positions[:, 1] = along_m.mean() - along_m  # first port leftmost (+y)
     return positions
@@ -180,6 +183,7 @@ def _mounted(
     roll_deg: float = 0.0,
 ) -> Array:
     """Elements of one pattern in a device that is turned and rolled."""
+    # no pitch: the arrays of the paper and of maps look level
     mount = rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, 0.0, roll_deg]))
     return Array(positions_m, np.radians(np.array(slant_deg)), (pattern or Isotropic(),), mount)
 
@@ -221,6 +225,7 @@ def uav_comparison_array(
         Of four ports.
     """
     half = wavelength_m / 4
+    # the left column first, its upper port before its lower one
     positions = np.array([[0, half, half], [0, half, -half], [0, -half, half], [0, -half, -half]])
     return _mounted(positions, slant_deg, pattern, yaw_deg, roll_deg)
 

@@ -24,6 +24,7 @@ from .paths import Faces
 _WALL_FOOT_M = 0.5
 
 # Sine of the angle between two edges below which they are one wall.
+# A nanometre off over a metre; maps are drawn to the millimetre.
 _COLLINEAR = 1e-9
 
 _UP = np.array([0.0, 0.0, 1.0])
@@ -58,6 +59,7 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
     Faces
         Ground planes first (``solid`` is -1), then walls and roof of each building.
     """
+    # sorted and each once: the numbers of faces must not depend on the order of towers
     grounds = sorted({site.towers[name].ground_m for name in (towers or site.towers)}) or [0.0]
     return _faces(tuple(grounds), site.ground_material, site.buildings)
 
@@ -90,8 +92,10 @@ def _ground(height_m: float, material: str, several: bool) -> _Face:
 
 def _parts(footprint: Polygon) -> list[Polygon]:
     """Valid, counter-clockwise polygons (holes clockwise) without collinear vertices."""
+    # a ring that crosses itself becomes several, and perhaps lines, which are no walls
     valid = footprint if footprint.is_valid else shapely.make_valid(footprint)
     polygons = [part for part in shapely.get_parts(valid) if part.geom_type == "Polygon" and part.area > 0.0]
+    # counter-clockwise, so that every edge has the building on its left
     return [
         orient(Polygon(_corners(part.exterior), [_corners(hole) for hole in part.interiors]), 1.0) for part in polygons
     ]
@@ -99,7 +103,9 @@ def _parts(footprint: Polygon) -> list[Polygon]:
 
 def _corners(ring: shapely.LinearRing) -> FloatArray:
     """Vertices (corners, 2) of a ring at which it turns."""
+    # a ring repeats its first corner; a third coordinate of the map is no height of ours
     points = np.asarray(ring.coords, dtype=np.float64)[:-1, :2]
+    # a triangle stays one, however flat
     while len(points) > 3:
         before = points - np.roll(points, 1, axis=0)
         after = np.roll(points, -1, axis=0) - points
@@ -124,6 +130,7 @@ def _walls(building: Building, footprint: Polygon, solid: int) -> list[_Face]:
             # the solid lies left of every edge, so the outward normal is to the right
             along = np.array([edge[0], edge[1], 0.0]) / length
             normal = np.array([along[1], -along[0], 0.0])
+            # in-plane coordinates count from the site's origin, not from the wall's corner
             first = float(along[:2] @ start)
             label = f"{building.name} wall {len(faces) + 1}"
             offset = float(normal[:2] @ start)
@@ -152,7 +159,9 @@ def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
     along = np.array([longest[0], longest[1], 0.0]) / np.hypot(*longest)
     across = np.array([-along[1], along[0], 0.0])
     turned = shapely.transform(footprint, lambda p: p @ np.column_stack([along[:2], across[:2]]))
+    # a rectangle that is turned fills its bounds only along its own axes
     low_a, low_b, high_a, high_b = turned.bounds
+    # most roofs: bounds alone then say what is inside, which costs no polygon
     fills = np.isclose(turned.area, (high_a - low_a) * (high_b - low_b), rtol=1e-12, atol=0.0)
     polygon = None if fills else turned
     if polygon is not None:
@@ -191,8 +200,10 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
     """
     a = np.einsum("ij,ij->i", faces.along.take(index, 0), points_m)
     b = np.einsum("ij,ij->i", faces.across.take(index, 0), points_m)
+    # take: an index in brackets is several times slower for rows of two
     low, high = (faces.lower - tolerance_m).take(index, 0), (faces.upper + tolerance_m).take(index, 0)
     good = (a >= low[:, 0]) & (a <= high[:, 0]) & (b >= low[:, 1]) & (b <= high[:, 1])
+    # polygons last, and only for points within the bounds
     for face in np.flatnonzero(np.bincount(index[good])):
         polygon = faces.polygon[face]
         if polygon is None:
@@ -200,6 +211,7 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
         rows = np.flatnonzero(good & (index == face))
         hit = shapely.intersects_xy(polygon, a[rows], b[rows])
         if tolerance_m > 0.0 and not hit.all():
+            # beyond the edge by up to the tolerance still counts
             hit = hit | shapely.dwithin(polygon, shapely.points(a[rows], b[rows]), tolerance_m)
         elif tolerance_m < 0.0 and hit.any():
             hit = hit & ~shapely.dwithin(polygon.boundary, shapely.points(a[rows], b[rows]), -tolerance_m)
@@ -247,6 +259,7 @@ def triangles(faces: Faces, reach_m: float) -> tuple[FloatArray, IntArray, IntAr
         else:
             base = faces.normal[index] * faces.offset_m[index]
             axes = np.stack([faces.along[index], faces.across[index]])
+            # constrained: triangles of a plain one would cover the hollows
             pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
             parts = [base + np.asarray(orient(piece, 1.0).exterior.coords)[:3] @ axes for piece in pieces]
         vertices.extend(parts)
@@ -261,6 +274,7 @@ def inside_solids(site: Site, points_m: FloatArray) -> BoolArray:
     top = np.array([building.base_m + building.height_m for building in site.buildings])
     low = np.flatnonzero(np.isfinite(points_m).all(axis=1) & (points_m[:, 2] < top.max(initial=-np.inf)))
     if len(low):
+        # "within" is strict: a pose on a wall or a roof is not inside
         tree = shapely.STRtree([building.footprint for building in site.buildings])
         point, building = tree.query(shapely.points(points_m[low, :2]), predicate="within")
         result[low[point[points_m[low[point], 2] < top[building]]]] = True

@@ -86,6 +86,7 @@ class Faces:
         if self.along.shape == (count, 3):
             return
         # any axis that is not the normal will do for a whole plane
+        # the axis least along the normal: a product with one nearly along it would lose digits
         helper = np.eye(3)[np.argmin(np.abs(self.normal), axis=1)] if count else np.zeros((0, 3))
         along = np.cross(helper, self.normal)
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
@@ -233,6 +234,7 @@ class PathSet(Rows):
     terrain_db: FloatArray = field(default_factory=lambda: np.zeros(0))
 
     def __post_init__(self) -> None:
+        # frozen, so the default of the right length is set behind its back
         if len(self.terrain_db) != len(self.pose):
             object.__setattr__(self, "terrain_db", np.zeros(len(self.pose)))
 
@@ -251,6 +253,7 @@ class PathSet(Rows):
     @property
     def turns(self) -> IntArray:
         """A digit 1 for each reflection (paths,)."""
+        # 1, 11, 111
         return np.asarray((10**self.depth - 1) // 9)
 
     @classmethod
@@ -276,6 +279,7 @@ class PathSet(Rows):
         points = np.full((len(pose), max_depth, 3), np.nan)
         depth = faces.shape[1]
         sequence[:, :depth] = faces
+        # a sequence may end early: what stands behind its last face is no point
         points[:, :depth] = np.where((faces >= 0)[..., None], vertices_m, np.nan)
         return cls(pose, np.full(len(pose), tower), (sequence >= 0).sum(axis=1), sequence, points)
 
@@ -296,6 +300,7 @@ def legs(source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray) -> 
 
     A vertex (paths, vertices, 3) that is not used (NaN) is the point after it: a leg that begins there has no length.
     """
+    # backwards: a corner that is not used takes the place of the one after it
     points = [target_m]
     for step in reversed(range(vertices_m.shape[1])):
         vertex = vertices_m[:, step]

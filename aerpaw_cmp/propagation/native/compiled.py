@@ -89,6 +89,7 @@ def switch() -> str:
 
 def _source_hash() -> str:
     """Hash of the sources, of numba's version and of Python's."""
+    # machine code of another numba or Python is another, and may not be loadable
     digest = sha256(f"{version('numba')} {sys.version_info[:3]}".encode())
     for name in SOURCES:
         digest.update((ROOM / name).read_bytes())
@@ -103,8 +104,10 @@ def code_folder() -> Path | None:
         folder = base / f"kernels-{_source_hash()}"
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # in a folder that others can write to, anybody could leave code for us to run
             if not _is_private(folder.stat()):
                 continue
+            # trying is the only sure way: rights, quotas and read-only mounts look alike
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except OSError:
@@ -146,6 +149,7 @@ def _worth(name: str, numpy_s: float, job_s: float = 0.0) -> ModuleType | None:
     """Compiled code for (a part of) a job that takes NumPy so many CPU seconds; None where that is quicker."""
     chosen = switch()
     _in_numpy_s[name] += numpy_s  # many small jobs of one process are a large one
+    # a job in parts is judged as a whole: no part alone would be worth a compiler
     job_s = max(job_s, numpy_s)
     if chosen == "never" or (chosen == "auto" and (job_s < LEAST_S or max(job_s, _in_numpy_s[name]) < _cost_s(name))):
         return None
@@ -157,6 +161,7 @@ def _worth(name: str, numpy_s: float, job_s: float = 0.0) -> ModuleType | None:
 
 def _cost_s(name: str) -> float:
     """CPU seconds until compiled code runs: it is loaded, kept on disk, or has to be compiled."""
+    # loaded already: nothing left to pay
     if f"aerpaw_cmp.{name}" in sys.modules:
         return LEAST_S
     folder = code_folder() if find_spec("numba") else None
@@ -178,6 +183,7 @@ def load(name: str) -> State:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba's own, about its cache
             kernels = import_module(f"aerpaw_cmp.{name}")
+            # a broken LLVM shows itself when something is compiled, not on import
             kernels.try_out()
             if (folder := code_folder()) is not None:
                 (folder / f"{name}.compiled").touch()
@@ -210,6 +216,7 @@ def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int) -
     count = min(threads, len(parts))
     if count < 2:
         return [call(part) for part in parts]
+    # threads suffice: kernels let go of the interpreter's lock
     with ThreadPoolExecutor(count) as pool:
         waiting = [pool.submit(call, part) for part in parts]
         try:
@@ -221,4 +228,5 @@ def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int) -
 
 def column(values: AnyArray, kind: Any = np.float64) -> AnyArray:
     """An array as kernels take it: of one type, contiguous, writable (a read-only one would be compiled for anew)."""
+    # numba compiles anew for every layout, and for what is read-only
     return np.require(values, kind, ["C", "W"])

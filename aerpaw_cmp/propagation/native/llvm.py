@@ -33,6 +33,7 @@ LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
 # Folders to look into instead of the system's, separated as in PATH.
 FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
 
+# Far above the two seconds that it takes: a slow disk must not look like a library that hangs.
 _TRIAL_TIMEOUT_S = 300.0
 
 # Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have.
@@ -140,6 +141,7 @@ def version_in_name(name: str) -> tuple[int, ...] | None:
 
 def _library(path: Path) -> Library | None:
     """The file behind a name; links are followed because ``libLLVM.so`` often points to ``libLLVM.so.19.1``."""
+    # a link to nothing is left where a package was removed
     if path.suffix == ".a" or not path.is_file():  # an LLVM to compile against brings two hundred of them
         return None
     versions = [version_in_name(name) for name in (path.resolve().name, path.name)]
@@ -152,11 +154,13 @@ def _library(path: Path) -> Library | None:
 def _system_paths() -> list[Path]:
     """Every file the linker or the usual folders offer under a libLLVM name."""
     paths: list[Path] = []
+    # /sbin is not in the path of a plain Debian user
     if ldconfig := shutil.which("ldconfig") or shutil.which("/sbin/ldconfig"):
         listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
         paths += [Path(line.rpartition("=> ")[2]) for line in listing.splitlines() if "libLLVM" in line]
     for pattern in _FOLDERS:
         folder = Path(pattern)
+        # pathlib refuses absolute patterns: they are taken from the root
         paths += folder.parents[-1].glob(str(folder.relative_to(folder.anchor) / "libLLVM*"))
     return paths
 
@@ -187,6 +191,7 @@ def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
     by_path: dict[Path, Library] = {}
     for library in filter(None, map(_library, paths)):  # one file under several names: the one that tells the release
         by_path[library.path] = max(by_path.get(library.path, library), library, key=lambda file: file.version)
+    # an empty version sorts below every number, so unknown files come last
     return sorted(by_path.values(), key=lambda library: (library.version, str(library.path)), reverse=True)
 
 
@@ -207,6 +212,7 @@ def _failure(child: subprocess.CompletedProcess[str]) -> str:
         return f"Dr.Jit cannot be loaded, the system has no {missing}"
     lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
     message = next((line for line in lines if "LLVM ERROR" in line), lines[-1] if lines else "no message")
+    # a negative code is the signal's number: LLVM aborts
     how = f"was ended by signal {-child.returncode}" if child.returncode < 0 else f"ended with {child.returncode}"
     return f"the trial {how}: {message[:200]}"
 
@@ -216,17 +222,20 @@ def _run_trial(
 ) -> tuple[str, dict[str, object]]:
     """Reason of failure (empty if none) and the child's answer."""
     with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-trial-") as scratch:
+        # a kernel in the user's cache would hide that this library cannot compile
         environ = {**os.environ, "DRJIT_CACHE_DIR": scratch}
         if library is not None:
             environ[LIBRARY_VARIABLE] = str(library.path)
         try:
             child = subprocess.run(
                 [python, "-c", program, variant],
+                # Python puts the working folder first in its path: a file mitsuba.py there would be run
                 cwd=scratch,
                 env=environ,
                 stdin=subprocess.DEVNULL,
                 capture_output=True,
                 text=True,
+                # LLVM's own messages may hold any bytes
                 errors="replace",
                 timeout=timeout_s,
                 check=False,
@@ -295,6 +304,7 @@ def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], 
     for library in libraries:
         trials.append(attempt(library))
         # what is missing is Sionna itself: the next library would fare no better
+        # a failure of Sionna itself would come back with every library
         if trials[-1].ok or not trials[-1].blames_library:
             break
     return trials
@@ -303,6 +313,7 @@ def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], 
 @cache
 def _trials() -> tuple[Trial, ...]:
     """The trials that led to this process's choice, made once."""
+    # without loading Sionna, which takes three times as long and tells no more of an LLVM
     return tuple(first_that_works(candidates(), lambda library: try_library(library, program=TRIAL_PROGRAM)))
 
 
@@ -327,6 +338,7 @@ def prepare_llvm() -> Path:
     if not trials or not trials[-1].ok or trials[-1].library is None:
         line = INSTALL_AGAIN if sionna_fails(trials) else install_line()
         raise SionnaMissingError(f"{explain(trials)}. Mend it with: {line}")
+    # Dr.Jit reads it once, when it is imported
     os.environ[LIBRARY_VARIABLE] = str(trials[-1].library.path)
     return trials[-1].library.path
 
@@ -371,6 +383,7 @@ def os_families() -> set[str]:
         release = platform.freedesktop_os_release()
     except OSError:
         return {platform.system().lower()}
+    # Mint and Pop say that they are like Ubuntu
     return {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
 
 
@@ -401,6 +414,7 @@ def install_line() -> str:
         known = known_to_apt()
         offered = apt_packages(known)
         if known and not offered:  # Ubuntu 22.04 ends at 15: packages of the LLVM project
+            # a minimal image has none of these
             needs = "wget gnupg lsb-release software-properties-common"  # what that script calls
             fetch = "wget https://apt.llvm.org/llvm.sh && sudo bash llvm.sh 19"
             first = f"sudo apt-get update && sudo apt-get install -y {needs} && {fetch}"

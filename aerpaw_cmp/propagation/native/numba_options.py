@@ -18,6 +18,7 @@ from .compiled import code_folder
 
 FOLDER = code_folder()
 _MARK = b"aerpaw-cmp kernel 1\n"
+# As NumPy: 1 / 0 is infinite, not an exception; and no sum is reordered, or bits would differ.
 _MATHS: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 _PART: dict[str, Any] = {"forceinline": True, "_nrt": False}
 
@@ -33,6 +34,7 @@ def kernel(function: Callable[..., Any], **options: Any) -> Any:
             compiled.enable_caching()
         finally:
             config.CACHE_DIR = before
+        # after numba has made its own, which would unpickle whatever lies in the folder
         compiled._cache._cache_file = _Sealed(function)
     return compiled
 
@@ -49,6 +51,7 @@ class _Sealed:
 
     def _place(self, key: Any) -> Path:
         assert FOLDER is not None
+        # hashed: a signature of records is longer than a file name may be
         return FOLDER / f"{self._name}-{sha256(repr(key).encode()).hexdigest()[:32]}.kernel"
 
     def load(self, key: Any) -> Any:

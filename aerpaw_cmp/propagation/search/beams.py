@@ -140,6 +140,7 @@ def _rules(surfaces: Surfaces, max_depth: int, *, solids: bool, beams: bool = Tr
 
 def _searches(surfaces: Surfaces, links: Links, rules: Rules) -> Iterator[tuple[int, IntArray, _Search]]:
     """Tower, poses and search of every tower that has a pose to be searched for."""
+    # tower by tower: all have one scene and their own usable faces
     alive = searched_links(links)
     for tower in np.flatnonzero(alive.any(axis=1)).tolist():
         poses = np.flatnonzero(alive[tower])
@@ -213,6 +214,7 @@ class _Search:
 
 def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int]]:
     """Rounds of chunks for all threads."""
+    # small enough to share out evenly, large enough to hide the call
     at, each = 0, max(16, min(1024, len(first) // (8 * threads) + 1))
     while at < len(first):
         parts = [first[k : k + each] for k in range(at, min(at + each * 4 * threads, len(first)), each)]
@@ -230,6 +232,7 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
         return paths
     plane = np.append(surfaces.plane, -1)[paths.faces]
     key = np.column_stack([paths.pose, paths.tower, paths.depth, plane])
+    # the first of each: paths come sorted, so the choice does not depend on threads
     _, first = np.unique(key, axis=0, return_index=True)
     paths = paths.select(np.sort(first))
     # near coincidence: neighbours in a grid of twice the tolerance, asked pairwise within a link
@@ -239,6 +242,7 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
     repeated = np.zeros(len(paths), dtype=np.bool_)
     for rows in np.split(order, starts[1:]):
         depth = int(paths.depth[rows[0]])
+        # lines of sight have no points to compare
         if len(rows) < 2 or not depth:
             continue
         points = paths.vertices_m[rows, :depth]
@@ -302,6 +306,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
         for step in range(depth - 1, -1, -1):
             f = sequence[row, step]
             low, top = _height(normal, offset, f, images[step]), _height(normal, offset, f, point)
+            # on two sides of the mirror, or both in it: no reflection
             if low * top < 0.0 or abs(low) + abs(top) <= SIDE_M:
                 good[row] = False
                 break
@@ -389,6 +394,7 @@ def _first_cut(corners, a, b, before, after, rules):  # type: ignore[no-untyped-
 def _cut_at(corners, a, way, length, before, after, rules):  # type: ignore[no-untyped-def]
     """Share of the way at which a triangle cuts a segment; -1 where it cuts nothing."""
     t = _share_to(corners, a, way, length, rules.margin)
+    # the open segment: its ends lie on mirrors and antennas
     if t <= 0.0 or t >= 1.0:
         return -1.0
     hit = a[0] + t * way[0], a[1] + t * way[1], a[2] + t * way[2]
@@ -404,11 +410,13 @@ def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
     Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997), doi:10.1080/10867651.1997.10487468.
     """
     c, (d0, d1, d2) = corners, way
+    # seams between triangles of a sheet must not leak; of a solid, a graze must not cut
     edge = margin if margin > 0.0 else -1e-9
     e0, e1, e2 = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2]
     g0, g1, g2 = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
     p0, p1, p2 = d1 * g2 - d2 * g1, d2 * g0 - d0 * g2, d0 * g1 - d1 * g0
     det = e0 * p0 + e1 * p1 + e2 * p2
+    # along the triangle's plane: it has no thickness to cut with
     if abs(det) <= 1e-14 * length:
         return -1.0
     if margin > 0.0:  # so near to grazing that a tolerance might decide
@@ -430,6 +438,7 @@ def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
 def _at_end(mirror, hit, distance, rules):  # type: ignore[no-untyped-def]
     """Check whether a triangle is met too near an end to cut: in the mirror's plane, or at the antenna."""
     normal, offset = mirror
+    # zeros stand for an antenna: a record for either kind would be counted in and out
     if normal[0] == 0.0 and normal[1] == 0.0 and normal[2] == 0.0:
         return distance <= rules.end
     return abs(normal[0] * hit[0] + normal[1] * hit[1] + normal[2] * hit[2] - offset) <= rules.clearance
@@ -440,6 +449,7 @@ def _direct(solids, source, targets, rules):  # type: ignore[no-untyped-def]
     free = np.zeros(len(targets), np.bool_)
     antenna = np.zeros(3), 0.0
     for r in range(len(targets)):
+        # one receiver after the other: a line of sight costs too little to be shared out
         free[r] = not segment_cut(solids.corners, solids.tree, source, targets[r], antenna, antenna, rules)
     return free
 
@@ -459,6 +469,7 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
         if not mirrors.usable[f]:
             continue
         height = _height(normal, offset, f, source)
+        # a sheet has two sides and is none for a source in its own plane; a solid has an outside
         if (abs(height) <= rules.side and rules.margin == 0.0) or (mirrors.front_only[f] and height < -rules.side):
             continue
         good[f] = not (rules.shadows and _wholly_hidden(mirrors, face_tree, source, f, -1, 0.0, rules, stack))
@@ -486,6 +497,7 @@ def _wholly_hidden(mirrors, face_tree, source, f, before, sign, rules, stack):  
     while node >= 0:
         for k in range(start[node], start[node] + many[node]):
             g = items[k]
+            # what has hollows may let the beam through; what lies in one plane hides nothing of it
             if not convex[g] or plane[g] == plane[f] or g == before:
                 continue
             if _beyond(mirrors, before, sign, g, rules) and _hides(mirrors, source, f, g, rules):
@@ -513,6 +525,7 @@ def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
     normal, offset = mirrors.normal, mirrors.offset
     window, clearance = mirrors.window, rules.clearance
     from_source = _height(normal, offset, g, source)
+    # so near to its plane the source may see past it
     if abs(from_source) <= 10.0 * clearance:
         return False
     for k in range(WINDOW):
@@ -525,6 +538,7 @@ def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
         run = corner - source
         length = np.sqrt(run[0] ** 2 + run[1] ** 2 + run[2] ** 2)
         cosine = abs(from_source - height) / length
+        # at grazing incidence a tolerance in the plane moves the point too far along it
         if cosine < 0.05 or abs(_height(normal, offset, f, point)) <= 2.0 * clearance:
             return False
         if not _well_inside(window[g], normal[g], point, clearance / cosine + 1e-3):
@@ -539,6 +553,7 @@ def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def
         a, b = outline[k], outline[(k + 1) % WINDOW]
         e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
         size = np.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
+        # the outline repeats its last corner
         if size == 0.0:
             continue
         # normal x edge points inwards
@@ -566,12 +581,14 @@ def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
             continue
         n0, n1, n2 = n0 / size, n1 / size, n2 / size
         middle = n0 * (m0 - a[0]) + n1 * (m1 - a[1]) + n2 * (m2 - a[2])
+        # which way an outline goes round depends on the side it is seen from
         if middle < 0.0:
             n0, n1, n2 = -n0, -n1, -n2
         # the plane goes through the apex and, a little outside, along the side of the outline
         offset = n0 * apex[0] + n1 * apex[1] + n2 * apex[2]
         reach = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
         planes[count, 0], planes[count, 1], planes[count, 2] = n0, n1, n2
+        # pushed outwards: a cut may keep too much, never too little
         planes[count, 3] = -offset + SLACK_M * max(1.0, 1e3 / max(reach, 1e-3))
         count += 1
     return count
@@ -620,6 +637,7 @@ def in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-
     for t in range(first[f], first[f + 1]):
         c = flat[t]
         area = (c[1, 0] - c[0, 0]) * (c[2, 1] - c[0, 1]) - (c[1, 1] - c[0, 1]) * (c[2, 0] - c[0, 0])
+        # triangles of a file go round either way
         sign = 1.0 if area > 0.0 else -1.0
         good = True
         for k in range(3):
@@ -651,10 +669,12 @@ def _reflects(shapes, level, chain, signs, images, points, target, rules):  # ty
         g = chain[step]
         top = signs[step] * _height(normal, offset, g, point)
         low = signs[step] * _height(normal, offset, g, images[step])
+        # both ends before the mirror
         if top < -side or low < -side or top + low <= (side if strict else 1e-12):
             return False
         if step < level and top <= (side if strict else -side):
             return False
+        # the image lies as far behind the mirror as its source before it
         share, behind = low / (low + top), images[step + 1]
         for axis in range(3):
             points[step, axis] = behind[axis] + share * (point[axis] - behind[axis])
@@ -681,6 +701,7 @@ def _hidden(mirrors, solids, chain, source, points, target, rules):  # type: ign
 def _doubled(pose, faces, points):  # type: ignore[no-untyped-def]
     """Rows with room for as many more."""
     many, depth = faces.shape
+    # doubled: the number of paths is not known beforehand, and a list would need the interpreter
     pose2, points2 = np.empty(2 * many, np.int64), np.zeros((2 * many, depth, 3))
     faces2 = np.full((2 * many, depth), -1, np.int64)
     pose2[:many], faces2[:many], points2[:many] = pose, faces, points

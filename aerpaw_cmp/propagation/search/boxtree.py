@@ -34,6 +34,7 @@ def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
 @kernel
 def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     n = len(lower)
+    # a binary tree of n leaves has 2 n - 1 nodes
     most = max(1, 2 * n)
     low, high = np.empty((most, 3)), np.empty((most, 3))
     child = np.full(most, -1, np.int64)
@@ -54,6 +55,7 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
             for k in range(first, first + many):
                 low[node, axis] = min(low[node, axis], lower[items[k], axis])
                 high[node, axis] = max(high[node, axis], upper[items[k], axis])
+        # a few items are tested as fast as their boxes
         if many <= leaf:
             continue
         longest, widest = 0, -1.0
@@ -65,9 +67,11 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
             if most_ - least > widest:
                 longest, widest = axis, most_ - least
         mine = items[first : first + many].copy()
+        # a full sort, since numba has no partition of indices
         order = np.argsort(middle[mine, longest])
         items[first : first + many] = mine[order]
         half = many // 2
+        # the second child stands behind the first
         child[node] = nodes
         start[nodes], count[nodes] = first, half
         start[nodes + 1], count[nodes + 1] = first + half, many - half
@@ -186,6 +190,7 @@ def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-de
 @part
 def _apart(lower, upper, node, box):  # type: ignore[no-untyped-def]
     """Check whether a box of the tree lies apart from another, given by its corners (3,)."""
+    # touching counts as overlap: the tree only leaves out
     low, high = box
     for axis in range(3):  # noqa: SIM110 - compiled
         if lower[node, axis] > high[axis] or upper[node, axis] < low[axis]:
@@ -216,6 +221,7 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     for p in range(many):
         a, b, c = planes[p, 0], planes[p, 1], planes[p, 2]
         best = planes[p, 3]
+        # the corner farthest along the normal: is even that outside, all of the box is
         best += a * (upper[node, 0] if a > 0.0 else lower[node, 0])
         best += b * (upper[node, 1] if b > 0.0 else lower[node, 1])
         best += c * (upper[node, 2] if c > 0.0 else lower[node, 2])
@@ -245,6 +251,7 @@ def box_missed(lower, upper, node, segment):  # type: ignore[no-untyped-def]
     bool
     """
     a, inverse = segment
+    # shares of the way, so nothing behind the start or beyond the end is met
     enter, leave = 0.0, 1.0
     for axis in range(3):
         at_lower = (lower[node, axis] - a[axis]) * inverse[axis]

@@ -64,6 +64,7 @@ def merged(scene: TriangleScene, merge_m: float = _MERGE_M) -> Surfaces:
     face_area = np.add.reduceat(triangle_area, first[:-1])
     low = np.minimum.reduceat(corners.min(axis=1), first[:-1], axis=0)
     high = np.maximum.reduceat(corners.max(axis=1), first[:-1], axis=0)
+    # grown by the tolerance: neighbours of one plane must meet
     face_tree = box_tree(low - merge_m, high + merge_m)
     plane = _shared_planes(face_tree, corners, first, (normal, offset), face_area, (low, high), merge_m)
     normal, offset = normal[plane], offset[plane]
@@ -122,10 +123,12 @@ def _planes(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 def _axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
     """In-plane unit axes: level and uphill where there is such a thing."""
+    # across the slope: level where the face is no ground
     along = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
     size = np.linalg.norm(along, axis=1)
     level = size < 1e-6
     along = np.where(level[:, None], np.array([1.0, 0.0, 0.0]), along / np.where(level, 1.0, size)[:, None])
+    # the axis of a nearly level face still leans out of it
     along -= np.einsum("fi,fi->f", along, normal)[:, None] * normal
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     return along, np.cross(normal, along)
@@ -135,7 +138,9 @@ def _faces_of_triangles(
     corners: FloatArray, normal: FloatArray, offset: FloatArray, area: FloatArray, shape: IntArray, merge_m: float
 ) -> tuple[IntArray, IntArray]:
     """Face of each triangle, and the triangle whose plane each face has: its largest."""
+    # files repeat a corner for each triangle, in float32: equal means equal to a tenth of a millimetre
     grid = np.round(corners.reshape(-1, 3) / WELD_M).astype(np.int64)
+    # within one shape: walls of two houses that touch are two faces
     key = np.column_stack([np.repeat(shape, 3), grid])
     order = np.lexsort(key.T)
     new = np.ones(len(order), dtype=np.int64)
@@ -150,6 +155,7 @@ def _faces_of_triangles(
     by_edge = np.argsort(edge, kind="stable")
     start = np.searchsorted(edge[by_edge], np.arange(int(edge.max()) + 2))
     neighbours = edge.reshape(-1, 3), by_edge // 3, start
+    # the largest first: its plane is known best
     face, leader = _merge_neighbours(np.argsort(-area, kind="stable"), corners, normal, offset, neighbours, merge_m)
     return face, leader
 
@@ -201,6 +207,7 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
     (normal, offset), (low, high) = planes, bounds
     plane = np.arange(len(normal))
     near = np.empty(len(normal), np.int64)
+    # the largest first, so that a face is asked after all that it may join
     for f in np.argsort(-area):
         many = overlapping(tree, low[f] - merge_m, high[f] + merge_m, near)
         best = -1
@@ -208,6 +215,7 @@ def _shared_planes(tree, corners, first, planes, area, bounds, merge_m):  # type
             if area[neighbour] < area[f] or (area[neighbour] == area[f] and neighbour >= f):
                 continue
             lead = plane[neighbour]
+            # a tiny face lies within a millimetre of planes that it has nothing to do with
             if abs(np.dot(normal[lead], normal[f])) < 0.7:
                 continue
             if not _lie_in(corners, first[f], first[f + 1], (normal[lead], offset[lead]), merge_m):
@@ -224,12 +232,15 @@ def _windows(
 ) -> tuple[FloatArray, BoolArray]:
     """Convex outlines (faces, 8, 3), counter-clockwise round the normal, and which faces fill theirs."""
     owner = np.repeat(np.arange(len(area)), 3 * np.diff(first))
+    # a corner that turns by a tenth of a micrometre is rounding, and would take one of the eight places
     hull = shapely.simplify(shapely.convex_hull(shapely.multipoints(flat.reshape(-1, 2), indices=owner)), 1e-7)
     corners = shapely.get_num_coordinates(hull) - 1
+    # overlapping triangles of one face could add up to its outline by chance: only exact fits count
     convex = (corners <= WINDOW) & (np.abs(shapely.area(hull) - area) <= 1e-6 * area)
     hull[corners > WINDOW] = shapely.oriented_envelope(hull[corners > WINDOW])
     point, face = shapely.get_coordinates(shapely.orient_polygons(hull), return_index=True)
     start = np.searchsorted(face, np.arange(len(area) + 1))
+    # a ring closes with its first corner, which the window does not need; a sliver may have become a line
     last = start[1:] - np.where(shapely.get_type_id(hull) == shapely.GeometryType.POLYGON, 2, 1)
     outline = point[np.minimum(start[:-1, None] + np.arange(WINDOW), last[:, None])]
     window = base[:, None] + outline[..., :1] * along[:, None] + outline[..., 1:] * across[:, None]

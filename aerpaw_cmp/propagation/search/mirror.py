@@ -84,6 +84,7 @@ def find_paths(
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
     sources_m, targets_m, usable = links.sources_m, links.targets_m, links.usable
+    # a part of a flight has the tolerance of the whole, or its paths might differ
     known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
     tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
@@ -91,6 +92,7 @@ def find_paths(
     growth = _Growth(
         faces=faces,
         bounds=box,
+        # pairs of faces are asked for from the second reflection on
         facing=_facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_),
         tolerance_m=tolerance_m,
         max_depth=max_depth,
@@ -116,6 +118,7 @@ def searched_links(links: Links) -> BoolArray:
     """Links (towers, poses) that may have paths: with a pose, long enough and not excluded."""
     alive = np.empty((len(links.sources_m), len(links.targets_m)), dtype=np.bool_)
     with np.errstate(invalid="ignore"):
+        # tower by tower: an array of all pairs and three coordinates would be the largest of the search
         for tower, source in enumerate(links.sources_m.reshape(-1, 3)):
             apart = links.targets_m - source
             gap2 = np.einsum("ij,ij->i", apart, apart)
@@ -149,6 +152,7 @@ class _Bounds:
     @classmethod
     def of(cls, faces: Faces, farthest_m: float) -> _Bounds:
         """Bounds of faces, the infinite ones cut at ten times the farthest point."""
+        # far beyond any reflection point between two points of the scene
         box = corners(faces, 10.0 * farthest_m)
         first, second, third, fourth = box.transpose(1, 0, 2)
         return cls(box, (first + third) / 2, np.stack([second - first, fourth - first], axis=1) / 2)
@@ -207,6 +211,7 @@ class _Growth:
         highest = [(normal @ targets_m[start : start + TARGETS_AT_ONCE].T).max(axis=1) for start in starts]
         lit = np.max(highest, axis=0) - self.faces.offset_m >= -self.tolerance_m
         low, high = targets_m.min(axis=0), targets_m.max(axis=0)
+        # the box round all poses: a beam that misses it misses each
         hull = (low + high)[None] / 2, np.diag(high - low)[None] / 2
         return [levels[0], *(self._reaching(level, lit, hull) for level in levels[1:])]
 
@@ -215,6 +220,7 @@ class _Growth:
         faces, box, depth = self.faces, self.bounds, level.faces.shape[1]
         grown: list[IntArray] = []
         images: list[FloatArray] = []
+        # eight arrays of this size live at once
         step = max(1, CELLS_PER_CHUNK // (8 * len(faces)))
         for start in range(0, len(level.faces), step):
             now, past = level.faces[start : start + step], level.images_m[start : start + step]
@@ -227,8 +233,10 @@ class _Growth:
                 before = now[row, -1]
                 beam = last_image[row], box.corners_m[before], box.centre_m[face], box.reach_m[face]
                 keep = _beam_meets(*beam, self.tolerance_m)
+                # the ground is met by any beam that goes down, and its cut corners are no outline
                 keep |= ~np.isfinite(faces.lower[face, 0]) | ~np.isfinite(faces.lower[before, 0])
                 row, face = row[keep], face[keep]
+            # the image counts for every target, so it is made once a sequence
             mirrored = last_image[row] - 2.0 * height[row, face][:, None] * faces.normal[face]
             grown.append(np.concatenate([now[row], face[:, None]], axis=1))
             images.append(np.concatenate([past[row], mirrored[:, None]], axis=1))
@@ -305,6 +313,7 @@ def _beam_meets(
     sense = np.sign((side.sum(axis=1) * ray.sum(axis=1)).sum(axis=0))
     ahead = (side * (centre - apex).T[:, None]).sum(axis=0) * sense
     ahead += np.abs((side * reach.transpose(1, 2, 0)[:, :, None]).sum(axis=1)).sum(axis=0)
+    # side planes are not normalised, so the tolerance takes their length instead
     size = np.sqrt((side * side).sum(axis=0))
     return np.asarray((ahead >= -tolerance_m * size).all(axis=0))
 
@@ -339,8 +348,10 @@ def _paths_of_level(
                 row, column = np.zeros(len(some), np.int64), np.arange(len(some))
             # taken: an index in brackets costs four times as much for rows of three
             sequence, images, pose = level.faces[part].take(row, 0), level.images_m[part].take(row, 0), some[column]
+            # after the cheap test of the last face, which few pairs pass
             vertices, good = trace_back(faces, sequence, images, targets.take(pose, 0), hiding.tolerance_m)
             sequence, pose, vertices = sequence[good], pose[good], vertices[good]
+            # last, since it is the dearest: on what geometry has left
             free = ~hiding.any_segment(np.broadcast_to(source, (len(pose), 3)), vertices, targets[pose])
             pieces.append(PathSet.from_tower(tower, pose[free], sequence[free], vertices[free], max_depth))
     return merge(pieces, max_depth, None)
@@ -377,6 +388,7 @@ def _meets_last_face(
     with np.errstate(divide="ignore", invalid="ignore"):
         share = below[:, None] / (below[:, None] - height)
     good = height >= -tolerance_m
+    # a target behind the face would put the point anywhere
     share[~good] = 0.0
     for axis, which in ((faces.along, 0), (faces.across, 1)):
         start = np.einsum("ij,ij->i", axis[last], image)[:, None]
@@ -424,6 +436,7 @@ def _passes_first_faces(faces: Faces, sequence: IntArray, image: FloatArray, tar
                 place = start + share * (end - start)
                 meets &= place >= faces.lower[face, which, None] - REACH_SLACK_M
                 meets &= place <= faces.upper[face, which, None] + REACH_SLACK_M
+        # where the place is not sure, the exact tracing decides
         good &= meets | (abs(below - height) < _SURE_M)
     return good
 
@@ -531,6 +544,7 @@ def _order(paths: PathSet) -> IntArray:
 def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
     """Paths (paths,) over the same planes as one before them in ``order``, with the same ends."""
     plane = planes_of(faces)
+    # most scenes have no two faces in a plane, and then no path can repeat
     shared = np.append(np.bincount(plane)[plane] > 1, False)
     repeated = np.zeros(len(paths), dtype=np.bool_)
     rows = order[shared[paths.faces[order]].any(axis=1)] if shared.any() else order[:0]
@@ -545,6 +559,7 @@ def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
 
 def planes_of(faces: Faces) -> IntArray:
     """Number (faces,) of the plane each face lies in; coplanar faces that look the same way share it."""
+    # coplanar to the rounding of a map: a nanometre of tilt, a micrometre of offset
     key = np.column_stack([faces.normal / 1e-9, faces.offset_m / 1e-6]).round()
     order = np.lexsort(key.T)
     plane = np.empty(len(key), dtype=np.int64)
@@ -558,4 +573,5 @@ def plane_keys(paths: PathSet, planes: IntArray) -> list[tuple[int, ...]]:
     The padding is left out: two sets may have different depths.
     """
     rows = np.column_stack([paths.pose, paths.tower, np.append(planes, -1)[paths.faces]])
+    # tuples, to be keys of sets
     return [tuple(number for number in row if number >= 0) for row in rows.tolist()]

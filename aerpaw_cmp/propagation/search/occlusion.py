@@ -26,6 +26,7 @@ from ..geometry.paths import Faces, legs
 CELLS_PER_CHUNK = 1_000_000
 
 # Radius, in tolerances, within which a point of a seam must be surrounded by buildings; shorter seams hide nothing.
+# At 1 km some ten micrometres: far above rounding, far below any gap that a map draws.
 _NEIGHBOURHOOD = 1e4
 
 # Share of its area by which a convex footprint may fall short of its hull.
@@ -88,11 +89,14 @@ class Occlusion:
         return cut
 
     def _cut(self, start: FloatArray, end: FloatArray) -> BoolArray:
+        # from coarse to fine: all segments at once, then each box by itself, then the planes of a piece
         solids = self._solids_near(start, end)
         near = self._boxes(start, end, solids)
         result = np.zeros(len(start), dtype=np.bool_)
+        # most segments touch nothing, so seams are looked at once all pieces were asked
         seams: list[tuple[IntArray, FloatArray, FloatArray, int, int]] = []
         for column, solid in enumerate(solids.tolist()):
+            # one cut is enough
             rows = np.flatnonzero(near[:, column] & ~result)
             for number, (normal, offset) in enumerate(self.pieces[solid]):
                 if not len(rows):
@@ -102,16 +106,19 @@ class Occlusion:
                 hit = enter < leave
                 result[rows[hit]] = True
                 if self.abutting[solid][number]:
+                    # now grown by the tolerance: what runs along the piece without entering it
                     enter, leave = _within(before[~hit], after[~hit], self.tolerance_m)
                     along = enter < leave
                     seams.append((rows[~hit][along], enter[along], leave[along], solid, number))
                 rows = rows[~hit]
+        # one piece alone has no seam
         if len(seams) > 1:
             self._seams(result, start, end, seams)
         return result
 
     def _solids_near(self, start: FloatArray, end: FloatArray) -> IntArray:
         """Solids whose boxes meet the box of all segments, and from above also that turned to their mean direction."""
+        # links to one tower go one way: a box turned along them is thin
         east, north = np.nansum((end - start)[:, :2], axis=0)
         axes = np.array([[1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [east, north, 0], [-north, east, 0]])
         ends = np.concatenate([start, end]) @ axes.T
@@ -148,6 +155,7 @@ class Occlusion:
 
         ``touches`` are, per piece, the segments that run along it and the shares of their length from and to which.
         """
+        # touches of all pieces, then gathered by segment
         row, enter, leave = (np.concatenate([t[column] for t in touches]) for column in range(3))
         touch = np.repeat(np.arange(len(touches)), [len(t[0]) for t in touches])
         order = np.argsort(row, kind="stable")
@@ -167,12 +175,14 @@ class Occlusion:
         length_m = float(np.linalg.norm(end - start))
         breaks = np.unique([share for enter, leave, _ in runs for share in (enter, leave)])
         long = np.flatnonzero(np.diff(breaks) * length_m > 10.0 * radius_m)
+        # between two breaks the same pieces run along: one point speaks for the stretch
         for share in (breaks[long] + breaks[long + 1]) / 2:
             point = start + share * (end - start)
             ring = point + radius_m * _AROUND
             covered = np.zeros(len(ring), dtype=np.bool_)
             for enter, leave, (normal, offset) in runs:
                 height = ring @ normal.T - offset
+                # between roof and foot: above a roof nothing is surrounded
                 if enter < share < leave and (height[:, :2] < -self.tolerance_m).all():
                     covered |= (height[:, 2:] <= self.tolerance_m).all(axis=1)
             if covered.all():
@@ -211,10 +221,12 @@ def _prisms(
     if not len(rows):
         return np.zeros(0, np.int64), [], []
     number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(rows)))
+    # exactly: roofs are made with this very normal
     level = faces.normal[rows, 2] == 1.0
     lacking = np.bincount(number[level], minlength=len(starts)) == 0
     if lacking.any():
         raise ValueError(f"the solid of '{faces.label[rows[starts[lacking.argmax()]]]}' has no roof")
+    # the lowest wall of each building; roofs do not count
     foot = np.minimum.reduceat(np.where(level, np.inf, faces.lower[rows, 1]), starts)
     foot[np.isposinf(foot)] = -np.inf  # no walls
     roofs = rows[level]
@@ -249,6 +261,7 @@ def convex_pieces(footprint: Polygon) -> tuple[Polygon, ...]:
     first = 0
     while first < len(pieces):
         for second in range(first + 1, len(pieces)):
+            # tried rather than computed: which joins stay convex depends on both outer angles
             union = shapely.union(pieces[first], pieces[second])
             if union.geom_type == "Polygon" and _is_convex(union):
                 pieces[first] = union
@@ -273,10 +286,12 @@ def _planes(footprints: list[Polygon], foot: FloatArray, top: FloatArray) -> lis
     count = np.bincount(owner, minlength=len(ring))
     first = np.cumsum(count) - count
     turned = np.arange(len(point))
+    # outward normals need one sense round the ring
     backwards = ~shapely.is_ccw(ring)[owner]
     turned[backwards] = (2 * first + count - 1)[owner[backwards]] - turned[backwards]
     point = point[turned]
     edge, start, side_of = np.diff(point, axis=0), point[:-1], owner[:-1]
+    # not from one ring's end to the next one's start, and no side without a length
     real = (owner[1:] == side_of) & (edge != 0.0).any(axis=1)
     edge, start, side_of = edge[real], start[real], side_of[real]
     outward = np.column_stack([edge[:, 1], -edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]

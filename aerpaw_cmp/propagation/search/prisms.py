@@ -49,9 +49,11 @@ def find_paths(
     """
     sources_m, targets_m = links.sources_m, links.targets_m
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m if extent_m is None else extent_m)
+    # candidates: too many rather than too few
     paths = grow_paths(solid_surfaces(faces, sources_m, targets_m), links, run, max_depth=max_depth, solids=True)
     hiding = Occlusion(faces, tolerance_m)
     pieces = []
+    # of one depth at once: tracing back takes sequences of one length
     for depth in range(max_depth + 1):
         some = paths.select(paths.depth == depth)
         source, target = sources_m[some.tower], targets_m[some.pose]
@@ -71,6 +73,7 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
     reach = REACH * float(max(1.0, *finite, *(np.abs(p).max(initial=0.0) for p in (known, sources_m))))
     vertices, triangle, owner = triangles(faces, reach)
     points = vertices[triangle]
+    # a bounding quadrilateral, which for a roof with corners cut is larger than the roof: a cut may keep more
     outline = corners(faces, reach)
     axes = np.stack([faces.along[owner], faces.across[owner]], axis=1)
     flat = np.einsum("tki,tai->tka", points, axes)
@@ -86,6 +89,7 @@ def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -
         first=np.searchsorted(owner, np.arange(len(faces) + 1)),
         flat_m=np.ascontiguousarray(flat),
         window_m=np.ascontiguousarray(outline[:, np.minimum(np.arange(WINDOW), 3)]),
+        # the ground hides nothing, and what has a polygon does not fill its outline
         convex=(faces.solid >= 0) & np.array([polygon is None for polygon in faces.polygon], dtype=np.bool_),
         plane=planes_of(faces),
         tree=box_tree(obstacles.min(axis=1), obstacles.max(axis=1)),

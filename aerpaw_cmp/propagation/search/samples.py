@@ -53,6 +53,7 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
     while samples < MOST:
         samples *= _FACTOR
         paths = pilot(samples)
+        # the paths themselves, not their number: one may be lost while another is found
         if set(plane_keys(paths, plane)) == set(plane_keys(before, plane)):
             words = f"{samples // _FACTOR:,} and {samples:,} rays a tower found the same {counted(len(paths), 'path')}"
             return Choice(samples, f"{words} at {counted(poses, 'pose')}".replace(",", " "))

@@ -112,6 +112,7 @@ def _variant(kinds: Sequence[str]) -> str:
     resolver: Any = mi.file_resolver
     resolver().clear()
     resolver().append(str(Path(mi.__file__).parent))
+    # a variant once set stays: changing it would leave objects of two kinds alive
     current = mi.variant()
     if current in [f"{kind}_ad_mono_polarized" for kind in kinds]:
         return str(current)
@@ -180,6 +181,7 @@ class _Builder:
         _ALIVE.add(scene)
         scene.frequency = self.carrier_hz
         ends = np.concatenate([self.links.sources_m, self.links.targets_m])
+        # as far as reflections between the ends can lie, and no farther: float32 coordinates grow coarse
         reach = 4.0 * float(max(np.nanmax(np.abs(ends)), 100.0))
         vertices, triangle, owner = triangles(faces, reach) if self.surfaces is None else self.surfaces.mesh()
         objects, owners = [], []
@@ -188,6 +190,7 @@ class _Builder:
             rows = np.flatnonzero(np.isin(owner, members))
             plain = f"faces-{_plain(name)}"
             material = _material(name, self.carrier_hz, self.own_table)
+            # one mesh a material, not a face: Dr.Jit compiles for what a scene holds
             mesh = self._mesh(plain, vertices, triangle[rows])
             objects.append(rt.SceneObject(mi_mesh=mesh, name=plain, radio_material=material))
             owners.append(owner[rows])
@@ -201,6 +204,7 @@ class _Builder:
         import mitsuba as mi
 
         corners, place = np.unique(triangle, return_inverse=True)
+        # only corners in use: a mesh of all would be sent to the device once a material
         points = vertices[corners]
         mesh = mi.Mesh(name, vertex_count=len(points), face_count=len(triangle))
         parameters = mi.traverse(mesh)
@@ -226,6 +230,7 @@ def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
 
         if name.partition(" with ")[0] in ITU_MATERIALS_PROPERTIES:
             return rt.ITURadioMaterial(f"m-{plain}", name.partition(" with ")[0], thickness=thick)
+    # Sionna takes the conductivity [S/m] and divides by omega eps0 again
     conductivity = -eta.imag * 2.0 * np.pi * carrier_hz * 8.8541878128e-12
     return rt.RadioMaterial(
         f"m-{plain}",
@@ -325,16 +330,19 @@ class _Finder:
         scene = built.scene
         arrays = (("tx_array", sources.elements_m, patterns[0]), ("rx_array", elements_m, patterns[1]))
         for name, elements, kind in arrays:
+            # both polarisations: slants are made of them afterwards, without another search
             pattern = rt.antenna_pattern.antenna_pattern_registry.get(kind)(polarization="VH")
             wavelength = float(np.asarray(scene.wavelength).ravel()[0])
             setattr(scene, name, rt.AntennaArray(pattern, _points(elements / wavelength)))
         for i in range(len(sources.centres_m)):
+            # places come later, as arrays; Sionna only counts these
             scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
         self.limit, self.slots = MAXIMUM_PATHS, _slots(built, batch * len(elements_m))
         self.candidates: Any = None  # PathSolver fills it
         if not synthetic:  # each element of a tower is a source, with a table and room of its own
+            # slots and limits are powers of two
             elements = 2 ** int(np.ceil(np.log2(len(sources.elements_m))))
             self.slots, self.limit = self.slots // elements, self.limit // elements
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = self.slots
@@ -404,6 +412,7 @@ class _Finder:
         """Sionna's paths of one batch, padded, searched until there was room for all."""
         self.targets = targets.padded(self.batch).arguments(self.synthetic)
         paths = self._solved(max_depth, samples)
+        # lines of sight alone need no table
         while max_depth and self._more_room():
             paths = self._solved(max_depth, samples)
         return paths
@@ -428,6 +437,7 @@ class _Finder:
 
         most = 0 if self.candidates is None else int(np.asarray(self.candidates.numpy()).max(initial=0))
         slots = self.slots
+        # doubled: the slots of a table stay a power of two
         while most > _FULLEST_TABLE * slots:
             slots *= 2
         slots = max(self.slots, min(slots, _MOST_SLOTS // max(1, len(self.built.scene.transmitters))))
@@ -457,6 +467,7 @@ class _Finder:
                 f"a tower has nearly {self.limit} paths in one batch, beyond which Sionna drops paths",
                 cause="take a smaller batch",
             )
+        # over both polarisations at both ends
         gain = np.sqrt((real**2 + imaginary**2).sum(axis=(1, 3)))[:count]
         return _arrays(paths, count) | {"gain": gain}
 
@@ -659,6 +670,7 @@ def _raw_paths(
     receiver, tower, path = np.nonzero(raw["valid"])
     steps = min(rays.max_depth, len(raw["kind"]))
     kinds = raw["kind"][:, receiver, tower, path]
+    # 0 is no interaction, 1 a specular reflection
     good = np.flatnonzero(((kinds == 0) | (kinds == 1)).all(axis=0))
     receiver, tower, path = receiver[good], tower[good], path[good]
     pose, source, sequence = _sequences(raw, finder.built.face_of, poses, towers, rays.max_depth)
@@ -724,6 +736,7 @@ def _slanted(a: AnyArray, uav: Array, tower: Array) -> ComplexArray:
     Slanted elements are sums of both: model 2 of 3GPP TR 38.901 section 7.3.2.
     """
     n_uav, n_tower = len(uav), len(tower)
+    # Sionna counts polarisations outside, elements inside
     halves = a.reshape(len(a), 2, n_uav, a.shape[2], 2, n_tower).astype(np.complex128)
     return np.asarray(np.einsum("rautbv,au,bv->rutv", halves, uav.slant_parts, tower.slant_parts))
 
@@ -785,6 +798,7 @@ def _refine(
 ) -> PathSet:
     """Reflection points in float64; paths whose points miss their faces are dropped."""
     rows = np.column_stack([pose, tower, sequence])
+    # rays that differ by rounding report one path several times
     rows = np.unique(rows, axis=0) if len(rows) else rows
     pose, tower, sequence = rows[:, 0], rows[:, 1], rows[:, 2:]
     depth = (sequence >= 0).sum(axis=1)
@@ -821,11 +835,13 @@ def _relocate(
     everywhere = trace_back(faces, sequence, images_of(faces, sequence, sources_m), targets_m, tolerance_m, np.inf)[0]
     result = sequence.copy()
     for step in range(sequence.shape[1]):
+        # only where the face that Sionna named does not hold the point
         outside = np.flatnonzero(~inside(faces, sequence[:, step], everywhere[:, step], _EDGE_TOLERANCE_M))
         for row in outside:  # few: only scenes with disjoint coplanar faces
             twins = np.flatnonzero(plane == plane[sequence[row, step]])
             point = np.tile(everywhere[row, step], (len(twins), 1))
             holding = twins[inside(faces, twins, point, _EDGE_TOLERANCE_M)]
             if len(holding):
+                # any will do: where coplanar faces overlap merge() keeps one
                 result[row, step] = holding[-1]
     return np.asarray(result)

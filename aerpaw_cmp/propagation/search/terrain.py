@@ -25,8 +25,10 @@ from .occlusion import Occlusion
 TERRAIN = -2
 
 # A mirror over less of its Fresnel zone is left out.
+# That is 20 dB below the whole mirror.
 _SMALLEST_PART = 0.1
 
+# A point that still moves after so many gets the plane of a crease.
 _STEPS = 8
 _STILL_M = 1e-6
 
@@ -130,11 +132,13 @@ class _Candidates:
             material=tuple(faces.material[f] for f in mine.tolist()),
             label=("terrain",) * len(where),
         )
+        # in place: the record is frozen, the array that it made is not shared
         plain.solid[:] = TERRAIN
         every = joined(faces, plain)
         sequence = self.sequence[where].copy()
         sequence[np.arange(len(where)), slot[where]] = len(faces) + np.arange(len(where))
         paths = self._traced(every, where, sequence, links, -20.0 * np.log10(part[~level]))
+        # buildings of the scene before its new planes, which hide nothing
         hiding = Occlusion(faces, RELATIVE_TOLERANCE * 1e4)
         cut = hiding.any_segment(links.sources_m[paths.tower], paths.vertices_m, links.targets_m[paths.pose])
         paths = paths.select(~cut)
@@ -158,6 +162,7 @@ def _ends_seen_from(
     faces: Faces, sequence: IntArray, slot: IntArray, source: FloatArray, target: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Both ends as the ground at ``slot`` sees them: mirrored at the faces between."""
+    # from the tower up to the ground's place, and from the UAV back to it
     steps = range(sequence.shape[1])
     for end, order, side in ((source, steps, -1), (target, reversed(steps), 1)):
         for step in order:
@@ -237,8 +242,10 @@ def _stationary(
             after = (d - length + slope * (z - up[1])) / np.maximum(from_target, 1e-12)
             return np.asarray(before + after)
 
+        # at both ends of each piece of the profile: between them it changes its sign at most once
         ends = [growth(along[:-1], ground[:-1]), growth(along[1:], ground[1:])]
     turns = np.stack(ends, axis=1).reshape(-1, len(source))
+    # a change of sign within a piece is a mirror in it, between two pieces one in their crease
     falls, known = turns < 0.0, np.isfinite(turns)
     column, entry = np.nonzero(((falls[1:] != falls[:-1]) & known[1:] & known[:-1]).T)
     piece, crease = entry // 2, entry % 2 == 1
@@ -251,9 +258,11 @@ def _stationary(
     d = np.where(crease, d, inner)
     z = np.where(crease, ground[piece + 1, column], z0 + m * (d - d0))
     way = np.hypot(d, z - up[0][column]) + np.hypot(d - total, z - up[1][column])
+    # seen from above by both ends
     good = crease | ((over[0] > 0.0) & (over[1] > 0.0))
     column, d, z, crease, way = column[good], d[good], z[good], crease[good], way[good]
     zone = np.cumsum((np.diff(column, prepend=-1) != 0) | (np.abs(np.diff(way, prepend=0.0)) >= wavelength_m / 2.0))
+    # within a Fresnel zone the shortest way, which comes first (Fermat)
     order = np.lexsort((way, zone))
     first = order[np.flatnonzero(np.diff(zone[order], prepend=-1))]
     column, d, z, crease, way = column[first], d[first], z[first], crease[first], way[first]
@@ -272,6 +281,7 @@ def _stationary(
         for up in (ground[:, column], z + lean * (at - d))
     ]
     part = np.minimum(widths[0] / np.maximum(widths[1], 1e-12), 1.0)
+    # level ground must come out as exactly 1, so that it stays the plane that it was
     part = np.where(part > 1.0 - 1e-9, 1.0, part)
     good = part >= _SMALLEST_PART
     return column[good], d[good], crease[good], part[good]
@@ -316,6 +326,7 @@ def _settled(
         height_sum = np.where(over[0] + over[1] > 0.0, over[0] + over[1], np.inf)
         moved = feet[0] + (feet[1] - feet[0]) * (over[0] / height_sum)[:, None] - spot
         moved = np.where(crease[:, None], moved - (moved * way).sum(axis=1)[:, None] * way, moved)
+        # within a cell: farther off the surface is another one
         spot = begin + np.clip(spot + moved - begin, -dem.cell_m, dem.cell_m)
     place = np.column_stack([spot, dem.ground_m(*spot.T)])
     slope = np.stack(dem.slope(*spot.T), axis=1)
@@ -323,6 +334,7 @@ def _settled(
     rays = [end - place for end in (source, target)]
     between = sum(r / np.maximum(np.linalg.norm(r, axis=1, keepdims=True), 1e-12) for r in rays)
     smooth = ~crease & (np.abs(moved).max(axis=1, initial=0.0) < _STILL_M)
+    # on a crease no tangent plane is defined: the plane that sends one end to the other serves
     normal = np.where(smooth[:, None], tangent, between)
     normal = normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
     above = [(r * normal).sum(axis=1) > 0.0 for r in rays]

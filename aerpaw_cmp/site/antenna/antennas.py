@@ -76,6 +76,7 @@ class HalfWaveDipole:
         zeros = _zeros(theta_rad, phi_rad)
         theta = np.asarray(theta_rad, dtype=np.float64)
         sine = np.sin(theta)
+        # along the wire both the numerator and the sine vanish; the limit of their ratio is 0
         safe = np.where(np.abs(sine) < 1e-9, 1.0, sine)
         shape = np.where(np.abs(sine) < 1e-9, 0.0, np.cos(np.pi / 2 * np.cos(theta)) / safe)
         return zeros + math.sqrt(_HALF_WAVE_DIPOLE_GAIN) * shape, zeros
@@ -135,15 +136,18 @@ class MeasuredPattern:
             raise UsageError(f"pattern '{name}' has {thetas} x {phis} samples", expected="3 or more x an even number")
         samples = np.abs(e_theta) ** 2 + (0.0 if e_phi is None else np.abs(e_phi) ** 2)
         self.peak_gain_dbi = float(db_from_power(samples.max()))
+        # a null of exactly zero is -300 dBi, not minus infinity
         self.least_gain_dbi = float(db_from_power(max(samples.min(), 1e-30)))
         self.efficiency = _sphere_mean(samples)
         if e_phi is None:
             amplitude = np.abs(e_theta)
             for row in (0, -1):  # a pole is one direction
                 amplitude[row] = np.sqrt((amplitude[row] ** 2).mean())
+            # an amplitude without polarisation has no direction to turn
             self._layers = [_spline(_torus(amplitude, +1).real)]
         else:
             theta_part, phi_part = _single_valued_poles(e_theta, e_phi)
+            # beyond a pole both unit vectors point the other way
             torus = [_torus(theta_part, -1), _torus(phi_part, -1)]
             self._layers = [_spline(layer) for part in torus for layer in (part.real, part.imag)]
 
@@ -157,12 +161,14 @@ class MeasuredPattern:
         theta, phi = np.broadcast_arrays(np.asarray(theta_rad, dtype=float), np.asarray(phi_rad, dtype=float))
         rows, columns = self._layers[0].shape
         full = 2 * np.pi
+        # in samples, not radians: rows and columns of the torus
         at = np.stack([(theta % full).ravel() * (rows / full), (phi % full).ravel() * (columns / full)])
         parts = [
             map_coordinates(layer, at, order=3, mode="grid-wrap", prefilter=False).reshape(theta.shape)
             for layer in self._layers
         ]
         if len(parts) == 1:
+            # a cubic spline swings below zero beside a deep null, and an amplitude cannot
             return np.maximum(parts[0], 0.0).astype(np.complex128), _zeros(theta, phi)
         return parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]
 
@@ -188,6 +194,7 @@ def _sphere_mean(gain: FloatArray) -> float:
     """Mean over the sphere of rows theta = 0..pi: exact where the gain is linear in cos theta between rows."""
     theta = np.linspace(0, np.pi, gain.shape[0])
     edges = np.concatenate([[0.0], (theta[1:] + theta[:-1]) / 2, [np.pi]])
+    # area of the band about each row: at a pole it is not zero, as the sine there would be
     weight = np.cos(edges[:-1]) - np.cos(edges[1:])
     return float((gain.mean(axis=1) * weight).sum() / 2)
 
@@ -266,6 +273,7 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     fields = np.moveaxis(amplitude_from_db(amplitude_db) * np.exp(1j * phase), -1, 0)
     e_theta, e_phi = _unfold(fields) if folded else fields
     along = _points_along_phi(e_theta.T, e_phi.T)
+    # phi is then a turntable's angle: azimuth runs against it
     if not along:
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
     pattern = MeasuredPattern(path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
@@ -280,6 +288,7 @@ _FREQUENCY = re.compile(
 
 
 def _read_rows(path: Path) -> _Rows:
+    # spreadsheets put a byte-order mark in front, which would hide the first header
     text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig")
     rows = _Rows(np.zeros((0, 7)))
     values: list[list[float]] = []
@@ -313,6 +322,7 @@ def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
     if not rows.lines or text.endswith(("\n", "\r")):
         return
     lines = text.splitlines()
+    # digits behind the point of the last cell: all rows of a lab's file have as many
     places = [len(lines[number - 1].split()[-1].rpartition(".")[2]) for number in rows.lines]
     if len(places) > 1 and len(set(places[:-1])) == 1 and places[-1] < places[0]:
         raise InputError(
@@ -324,6 +334,7 @@ def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
 
 
 def _check_header(line: str, path: Path, number: int) -> None:
+    # headers differ in blanks and points from file to file
     columns = [re.sub(r"[\s.]", "", cell.lower()) for cell in line.split("\t")]
     if len(columns) != 7 or not all(cell.startswith(column) for cell, column in zip(columns, _COLUMNS, strict=True)):
         cause = "the columns are not separated by tabs" if len(columns) == 1 else None
@@ -355,6 +366,7 @@ def _check_units(rows: _Rows, path: Path) -> None:
     for columns, what in (((0, 1), "angles"), ((5, 6), "phases")):
         largest = np.abs(values[:, columns]).max(axis=1)
         worst = int(largest.argmax())
+        # a tenth beyond a turn is rounding of a table, more is degrees
         if largest[worst] > 2 * np.pi + 0.1:
             raise InputError(
                 f"{what} reach {largest[worst]:g}",
@@ -371,6 +383,7 @@ def _check_units(rows: _Rows, path: Path) -> None:
             path=path,
             line=rows.lines[worst],
         )
+    # the file says the sum, too: a check of units that costs nothing
     total = db_from_power(power_from_db(values[:, 3]) + power_from_db(values[:, 4]))
     wrong = np.flatnonzero(np.abs(total - values[:, 2]) > 0.05)
     if len(wrong):
@@ -386,6 +399,7 @@ def _check_units(rows: _Rows, path: Path) -> None:
 
 def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
     """Give whether theta is a full circle, and rows as (phis, thetas, 7); both angles complete and equally spaced."""
+    # five digits: float32 angles of one grid line differ in the seventh
     key = np.round(rows.values[:, :2], 5)
     phi, at_phi = np.unique(key[:, 0], return_inverse=True)
     theta, at_theta = np.unique(key[:, 1], return_inverse=True)
@@ -409,6 +423,7 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
             path=path,
             line=None if what == "missing" else rows.lines[np.flatnonzero((at_phi == i) & (at_theta == j))[1]],
         )
+    # theta from -pi on: phi then runs half a circle only
     folded = theta[0] < -0.1
     span = np.pi if folded else 2 * np.pi
     phi_expected = np.arange(len(phi)) * (span / len(phi))
@@ -423,6 +438,7 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
                 cause="angles are missing",
                 path=path,
             )
+    # rows may come in any order
     order = np.empty((len(phi), len(theta)), dtype=np.int64)
     order[at_phi, at_theta] = np.arange(len(key))
     return bool(folded), rows.values[order]
@@ -434,6 +450,7 @@ def _unfold(folded: ComplexArray) -> ComplexArray:
     Some files keep spherical components there, some those of the cut, which differ in sign. Where phi wraps round,
     and along each meridian next to the poles, the field goes on smoothly; that tells the two apart.
     """
+    # theta is zero there
     middle = folded.shape[2] // 2
     near, far = folded[:, :, middle:].copy(), folded[:, :, middle::-1].copy()
     inner = slice(1, -1)
@@ -452,18 +469,21 @@ def _apart(first: ComplexArray, second: ComplexArray) -> float:
 
 def _mirrored(half: ComplexArray) -> ComplexArray:
     """(phis, thetas) with phi turned into -phi."""
+    # reversed, phi 0 would be last: it stays first
     return np.roll(half[::-1], 1, axis=0)
 
 
 def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
     """Check whether E_phi points along increasing phi: only then is the field near the poles one vector."""
     scores = []
+    # with the right sign the rows at both poles are one vector seen from all sides
     for sign in (1.0, -1.0):
         score = 0.0
         for row, slope in ((0, 1.0), (1, 1.0), (-2, -1.0), (-1, -1.0)):
             power = float((np.abs(e_theta[row]) ** 2 + np.abs(e_phi[row]) ** 2).mean())
             score += power * _pole_vectors(e_theta, sign * e_phi, row, slope)[2]
         scores.append(score)
+    # clearly better, or AERPAW's own sense is taken
     return scores[0] > 1.05 * scores[1] + 1e-6
 
 
@@ -479,6 +499,7 @@ def check_power(pattern: MeasuredPattern, path: Path, *, most_db: float = 0.5) -
         Greatest mean gain over the sphere; an antenna without loss has 0 dB, the rest is error of the measurement.
     """
     # without a gain below that of an isotropic antenna none can lie above it
+    # linear gains read as dBi lie between 0 and a few: no antenna is above isotropic everywhere
     linear = pattern.least_gain_dbi >= 0.0 and pattern.peak_gain_dbi - pattern.least_gain_dbi > most_db
     if linear or not _MINIMUM_EFFICIENCY <= pattern.efficiency <= power_from_db(most_db):
         raise InputError(
@@ -533,6 +554,7 @@ def read_gain_grid(path: str | Path, variable: str) -> MeasuredPattern:
         )
     if gain.max() > HIGHEST_DBI:
         raise InputError(f"'{variable}' reaches {gain.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
+    # the second modulo: 359.9999999 rounds to 360, which is 0
     by_azimuth = np.argsort(np.round(azimuth % 360.0, 6) % 360.0)
     gain = gain[np.argsort(-elevation)][:, by_azimuth]
     pattern = MeasuredPattern(variable, np.sqrt(power_from_db(gain)).astype(np.complex128), None)

@@ -12,6 +12,7 @@ from .antennas import MeasuredPattern, check_power
 from .learned import BAND
 from .sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid
 
+# As the cuts of planning tools are read: finer than any lobe that a flight can teach.
 _STEP_DEG = 3.0
 
 
@@ -43,6 +44,7 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
         frequency = pattern.frequency_hz or carrier_hz
         if not frequency:
             raise UsageError("the pattern has no frequency", expected="--carrier HZ", path=target)
+        # the antenna of another band is another antenna
         if abs((carrier_hz or frequency) / frequency - 1.0) > BAND:
             raise UsageError(
                 f"a pattern of {frequency / 1e9:g} GHz", expected="--carrier within 2 % of it", path=target
@@ -63,12 +65,14 @@ def _sionna_module(pattern: MeasuredPattern, name: str, target: Path, notes: tup
     import base64
 
     theta, phi, _ = sphere_grid(_STEP_DEG)
+    # closed at 360 deg: the module that is written interpolates within its table, not round its end
     at = np.meshgrid(np.radians(theta), np.radians(np.append(phi, 360.0)), indexing="ij")
     table = np.stack([part for field in pattern.field(*at) for part in (field.real, field.imag)], axis=-1)
     template = Path(__file__).with_name("sionna_pattern.txt").read_text(encoding="utf-8")
     return template.format(
         name=re.sub(r"\W", "_", name),
         module=re.sub(r"\W", "_", target.stem),
+        # notes stand in a docstring: a quote or a backslash of a file name would end it
         notes="\n".join(re.sub(r'["\\]', "'", note) for note in notes),
         table=base64.b64encode(table.astype("<f4").tobytes()).decode("ascii"),
         shape=table.shape,

@@ -25,10 +25,12 @@ from ...common.yamlfile import StrictModel, dump_yaml, load_yaml
 _INDEX = "learned.yaml"
 
 # Share by which a carrier may differ from the one that an antenna was learned at.
+# Lake Wheeler's bands at 3.3, 3.4 and 3.51 GHz lie 3 % apart: other antennas, other gains.
 BAND = 0.02
 
 
 # Readers of exports of one receiver: what the one taught holds for the other.
+# The same phone and the same readings, saved by its program as KML or as CSV.
 _EXPORTS = {"nemo_kml": "nemo_csv"}
 
 
@@ -177,6 +179,7 @@ class Learned(StrictModel):
 class _Index(Learned):
     """The same as it is written, with entries of any version."""
 
+    # a newer entry must not be lost because an older version adds one beside it
     entries: dict[_Name, Entry | _Foreign] = Field(default_factory=dict)  # type: ignore[assignment]
 
 
@@ -206,6 +209,7 @@ def _read(folder: Path, model: type[Learned]) -> Learned:
     index = inside(folder, _INDEX, folder / _INDEX)
     memory = load_yaml(index, model) if index.is_file() else model()
     for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
+        # before any is opened: an index may come from a stranger
         inside(folder, name, index, plain=True)
     return memory
 
@@ -234,12 +238,15 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
         As :func:`read_learned`; the folder cannot be written.
     """
     folder = folder_of(site)
+    # mtime=0: the same content has the same bytes, and so the same SHA-256
     packed = {file: gzip.compress(content, 9, mtime=0) for file, content in files.items()}
     tables = {file: hashlib.sha256(content).hexdigest() for file, content in packed.items()}
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
+        # two calibrations of one site at once: each must see the other's entry
         with locked(folder):
             memory = _read(folder, _Index)
+            # what an entry names with its digest is ours; all else is somebody's file
             written = {item for known in memory.entries.values() for item in known.tables.items()}
             for file in packed:
                 place = inside(folder, file, folder / _INDEX, plain=True)
@@ -253,9 +260,11 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
                 write_whole(folder / file, content)
             entries = dict(sorted({**memory.entries, name: entry.model_copy(update={"tables": tables})}.items()))
             text = dump_yaml(memory.model_copy(update={"entries": entries}).model_dump(mode="json", exclude_none=True))
+            # after the tables that it names: a reader meets no entry without its files
             write_whole(folder / _INDEX, text)
             used = {file for known in entries.values() for file in files_of(known)}
             for file, digest in sorted(written):
+                # changed since, it is no longer the table that was written: it stays
                 if file not in used and (folder / file).is_file() and file_digest(folder / file) == digest:
                     (folder / file).unlink()
     return [folder / _INDEX, *(folder / file for file in files)]
@@ -269,6 +278,7 @@ def carry_memory(base: str | Path, site: Path) -> list[str]:
     entries = read_learned(base).entries
     with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
+        # the index last: until it is there the new site has no memory
         for name in [*sorted(set().union(*map(files_of, entries.values()))), _INDEX]:  # without it there is no memory
             place = inside(origin, name, origin / _INDEX, plain=True)
             if place.is_file() and not (folder / name).exists():
@@ -311,6 +321,7 @@ def read_table(path: Path, expected: str) -> bytes:
     if not content.startswith(b"\x1f\x8b"):
         return content
     with parsing(path, expected, "a cut copy"), gzip.open(path) as book:
+        # one byte more than allowed tells a table that is too large without unpacking all of it
         unpacked = book.read(LARGEST_TABLE + 1)
     if len(unpacked) > LARGEST_TABLE:
         raise InputError(f"it unpacks to more than {LARGEST_TABLE} bytes", expected=expected, path=path)
@@ -329,6 +340,7 @@ class Named(StrictModel):
         if end == "tower":
             return next((s for s in self.entry.series if f"{s.tower}.{s.channel}" == self.part), None)
         exact = [s for s in self.entry.series if (s.tower, s.channel) == (tower, channel)]
+        # an airframe carries one antenna, whichever channel taught it
         return next(iter([*exact, *self.entry.series]), None)
 
 
@@ -347,6 +359,7 @@ def find_named(name: str, folder: Path) -> Named:
         No such site, entry or part; a memory that cannot be read.
     """
     site, _, entry_part = name.rpartition("/")
+    # a site beside the flight file comes before a packaged one of its name
     place: str | Path = folder.absolute() / f"{site}.yaml"  # the paths in it hold in any working folder
     packaged = folder_of(site)
     if not folder_of(place).is_dir() and packaged.is_absolute() and packaged.is_dir():

@@ -14,6 +14,7 @@ from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.units import FloatArray
 
 # Share of the variance by which rounded values may miss the function.
+# The file has gains to 0.01 dB and angles to 0.1 deg: neighbours may contradict by as much.
 _NUGGET = 1e-3
 
 _HEAD = re.compile(r"^# pair: length (\S+) sd_db (\S+)$", re.MULTILINE)
@@ -47,6 +48,7 @@ class PairGain:
     @cached_property
     def _factor(self) -> Factor:
         matrix = gaussian_kernel(self.directions, self.directions, self.length)
+        # directions flown twice would make two equal rows, which have no factor
         matrix[np.diag_indices(len(matrix))] += _NUGGET
         return Factor.of(matrix)
 
@@ -71,10 +73,12 @@ class PairGain:
         """
         gain, sd = np.empty(len(directions)), np.empty(len(directions))
         white = self._factor.whiten(self.gain_db)
+        # bounds the memory of the kernel against all known directions
         for start in range(0, len(directions), 4096):
             part = slice(start, start + 4096)
             across = gaussian_kernel(directions[part], self.directions, self.length)
             gain[part], known = self._factor.condition(across, white)
+            # a share: rounding takes it beyond 1 at a known direction
             known = np.minimum(known, 1.0)
             near = across @ self.sd_db**2 / np.maximum(across.sum(axis=1), 1e-12)
             away = apart_sd_db[part] ** 2 + self.prior_sd_db**2

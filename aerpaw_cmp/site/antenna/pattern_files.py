@@ -19,6 +19,7 @@ from ...common.units import FloatArray, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
 from .sphere_pattern import COLUMNS, read_sphere_csv
 
+# A half-wave dipole over an isotropic antenna.
 _DBI_OF_DBD = 2.15
 STEP_DEG = 3.0
 
@@ -80,9 +81,11 @@ def _planet(text: str, path: Path) -> dict[str, FloatArray]:
     gain = _GAIN.search(text)
     if gain is None:
         raise InputError("no line 'GAIN value dBi'", expected="GAIN in dBi or dBd", path=path)
+    # MSI Planet's own default is dBd
     peak = float(gain[1]) + (0.0 if (gain[2] or "dBd").lower() == "dbi" else _DBI_OF_DBD)
     cuts: dict[str, FloatArray] = {}
     for cut in _PLANET.finditer(text):
+        # the header says how many lines follow; what stands behind them is the next cut's
         rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]), path)
         cuts[cut[1].upper()] = _each_degree(rows, cut[1], path)
     return _about_peak(cuts, peak, path)
@@ -91,6 +94,7 @@ def _planet(text: str, path: Path) -> dict[str, FloatArray]:
 def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dict[str, FloatArray]:
     """Gain [dBi] of cuts that hold attenuations below the peak, of whichever sign the program wrote."""
     values = np.concatenate(list(cuts.values()))
+    # attenuations have one sign, whichever; both signs are gains about a level
     if min(-values.min(), values.max()) > _RIPPLE_DB:
         raise InputError(
             f"values from {values.min():g} to {values.max():g} dB below the peak",
@@ -132,6 +136,7 @@ def _each_degree(rows: FloatArray, cut: str, path: Path) -> FloatArray:
     if np.ptp(rows[:, 0]) <= 180.0 and np.abs(rows[:, 0]).max() <= 90.0:  # front half alone: the back as the front
         angle, value = np.concatenate((angle, (180.0 - rows[:, 0]) % 360.0)), np.concatenate((value, value))
     order = np.argsort(angle, kind="stable")
+    # round the circle: the gap over the front counts too
     if np.diff(np.append(angle[order], angle[order][0] + 360.0)).max() > 15.0:
         raise InputError(f"cut {cut} has gaps above 15 deg", expected="a full circle", path=path)
     return np.asarray(np.interp(np.arange(360.0), angle[order], value[order], period=360.0))
@@ -146,7 +151,9 @@ def _from_cuts(cuts: dict[str, FloatArray], name: str, path: Path, frequency_hz:
     theta, phi = _grid()
     below = np.degrees(theta) - 90.0
     around = np.degrees(phi)
+    # how far round the back: it weighs the vertical cut's front against its back
     share = np.minimum(around, 360.0 - around) / 180.0  # 0 in front, 1 behind
+    # planning tools count clockwise, azimuth here counter-clockwise
     level = _at(horizontal, -around)[None, :] + (1.0 - share)[None, :] * (_at(vertical, below) - horizontal[0])[:, None]
     level = level + share[None, :] * (_at(vertical, 180.0 - below) - horizontal[180])[:, None]
     return _pattern(level, name, path, frequency_hz)
@@ -181,12 +188,14 @@ def _great_circle(text: str, name: str, path: Path, carrier_hz: float | None) ->
             raise InputError(f"{len(frequencies)} frequencies", expected="a carrier that says which", path=path)
         frequency = float(frequencies[np.argmin(np.abs(frequencies - carrier_hz))])
     cut = table[table[:, 0] == frequency]
+    # -pi and pi, or a row written twice: interpolation needs ascending angles
     _, once = np.unique(np.round(cut[:, 1], 6), return_index=True)
     angle, gain = cut[once, 1], cut[once, 2]
     if len(angle) < 8 or angle[0] > -3.1 or angle[-1] < 3.1 or np.diff(angle).max() > 0.3:
         raise InputError(f"{len(angle)} angles at {frequency / 1e6:g} MHz", expected="theta from -pi to pi", path=path)
     theta, phi = _grid()
     share = np.minimum(np.degrees(phi), 360.0 - np.degrees(phi)) / 180.0
+    # the circle's two halves: blended round the axis, since nothing says what lies between
     front, back = np.interp(theta, angle, gain), np.interp(-theta, angle, gain)
     return _pattern((1.0 - share) * front[:, None] + share * back[:, None], name, path, frequency)
 

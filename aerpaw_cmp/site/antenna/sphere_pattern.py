@@ -59,6 +59,7 @@ class SpherePattern(MeasuredPattern):
 
         theta, phi = np.broadcast_arrays(np.asarray(theta_rad, dtype=float), np.asarray(phi_rad, dtype=float))
         rows, columns = self._sd_db.shape
+        # the first meridian again behind the last, so that interpolation goes round
         wrapped = np.concatenate([self._sd_db, self._sd_db[:, :1]], axis=1)
         at = [theta.ravel() / np.pi * (rows - 1), (phi.ravel() % (2 * np.pi)) / (2 * np.pi) * columns]
         return np.asarray(map_coordinates(wrapped, at, order=1, mode="nearest").reshape(theta.shape))
@@ -66,6 +67,7 @@ class SpherePattern(MeasuredPattern):
 
 def sphere_grid(step_deg: float = 5.0) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Zenith angles (t,) and azimuths (p,) [deg] of a full sphere, and unit vectors (t, p, 3)."""
+    # both poles, but 360 deg not again: it is 0
     theta, phi = np.arange(0.0, 180.0 + step_deg / 2, step_deg), np.arange(0.0, 360.0, step_deg)
     t, p = np.radians(theta)[:, None], np.radians(phi)[None, :]
     vectors = np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
@@ -78,6 +80,7 @@ def unit_mean_gain(gain_db: FloatArray) -> FloatArray:
     The level of a learned gain is not identified: it stands in the offset.
     """
     theta = np.linspace(0.0, np.pi, gain_db.shape[0])
+    # area of a ring; a pole has none
     weight = np.sin(theta)[:, None] * np.ones_like(gain_db)
     return np.asarray(gain_db - db_from_power((power_from_db(gain_db) * weight).sum() / weight.sum()))
 
@@ -139,6 +142,7 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
     _check_grid(azimuth, elevation, len(values), path)
     row = np.argmin(np.abs(elevation[None, :] - values[:, 1:2]), axis=1)
     column = np.argmin(np.abs(azimuth[None, :] - values[:, :1] % 360.0), axis=1)
+    # the grid is complete by number, so a direction twice means another is missing
     if len(np.unique(row * len(azimuth) + column)) != len(values):
         raise InputError("a direction is given twice", expected="each direction once", path=path)
     gain, sd = np.zeros((2, len(elevation), len(azimuth)))
@@ -146,6 +150,7 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
     if len(header) > 3:
         sd[row, column] = values[:, 3]
     notes = "\n".join(line for line in text.splitlines() if line.startswith("#"))
+    # the name of the file is that of the antenna in reports
     pattern = SpherePattern(path.stem, gain, sd, notes=notes)
     check_power(pattern, path)
     return pattern
@@ -159,6 +164,7 @@ def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> Floa
     """Cells (lines, width) of numbered lines; line by line only where that finds the one that is wrong."""
     with suppress(ValueError):
         if numbered:
+            # quick for files that are right, which most are
             values = np.loadtxt([line for _, line in numbered], delimiter=",", comments=None, ndmin=2)
             if values.shape == (len(numbered), width) and not _refused(values).any():
                 return values
@@ -226,6 +232,7 @@ def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float, notes:
         Text with a line end at its end.
     """
     degrees = np.radians(np.arange(360.0))
+    # minus: HORIZONTAL runs clockwise
     level = pattern.gain_dbi(np.full(360, np.pi / 2), -degrees)
     below = np.pi / 2 + degrees  # zenith angle on the great circle through the boresight
     over = pattern.gain_dbi(below, np.zeros(360))

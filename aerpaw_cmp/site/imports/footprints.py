@@ -45,7 +45,9 @@ from .tags import (
     positive_metres,
 )
 
+# OpenStreetMap's own rule of thumb for a storey.
 _LEVEL_M = 3.0
+# Two storeys: a barn, a house.
 _DEFAULT_HEIGHT_M = 6.0
 TALLEST_M = 300.0
 # Outlines farther from the origin are not of this site.
@@ -166,6 +168,7 @@ def import_footprints(
         _sort(content, Path(path), frame, untagged, shapes, result.actions)
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
+    # heights before duplicates go: a part may have its height from an outline that repeats another
     _inherit(shapes["building"], result.actions)
     _warn_of_feet(shapes["building"], result.actions)
     near = None if area_m is None else box(area_m[0], area_m[2], area_m[1], area_m[3]).buffer(_FOREST_MARGIN_M)
@@ -224,10 +227,12 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
     crown = positive_metres(tree.tags, ("diameter_crown", "crown_diameter"), notes)
     girth = positive_metres(tree.tags, ("circumference",), notes)
     points = np.stack(frame.to_local(*np.array(tree.positions, dtype=np.float64).reshape(-1, 2).T), axis=1)
+    # a torn number of degrees projects to infinity
     points = points[np.isfinite(points).all(axis=1)]
     if not len(points) or float(np.hypot(*points.mean(axis=0))) > FAR_M:
         actions.append(f"{tree.source}: a tree left out, it does not stand at the site")
         return []
+    # a tree row is mapped as a line
     if len(points) > 1:
         points = _along(points, crown or _ROW_SPACING_M)
         notes.append(f"{counted(len(points), 'tree')} placed along the row, {crown or _ROW_SPACING_M:g} m apart")
@@ -248,6 +253,7 @@ def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> 
     near_shapes = []
     for shape in shapes:
         inside = shape.area if near is None else _areas_only(shape.area.intersection(near))
+        # less is rounding of the cut, not worth a line
         if inside.area < 0.999 * shape.area.area:
             lost = (shape.area.area - inside.area) / 1e4
             actions.append(
@@ -262,6 +268,7 @@ def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> 
 def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float | None) -> None:
     actions = result.actions
     buildings = _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions)
+    # woods have no height that could decide: the first in the file keeps the ground
     woods = _first_keeps(_without_duplicates(shapes["forest"], actions), actions)
     for name, shape, area in _parts(buildings, actions):
         result.buildings.append(
@@ -270,6 +277,7 @@ def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float 
     for name, shape, area in _parts(woods, actions):
         wood = Forest(name, area, source=shape.source, evergreen_share=shape.evergreen)
         result.forests.append(
+            # 0 is "not stated"
             wood if canopy_m is None else replace(wood, height_m=round(shape.height_m, 2) or canopy_m)
         )
     for name, _, area in _parts(shapes["geofence"], actions):
@@ -297,6 +305,7 @@ def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
     if not positions:
         return
     latitude, longitude = np.array(positions).T
+    # one outline near is enough: a file may reach beyond the site
     if _distance_m(latitude, longitude, frame).min() <= FAR_M:
         return
     centre = f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}"
@@ -326,6 +335,7 @@ def _distance_m(latitude: Any, longitude: Any, frame: SiteFrame) -> Any:
     """Rough distance [m] from the origin; inf where it is no position on Earth."""
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
     north = np.where(good, latitude, 0.0) - frame.latitude_deg  # a torn number may be 1e306
+    # the short way round the Earth
     turn = (np.where(good, longitude, 0.0) - frame.longitude_deg + 180) % 360 - 180
     east = turn * math.cos(math.radians(frame.latitude_deg))
     return np.where(good, 111_200 * np.hypot(north, east), np.inf)
@@ -335,6 +345,7 @@ def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape |
     """The outline in metres, valid; None (and a line in ``actions``) when nothing is left."""
     areas, notes = [], []
     for outer, holes in outline.parts:
+        # no outline spans half of the Earth: it goes over 180 degrees
         if max(np.abs(np.diff([p[1] for p in outer])), default=0) > 180:
             notes.append("crosses the antimeridian; its parts were joined")
         ring = _ring(outer, frame)
@@ -346,6 +357,7 @@ def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape |
         if len(inner) < len(holes):
             notes.append("a hole with fewer than 3 distinct points was left out")
         if inner:
+            # holes joined first: two that overlap would make an outline that is not valid
             without = shapely.union_all([_repaired(hole, notes, "a hole was repaired") for hole in inner])
             if not without.intersects(area):
                 notes.append("a hole outside its outline was left out")
@@ -379,6 +391,7 @@ def _why_no_ring(positions: Sequence[Position]) -> str:
 
 
 def _ring(positions: Sequence[Position], frame: SiteFrame) -> Polygon | None:
+    # a ring repeats its first point, and some repeat all
     if len(set(positions)) < 3:
         return None
     latitude, longitude = np.array(positions).T
@@ -394,6 +407,7 @@ def _repaired(ring: Polygon, notes: list[str], note: str) -> BaseGeometry:
         notes.append(f"a ring that crosses itself at more than {MAX_CROSSINGS} places was left out")
         return Polygon()
     notes.append(f"{note} ({shapely.is_valid_reason(ring).split('[')[0].lower()})")
+    # "structure" keeps what the ring runs round; "linework" would make holes of what it runs round twice
     return _areas_only(shapely.make_valid(ring, method="structure"))
 
 
@@ -405,6 +419,7 @@ def _areas_only(shape: BaseGeometry) -> BaseGeometry:
 
 
 def _describe(shape: _Shape, outline: Outline, path: Path, actions: list[str]) -> None:
+    # shapefiles write the names of their columns in capitals
     tags = {key.lower(): value for key, value in outline.tags.items()}
     notes: list[str] = []
     height = height_of(tags, notes)
@@ -426,6 +441,7 @@ def _describe(shape: _Shape, outline: Outline, path: Path, actions: list[str]) -
         )
     shape.height_m = height
     shape.material = material_of(tags)
+    # 3.28 feet a metre: such a ratio of height to storeys is no accident
     if height > 2 * _LEVEL_M and levels and 2.7 <= height / (levels * _LEVEL_M) <= 4.5:
         shape.stated = False  # counted by _warn_of_feet
         actions.append(f"warning: {shape.source}: {height:g} m for {levels:g} levels; are these feet?")
@@ -433,6 +449,7 @@ def _describe(shape: _Shape, outline: Outline, path: Path, actions: list[str]) -
 
 def _inherit(shapes: list[_Shape], actions: list[str]) -> None:
     """Parts without a height are as high as the building whose outline holds them."""
+    # whole buildings whose height the map states
     known = [shape for shape in shapes if not (shape.part or shape.assumed)]
     tree = shapely.STRtree([shape.area for shape in known])
     for part in (shape for shape in shapes if shape.part and shape.assumed):
@@ -486,6 +503,7 @@ def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape
             continue
         for j in sorted(int(k) for k in tree.query(shape.area) if k > i and int(k) not in duplicates):
             other = shapes[j]
+            # of like size first: an intersection is dear
             ratio = shape.area.area / max(other.area.area, 1e-9)
             alike = shape.part == other.part and 0.98 < ratio < 1.02
             if not (alike and shape.area.intersection(other.area).area > 0.98 * shape.area.area):
@@ -503,6 +521,7 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
         return []
     areas = np.array([shape.area for shape in shapes], dtype=object)
     first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
+    # neighbours share a wall, and rounding an area of it
     overlap = shapely.area(shapely.intersection(areas[first], areas[second])) > 0.01
     pairs = coo_array((overlap[overlap], (first[overlap], second[overlap])), shape=(len(shapes), len(shapes)))
     groups: dict[int, list[_Shape]] = {}
@@ -538,6 +557,7 @@ def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
     disjoint: list[_Shape] = []
+    # from the highest down: what is under a higher roof is not seen
     for shape in sorted(group, key=lambda shape: -shape.height_m):
         over = [higher for higher in disjoint if higher.area.intersects(shape.area)]
         free = _areas_only(shape.area.difference(shapely.union_all([higher.area for higher in over])))

@@ -55,8 +55,10 @@ def read_map_file(path: str | Path) -> MapFile:
     """
     path = Path(path)
     data = read_input(path, MAX_BYTES, "a map file")
+    # by content: browsers save a KMZ as .zip or .kml
     if data.startswith(b"PK\x03\x04"):
         data = _unzipped(data, path)
+    # a byte-order mark and blank lines may stand before the first sign
     start = data[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
     if not data.strip():
         raise InputError("the file is empty", expected=FORMATS, path=path)
@@ -86,6 +88,7 @@ def _unzipped(data: bytes, path: Path) -> bytes:
     maps = {name.lower(): member for name, member in members.items() if name.lower().endswith(".kml")}
     if not maps:
         raise InputError("an archive without a .kml file", expected="KMZ", path=path)
+    # what Google Earth opens: doc.kml, else the first
     main = maps.get("doc.kml") or next(iter(maps.values()))
     if main.size > MAX_BYTES:
         raise InputError(f"{main.name} has {main.size} bytes", expected=f"at most {MAX_BYTES}", path=path)
@@ -97,6 +100,7 @@ def _from_json(data: bytes, path: Path) -> MapFile:
         text = data.decode("utf-8-sig")
         content = json.loads(text)
     except json.JSONDecodeError as error:
+        # an error at the very end is a text that ends too early
         cause = "the file was cut off" if error.pos >= len(text.rstrip()) - 1 else None
         raise InputError(f"not JSON: {error.msg}", cause=cause, path=path, line=error.lineno) from None
     except UnicodeDecodeError as error:
@@ -106,6 +110,7 @@ def _from_json(data: bytes, path: Path) -> MapFile:
         ) from None
     if isinstance(content, dict) and isinstance(content.get("elements"), list):
         result = read_elements("Overpass JSON", content["elements"], path, _lines_of(text, "elements"))
+        # Overpass answers with status 200 and a remark when it ran out of time
         if remark := content.get("remark"):
             result.notes.append(f"warning: {path.name}: the Overpass server says: {str(remark)[:200]}")
         return result
@@ -170,6 +175,7 @@ def _check_crs(crs: Any, path: Path) -> None:
     """GeoJSON of before RFC 7946 may name a coordinate system; only WGS84 can be used."""
     named = crs.get("properties") if isinstance(crs, dict) else crs
     name = str(named.get("name", "CRS84") if isinstance(named, dict) else named or "CRS84")
+    # 4979 is WGS84 with heights
     if not any(code in name for code in ("CRS84", "4326", "4979")):
         raise InputError(
             f"coordinates in {name}",
@@ -183,6 +189,7 @@ def _feature(feature: Any, number: int, result: MapFile, lines: Counter[str], pa
     is_feature = feature.get("type") == "Feature"
     properties = (feature.get("properties") or {}) if is_feature else {}
     tags = _words(properties)
+    # some exporters, osmtogeojson among them, keep OSM's tags in an object of their own
     if isinstance(nested := properties.get("tags"), dict):
         tags.update(_words(nested))
     identity = str(feature.get("id", tags.get("@id", number)))
@@ -214,6 +221,7 @@ def _geometry(geometry: dict[str, Any], outline: Outline, result: MapFile, lines
     if single == "Polygon":
         for rings in several:
             _polygon(rings, outline, path)
+    # points and lines are trees only where they say so
     elif (single, natural) in (("Point", "tree"), ("LineString", "tree_row")):
         rows = [[points] if single == "Point" else points for points in several]
         source = outline.source
@@ -235,6 +243,7 @@ def _polygon(rings: list[Any], outline: Outline, path: Path) -> None:
 def _from_xml(data: bytes, path: Path) -> MapFile:
     if b"<html" in data[:4096].lower():
         raise InputError("a web page", expected=FORMATS, cause="the server's message was saved, not the map", path=path)
+    # counted before parsing: a parser would have filled the memory by then
     if (tags := data.count(b"<")) > MAX_TAGS:
         raise InputError(
             f"the XML has {tags} tags",
@@ -330,6 +339,7 @@ def _kml_height(polygons: list[ElementTree.Element], outline: Outline) -> None:
     modes = {mode for polygon in polygons for mode in kml.modes_of(polygon)}
     cells = [place[2] for polygon in polygons for place in kml.cells_of(polygon) if len(place) == 3]
     highest = max((float(height) for height in cells if _HEIGHT.fullmatch(height)), default=0.0)
+    # heights above sea level say nothing of a building
     if modes == {"relativeToGround"} and highest > 0.0:
         outline.tags = {"height": f"{highest:g}", **outline.tags}
 

@@ -60,6 +60,7 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
     lines: Counter[str] = Counter()
     used_ways = _relations(data, result, lines, line_of)
     for identity, way in data.ways.items():
+        # a way without tags is part of a relation, or nothing
         if way.get("tags") and identity not in used_ways:
             try:
                 _way_outline(identity, way, data, result, lines)
@@ -79,12 +80,14 @@ def _sort(element: Element, index: int, data: _Data) -> None:
     if element["type"] == "node":
         if element.get("lat") is None and element.get("lon") is None:
             return  # out ids, out tags: no position was asked for
+        # ids as text: OSM XML has them so, Overpass as numbers
         data.nodes[identity] = lonlat((element.get("lon"), element.get("lat")), f"node {identity}", data.path)
         if (element.get("tags") or {}).get("natural") == "tree":
             data.trees[identity] = _words(element)
     elif element["type"] in ("way", "relation"):
         store = data.ways if element["type"] == "way" else data.relations
         given = {key: value for key, value in {**element, "index": index}.items() if value is not None and value != {}}
+        # "out body; >; out skel;" gives a way with tags, then once more without
         store[identity] = {**store.get(identity, {}), **given}
 
 
@@ -106,6 +109,7 @@ def _way_outline(identity: str, way: Element, data: _Data, result: MapFile, line
         result.trees.append(TreeLine(outline.source, outline.tags, tuple(ring)))
         result.notes += [f"{outline.source}: {fault}" for fault in outline.broken]
         return
+    # with "out geom" there are positions and no ids: a ring closes by place
     references = way.get("nodes") or ring
     if not references or references[0] != references[-1]:
         if kind_of(outline.tags) is None:
@@ -144,10 +148,12 @@ def _relations(data: _Data, result: MapFile, lines: Counter[str], line_of: LineO
     used_ways: set[str] = set()
     for identity, relation in data.relations.items():
         tags = _words(relation)
+        # sites, routes and the like collect things and bound no area
         if tags.get("type") not in ("multipolygon", "boundary"):
             if kind_of({k: v for k, v in tags.items() if k != "type"}):
                 lines[f"relations of type '{tags.get('type', '')}'"] += 1
             continue
+        # old relations leave the role of an outer way empty
         outer = [str(m.get("ref")) for m in relation.get("members") or [] if m.get("role") in ("outer", "", None)]
         own = [ref for ref in outer if (data.ways.get(ref) or {}).get("tags")]
         kind = kind_of({k: v for k, v in tags.items() if k != "type"})
@@ -177,6 +183,7 @@ def _multipolygon(relation: Element, data: _Data, outline: Outline) -> None:
             if member.get("type") == "relation":
                 outline.broken.append(f"its member relation {member.get('ref')} was left out")
             continue
+        # Overpass gives a member's line with the relation, XML by its id
         way = member if isinstance(member.get("geometry"), list) else data.ways.get(str(member.get("ref")))
         if way is None:
             outline.broken.append(f"way {member.get('ref')} is not in the file")
@@ -201,6 +208,7 @@ def _inside(ring: list[Position], shell: list[Position]) -> bool:
     shapes = [Polygon(line) for line in (ring, shell)]
     if any(not shape.is_valid and is_tangled(shape) for shape in shapes):
         return False
+    # a ring that crosses itself covers nothing until it is repaired
     inner, outer = (shapely.make_valid(shape) for shape in shapes)
     return bool(inner.area < outer.area and shapely.covers(outer, inner))
 
@@ -219,6 +227,7 @@ def _join_rings(lines: list[list[Position]], outline: Outline) -> list[list[Posi
     rings, open_ = [], [list(line) for line in lines if len(line) > 1]
     while open_:
         ring = open_.pop()
+        # pieces come in any order and direction
         while ring[0] != ring[-1] and (index := _next_piece(ring, open_)) is not None:
             piece = open_.pop(index)
             if ring[-1] in (piece[0], piece[-1]):

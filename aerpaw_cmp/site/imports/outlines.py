@@ -83,6 +83,7 @@ def is_tangled(ring: Polygon) -> bool:
     """Check whether a ring crosses itself at more than :data:`MAX_CROSSINGS` places; in pieces, with an early end."""
     line = np.asarray(ring.exterior.coords)[:, :2]
     segments = shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1))
+    # too few pairs to cross so often
     if len(segments) * (len(segments) - 1) // 2 <= MAX_CROSSINGS:
         return False
     tree, crossings = shapely.STRtree(segments), 0

@@ -17,6 +17,7 @@ _FOREST_TAGS = (("landuse", "forest"), ("natural", "wood"), ("landcover", "trees
 _NOT = ("no", "", "none", "false", "0")
 _UNITS_M = {"m": 1.0, "cm": 0.01, "km": 1000.0, "ft": _FOOT_M}
 _UNIT_WORDS = {"metre": "m", "meter": "m", "foot": "ft", "feet": "ft"}
+# OSM's words for what P.2040 has under another name, or nearly.
 _MATERIAL_WORDS = {
     "steel": "metal",
     "aluminium": "metal",
@@ -39,6 +40,7 @@ def kind_of(tags: Mapping[str, str]) -> Kind | None:
         return "building"
     if any(tags.get(key) == value for key, value in _FOREST_TAGS):
         return "forest"
+    # not OSM's: keys of our own exports and of hand-made GeoJSON
     word = tags.get("kind", tags.get("type", ""))
     for kind in ("building", "forest", "geofence"):
         if word == kind or (kind == "geofence" and kind in tags):
@@ -63,6 +65,7 @@ def below_ground(tags: Mapping[str, str]) -> bool:
     """
     if "underground" in (tags.get("location", "").lower(), tags.get("parking", "").lower()):
         return True
+    # below zero things lie under others
     layer = _number(tags.get("layer", ""))
     if tags.get("tunnel", "no").lower() not in _NOT or (layer is not None and layer < 0):
         return True
@@ -108,6 +111,7 @@ def metres(text: str) -> float | None:
         text = text.replace(typed, plain)
     if re.search(r"\d,\d{3}(?!\d)", text):
         return None
+    # a decimal comma, now that thousands are refused
     text = text.replace(",", ".")
     if match := re.fullmatch(r"(-?\d+(?:\.\d+)?)\s*(m|cm|km|ft|metre|meter|foot|feet)?s?\.?", text):
         unit = match.group(2) or "m"
@@ -126,11 +130,13 @@ def positive_metres(tags: Mapping[str, str], keys: tuple[str, ...], notes: list[
         written = tags.get(key, "").strip()
         if not written:
             continue
+        # OSM joins several values by semicolons
         parts = [metres(part.strip().lstrip("~")) for part in written.split(";")]
         lengths = [value for value in parts if value is not None]
         if len(lengths) < len(parts):
             notes.append(f"the {key} '{written}' is not a length")
             continue
+        # exports of databases write 0 or -1 for "unknown"
         if max(lengths) <= 0:
             notes.append(f"the {key} '{written}' is not above 0, as where nobody knows it")
             continue
@@ -162,6 +168,7 @@ def height_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
     names = [name for name in tags if re.search("height|hgt|hght", name.lower())]
     names = [name for name in names if not _OTHER_HEIGHTS.search(name.lower())]
     first = ("height", "building:height", "height_m", "est_height")
+    # OSM's own key first; foreign columns after it, in the file's order
     for name in sorted(names, key=lambda n: first.index(n) if n in first else len(first)):
         named = _UNIT_AT_END.search(name.lower())
         unit = named[1] if named else "ft" if _FEET.search(name.lower()) else tags.get(f"{name}_unit", "")

@@ -116,6 +116,7 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
             raise InputError(
                 f"the header says '{line.strip()[:60]}'", expected="a PLY header", path=path, line=number
             ) from None
+    # a negative count would read backwards
     if kind not in ("ascii", "binary_little_endian", "binary_big_endian") or any(e.count < 0 for e in elements):
         raise InputError(f"a PLY of format '{kind}'", expected="ascii or binary", path=path)
     return kind, elements, start
@@ -150,6 +151,7 @@ class _Body:
 
     def take(self, kind: Any, count: int, element: _Element) -> AnyArray:
         """The next ``count`` items of a type."""
+        # numpy's own order is that of this machine
         what = np.dtype(kind).newbyteorder(self.order)
         if count < 0 or self.place + count * what.itemsize > len(self.data):
             raise InputError(
@@ -167,8 +169,10 @@ class _Body:
         begun = self.place
         if not element.count or not least:
             return {name: np.zeros((0, 1)) for name, *_ in element.properties}
+        # a header that promises more than the file holds ends here, before memory is asked for it
         self.take(("V", least), element.count, element)  # or no row need be looked at
         self.place = begun
+        # most meshes are triangles throughout: lists as long as the first are read as one table
         first, fields = self._row(element), list[Any]()
         for i, ((_, kind, length), values) in enumerate(zip(element.properties, first, strict=True)):
             fields += [(f"length {i}", length)] if length else []
@@ -224,5 +228,6 @@ def _fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[I
             height = np.einsum("pki,pi->pk", points - points[:, :1], normal / np.where(size > 0.0, size, 1.0))
             bent += int((np.abs(height).max(axis=1) > _FLAT_M).sum())
         for k in range(1, corners - 1):
+            # a fan from the first corner
             triangles.append(group[:, [0, k, k + 1]])
     return (np.concatenate(triangles) if triangles else np.zeros((0, 3), dtype=np.int64)), bent

@@ -29,6 +29,7 @@ from .meshfiles import RawMesh, read_mesh
 _DEFAULT_THICKNESS_M = 0.1
 
 _LARGEST_XML = 256 * 2**20
+# Munich, a scene of Sionna's, has 40 000.
 _MOST_TRIANGLES = 20_000_000
 
 # Names and materials of meshes that are vegetation, as words: no street, no treehouse.
@@ -163,6 +164,7 @@ def _materials(
     radio: dict[str, str] = {}
     unknown: dict[str, str] = {}
     rough: list[str] = []
+    # those of the scene first: a shape may carry one of its own without a name
     for number, bsdf in enumerate((*root.findall("./bsdf"), *root.findall(".//shape/bsdf"))):
         name = bsdf.get("id") or bsdf.get("name") or f"unnamed {number + 1}"
         bsdf.set("id", name)
@@ -193,6 +195,7 @@ def _radio_material(bsdf: ElementTree.Element, name: str, path: Path) -> str | N
     thickness = _float(bsdf, "thickness", _DEFAULT_THICKNESS_M, path)
     stated = bsdf.find("string[@name='type']")
     if kind == "itu-radio-material" or plain.startswith(("itu_", "itu-")):
+        # Blender's exporter names materials so, and Sionna takes the name for the kind
         itu = plain[4:] if plain.startswith(("itu_", "itu-")) else plain
         if stated is not None:
             itu = stated.get("value", "")
@@ -237,6 +240,7 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
         reading.skipped[kind] = reading.skipped.get(kind, 0) + 1
         return
     name = shape.get("id") or f"shape {len(reading.names) + 1}"
+    # an empty transform moves nothing, and exporters write it
     if len(shape.find("transform[@name='to_world']") or ()):
         raise InputError(
             f"the shape '{name}' is moved by a to_world",
@@ -263,8 +267,10 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
 def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown: Mapping[str, str]) -> str:
     """Radio material of a shape."""
     inner = shape.find("bsdf")
+    # a shape may refer to media and emitters as well
     refs = [item.get("id", "") for item in shape.findall("ref") if item.get("name", "bsdf") == "bsdf"]
     which = inner.get("id", "") if inner is not None else (refs[0] if refs else "")
+    # before its material is asked for: leaves often have one that says nothing about radio
     if _VEGETATION.search(f"{name} {which}".lower()):
         return CROWN
     if which in reading.radio:
@@ -304,5 +310,6 @@ def _mesh(reading: _Reading, shape: ElementTree.Element, name: str) -> RawMesh:
             path=reading.path,
         )
     mesh, data = read_mesh(place)
+    # digests of digests: where one file ends cannot be shifted into the next
     reading.digest.update(hashlib.sha256(data).digest())
     return mesh

@@ -61,17 +61,20 @@ class Dem:
             from pyproj.exceptions import CRSError
 
             try:
+                # or a crs of degrees would take latitude first
                 transformer = Transformer.from_crs("EPSG:4326", self.crs, always_xy=True)
             except CRSError:
                 raise UsageError(f"unknown crs '{self.crs}'", expected="such as EPSG:4326 or EPSG:26917") from None
             object.__setattr__(self, "_to_grid", transformer)
             end = self.west + self.step_x * self.height_m.shape[1], self.south + self.step_y * self.height_m.shape[0]
+            # a little beyond 360 and 90: the outer cells of a global grid reach over
             if transformer.target_crs.is_geographic and (max(abs(self.west), abs(end[0])) > 361 or abs(end[1]) > 91):
                 raise InputError(
                     f"the grid runs to {end[0]:g}, {end[1]:g} degrees",
                     expected=f"coordinates of {self.crs}",
                     cause="they are metres or feet: another crs",
                 )
+        # up counts from the ground at the origin, whatever datum the grid has
         object.__setattr__(self, "_origin_m", float(self.absolute_m(0.0, 0.0)))
         if np.isnan(self._origin_m):
             gap = self._covers_origin()
@@ -103,6 +106,7 @@ class Dem:
         column, row = self._cell(east_m, north_m)
         inside = (column >= 0) & (column <= columns - 1) & (row >= 0) & (row <= rows - 1)
         column, row = np.where(inside, column, 0.0), np.where(inside, row, 0.0)
+        # the last row has no neighbour beyond it: it is the far end of the cell before
         i = np.minimum(row.astype(np.int64), max(rows - 2, 0))
         j = np.minimum(column.astype(np.int64), max(columns - 2, 0))
         u, v = row - i, column - j
@@ -118,6 +122,7 @@ class Dem:
 
     def slope(self, east_m: FloatArray, north_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rise of the ground per metre to the east and to the north, from points 1/64 of a cell apart."""
+        # within one cell the surface is bilinear, so a short step gives its slope exactly
         step = self.cell_m / 128
         return (
             (self.ground_m(east_m + step, north_m) - self.ground_m(east_m - step, north_m)) / (2 * step),
@@ -143,6 +148,7 @@ class Dem:
         """
         way = (target_m - source_m)[:, :2]
         count = np.maximum(np.ceil(np.hypot(*way.T) / (self.cell_m / 2)).astype(np.int64), 2)
+        # lines of like length together: a batch is as long as its longest
         order = np.argsort(count)
         begin = 0
         while begin < len(order):
@@ -176,8 +182,10 @@ class Dem:
         tolerance, free = np.broadcast_to(tolerance_m, len(source)), np.ones(len(source), dtype=bool)
         for some, share, ground in self.profiles(source, target):
             start, way = source[some], target[some] - source[some]
+            # height of the Earth's curve over the chord; up is measured from a plane
             bulge = share * (1 - share) * np.hypot(*way[:, :2].T) ** 2 / (2 * EARTH_RADIUS_M)
             intrusion = ground + bulge - (start[:, 2] + share * way[:, 2])
+            # an antenna may stand in a cell whose mean lies above its foot
             free[some] = ~((intrusion > tolerance[some]) & (share > 0.0) & (share < 1.0)).any(axis=0)
         return free
 
@@ -229,6 +237,7 @@ def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str) -> Dem:
     lines = data.decode("utf-8-sig").splitlines()
     header, begin = _ascii_header(lines, path)
     rows, columns, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
+    # ESRI's default
     gap = header.get("nodata_value", -9999.0)
     values: list[FloatArray] = []
     for number, line in enumerate(lines[begin:], start=begin + 1):
@@ -243,6 +252,7 @@ def _read_ascii(data: bytes, path: Path, frame: SiteFrame, crs: str) -> Dem:
             path=path,
             line=len(lines),
         )
+    # heights are those of cell centres; a corner lies half a cell off
     west = header.get("xllcenter", header.get("xllcorner", 0.0) + step / 2)
     south = header.get("yllcenter", header.get("yllcorner", 0.0) + step / 2)
     return Dem(
@@ -305,8 +315,10 @@ def _read_geotiff(data: bytes, frame: SiteFrame) -> Dem:
     arrays, notes = read("geotiff", data)
     band, unit = arrays["band"], notes["unit"]
     step_east, shear_east, west, shear_north, step_north, north = notes["transform"]
+    # a north-up raster has a negative step to the north: rows run south
     if notes["crs"] is None or shear_east or shear_north or step_east <= 0 or step_north >= 0:
         raise InputError("the GeoTIFF is not georeferenced north-up", cause="gdalwarp makes it so")
+    # foot, feet, ft
     if unit.startswith(("f", "us survey f")):
         raise InputError(f"heights in '{unit}'", expected="metres", cause="gdal_calc or gdal_translate converts")
     band = _plausible(band)

@@ -27,6 +27,7 @@ _CELL_M, _MOST_CELLS = 25.0, 40_000
 
 # Lengths and standard deviations [m] that are tried.
 _LENGTHS_M = np.geomspace(30.0, 2000.0, 9)
+# Both in steps of some 65 %.
 _DEVIATIONS_M = np.geomspace(1.0, 50.0, 9)
 
 # Heights at places this near are of one place; they contradict where they differ by so many standard deviations.
@@ -83,9 +84,11 @@ class Surface:
         for drawn in draws:
             off = self.height_m - self.level_m
             prior = np.zeros(len(place))
+            # a draw of the process, moved by what the points say of it: one solve, no factor of the whole grid
             if drawn is not None:
                 waves = self._waves(drawn)
                 prior = waves.on_grid(across, along).ravel()
+                # heights of points have errors of their own, which each draw throws anew
                 off = off + drawn.normal(0.0, self.error_m) - waves(self.place_m)
             height = self.level_m + prior + near @ factor.solve(off)
             yield Dem(
@@ -97,6 +100,7 @@ class Surface:
         """Standard deviation (places,) of the surface [m]."""
         near = self._between(np.column_stack([east_m, north_m]))
         known = (self._factor().whiten(near.T) ** 2).sum(axis=0)
+        # rounding at a point itself
         return np.asarray(np.sqrt(np.maximum(self.deviation_m**2 - known, 0.0)))
 
     def _between(self, place_m: FloatArray) -> FloatArray:
@@ -107,6 +111,7 @@ class Surface:
 
     def _waves(self, random: np.random.Generator) -> _Waves:
         """A draw before any point is known: waves whose vectors have the process' spectrum, Student's t of 3."""
+        # of order 3/2 in the plane: a normal over the root of chi-squared of 3 by 3
         vector = random.standard_normal((2, _WAVES)) / (self.length_m * np.sqrt(random.chisquare(3, _WAVES) / 3.0))
         height = self.deviation_m * np.sqrt(2.0 / _WAVES)
         return _Waves(vector, random.uniform(0.0, 2.0 * np.pi, _WAVES), height)
@@ -190,5 +195,6 @@ def _likelihood(
     """Log likelihood of the points under a process, and its most likely mean [m]."""
     covariance = deviation_m**2 * _matern(apart_m, length_m) + np.diag(error_m**2)
     factor = Factor.of(covariance)
+    # generalised least squares: near points count as one
     level = float(np.average(height_m, weights=factor.solve(np.ones(len(height_m)))))
     return factor.log_likelihood(height_m - level), level

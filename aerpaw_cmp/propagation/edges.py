@@ -29,7 +29,6 @@ from .field.geometry import parts_of, pattern_fields, plain, rows_of
 from .field.sum import Fields, Further, parts_between_poses
 from .field.wedge import wedge
 from .geometry.arrays import Array, Link, Poses
-from .geometry.faces import inside
 from .geometry.paths import Faces, PathSet, legs, sources_of
 from .scene import Scene
 from .search.mirror import scene_tolerance_m
@@ -106,7 +105,6 @@ class EdgePaths(Further):
 
     def words(self, faces: Faces) -> list[str]:
         """Corners of each path, from tower to UAV."""
-        # an index of -1 then takes the empty word at the end
         label = (*faces.label, "")  # of -1, no face
         edges = zip(self.wedge.tolist(), self.vertices_m[:, 1].tolist(), strict=True)
         middle = (f"edge of {label[f]} and {label[n]} at {', '.join(f'{x:.1f}' for x in at)} m" for (f, n), at in edges)
@@ -360,13 +358,10 @@ class _Search:
     ) -> BoolArray:
         """Check whether paths (paths,) stay above their ground, bend in the air, and nothing cuts their legs."""
         point, good = vertices_m[:, 1], np.ones(len(edge), np.bool_)
-        for index, spot, end in zip(ground, (vertices_m[:, 0], vertices_m[:, 2]), (source_m, target_m), strict=True):
+        for index, end in zip(ground, (source_m, target_m), strict=True):
             if index >= 0:
                 # an edge that lies in the ground has no reflection between it and the ground
                 good &= (self.faces.height_m(index, point) > NEAREST_M) & (self.faces.height_m(index, end) > 0.0)
-                rows = np.flatnonzero(good)
-                # a ground plane has no end, but the planes of terrain have
-                good[rows] = inside(self.faces, np.full(len(rows), index), spot[rows], 0.0)
         good[good] &= self._exposed(edge[good], point[good])
         for start, end in legs(source_m, vertices_m, target_m):
             good[good] &= ~self.hiding.segments(start[good], end[good])
@@ -388,8 +383,8 @@ class _Search:
         axes = np.stack([edges.along, edges.face_axis, edges.normal, edges.normal_n])
         start = (axes * edges.start_m).sum(axis=2)
         along, down, up, up_n = axes @ points_m.T - start[..., None]
-        # out of both faces' fronts at once is inside the wedge, where no wave is
         far = np.hypot(down, up)
+        # a point in front of neither face is inside the wedge, where no wave is
         return along, np.where((far >= NEAREST_M) & ((up >= 0.0) | (up_n >= 0.0)), far, -1.0)
 
     def _on_ground(self, ground: int, image_m: FloatArray, points_m: FloatArray) -> FloatArray:

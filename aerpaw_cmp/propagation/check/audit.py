@@ -141,7 +141,7 @@ def audit(
     chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
     engine: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
     search = replace(search, engine=engine)
-    # on few poses, for the other engine is a hundred times slower
+    # on few poses, for the other engine is some hundred times slower
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     checked = run_replay(site, link, few, search, Field(field.loss), run)
     rays = checked.samples or (_FIELD_SAMPLES if search.samples == "auto" else search.samples)

@@ -53,13 +53,10 @@ def building_mesh(building: Building) -> Mesh:
     return np.concatenate(vertices), np.concatenate(triangles).astype(np.int64)
 
 
-def _ground_mesh(site: Site) -> Mesh:
-    """The flat ground, up = 0: two triangles that face upwards."""
-    west, east, south, north = site.area_m
-    corners = [(west, south), (east, south), (east, north), (west, north)]
-    out = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) * _GROUND_MARGIN_M
-    vertices = np.column_stack([np.array(corners) + out, np.zeros(4)])
-    return vertices, np.array([[0, 1, 2], [0, 2, 3]])
+def rectangle(west_m: float, east_m: float, south_m: float, north_m: float, up_m: float) -> Mesh:
+    """A level rectangle that looks up: two triangles."""
+    corners = [(west_m, south_m, up_m), (east_m, south_m, up_m), (east_m, north_m, up_m), (west_m, north_m, up_m)]
+    return np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])
 
 
 def site_meshes(site: Site) -> dict[str, Mesh]:
@@ -77,7 +74,9 @@ def site_meshes(site: Site) -> dict[str, Mesh]:
     """
     pieces: dict[str, list[Mesh]] = {}
     if site.scene is None:
-        pieces[material(site.ground_material).name] = [_ground_mesh(site)]
+        (west, east, south, north), beyond = site.area_m, _GROUND_MARGIN_M
+        ground = rectangle(west - beyond, east + beyond, south - beyond, north + beyond, 0.0)
+        pieces[material(site.ground_material).name] = [ground]
     for building in site.buildings:
         pieces.setdefault(material(building.material).name, []).append(building_mesh(building))
     return {name: _joined(parts) for name, parts in pieces.items()}

@@ -19,6 +19,7 @@ from ..common.errors import UsageError
 from ..common.units import FloatArray
 from .materials import CROWN, material
 from .mesh_scenes.mitsuba import TriangleScene, read_scene
+from .meshes import rectangle
 from .site import Building, Forest, Site
 
 # A ground plane that is added reaches this many times the size of the scene beyond it.
@@ -87,10 +88,8 @@ def with_ground(scene: TriangleScene, name: str) -> TriangleScene:
     low, high = bounds(scene)
     # so far that no reflection between points of the scene falls off its edge
     reach = _PLANE_MARGIN * float(max(*(high - low)[:2], 100.0))
-    corners = [(low[0] - reach, low[1] - reach), (high[0] + reach, low[1] - reach)]
-    corners += [(high[0] + reach, high[1] + reach), (low[0] - reach, high[1] + reach)]
-    vertices = np.array([(east, north, low[2]) for east, north in corners])
-    return added(scene, vertices, np.array([[0, 1, 2], [0, 2, 3]]), "ground plane", material(name).name)
+    mesh = rectangle(low[0] - reach, high[0] + reach, low[1] - reach, high[1] + reach, low[2])
+    return added(scene, *mesh, "ground plane", material(name).name)
 
 
 def added(

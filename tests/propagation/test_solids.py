@@ -123,15 +123,6 @@ def test_field_goes_on_smoothly_to_the_ground_a_wall_and_a_roof(scenes):
         assert rss == pytest.approx(rss[0], abs=1e-3)
 
 
-def test_solid_without_a_roof_is_refused(scenes):
-    import dataclasses
-
-    faces = site_faces(scenes.site([Building("barn", box(30, -10, 50, 10), 8.0)]))
-    walls = dataclasses.replace(faces, normal=np.where(faces.solid[:, None] >= 0, [1.0, 0.0, 0.0], faces.normal))
-    with pytest.raises(ValueError, match="no roof"):
-        Occlusion(walls, 1e-9)
-
-
 @pytest.mark.parametrize("turn", [False, True])
 def test_points_inside_the_planes_are_those_inside_a_building(scenes, turn):
     """Against shapely: convex and not, with a court, with a corner named twice, either way round, one beside another."""

@@ -46,11 +46,6 @@ class Occlusion:
         below it.
     tolerance_m : float
         Deeper than this inside a solid a segment is cut.
-
-    Raises
-    ------
-    ValueError
-        If a solid has no roof.
     """
 
     def __init__(self, faces: Faces, tolerance_m: float) -> None:
@@ -223,12 +218,8 @@ def _prisms(
     number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(rows)))
     # exactly: roofs are made with this very normal
     level = faces.normal[rows, 2] == 1.0
-    lacking = np.bincount(number[level], minlength=len(starts)) == 0
-    if lacking.any():
-        raise ValueError(f"the solid of '{faces.label[rows[starts[lacking.argmax()]]]}' has no roof")
     # the lowest wall of each building; roofs do not count
     foot = np.minimum.reduceat(np.where(level, np.inf, faces.lower[rows, 1]), starts)
-    foot[np.isposinf(foot)] = -np.inf  # no walls
     roofs = rows[level]
     footprints = _footprints(faces, roofs)
     convex = _is_convex(footprints).tolist()

@@ -44,27 +44,14 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
 
 def _set(plain: dict[str, Any], key: str, value: Any) -> None:
     level: Any = plain
-    parts = key.split(".")
+    holder, parts = plain, key.split(".")
     for depth, part in enumerate(parts):
-        last = depth == len(parts) - 1
-        if isinstance(level, list):
-            if not part.isdigit() or int(part) >= len(level):
-                raise UsageError(f"the override {key!r} has no element {part!r}", expected=f"0 to {len(level) - 1}")
-            if last:
-                level[int(part)] = value
-            else:
-                level = level[int(part)]
-            continue
         if not isinstance(level, dict):
-            raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which is a value")
+            raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which is no group of keys")
         if part not in level:
             _add(plain, level, parts[:depth], part, key)
-        if last:
-            level[part] = value
-        elif isinstance(level[part], (dict, list)):
-            level = level[part]
-        else:
-            raise UsageError(f"the override {key!r} goes below {'.'.join(parts[: depth + 1])!r}, which is a value")
+        holder, level = level, level[part]
+    holder[parts[-1]] = value
 
 
 def _add(plain: dict[str, Any], level: dict[str, Any], above: list[str], part: str, key: str) -> None:

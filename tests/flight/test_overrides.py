@@ -1,4 +1,4 @@
-"""Dotted keys that change checked settings: copies that are begun from others, elements of lists, and what is refused."""
+"""Dotted keys that change checked settings: copies that are begun from others, and what is refused."""
 
 from pathlib import Path
 
@@ -25,10 +25,6 @@ def test_a_key_changes_itself_alone(settings: FlightFile) -> None:
     assert before == after
     assert overridden(settings, {}) is settings
     assert overridden(settings, {"rt.advanced.maximum_gap_s": 7.0}).rt.advanced.maximum_gap_s == 7.0
-    log = overridden(settings, {"logs.1.channel": "Z"})
-    assert [entry.channel for entry in log.logs] == [
-        "Z" if k == 1 else entry.channel for k, entry in enumerate(settings.logs)
-    ]
 
 
 def test_new_channels_and_towers_begin_as_copies_whatever_the_order(settings: FlightFile) -> None:
@@ -51,23 +47,15 @@ def test_new_channels_and_towers_begin_as_copies_whatever_the_order(settings: Fl
     [
         ("rt.max_deph", 1, "no key 'max_deph' below 'rt'.*max_depth"),
         ("rtt", 1, "no key 'rtt'.*'rt'"),
-        ("rt.engine.kind", 1, "goes below 'rt.engine', which is a value"),
-        ("rt.max_depth.more.still", 1, "goes below 'rt.max_depth', which is a value"),
-        ("logs.99.node", "LW1", "no element '99'.*0 to"),
-        ("logs.-1.node", "LW1", "no element '-1'"),
+        ("rt.engine.kind", 1, "goes below 'rt.engine', which is no group of keys"),
+        ("rt.max_depth.more.still", 1, "goes below 'rt.max_depth', which is no group of keys"),
+        ("logs.0.node", "LW1", "goes below 'logs', which is no group of keys"),
         ("rt.max_depth", "deep", "'rt.max_depth': found 'deep'"),
     ],
 )
 def test_a_mistake_is_named_with_what_was_meant(settings: FlightFile, key: str, value: object, words: str) -> None:
     with pytest.raises(UsageError, match="(?s)" + words):
         overridden(settings, {key: value})
-
-
-def test_the_last_element_of_a_list_is_one_and_the_next_is_none(settings: FlightFile) -> None:
-    count = len(settings.logs)
-    assert overridden(settings, {f"logs.{count - 1}.channel": "Q"}).logs[-1].channel == "Q"
-    with pytest.raises(UsageError, match=f"0 to {count - 1}"):
-        overridden(settings, {f"logs.{count}.channel": "Q"})
 
 
 def test_links_are_those_of_the_paper_unless_the_file_says_otherwise() -> None:

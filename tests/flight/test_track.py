@@ -290,11 +290,6 @@ def test_a_position_is_on_earth_and_not_where_a_receiver_without_a_fix_says(plac
     assert good_positions(*(np.array([value]) for value in place)).tolist() == [bool(good)]
 
 
-def test_a_gap_limit_must_be_positive():
-    with pytest.raises(ValueError, match="positive"):
-        Track(telemetry([0.0], 0, 0, 1), FRAME, maximum_gap_s=0)
-
-
 @pytest.mark.parametrize(("speed_mps", "joined"), [(2.0, True), (15.0, False)])
 def test_sparse_fixes_of_a_slow_flight_are_joined_by_lines(speed_mps: float, joined: bool) -> None:
     """Speed between fixes decides: 14 s are 28 m of a search, and 210 m of a survey."""

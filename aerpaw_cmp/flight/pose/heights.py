@@ -22,9 +22,7 @@ Ground = Callable[[FloatArray, FloatArray], FloatArray]
 _DRIFT_M = 5.0
 
 
-def raised(
-    up_m: FloatArray, ground_m: FloatArray, takeoff_m: float, least_m: float = MINIMUM_HEIGHT_M
-) -> tuple[FloatArray, BoolArray]:
+def raised(up_m: FloatArray, ground_m: FloatArray, takeoff_m: float) -> tuple[FloatArray, BoolArray]:
     """Heights of poses over the ground under them, and which poses lie below it.
 
     A little below ground that is about as high as the take-off point is the drift of the height; all else below
@@ -36,8 +34,6 @@ def raised(
         Of the poses and of the ground under them [m].
     takeoff_m : float
         Up of the take-off point [m].
-    least_m : float
-        Lower poses are raised to this height above the ground [m].
 
     Returns
     -------
@@ -50,7 +46,7 @@ def raised(
     """
     drift = np.where(ground_m <= takeoff_m + _DRIFT_M, _DRIFT_M, 0.0)
     buried = up_m < ground_m - drift
-    return np.where(buried, up_m, np.fmax(up_m, ground_m + least_m)), buried
+    return np.where(buried, up_m, np.fmax(up_m, ground_m + MINIMUM_HEIGHT_M)), buried
 
 
 _IN_NAME = re.compile(r"(?<![A-Za-z0-9.])(\d{1,3}) ?(?:m|meters|metres)(?![A-Za-z0-9])")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...common.geodesy import SiteFrame, bearing_deg
-from ...common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...propagation.geometry.arrays import rotation_from_aircraft
 from .heights import Ground, raised
 
@@ -270,8 +270,6 @@ class Track:
         The site's frame.
     maximum_gap_s : float
         Longer gaps are not bridged [s].
-    minimum_height_m : float
-        Lower poses are raised to this height above the ground under them [m].
     ground_m : float
         Height of the take-off point above the site origin [m], added to ``altitude_m``.
     ground : callable, optional
@@ -291,15 +289,11 @@ class Track:
         frame: SiteFrame,
         *,
         maximum_gap_s: float = _MAXIMUM_GAP_S,
-        minimum_height_m: float = MINIMUM_HEIGHT_M,
         ground_m: float = 0.0,
         ground: Ground | None = None,
     ) -> None:
-        if not maximum_gap_s > 0:
-            raise ValueError(f"maximum_gap_s must be positive, found {maximum_gap_s}")
         self.frame = frame
         self.maximum_gap_s = maximum_gap_s
-        self.minimum_height_m = minimum_height_m
         self.ground_m = ground_m
         self._ground = ground or (lambda east, _: np.full(len(east), ground_m))
         self._load(telemetry)
@@ -433,8 +427,7 @@ class Track:
 
     def _raised(self, position: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Up of positions (n, 3), the lowest raised to just above the ground, and those that lie below it."""
-        ground = self._ground(position[:, 0], position[:, 1])
-        return raised(position[:, 2], ground, self.ground_m, self.minimum_height_m)
+        return raised(position[:, 2], self._ground(position[:, 0], position[:, 1]), self.ground_m)
 
     def _codes(self, t: FloatArray) -> AnyArray:
         """Index into :data:`REASONS` for every instant."""

@@ -45,6 +45,10 @@ class RssSeries:
     link: LinkSettings
     settings_key: str
     """Equal for series whose link settings are equal: they share a replay."""
+    log: IntArray
+    """Number of the log (n,) under ``logs:`` that holds each sample."""
+    line: IntArray
+    """Line (n,) of that log."""
     noise_dbm: float | None = None
     """Of a ratio to the noise: that of the receiver, where its bandwidth or floor is given; None for levels."""
     flagged: Mapping[str, int] = field(default_factory=dict)
@@ -53,10 +57,6 @@ class RssSeries:
     """Of a cell: 1 where it served the phone, 0 where another did (n,), NaN unknown; None for other levels."""
     locked: FloatArray | None = None
     """Of a sounder: 1 where it was in lock, 0 where it had lost it (n,), NaN unknown; None for other levels."""
-    log: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Number of the log (n,) under ``logs:`` that holds each sample; empty where it is not known."""
-    line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
-    """Line (n,) of that log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,8 +68,8 @@ class RankSeries:
     rank: FloatArray
     sinr_db: FloatArray
     position_m: FloatArray | None
+    log: IntArray
     flagged: Mapping[str, int] = field(default_factory=dict)
-    log: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Both as in :class:`RssSeries`."""
 
     @property

@@ -25,8 +25,6 @@ from .settings import FlightFile
 
 def logs_of(data: FlightData, series: RssSeries | RankSeries) -> tuple[str, ...]:
     """SHA-256 of the logs that hold a series."""
-    if not len(series.log):
-        return union(file.sha256 for file in data.files)
     return tuple(data.files[number].sha256 for number in np.unique(series.log))
 
 

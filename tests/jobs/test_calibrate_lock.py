@@ -105,11 +105,11 @@ def test_what_a_site_remembers_of_the_lock_is_used_with_its_airframe_alone(tmp_p
     entry = Entry(command="c", made="2026-01-02", flights=["a", "b"], flown=[], trained_on=["a" * 64], series=[series])
     remember(tmp_path / "mine.yaml", "afar", entry, {})
     assert read_learned(tmp_path / "mine.yaml").entries["afar"].series[0].lock == lock
-    times = np.zeros(0, dtype="datetime64[ns]")
+    times, none = np.zeros(0, dtype="datetime64[ns]"), np.zeros(0, dtype=np.int64)
     link = LinkSettings(carrier_hz=3.32e9)
 
     def known(channel: str, antennas: dict[str, str]) -> LearnedLock | None:
-        series = RssSeries("NODE", channel, "dB re full scale", times, np.zeros(0), link, "")
+        series = RssSeries("NODE", channel, "dB re full scale", times, np.zeros(0), link, "", none, none)
         return lock_elsewhere(antennas, series, tmp_path)
 
     assert known("power", {"uav": "mine/afar_uav"}) == lock

@@ -394,12 +394,12 @@ def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, f
 
 def _reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
     """Reader of the log that holds a series, or the first of its receiver's."""
-    return receiver_of(data.files[int(series.log[0]) if len(series.log) else 0].result.reader)
+    return receiver_of(data.files[int(series.log[0])].result.reader)
 
 
 def _quantity_of(data: FlightData, series: RankSeries) -> str:
     """Rank that a series holds, as its log calls it."""
-    file = data.files[int(series.log[0]) if len(series.log) else 0]
+    file = data.files[int(series.log[0])]
     return next(rank_quantity(stream, file.result.reader) for stream in file.result.streams if stream.kind == "rank")
 
 

@@ -129,7 +129,9 @@ def replay_rss(
         times = [telemetry_time(data.rss[i].time, shifts[i]) for i in members]
         valid, places, tracks = _towers_and_poses(data, tower, times)
         poses = [valid_poses(track, rt.attitude) for track in tracks]
-        joined = poses[0] if len(poses) == 1 else _joined_poses(poses)
+        joined = poses[0] if len(poses) == 1 else Poses(
+            np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses])
+        )  # fmt: skip
         channels = ", ".join(data.rss[i].channel for i in members)
         progress(f"replay RSS {tower} {channels}: {counted(len(joined), 'pose')}")
         towers_m = None if tower not in data.nodes else np.concatenate(places)
@@ -163,10 +165,6 @@ def _towers_and_poses(
         tracks.append(track.pick(track.valid))
         places.append(place if len(place) == 1 and tower not in data.nodes else place[track.valid])
     return valid, places, tracks
-
-
-def _joined_poses(poses: Sequence[Poses]) -> Poses:
-    return Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
 
 
 def telemetry_time(time: Times, clock: Clock | None) -> Times:

@@ -169,27 +169,19 @@ class LinkSettings(StrictModel):
         )
 
 
-def _rss_link() -> LinkSettings:
-    return LinkSettings(carrier_hz=3.3e9)
+class LinksSettings(StrictModel):
+    """The RSS link (single elements, 3.3 GHz) and the rank link (4 x 4, 3.4 GHz) of the paper as defaults."""
 
-
-def _rank_link() -> LinkSettings:
-    return LinkSettings(
+    rss: LinkSettings = LinkSettings(carrier_hz=3.3e9)
+    channels: dict[str, LinkSettings] = {}
+    """RSS link of single channels that differ, by channel name (two antennas point differently)."""
+    rank: LinkSettings = LinkSettings(
         carrier_hz=3.4e9,
         uav_transmits=False,
         bandwidth_hz=20e6,  # rank is reported above the noise of a modem's channel, not of 1 Hz
         tower=ArraySettings(layout="tower_comparison", slant_deg=[45.0, -45.0, 45.0, -45.0], yaw_deg=45.0),
         uav=ArraySettings(layout="uav_comparison", slant_deg=[45.0, -45.0, -45.0, 45.0], yaw_deg=315.0, roll_deg=90.0),
     )
-
-
-class LinksSettings(StrictModel):
-    """The RSS link (single elements, 3.3 GHz) and the rank link (4 x 4, 3.4 GHz) of the paper as defaults."""
-
-    rss: LinkSettings = Field(default_factory=_rss_link)
-    channels: dict[str, LinkSettings] = {}
-    """RSS link of single channels that differ, by channel name (two antennas point differently)."""
-    rank: LinkSettings = Field(default_factory=_rank_link)
 
     def of(self, channel: str) -> LinkSettings:
         """The RSS link of a channel."""
@@ -414,7 +406,7 @@ class FlightFile(StrictModel):
 
     flight: FlightSettings
     site: SiteChoice = SiteChoice()
-    towers: dict[str, GroundNode] = Field(default_factory=dict)
+    towers: dict[str, GroundNode] = {}
     """Nodes of this flight beside those of the site (a rover)."""
     timezone: str | None = None
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = []

@@ -82,18 +82,15 @@ def plan_trajectory(plan: PlanSettings) -> Trajectory:
     >>> plan_trajectory(PlanSettings(start=datetime(2025, 6, 1), waypoints=ends, speed_mps=8)).duration_s
     10.0
     """
-    times, positions = [0.0], []
-    points = plan.waypoints
-    positions.append((points[0].east_m, points[0].north_m, points[0].height_m))
-    for index, point in enumerate(points):
-        corner = (point.east_m, point.north_m, point.height_m)
-        if index:
-            last = positions[-1]
-            horizontal = np.hypot(corner[0] - last[0], corner[1] - last[1])
-            duration = max(horizontal / plan.speed_mps, abs(corner[2] - last[2]) / plan.climb_mps)
-            if duration > 0:
-                times.append(times[-1] + float(duration))
-                positions.append(corner)
+    first = plan.waypoints[0]
+    times, positions = [0.0], [(first.east_m, first.north_m, first.height_m)]
+    for point in plan.waypoints:
+        corner, last = (point.east_m, point.north_m, point.height_m), positions[-1]
+        horizontal = np.hypot(corner[0] - last[0], corner[1] - last[1])
+        duration = max(horizontal / plan.speed_mps, abs(corner[2] - last[2]) / plan.climb_mps)
+        if duration > 0:
+            times.append(times[-1] + float(duration))
+            positions.append(corner)
         if point.hold_s > 0:
             times.append(times[-1] + point.hold_s)
             positions.append(corner)

@@ -150,7 +150,7 @@ def test_a_leg_lasts_as_long_as_its_length_at_the_speed(most_s):
     names = ("east_m", "north_m", "height_m", "yaw_deg", "hold_s")
     last_one = (30.0, 40.0, 80.0, 45.0, 0.0)
     points = [Waypoint(**dict(zip(names, place, strict=True))) for place in (*places, last_one)]
-    route = flown("legs", points, 10.0, most_s)
+    route = cut(flown("legs", points, 10.0), most_s, 10.0)
     east, north = [0, 10, 20, *[30] * 12], [*[0] * 4, 10, 20, 30, *[40] * 8]
     by_hand = np.column_stack([east, north, [*[30] * 10, 40, 50, 60, 70, 80]])
     last = int(min(14, most_s))

@@ -10,7 +10,7 @@ import numpy as np
 from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.units import FloatArray
 from ...compare.gains.direction_gain import link_directions
-from ...propagation.geometry.arrays import Array, Link, Pattern, Poses
+from ...propagation.geometry.arrays import Link, Pattern, Poses
 from ...site.antenna.sphere_pattern import SpherePattern
 
 
@@ -54,7 +54,7 @@ def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain 
     for end, array in (("uav", link.uav_array), ("tower", tower_array)):
         pattern = array.patterns[0]
         if isinstance(pattern, SpherePattern):
-            ends[end] = pattern, _in_mount(array, towards[end])
+            ends[end] = pattern, np.asarray(towards[end] @ array.mount)
     if not ends:
         return None
     pair_db, sd_db = pair_and_sd_db(ends)
@@ -91,7 +91,3 @@ def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | floa
     """Gain (poses,) towards both ends at once, to be added to the level [dB]; 0 where none is learned."""
     gain = learned_gain(link, poses, source_m)
     return 0.0 if gain is None else gain.pair_db
-
-
-def _in_mount(array: Array, direction: FloatArray) -> FloatArray:
-    return np.asarray(direction @ array.mount)

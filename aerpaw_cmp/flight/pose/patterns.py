@@ -78,8 +78,8 @@ class Route:
         return float(self.time_s[-1] - self.time_s[0])
 
 
-def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float, most_s: float = math.inf) -> Route:
-    """A route along waypoints at one speed, cut where the time is over.
+def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float) -> Route:
+    """A route along waypoints at one speed.
 
     Parameters
     ----------
@@ -87,8 +87,6 @@ def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float, most_s: fl
     waypoints : sequence of Waypoint
         Two or more.
     speed_mps : float
-    most_s : float
-        Longest flight [s].
 
     Returns
     -------
@@ -108,7 +106,7 @@ def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float, most_s: fl
             time.append(begin)
             at.append(place[i + 1])
             yaw.append(w.yaw_deg)
-    seconds = np.arange(0.0, min(begin, most_s) + 1e-9, 1.0)
+    seconds = np.arange(0.0, begin + 1e-9, 1.0)
     leg = np.minimum(np.searchsorted(np.array(time), seconds), len(yaw) - 1)
     position = interpolated(seconds, np.array(time), np.array(at))
     return Route(
@@ -227,7 +225,7 @@ def waypoints_of(legs: Sequence[FloatArray], area: Any, height_m: float, nose: N
     out: list[Waypoint] = []
     for (place, number), (following, _) in pairwise([*corners, corners[-1]]):
         step = following - place
-        course = float(bearing_deg(step)) if step.any() else (out[-1].yaw_deg if out else 0.0)
+        course = float(bearing_deg(step))
         yaw = {"along": course, "fixed": 0.0, "four headings": course + 90.0 * (number % 4)}[nose]
         if not step.any() and out:
             yaw = out[-1].yaw_deg
@@ -334,4 +332,4 @@ def cut(route: Route, most_s: float, speed_mps: float) -> Route:
             within.append(replace(w, east_m=east, north_m=north, height_m=up, hold_s=0.0))
             break
         clock += needed
-    return flown(route.name, within, speed_mps, most_s)
+    return flown(route.name, within, speed_mps)

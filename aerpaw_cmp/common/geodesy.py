@@ -8,7 +8,7 @@ Horizontal distances within 3 km differ from the geodesic by less than 1 mm.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -92,6 +92,22 @@ def unit_vectors(vectors: FloatArray) -> FloatArray:
     """Vectors (n, 3) of length one; those without a length stay zero."""
     # 0 / 1e-300 is 0 and changes no real length; 0 / 0 would be NaN with a warning
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300))
+
+
+# Of a degree of a meridian, to 0.5 %: for distances that are held against a limit.
+_DEGREE_M = 111_200.0
+
+
+def rough_m(latitude_deg: FloatArray, longitude_deg: FloatArray, about: Sequence[float]) -> FloatArray:
+    """East and north (n, 2) [m] of places about a latitude and longitude, a hundred times faster than a projection.
+
+    Examples
+    --------
+    >>> rough_m(np.array([60.0]), np.array([11.0]), (60.0, 10.0)).round().tolist()
+    [[55600.0, 0.0]]
+    """
+    east = (longitude_deg - about[1]) * np.cos(np.radians(about[0]))
+    return np.stack([east, latitude_deg - about[0]], axis=-1) * _DEGREE_M
 
 
 def in_shape(transform: Callable[[Any, Any], Any], x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:

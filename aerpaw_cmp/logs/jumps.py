@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 
 from ..common.counting import counted
+from ..common.geodesy import rough_m
 from ..common.units import BoolArray, FloatArray, IntArray
 from .records import Stream
 
@@ -23,8 +24,6 @@ _JITTER_M = 15.0
 
 # Jumps are few; where more rows do not fit, the track is not one track, or its times are wrong.
 _FEW_SHARE = 0.2
-
-_DEGREE_M = 111_200.0
 
 # A step back is shorter than this share of the steps there.
 _BACK_SHARE = 0.2
@@ -77,9 +76,7 @@ def _path(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
         return rows, np.zeros(0), np.zeros((0, 3))
     up = frame[PLACE[2]].to_numpy(np.float64)[rows] if PLACE[2] in frame else np.zeros(len(rows))
     up = np.where(up > -900.0, np.nan_to_num(up), 0.0)  # -999 is what loggers write without a fix
-    narrow = np.cos(np.radians(np.median(latitude[rows])))
-    east = (longitude[rows] - longitude[rows[0]]) * narrow
-    flat = np.column_stack([east, latitude[rows] - latitude[rows[0]]]) * _DEGREE_M
+    flat = rough_m(latitude[rows], longitude[rows], (float(np.median(latitude[rows])), longitude[rows[0]]))
     return rows, (time[rows] - time[rows[0]]) / np.timedelta64(1, "s"), np.column_stack([flat, up])
 
 

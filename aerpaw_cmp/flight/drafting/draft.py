@@ -15,6 +15,7 @@ import yaml
 
 from ...common.counting import counted
 from ...common.errors import InputError, UsageError, one_line
+from ...common.geodesy import rough_m
 from ...common.yamlfile import parse_yaml
 from ...logs.ingest import IngestedFile, name_inside, read_log
 from ...logs.records import Stream, has_wall_clock
@@ -26,7 +27,7 @@ from ..gains.losses import sight_shares
 from ..gains.memory import with_learned
 from ..marks import mark_of
 from ..pose.cross_checks import questions
-from ..pose.grouping import Flight, Span, flights, stream_span
+from ..pose.grouping import Flight, Span, flights, meet, stream_span
 from ..pose.heights import height_in_name, lacks_height
 from ..pose.hour_shift import clock_trap
 from ..pose.time_origin import Origin, origin_of
@@ -679,7 +680,7 @@ class _Entries:
 
     def _enter_series(self, key: tuple[str, ...], span: Span, shown: str) -> str | None:
         """Enter a series; the reason where one of that tower, channel and time is there already."""
-        same = [source for when, source in self.entered.get(key, []) if _meet(span, when)]
+        same = [source for when, source in self.entered.get(key, []) if meet(span, when)]
         if same:
             where = "another stream of the log" if same[0] == shown else same[0]
             return f"{where} has {key[1]} of that tower and time already"
@@ -706,7 +707,7 @@ class _Entries:
                 return None
             if relative and has_wall_clock(self.flown[1][0]):
                 return "the track is that of other telemetry"
-            return "the track is that of other telemetry" if _meet(span, self.flown[1]) else _late(span, self.flown[1])
+            return "the track is that of other telemetry" if meet(span, self.flown[1]) else _late(span, self.flown[1])
         if self.flown is None and self.positioned and not _has_positions(stream):
             return "it has no positions, and no telemetry is here"
         same_clock = self.flown is not None and not has_wall_clock(self.flown[1][0])  # the track counts as the log does
@@ -714,7 +715,7 @@ class _Entries:
             return "its times are relative; read it again with --time-origin"
         if same_clock and not relative:
             return "the times of the track are relative; read it again with --time-origin"
-        if self.flown is not None and not relative and not _meet(span, self.flown[1]):
+        if self.flown is not None and not relative and not meet(span, self.flown[1]):
             return _late(span, self.flown[1], self.options.timezone)
         return _RATIO if self.has_level and is_ratio(stream) else None
 
@@ -771,7 +772,7 @@ def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None)
     """Check whether some stream of the flight is RSS in the proper sense."""
     levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
     spans = [span for s in levels if (span := stream_span(s))]
-    return any(flown is None or _meet(span, flown[1]) for span in spans)
+    return any(flown is None or meet(span, flown[1]) for span in spans)
 
 
 def _samples(file: IngestedFile) -> int:
@@ -791,7 +792,7 @@ def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
     ]
 
     def worth(flight: tuple[Stream, Span]) -> tuple[int, np.timedelta64]:
-        return sum(_meet(flight[1], span) for span in measured), flight[1][1] - flight[1][0]
+        return sum(meet(flight[1], span) for span in measured), flight[1][1] - flight[1][0]
 
     # without any wall clock, a log that holds both levels and positions is a flight in its own time
     return max(telemetry or relative[:1], key=worth, default=None)
@@ -821,7 +822,7 @@ def _carrier(
     tracks = [flown]
     for stream in (s for file in files for s in file.result.streams if s.kind == "telemetry" and s is not flown[0]):
         span = stream_span(stream)
-        if span is not None and _meet(span, flown[1]) and _apart_m(stream, flown[0]) > _ONE_VEHICLE_M:
+        if span is not None and meet(span, flown[1]) and _apart_m(stream, flown[0]) > _ONE_VEHICLE_M:
             tracks.append((stream, span))
     if len(tracks) == 1:
         return flown, ""
@@ -842,13 +843,9 @@ def _apart_m(first: Stream, second: Stream) -> float:
     if len(time) < 2 or len(at) < 2:
         return 0.0
     both = (time >= at[0]) & (time <= at[-1])
-    away = (place[both] - interpolated(time[both], at, other)) * 111_200.0
-    away[:, 1] *= np.cos(np.radians(other[0, 0]))
-    return float(np.median(np.linalg.norm(away, axis=1))) if both.any() else 0.0
-
-
-def _meet(first: Span, second: Span) -> bool:
-    return bool(first[0] <= second[1] and second[0] <= first[1])
+    flown = (place[both], interpolated(time[both], at, other))
+    here, there = (rough_m(some[:, 0], some[:, 1], other[0]) for some in flown)
+    return float(np.median(np.linalg.norm(here - there, axis=1))) if both.any() else 0.0
 
 
 # Of a log's cells, those told most often are proposed; in a city a phone hears a hundred.

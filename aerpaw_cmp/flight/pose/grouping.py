@@ -89,6 +89,11 @@ def stream_span(stream: Stream) -> Span | None:
     return (time.min(), time.max()) if len(time) else None
 
 
+def meet(first: Span, second: Span) -> bool:
+    """Check whether two spans share an instant."""
+    return bool(first[0] <= second[1] and second[0] <= first[1])
+
+
 def _tracks(file: IngestedFile) -> list[Stream]:
     return [stream for stream in file.result.streams if stream.kind == "telemetry"]
 
@@ -106,14 +111,12 @@ def _place(file: IngestedFile) -> tuple[float, float] | None:
 
 
 def _meet(flight: Flight, span: Span, place: tuple[float, float] | None) -> bool:
-    if flight.span is None or flight.span[0] - SLACK > span[1] or span[0] > flight.span[1] + SLACK:
+    if flight.span is None or not meet((flight.span[0] - SLACK, flight.span[1] + SLACK), span):
         return False
     if place is None or flight.place is None:
         return True
     # the margin before and after is for radios: two tracks must share time
-    if flight.span[0] > span[1] or span[0] > flight.span[1]:
-        return False
-    return max(abs(place[0] - flight.place[0]), abs(place[1] - flight.place[1])) < APART_DEG
+    return meet(flight.span, span) and max(abs(place[0] - flight.place[0]), abs(place[1] - flight.place[1])) < APART_DEG
 
 
 def _shared(first: Span | None, second: Span) -> np.timedelta64:

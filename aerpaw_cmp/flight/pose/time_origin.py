@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import shapely
 
+from ...common.geodesy import rough_m
 from ...common.units import AnyArray, BoolArray, FloatArray
 from ...logs.records import Stream, has_wall_clock
 from .track import interpolated
@@ -19,7 +20,6 @@ _NEAR_M = 4.0 * _AGREE_M
 # The second-best origin, a minute away or farther, must be so many times worse.
 _UNIQUE = 1.8
 _POINTS = 240
-_METRES = 111_320.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,10 +102,7 @@ def _points(frame: pd.DataFrame, most: int | None) -> tuple[AnyArray, FloatArray
 
 def _metres(points: FloatArray, about: FloatArray) -> FloatArray:
     """Places in metres from the first; heights as logged, 0 where there are none."""
-    centre = about[0]
-    east = (points[:, 1] - centre[1]) * _METRES * np.cos(np.radians(centre[0]))
-    north = (points[:, 0] - centre[0]) * _METRES
-    return np.stack([east, north, np.nan_to_num(points[:, 2])], axis=1)
+    return np.column_stack([rough_m(points[:, 0], points[:, 1], about[0]), np.nan_to_num(points[:, 2])])
 
 
 def _median_distances(

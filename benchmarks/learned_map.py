@@ -38,7 +38,7 @@ from aerpaw_cmp.compare.learning.field_gp import FieldFit, FieldModel, Rows, fit
 from aerpaw_cmp.compare.statistics.intervals import mean_interval
 from aerpaw_cmp.flight.settings import AntennaSettings
 from aerpaw_cmp.jobs.learning.calibrate import gain_of, learned_antennas, observe
-from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankFitSettings, RankSamples, Tried, rank_samples
+from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankSamples, Tried, rank_samples
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
@@ -351,7 +351,7 @@ def ranks(bench: Bench, *, quick: bool) -> None:
     names = "nr_flight1", "nr_flight3"
     for test, train in (names, names[::-1])[: 1 if quick else None]:
         (teacher,), (item,) = bench.ranks(train), bench.ranks(test)
-        receiver = Tried.of([teacher], RankFitSettings()).fit([0])
+        receiver = Tried.of([teacher]).fit([0])
         own, taught = (Reports.of(reports, receiver, 20 if quick else 2) for reports in (item, teacher))
         for title, parts in rank_parts(own, taught).items():
             alone = np.concatenate([-(asked.was * asked.logit).sum(axis=1) for asked, _ in parts])

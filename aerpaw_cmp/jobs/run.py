@@ -603,14 +603,14 @@ def run_calibrate(
     ):
         with stages("read"):
             flights, remarks = read_flights(settings, path.parent, options.logs_root)
-            reports = {} if settings.rank is None else samples_by_tower(flights)
+            reports = samples_by_tower(flights) if settings.rank else {}
         ranked, calibration = None, None
-        if settings.rank is None or any(data.rss for data in flights):
+        if not settings.rank or any(data.rss for data in flights):
             calibration = calibrate(settings, flights, path.parent, options.logs_root, stages=stages, score=score)
         stages.checked(lambda: [PlannedStage("rank", counted(len(reports), "receiver"))])
-        if settings.rank is not None:
+        if settings.rank:
             with stages("rank"):
-                ranked = fit_rank(reports, settings.rank)
+                ranked = fit_rank(reports)
         calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked)
         with output.filling() as place:
             metrics, text = write_files(calibrated, place, folder.name, stages.seconds)

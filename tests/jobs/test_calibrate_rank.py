@@ -10,7 +10,7 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.jobs.learning.calibrate_rank import (
     FittedReceiver,
     RankCalibration,
-    RankFitSettings,
+    RankGrid,
     RankSamples,
     Timing,
     Tried,
@@ -26,8 +26,8 @@ from aerpaw_cmp.propagation.geometry.arrays import (
     uav_comparison_array,
 )
 
-SETTINGS = RankFitSettings(
-    yaw_step_deg=45, uav_slant_deg=[[45, -45, -45, 45], [0, 90, 0, 90]], ground=[0.2], thin=2, members=3
+SETTINGS = RankGrid(
+    yaw_step_deg=45, uav_slant_deg=((45, -45, -45, 45), (0, 90, 0, 90)), ground=(0.2,), thin=2, members=3
 )
 
 
@@ -94,9 +94,9 @@ def legs() -> RankSamples:
 
 @pytest.mark.parametrize(("shift_s", "average_s"), [(4.0, 0.0), (2.0, 12.0)])
 def test_planted_delay_and_mean_of_the_reports_are_found(shift_s: float, average_s: float) -> None:
-    settings = RankFitSettings(
-        yaw_step_deg=90, uav_slant_deg=[[45, -45, -45, 45]], ground=[0.2], thin=1, members=1,
-        shift_s=[0, 2, 4], average_s=[0, 12],
+    settings = RankGrid(
+        yaw_step_deg=90, uav_slant_deg=((45, -45, -45, 45),), ground=(0.2,), thin=1, members=1,
+        shift_s=(0, 2, 4), average_s=(0, 12),
     )  # fmt: skip
     bare = legs()
     truth = Tried.of([bare], settings).geometries[1]

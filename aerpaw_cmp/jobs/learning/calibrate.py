@@ -34,7 +34,6 @@ from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ...report.words.calibration import sentences
 from ...site.antenna.learned import LearnedLock, Source
 from .calibrate_lock import learned_locks, lock_words
-from .calibrate_rank import RankFitSettings
 
 # Heights of roughness that are tried [m]; infinite is no ground ray.
 _ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
@@ -57,7 +56,7 @@ class CalibrationFile(StrictModel):
     patterns: PatternsSettings = PatternsSettings()
     source: Source = Source()
     """Title, DOI and licence of the flights' data, and their airframe: kept beside what a site remembers."""
-    rank: RankFitSettings | None = None
+    rank: bool = False
     """Also learn how the receiver decides its rank."""
 
 

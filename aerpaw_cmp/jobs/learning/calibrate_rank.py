@@ -12,16 +12,14 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any
 
 import numpy as np
-from pydantic import Field
 
 from ...common.errors import InputError, UsageError, parsing
 from ...common.jsonable import json_safe
 from ...common.provenance import KEY, MARKS, union
 from ...common.units import FloatArray, IntArray
-from ...common.yamlfile import StrictModel
 from ...compare.level.rss import seconds
 from ...compare.ranks import receiver
 from ...compare.ranks.forecast import ForecastScore, constant_forecast, score_forecast
@@ -46,27 +44,34 @@ _SLANTS_DEG: tuple[tuple[float, ...], ...] = (
 )  # fmt: skip
 
 
-class RankFitSettings(StrictModel):
-    """``rank`` of calibration.yaml: which geometries are tried."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankGrid:
+    """Geometries and timings that are tried.
 
-    yaw_step_deg: Annotated[float, Field(ge=5, le=90)] = 30.0
-    uav_slant_deg: list[Annotated[list[float], Field(min_length=4, max_length=4)]] | None = None
-    """Slants of the modem's ports to try; by default :data:`_SLANTS_DEG`."""
-    ground: list[Annotated[float, Field(ge=0, le=2)]] = Field(default_factory=lambda: [0.0, 0.2, 0.5, 1.0])
-    """Amplitude factors on the ground reflection to try."""
-    sum: Literal["power_sum", "coherent"] = "power_sum"
-    members: Annotated[int, Field(ge=1, le=60)] = 20
-    """Of the geometries that cannot be told apart, how many the forecast averages."""
-    thin: Annotated[int, Field(ge=1)] = 4
-    """Every n-th sample chooses the geometry; all fit."""
-    shift_s: list[Annotated[float, Field(ge=-30, le=30)]] = Field(
-        default_factory=lambda: [0.0, 2.0, 4.0, 6.0], min_length=1
-    )
-    """Seconds to try by which a report belongs to a later position than the log says."""
-    average_s: list[Annotated[float, Field(ge=0, le=120)]] = Field(
-        default_factory=lambda: [0.0, 8.0, 16.0, 24.0], min_length=1
-    )
-    """Seconds to try over which the modelled channel is averaged."""
+    Parameters
+    ----------
+    yaw_step_deg : float
+        Between mounts of the modem's array.
+    uav_slant_deg : tuple of tuple of float
+        Slants of the modem's ports.
+    ground : tuple of float
+        Amplitude factors on the ground reflection.
+    members : int
+        Of the geometries that cannot be told apart, how many the forecast averages.
+    thin : int
+        Every n-th sample chooses the geometry; all fit.
+    shift_s, average_s : tuple of float
+        Seconds by which a report may belong to a later position than the log says, and over which the modelled channel
+        may be averaged.
+    """
+
+    yaw_step_deg: float = 30.0
+    uav_slant_deg: tuple[tuple[float, ...], ...] = _SLANTS_DEG
+    ground: tuple[float, ...] = (0.0, 0.2, 0.5, 1.0)
+    members: int = 20
+    thin: int = 4
+    shift_s: tuple[float, ...] = (0.0, 2.0, 4.0, 6.0)
+    average_s: tuple[float, ...] = (0.0, 8.0, 16.0, 24.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -259,13 +264,12 @@ def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatA
     )
 
 
-def candidates(settings: RankFitSettings, samples: RankSamples) -> tuple[Geometry, ...]:
+def candidates(grid: RankGrid, samples: RankSamples) -> tuple[Geometry, ...]:
     """Geometries to try: upright and rolled by 90 deg (half a turn is the same), lying flat."""
-    half, full = (np.arange(0.0, end, settings.yaw_step_deg) for end in (180.0, 360.0))
+    half, full = (np.arange(0.0, end, grid.yaw_step_deg) for end in (180.0, 360.0))
     mounts = [(float(y), 0.0, r) for r in (0.0, 90.0) for y in half] + [(float(y), 90.0, 0.0) for y in full]
     tower = tuple(np.degrees(samples.link.tower_arrays[samples.tower].slant_rad).round(9).tolist())
-    slants = [tuple(s) for s in settings.uav_slant_deg] if settings.uav_slant_deg else list(_SLANTS_DEG)
-    return every_geometry(mounts, [tower], slants, settings.ground, (settings.sum,))
+    return every_geometry(mounts, [tower], grid.uav_slant_deg, grid.ground)
 
 
 def samples_by_tower(flights: Sequence[FlightData]) -> dict[str, list[RankSamples]]:
@@ -279,12 +283,12 @@ def samples_by_tower(flights: Sequence[FlightData]) -> dict[str, list[RankSample
     return towers
 
 
-def fit_rank(towers: Mapping[str, Sequence[RankSamples]], settings: RankFitSettings) -> RankCalibration:
+def fit_rank(towers: Mapping[str, Sequence[RankSamples]]) -> RankCalibration:
     """Fit a receiver per tower on all flights, and score it on each flight left out; InputError of too few reports."""
     receivers, warnings = {}, []
     scores: dict[str, list[tuple[str, str, ForecastScore]]] = {"flight_left_out": [], "sector_left_out": []}
     for tower, samples in towers.items():
-        tried = Tried.of(samples, settings)
+        tried = Tried.of(samples)
         receivers[tower] = tried.fit(range(len(samples)))
         if len(samples) < 2:
             warnings.append(f"rank at {tower}: one flight alone, no flight can be left out and nothing is scored")
@@ -326,18 +330,18 @@ def _sectors(samples: RankSamples, fitted: FittedReceiver, constant: FloatArray)
 class Tried:
     """All candidates at thinned samples of each flight, evaluated once: ``power`` (geometries, n, 4) per flight."""
 
-    settings: RankFitSettings
+    grid: RankGrid
     samples: Sequence[RankSamples]
     geometries: tuple[Geometry, ...]
     thinned: Sequence[RankSamples]
     power: Sequence[FloatArray]
 
     @classmethod
-    def of(cls, samples: Sequence[RankSamples], settings: RankFitSettings) -> Tried:
-        """All candidates of the settings, for flights at one tower."""
-        geometries = candidates(settings, samples[0])
-        thinned = [sample.part(slice(None, None, settings.thin)) for sample in samples]
-        return cls(settings, samples, geometries, thinned, [_powers_of(geometries, item) for item in thinned])
+    def of(cls, samples: Sequence[RankSamples], grid: RankGrid = RankGrid()) -> Tried:
+        """All candidates of a grid, for flights at one tower."""
+        geometries = candidates(grid, samples[0])
+        thinned = [sample.part(slice(None, None, grid.thin)) for sample in samples]
+        return cls(grid, samples, geometries, thinned, [_powers_of(geometries, item) for item in thinned])
 
     def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
         """Choose geometries and timing, and fit, on some of the flights.
@@ -346,9 +350,9 @@ class Tried:
         are then compared again.
         """
         first = self.choose(flights, Timing())
-        timing = self.choose_timing(flights, first.order[: self.settings.members])
+        timing = self.choose_timing(flights, first.order[: self.grid.members])
         choice = first if timing.shift_s == timing.average_s == 0.0 else self.choose(flights, timing)
-        chosen = tuple(self.geometries[i] for i in choice.tied[: self.settings.members])
+        chosen = tuple(self.geometries[i] for i in choice.tied[: self.grid.members])
         train = [self.samples[i] for i in flights]
         mixture = receiver.fit_mixture(
             np.concatenate([features_of(chosen, item, timing) for item in train], axis=1),
@@ -386,8 +390,8 @@ class Tried:
                     self.features(flights, Timing(shift_s=shift_s, average_s=average_s), which), rank, groups
                 ),
             )
-            for shift_s in self.settings.shift_s
-            for average_s in self.settings.average_s
+            for shift_s in self.grid.shift_s
+            for average_s in self.grid.average_s
         ]
         return min(candidates, key=lambda timing: timing.log_score)
 

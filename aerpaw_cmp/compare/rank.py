@@ -228,8 +228,6 @@ def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
 def _both(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
     """Both ranks as integers, 0 where there is none."""
     ranks = _ranks(measured), _ranks(simulated)
-    if ranks[0].shape != ranks[1].shape:
-        raise ValueError(f"measured has {ranks[0].size} ranks, simulated {ranks[1].size}: they must be pairs")
     # no report (NaN) compares as False, and becomes 0
     first, second = (np.where(rank >= 1, rank, 0).astype(np.int64) for rank in ranks)
     return first, second
@@ -272,15 +270,8 @@ def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
     if not len(measured_rank):
         return float("nan")
     size = int(max(measured_rank.max(), simulated_rank.max())) + 1
-    return _kappa(
-        float(np.mean(measured_rank == simulated_rank)),
-        np.bincount(measured_rank, minlength=size),
-        np.bincount(simulated_rank, minlength=size),
-    )
-
-
-def _kappa(observed: float, first: IntArray, second: IntArray) -> float:
-    chance = float((first / first.sum()) @ (second / second.sum()))
+    shares = [np.bincount(rank, minlength=size) / len(rank) for rank in (measured_rank, simulated_rank)]
+    observed, chance = float(np.mean(measured_rank == simulated_rank)), float(shares[0] @ shares[1])
     # two equal constants: 0 / 0
     return (observed - chance) / (1.0 - chance) if chance < 1.0 - 1e-12 else float("nan")
 

@@ -251,9 +251,7 @@ def _numbered(items: Mapping[str, AnyArray], shelf: str) -> list[str]:
 def _read_file(items: Mapping[str, AnyArray], group: str) -> IngestedFile:
     meta = _read_json(items[f"{group}meta"])
     rejected = tuple(RejectedLine(*entry) for entry in _read_json(items[f"{group}rejected"]))
-    # files of version 0.3 hold every rejected line, and no reasons
-    account = items.get(f"{group}reasons")
-    reasons = () if account is None else tuple(RejectedReason(*entry) for entry in _read_json(account))
+    reasons = tuple(RejectedReason(*entry) for entry in _read_json(items[f"{group}reasons"]))
     streams = tuple(_read_stream(items, name) for name in _numbered(items, f"{group}streams/"))
     result = ReadResult(
         reader=meta["reader"], streams=streams, lines=meta["lines"], accepted=meta["accepted"], blank=meta["blank"],

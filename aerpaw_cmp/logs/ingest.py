@@ -69,11 +69,8 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
     """Content of a packed file, other content as it is."""
-    return raw if packed.form(raw) is None else packed.unpacked(raw, path, _most_unpacked(raw))
-
-
-def _most_unpacked(raw: bytes) -> int:
-    return min(MAX_BYTES, archives.most_bytes(len(raw)))
+    most = min(MAX_BYTES, archives.most_bytes(len(raw)))
+    return raw if packed.form(raw) is None else packed.unpacked(raw, path, most)
 
 
 def _raw(place: Path, limit: int | None = None) -> bytes:

@@ -10,8 +10,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
 from .records import Attribute, ReadResult, Stream
 
 if TYPE_CHECKING:
@@ -32,7 +30,7 @@ def _origins(stream: Stream, reader: Reader, options: ReadOptions) -> dict[str, 
     attributes: dict[str, Attribute] = {}
     if "clock_from" not in about:
         attributes |= _split("clock", _clock(stream, reader, options))
-    if "height_from" not in about and _has_heights(stream):
+    if "height_from" not in about and "altitude_m" in stream.frame and stream.frame["altitude_m"].notna().any():
         attributes |= _split("height", reader.height_from)
     if stream.kind in ("rss", "rank") and "identity_from" not in about:
         named = any(key in about for key in ("node", "pci", "rnti")) or options.node is not None
@@ -46,10 +44,6 @@ def _clock(stream: Stream, reader: Reader, options: ReadOptions) -> str:
     if stream.attributes.get("clock") == "relative":
         return "assumed: the times are relative, from an unknown origin"
     return reader.clock_from
-
-
-def _has_heights(stream: Stream) -> bool:
-    return "altitude_m" in stream.frame and bool(np.isfinite(stream.frame["altitude_m"].to_numpy()).any())
 
 
 def _split(what: str, text: str) -> dict[str, Attribute]:

@@ -104,7 +104,7 @@ def _tuple(values: list[float], places: int) -> str:
     return ",".join(repr(round(value, places) + 0.0) for value in values)
 
 
-def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str, *, foot: bool = False) -> bytes:
+def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str) -> bytes:
     """Levels as the sounder's ``power_log``: ``od -f -w4`` through ``ts``.
 
     Parameters
@@ -115,29 +115,20 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str, *, foot
         Levels [dB re full scale], written as float32; NaN (out of coverage) becomes the no-signal floor.
     timezone : str
         Zone of the tower's clock.
-    foot : bool
-        Write od's closing offset, as a sounder that ends by itself does. Always written where the log ends inside
-        a run of equal samples, whose length would be lost otherwise.
 
     Returns
     -------
     bytes
         The file.
 
-    Raises
-    ------
-    ValueError
-        Times and levels of different lengths.
-
     Notes
     -----
-    Samples equal to the one before are suppressed: one ``*`` for the run, as ``od`` does without ``-v``.
+    Samples equal to the one before are suppressed: one ``*`` for the run, as ``od`` does without ``-v``. od's closing
+    offset is written where the log ends inside such a run, whose length would be lost otherwise.
     """
     level = unmasked(rss_db)
     level = np.where(np.isnan(level), _FLT_MIN_DB - _RX_GAIN_DB, level).astype(np.float32)
     stamps = local_text(times, timezone)
-    if len(stamps) != len(level):
-        raise ValueError(f"{len(stamps)} times and {len(level)} levels")
     same = np.concatenate(([False], level[1:] == level[:-1])) if len(level) else np.zeros(0, dtype=bool)
     lines = []
     for i, (stamp, value) in enumerate(zip(stamps, level, strict=True)):
@@ -145,7 +136,7 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str, *, foot
             lines.append(f"[{stamp}] {4 * i:07o}{str(value).removesuffix('.0'):>16}\n")
         elif not same[i - 1]:
             lines.append(f"[{stamp}] *\n")
-    if len(level) and (foot or same[-1]):
+    if len(level) and same[-1]:
         lines.append(f"[{stamps[-1]}] {4 * len(level):07o}\n")
     return "".join(lines).encode("ascii")
 

@@ -43,11 +43,6 @@ def test_samples_without_report_or_forecast_take_no_part():
     assert np.isnan(score_forecast(rank, np.full((50, 4), np.nan), np.zeros(50), np.full(4, 0.25)).kappa)
 
 
-def test_lengths_must_match():
-    with pytest.raises(ValueError, match="not in pairs"):
-        score_forecast([1, 2], np.ones((3, 4)) / 4, [1, 2, 3], np.full(4, 0.25))
-
-
 def test_every_interval_is_that_of_blocks_of_the_longest_memory():
     """By hand: the draws of each number, of one bootstrap whose blocks remember as long as any of the three sequences."""
     rng, rank = np.random.default_rng(5), ranks(600, 4)

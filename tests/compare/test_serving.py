@@ -40,13 +40,6 @@ def test_no_prediction_is_a_column_of_its_own() -> None:
     assert comparison.as_dict()["confusion"]["a"] == {"a": 0, "b": 0, "none": 1}
 
 
-def test_wrong_shapes_are_refused() -> None:
-    with pytest.raises(ValueError, match="shape"):
-        compare_serving([0], [[1.0]], ["a", "b"])
-    with pytest.raises(ValueError, match="serving cell 2 of 2"):
-        compare_serving([2], [[1.0, 2.0]], ["a", "b"])
-
-
 def test_the_value_nearest_in_time_is_that_of_a_search_through_all():
     rng = np.random.default_rng(8)
     for count in (1, 2, 3, 9):

@@ -166,7 +166,8 @@ def climb(
         )
         for rung, ok in zip(rungs, enough, strict=True)
     )
-    joined = [np.concatenate(e)[_in_time(time_s)] if e else np.zeros(0) for e in errors]
+    in_time = np.argsort(np.concatenate([*time_s, np.zeros(0)]), kind="stable")
+    joined = [np.concatenate([*e, np.zeros(0)])[in_time] for e in errors]
     rmse = tuple(_rmse(e) for e in joined)
     if not any(np.isfinite(rmse)):
         return Ladder(rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=None, best_replay=None, recommended=None)
@@ -374,10 +375,6 @@ def _covers(measured: Sequence[FloatArray], rung: Rung) -> bool:
 
 def _shared(measured: FloatArray, levels: Sequence[FloatArray]) -> BoolArray:
     return np.asarray(np.isfinite([measured, *levels]).all(axis=0))
-
-
-def _in_time(time_s: Sequence[FloatArray]) -> IntArray:
-    return np.argsort(np.concatenate(list(time_s)), kind="stable")
 
 
 def _rmse(error: FloatArray) -> float:

@@ -296,7 +296,7 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     if not heights:
         return Verdict()
     worst = min(heights, key=lambda height: height.covered)
-    by_trees = _fraction(worst.clear - worst.covered)
+    by_trees = max(float(np.nan_to_num(worst.clear - worst.covered)), 0.0)
     if worst.outside > 0.5:
         cause = "extrapolated"
     elif worst.covered == 0.0:
@@ -306,7 +306,3 @@ def coverage_verdict(heights: Sequence[Coverage]) -> Verdict:
     else:
         cause = "trees" if by_trees >= 1.0 - worst.covered - by_trees else "blocked"
     return Verdict(cause=cause, effect=worst.covered, where=f"{worst.height_m:g} m")
-
-
-def _fraction(value: float) -> float:
-    return max(value, 0.0) if math.isfinite(value) else 0.0

@@ -123,15 +123,8 @@ def compare_rss(
     Returns
     -------
     RssComparison
-
-    Raises
-    ------
-    ValueError
-        If lengths differ.
     """
     time, measured, simulated = seconds(time_s), _levels(measured_db), _levels(simulated_db)
-    if not time.shape == measured.shape == simulated.shape or time.ndim != 1:
-        raise ValueError(f"time {time.shape}, measured {measured.shape} and simulated {simulated.shape} must be (n,)")
     has_pose = np.ones(len(time), dtype=bool) if posed is None else np.asarray(posed, dtype=bool)
     use = has_pose & np.isfinite(measured) & np.isfinite(simulated)
     order = np.flatnonzero(use)[np.argsort(time[use], kind="stable")]
@@ -486,12 +479,12 @@ class ChannelDifference:
     """
 
     n: int
-    mean_db: float
-    std_db: float
-    correlation: float
-    share_parted: float
-    interval_std_db: Interval
-    spans: list[ErrorSpan]
+    mean_db: float = float("nan")
+    std_db: float = float("nan")
+    correlation: float = float("nan")
+    share_parted: float = float("nan")
+    interval_std_db: Interval = NO_INTERVAL
+    spans: list[ErrorSpan] = field(default_factory=list)
 
 
 def channel_difference(
@@ -523,10 +516,7 @@ def channel_difference(
     first, second = _levels(first_db), _levels(second_db)
     ok = np.isfinite(first) & np.isfinite(second)
     if not ok.any():
-        nan = float("nan")
-        return ChannelDifference(
-            n=0, mean_db=nan, std_db=nan, correlation=nan, share_parted=nan, interval_std_db=NO_INTERVAL, spans=[]
-        )
+        return ChannelDifference(n=0)
     difference = first - second
     # the channels of a receiver have gains of their own
     mean = float(difference[ok].mean())

@@ -73,10 +73,6 @@ def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence
     """
     index = np.nan_to_num(unmasked(served), nan=-1.0).astype(np.int64)
     level: FloatArray = unmasked(predicted_dbm)
-    if level.shape != (len(index), len(cells)):
-        raise ValueError(f"levels must have shape {(len(index), len(cells))}, found {level.shape}")
-    if index.size and index.max() >= len(cells):
-        raise ValueError(f"serving cell {index.max()} of {len(cells)}")
     known = index >= 0
     filled = np.where(np.isnan(level), -np.inf, level)
     strongest = np.where(np.isnan(level).all(axis=1), len(cells), filled.argmax(axis=1) if len(cells) else 0)

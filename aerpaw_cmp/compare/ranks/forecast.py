@@ -138,17 +138,8 @@ def score_forecast(
     -------
     ForecastScore
         All NaN where no sample has both.
-
-    Raises
-    ------
-    ValueError
-        If the three are not of one length.
     """
     ri, decision = unmasked(measured).ravel(), unmasked(decided).ravel()
-    if not len(ri) == len(decision) == len(probability):
-        raise ValueError(
-            f"{len(ri)} measured ranks, {len(probability)} forecasts, {len(decision)} decisions: not in pairs"
-        )
     counts = (ri >= 1) & (decision >= 1) & np.isfinite(probability).all(axis=1)
     rank, choice, p = ri[counts].astype(np.int64), decision[counts].astype(np.int64), probability[counts]
     if not len(rank):

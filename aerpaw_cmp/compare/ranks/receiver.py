@@ -162,8 +162,6 @@ class Receiver:
 
     def probabilities(self, features: FloatArray) -> FloatArray:
         """Probability (n, ranks) of each rank at features (n, features); NaN where a feature is NaN."""
-        if features.shape[-1] != len(self.mean):
-            raise ValueError(f"{features.shape[-1]} features for a receiver of {len(self.mean)}")
         return _softmax(_design((features - self.mean) / self.scale) @ self.coefficient.T)
 
     def decide(self, probability: FloatArray) -> IntArray:
@@ -212,9 +210,6 @@ def _fitted(x: FloatArray, rank: IntArray, penalty: float) -> Receiver:
 def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
     """Features (geometries, n, features), ranks and groups of the samples that have a rank and all features."""
     ri = unmasked(rank)
-    if not len(ri) == features.shape[1] == len(groups):
-        counts = f"{len(ri)} ranks, {features.shape[1]} rows of features, {len(groups)} groups"
-        raise ValueError(f"{counts}: not of one length")
     good = np.asarray((ri >= 1) & np.isfinite(features).all(axis=(0, 2)))
     y = ri[good].astype(np.int64)
     if len(y) < FEWEST or np.ptp(y) == 0:
@@ -417,8 +412,6 @@ class ReceiverMixture:
 
     def probabilities(self, features: FloatArray) -> FloatArray:
         """Mean probability (n, ranks) at features (members, n, features)."""
-        if len(features) != len(self.members):
-            raise ValueError(f"features of {len(features)} geometries for {len(self.members)} receivers")
         return np.asarray(
             np.mean([member.probabilities(x) for member, x in zip(self.members, features, strict=True)], axis=0)
         )

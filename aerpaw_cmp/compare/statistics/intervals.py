@@ -461,11 +461,6 @@ def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_of
     -------
     PairedDifference
 
-    Raises
-    ------
-    ValueError
-        If the two are not of one length.
-
     Notes
     -----
     With d the difference of the two predictions, which the route fixes, and b the share of it that the measurement asks
@@ -479,8 +474,6 @@ def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_of
     2.0
     """
     first, second = (np.asarray(values, dtype=np.float64).ravel() for values in (error_db, other_error_db))
-    if first.shape != second.shape:
-        raise ValueError(f"errors to compare must be of one length, found {len(first)} and {len(second)}")
     finite = np.isfinite(first) & np.isfinite(second)
     first, second = first[finite], second[finite]
     if free_offset and len(first):

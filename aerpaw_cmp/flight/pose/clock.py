@@ -218,7 +218,8 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
         return _nothing(_NO_OVERLAP, window_s)
     if all(b.flat for b in bins.values()):
         return _nothing(_FLAT_LEVEL, window_s)
-    lags = _symmetric(window_s, _STEP_S)
+    steps = int(window_s / _STEP_S + 1e-9)
+    lags = np.asarray(np.arange(-steps, steps + 1) * _STEP_S, dtype=np.float64)
     first = np.sum([b.likelihood(lags, [[_START]] * len(names)).sum(axis=0) for names, b in bins.items()], axis=0)
     starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # of each model, and of clocks that agree
     parts = {names: b.fitted(starts) for names, b in bins.items()}
@@ -303,12 +304,6 @@ def _finer(
         order = np.argsort(lags)
         lags, nats = lags[order], nats[..., order]
     return lags, nats
-
-
-def _symmetric(limit: float, step: float) -> FloatArray:
-    """Multiples of ``step`` from -limit to limit."""
-    count = int(limit / step + 1e-9)
-    return np.asarray(np.arange(-count, count + 1) * step, dtype=np.float64)
 
 
 def _nothing(reason: str, window_s: float) -> ClockEstimate:

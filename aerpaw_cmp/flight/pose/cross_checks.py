@@ -141,15 +141,8 @@ def _name_starts(path: str) -> list[tuple[str, datetime, str, timedelta]]:
             time = datetime(*parts, tzinfo=zones.utc)  # type: ignore[misc, arg-type]
         except ValueError:
             continue
-        exact = len(parts) > 3
-        starts.append(
-            (
-                "the file's name",
-                time,
-                "%Y-%m-%d %H:%M" if exact else "%Y-%m-%d",
-                _OF_THE_MINUTE if exact else _OF_THE_DAY,
-            )
-        )
+        form, slack = ("%Y-%m-%d %H:%M", _OF_THE_MINUTE) if len(parts) > 3 else ("%Y-%m-%d", _OF_THE_DAY)
+        starts.append(("the file's name", time, form, slack))
     return starts
 
 

@@ -144,6 +144,7 @@ def table(columns: list[str], rows: list[list[str]], title: str | None = None, w
     from rich.console import Console
     from rich.table import Table
 
+    # before widths are taken: an escape is longer than the character
     rows = [[one_line(cell) for cell in row] for row in rows]
     columns, title = [one_line(name) for name in columns], title and one_line(title)
     # without a terminal rich takes 80 columns

@@ -202,6 +202,7 @@ class GrowingNetcdf:
     def _append(self, data: Any) -> None:
         if self._book is None:
             self._sink.write(netcdf_bytes(data, self._grows))
+            # h5py goes on where netCDF4 began: that library appends to no stream
             self._book = library("h5py").File(self._sink, "r+")
             for variable in self._book.values():
                 if "_FillValue" in variable.attrs and variable.attrs["_FillValue"][0] == 0:

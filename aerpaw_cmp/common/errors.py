@@ -183,6 +183,7 @@ def parsing(
         if isinstance(error, _FAULTS) and not any_shape and _is_raised_here(error):
             raise
         words = f"{type(error).__name__}: {one_line(str(error)[:200])}"
+        # of a class by its base: UnicodeDecodeError is a UnicodeError
         words = next((text for kind, text in _IN_WORDS.items() if isinstance(error, kind)), words)
         raise InputError(
             f"cannot be read ({words})",
@@ -196,6 +197,7 @@ def _is_raised_here(error: BaseException) -> bool:
     """Check whether a line of this package or of its readers raised an error, not a library that it called."""
     trace = error.__traceback__
     while trace is not None and trace.tb_next is not None:
+        # the last frame is where it was raised
         trace = trace.tb_next
     name = "" if trace is None else str(trace.tb_frame.f_globals.get("__name__"))
     return name.partition(".")[0] in ("aerpaw_cmp", "aerpaw_parsers")

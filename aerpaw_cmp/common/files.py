@@ -95,6 +95,7 @@ def locked(folder: Path) -> Iterator[None]:
     """A folder for one process at a time: others wait. Without effect on systems and disks that have no locks."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
+        # no fcntl on Windows, no locks on some network disks
         with contextlib.suppress(ImportError, OSError):
             import fcntl
 

@@ -136,6 +136,7 @@ class Factor:
         ``inv(P_bb) (P y)_b`` (Rasmussen and Williams, eq. 5.10-5.12, for blocks).
         """
         inverse = self.inverse()
+        # once: every part takes its rows of it
         right = inverse @ values
         for code in np.unique(part):
             index = np.flatnonzero(part == code)

@@ -52,6 +52,7 @@ class SiteFrame:
         latitude = unmasked(latitude_deg)
         longitude = unmasked(longitude_deg)
         east, north = in_shape(self._projection, longitude, latitude)
+        # PROJ gives infinity for them, which would pass for a place far away
         bad = ~(np.isfinite(latitude) & np.isfinite(longitude))
         return np.where(bad, np.nan, east), np.where(bad, np.nan, north)
 

@@ -16,5 +16,6 @@ def html_table(titles: Sequence[str], rows: Iterable[Sequence[object]], caption:
     """
     head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    # a caption comes first in a table: HTML allows it nowhere else
     name = f"<caption>{html.escape(caption)}</caption>" if caption else ""
     return f"<table>{name}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

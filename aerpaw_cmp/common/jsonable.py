@@ -63,6 +63,7 @@ def json_object(**entries: Any) -> dict[str, Any]:
 
 def _listed(array: AnyArray) -> Any:
     if array.dtype.kind == "f":  # large maps: one pass, not one call per number
+        # Python's floats: JSON writes them with the fewest digits that read back
         boxed = array.astype(object)
         boxed[~np.isfinite(array)] = None
         return boxed.tolist()

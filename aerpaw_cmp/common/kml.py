@@ -188,6 +188,7 @@ def write_archive(path: Path, title: str, description: str, body: str, pictures:
     )
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in {"doc.kml": document.encode(), **pictures}.items():
+            # named here: writestr by name would stamp the hour
             entry = zipfile.ZipInfo(name, _DATE)
             entry.compress_type = zipfile.ZIP_DEFLATED
             archive.writestr(entry, content)
@@ -229,6 +230,7 @@ class _Sheet:
         import matplotlib
         from PIL import Image, ImageDraw, ImageFont
 
+        # a little transparent: the ground shows through
         self.picture = Image.new("RGBA", (round(width * _DPI), round(height * _DPI)), (255, 255, 255, 230))
         self.pen = ImageDraw.Draw(self.picture)
         self._font = ImageFont.truetype(f"{matplotlib.get_data_path()}/fonts/ttf/DejaVuSans.ttf", 12)

@@ -165,6 +165,7 @@ def _hdf5(depth: int) -> Read:
             book["x"].attrs[name] = book.attrs[name] = value
         book.flush()
         read(book.id.get_file_image())  # loads what h5py and NumPy load late: later they cannot
+    # loads zipfile, which answer() needs when nothing can be opened any more
     np.savez(io.BytesIO(), np.zeros(1))
     return read
 

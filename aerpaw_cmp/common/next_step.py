@@ -68,6 +68,7 @@ def _nearest(place: Path) -> str:
         names = [item.name for item in folder.iterdir()]
     except OSError:
         names = []
+    # nearly alike: a far name would send to another flight
     near = get_close_matches(place.name, names, n=1, cutoff=0.8) if folder == place.parent else []
     if near:
         return f"the same command with {one_line(str(folder / near[0]))}"

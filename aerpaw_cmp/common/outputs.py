@@ -308,6 +308,7 @@ class OutputFolder:
                 self._refuse_content()
                 (self._place.part / _UNFINISHED).touch()
             except BaseException:
+                # Python calls it for a block that was entered alone
                 self.__exit__(None, None, None)
                 raise
         return self

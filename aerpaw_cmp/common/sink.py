@@ -26,6 +26,7 @@ class Sink:
         if self._failure is None:
             try:
                 return action(*given)
+            # an interrupt, too: HDF5 would be left in the middle of a write
             except BaseException as failure:
                 self._failure = failure
         return instead

@@ -149,10 +149,12 @@ class Stages:
         raise_interrupt()
         if name not in self.seconds:
             self.progress(name)
+        # by this clock: time of day may be set while a job runs
         start = time.perf_counter()
         try:
             yield
         finally:
+            # also where it failed or was interrupted: the page says what was spent
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
             give_memory_back()
 

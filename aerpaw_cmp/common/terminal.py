@@ -22,6 +22,7 @@ class _Descriptor(io.FileIO):
                 return super().write(data)
             except OSError as error:
                 self.fault = error
+        # as if all were written: a caller that gets less writes again, for ever
         return memoryview(data).nbytes
 
 
@@ -69,6 +70,7 @@ def output_fault() -> OSError | None:
         sys.stdout.flush()
     except OSError as error:
         return error
+    # what a test or a notebook put there has no descriptor of ours
     buffer = getattr(sys.stdout, "buffer", None)
     raw = getattr(buffer, "raw", buffer)
     return raw.fault if isinstance(raw, _Descriptor) else None

@@ -42,6 +42,7 @@ def commit() -> str:
     # --long counts the commits behind a tag also where there are none, so that the answer has one form
     ask = ["git", "-C", str(package.parent), "describe", "--tags", "--always", "--long", "--abbrev=7"]
     try:
+        # no shell: the path of a checkout may hold blanks and quotes
         told = subprocess.run(
             [*ask, "--dirty=.dirty", "--match", release], capture_output=True, text=True, check=True, timeout=10
         )

@@ -22,6 +22,7 @@ def xml_root(data: bytes, path: Path | None, expected: str) -> ElementTree.Eleme
     if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
         raise InputError("the XML declares entities, or is not UTF-8", expected=expected, path=path)
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()  # a KML with gx:Track and no xmlns:gx is common
+    # one piece of text for an element: expat hands it on line by line else
     parser.buffer_text = True
     parser.StartElementHandler = builder.start
     parser.EndElementHandler, parser.CharacterDataHandler = builder.end, builder.data

@@ -69,6 +69,7 @@ def nearest(name: object, choices: Iterable[str]) -> str | None:
     >>> nearest("zzz", ["flight"]) is None
     True
     """
+    # a wrong case is the commonest slip
     by_lower = {choice.lower(): choice for choice in choices}
     matches = difflib.get_close_matches(str(name).lower(), by_lower, n=1, cutoff=0.5)
     return by_lower[matches[0]] if matches else None
@@ -346,6 +347,7 @@ def _explain(
     for item in error.errors(include_url=False):
         problem, cause = _finding(item, model)
         findings.append((document.line(item["loc"]), problem, cause))
+    # in the order of the file; pydantic has them in that of the model
     findings.sort(key=lambda finding: finding[0] or 0)
     if len(findings) == 1:
         line, problem, cause = findings[0]
@@ -354,6 +356,7 @@ def _explain(
         f"line {line}: {problem}" + (f" ({cause})" if cause else "") if line else problem
         for line, problem, cause in findings
     ]
+    # a file of another kind has hundreds of mistakes
     shown = lines[:20] + ([f"and {len(lines) - 20} more"] if len(lines) > 20 else [])
     return UsageError(f"{len(findings)} problems\n  " + "\n  ".join(shown), path=path)
 

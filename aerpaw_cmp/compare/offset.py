@@ -153,6 +153,7 @@ def grid_offset(
         return _NO_FIT
     mean, variance = _mean_and_variance(difference)
     best = nearest_offset(grid, mean, step_db)
+    # without squaring a difference of 1e200
     rmse = float(np.hypot(np.sqrt(variance), mean - grid[best]))
     return OffsetFit(float(grid[best]), rmse, len(difference), best in (0, len(grid) - 1))
 

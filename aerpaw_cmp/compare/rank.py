@@ -100,6 +100,7 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
     alive = (largest[..., 0] > 0) & np.isfinite(largest[..., 0])
     rank = above.sum(axis=-1)
     if k > 1:
+        # the margin may not take the largest from itself
         rank = np.maximum(rank, 1)
     return np.where(alive, rank, 0).astype(np.int64)
 
@@ -297,6 +298,7 @@ def histogram_test(measured: ArrayLike, simulated: ArrayLike, *, replicates: int
     measured_rank, simulated_rank = _pairs(measured, simulated)
     if not len(measured_rank):
         return float("nan")
+    # an exchange of a block turns the sign of its difference
     difference = one_hot(measured_rank) - one_hot(simulated_rank)
     length = max(autocorrelation(measured_rank).block_length, autocorrelation(simulated_rank).block_length, 1)
     sums = np.add.reduceat(difference, np.arange(0, len(measured_rank), length), axis=0)
@@ -486,6 +488,7 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike) -> IntArray:
     for layers in range(1, gain.shape[-1] + 1):
         rate = np.log2(1.0 + snr[..., None] * gain[..., :layers] / layers).sum(axis=-1)
         rates.append(np.broadcast_to(rate, shape))
+    # argmax takes the first of equal rates: that of fewer layers
     stacked = np.stack(rates, axis=-1)
     alive = np.isfinite(stacked).all(axis=-1)
     best = np.argmax(np.where(alive[..., None], stacked, 0.0), axis=-1) + 1

@@ -223,6 +223,7 @@ class RssResult:
     def residual_db(self) -> FloatArray:
         """Calibrated measurement minus simulation (n,); NaN where a side is missing, or was learned on this flight."""
         if LEARNED_HERE in self.score.fitted_on_scored:
+            # nothing that was learned here is scored here
             return np.full(len(self.time), np.nan)
         return self.calibrated_db - self.simulated_dbm
 

@@ -144,6 +144,7 @@ def choose_site(choice: SiteChoice, folder: Path) -> Site:
             key: dataclasses.replace(tower, antenna_height_m=choice.antenna_height_m)
             for key, tower in site.towers.items()
         }
+        # of every tower: a flight does not say which are its own
         site = dataclasses.replace(site, towers=towers)
     if choice.without_buildings:
         note = "this flight is replayed without the buildings of the site (site.without_buildings)"
@@ -229,16 +230,19 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     path, logged = folder / node.track.path, node.height == "logged"
     frame = _node_positions(name, node.track, path, settings.timezone)
     latitude, longitude = (frame[key].to_numpy(np.float64) for key in ("latitude_deg", "longitude_deg"))
+    # the median: one position of a receiver without a fix moves no node
     middle = float(np.median(latitude)), float(np.median(longitude))
     east, north = site.frame.to_local(latitude, longitude)
     centre = site.frame.to_local(np.array([middle[0]]), np.array([middle[1]]))
     reach_m = float(np.hypot(east - centre[0], north - centre[1]).max())
+    # a node on the ground is logged below it as often as above
     up = np.maximum(frame["altitude_m"].to_numpy(np.float64) + site.takeoff_ground_m, MINIMUM_HEIGHT_M)
     height = float(np.nanmedian(up)) if logged and np.isfinite(up).any() else float("nan")
     if logged and not np.isfinite(height):
         raise InputError(
             "no heights in this log", expected=f"those of towers.{name}, which has height: logged", path=path
         )
+    # a height that is taken from the ground does not move
     rises = float(np.nanmax(np.abs(up - height))) if logged else 0.0
     stands = _NodePlace(
         latitude_deg=middle[0], longitude_deg=middle[1], height_m=height if logged else node.antenna_height_m
@@ -246,6 +250,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
     if max(reach_m, rises) <= STANDS_STILL_M:
         return stands
     track = Track(
+        # on the ground: its own heights are not used, and may be missing
         frame if logged else frame.assign(altitude_m=0.0),
         site.frame,
         maximum_gap_s=settings.rt.advanced.maximum_gap_s,
@@ -260,6 +265,7 @@ def _node_place(name: str, node: GroundNode, folder: Path, settings: FlightFile,
             path=path,
         )
     remarks = [f"moves {reach_m:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
+    # nobody uses how a node is turned
     remarks += [text for text in track.account.warnings if "attitude" not in text]
     return dataclasses.replace(stands, track=track, remarks=tuple(remarks))
 
@@ -296,6 +302,7 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     InputError
         A missing file, a log of another kind than the flight file says, a log without any record.
     """
+    # a flight file of several logs is read once
     root, cache = logs_root or folder, Held()
     return tuple(
         read_log(root, log.path, log.options(settings.timezone), reader=log.reader, held=cache) for log in settings.logs
@@ -366,6 +373,7 @@ def gather(
         streams = [stream for stream in file.result.streams if stream.name not in log.skip]
         telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
         for stream in (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s)):
+            # the sounder writes power and quality to files of their own
             elsewhere = (candidate for source in files if source is not file for candidate in source.result.streams)
             locked, remark = lock_of(stream, [*file.result.streams, *elsewhere])
             warnings += [f"{log.path}: {remark}"] if remark else []
@@ -393,6 +401,7 @@ def gather(
     track = (
         _track(site, *telemetry[0], warnings, maximum_gap_s=settings.rt.advanced.maximum_gap_s) if telemetry else None
     )
+    # without any position at all the message of the overlap says it better
     if track is None and rss and any(series.position_m is not None for _, series in rank):
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
         warnings.append(f"no telemetry log: the levels of {levels} have no positions and are left out")
@@ -415,6 +424,7 @@ def gather(
     asked = (
         () if track is None else doubts(track, telemetry[0][1], _times_on_track(data), _undated(data, telemetry[0][0]))
     )
+    # after the overlap was checked: a flight that shares no time stops with its own message
     data = dataclasses.replace(data, doubts=asked, warnings=(*data.warnings, *(f"{text}." for text in asked)))
     return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
 
@@ -506,6 +516,7 @@ def check_place(site: Site, path: str, stream: Stream) -> None:
     latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
     if not (near := nearest_m(site, latitude, longitude)) > FAR_M:
         return
+    # in the order in which they happen
     turned = {
         "latitude and longitude are exchanged": (longitude, latitude),
         "the longitude lacks its sign (west is negative)": (latitude, -longitude),
@@ -523,10 +534,12 @@ def check_place(site: Site, path: str, stream: Stream) -> None:
 
 def nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -> float:
     """Least horizontal distance of positions to any tower [m]; NaN without a position."""
+    # impossible angles are refused elsewhere, and would stop the projection
     can = (np.abs(latitude_deg) <= 90.0) & (np.abs(longitude_deg) <= 180.0)
     if not can.any():
         return float("nan")
     east, north = site.frame.to_local(latitude_deg[can], longitude_deg[can])
+    # by each tower's nearest sample: a flight may be long
     gaps = [np.hypot(east - t.position_m[0], north - t.position_m[1]).min() for t in site.towers.values()]
     return float(np.min(gaps, initial=np.inf))
 
@@ -613,6 +626,7 @@ def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | N
         takeoff_m = site.takeoff_ground_m  # as of the track: altitude_m counts from there
         up = frame["altitude_m"].to_numpy(np.float64) + takeoff_m
         up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)
+        # buried and without a height: no position, as in a track
         position = np.stack([east, north, np.where(buried | np.isnan(frame["altitude_m"]), np.nan, up)], axis=-1)
     sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
     return RankSeries(
@@ -646,6 +660,7 @@ def _records(parts: Sequence[tuple[str, Series]], name: Callable[[Series], str])
 def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
     if len(group) == 1:
         return group[0][1]
+    # in time, whatever the order of the flight file; a record without a sample has no place in it
     parts = sorted((p for p in group if len(p[1].time)), key=lambda p: p[1].time.min()) or [group[0]]
     for (path, before), (later_path, after) in itertools.pairwise(parts):
         if after.time.min() < before.time.max() or _form(before) != _form(after):
@@ -655,6 +670,7 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
                 expected="one record of each channel and of each tower's rank",
                 cause="a copy: leave one out, by its path or by 'skip'; another radio: give it its own 'channel'",
             )
+    # what does not grow with the record (link, unit) is that of its first part
     first = parts[0][1]
     series = [part for _, part in parts]
     arrays: dict[str, Any] = {
@@ -722,6 +738,7 @@ def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: 
     expected = "logs of the same flight"
     if node is not None:
         of, expected = "the track of this tower", "positions of the node during the flight"
+        # 1970: times from a zero of their own
         if pd.Timestamp(end).year < _FIRST_YEAR:
             cause = "relative times: they want 'time_origin' beside the log"
         cause = cause.replace("beside the log", f"beside 'path' in towers.{node}.track")
@@ -747,6 +764,7 @@ def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray,
     known = np.isfinite(position).all(axis=1)
     if track is not None and not known.all():
         pose = track.pose_at(series.time)
+        # row by row: a modem without a fix for a while has the track's position then
         use = ~known & pose.valid
         position, known = np.where(use[:, None], pose.position_m, position), known | use
     return position, np.asarray(known)

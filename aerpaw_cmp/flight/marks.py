@@ -41,12 +41,14 @@ _LEAST_SD = 0.2
 def mark_of(time: AnyArray, readings: FloatArray) -> str:
     """Mark of the readings (n,) of a series at instants (n,); empty for what tells too little or repeats itself."""
     known = np.flatnonzero(np.isfinite(readings) & ~np.isnat(time))
+    # the order of equal times stays: a mark must not depend on the sort
     known = known[np.argsort(time[known], kind="stable")]
     if not len(known):
         return ""
     seconds, values = (time[known] - time[known[0]]) / np.timedelta64(1, "s"), readings[known]
     if values.min() > 0.0 and (values.max() < 1.0 or values.max() > _POWER_RATIO * values.min()):
         values = 10.0 * np.log10(values)
+    # about the mean: sums of levels near -90 dB over hours would lose the digits of a change
     total = np.concatenate([[0.0], np.cumsum(values - values.mean())])
     at = np.arange(0.0, min(float(seconds[-1]), _LONGEST_S), _STEP_S)
 
@@ -60,13 +62,16 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
     if len(change) < _FEWEST or not change.std() > _LEAST_SD:
         return ""
     spread = 1.4826 * float(np.median(np.abs(change)))
+    # ranks hardly change: the median of their changes is 0
     spread = spread if spread > 0.05 * change.std() else float(change.std())
     digits = np.clip(np.rint(change / spread * _PER_SD) + _MIDDLE, 0, len(_DIGITS) - 1).astype(np.int64)
     text = np.full(len(at), _GAP)
     text[told] = np.array(list(_DIGITS))[digits]
     digits, apart = "".join(text), int(_TREND_S / _STEP_S)
+    # a series that is like itself at another time (a test tone) would be like any other of its kind
     if (_evidence(digits, digits) >= _LEAST_Z)[apart:-apart].any():
         return ""
+    # half seconds, so that it counts in steps of the mark
     first = time[known[0]]
     start = round((first - np.datetime64(0, "ns")) / np.timedelta64(500, "ms")) if has_wall_clock(first) else ""
     return f"{start}{_BEGIN}{digits}"
@@ -99,6 +104,7 @@ def _parts(mark: str) -> tuple[int | None, str]:
 
 def _evidence(first: str, second: str) -> FloatArray:
     """Fisher's z over its spread at each circular lag, 0 of few or loose pairs; of level and path loss signs differ."""
+    # room for every lag, forwards and backwards
     size = 1 << (len(first) + len(second) - 1).bit_length()
     left, right = _spectra(first, size), _spectra(second, size)
 
@@ -109,6 +115,7 @@ def _evidence(first: str, second: str) -> FloatArray:
     ours, theirs = at_lags(1, 0), at_lags(0, 1)
     variances = (at_lags(2, 0) - ours**2 / count) * (at_lags(0, 2) - theirs**2 / count)
     covariance = np.abs(at_lags(1, 1) - ours * theirs / count)
+    # below 1: arctanh of a log with itself would be infinite
     r = np.minimum(covariance / np.sqrt(np.maximum(variances, (0.01 * count) ** 2)), 0.9999)
     z = np.arctanh(r) * np.sqrt(np.maximum(count / _memory(left[1], right[1], size) - 3.0, 0.0))
     return np.where((count >= _FEWEST) & (r >= _LEAST_R), z, 0.0)

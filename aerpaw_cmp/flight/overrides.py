@@ -37,6 +37,7 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
+        # the message names what was typed, also where the mistake is found above or below it
         key = next((k for k in overrides if k.startswith(where) or where.startswith(k)), where)
         message = str(first["msg"]).removeprefix("Value error, ")
         raise UsageError(f"the override {key!r}: found {first['input']!r} at {where}", expected=message) from None

@@ -120,6 +120,7 @@ def replay_rss(
     """Replay every RSS series; series of one tower with equal links are replayed together."""
     groups: dict[tuple[str, str], list[int]] = {}
     for index, series in enumerate(data.rss):
+        # one search of paths for all channels that share a link
         groups.setdefault((series.tower, series.settings_key), []).append(index)
     shifts = clocks or [None] * len(data.rss)
     rt, out = data.settings.rt, dict[int, Replayed]()
@@ -200,6 +201,7 @@ def same_computer(data: FlightData) -> list[list[int]]:
         keys.add(("tower", series.tower))
         shared = [group for group in groups if group[0] & keys]
         groups = [group for group in groups if not group[0] & keys]
+        # groups that this series connects become one
         groups.append((keys.union(*(k for k, _ in shared)), [*(i for _, many in shared for i in many), index]))
     return [members for _, members in groups]
 
@@ -238,6 +240,7 @@ def clock_channels(data: FlightData, channels: Sequence[RssSeries]) -> list[Cloc
     start, end = data.track.start_ns, data.track.end_ns
     towers = dict.fromkeys(series.tower for series in channels)
     step = _MOVING_CLOCK_STEP_S if any(tower in data.nodes for tower in towers) else _CLOCK_STEP_S
+    # as many instants at most: hours of flight cost no more than half an hour does
     step = max(step, (end - start) * 1e-9 / _CLOCK_INSTANTS)
     instants = (start + np.round(np.arange(0.0, (end - start) * 1e-9, step) * 1e9).astype(np.int64)).astype(
         "datetime64[ns]"
@@ -284,10 +287,12 @@ def _levels_along(
     track = data.poses_at(instants).where(known)
     poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
     field = Field(path_loss(data.site, data.settings.rt, links[0].carrier_hz))
+    # the directions at both ends: gains over them are fitted beside the lag
     line = track.position_m - place
     distance = np.linalg.norm(line, axis=1)
     unit = line / distance[:, None]
     body = -np.einsum("nij,ni->nj", track.rotation, unit)
+    # the image engine whatever the flight uses: a lag needs no deeper path, and no minute of waiting
     search = Search("image", max_depth=depth)
     if tower not in data.nodes:
         traced, sources = replay(data.site, links[0], poses, search), data.site.towers[tower].position_m[None, :]
@@ -343,7 +348,9 @@ def part_of(replayed: Replay, start: int, stop: int) -> Replay:
         rows = (paths.pose >= start) & (paths.pose < stop)
         return dataclasses.replace(paths.select(rows), pose=paths.pose[rows] - start)  # type: ignore[type-var]
 
+    # what a part cost is its share of what all did
     share = (stop - start) / max(len(replayed.rss_dbm), 1)
+    # views, no copies: a long flight has its paths once
     columns: dict[str, Any] = {name: getattr(replayed, name)[start:stop] for name in PER_LINK}
     return dataclasses.replace(
         replayed,
@@ -378,6 +385,7 @@ def rank_poses(data: FlightData, series: RankSeries) -> tuple[Poses, BoolArray, 
     position, valid = rank_positions(series, data.track)
     valid = valid & data.tower_at(series.tower, series.time)[1]
     track = None if data.track is None else data.poses_at(series.time).pick(valid)
+    # without an attitude the array stays as it is mounted in the site
     rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
     if track is not None:
         rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]

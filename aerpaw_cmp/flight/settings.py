@@ -93,6 +93,7 @@ class ArraySettings(StrictModel):
     def build(self, wavelength: float, folder: Path) -> Array:
         """The array, with patterns loaded from files relative to ``folder``."""
         positions = self.positions(wavelength)
+        # one slant for all, or one for each element
         slant = np.atleast_1d(np.asarray(self.slant_deg, dtype=np.float64))
         if len(slant) not in (1, len(positions)):
             raise UsageError(
@@ -104,6 +105,7 @@ class ArraySettings(StrictModel):
         return Array(
             positions,
             np.radians(np.broadcast_to(slant, (len(positions),)).copy()),
+            # one pattern for all elements; measured files may hold several carriers
             (load_pattern(self.antenna, folder, SPEED_OF_LIGHT_MPS / wavelength),),
             mount,
         )
@@ -113,6 +115,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
     """The element pattern of the settings; files resolve against ``folder``, the carrier chooses among frequencies."""
     from ..site.antenna import antennas
 
+    # a named model has no file, and none is opened for it
     file = folder / str(settings.file)
     if settings.model == "dipole":
         return antennas.HalfWaveDipole()
@@ -262,6 +265,7 @@ class PlanSettings(StrictModel):
 class FlightSettings(StrictModel):
     """Name and kind of the flight."""
 
+    # it names the folder of the report: no blank, no separator, no dot in front
     name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
     title: str | None = None
     synthetic: bool = False
@@ -503,8 +507,10 @@ def files_of(content: Mapping[str, Any], folder: Path, learned: Path | None = No
 
 def _joined(settings: FlightFile, learned: Mapping[str, Any], path: Path) -> FlightFile:
     """The settings of a flight with what was learned in place of its own."""
+    # what the file says, no defaults: a stated default would keep a learned value out
     stated: dict[str, Any] = settings.model_dump(mode="json", exclude_unset=True)
     link = dict(stated.get("link", {}))
+    # a channel begins as the RSS link, as with overrides; what was learned comes last
     rss_link = settings.link.rss.model_dump(mode="json", exclude_unset=True)
     channels = dict(link.get("channels", {}))
     for name, channel in learned.get("link", {}).get("channels", {}).items():

@@ -64,6 +64,7 @@ class Trajectory:
 
     def velocity_at(self, time_s: FloatArray) -> FloatArray:
         """Velocities (n, 3) [m/s] east, north, up; zero while waiting."""
+        # the last corner belongs to the leg before it
         leg = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
         return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
 
@@ -113,6 +114,7 @@ def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArra
     """
     velocity = trajectory.velocity_at(time_s)
     speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    # a hover has no course: the nose stays where it was, and before the first leg where that points
     yaw = pd.Series(np.where(speed > 0.1, bearing_deg(velocity), np.nan))
     return np.zeros(len(time_s)), -0.6 * speed, yaw.ffill().bfill().fillna(0.0).to_numpy()
 
@@ -120,6 +122,7 @@ def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArra
 def planned_poses(plan: PlanSettings, ground_m: float, step_s: float) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Instants (n,) [s], positions (n, 3) [m] and headings (n,) [deg] of a plan; take-off stands at ``ground_m``."""
     trajectory = plan_trajectory(plan)
+    # a little longer: the end is a sample where the step divides the flight
     time_s = np.arange(0.0, trajectory.duration_s + 1e-9, step_s)
     position = trajectory.position_at(time_s)
     position[:, 2] = np.maximum(position[:, 2] + ground_m, MINIMUM_HEIGHT_M)
@@ -162,6 +165,7 @@ def telemetry_frame(
             "yaw_deg": yaw,
             "velocity_north_mps": velocity[:, 1],
             "velocity_east_mps": velocity[:, 0],
+            # autopilots count downwards
             "velocity_down_mps": -velocity[:, 2],
             "fix": 4,
             "satellites": 18,
@@ -203,6 +207,7 @@ def correlated_noise(
         return np.zeros(count)
     keep = np.exp(-step_s / correlation_s)
     white = generator.standard_normal(count) * np.sqrt(1 - keep**2)
+    # the first sample has the full standard deviation: the sequence has gone on for ever
     white[0] /= np.sqrt(1 - keep**2)
     return np.asarray(lfilter([1.0], [1.0, -keep], white) * standard_deviation)
 
@@ -210,6 +215,7 @@ def correlated_noise(
 def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
     """The start in its zone; a wall time that never was, or was twice, or no clock can show, is refused."""
     try:
+        # NaT for both: pandas would raise exceptions of pytz and of its own
         local: Any = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(timezone, ambiguous="NaT", nonexistent="NaT")
         if not 1980 <= start.year <= 2200:
             why = "a clock that nothing flew by"
@@ -311,6 +317,7 @@ class FlightSimulator:
 
     def _flight_file(self) -> dict[str, Any]:
         """The settings as they hold in another folder: site and antenna files by absolute paths."""
+        # what the user stated alone: defaults may change
         content: dict[str, Any] = self.settings.model_dump(mode="json", exclude_unset=True)
         place = site_place(self.settings.site.file, self.folder)
         content["site"] = {**content.get("site", {}), "file": place if isinstance(place, str) else str(place.resolve())}
@@ -372,6 +379,7 @@ class FlightSimulator:
             self.generator, len(level), plan.fading_db, plan.rss_interval_s, plan.fading_correlation_s
         )
         out_of_coverage = ~np.isfinite(level) | (level < _LOWEST_DBM)
+        # of the tower's clock: the levels are those of the true time
         shift = plan.clock_shift_s.get(tower, 0.0)
         self.truth_["rss"].setdefault(tower, {})[str(log.channel)] = {
             "offset_db": offset,
@@ -417,6 +425,7 @@ class FlightSimulator:
         generator, plan = self.generator, self.plan
         off = generator.random(len(rank)) < plan.rank_error_share
         step = np.where(generator.random(len(rank)) < 0.5, -1, 1)
+        # no rank below 1: a modem without a channel reports no CSI, not 0 layers
         reported = np.where(off, np.clip(rank + step, 1, layers), rank)
         return np.where(generator.random(len(rank)) < plan.no_csi_share, 0, reported)
 
@@ -424,6 +433,7 @@ class FlightSimulator:
         """Insert ``plan.bad_lines`` broken lines at seeded places (never first, so that sniffing still works)."""
         count = self.plan.bad_lines
         lines = data.splitlines(keepends=True)
+        # too few lines to stay a log with damage in it
         if count == 0 or len(lines) < 20:
             return data, []
         end = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
@@ -432,6 +442,7 @@ class FlightSimulator:
         )
         damage = []
         for number, place in enumerate(places):
+            # as a killed logger leaves them, and as a console prints between
             torn = lines[place].rstrip()[: max(4, len(lines[place]) // 3)]
             text = torn if number % 2 == 0 else b"Killed by signal 15 " + torn[:8]
             lines.insert(place, text + end)

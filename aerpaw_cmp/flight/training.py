@@ -87,6 +87,7 @@ def _original(pattern: MeasuredPattern, folder: Path, memory: Path) -> SpherePat
     Tables of the memory of the site and of those in the package, and of calibrations in the folder.
     """
     packaged = folder_of("lake_wheeler").parent.glob("*.learned/*.csv.gz")
+    # the site's own memory first: mostly it is there
     places = dict.fromkeys([*memory.glob("*.csv.gz"), *packaged, *folder.glob("*.csv"), *folder.glob("*/*.csv")])
     tables = (table for place in places if (table := _learned_table(place)) is not None)
     return next((table for table in tables if _same_numbers(pattern, table)), None)
@@ -111,7 +112,9 @@ def _same_numbers(pattern: MeasuredPattern, table: SpherePattern) -> bool:
     theta = np.concatenate([np.full(len(angle), np.pi / 2), np.where(angle < np.pi, angle, 2 * np.pi - angle)])
     phi = np.concatenate([angle, np.where(angle < np.pi, 0.0, np.pi)])
     gain, other = pattern.gain_dbi(theta, phi), table.gain_dbi(theta, phi)
+    # but for a level: programs norm patterns to their maximum
     apart = np.abs(gain - other - np.median(gain - other))
+    # what is flat is like every other
     return bool(np.ptp(other) > 1.0 and np.mean(apart < 0.06) > 0.95)
 
 

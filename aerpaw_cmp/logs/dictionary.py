@@ -265,6 +265,7 @@ def plain(name: str) -> str:
     >>> plain("RSRP (LTE detected) - 1")
     'rsrp lte detected 1'
     """
+    # a zero-width space stands in headers that were copied from web pages
     return re.sub(r"[^a-z0-9]+", " ", name.lower().replace("\u200b", "")).strip()
 
 
@@ -355,6 +356,7 @@ def in_brackets(name: str) -> tuple[str, str, str]:
 def rank_of(quantity: Quantity, words: str) -> tuple[int, int]:
     """Place of a plain name in the order of preference: rows come so, and the patterns of a row."""
     fits = [i for i, pattern in enumerate(quantity.names) if re.search(pattern, words)]
+    # a height above the ellipsoid only where no other is: it is 33 m off at Lake Wheeler
     last = len(QUANTITIES) * (quantity.datum == "ellipsoid")
     return QUANTITIES.index(quantity) + last, fits[0] if fits else len(quantity.names)
 
@@ -374,12 +376,14 @@ def impossible(quantity: Quantity, values: FloatArray) -> BoolArray:
 
 def angle_form(values: FloatArray, quantity: Quantity) -> str:
     """The unit of positions that cannot be degrees: MAVLink's integers, or NMEA's degrees and minutes; else empty."""
+    # zeros are rows before the first fix
     known = np.abs(values[np.isfinite(values) & ~is_none(quantity, values) & (values != 0)])
     most = quantity.can_be[1]
     if not len(known) or np.median(known) <= most:
         return ""
     if (known == np.round(known)).all() and np.median(known) > 1e5 and known.max() <= most * 1e7:
         return "1e-7 deg"
+    # minutes end at 60: of degrees and minutes run together all do
     if known.max() <= 100 * most and (known % 100 < 60).all():
         return "ddmm.mmmm"
     return ""

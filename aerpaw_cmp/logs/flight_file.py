@@ -100,6 +100,7 @@ def fill(stream: BinaryIO, files: Sequence[IngestedFile]) -> None:
                 _write_file(shelf.create_group(f"{i:05d}"), file, sink)
     finally:
         sink.raise_spared()  # what HDF5 says after a failure is its consequence
+    # HDF5 ignores what stands behind its own end
     size = stream.seek(0, os.SEEK_END)
     digest = _digest(stream, size)
     stream.seek(size)
@@ -213,6 +214,7 @@ def _codes(part: AnyArray, number: dict[str | None, int]) -> AnyArray:
 def _write_json(group: Any, name: str, content: Any) -> None:
     import numpy as np
 
+    # escapes keep torn bytes (lone surrogates), which UTF-8 cannot hold
     text = json.dumps(content, ensure_ascii=True).encode("ascii")
     group.create_dataset(name, data=np.frombuffer(text, dtype=np.uint8))
 
@@ -278,6 +280,7 @@ def _read_column(items: Mapping[str, AnyArray], name: str, kind: str) -> Any:
         return values.astype("datetime64[ns]")
     if kind != "text":
         return values
+    # code -1 takes the last: no text
     words = np.array([*_read_json(items[f"{name}.words"]), None], dtype=object)
     return pd.Series(words[values], dtype=object)
 

@@ -159,6 +159,7 @@ def as_utf8(data: bytes) -> bytes:
     """
     if data[:2] in _UTF_16:
         text = data.decode("utf-16", errors="replace")
+        # a binary file may begin with the same two bytes
         return data if "\0" in text or text.count("\ufffd") > 8 else text.encode()
     return data.removeprefix(b"\xef\xbb\xbf")
 
@@ -239,6 +240,7 @@ def read_log(
         files = [_of_kind(_source(*part, held), None if reader is None else by_name(reader), part[0])]
     else:
         files = ingest([path], options=options, reader=reader)
+    # a folder of pieces is one log; several would have one node and one channel
     if len(files) != 1:
         names = ", ".join(one_line(Path(item.path).name) for item in files[:4])
         raise UsageError(
@@ -314,12 +316,14 @@ def _member(
     chosen: Reader | None,
 ) -> IngestedFile:
     """One file of an archive; what its first bytes show to be no log is not unpacked."""
+    # only the beginning: a data set holds recordings of GiB beside its logs
     head = member.read(DEEP_BYTES)
     if chosen is None and member.size > DEEP_BYTES and packed.form(head) is None and not archives.is_archive(head):
         chosen = identify(as_utf8(head), path=str(path))
     unpacked = _unpacked(member.read(None), path)
     digest = hashlib.sha256(unpacked).hexdigest()
     data = as_utf8(unpacked)
+    # each level would multiply what may be unpacked
     if archives.is_archive(data[:HEAD_BYTES]):
         raise InputError("an archive inside an archive: unpack it", path=path)
 
@@ -400,6 +404,7 @@ def name_inside(path: str) -> str:
 def _source(flight_file: Path, name: str, held: Held | None = None) -> IngestedFile:
     """One of the logs that a flight file holds, by its path or the end of it."""
     held = {} if held is None else held
+    # once for all logs of a flight.yaml that name it
     files = held[flight_file] = held.get(flight_file) or read_flight(flight_file)
     named = [item for item in files if item.path == name or Path(item.path).as_posix().endswith(f"/{name}")]
     if len(named) != 1:
@@ -470,6 +475,7 @@ def _folder(
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     try:
+        # in order of names: joined pieces and equal clocks then have one order on every disk
         places = sorted(p for p in folder.rglob("*") if not p.name.startswith(".") and (p.is_file() or p.is_symlink()))
     except OSError as error:
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
@@ -551,6 +557,7 @@ def _account_row(file: Mapping[str, Any], folder: str, every_stream: bool) -> li
     kinds: dict[str, list[str]] = {}
     for stream in streams:
         kinds.setdefault(stream["kind"], []).append(f"{stream['name']} {stream['rows']}")
+    # as a set: streams of one log mostly share their rate
     rates = {"-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in streams}
     start, seconds = _start_and_length([s for s in streams if s["start"]])
     return [

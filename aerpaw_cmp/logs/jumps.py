@@ -82,9 +82,11 @@ def _path(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
 
 def _speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
     """Median speed of the part in which the track moves, over steps long enough for stamps written in bursts."""
+    # over a fiftieth of the track: loggers write a second's rows in one burst
     apart = max(1, len(time_s) // 50)
     step_m = np.linalg.norm(place_m[apart:] - place_m[:-apart], axis=1)
     step_s = np.abs(time_s[apart:] - time_s[:-apart])
+    # a hover says nothing about the unit of times
     moving = (step_s > 0) & (step_m > 1.0)
     return float(np.median(step_m[moving] / step_s[moving])) if moving.sum() >= 3 else 0.0
 
@@ -92,6 +94,7 @@ def _speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
 def _runs(time_s: FloatArray, place_m: FloatArray) -> tuple[IntArray, IntArray]:
     """First rows, and the rows behind the last, of the runs that fast steps divide a track into."""
     step_m = np.linalg.norm(np.diff(place_m, axis=0), axis=1)
+    # either way in time: a clock that steps back is no jump of the position
     fast = step_m > FASTEST_MPS * np.abs(np.diff(time_s)) + _JITTER_M
     begins = np.concatenate([[0], np.flatnonzero(fast) + 1])
     return begins, np.append(begins[1:], len(time_s))
@@ -118,6 +121,7 @@ def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, float, 
     begins, ends = _runs(time_s, place_m)
     if len(begins) == 1:
         return astray, 0.0, 0
+    # the longest run is the track: jumps are short
     main = int(np.argmax(ends - begins))
     few = max(3.0, 0.05 * count)
 

@@ -149,6 +149,7 @@ class _Check:
         beyond: dict[str, BoolArray] = {}
         for name in names:
             value, (low, high) = self._values(name), ranges[name]
+            # least and greatest first: a mask of every column of a large log would cost more than reading it
             least = np.fmin.reduce(value) if len(value) else np.nan
             if not np.isnan(least) and not (low <= least and np.fmax.reduce(value) <= high):
                 beyond[name] = (value < low) | (value > high)
@@ -203,6 +204,7 @@ class _Check:
 
     def _two_levels(self) -> None:
         """Say where the levels of a series alternate between two: of two devices, SIMs or networks."""
+        # the beginning: two devices alternate all along
         level = self._values("rss_db")[:10_000]
         level = level[np.isfinite(level)]
         if len(level) < _FEW_ALTERNATE:
@@ -216,6 +218,7 @@ class _Check:
 
     def _near_in_time(self) -> None:
         """Flag a few stamps that lie days from all the others."""
+        # differences as floats: those of int64 would wrap for NaT and for stamps 300 years apart
         time = self.frame["time"].to_numpy("datetime64[ns]")
         stamp: IntArray = time.view(np.int64)
         if len(stamp) < 2 or _one_run(stamp):
@@ -227,6 +230,7 @@ class _Check:
         group = np.concatenate(([0], np.cumsum(np.diff(stamp[order].astype(np.float64)) > _APART_S * 1e9)))
         size = np.bincount(group)
         few = size <= max(_FEW_ROWS, _FEW_SHARE * len(order))
+        # the largest group is the log
         few[int(np.argmax(size))] = False
         few &= 2 * size.max() > len(order)  # without a main part: two flights in one file, not a few bad stamps
         last = stamp[order][np.append(np.flatnonzero(np.diff(group)), len(order) - 1)]

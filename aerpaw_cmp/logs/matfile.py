@@ -78,6 +78,7 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
             expected="a file that begins with 'MATLAB 5.0 MAT-file' or 'MATLAB 7.3 MAT-file'",
             cause="another kind of file",
         )
+    # the letters MI as a 16-bit number, in the order of the machine that wrote them
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
         raise _damaged("no byte order")
@@ -85,6 +86,7 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
     allowance = FREE_BYTES + MOST_RATIO * len(data)
     for element in _elements(data, 128, order, padded=False):
         variable = _inflated(element, order, min(allowance, MOST_BYTES)) if element.kind == _COMPRESSED else element
+        # all variables share it: a thousand small bombs are one large
         allowance -= len(variable.body) if element.kind == _COMPRESSED else 0
         if variable.kind != _MATRIX:
             raise _damaged(f"element of type {variable.kind} where a variable was expected")
@@ -101,6 +103,7 @@ def names_of(head: bytes) -> list[str]:
         for element in islice(_elements(head, 128, order, padded=False, cut=True), 64):
             body = element.body
             if element.kind == _COMPRESSED:
+                # 256 bytes hold flags, dimensions and a name; the tag in front is that of the matrix
                 body = zlib.decompressobj().decompress(body, 256)[8:]
             names.append(_head_of(_elements(body, 0, order, padded=True, cut=True))[2])
     return names
@@ -149,6 +152,7 @@ def _elements(data: bytes, at: int, order: str, *, padded: bool, cut: bool = Fal
 def _inflated(element: _Element, order: str, most: int) -> _Element:
     machine = zlib.decompressobj()
     try:
+        # 0 would mean no limit
         plain = machine.decompress(element.body, max(most, 1))
     except zlib.error as error:
         raise _damaged(str(error)) from None
@@ -172,6 +176,7 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
     """Name and array of a variable; None for one that is not wanted or of another class."""
     parts = _elements(body, 0, order, padded=True)
     flags, dimensions, title = _head_of(parts)
+    # signed: a negative one is damage, and would wrap to a huge one
     shape = struct.unpack(f"{order}{len(dimensions) // 4}i", dimensions)
     if min(shape) < 0:
         raise _damaged("a negative dimension")

@@ -33,6 +33,7 @@ def _origins(stream: Stream, reader: Reader, options: ReadOptions) -> dict[str, 
     if "height_from" not in about and "altitude_m" in stream.frame and stream.frame["altitude_m"].notna().any():
         attributes |= _split("height", reader.height_from)
     if stream.kind in ("rss", "rank") and "identity_from" not in about:
+        # a cell or a connection is an identity as good as a node's name
         named = any(key in about for key in ("node", "pci", "rnti")) or options.node is not None
         attributes["identity_from"] = "written" if named else "assumed"
     return attributes

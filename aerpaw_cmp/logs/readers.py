@@ -166,6 +166,7 @@ def claims(data: bytes) -> list[Reader]:
     """
     data = _BLANK_LINES.sub(b"", data[:DEEP_BYTES])
     heads = (data[:HEAD_BYTES], data) if len(data) > HEAD_BYTES else (data,)
+    # log readers first, with little and then with more: a page of text may quote a log
     tried = [(head, True) for head in heads] + [(head, False) for head in reversed(heads)]
     accepting = ([r for r in catalogue() if bool(r.kinds) is of_logs and r.sniff(head)] for head, of_logs in tried)
     return next((readers for readers in accepting if readers), [])
@@ -182,6 +183,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     if not data.strip():
         raise InputError("the file is empty", expected="log lines", cause="an aborted run", path=path)
     head = data[:HEAD_BYTES]
+    # before any sniffer: it is a text, and would be called an unknown one
     if head.startswith(b"version https://git-lfs"):
         raise InputError(
             "a Git-LFS pointer stands in place of the data",
@@ -213,6 +215,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
 
 def _way_out(head: bytes) -> str:
     first = head.lstrip(b"\xef\xbb\xbf \r\n").split(b"\n", 1)[0].decode("utf-8", "replace").strip()
+    # the commonest: a decimal comma stands less often than what parts the cells
     sign = max(",;\t|", key=first.count)
     names = [name.strip().strip('"') for name in first.split(sign)]
     if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):

@@ -158,10 +158,12 @@ class ReadResult:
     reasons: tuple[RejectedReason, ...] = ()
 
     def __post_init__(self) -> None:
+        # readers of small files give the lines alone
         if not self.reasons:
             reasons = by_reason(RejectedReason(line.reason, 1, line.number, line.number) for line in self.rejected)
             object.__setattr__(self, "reasons", reasons)
         if len(self.rejected) > KEPT_REJECTED:
+            # the others stay counted in the reasons: a torn log of 1 GB would fill the memory with its text
             object.__setattr__(self, "rejected", self.rejected[:KEPT_REJECTED])
         if self.lines != self.accepted + self.rejected_count + self.blank:
             raise ValueError(

@@ -89,6 +89,7 @@ class _Route:
 
 def _route(data: bytes, path: str | Path) -> _Route:
     head = data[:HEAD_BYTES]
+    # before the log readers: a plan is a JSON that one of them may take for its own
     if re.match(rb"\s*\{", head) and b'"fileType"' in data[: 1 << 20]:
         return _plan(data, path)
     if re.match(rb"\s*QGC WPL \d+", head):
@@ -122,6 +123,7 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
             place = f"{int(silent.sum())} of {counted(len(table), 'point')} without a height"
             raise InputError(place, expected="heights above take-off in the file, or one height for all points")
         table["altitude_m"] = table["altitude_m"].fillna(height_m)
+    # programs count headings from -180 or from 0
     table["yaw_deg"] = table["yaw_deg"] % 360.0
     table.attrs["remarks"] = list(route.remarks)
     return table
@@ -129,10 +131,12 @@ def _table(route: _Route, height_m: float | None) -> pd.DataFrame:
 
 def _log(path: str | Path) -> _Route:
     """Track of a log: the clock's zone is of no account."""
+    # any zone and origin: a route has no date
     file = read_file(path, options=ReadOptions(timezone="UTC", time_origin="2000-01-01T00:00:00"))
     tracks = [stream for stream in file.result.streams if "latitude_deg" in stream.frame.columns]
     if not tracks:
         raise InputError(f"a log of {file.result.reader!r} without positions", expected=_EXPECTED)
+    # telemetry before the places of a radio
     track = max(tracks, key=lambda stream: (stream.kind == "telemetry", len(stream.frame)))
     frame = track.frame[track.frame["latitude_deg"].notna()]
     route = _Route(remarks=[str(text) for text in file.result.warnings])
@@ -195,6 +199,7 @@ def _waypoint_text(text: str) -> _Route:
             values = _numbers(cells[4:11], 7)
         except (ValueError, IndexError) as error:
             raise InputError(f"no waypoint: {line[:60]!r}", expected="12 fields", line=number) from error
+        # line 0 of a waypoint file is home, whatever its command
         if index == 0:
             home = values[4:7]
         else:
@@ -215,6 +220,7 @@ def _fly(route: _Route, items: Sequence[_Item], home: tuple[float, ...], *, name
     named_yaw : bool
         Is the fourth parameter of a waypoint its yaw? ArduPilot ignores it.
     """
+    # a take-off without coordinates happens at home
     place = home[:2] if len(home) > 1 else (math.nan, math.nan)
     for item in items:
         latitude, longitude, height = item.numbers[4:7]
@@ -236,11 +242,13 @@ def _turn(route: _Route, item: _Item) -> None:
     degrees, direction, relative = item.numbers[0], item.numbers[2], item.numbers[3]
     if relative == 1:
         route.remark("Turns relative to the course before them are left out.")
+    # -1, 0 or 1; anything else is another program's parameter
     elif math.isfinite(degrees) and abs(direction) <= 1:
         route.points[-1] = (*route.points[-1][:3], degrees, math.nan)
 
 
 def _height(route: _Route, item: _Item, height: float, home: tuple[float, ...]) -> float:
+    # a landing ends on the ground, whatever altitude its item holds
     if item.command in _LANDINGS:
         return 0.0
     if item.frame in _SEA_LEVEL_FRAMES:
@@ -285,6 +293,7 @@ def _kml(data: bytes) -> _Route:
     for shape in lines or shapes:
         modes = kml.modes_of(shape)
         sea_level |= "absolute" in modes
+        # KML's default; drawn lines then hold a 0 that is no height
         clamped = not modes or any(mode.startswith("clamp") for mode in modes)
         headings = [float(m[1]) for angles in named(shape, "angles") if (m := _HEADING.match(str(angles.text or "")))]
         for index, place in enumerate(kml.places_of(shape)):
@@ -334,6 +343,7 @@ def _sheet(text: str) -> _Route:
     if not lines:
         raise InputError("the file is empty", expected=_EXPECTED)
     sign = max(",;\t", key=lines[0].count)
+    # quoted names may hold the separator
     rows = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=sign, skipinitialspace=True))
     known = [dictionary.meaning(name) for name in rows[0]]
     above_sea = [m is not None and m.quantity.datum in ("sea level", "ellipsoid") for m in known]

@@ -72,8 +72,10 @@ def format_vehicle_out(frame: pd.DataFrame, timezone: str) -> bytes:
     )
     angles = np.radians(frame[["pitch_deg", "yaw_deg", "roll_deg"]].fillna(0.0).to_numpy())
     angles = (angles + np.pi) % (2 * np.pi) - np.pi  # the autopilot writes yaw in -pi..pi
+    # plus 0.0: -0.0 would be written with its sign
     speed = frame[["velocity_north_mps", "velocity_east_mps", "velocity_down_mps"]].fillna(0.0).to_numpy() + 0.0
     fix = np.where(nowhere, 0, np.where(frame["fix"] < 0, 3, frame["fix"]))
+    # -1 is the record's "unknown": the logger always writes a number
     satellites = np.where(frame["satellites"] < 0, 12, frame["satellites"])
     lines = [
         f'{i + 1},{_short(lon, 7)},{_short(lat, 7)},{_short(alt, 3)},"({_tuple(angle, 17)})","({_tuple(v, 2)})",'
@@ -127,6 +129,7 @@ def format_power_log(times: ArrayLike, rss_db: ArrayLike, timezone: str) -> byte
     offset is written where the log ends inside such a run, whose length would be lost otherwise.
     """
     level = unmasked(rss_db)
+    # as float32, as the sounder writes them: equal ones are equal in its digits, too
     level = np.where(np.isnan(level), _FLT_MIN_DB - _RX_GAIN_DB, level).astype(np.float32)
     stamps = local_text(times, timezone)
     same = np.concatenate(([False], level[1:] == level[:-1])) if len(level) else np.zeros(0, dtype=bool)

@@ -123,6 +123,7 @@ class StatusLine:
         elif self._enabled:
             print(self._lines[name], file=sys.stderr, flush=True)
         if now.alarm:
+            # the terminal's bell
             print("\a", end="", file=sys.stderr, flush=True)
 
 

@@ -304,6 +304,7 @@ class GainFit:
 
     def scaled(self) -> GainFit:
         """The fit with all standard deviations times :attr:`common_scale`: the same gains, other uncertainties."""
+        # a scale moves no mean: the factor and the evidence follow in closed form
         s, count = self.common_scale, len(self._weights)
         misfit = s**2 * max(count - len(self.rows), 1)
         return dataclasses.replace(
@@ -453,6 +454,7 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
 
 def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArray) -> GainFit:
     """The fit of rows with the covariance of their levels, in the place of which it is factored."""
+    # in its place: at 3 000 rows a copy is 72 MB
     factor = Factor.of(covariance)
     target = np.concatenate([s.residual_db - s.residual_db.mean() for s in rows])
     weights = factor.solve(target)

@@ -250,6 +250,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     least, named = _MARGIN + math.log(max(len(channels), 1)), {}
     for name in (trouble for trouble in best if lead[trouble] >= least):
         shown = [table for table in tables if name in _names(_best(table, best))]
+        # the clearest channel gives the words
         shown.sort(key=lambda table: -_best(table, {name}).gain)
         # also alone it must bring levels and prediction together, not only their changes from second to second
         alone = _share_of_error(shown, _SOUND, {name})
@@ -529,6 +530,7 @@ def _tuned(
     """The best of some values and of those about it, whose changes of the level are interpolated; at 0 is none."""
     from scipy.interpolate import CubicSpline
 
+    # no change is known of 0: the curve goes through it
     values = sorted({0.0, *changes_db})
     likely = _profiled(e, {value: trial(value, change) for value, change in changes_db.items()})
     best = likely.estimate[0]

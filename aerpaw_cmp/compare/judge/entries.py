@@ -92,6 +92,7 @@ def level_scores(series: Sequence[LevelSeries]) -> dict[str, float]:
 def _series_scores(s: LevelSeries) -> dict[str, float]:
     error = s.error_db
     slow = local_mean_db(s.time_s, s.measured_db, WINDOW_S) - local_mean_db(s.time_s, s.level_db, WINDOW_S)
+    # the mean of local means is not that of the samples: it has an offset of its own
     slow = slow - slow.mean() if s.own_offset else slow
     scores = {
         "rmse_db": float(np.sqrt(np.mean(error**2))),

@@ -172,6 +172,7 @@ def climb(
     if not any(np.isfinite(rmse)):
         return Ladder(rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=None, best_replay=None, recommended=None)
     replays = [i for i, rung in enumerate(rungs) if rung.regressor_db is None and np.isfinite(rmse[i])]
+    # lines replay nothing: they are shown, and never recommended
     chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
     if chosen is not None:
         recommended = next(i for i in replays if i == chosen or _as_good(joined[i], joined[chosen]))

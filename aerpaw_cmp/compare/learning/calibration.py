@@ -150,6 +150,7 @@ def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
     at = dataclasses.replace(samples, residual_db=np.zeros(len(samples))).binned(_FINE_S)
     if not len(at):
         return np.full(len(samples), np.nan)
+    # linear between half seconds: each mean costs a row of kernels
     gain = np.interp(samples.time_s, at.time_s, fit.mean(at))
     return np.where(np.isfinite(samples.at_uav).all(axis=1), gain, np.nan)
 
@@ -356,6 +357,7 @@ def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[
         fitted = score(o, gain)
         if fitted is None:
             continue
+        # evenly over the flight: neighbours have the same standard deviation
         some = spread_out(len(gain), _SPREAD_SAMPLES)
         stated = StatedSpread(
             gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)

@@ -154,6 +154,7 @@ class Correction:
         if not self.on and flight not in self.flights and len(targets):
             # without a field one target with a position stands for all
             targets = targets.part(np.array([np.isfinite(targets.position_m).all(axis=1).argmax()]))
+        # solved once for each antenna: maps ask tile by tile
         fit = self.fits.setdefault(samples.antenna, FieldFit(self.model, channel.rows, channel.left_db))
         exact = fit.fits(max(len(targets), all_targets))
         mean, sd = fit.predict(targets, exact=exact)

@@ -296,6 +296,7 @@ class FieldFit:
         # levels alone come from all rows; the level of another flight than the targets' own tells them nothing
         row_sd = row_sd * (np.isin(self.rows.flight, targets.flight) & bool(near_parts))
         prior = prior_sd_db(self.model, near_parts) ** 2 if near_parts else 0.0
+        # of several headings there is no one direction to be near to
         turned = math.isfinite(self.model.turn) and targets.direction.ndim == 2
         tree, places = cKDTree(self._scaled(self.rows, turned)), self._scaled(targets, turned)
         for part, shared in _cells(places, step):

@@ -229,6 +229,7 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
     rows = rows[np.argsort(time[rows], kind="stable")]
     t, x = time[rows], level[rows]
     top = x.max()
+    # relative to the strongest: levels re full scale of any gain stay in range
     power = power_from_db(x - top)
     first = np.searchsorted(t, t - 0.5 * window_s, side="left")
     last = np.searchsorted(t, t + 0.5 * window_s, side="right")

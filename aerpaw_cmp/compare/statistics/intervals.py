@@ -205,6 +205,7 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
         hidden = long_run / n
     slope = max(0.0, 2.0 * reach / long_run)
     length = _LONGER * (1.5 * slope**2 * n) ** (1.0 / 3.0)
+    # five blocks at least: of fewer the draws repeat each other
     block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
     factor = 1.0 / (1.0 - min(0.5, slope / block))
     return Autocorrelation(n, block, float(np.clip(n * (unbiased[0] + hidden) / long_run, 1.0, n)), factor)
@@ -553,6 +554,7 @@ def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | 
 
     Channels of which the same was ``measured`` count once.
     """
+    # Holm's: the least chance is held against the number of all, the next against one less
     order = sorted(range(len(pairs)), key=lambda i: pairs[i].p_value)
     names = measured or range(len(pairs))
     out, tried = list(pairs), {names[i] for i in order if pairs[i].verdict != "no interval"}

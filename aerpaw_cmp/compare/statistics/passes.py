@@ -227,6 +227,7 @@ def _entered(flown: Pass, good: BoolArray, places: dict[bytes, _Places]) -> byte
     digest.update(np.ascontiguousarray(flown.position_m).tobytes())
     if flown.heading_deg is not None:
         digest.update(np.ascontiguousarray(flown.heading_deg).tobytes())
+    # by content: links that were sampled together have equal places in arrays of their own
     key = digest.digest()
     if key not in places:
         places[key] = _Places(flown.position_m, flown.heading_deg, np.flatnonzero(good))
@@ -254,6 +255,7 @@ def cell_means(
     residual_db, height_m : (c,)
         Means over the samples of each square.
     """
+    # in the plan: two passes at other heights share their squares
     cells = np.floor(position_m[good, :2] / cell_m).astype(np.int64)
     cell, which = np.unique(cells, axis=0, return_inverse=True)
     # NumPy 2.0 gives it two dimensions

@@ -155,9 +155,11 @@ def draft(
     parts += [RANK] if "rank" in entries.kinds else []
     parts += _settings(entries, known)
     text = "".join(parts)
+    # the draft is read and gathered as a report would: what it promises is true
     proof = _proof(text, folder, {file.path: file for file in files}, list(entries.lines))
     if proof.reason:
         text = text.replace(HEAD, f"{HEAD}# No sample of this draft can be compared: {proof.reason}.\n", 1)
+    # questions stand at the ends of lines, so that the file itself can be searched for them
     checks = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
     proved = [f"no sample of this draft can be compared: {proof.reason}"]
     if not proof.reason:
@@ -168,6 +170,7 @@ def draft(
 def _proof(text: str, folder: Path, files: Mapping[str, IngestedFile], paths: Sequence[str]) -> DryRun:
     """Dry run of the draft's report: the samples it would score; logs whose times the draft moves are read again."""
     settings = parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
+    # a band that the memory does not know changes what can be compared
     settings = with_learned(settings, folder)
     read = []
     for log, path in zip(settings.logs, paths, strict=True):
@@ -253,10 +256,12 @@ class NamedFlight:
 def flights_by_name(files: Sequence[IngestedFile]) -> dict[str, NamedFlight]:
     """Flights that can be drafted, by name, in the order of time."""
     every = [flight for flight in flights(files) if flight.measured]
+    # one flight alone is complete: all other logs stand in its draft, as left out
     complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
     named: dict[str, NamedFlight] = {}
     for flight in complete or [Flight(list(files))]:
         name = _name(_flown(flight.files), flight.files)
+        # two flights of one minute, or a folder without times
         taken = sum(other == name or other.startswith(f"{name}_") for other in named)
         name = f"{name}_{taken + 1}" if taken else name
         inside = flight.files if len(complete) > 1 else list(files)
@@ -506,6 +511,7 @@ class _Entries:
                 comment = self._doubt(entry, levels, self.placer)
         if self.is_utc(file):
             entry["clock"] = "utc"
+            # the telemetry decides: the same numbers fit as UTC and not as local time
             comment = _also(comment, "as local time it misses the telemetry, as UTC it meets it: is it UTC?")
         refused = self._refused(streams, entry, shown, dated=origin is not None)
         compared = [s for s in streams if s.name not in refused]
@@ -522,12 +528,14 @@ class _Entries:
             return
         self.out += [f"{shown}: {name}: {reason}" for name, reason in refused.items() if reason != _RATIO]
         if all(s.kind == "telemetry" for s in compared):
+            # a track has no tower and no channel
             entry, comment = {"path": path, "reader": file.result.reader}, ""
         if self.options.time_origin and any("clock" in s.attributes for s in compared):
             entry["time_origin"] = self.options.time_origin
         elif origin is not None:
             entry["time_origin"] = f"{origin.time.astype('datetime64[ms]')}Z"
             comment = _also(comment, f"time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?")
+        # what was said of its columns has to stand in the draft, or the report cannot read it
         if file.result.reader == "generic_csv":
             entry |= self.options.mapping
         if refused:
@@ -576,6 +584,7 @@ class _Entries:
             s for s in compared if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"
         ]  # whole decibels repeat
         if (floor := receiver_floor_db(levels)) is not None:
+            # a hundredth above: levels at or below the floor are out of coverage
             entry["floor_db"] = round(floor + 0.01, 2)  # at the floor is below it
             comment = _also(
                 comment, f"floor of the receiver at {floor:.1f} dB?" if comment else f"receiver floor {floor:.1f} dB?"
@@ -605,7 +614,9 @@ class _Entries:
         str
         """
         places, memory = {}, site_place(self.options.site, self.folder)
+        # None: a log without cells is one level
         for pci in entry.get("cells", [None]):
+            # the first of its kind: receivers of one node stand at one place
             level = next((s for s in levels if s.attributes.get("pci") == pci), None)
             if level is not None:
                 series = _key(level, entry)[1], file.result.reader
@@ -675,6 +686,7 @@ class _Entries:
             why = self._reason(stream, span, dated=dated)
             return why or (None if stream.kind == "telemetry" else self._enter_series(_key(stream, entry), span, shown))
 
+        # the fuller of two ranks is entered first, and the other refused as its double
         ordered = sorted(streams, key=_missing)
         return {stream.name: why for stream in ordered if (why := reason(stream)) is not None}
 
@@ -696,6 +708,7 @@ class _Entries:
         span = stream_span(stream)
         if self.flown is None or span is None or stream.kind == "telemetry":
             return 0.0
+        # an offset that the log itself writes is no guess of ours to mend
         trap = clock_trap(span, self.flown[1], self.options.timezone)
         written = stream.attributes.get("clock_from") == "written"
         return trap.hours if trap is not None and trap.is_utc and not written else 0.0
@@ -738,6 +751,7 @@ def _leading(streams: Sequence[Stream]) -> dict[str, str]:
     """Streams that tell again what the RSRP of their receiver and cell tells, and the name of that RSRP."""
     leaders: dict[object, str] = {}
     same = {}
+    # RSRP first: RSSI and wideband power of a cell hold its load and its neighbours
     for stream in sorted(streams, key=lambda s: s.attributes.get("quantity") != "RSRP"):
         if stream.kind != "rss" or "quantity" not in stream.attributes:
             continue
@@ -795,6 +809,7 @@ def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
         return sum(meet(flight[1], span) for span in measured), flight[1][1] - flight[1][0]
 
     # without any wall clock, a log that holds both levels and positions is a flight in its own time
+    # the longest of equals: it gives a position to most samples
     return max(telemetry or relative[:1], key=worth, default=None)
 
 
@@ -829,6 +844,7 @@ def _carrier(
     levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
     evidence = [max((Placer(site, s).evidence(level) for level in levels), default=-np.inf) for s, _ in tracks]
     order = np.argsort(evidence)
+    # all must have evidence: a track without levels of its own says nothing against another
     sure = np.isfinite(evidence).all() and evidence[order[-1]] - evidence[order[-2]] > _SURE_OF_VEHICLE
     best = tracks[order[-1]] if sure else flown
     named = " and ".join(stream.name for stream, _ in tracks)
@@ -867,6 +883,7 @@ def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[s
     if not need:
         return entry, ""
     here = Path(file.path).resolve()
+    # a home folder may be called after a tower, too
     near = _named_tower("/".join(here.parts[-2:]), towers)  # of the file or its folder
     alone = towers[0] if len(towers) == 1 else None
     entry["node"] = near or _named_tower(path, towers) or alone or next(iter(towers), "LW1")
@@ -885,9 +902,11 @@ def _named_tower(path: str, towers: Sequence[str]) -> str | None:
     places = {}
     for tower in towers:
         letters = "[-_ ]?".join(map(re.escape, re.findall(r"\d+|[^\W\d_]+", tower)))
+        # LW1 is not in LW12, nor CC in ACCESS
         ends = r"(?!\d)" if tower[-1:].isdigit() else r"(?![^\W_])"
         for match in re.finditer(rf"(?<![^\W_]){letters}{ends}" if letters else r"(?!)", path, re.IGNORECASE):
             places[match.start()] = tower
+    # the last: file names stand behind folders
     return places[max(places)] if places else None
 
 
@@ -913,6 +932,7 @@ def _flow(entry: dict[str, Any]) -> str:
 
     text = dumped(None)
     try:
+        # our reader follows YAML 1.2, the writer 1.1: a name such as 1e6 or 12:30 may come back as another
         as_read = len(text.splitlines()) == 1 and parse_yaml(text, LogSettings).path == entry["path"]
     except UsageError:
         as_read = False
@@ -937,5 +957,6 @@ def _name(flown: tuple[Stream, Span] | None, files: Sequence[IngestedFile]) -> s
     if flown is None or flown[1][0] < _FIRST_CLOCK:
         place = Path(files[0].path).resolve()
         stem = place.stem if flown is not None and len(files) == 1 else place.parent.name
+        # what flight.name allows
         return re.sub(r"[^A-Za-z0-9_.-]", "_", stem).lstrip("_.-") or "flight"
     return "flight_" + str(flown[1][0].astype("datetime64[m]")).replace("T", "_").replace(":", "")

@@ -157,6 +157,7 @@ class Placer:
         time = frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
         level = frame["rss_db"].to_numpy(np.float64)
         below_floor = frame["flag"].astype(str).str.contains("out_of_coverage").to_numpy()
+        # out of coverage is knowledge: the level was below the floor there
         level = np.where(np.isnan(level) & below_floor & np.isfinite(floor_db), floor_db, level)
         track = level_track(time, place, level, floor_db=floor_db)
         if airframe is None or not len(track.time_s):
@@ -182,6 +183,7 @@ class Placer:
         known = np.array([
             self._taught_odds(track, t.name, taught[t.name]) if t.name in taught else -np.inf for t in towers
         ])  # fmt: skip
+        # as odds against any place, like those of the search
         known -= estimate.anywhere + _TAUGHT_MORE
         odds_tower = np.maximum(odds_tower, known)
         if len(listed) and odds_listed.max() >= max(_TOWER_ODDS, odds_tower.max()):
@@ -252,6 +254,7 @@ class Placer:
         return float(np.median(free - track.level_db))
 
     def _node(self, place: FloatArray, latitude: float, longitude: float, height: float, about: str) -> Placement:
+        # two channels of one rover are placed some metres apart
         same = [name for name, placed in self.nodes.items() if np.hypot(*(placed[:2] - place[:2])) < 100.0]
         name = same[0] if same else "NODE" + (str(len(self.nodes) + 1) if self.nodes else "")
         tower = {"latitude_deg": round(latitude, 7), "longitude_deg": round(longitude, 7), "antenna_height_m": height}
@@ -268,6 +271,7 @@ class Placer:
         if not len(self.track):
             return False
         start = self.track.pose_at(np.array([self.track.start_ns], dtype="datetime64[ns]")).position_m[0]
+        # a list may hold angles that are none
         with np.errstate(invalid="ignore"):
             east, north = self.site.frame.to_local(np.array([latitude_deg]), np.array([longitude_deg]))
         return bool(np.hypot(east[0] - start[0], north[0] - start[1]) < NEAR_M)

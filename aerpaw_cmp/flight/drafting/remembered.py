@@ -66,6 +66,7 @@ def remembered(site: str | Path) -> dict[str, Remembered]:
         A memory or a table that is damaged.
     """
     folder, out = learned.folder_of(site), {}
+    # the latest last: it takes the place of earlier ones
     for entry in sorted(learned.read_learned(site).entries.values(), key=lambda entry: entry.made):
         for series in entry.series:
             tower, uav = (read_sphere_csv(folder / file) for file in (series.tower_file, series.uav_file))
@@ -124,6 +125,7 @@ def propose(known: learned.Learned, site: str, series: Sequence[_SeriesKey], nod
     antennas: dict[str, str] = {}
     about, carrier = "", None
     fits = {name: _fits(entry, series, nodes) for name, entry in known.entries.items()}
+    # exact fits count first: tuples compare so
     best = max(fits, key=lambda name: fits[name], default=None)
     if best is not None and fits[best] > (0, 0):
         entry = known.entries[best]
@@ -232,6 +234,7 @@ def offered(data: FlightData) -> FlightFile | None:
         known = propose(learned.read_learned(data.site_place), str(Path(site).with_suffix("")), series, nodes)
     except (InputError, UsageError):
         return None
+    # one is the airframe, alone
     if len(known.antennas) < 2:
         return None
     settings = with_learned(data.settings.model_copy(update={"antennas": dict(known.antennas)}), data.folder)

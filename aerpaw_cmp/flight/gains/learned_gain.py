@@ -70,6 +70,7 @@ def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tupl
     sd_db = np.sqrt(square)
     if len(ends) == 2:
         (uav, at_uav), (tower, at_tower) = ends["uav"], ends["tower"]
+        # a pair's gain is what these two leave together: it means nothing beside another table
         if tower.pair is not None and uav.trained_on == tower.trained_on:  # of one and the same calibration
             return tower.pair.at(np.concatenate([at_uav, at_tower], axis=1), sd_db)
     return np.zeros(len(sd_db)), sd_db
@@ -84,6 +85,7 @@ def mean_gain_db(patterns: Sequence[Pattern], theta_rad: FloatArray, phi_rad: Fl
     """Mean gain (n,) of the elements of an array towards directions of its frame [dBi]; no lower than -60."""
     fields = [pattern.field(theta_rad, phi_rad) for pattern in patterns]
     power = sum(np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2 for e_theta, e_phi in fields)
+    # a null is -60 dB: no model of a pattern is that sure
     return np.asarray(10.0 * np.log10(np.maximum(power / len(patterns), 1e-6)))
 
 

@@ -135,6 +135,7 @@ def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
         source, target = sources_m[paths.tower], targets_m[paths.pose]
+        # single trees and woods as media shade one behind the other: their losses add
         trees_db = foliage_loss_db(source, paths.vertices_m, target, index, model)
         return trees_db + stand_loss_db(site, source, paths.vertices_m, target, model, wavelength, evergreen)
 
@@ -146,6 +147,7 @@ def sight_shares(site: Site, tower: str, poses_m: FloatArray) -> tuple[float, fl
     source = site.towers[tower].position_m
     array = single_element()
     poses = Poses(poses_m, np.broadcast_to(np.eye(3), (len(poses_m), 3, 3)))
+    # without a cache: a draft asks once
     seen = replay(site, Link(_ANY_HZ, {tower: array}, array), poses, Search(max_depth=0), run=Run(cache_dir=""))
     return float((direct_foliage_m(source, poses_m, site) > 0.0).mean()), float(1.0 - len(seen.paths) / len(poses_m))
 

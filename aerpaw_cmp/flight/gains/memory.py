@@ -71,9 +71,11 @@ def _with_antenna(
 ) -> dict[str, LinkSettings]:
     """Links of the channels that a learned antenna belongs to."""
     tower, _, channel = key.partition(".")
+    # the airframe without any channel yet: those that it was learned with
     names = [channel] if key != "uav" else list(channels) or [s.channel for s in named.entry.series]
     out = {}
     for name in names:
+        # a channel that nothing describes is the RSS link with another antenna
         link = channels.get(name, settings.link.rss)
         file = str(antenna_file(named, key, name, link.carrier_hz))
         array = ArraySettings(antenna=AntennaSettings(model="sphere", file=file))

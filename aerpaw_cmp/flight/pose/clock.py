@@ -103,6 +103,7 @@ class Along:
     def features(self) -> FloatArray:
         """Features (g, p) of offset, slope and the gains of both ends."""
         ends = [_gain_features(self.directions[:, 3 * end : 3 * end + 3], _CHORDS[end]) for end in (0, 1)]
+        # about 100 m: offset and slope then say little of each other
         slope = np.log10(self.distance_m) - 2.0
         return np.column_stack([np.ones_like(slope), slope, *ends])
 
@@ -220,6 +221,7 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
         return _nothing(_FLAT_LEVEL, window_s)
     steps = int(window_s / _STEP_S + 1e-9)
     lags = np.asarray(np.arange(-steps, steps + 1) * _STEP_S, dtype=np.float64)
+    # with one guess of the memory: it finds the likely lags, at which the memory is fitted then
     first = np.sum([b.likelihood(lags, [[_START]] * len(names)).sum(axis=0) for names, b in bins.items()], axis=0)
     starts = np.unique([0.0, *lags[first.argmax(axis=1)]])  # of each model, and of clocks that agree
     parts = {names: b.fitted(starts) for names, b in bins.items()}
@@ -230,6 +232,7 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     tried, nats = _finer(lags, likelihood, window_s)
     names = [name for together in bins for name in together]
     estimate = _judged(tried, nats, names, window_s)
+    # channels of one computer have one lag: their evidence adds
     total = nats.sum(axis=0).max(axis=1)  # of each model at its likeliest lag
     n = sum(b.n * len(together) for together, b in bins.items())
     estimate = replace(estimate, model=models[int(total.argmax())], n=n)
@@ -298,6 +301,7 @@ def _finer(
         if len(near) > _MOST_FINE:
             break
         step /= 5.0
+        # rounded: a lag that two coarse ones reach is one
         fine = np.unique(np.round((near[:, None] + step * np.arange(-4, 5)).ravel(), 6))
         fine = fine[(np.abs(fine) <= window_s) & ~np.isin(fine, np.round(lags, 6))]
         lags, nats = np.concatenate([lags, fine]), np.concatenate([nats, likelihood(fine)], axis=-1)
@@ -387,11 +391,13 @@ class _Bins:
             low, high = (np.floor((t + side - along.start_s) / along.step_s) for side in (-window_s, window_s))
             ok: BoolArray = np.isfinite(y).all(axis=1) & (low >= 0) & (high + 1 < len(lost))
         begin, end = (np.where(ok, side, 0).astype(np.int64) for side in (low, high))
+        # a running count of gaps: no instant of the whole window may lack a prediction
         ok[ok] = missing[end[ok] + 2] == missing[begin[ok]]
         order = np.flatnonzero(ok)[np.argsort(t[ok], kind="stable")]
         t, y = t[order], y[order]
         if not len(t):
             return None
+        # one second, longer on flights beyond a quarter of an hour: the cost grows with the bins
         width = max(1.0, (t[-1] - t[0]) / _BINS)
         _, first, count = np.unique(np.floor(t / width), return_index=True, return_counts=True)
         if len(first) < _FEWEST:
@@ -421,6 +427,7 @@ class _Bins:
             level = np.add.reduceat(self._between(self.at_s - lag, self.levels), self.first, axis=0) / count
             residual = np.repeat(self.mean_db, models, axis=1) - level[:, self.predicted.ravel()]
             out[:, row, :features] = self._between(self.mean_s - lag, self.features)
+            # the offset is free: near 0 the numbers keep their digits
             out[:, row, features:] = residual - residual.mean(axis=0)
         return out
 
@@ -459,6 +466,7 @@ def _calm(mean_db: FloatArray) -> FloatArray:
     from scipy.ndimage import median_filter
 
     middle = median_filter(mean_db, _NEIGHBOURS, mode="nearest")
+    # 1.4826: from the median of absolute deviations to the standard deviation of a normal distribution
     reach = _LONE * 1.4826 * float(np.median(np.abs(mean_db - middle)))
     return np.asarray(np.clip(mean_db, middle - reach, middle + reach))
 
@@ -487,9 +495,11 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
     def covariance(first: FloatArray, second: FloatArray) -> FloatArray:
         return np.asarray(np.mean([gaussian_kernel(first, second, chord) for chord in chords], axis=0))
 
+    # thinned: neighbours in time point to the same direction
     some = unit[:: max(1, len(unit) // 1500)]
     base = some[determining(some, covariance, _LEFT, _FEATURES)]
     out = np.full((len(direction), len(base)), np.nan)
+    # the points were chosen to be nearly independent: a little on the diagonal covers their rounding
     known = Factor.of(covariance(base, base) + 1e-9 * np.eye(len(base)))
     out[finite] = known.whiten(covariance(unit, base).T).T
     return out
@@ -526,14 +536,17 @@ def _likelihood(columns: FloatArray, time_s: FloatArray, residuals: int, parts: 
 
     Offset, slope and gains are integrated out, the scale is profiled.
     """
+    # each memory is whitened once: the gains on top change no covariance of the residual
     memories = list(dict.fromkeys((part.memory_s, part.white) for part in parts))
     white, log_det = _whitened(columns, time_s, memories)
     lags = range(columns.shape[1])
+    # all that the likelihood needs of the rows: the gains are tried on these small matrices
     gram = np.stack([[white[:, m, lag].T @ white[:, m, lag] for lag in lags] for m in range(len(memories))])
     n, p = len(columns), columns.shape[2] - residuals
     out = np.empty((len(parts), len(lags), residuals))
     for row, part in enumerate(parts):
         which = memories.index((part.memory_s, part.white))
+        # the first two features are offset and slope
         spread = np.concatenate([[_FREE] * 2, np.full(p - 2, part.gain), np.ones(residuals)])
         bordered = spread[:, None] * gram[which] * spread
         square = np.diagonal(bordered, axis1=1, axis2=2)[:, p:]

@@ -49,6 +49,7 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
     if start is not None:
         zone = ZoneInfo(timezone) if timezone else None
         starts = _name_starts(file.path)
+        # names of a flight file are those of the machine that made it
         if not file.holder:  # else a path that the flight file names, of another machine
             starts += _summary_starts(Path(file.path))
         texts += [
@@ -62,6 +63,7 @@ def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | Non
         texts.append(f"the heights are read as {_source(streams, 'height') or 'above take-off'}: right?")
     for stream in streams:
         sentence = "" if (jumps := jumps_of(stream))[0].any() else jumps[1]
+        # a draft is checked by its lines that end in a question mark
         texts += [f"{sentence.rstrip('?')}?"] if sentence else []
         if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > _GROUND_M:
             texts.append(f"the lowest height is {low:.0f} m, expected 0 m: does the track begin in the air?")
@@ -177,10 +179,12 @@ _HEAD_BYTES = 2000
 def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
     """Least distance of a time from the start, read as UTC and as local; without a zone in any zone."""
     if not exact:
+        # a date is its noon, give or take
         return abs(start - time - timedelta(hours=12))
     if zone is not None:
         offset = start.astimezone(zone).utcoffset() or timedelta(0)
         return min(abs(start - time), abs(start + offset - time))
+    # every zone that there is, by half hours
     return min(abs(start - time + timedelta(minutes=30 * half)) for half in range(-28, 29))
 
 
@@ -192,4 +196,5 @@ def _source(streams: Sequence[Stream], what: str) -> str:
 def _lowest_m(stream: Stream) -> float | None:
     height = stream.frame["altitude_m"].to_numpy(np.float64)
     height = height[np.isfinite(height)]
+    # not the least: one row of a receiver without a fix may be far below
     return float(np.percentile(height, 1.0)) if len(height) else None

@@ -57,6 +57,7 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     """
     timed = [(file, span) for file in files if (span := _span_of(file)) is not None]
     groups: list[Flight] = []
+    # tracks first, in the order of time: radio logs then find their flight
     for file, span in sorted(timed, key=lambda entry: (not _has_track(entry[0]), entry[1][0])):
         place = _place(file)
         near = [flight for flight in groups if _meet(flight, span, place)]
@@ -67,6 +68,7 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
         flight.files.append(file)
         if _has_track(file) or not any(_has_track(member) for member in flight.files):
             assert flight.span is not None
+            # a radio that was left on does not stretch a flight that has a track
             flight.span = (min(flight.span[0], span[0]), max(flight.span[1], span[1]))
             flight.place = flight.place or place
     for file in files:
@@ -153,6 +155,7 @@ def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
         (origin.distance_m, i) for i, flight in enumerate(known) if (origin := _origin(file, flight)) is not None
     ]
     if by_track:
+        # nearest track first
         (near_m, best), *others = sorted(by_track)
         rivals = [i for away_m, i in others if away_m < max(_ALIKE * near_m, _ALIKE_M)]
         if rivals:

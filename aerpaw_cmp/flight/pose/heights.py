@@ -92,6 +92,7 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
             cause="the log has altitudes of its own, or no positions",
         )
     note = f"no altitude in the log: {log.height_m:g} m above take-off in all of it, as height_m says"
+    # the reader asked for what is answered here
     warnings = [text for text in file.result.warnings if not text.startswith("no column is known as a height")]
     return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, note)))
 
@@ -104,5 +105,6 @@ def height_in_name(path: str) -> float | None:
     >>> height_in_name("urban/60m.csv"), height_in_name("run2_120m_5G.csv"), height_in_name("phone.csv")
     (60.0, 120.0, None)
     """
+    # as a set: 'flight_60m_60m' tells one height, '40m_to_60m' none
     heights = {float(text) for text in _IN_NAME.findall(Path(path).stem.replace("_", " "))}
     return heights.pop() if len(heights) == 1 else None

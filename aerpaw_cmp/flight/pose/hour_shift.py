@@ -63,6 +63,7 @@ def clock_trap(
         start = np.maximum(radio[0] + 3600.0 * hours, telemetry[0])
         return np.asarray(np.maximum(0.0, np.minimum(radio[1] + 3600.0 * hours, telemetry[1]) - start))
 
+    # UTC-12 to UTC+14, and by halves for India and Newfoundland
     shifts = np.asarray(np.arange(-28, 29) * 0.5, dtype=np.float64)
     shared = overlap(shifts)
     now = float(overlap(np.zeros(1))[0])
@@ -70,6 +71,7 @@ def clock_trap(
     order = [(-round(float(shared[i])), shifts[i] % 1 != 0, abs(float(shifts[i])), i) for i in range(len(shifts))]
     best = min(order)[-1]
     shorter = min(radio[1] - radio[0], telemetry[1] - telemetry[0])
+    # the logs share most of their time as they are: their clocks agree
     if now >= 0.5 * shorter or shared[best] < max(0.5 * shorter, 1e-9):
         return None
     hours = float(shifts[best])
@@ -86,6 +88,7 @@ def _explain_hours(hours: float, instant: float, timezone: str | None) -> tuple[
         moment = datetime.fromtimestamp(instant, utc.utc).astimezone(ZoneInfo(timezone))
         offset = moment.utcoffset()
         east = offset.total_seconds() / 3600.0 if offset else 0.0
+        # hours are added to the radio: local time is behind UTC where the zone is west
         if east and hours == -east:
             return f"radio times are local time ({timezone}) stored as if they were UTC", False
         if east and hours == east:

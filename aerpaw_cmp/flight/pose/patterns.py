@@ -106,6 +106,7 @@ def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float) -> Route:
             time.append(begin)
             at.append(place[i + 1])
             yaw.append(w.yaw_deg)
+    # a little longer: a flight of whole seconds has its last one
     seconds = np.arange(0.0, begin + 1e-9, 1.0)
     leg = np.minimum(np.searchsorted(np.array(time), seconds), len(yaw) - 1)
     position = interpolated(seconds, np.array(time), np.array(at))
@@ -135,6 +136,7 @@ def allowed_area(fence: Any, avoid: Sequence[Any], towers_m: FloatArray, distanc
         Nothing is left.
     """
     circles = [shapely.Point(*place).buffer(distance_m) for place in towers_m[:, :2]] if distance_m > 0 else []
+    # a buffer of 0 mends outlines that cross themselves
     remaining = fence.buffer(0).difference(shapely.union_all([*avoid, *circles])).buffer(-MARGIN_M)
     parts = [p for p in getattr(remaining, "geoms", [remaining]) if p.area > 0]
     if not parts:
@@ -151,11 +153,13 @@ def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArra
     centre = area.centroid
     turned = shapely.affinity.rotate(area, azimuth_deg, origin=centre)  # legs now run north
     west, south, east, north = turned.bounds
+    # evenly over the width: the last leg would else lie anywhere between two
     count = max(int((east - west) // spacing_m), 1)
     at = west + (np.arange(count) + 0.5) * (east - west) / count
     legs, up = [], True
     for x in at:
         cut = turned.intersection(shapely.LineString([(x, south - 1.0), (x, north + 1.0)]))
+        # a leg may cross a hole: several pieces, or a point where it touches a corner
         pieces = [p for p in getattr(cut, "geoms", [cut]) if p.length >= _LEAST_LEG_M]
         pieces.sort(key=lambda p: p.bounds[1], reverse=not up)
         for piece in pieces:
@@ -169,7 +173,9 @@ def lawnmower(area: Any, azimuth_deg: float, spacing_m: float) -> list[FloatArra
 
 def cross(area: Any, azimuth_deg: float) -> list[FloatArray]:
     """Two legs (2, 2) at right angles through the middle of an area."""
+    # of a bent area the centroid may lie outside
     middle = area.centroid if area.contains(area.centroid) else area.representative_point()
+    # longer than the area from any of its points
     reach = 2.0 * math.hypot(area.bounds[2] - area.bounds[0], area.bounds[3] - area.bounds[1])
     legs = []
     for course in (azimuth_deg, azimuth_deg + 90.0):
@@ -184,6 +190,7 @@ def cross(area: Any, azimuth_deg: float) -> list[FloatArray]:
 def path_within(area: Any, begin: FloatArray, end: FloatArray) -> list[FloatArray]:
     """Corners between two points of an area (without them), along its border where the straight line leaves it."""
     line = shapely.LineString([begin, end])
+    # ends of legs lie on the border, give or take rounding
     if area.buffer(0.1).covers(line):
         return []
     corners: list[FloatArray] = []
@@ -198,6 +205,7 @@ def path_within(area: Any, begin: FloatArray, end: FloatArray) -> list[FloatArra
         first, last = min(begin_m, end_m), max(begin_m, end_m)
         back = shapely.LineString([*substring(ring, last, ring.length).coords, *substring(ring, 0.0, first).coords])
         back = back if begin_m > end_m else back.reverse()
+        # corners nearer than a metre to their line are no turns to fly
         arc = min((forth, back), key=lambda a: a.length).simplify(1.0)
         corners += [np.array(c) for c in arc.coords]
     return sorted(corners, key=lambda c: float(np.linalg.norm(c - begin))) if len(area.interiors) > 1 else corners
@@ -303,12 +311,14 @@ def route_of(pattern: Pattern, area: Any, speed_mps: float, most_s: float) -> Ro
     if pattern.shape == "cross":
         legs = cross(area, pattern.azimuth_deg)
         route, more = made(legs), list(legs)
+        # a short cross in a long flight would go on for hours
         while route.duration_s < most_s and len(more) < 60:
             more += [leg[::-1] for leg in legs] if (len(more) // max(len(legs), 1)) % 2 else list(legs)
             route = made(more)
         return cut(route, most_s, speed_mps)
     low, high = _CLOSEST_M, widest
     for _ in range(14):
+        # spacings are searched by their ratio: 14 halvings from hundreds of metres
         middle = math.sqrt(low * high)
         longer = made(lawnmower(area, pattern.azimuth_deg, middle)).duration_s > most_s
         low, high = (middle, high) if longer else (low, middle)

@@ -9,7 +9,9 @@ from typing import Any
 from ...common.geodesy import SiteFrame
 from .patterns import Waypoint
 
+# MAV_FRAME_GLOBAL_RELATIVE_ALT; NAV_WAYPOINT, CONDITION_YAW, DO_CHANGE_SPEED of MAVLink
 _FRAME_ABOVE_HOME, _WAYPOINT, _YAW, _SPEED = 3, 16, 115, 178
+# MAV_AUTOPILOT and MAV_TYPE (quadrotor)
 _ARDUPILOT, _COPTER = 3, 2
 
 
@@ -33,9 +35,11 @@ def plan_text(waypoints: Sequence[Waypoint], frame: SiteFrame, speed_mps: float)
     str
         JSON. Take-off, landing and the way there are left to the pilot.
     """
+    # 1: ground speed; -1: the throttle stays
     items: list[dict[str, Any]] = [_item(_SPEED, [1, speed_mps, -1, 0, 0, 0, 0], frame=2)]
     for latitude, longitude, w in _places(waypoints, frame):
         items.append(_item(_WAYPOINT, [w.hold_s, 0, 0, None, latitude, longitude, w.height_m]))
+        # a command of its own: ArduPilot ignores the yaw of a waypoint
         items.append(_item(_YAW, [w.yaw_deg, 0, 0, 0, 0, 0, 0], frame=2))
     for number, item in enumerate(items, start=1):
         item["doJumpId"] = number

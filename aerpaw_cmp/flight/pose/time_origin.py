@@ -58,6 +58,7 @@ def origin_of(log: Stream, track: Stream) -> Origin | None:
     time_s = mine[0].astype(np.int64) / 1e9
     track_s = tracked[0].astype(np.int64) / 1e9 - zero_s
     log_m, track_m = _metres(mine[1], tracked[1]), _metres(tracked[1], tracked[1])
+    # in the plan: heights may count from other grounds
     line = shapely.linestrings(track_m[:, :2])
     shapely.prepare(line)
     # half of the half that lies within the track's time has to be that near to it, at whatever time
@@ -94,8 +95,10 @@ def _points(frame: pd.DataFrame, most: int | None) -> tuple[AnyArray, FloatArray
     places = np.column_stack([frame[name].to_numpy(np.float64) for name in names])
     known = np.flatnonzero(np.isfinite(places[:, :2]).all(axis=1))
     time, first = np.unique(frame["time"].to_numpy("datetime64[ns]")[known], return_index=True)
+    # fewer places lie on any track by chance
     if len(time) < 20:
         return None
+    # evenly, not the first: take-off is where all flights are alike
     at = slice(None) if most is None or len(time) <= most else np.linspace(0, len(time) - 1, most).astype(int)
     return time[at], places[known[first]][at]
 

@@ -179,6 +179,7 @@ class TrackPoses:
 
 def nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
     """UTC instants as int64 ns since 1970; NaT becomes the smallest integer. Floats are epoch seconds."""
+    # to the nanosecond whatever pandas or NumPy had: their default units differ by version
     array = np.asarray(times)
     if array.dtype.kind == "M":
         return np.asarray(array.astype("datetime64[ns]").astype(np.int64))
@@ -208,9 +209,11 @@ def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
     """
     if not len(stamp):
         return np.zeros(0, dtype=bool), 0, 0
+    # the latest stamp before each row, and the earliest after it
     before = np.concatenate([[NO_TIME], np.maximum.accumulate(stamp)[:-1]])
     after = np.concatenate([np.minimum.accumulate(stamp[::-1])[::-1][1:], [np.iinfo(np.int64).max]])
     onward, mirrored = stamp >= before, stamp <= after
+    # on a tie the plain rule: what came first is right
     ordered = onward if onward.sum() >= mirrored.sum() else mirrored
     keep = ordered.copy()
     rows = np.flatnonzero(ordered)
@@ -242,6 +245,7 @@ def _hour_steps(stamp: AnyArray) -> int:
     """Steps between rows that are whole hours, forward or back, give or take five seconds."""
     step = np.diff(stamp) * 1e-9
     hours = np.round(step / 3600.0)
+    # clocks are turned by one hour, in Antarctica by two
     return int(((hours != 0) & (np.abs(hours) <= 2) & (np.abs(step - 3600.0 * hours) < 5.0)).sum())
 
 
@@ -305,6 +309,7 @@ class Track:
         stamp = nanoseconds(telemetry["time"])
         latitude, longitude, altitude = column("latitude_deg"), column("longitude_deg"), column("altitude_m")
         timed = stamp != NO_TIME
+        # only rows with both can be interpolated from; the others count in the account
         placed = timed & good_positions(latitude, longitude, altitude)
         rows = np.flatnonzero(placed)
         east, north = self.frame.to_local(latitude[rows], longitude[rows])
@@ -324,6 +329,7 @@ class Track:
         self._course_deg = _courses(self._velocity)
         self._attitude = np.column_stack([column("roll_deg"), column("pitch_deg"), column("yaw_deg")])[rows]
         turn, yaw = self._attitude[:, :2], self._attitude[:, 2]
+        # all zero is no heading: converters write it for "unknown"
         heading_alone = np.isfinite(yaw) & ~np.isfinite(turn).any(axis=1) & bool(np.nan_to_num(yaw).any())
         turn[heading_alone] = 0.0
         known = np.isfinite(self._attitude).all(axis=1) & (np.any(self._attitude != 0.0, axis=1) | heading_alone)
@@ -331,6 +337,7 @@ class Track:
         self._asked = np.zeros(0, np.int64), self._pose_at(np.zeros(0, np.int64))
         interval = np.diff(self._time_s)
         sparse_s, sparse_error_m = self._sparse(interval)
+        # last: what is sparse is judged by the limit that was asked for
         self.maximum_gap_s = max(self.maximum_gap_s, _SPARSE_GAP * sparse_s)
         self.account = TrackAccount(
             rows=len(stamp),
@@ -389,12 +396,14 @@ class Track:
     def _pose_at(self, instant: AnyArray) -> TrackPoses:
         """Poses at instants (n,) [ns since 1970]."""
         timed = instant != NO_TIME
+        # from the first row: a float64 of seconds since 1970 has but 0.2 microseconds
         t = np.where(timed, instant - self.start_ns, 0) * 1e-9
         code = self._codes(t)
         code[~timed] = REASONS.index("no time")
         valid = code == 0
         n = len(t)
         if len(self):
+            # an instant that rounding puts before the first row is at it
             t = np.clip(t, self._time_s[0], self._time_s[-1])
         position = np.full((n, 3), np.nan)
         rotation = np.full((n, 3, 3), np.nan)
@@ -445,6 +454,7 @@ class Track:
         at = self._time_s[self._known]
         near = np.zeros(len(t), dtype=bool)
         if len(at):
+            # attitudes may end before positions do, and have gaps of their own
             near = (t >= at[0]) & (t <= at[-1]) & ~_in_gap(t, at, self.maximum_gap_s)
         if near.all() and len(t):
             return _slerp(t, at, self._attitude[self._known]), near
@@ -455,6 +465,7 @@ class Track:
 
     def _course_at(self, t: FloatArray) -> FloatArray:
         """Course over ground [deg], interpolated as a direction."""
+        # by sine and cosine: between 350 and 10 degrees lies north
         angle = np.radians(self._course_deg)
         return bearing_deg(interpolated(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)])))
 
@@ -468,6 +479,7 @@ def _in_gap(t: FloatArray, at: FloatArray, limit_s: float) -> BoolArray:
     """Check whether an instant lies strictly inside an interval longer than the limit."""
     later = np.clip(np.searchsorted(at, t, side="left"), 0, len(at) - 1)
     earlier = np.maximum(later - 1, 0)
+    # at a row itself the pose is known, whatever gap follows
     exact = np.minimum(np.abs(at[later] - t), np.abs(at[earlier] - t)) <= _SAME_S
     return np.asarray((at[later] - at[earlier] > limit_s) & ~exact)
 
@@ -494,6 +506,7 @@ def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> Floa
         return np.where(np.isfinite(logged), logged, 0.0)
     early, late = np.maximum(t - _COURSE_SPAN_S, t[0]), np.minimum(t + _COURSE_SPAN_S, t[-1])
     early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))
+    # by at least one row on either side: sparse telemetry has none within the span
     moved = np.column_stack([np.interp(late, t, p) - np.interp(early, t, p) for p in position.T])
     derived = moved / (late - early)[:, None]
     missing = np.asarray(~np.isfinite(logged).all(axis=1))

@@ -27,6 +27,7 @@ def may_lose_lock(stream: Stream) -> bool:
         return False
     quality = stream.frame["rss_db"].to_numpy(np.float64)
     locked = quality[quality > _LOST_QUALITY_DB]
+    # near its peak wherever it is locked: an SNR of another receiver spreads over tens of decibels
     return bool(len(locked)) and abs(float(np.median(locked)) - _LOCK_QUALITY_DB) < 3.0
 
 

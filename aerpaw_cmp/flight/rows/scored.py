@@ -17,6 +17,7 @@ def unscored(frame: pd.DataFrame) -> BoolArray:
     """Rows (n,) that carry a flag of :data:`~aerpaw_cmp.logs.limits.UNSCORED`."""
     flag = frame["flag"].to_numpy(dtype=object)
     out = np.zeros(len(flag), dtype=np.bool_)
+    # one by one: few rows have a flag
     for i in np.flatnonzero(flag != ""):
         out[i] = any(word in UNSCORED for word in str(flag[i]).split(";"))
     return out

@@ -61,6 +61,7 @@ class Member:
 
 def is_archive(head: bytes) -> bool:
     """Check whether the first bytes of a file (gunzipped or not) are those of an archive."""
+    # the mark of POSIX tar stands behind 257 bytes of the first header
     return head.startswith(_ZIP) or head[257:262] == _TAR
 
 
@@ -96,6 +97,7 @@ def _zip(data: bytes, path: str | Path) -> Iterator[Member]:
     for entry in book.infolist():
         if not entry.is_dir() and not _hidden(entry.filename):
             size = entry.file_size
+            # deflate cannot do it: the directory lies
             lies = size > MOST_BYTES or size > _RATIO * entry.compress_size + _MARGIN
             read = (
                 partial(_refused, f"the member unpacks to {size} bytes", f"at most {MOST_BYTES}", path)
@@ -109,6 +111,7 @@ def _unzipped(book: zipfile.ZipFile, entry: zipfile.ZipInfo, path: str | Path, m
     place = f"{path}/{entry.filename}"
     try:
         with book.open(entry) as stream:
+            # one byte more than is said shows a lie
             content = stream.read(entry.file_size + 1 if most is None else most)
     except (*_DAMAGE, RuntimeError) as error:
         raise InputError(f"a damaged or locked member ({error})", cause="a cut download", path=place) from error
@@ -118,8 +121,10 @@ def _unzipped(book: zipfile.ZipFile, entry: zipfile.ZipInfo, path: str | Path, m
 
 
 def _tar(data: bytes, path: str | Path) -> Iterator[Member]:
+    # "r:": no compression, which would be unpacked without a limit
     book = tarfile.open(fileobj=io.BytesIO(data), mode="r:")  # noqa: SIM115 - members are read later
     for entry in book.getmembers():
+        # no links, devices or pipes
         if entry.isreg() and not _hidden(entry.name):
             yield _member(entry.name, entry.size, path, partial(_untarred, book, entry))
 

@@ -67,6 +67,7 @@ class Column:
         """Values behind those that are there."""
         end = self._count + len(piece)
         if end > len(self._values):
+            # a sixteenth more: few moves, little to spare
             self._values.resize(end + end // 16, refcheck=False)  # the system moves pages, not bytes
         self._values[self._count : end] = piece
         self._count = end

@@ -36,6 +36,7 @@ class _Gunzip:
     """One member of a gzip file, with the interface of the other two libraries."""
 
     def __init__(self) -> None:
+        # 16: with the header of gzip, which is checked
         self._machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
 
     def decompress(self, data: bytes, most: int) -> bytes:
@@ -58,12 +59,14 @@ def _machine(name: str, path: str | Path) -> Callable[[], Any]:
     if name == "gzip":
         return _Gunzip
     try:
+        # here: Python may lack these modules
         if name == "bzip2":
             import bz2
 
             return bz2.BZ2Decompressor
         import lzma
 
+        # a header may ask for GiB of dictionary
         return lambda: lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=_MOST_MEMORY)
     except ImportError as error:
         raise InputError(
@@ -107,6 +110,7 @@ def pieces(content: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
         except Exception as error:  # bz2 raises OSError and ValueError, lzma an exception of its own
             raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
         bytes_out += len(piece)
+        # as it goes, so that a bomb is stopped at its first piece
         if bytes_out > _MOST_RATIO * bytes_in + _PIECE:
             raise InputError(f"the {name} file unpacks to more than {_MOST_RATIO} times its size", cause="no log",
                              path=path)  # fmt: skip

@@ -112,9 +112,11 @@ def zone(name: str | None, *, needed_by: str) -> tzinfo:
 def _offset_s(wall_s: int, where: tzinfo, fold: int) -> int:
     try:
         moment = datetime(1970, 1, 1) + timedelta(seconds=wall_s)
+        # fold 0 and 1 differ where the wall clock was twice, or never
         offset = moment.replace(tzinfo=where, fold=fold).utcoffset()
     except (OverflowError, ValueError):
         return 0
+    # some zones had seconds before 1900
     return 0 if offset is None else round(offset.total_seconds())
 
 
@@ -162,6 +164,7 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     if back < len(wall_ns):
         behind = ambiguous.copy()
         behind[:back] = False
+        # the second pass is later by what the clock was turned
         utc[behind] += np.repeat((first - second)[index], length)[behind].astype("timedelta64[s]")
     warnings = []
     if ambiguous.any():
@@ -201,6 +204,7 @@ def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
     if len(wall_ns) == 0:
         none = np.zeros(0, dtype=np.int64)
         return none, none, none
+    # one look into the zone's table for a quarter of an hour of rows
     bucket = wall_ns // (_BUCKET_S * 1_000_000_000)
     starts = np.flatnonzero(np.concatenate(([True], bucket[1:] != bucket[:-1])))
     unique, index = np.unique(bucket[starts], return_inverse=True)
@@ -234,12 +238,14 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
     if count == 0:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
     # logs run forward: the date and the minute of a run of times are read once
+    # sixteen characters as two integers: two comparisons a row
     half = np.ascontiguousarray(cells[:, :16]).view(np.uint64)
     starts = np.flatnonzero(np.concatenate(([True], (half[1:, 0] != half[:-1, 0]) | (half[1:, 1] != half[:-1, 1]))))
     length = np.diff(np.append(starts, count))
     minute, dated = _minutes(cells[starts, :16])
     valid = np.repeat(dated, length)
     second, good = _integers(cells[:, 17:19])
+    # a leap second (60) is no second of datetime64
     valid &= good & (second < 60) & (cells[:, 16] == 58)
     wall = np.repeat(minute, length) + second * np.int64(1_000_000_000)
     if fraction:
@@ -254,6 +260,7 @@ def _integers(cells: AnyArray) -> tuple[IntArray, BoolArray]:
     """Digits, uint8 of shape (n, up to 9), as whole numbers; second, whether they are digits."""
     total, worst = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells), dtype=np.uint8)
     for column in cells.T:
+        # what is no digit wraps to more than 9
         digit = column - np.uint8(48)
         np.maximum(worst, digit, out=worst)
         total *= 10
@@ -296,6 +303,7 @@ def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolAr
     count = len(column)
     wall, offset = np.zeros((2, count), dtype=np.int64)
     valid, zoned = np.zeros((2, count), dtype=bool)
+    # room for nine digits and an offset, so that every row can be cut at the same places
     width = max(column.dtype.itemsize, 30)
     cells = column.astype(f"S{width}").view(np.uint8).reshape(count, width)
     digits = (cells[:, 20:29] >= 48) & (cells[:, 20:29] <= 57)

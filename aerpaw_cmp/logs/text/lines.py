@@ -104,6 +104,7 @@ _SLICE = 1 << 17
 def _places(buffer: AnyArray, byte: int) -> IntArray:
     """Places where a byte stands, shape (n,)."""
     starts = range(0, len(buffer), _SLICE)
+    # slice by slice: a mask of a GiB would be a GiB
     parts = [np.flatnonzero(buffer[first : first + _SLICE] == byte) + first for first in starts]
     return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
 
@@ -126,6 +127,7 @@ def split(data: bytes) -> Lines:
     else:
         starts = starts[:-1]
     if len(ends) and b"\r" in data:
+        # an empty first line has nothing before it
         before = buffer[np.maximum(ends - 1, 0)]
         ends = np.where((ends > starts) & (before == 13), ends - 1, ends)
     return Lines(data, starts, ends)
@@ -237,6 +239,7 @@ def numbers(column: AnyArray) -> AnyArray:
     """Text of numbers to float64; empty text is NaN."""
     if column.dtype.itemsize == 0 or len(column) == 0:
         return np.full(len(column), np.nan)
+    # Python programs print None for what they do not know
     return np.asarray(np.where((column == b"") | (column == b"None"), b"nan", column).astype(np.float64))
 
 
@@ -259,6 +262,7 @@ def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
 
 def first_lines(head: bytes, count: int = 40) -> list[bytes]:
     """Complete, non-blank lines at the start of a file: what sniffers judge by."""
+    # enough for any forty lines of a log
     pieces = head[:16_384].split(b"\n")
     if len(head) > 16_384 or (len(pieces) > 1 and not head.endswith(b"\n")):
         pieces = pieces[:-1]  # a cut line proves nothing

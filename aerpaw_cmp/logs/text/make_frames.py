@@ -57,6 +57,7 @@ def frame(
             content[name] = array(values[name], dtype=np.float64) if name in values else np.full(count, np.nan)
     for name, column in values.items():
         if name not in content:
+            # a copy: the same array may serve several streams
             content[name] = np.array(column)
     columns: pd.DataFrame = pd.DataFrame(content, copy=False)
     return columns
@@ -71,5 +72,6 @@ def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Att
 def steps_back(records: pd.DataFrame) -> list[str]:
     """Warning where the clock of a log runs backwards."""
     time = records["time"].to_numpy()
+    # NaT compares as False
     back = int(np.count_nonzero(time[1:] < time[:-1]))
     return [f"time steps back at {counted(back, 'place')}"] if back else []

@@ -179,6 +179,7 @@ class Rows:
         names: dict[str, Stream] = {}
         for stream in streams:
             if stream is not None:
+                # names are unique in a file: what comes again (a console that was started anew) gets a number
                 alike = sum(name == stream.name or name.startswith(f"{stream.name}_again") for name in names)
                 name = f"{stream.name}_again{alike}" if alike else stream.name
                 names[name] = replace(stream, name=name) if alike else stream
@@ -277,6 +278,7 @@ def built(
     """
     comment = np.zeros(len(rows), dtype=bool) if skip is None else skip(rows)
     before = list(extra)
+    # rejected before: they are accounted for, and are looked at no more
     known = np.concatenate((rows, np.array([line.number - 1 for line in before], dtype=np.int64))).astype(np.int64)
     blank, rejected = _lines.remainder(lines, known, reason, blank=markup)
     rejected += before
@@ -308,6 +310,7 @@ def built(
 def _untimed(lines: _lines.Lines, rows: IntArray, cells: AnyArray, valid: BoolArray, clock: str) -> list[RejectedLine]:
     """Lines rejected for their time: it is of no known form, no date of the calendar, or beyond any flight."""
     bad = np.flatnonzero(~valid & ~np.isin(rows, rows[valid]))
+    # a line of several records is rejected once
     bad = bad[np.unique(rows[bad], return_index=True)[1]] if len(bad) else bad
     if clock != "wall":
         return lines.reject_all(rows[bad], NO_TIME)
@@ -346,6 +349,7 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
         return False, instants, valid
     form, unit = clock.split("_")
     unit_ns = _time.COUNTS[unit].ns
+    # tables are parsed to floats already
     value = cells if cells.dtype.kind == "f" else np.asarray(_lines.numbers(cells), dtype=np.float64)
     origin = _time.origin_ns(options, needed_by=reader) if form == "relative" else 0
     most = _FLIGHT_S if form == "relative" else _MOST_S
@@ -400,6 +404,7 @@ def ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, mean
     float array, shape (m,)
     """
     absent = np.isnan(ri) | (np.zeros(len(ri), dtype=bool) if none is None else none)
+    # 3GPP knows up to eight layers
     inside = (ri >= 1) & (ri <= 8) & ~absent
     integer = inside & (ri == np.round(ri))
     _lines.add_flag(flag, absent, "no_csi")

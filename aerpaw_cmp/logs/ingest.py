@@ -9,9 +9,10 @@ from __future__ import annotations
 import hashlib
 import os
 from collections.abc import Callable, Collection, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..common.counting import counted
 from ..common.errors import InputError, UsageError, one_line, parsing
@@ -20,13 +21,13 @@ from .files import archives, chunks, packed
 from .files.pieces import join
 from .flight_file import IngestedFile, read_flight
 from .readers import DEEP_BYTES, HEAD_BYTES, Reader, ReadOptions, by_name, claims, identify
-from .records import ReadResult, has_wall_clock
-
-if TYPE_CHECKING:
-    import pandas as pd
+from .records import ReadResult, Stream, has_wall_clock
 
 # Largest content of a packed file that is unpacked in memory.
 MAX_BYTES = 2**32
+
+# A log of fewer bytes takes less than 300 MiB as a whole.
+_LARGE_BYTES = 1 << 28
 
 # Rejected lines of a file that a summary quotes.
 _FIRST_REJECTED = 3
@@ -417,10 +418,18 @@ def _in_pieces(place: Path, reader: Reader, options: _OptionsFor | None) -> Inge
     """A log of a reader that takes pieces; None for text in UTF-16, which is turned as one."""
     if reader.read_pieces is None or _raw(place, 2) in _UTF_16:
         return None
-    digest = hashlib.sha256()
-    chosen = _options(place, options, _neighbour_reader(place))
-    read_pieces = reader.read_pieces
-    result = _checked(place, reader, chosen, lambda: read_pieces(chunks.file_pieces(place, digest), chosen))
+    chosen, digest = _options(place, options, _neighbour_reader(place)), hashlib.sha256()
+    read_pieces, read_sections = reader.read_pieces, reader.read_sections
+
+    def read() -> ReadResult:
+        nonlocal digest
+        if chosen.only_spans and read_sections is not None and place.stat().st_size > _LARGE_BYTES:
+            with suppress(chunks.WholeLogError):
+                return chunks.spans(read_sections(chunks.file_pieces(place, digest), chosen, chunks.SECTION))
+            digest = hashlib.sha256()
+        return read_pieces(chunks.file_pieces(place, digest), chosen)
+
+    result = _checked(place, reader, chosen, read)
     return IngestedFile(str(place), digest.hexdigest(), result)
 
 
@@ -507,7 +516,7 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
             "first_rejected": [asdict(line) for line in file.result.rejected[:_FIRST_REJECTED]],
             "blank": file.result.blank,
             "streams": [
-                {"kind": stream.kind, "name": stream.name, "rows": len(stream.frame), **_span(stream.frame)}
+                {"kind": stream.kind, "name": stream.name, "rows": stream.rows, **_span(stream)}
                 for stream in file.result.streams
             ],
             "warnings": list(file.result.warnings),
@@ -519,14 +528,14 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
     return {"files": entries, "skipped": skipped, "warnings": warnings}
 
 
-def _span(frame: pd.DataFrame) -> dict[str, Any]:
+def _span(stream: Stream) -> dict[str, Any]:
     """First and last time (ISO, UTC) and mean rate; None where undefined."""
-    if not len(frame):
+    if not stream.rows:
         return {"start": None, "end": None, "rate_hz": None}
-    time = frame["time"]
+    time = stream.frame["time"]
     start, end = time.min(), time.max()
     seconds = (end - start).total_seconds()
-    rate = (len(frame) - 1) / seconds if seconds > 0 else None
+    rate = (stream.rows - 1) / seconds if seconds > 0 else None
     return {"start": start.isoformat() + "Z", "end": end.isoformat() + "Z", "rate_hz": rate}
 
 

@@ -221,7 +221,7 @@ class _Check:
         # differences as floats: those of int64 would wrap for NaT and for stamps 300 years apart
         time = self.frame["time"].to_numpy("datetime64[ns]")
         stamp: IntArray = time.view(np.int64)
-        if len(stamp) < 2 or _one_run(stamp):
+        if len(stamp) < 2 or one_run(stamp):
             return
         timed = ~np.isnat(time)
         if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= _APART_S * 1e9:
@@ -244,7 +244,7 @@ class _Check:
             self._flag(bad, "time_out_of_range", np.datetime_as_string(time[row], unit="s"), why)
 
 
-def _one_run(stamp: IntArray) -> bool:
+def one_run(stamp: IntArray) -> bool:
     """Check whether all stamps [ns] lie within a day, or each within a day of the next; nothing beside them is held."""
     low, high = int(stamp.min()), int(stamp.max())
     if low == np.iinfo(np.int64).min:  # a record without a time

@@ -7,13 +7,13 @@ lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` name
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Literal
 
 from ..common.errors import InputError, UsageError
-from .records import Kind, ReadResult
+from .records import Kind, ReadResult, Stream
 
 ENTRY_POINT_GROUP = "aerpaw_cmp.readers"
 # Sniffers see this much of a file first.
@@ -23,6 +23,7 @@ DEEP_BYTES = 4 << 20
 
 # Reads a log from pieces of whole lines: the same result whatever their size.
 _ReadPieces = Callable[[Iterable[bytes], "ReadOptions"], ReadResult]
+_ReadSections = Callable[[Iterable[bytes], "ReadOptions", float], Iterator[Stream | ReadResult]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +52,8 @@ class ReadOptions:
         Unit of RSS where the file does not fix it.
     floor_db : float
         RSS at or below this is out of coverage.
+    only_spans : bool
+        Of a large log its account, and of each stream the first and the last record in time and their number.
     file_name : str
         Of the log, without folders; set by ``ingest``. For formats whose content does not say what it is.
     neighbour : callable, optional
@@ -69,6 +72,7 @@ class ReadOptions:
     frequency_hz: float | None = None
     unit: str | None = None
     floor_db: float = -200.0
+    only_spans: bool = False
     file_name: str = ""
     neighbour: Callable[[str], bytes | None] | None = None
 
@@ -96,6 +100,8 @@ class Reader:
     read_pieces : callable, optional
         ``read_pieces(pieces, options) -> ReadResult``: the same from pieces of whole lines, for logs larger than
         memory; see :mod:`aerpaw_cmp.logs.files.chunks`.
+    read_sections : callable, optional
+        ``read_sections(pieces, options, most)`` gives streams of some ``most`` records each, last the result.
     clock_from, height_from : str
         ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.origins`. A stream's own
         attribute of that name wins.
@@ -109,6 +115,7 @@ class Reader:
     read: Callable[[bytes, ReadOptions], ReadResult]
     pieces: bool = False
     read_pieces: _ReadPieces | None = None
+    read_sections: _ReadSections | None = None
     clock_from: str = "assumed: local wall time"
     height_from: str = "assumed: above take-off"
 

@@ -66,6 +66,8 @@ class Stream:
         The records in file order, default integer index.
     attributes : mapping
         What holds for the whole stream: node, channel, unit, frequency_hz, ri_base, clock.
+    stand_for : int, optional
+        Number of records where the frame holds the first and the last of them in time alone.
 
     Raises
     ------
@@ -77,12 +79,18 @@ class Stream:
     name: str
     frame: pd.DataFrame
     attributes: Mapping[str, Attribute] = field(default_factory=dict)
+    stand_for: int | None = None
 
     def __post_init__(self) -> None:
         present = set(self.frame.columns)
         missing = [c for c in ("time", "line", "flag", *COLUMNS[self.kind]) if c not in present]
         if missing:
             raise ValueError(f"stream {self.name!r} of kind {self.kind!r} lacks columns {missing}")
+
+    @property
+    def rows(self) -> int:
+        """Number of records."""
+        return len(self.frame) if self.stand_for is None else self.stand_for
 
     @property
     def channel(self) -> str:

@@ -10,15 +10,16 @@ name: ``LW1:LW2:3235751:3.32G:0:2026-06-01_02_00_05:power_log.txt`` (transmitter
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections import Counter
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs.files.chunks import Column
+from aerpaw_cmp.logs.files.chunks import Column, Sections, WholeLogError
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import KEPT_REJECTED, ReadResult, Stream
 from aerpaw_cmp.logs.text import clocks as _time
@@ -74,6 +75,7 @@ class _Samples:
 
 
 _COLUMNS = ("line", "wall", "offset", "value")
+_KINDS = (np.int64, np.int64, np.int64, np.float64)
 _NONE = np.zeros(0, dtype=np.int64)
 
 
@@ -237,9 +239,64 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     UsageError
         If no time zone is given.
     """
-    columns = [Column(np.int64), Column(np.int64), Column(np.int64), Column(np.float64)]
+    *streams, result = read_sections(pieces, options)
+    assert isinstance(result, ReadResult)
+    return replace(result, streams=tuple(item for item in streams if isinstance(item, Stream)))
+
+
+def read_sections(pieces: Iterable[bytes], options: ReadOptions, most: float = np.inf) -> Sections:
+    """The stream in sections of some ``most`` samples and more, last the account and warnings without a stream.
+
+    Raises
+    ------
+    WholeLogError
+        If sections cannot settle what all samples together can.
+    """
+    rejects, tally, notes = _lines.Rejects(), Counter[str](), list[str]()
+    for section in _sections(pieces, rejects, most):
+        repeats, used, bad = _expand(section.samples, section.marks)
+        tally["repeated"] += len(repeats.line)
+        if most < np.inf and (bad or tally["repeated"] > _MOST_REPEATS):
+            raise WholeLogError  # how many samples a damaged offset may claim depends on the runs before it
+        feet = section.marks.line[section.marks.offset >= 0].tolist()
+        foot = "no value behind the offset (torn last line, or the end of od's input)"
+        for i, reason in (*bad, *((i, foot) for i in feet)):
+            rejects.add_line(i + 1, reason, section.texts.get(i, ""))
+        tally.update(accepted=len(section.samples.line) - section.known + len(used), blank=section.blank)
+        tally["lines"] = section.lines
+        stream = _stream(section, repeats, options, tally, notes)
+        if most < np.inf and notes:
+            raise WholeLogError  # an hour that a clock showed twice: which of the two depends on a step back later on
+        if stream is not None and len(stream.frame):
+            yield stream
+    rejected, reasons = rejects.result()
+    yield ReadResult(
+        reader="sounder_log", streams=(), lines=tally["lines"], accepted=tally["accepted"], blank=tally["blank"],
+        rejected=rejected, warnings=tuple(_warnings(tally, notes, options)), reasons=reasons,
+    )  # fmt: skip
+
+
+@dataclass
+class _Section:
+    """Samples of some lines, the first ``known`` of them also the last of the section before; marks between them.
+
+    ``lines`` are all so far, ``texts`` those of marks; ``torn`` is the 0-based line without an end (-1: none).
+    """
+
+    samples: _Samples
+    marks: _Samples
+    texts: dict[int, str]
+    known: int
+    lines: int
+    blank: int
+    torn: int
+
+
+def _sections(pieces: Iterable[bytes], rejects: _lines.Rejects, most: float) -> Iterator[_Section]:
+    """Sections that end with a sample: its offset, time and value are all that the next one needs of it."""
     marks, texts = _Samples.none(), dict[int, str]()
-    rejects, before, blank, unterminated = _lines.Rejects(), 0, 0, False
+    known, before, blank, unterminated = 0, 0, 0, False
+    columns = [Column(kind) for kind in _KINDS]
     for data in pieces:
         lines = _lines.split(data)
         rejects.before = before
@@ -251,43 +308,40 @@ def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
         marks = marks.join(piece.marks) if len(piece.marks.line) else marks
         texts |= {before + i: text for i, text in piece.texts.items()} if len(texts) < KEPT_REJECTED else {}
         before, blank, unterminated = before + len(lines), blank + piece.blank, lines.unterminated
+        if len(columns[0]) > most:
+            samples = _Samples(*(column.array() for column in columns))
+            last, inside = samples.take(np.array([-1])), marks.line < samples.line[-1]
+            between = marks.take(inside)
+            yield _Section(samples=samples, marks=between, texts=texts, known=known, lines=before, blank=blank, torn=-1)
+            columns = [Column(kind, getattr(last, name)) for kind, name in zip(_KINDS, _COLUMNS, strict=True)]
+            known, blank, marks = 1, 0, marks.take(~inside)
     samples = _Samples(*(column.array() for column in columns))
-    del columns
-    repeats, used, bad = _expand(samples, marks)
-    foot = "no value behind the offset (torn last line, or the end of od's input)"
-    for i, reason in (*bad, *((i, foot) for i in marks.line[marks.offset >= 0].tolist())):
-        rejects.add_line(i + 1, reason, texts.get(i, ""))
-    accepted = len(samples.line) + len(used)
-    warnings: list[str] = []
-    stream = _stream(samples, repeats, before - 1 if unterminated else -1, options, warnings)
-    rejected, reasons = rejects.result()
-    return ReadResult(
-        reader="sounder_log", streams=(stream,) if stream is not None else (), lines=before, accepted=accepted,
-        blank=blank, rejected=rejected, warnings=tuple(warnings), reasons=reasons,
-    )  # fmt: skip
+    del columns  # logs may have 1 GB: what is taken out of the samples goes at once
+    torn = before - 1 if unterminated else -1
+    yield _Section(samples=samples, marks=marks, texts=texts, known=known, lines=before, blank=blank, torn=torn)
 
 
 def _stream(
-    samples: _Samples, repeats: _Samples, torn: int, options: ReadOptions, warnings: list[str]
+    section: _Section, repeats: _Samples, options: ReadOptions, tally: Counter[str], notes: list[str]
 ) -> Stream | None:
-    """The stream with its flags, ``torn`` the 0-based line without an end (-1: none); ``None`` without samples."""
+    """The stream with its flags, ``None`` without samples; ``notes`` receives what its times are warned of."""
+    samples = section.samples
     if not len(samples.line):
         return None
     repeated = np.zeros(0, dtype=bool)
     if len(repeats.line):
         samples = samples.join(repeats)
         repeated = np.isin(samples.line, repeats.line)  # lines of '*' hold nothing else
-        warnings.append(
-            f"{counted(len(repeats.line), 'sample')} put back that od had suppressed as '*'; flagged repeated"
-        )
     # what is not needed any more makes room at once: logs may have 1 GB
     jump = samples.offset
     jump[1:] -= jump[:-1]
     jump[0] = 0
-    lost, back = jump > 4, int((jump < 0).sum())
+    lost = jump > 4
     missing = int((jump[lost] // 4 - 1).sum())
+    tally.update(lost=int(lost.sum()), missing=missing, back=int((jump < 0).sum()))
     samples.offset = jump = _NONE
     instants = _time.wall_to_utc(samples.wall, options, needed_by="sounder_log")
+    notes += instants.warnings
     samples.wall = _NONE
     flag = _lines.flags(len(samples.line))
     instants.flag(flag)
@@ -296,30 +350,43 @@ def _stream(
     samples.value[silent] = np.nan
     _lines.add_flag(flag, silent, "out_of_coverage")
     _lines.add_flag(flag, lost, "samples_lost_before")
-    if lost.any():
-        warnings.append(f"offsets jump at {counted(int(lost.sum()), 'place')}: {counted(missing, 'sample')} missing")
-    if back:
-        warnings.append(f"offsets step back at {counted(back, 'place')}: several runs in one file?")
-    if torn >= 0:
-        _lines.add_flag(flag, samples.line == torn, _lines.UNTERMINATED)
+    if section.torn >= 0:
+        _lines.add_flag(flag, samples.line == section.torn, _lines.UNTERMINATED)
     samples.line += 1
     frame = _frames.frame("rss", instants.time, samples.line, flag, {"rss_db": samples.value}, own=True)
-    warnings += [*instants.warnings, *_frames.steps_back(frame)]
-    named = _NAMED.search(options.file_name.lower())
-    name = options.channel or (named.group() if named else "power")
-    ratio = name.lower() in ("quality", "snr")
-    if options.channel is None and not named:
-        warnings.append(
-            "power, quality and SNR logs have one layout: read as power, as the file name does not say; name another "
-            "with the channel option"
-        )
+    tally["time_back"] += _frames.steps_back(frame)
+    name, ratio = _name(options)
     attributes = _frames.attributes(
         options, channel=name, unit=options.unit or ("dB" if ratio else "dB re full scale"),
-        quantity="SNR" if name.lower() == "snr" else None, repeated_samples=len(repeats.line),
+        quantity="SNR" if name.lower() == "snr" else None, repeated_samples=tally["repeated"],
     )  # fmt: skip
     if link := _SOUNDING.match(options.file_name):
         attributes |= _sheet.identities({key: text for key, text in link.groupdict().items() if text != "null"})
-    return Stream("rss", name, frame, attributes)
+    return Stream("rss", name, frame.iloc[section.known :] if section.known else frame, attributes)
+
+
+def _name(options: ReadOptions) -> tuple[str, bool]:
+    """Name of the channel, and whether its levels are ratios."""
+    named = _NAMED.search(options.file_name.lower())
+    name = options.channel or (named.group() if named else "power")
+    return name, name.lower() in ("quality", "snr")
+
+
+def _warnings(tally: Counter[str], of_times: list[str], options: ReadOptions) -> Iterator[str]:
+    """Sentences on what was counted."""
+    if tally["repeated"]:
+        yield f"{counted(tally['repeated'], 'sample')} put back that od had suppressed as '*'; flagged repeated"
+    if tally["lost"]:
+        yield f"offsets jump at {counted(tally['lost'], 'place')}: {counted(tally['missing'], 'sample')} missing"
+    if tally["back"]:
+        yield f"offsets step back at {counted(tally['back'], 'place')}: several runs in one file?"
+    yield from of_times
+    yield from _frames.back_in_time(tally["time_back"])
+    if tally["accepted"] and options.channel is None and not _NAMED.search(options.file_name.lower()):
+        yield (
+            "power, quality and SNR logs have one layout: read as power, as the file name does not say; name another "
+            "with the channel option"
+        )
 
 
 # A file's name of the nightly soundings between towers.
@@ -332,4 +399,5 @@ READER = Reader(
     name="sounder_log", title="GNU Radio channel sounder power, quality or SNR log (od text)", kinds=("rss",),
     sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345", sniff=sniff,
     read=lambda data, options: read_pieces((data,), options), read_pieces=read_pieces,
+    read_sections=read_sections,
 )  # fmt: skip

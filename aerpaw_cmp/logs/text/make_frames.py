@@ -69,9 +69,13 @@ def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Att
     return {name: value for name, value in merged.items() if value is not None}
 
 
-def steps_back(records: pd.DataFrame) -> list[str]:
-    """Warning where the clock of a log runs backwards."""
+def steps_back(records: pd.DataFrame) -> int:
+    """Number of places where the clock of a log runs backwards."""
     time = records["time"].to_numpy()
     # NaT compares as False
-    back = int(np.count_nonzero(time[1:] < time[:-1]))
-    return [f"time steps back at {counted(back, 'place')}"] if back else []
+    return int(np.count_nonzero(time[1:] < time[:-1]))
+
+
+def back_in_time(places: int) -> list[str]:
+    """Warning where there are any."""
+    return [f"time steps back at {counted(places, 'place')}"] if places else []

@@ -27,7 +27,10 @@ def gaussian_kernel(first: FloatArray, second: FloatArray, length: float) -> Flo
     """
     from scipy.spatial.distance import cdist
 
-    return np.asarray(np.exp(-cdist(first, second, "sqeuclidean") / (2.0 * length**2)))
+    kernel = np.asarray(cdist(first, second, "sqeuclidean"))
+    kernel /= -2.0 * length**2  # in place: a second and a third matrix of this size cost as much as the exponentials
+    np.exp(kernel, out=kernel)
+    return kernel
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -14,6 +14,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from itertools import groupby, product
 from typing import Any, Literal
 
@@ -201,13 +202,20 @@ def _kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
     from scipy.spatial.distance import cdist
 
     if term.frame == "pair":
-        return term.sd_db**2 * gaussian_kernel(at, to, term.length)
-    # in place: these matrices are most of the time of a calibration
-    kernel = np.asarray(cdist(at, to))
-    kernel /= -term.length
-    np.exp(kernel, out=kernel)
+        kernel = gaussian_kernel(at, to, term.length)
+    else:  # in place: these matrices are most of the time of a calibration
+        kernel = np.asarray(cdist(at, to))
+        kernel /= -term.length
+        np.exp(kernel, out=kernel)
     kernel *= term.sd_db**2
     return kernel
+
+
+@lru_cache(maxsize=len(ANTENNA_TERMS))
+def _last_kernel(term: Term, at: bytes, to: bytes) -> FloatArray:
+    """:func:`_kernel` of float64 arguments, kept for the next series: channels of one log have the same directions."""
+    width = 6 if term.frame == "pair" else 3
+    return _kernel(term, np.frombuffer(at).reshape(-1, width), np.frombuffer(to).reshape(-1, width))
 
 
 def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
@@ -216,16 +224,13 @@ def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Seq
     out = np.zeros((sum(map(len, first)), sum(map(len, second))))
     for term in terms:
         at, to = (np.concatenate([argument_of(s, term.frame) for s in series]) for series in (first, second))
-        if term.per != "antenna":
-            (at, row), (to, column) = (np.unique(some, axis=0, return_inverse=True) for some in (at, to))
-            out += _kernel(term, at, to)[row][:, column]  # channels of one log have the same directions
-            continue
         blocks: dict[tuple[bytes, bytes], FloatArray] = {}
         for (name, mine), (other, theirs) in product(rows, columns):
-            if name == other:  # gains of two antennas share nothing; those beside each other see the same
-                key = at[mine].tobytes(), to[theirs].tobytes()
-                blocks[key] = _kernel(term, at[mine], to[theirs]) if key not in blocks else blocks[key]
-                out[mine, theirs] += blocks[key]
+            if term.per == "antenna" and name != other:  # gains of two antennas share nothing
+                continue
+            key = at[mine].tobytes(), to[theirs].tobytes()  # channels of one log have the same directions
+            blocks[key] = _kernel(term, at[mine], to[theirs]) if key not in blocks else blocks[key]
+            out[mine, theirs] += blocks[key]
     return out
 
 
@@ -248,7 +253,8 @@ def _expected(
         shared = own if term.per == "antenna" else np.ones_like(own)
         at = np.concatenate([argument_of(s, term.frame) for s in rows])[shared]
         at, place = np.unique(at, axis=0, return_inverse=True)  # channels of one log have the same directions
-        gain += _kernel(term, argument_of(samples, term.frame), at) @ np.bincount(place, weights[shared])
+        kernel = _last_kernel(term, argument_of(samples, term.frame).tobytes(), at.tobytes())
+        gain += kernel @ np.bincount(place, weights[shared])
     return gain
 
 

@@ -10,9 +10,9 @@ import io
 import re
 import zipfile
 from collections.abc import Iterator, Mapping
+from html import escape  # that of xml.sax would load OpenSSL
 from pathlib import Path
 from xml.etree import ElementTree
-from xml.sax.saxutils import escape
 
 import numpy as np
 
@@ -89,7 +89,7 @@ _DATE = (1980, 1, 1, 0, 0, 0)
 
 def xml_text(text: str) -> str:
     """Text for an XML element or attribute: characters that XML cannot hold as escapes."""
-    return escape(one_line(text), {'"': "&quot;"})
+    return escape(one_line(text), quote=False).replace('"', "&quot;")
 
 
 def coordinates(longitude: FloatArray, latitude: FloatArray, up_m: FloatArray | float = 0.0) -> list[str]:

@@ -10,6 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+# SciPy takes every name of NumPy, and the reader of Fortran among them loads for 0.08 s.
+if "f2py" in np.__all__:
+    np.__all__.remove("f2py")
+
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]

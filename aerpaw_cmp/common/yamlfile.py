@@ -56,7 +56,10 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 class StrictModel(pydantic.BaseModel):
     """Base of all settings: nothing unknown, every number one, no change after loading."""
 
-    model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+    # deferred: the validator of a part is made with that of the whole, once, and of what nobody asks for never
+    model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(
+        extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True
+    )
 
 
 def nearest(name: object, choices: Iterable[str]) -> str | None:

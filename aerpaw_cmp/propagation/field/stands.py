@@ -208,31 +208,30 @@ def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArr
 
 def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wavelength_m: float) -> FloatArray:
     """Loss (k,) of segments that cross a stand [dB]."""
-    source, target, stand = crossing.start, crossing.end, crossing.stand
-    count = len(source)
+    source, target, stand, count = crossing.start, crossing.end, crossing.stand, len(crossing.segment)
+    if isinstance(model, Opaque):
+        return model.loss_db(crossing.depth_m(np.zeros(count)))
     enter, leave, top = np.full(count, np.inf), np.full(count, -np.inf), np.full(count, -np.inf)
     np.minimum.at(enter, crossing.piece, crossing.share[:, 0])
     np.maximum.at(leave, crossing.piece, crossing.share[:, 1])
     np.maximum.at(top, crossing.piece, crossing.height_m + crossing.ground_m)
     # neither end in the canopy: only then are there ways over and around it
-    lower = np.zeros(count)
     outside = ((enter > 1e-9) | (source[:, 2] > top)) & ((leave < 1.0 - 1e-9) | (target[:, 2] > top))
-    ways = [] if isinstance(model, Opaque) else list(_detours(stand, source, target, enter, leave, top))
-    if ways:
-        top_way = ways[0]
-        zone = _CLEAR * np.sqrt(wavelength_m * top_way.length_m * top_way.share * (1.0 - top_way.share))
-        lower = np.where(outside, np.maximum((zone - top_way.intrusion_m).min(axis=0), 0.0), 0.0)
-    depth_m = crossing.depth_m(lower)
+    length, share = np.linalg.norm(target - source, axis=1), np.stack([enter, leave])
+    intrusion = top - source[:, 2] - share * (target - source)[:, 2]
+    zone = _CLEAR * np.sqrt(wavelength_m * length * share * (1.0 - share))
+    depth_m = crossing.depth_m(np.where(outside, np.maximum((zone - intrusion).min(axis=0), 0.0), 0.0))
     through = model.loss_db(depth_m)
-    if stand.evergreen_share and not isinstance(model, Opaque):
+    if stand.evergreen_share:
         # a mean of decibels, not of powers: the share is one of trees along each way, not of ways
         through = through + stand.evergreen_share * (in_leaf.loss_db(depth_m) - through)
-    if not ways:
-        return through
-    # as powers: nobody knows the edge of a canopy to a wavelength
-    power = sum(10.0 ** (-deygout_db(detour, wavelength_m) / 10.0) for detour in ways)
+    passed, some = np.zeros(count), np.flatnonzero(outside & (through > 0.0))  # what loses nothing needs no detour
+    over = Profile(length[some], share[:, some], intrusion[:, some])
+    for way in (over, *_around(stand, source[some], target[some])):
+        # as powers: nobody knows the edge of a canopy to a wavelength
+        passed[some] += 10.0 ** (-deygout_db(way, wavelength_m) / 10.0)
     # as shares that are lacking: so a detour of full power leaves no loss, and none leaves all
-    blocked = (1.0 - 10.0 ** (-through / 10.0)) * (1.0 - np.where(outside, np.minimum(power, 1.0), 0.0))
+    blocked = (1.0 - 10.0 ** (-through / 10.0)) * (1.0 - np.minimum(passed, 1.0))
     return np.asarray(-10.0 * np.log10(1.0 - blocked))
 
 
@@ -242,13 +241,9 @@ def _between(share: FloatArray, up: FloatArray, rise: FloatArray, low: float, hi
     return np.asarray(np.maximum(np.minimum(share[:, 1], last) - np.maximum(share[:, 0], first), 0.0))
 
 
-def _detours(
-    stand: Forest, start: FloatArray, end: FloatArray, enter: FloatArray, leave: FloatArray, top: FloatArray
-) -> Iterator[Profile]:
-    """Profiles of the ways over a stand and around both sides of it."""
+def _around(stand: Forest, start: FloatArray, end: FloatArray) -> Iterator[Profile]:
+    """Profiles of the ways around both sides of a stand."""
     length = np.linalg.norm(end - start, axis=1)
-    share = np.stack([enter, leave])
-    yield Profile(length, share, top - start[:, 2] - share * (end - start)[:, 2])
     corner = shapely.get_coordinates(stand.area.convex_hull)[:, None]
     way = (end - start)[:, :2]
     flat = np.maximum(np.hypot(*way.T), _UPRIGHT_M)

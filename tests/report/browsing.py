@@ -52,6 +52,21 @@ def frame(driver) -> None:
     driver.execute_async_script("const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(done));")
 
 
+def saved(driver, buttons: str) -> dict[str, str]:
+    """What buttons of charts would save, by name of file: a selector of CSS chooses them."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    clicked = driver.execute_script(
+        "window.files = {}; URL.createObjectURL = blob => { window.last = blob; return 'blob:'; };"
+        "HTMLAnchorElement.prototype.click = function () { window.last.text().then(t => { files[this.download] = t; }); };"
+        "const all = [...document.querySelectorAll(arguments[0])]; all.forEach(b => b.click());"
+        "return new Set(all.map(b => b.title + b.textContent)).size",
+        buttons,
+    )
+    WebDriverWait(driver, 20).until(lambda d: d.execute_script("return Object.keys(files).length") == clicked)
+    return driver.execute_script("return files")
+
+
 def complaints(driver) -> list[dict]:
     """What the console says; but not that pixels are read often: tests do, no page does."""
     said = [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]

@@ -6,7 +6,7 @@ import pytest
 from aerpaw_cmp.report.kit.canvas import rank_colour
 from aerpaw_cmp.report.kit.page import embedded
 from aerpaw_cmp.report.pages.places import BAND, COMPASS, LIKELIEST, Places, payload
-from tests.report.browsing import PageLaws, choose, frame, needs_browser, open_page, papers, start
+from tests.report.browsing import PageLaws, choose, frame, needs_browser, open_page, papers, saved, start
 from tests.report.shown import PAGES
 
 pytest.importorskip("selenium", reason="selenium is not installed")
@@ -59,6 +59,8 @@ def test_the_map_names_its_towers_and_reads_the_point_under_the_pointer(driver, 
     assert "−80.0 dBm" in text
     assert driver.find_element("id", "along").is_displayed()
     assert [b.text for b in driver.find_elements("css selector", "#saves button")] == ["SVG", "PNG", "CSV"]
+    (drawn,) = (text for name, text in saved(driver, "#saves button").items() if name.endswith(".svg"))
+    assert drawn.count("A 3.5 3.5") == 2 * len(driver.execute_script("return places.drawn()"))  # circles in halves
 
 
 def test_directions_lie_on_a_sphere_that_turns(driver):

@@ -179,31 +179,62 @@ const common = (() => {
     jobs.forEach(job => waiting.add(job));
   }
 
+  // commands of a path in the words of SVG; an arc is two, as SVG has none that ends where it began
+  const SPELLED = {
+    closePath: () => ["Z"], moveTo: (x, y) => ["M", x, y], lineTo: (x, y) => ["L", x, y], rect: (x, y, w, h) => ["M", x, y, "h", w, "v", h, "h", -w, "Z"],
+    arc: (x, y, r, from, to) => [0, 0.5, 1].flatMap(part => {
+      const angle = from + part * Math.min(to - from, 2 * Math.PI);
+      return [...(part ? ["A", r, r, 0, 0, 1] : ["L"]), x + r * Math.cos(angle), y + r * Math.sin(angle)];
+    }),
+  };
+  const spell = (name, values) => SPELLED[name](...values).map(v => Number.isFinite(v) ? +v.toFixed(2) : v).join(" ") + " ";
+  // a path as uPlot makes them apart from its canvas
+  class SpelledPath extends Path2D { constructor(...other) { super(...other); this.spelled = other.length ? other[0].spelled : ""; } }
+  const drawn = Path2D.prototype;
+  for (const name in SPELLED) SpelledPath.prototype[name] = function (...values) { this.spelled += spell(name, values); drawn[name].apply(this, values); };
+
   // what a canvas is drawn with, taken down as SVG while it is drawn anew
   function drawnAsSvg(canvas, draw) {
-    const pen = canvas.getContext("2d"), out = [], text = v => String(v).replace(/[&<]/g, c => `&#${c.charCodeAt(0)};`);
-    let path = "";
+    const pen = canvas.getContext("2d"), out = [], clips = [0], text = v => String(v).replace(/[&<"]/g, c => `&#${c.charCodeAt(0)};`);
+    let path = "", clip = 0;
+    const d = other => `d="${(other ? other.spelled : path).replace(/^L/, "M")}"`; // a canvas begins a line where nothing stands yet
+    const paint = (use, style) => { // many readers of SVG know no rgba()
+      const [, rgb, alpha] = style.match(/^rgba\((.*), ([\d.]+)\)$/) || [];
+      return rgb ? `${use}="rgb(${rgb})" ${use}-opacity="${alpha}"` : `${use}="${style}"`;
+    };
+    const matrix = () => { const m = pen.getTransform(); return `transform="matrix(${[m.a, m.b, m.c, m.d, m.e, m.f]})"`; };
     const mark = (tag, rest, filled) => {
-      const m = pen.getTransform(), line = `fill="none" stroke="${pen.strokeStyle}" stroke-width="${pen.lineWidth}" stroke-dasharray="${pen.getLineDash()}"`;
-      out.push(`<${tag} transform="matrix(${[m.a, m.b, m.c, m.d, m.e, m.f]})" opacity="${pen.globalAlpha}" ${filled ? `fill="${pen.fillStyle}"` : line} ${rest}`);
+      const line = () => `fill="none" ${paint("stroke", pen.strokeStyle)} stroke-width="${pen.lineWidth}" stroke-linejoin="${pen.lineJoin}" stroke-dasharray="${pen.getLineDash()}"`;
+      out.push(`<${tag} ${matrix()} opacity="${pen.globalAlpha}" ${filled ? paint("fill", pen.fillStyle) : line()} ${rest}`);
+    };
+    const box = filled => (x, y, w, h) => mark("rect", `x="${x}" y="${y}" width="${w}" height="${h}"/>`, filled);
+    const words = filled => (t, x, y) => {
+      const above = () => pen.measureText(t).actualBoundingBoxAscent, own = pen.textBaseline, to = above();
+      pen.textBaseline = "alphabetic"; // the only one that all readers of SVG draw alike
+      const base = y + above() - to;
+      pen.textBaseline = own;
+      mark("text", `x="${x}" y="${base}" style="font: ${text(pen.font)}" text-anchor="${{ center: "middle", right: "end" }[pen.textAlign] || "start"}">${text(t)}</text>`, filled);
     };
     const taken = {
-      beginPath: () => { path = ""; }, closePath: () => { path += "Z"; }, moveTo: (x, y) => { path += `M${x} ${y}`; },
-      lineTo: (x, y) => { path += `${path ? "L" : "M"}${x} ${y}`; }, stroke: () => mark("path", `d="${path}"/>`), fill: () => mark("path", `d="${path}"/>`, true),
-      fillRect: (x, y, w, h) => mark("rect", `x="${x}" y="${y}" width="${w}" height="${h}"/>`, true),
-      fillText: (t, x, y) => mark("text", `x="${x}" y="${y}" font-family="sans-serif" font-size="${parseFloat(pen.font.match(/[\d.]+px/))}" text-anchor="${{ center: "middle", right: "end" }[pen.textAlign] || "start"}">${text(t)}</text>`, true),
+      beginPath: () => { path = ""; }, stroke: other => mark("path", `${d(other)}/>`), fill: other => mark("path", `${d(other)}/>`, true),
+      fillRect: box(true), strokeRect: box(false), fillText: words(true), strokeText: words(false),
+      save: () => clips.push(0), restore: () => out.push("</g>".repeat(clips.pop())),
+      clip: other => { clips.push(clips.pop() + 1); out.push(`<clipPath id="clip${++clip}"><path ${matrix()} ${d(other)}/></clipPath><g clip-path="url(#clip${clip})">`); },
     };
+    for (const name in SPELLED) taken[name] = (...values) => { path += spell(name, values); };
     for (const name in taken) pen[name] = (...values) => { taken[name](...values); CanvasRenderingContext2D.prototype[name].apply(pen, values); };
-    try { draw(); } finally { for (const name in taken) delete pen[name]; }
-    return `<svg xmlns="http://www.w3.org/2000/svg" width="${canvas.clientWidth}" viewBox="0 0 ${canvas.width} ${canvas.height}">${out.join("")}</svg>`;
+    window.Path2D = SpelledPath;
+    try { draw(); } finally { window.Path2D = drawn.constructor; for (const name in taken) delete pen[name]; }
+    const left = "</g>".repeat(clips.reduce((sum, count) => sum + count));
+    return `<svg xmlns="http://www.w3.org/2000/svg" width="${canvas.clientWidth}" viewBox="0 0 ${canvas.width} ${canvas.height}">${out.join("")}${left}</svg>`;
   }
 
-  // buttons that save a chart: drawn anew as SVG where ``draw`` does that, as a picture, and the rows of its numbers
+  // buttons that save a chart: drawn anew by ``draw`` as SVG, as a picture, and the rows of its numbers
   function downloads(canvas, name, rows, draw) {
     const save = (kind, blob) => { const a = document.createElement("a"); a.href = URL.createObjectURL(blob); a.download = `${name}.${kind}`; a.click(); URL.revokeObjectURL(a.href); };
     const cell = v => v === null || Number.isNaN(v) ? "" : /[",\n]/.test(v) ? `"${String(v).replaceAll('"', '""')}"` : v;
     const kinds = { svg: () => save("svg", new Blob([drawnAsSvg(canvas, draw)])), png: () => canvas.toBlob(blob => save("png", blob)), csv: () => save("csv", new Blob([rows().map(row => row.map(cell).join(",")).join("\n") + "\n"])) };
-    return Object.keys(kinds).filter(kind => draw || kind !== "svg").map(kind => {
+    return Object.keys(kinds).map(kind => {
       const button = document.createElement("button");
       button.type = "button"; button.textContent = kind.toUpperCase(); button.title = `Save: ${name}`; button.addEventListener("click", kinds[kind]);
       return button;

@@ -170,6 +170,7 @@
       cursor: { drag: { x: true, y: false, setScale: false }, y: false, points: { show: false } },
       series: [{}, ...series],
       hooks: {
+        drawClear: [({ ctx }) => { ctx.save(); ctx.fillStyle = css("--paper"); ctx.fillRect(0, 0, ctx.canvas.width, ctx.canvas.height); ctx.restore(); }],
         draw: [bands],
         setCursor: [u => { if (!linking && u.cursor.left >= 0 && u.cursor.idx !== null) choose(u.posToVal(u.cursor.left, "x")); }],
         setSelect: [u => {
@@ -183,7 +184,8 @@
     made.parted = extra.parted;
     const saves = document.createElement("p");
     saves.className = "key saves";
-    saves.append(...common.downloads(made.ctx.canvas, label, () => [["time", ...series.map(one => one.label || "band")], ...Array.from(columns[0], (t, i) => columns.map(list => list[i]))]));
+    saves.append(...common.downloads(made.ctx.canvas, label, () => [["time", ...series.map(one => one.label || "band")], ...Array.from(columns[0], (t, i) => columns.map(list => list[i]))],
+      () => made.batch(u => u.redraw()))); // a batch draws before it returns, its paths made anew
     host.append(saves);
     made.over.addEventListener("dblclick", () => { span(null); zoomTo(null); });
     charts.push({ chart: made, host, height });

@@ -186,6 +186,7 @@ def test_the_map_shows_the_flight_over_the_prediction_and_is_linked(driver, fly)
     frame(driver)
     assert driver.execute_script("return live.state.pose") == t
     assert "24, 20, 80 m" in text(driver, "pose")
+    x, y, t = driver.execute_script("return live.poses()[5]")  # a longer line below the map moves it
     before = pixel(driver, "map", x, y)
     choose(driver, "colour", "residual-rsrp")
     assert pixel(driver, "map", x, y) != before

@@ -3,6 +3,7 @@
 import json
 import shutil
 from importlib import resources
+from xml.etree import ElementTree
 
 import pytest
 
@@ -53,13 +54,13 @@ def frame(driver) -> None:
 
 
 def saved(driver, buttons: str) -> dict[str, str]:
-    """What buttons of charts would save, by name of file: a selector of CSS chooses them."""
+    """What buttons of charts that are shown would save, by name of file: a selector of CSS chooses them."""
     from selenium.webdriver.support.ui import WebDriverWait
 
     clicked = driver.execute_script(
         "window.files = {}; URL.createObjectURL = blob => { window.last = blob; return 'blob:'; };"
         "HTMLAnchorElement.prototype.click = function () { window.last.text().then(t => { files[this.download] = t; }); };"
-        "const all = [...document.querySelectorAll(arguments[0])]; all.forEach(b => b.click());"
+        "const all = [...document.querySelectorAll(arguments[0])].filter(b => b.checkVisibility()); all.forEach(b => b.click());"
         "return new Set(all.map(b => b.title + b.textContent)).size",
         buttons,
     )
@@ -175,6 +176,17 @@ class PageLaws:
         assert page <= width
         assert rights
         assert max(rights) <= width
+
+    def test_every_chart_can_be_saved(self, driver):
+        """One button for SVG a canvas that is shown and no scale of another, each giving a picture with marks."""
+        shown = "[...document.querySelectorAll('canvas:not(#legend)')].filter(c => c.checkVisibility()).length"
+        drawn = {
+            name: text for name, text in saved(driver, ".saves button, .key button").items() if name[-4:] == ".svg"
+        }
+        assert len(drawn) == driver.execute_script(f"return {shown}")
+        assert all(
+            {"path", "text"} <= {e.tag.split("}")[1] for e in ElementTree.fromstring(t).iter()} for t in drawn.values()
+        )
 
     def test_dark_and_light(self, driver):
         assert [paper[:3] for paper in self.papers(driver)] == [[255, 255, 255], [23, 23, 23]]

@@ -197,8 +197,9 @@ const common = (() => {
   function drawnAsSvg(canvas, draw) {
     const pen = canvas.getContext("2d"), out = [], clips = [0], text = v => String(v).replace(/[&<"]/g, c => `&#${c.charCodeAt(0)};`);
     let path = "", clip = 0;
-    const d = other => `d="${(other ? other.spelled : path).replace(/^L/, "M")}"`; // a canvas begins a line where nothing stands yet
+    const d = other => `d="${(other?.spelled ?? path).replace(/^L/, "M")}"`; // a canvas begins a line where nothing stands yet
     const paint = (use, style) => { // many readers of SVG know no rgba()
+      if (typeof style !== "string") return `${use}="none"`; // a pattern, over a colour of its own
       const [, rgb, alpha] = style.match(/^rgba\((.*), ([\d.]+)\)$/) || [];
       return rgb ? `${use}="rgb(${rgb})" ${use}-opacity="${alpha}"` : `${use}="${style}"`;
     };
@@ -218,6 +219,7 @@ const common = (() => {
     const taken = {
       beginPath: () => { path = ""; }, stroke: other => mark("path", `${d(other)}/>`), fill: other => mark("path", `${d(other)}/>`, true),
       fillRect: box(true), strokeRect: box(false), fillText: words(true), strokeText: words(false),
+      drawImage: (image, x, y, w, h) => out.push(`<image ${matrix()} opacity="${pen.globalAlpha}" href="${image.toDataURL()}" x="${x}" y="${y}" width="${w}" height="${h}" preserveAspectRatio="none" style="image-rendering: pixelated"/>`),
       save: () => clips.push(0), restore: () => out.push("</g>".repeat(clips.pop())),
       clip: other => { clips.push(clips.pop() + 1); out.push(`<clipPath id="clip${++clip}"><path ${matrix()} ${d(other)}/></clipPath><g clip-path="url(#clip${clip})">`); },
     };
@@ -239,6 +241,13 @@ const common = (() => {
       button.type = "button"; button.textContent = kind.toUpperCase(); button.title = `Save: ${name}`; button.addEventListener("click", kinds[kind]);
       return button;
     });
+  }
+
+  // the same in a line of its own below the chart, or below its scale
+  function saves(canvas, name, rows, draw, above = canvas) {
+    let place = above.nextElementSibling;
+    if (!place?.classList.contains("saves")) above.after(place = Object.assign(document.createElement("p"), { className: "key saves" }));
+    place.replaceChildren(...downloads(canvas, name, rows, draw));
   }
 
   function whenResized(element, job) {
@@ -279,5 +288,5 @@ const common = (() => {
     for (const place of document.querySelectorAll("canvas[data-plot]")) whenResized(place, () => drawPlot(place));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, downloads, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar, plots };
+  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, downloads, saves, whenResized, digits, clockTicks, clockText, plan, planAxes, path, tower, colourBar, plots };
 })();

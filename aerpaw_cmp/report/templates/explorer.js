@@ -182,11 +182,8 @@
     };
     const made = new uPlot(options, columns, host);
     made.parted = extra.parted;
-    const saves = document.createElement("p");
-    saves.className = "key saves";
-    saves.append(...common.downloads(made.ctx.canvas, label, () => [["time", ...series.map(one => one.label || "band")], ...Array.from(columns[0], (t, i) => columns.map(list => list[i]))],
-      () => made.batch(u => u.redraw()))); // a batch draws before it returns, its paths made anew
-    host.append(saves);
+    common.saves(made.ctx.canvas, label, () => [["time", ...series.map(one => one.label || "band")], ...Array.from(columns[0], (t, i) => columns.map(list => list[i]))],
+      () => made.batch(u => u.redraw()), made.root); // a batch draws before it returns, its paths made anew
     made.over.addEventListener("dblclick", () => { span(null); zoomTo(null); });
     charts.push({ chart: made, host, height });
   }
@@ -328,6 +325,11 @@
 
   const polygon = (...given) => common.polygon(pen, ...given), polyline = (...given) => common.polyline(pen, ...given);
 
+  common.saves(canvas, "Flight", () => {
+    const f = flown(), s = rss(), r = rank(), columns = { time: f.time, east_m: f.east, north_m: f.north, up_m: f.up };
+    Object.assign(columns, s ? { measured: get(s.measured), residual_db: residuals() } : r ? { rank: get(r.measured) } : {});
+    return [Object.keys(columns), ...Array.from(f.time, (_, i) => Object.values(columns).map(list => list[i]))];
+  }, drawMap);
   function drawMap() {
     const ratio = devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
     canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio);
@@ -404,7 +406,7 @@
 
   // --- residual against a quantity, and histograms ----------------------------------------------------------------------
 
-  const saved = (id, name, rows, draw) => at(id).parentElement.querySelector(".saves").replaceChildren(...common.downloads(at(id), name, () => rows, draw));
+  const saved = (id, name, rows, draw) => common.saves(at(id), name, () => rows, draw);
   function drawScatter() {
     const s = rss();
     at("scatter-figure").hidden = !s || !s.geometry.length;

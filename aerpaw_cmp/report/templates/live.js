@@ -212,7 +212,7 @@
     const [low, high] = range(), [pen, w, h] = common.frame(canvas);
     const end = high - 0.04 * (high - low), marks = common.clockTicks(low / 1000, end / 1000, Math.max(2, w / 110), 0).map(t => t * 1000); // no label is cut at the edge
     const g = common.axes(pen, w, h + 16, { low, high, label: "", marks, words: t => clock(t) }, y, 52);
-    scales.set(id, { g, low, high });
+    scales.set(id, { g, low, high, again: () => chart(id, parts, y) });
     pen.save(); pen.beginPath(); pen.rect(g.left, g.top - 4, g.right - g.left, g.bottom - g.top + 8); pen.clip();
     for (const part of parts) part(pen, g, low, high);
     if (state.pose !== null) polyline(pen, [[g.X(state.pose), g.top], [g.X(state.pose), g.bottom]], css("--accent"), 1.5);
@@ -275,6 +275,10 @@
   for (const id of ["chart-rank", "chart-rsrp", "chart-residual", "chart-sinr"]) {
     const canvas = at(id);
     if (!canvas) continue;
+    const rows = () => { const c = state.modems[state.chosen].rows.columns; return [Object.keys(c), ...c.t.map((_, i) => Object.values(c).map(list => list[i]))]; };
+    const saves = Object.assign(document.createElement("p"), { className: "saves" });
+    saves.append(...common.downloads(canvas, id.slice(6), rows, () => scales.get(id)?.again()));
+    canvas.previousElementSibling.before(saves); // floats beside the heading: no line is lost in the field
     canvas.addEventListener("pointermove", e => {
       const s = scales.get(id);
       if (!s) return;

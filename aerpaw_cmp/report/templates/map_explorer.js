@@ -103,6 +103,7 @@
     return pen.createPattern(tile, "repeat");
   }
 
+  const cellValues = () => [["east_m", "north_m", at("title").textContent], ...Array.from(shown || [], (v, i) => [east[i % columns], north[Math.floor(i / columns)], asClasses() ? quantity().classes[v] : v])];
   function drawMap() {
     if (!image) draw();
     const [pen, w, h] = frame(canvas);
@@ -234,12 +235,12 @@
     return { low, high, label: (state.difference ? "A − B" : q.name.length > 22 ? "" : q.name) + (unit() ? ` [${unit()}]` : "") };
   }
   function drawProfile() {
-    const [pen, w, h] = frame(at("profile")), along = profile(), up = along.length ? [] : column(state.cell);
+    const [pen, w, h] = frame(at("profile")), along = profile(), up = along.length ? [] : column(state.cell), points = along.length ? along : up;
+    common.saves(at("profile"), "Profile", () => [[along.length ? "distance_m" : "height_m", quantity().name], ...points], drawProfile);
     if (!along.length && up.length < 2) {
       pen.fillStyle = css("--soft"); pen.textAlign = "left"; pen.fillText("Drag over the map: profile along the line.", 10, 24); pen.fillText("Point at a cell: its values over height.", 10, 44);
       return;
     }
-    const points = along.length ? along : up;
     const g = axes(pen, w, h, { low: points[0][0], high: points[points.length - 1][0], label: along.length ? "Distance along the line [m]" : "Height of the cell pointed at [m]" }, classAxis(points.map(p => p[1])));
     pen.strokeStyle = css("--accent"); pen.fillStyle = css("--accent"); pen.lineWidth = 1.6; pen.beginPath();
     let on = false;
@@ -259,6 +260,7 @@
       for (const v of finite) counts[Math.max(0, Math.min(n - 1, Math.floor((v - low) / wide)))]++;
       bars = counts.map((c, i) => [low + i * wide, low + (i + 1) * wide, c / shown.length]);
     }
+    common.saves(at("histogram"), "Distribution", () => [["from", "to", "share"], ...bars], drawHistogram);
     const most = Math.max(1e-6, ...bars.map(x => x[2])), x = classAxis(finite);
     const g = axes(pen, w, h, { ...x, low: Math.min(x.low, bars[0][0]), high: Math.max(x.high, bars[bars.length - 1][1]) }, { low: 0, high: 100 * most, label: "Share of cells [%]" });
     bars.forEach(([low, high, share], i) => {
@@ -319,7 +321,7 @@
     }
     controls();
   }
-  function everything() { compute(); later(drawMap, drawLegend, drawProfile, drawHistogram, describe, summarise); }
+  function everything() { compute(); common.saves(canvas, "Map", cellValues, drawMap, legend); later(drawMap, drawLegend, drawProfile, drawHistogram, describe, summarise); }
 
   at("quantity").addEventListener("change", e => { setQuantity(+e.target.value); if (state.difference) setDifference(true); everything(); });
   at("scale").addEventListener("change", e => { state.scale = e.target.value; everything(); });

@@ -99,6 +99,8 @@
     if (time === null) return;
     const [pen, w, h] = frame(chart), banded = state.layer === 0 && g.band.length === 2, [low, high] = g.band.map(values), ends = [1e9, -1e9];
     for (const list of banded ? [v, low, high] : [v]) for (const x of list) if (Number.isFinite(x)) { ends[0] = Math.min(ends[0], x); ends[1] = Math.max(ends[1], x); }
+    const table = { time_s: time, [l.name]: v, ...(banded ? { [g.band[0].name]: low, [g.band[1].name]: high } : {}) };
+    common.saves(chart, `${g.name} over time`, () => [Object.keys(table), ...Array.from(time, (_, i) => Object.values(table).map(list => list[i]))], drawAlong);
     const room = 0.05 * (ends[1] - ends[0]) || 0.5, known = [...v.keys()].filter(i => Number.isFinite(v[i]));
     const a = axes(pen, w, h, { low: time[0], high: time[time.length - 1], label: "Time along the route [s]" }, { low: ends[0] - room, high: ends[1] + room, label: l.name[0].toUpperCase() + l.name.slice(1) });
     if (banded) common.polygon(pen, [...known.map(i => [a.X(time[i]), a.Y(low[i])]), ...known.reverse().map(i => [a.X(time[i]), a.Y(high[i])])], css("--band-90"));

@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, ClassVar, NoReturn, TypeVar
+from zoneinfo import available_timezones
 
 import pydantic
 import yaml
@@ -76,6 +77,21 @@ def nearest(name: object, choices: Iterable[str]) -> str | None:
     by_lower = {choice.lower(): choice for choice in choices}
     matches = difflib.get_close_matches(str(name).lower(), by_lower, n=1, cutoff=0.5)
     return by_lower[matches[0]] if matches else None
+
+
+def nearest_zone(name: str) -> str | None:
+    """The IANA time zone most like a wrong name, by its city where it names no region.
+
+    Examples
+    --------
+    >>> nearest_zone("America/NewYork"), nearest_zone("new york")
+    ('America/New_York', 'America/New_York')
+    """
+    zones = available_timezones()
+    if "/" in name:
+        return nearest(name, zones)
+    cities = {zone.rpartition("/")[2]: zone for zone in sorted(zones)}
+    return cities.get(nearest(name.replace(" ", "_"), cities) or "")
 
 
 def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:

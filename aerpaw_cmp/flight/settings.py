@@ -22,7 +22,7 @@ from ..common.errors import UsageError
 from ..common.files import inside
 from ..common.jsonable import named
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wavelength_m
-from ..common.yamlfile import StrictModel, load_yaml
+from ..common.yamlfile import StrictModel, load_yaml, nearest_zone
 from ..logs.readers import ReadOptions
 from ..logs.records import Kind
 from ..propagation.geometry.arrays import (
@@ -446,9 +446,8 @@ class FlightFile(StrictModel):
             try:
                 ZoneInfo(value)
             except (KeyError, ValueError, OSError) as error:
-                raise ValueError(
-                    f"unknown time zone {value!r}; expected an IANA name such as America/New_York"
-                ) from error
+                near = nearest_zone(value) or "America/New_York"
+                raise ValueError(f"unknown time zone {value!r}; expected an IANA name such as {near}") from error
         return value
 
 

@@ -17,6 +17,7 @@ from typing import Any
 from ..common.counting import counted
 from ..common.errors import InputError, UsageError, one_line, parsing
 from ..common.jsonable import named
+from ..common.stages import duration
 from .files import archives, chunks, packed
 from .files.pieces import join
 from .flight_file import IngestedFile, read_flight
@@ -567,7 +568,7 @@ def _account_row(file: Mapping[str, Any], folder: str, every_stream: bool) -> li
     for stream in streams:
         kinds.setdefault(stream["kind"], []).append(f"{stream['name']} {stream['rows']}")
     # as a set: streams of one log mostly share their rate
-    rates = {"-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in streams}
+    rates = {"-" if s["rate_hz"] is None else _rate_words(s["rate_hz"]) for s in streams}
     start, seconds = _start_and_length([s for s in streams if s["start"]])
     return [
         one_line(str(Path(file["path"]).relative_to(folder) if folder else file["path"])),
@@ -582,6 +583,10 @@ def _account_row(file: Mapping[str, Any], folder: str, every_stream: bool) -> li
         start,
         seconds,
     ]
+
+
+def _rate_words(rate_hz: float) -> str:
+    return f"{rate_hz:.3g}" if rate_hz >= 0.1 else f"1 in {duration(1.0 / rate_hz)}"
 
 
 def _start_and_length(streams: Sequence[Mapping[str, Any]]) -> tuple[str, str]:

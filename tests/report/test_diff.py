@@ -150,7 +150,7 @@ def test_the_other_way_round_has_the_other_sign(noisy):
         assert there.rmse.difference_db == -back.rmse.difference_db
     assert forth.pooled.verdict == "worse"
     assert reverse.pooled.verdict == "better"
-    assert "significantly better: -" in verdict(reverse)
+    assert "significantly better: −" in verdict(reverse)
 
 
 def test_the_site_is_named_where_nothing_else_differs(noisy):

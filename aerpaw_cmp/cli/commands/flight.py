@@ -17,7 +17,7 @@ from ..shown import number, print_files, print_json, records, say, show, table, 
 @command(
     "report",
     examples=[
-        "aerpaw-cmp report sample_logs/flight.yaml",
+        "aerpaw-cmp sample -o sample && aerpaw-cmp report sample/flight.yaml",
         "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
         "aerpaw-cmp report flight.yaml --dry-run",
         "aerpaw-cmp report flight.yaml --figures all --style paper",

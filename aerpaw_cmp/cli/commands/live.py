@@ -36,7 +36,7 @@ class WebCommand(TyperCommand):
     examples=[
         "aerpaw-cmp tap",
         "aerpaw-cmp tap /dev/ttyUSB2 -o taplog --no-csi-alarm 5 --duration 600",
-        "aerpaw-cmp tap /tmp/modem -o taplog --web --flight sample_logs/flight.yaml",
+        "aerpaw-cmp tap /tmp/modem -o taplog --web --flight sample/flight.yaml",
     ],
     kind=WebCommand,
 )
@@ -146,7 +146,7 @@ def _needs_posix(command: str) -> None:
     "modem-sim",
     examples=[
         "aerpaw-cmp modem-sim --link /tmp/modem",
-        "aerpaw-cmp modem-sim --link demo/modem --flight sample_logs/flight.yaml --telemetry demo/vehicleOut.txt",
+        "aerpaw-cmp modem-sim --link demo/modem --flight sample/flight.yaml --telemetry demo/vehicleOut.txt",
     ],
 )
 def modem_sim(

@@ -18,7 +18,7 @@ from ..shown import number, print_json, records, say, show, table
 @command(
     "explain",
     examples=[
-        "aerpaw-cmp explain sample_logs/flight.yaml --time 20 --tower LW1",
+        "aerpaw-cmp sample -o sample && aerpaw-cmp explain sample/flight.yaml --time 20 --tower LW1",
         "aerpaw-cmp explain flight.yaml --time 2025-06-01T14:00:20Z --tower LW1 --channel USRP2 --json",
     ],
 )

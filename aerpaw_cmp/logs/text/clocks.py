@@ -102,10 +102,13 @@ def zone(name: str | None, *, needed_by: str) -> tzinfo:
     try:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        from ...common.yamlfile import nearest_zone
+
+        near = nearest_zone(name)
         raise UsageError(
             f"unknown time zone {name!r}",
             expected="an IANA name under 'timezone:', e.g. America/New_York",
-            cause="a misspelt name, or no zone database on this machine",
+            cause=f"did you mean '{near}'?" if near else "a misspelt name, or no zone database on this machine",
         ) from error
 
 

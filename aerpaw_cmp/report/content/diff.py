@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from ...common.counting import counted
+from ...common.units import Printed
 from ...compare.judge.report_difference import LevelDifference, Overlap, RankDifference
 from ...compare.statistics.intervals import PairedDifference
 
@@ -95,9 +96,9 @@ def _level_clauses(level: LevelDifference) -> Iterator[str]:
         if value > TOLERANCE_DB:
             yield f"{what} level by up to {value:.3g} dB"
     if abs(level.offset_db.difference) > TOLERANCE_DB:
-        yield f"offset by {level.offset_db.difference:+.3g} dB"
+        yield f"offset by {Printed(level.offset_db.difference):+.3g} dB"
     if abs(level.rmse.difference_db) > TOLERANCE_DB:
-        yield f"RMSE by {level.rmse.difference_db:+.3g} dB"
+        yield f"RMSE by {Printed(level.rmse.difference_db):+.3g} dB"
     if level.samples.only_first or level.samples.only_second:
         yield _alone(level.samples)
     elif level.scored.first != level.scored.second or level.scored.common != level.scored.first:

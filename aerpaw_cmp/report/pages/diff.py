@@ -8,6 +8,7 @@ from typing import Any
 
 from ...common.counting import counted
 from ...common.jsonable import fields_of, json_object
+from ...common.units import Printed
 from ..content.diff import TOLERANCE_DB, ReportDiff
 from ..kit.files import json_text, write_file
 from ..kit.page import rendered
@@ -72,9 +73,9 @@ def _numbers(diff: ReportDiff) -> str:
         return "; ".join(diff.differences[:_NAMED]) + (f"; and {more} more." if more > 0 else ".")
     common, most = (count(sum(getattr(item.samples, name) for item in scored)) for name in ("common", "first"))
     low, high = pooled.difference_ci95_db
-    interval = f"[{low:+.2f}, {high:+.2f}]" if math.isfinite(low) else ""
+    interval = f"[{Printed(low):+.2f}, {Printed(high):+.2f}]" if math.isfinite(low) else ""
     return (
         f"RSS over {common} common samples of {most}: RMSE {pooled.other_rmse_db:.2f} dB in the first, "
         f"{pooled.rmse_db:.2f} dB in the second. "
-        + DIFFERENCE[pooled.verdict].format(difference=pooled.difference_db, interval=interval)
+        + DIFFERENCE[pooled.verdict].format(difference=Printed(pooled.difference_db), interval=interval)
     )

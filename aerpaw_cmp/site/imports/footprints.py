@@ -176,9 +176,11 @@ def import_footprints(
     canopy_m = None if trees else _DEFAULT_CANOPY_M
     _fill(result, shapes, canopy_m)
     if not (result.buildings or result.forests or result.geofences or result.trees):
+        alone = f"{Path(files[0]).name}: " if len(files) == 1 else ""
         raise InputError(
             "no building, forest, geofence or tree found in " + ", ".join(Path(f).name for f in files),
-            cause="; ".join(result.actions[-3:]) or "the map is empty",
+            expected="areas tagged building, natural=wood or landuse=forest, or '--untagged building'",
+            cause="; ".join(text.removeprefix(alone) for text in result.actions[-3:]) or "the map is empty",
         )
     return result
 

@@ -32,9 +32,6 @@ from ..site.site import Site
 from .tasks.manifest import inputs_of_flight
 from .tasks.options import DEFAULT, JobOutcome, RunOptions
 
-# Name under which the link is built; antennas of ``link.rss.tower`` are those of the node.
-_NODE = "node"
-
 
 def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None = None) -> JobOutcome:
     """Place of the unknown node and its regions, as a page and numbers.
@@ -70,6 +67,13 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
             floor = LOCK_FLOOR_DB if is_sounder_power(level) else receiver_floor_db([level])
             track = Placer(site, vehicle).levels(level, -np.inf if floor is None else floor, uav, node)
             estimate = locate(track, model=UNKNOWN if node is None else _model_of(node))
+        if not estimate.placed:
+            raise InputError(
+                "the levels tell no place: they fit a node 30 km away as well",
+                expected="levels that fall with the distance",
+                cause="a receiver that logs one value, a hover, or a node far beyond the flight",
+                path=flight,
+            )
         assumed = "unknown, one gain over the elevation" if node is None else f"{node.name}, learned on other flights"
         ends = f"Antenna of the UAV: {'unknown' if uav is None else uav.name}. Antenna of the node: {assumed}."
         numbers = {"flight": settings.flight.name, "channel": level.channel, **_numbers(site, track, estimate, ends)}
@@ -99,8 +103,9 @@ def _antennas(
 ) -> tuple[MeasuredPattern | None, MeasuredPattern | None]:
     """Antennas of node and airframe that the flight file or else the site knows; none that this very log taught."""
     file, level = log
-    known = settings.link.of(level.channel).build([_NODE], logs_root or flight.parent)
-    node, uav = (array.patterns[0] for array in (known.tower_arrays[_NODE], known.uav_array))
+    # by no tower's name: its antennas are those of link.rss.tower
+    known = settings.link.of(level.channel).build(["node"], logs_root or flight.parent)
+    node, uav = (array.patterns[0] for array in (known.tower_arrays["node"], known.uav_array))
     if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
         return node if isinstance(node, SpherePattern) else None, uav
     mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))

@@ -231,6 +231,17 @@ def test_a_straight_flight_leaves_two_places_and_both_are_regions() -> None:
         assert any(np.hypot(*(mode.place_m - place)) <= mode.radius_m for mode in modes) is inside
 
 
+def test_levels_that_do_not_fall_with_the_distance_place_no_node() -> None:
+    time, position = _lawnmower(120)
+    noise = np.random.default_rng(4).normal(0.0, 3.0, 120)
+    near, far = (-30.0 * np.log10(np.linalg.norm(position - [east, 40.0, 1.5], axis=1)) for east in (80.0, 9000.0))
+    for way, level, placed in (
+        (position, near + noise, True), (position, far + noise, False), (position, np.full(120, -60.0), False),
+        (4.0 * position, np.full(120, -60.0), False), (0.0 * position + 30.0, noise, False),
+    ):  # fmt: skip
+        assert locate(level_track(2.0 * time, way, level)).placed == placed
+
+
 def test_regions_of_one_place_are_the_disks_of_a_normal_distribution() -> None:
     """Blurred by 20 m an axis, 90 % lie within 20 sqrt(2 ln 10) m and 50 % within 20 sqrt(2 ln 2) m."""
     regions = locating.Regions.of(np.array([[10.0, -30.0]]), np.ones(1))

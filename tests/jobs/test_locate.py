@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import re
 
 import numpy as np
 import pytest
@@ -84,6 +85,11 @@ def test_what_cannot_be_located_is_refused(flight, capsys, tmp_path):
     (flight.parent / "abroad.yaml").write_text(flight.read_text().replace("vehicleOut.txt", "abroad.txt"))
     assert main(["locate", str(flight.parent / "abroad.yaml"), "-o", str(tmp_path / "out")]) == 3
     assert "no nearer than" in capsys.readouterr().err
+    lines = flight.with_name("power.txt").read_text().splitlines(keepends=True)
+    flight.with_name("constant.txt").write_text("".join(re.sub(r"(?<=[ ,])-?\d+\.\d+$", "-60.0", x) for x in lines))
+    (flight.parent / "constant.yaml").write_text(flight.read_text().replace("path: power.txt", "path: constant.txt"))
+    assert main(["locate", str(flight.parent / "constant.yaml"), "-o", str(tmp_path / "out")]) == 3
+    assert "tell no place" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

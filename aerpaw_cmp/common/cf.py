@@ -16,6 +16,7 @@ from .geodesy import SiteFrame
 from .interrupts import held
 from .sink import Sink
 from .units import AnyArray
+from .versions import tool_version, utc_now
 
 CONVENTIONS = "CF-1.11"
 
@@ -48,26 +49,23 @@ def site_crs(frame: SiteFrame) -> Any:
     )
 
 
-def file_attributes(title: str, source: str, generated: str, version: str, comment: str) -> dict[str, str]:
+def file_attributes(title: str, source: str, comment: str) -> dict[str, str]:
     """Attributes of a file: what it holds and who wrote it when.
 
     Parameters
     ----------
     title, source, comment : str
-    generated : str
-        ISO 8601.
-    version : str
-        Of aerpaw-cmp.
 
     Returns
     -------
     dict of str to str
     """
+    version = tool_version()
     return {
         "Conventions": CONVENTIONS,
         "title": title,
         "source": f"aerpaw-cmp {version}: {source}",
-        "history": f"{generated} written by aerpaw-cmp {version}",
+        "history": f"{utc_now()} written by aerpaw-cmp {version}",
         "institution": "not stated",
         "references": "https://arxiv.org/abs/2502.10324",
         "comment": comment,

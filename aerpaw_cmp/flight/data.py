@@ -335,6 +335,25 @@ def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettin
     return link.floor_dbm, link.model_copy(update={"bandwidth_hz": None, "noise_figure_db": None})
 
 
+def unread(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> FlightData:
+    """The site and the nodes of a flight, with what is to be said of the nodes; no log of it is read.
+
+    Parameters
+    ----------
+    settings : FlightFile
+    folder : Path
+        Of the flight file.
+    logs_root : Path, optional
+        Where logs and antenna files resolve, in place of ``folder``.
+    """
+    root, warnings = logs_root or folder, list[str]()
+    site, nodes = ground_nodes(choose_site(settings.site, folder), settings, root, warnings)
+    place = site_place(settings.site.file, folder)
+    return FlightData(
+        settings=settings, folder=root, site_place=place, site=site, nodes=nodes, warnings=tuple(warnings)
+    )
+
+
 def gather(
     settings: FlightFile, folder: Path, files: Sequence[IngestedFile], logs_root: Path | None = None
 ) -> FlightData:
@@ -362,9 +381,9 @@ def gather(
     InputError
         No position, no row that may be compared, a flight far from every tower.
     """
-    warnings: list[str] = []
     files = [at_height(log, file) for log, file in zip(settings.logs, files, strict=True)]
-    site, nodes = ground_nodes(choose_site(settings.site, folder), settings, logs_root or folder, warnings)
+    data = unread(settings, folder, logs_root)
+    site, warnings = data.site, [*data.warnings]
     telemetry, placed = list[tuple[str, Stream]](), list[tuple[str, Stream]]()
     rss: list[tuple[str, RssSeries]] = []
     rank: list[tuple[str, RankSeries]] = []
@@ -406,17 +425,13 @@ def gather(
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
         warnings.append(f"no telemetry log: the levels of {levels} have no positions and are left out")
         rss = []
-    data = FlightData(
-        settings=settings,
-        folder=logs_root or folder,
-        site_place=site_place(settings.site.file, folder),
-        site=site,
+    data = dataclasses.replace(
+        data,
         files=tuple(files),
         track=track,
         rss=_records(rss, lambda s: f"RSS of {s.tower} {s.channel}"),
         rank=_records(rank, lambda s: f"rank of {s.tower}"),
         warnings=tuple(warnings),
-        nodes=nodes,
     )
     for path, stream in (*telemetry[:1], *placed):
         check_place(site, path, stream)

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 from ..common.errors import UsageError
 from ..common.outputs import OutputFile, is_sealed, sealed
-from ..flight.settings import AntennaSettings, load_pattern
-from ..site.antenna.antennas import MeasuredPattern
+from ..site.antenna.antennas import read_gain_grid
 from ..site.antenna.export import exported
+from ..site.antenna.pattern_files import read_cut_files, read_pattern_file
 from .tasks.options import JobOutcome
 
 
@@ -44,14 +43,14 @@ def run_antenna_export(
     inputs = [file, *([] if elevation is None else [elevation])]
     bare = out.suffix == ".msi"  # the format begins with NAME: no line in front
     with OutputFile(out, own=is_sealed, inputs=inputs, force=force) as output:
-        cut = None if elevation is None else str(elevation.absolute())
-        grid = variable is not None or file.suffix == ".mat"
-        if grid and cut is not None:
-            raise UsageError("an elevation cut beside a gain grid", expected="an azimuth cut as FILE", path=file)
-        kind: Any = {"model": "gain_grid", "variable": variable or ""} if grid else {"model": "file"}
-        settings = AntennaSettings(**kind, file=str(file.absolute()), elevation=cut)
-        pattern = load_pattern(settings, Path(), carrier_hz)
-        assert isinstance(pattern, MeasuredPattern)
+        if variable is not None or file.suffix == ".mat":
+            if elevation is not None:
+                raise UsageError("an elevation cut beside a gain grid", expected="an azimuth cut as FILE", path=file)
+            pattern = read_gain_grid(file, variable or "")
+        elif elevation is not None:
+            pattern = read_cut_files(file, elevation)
+        else:
+            pattern = read_pattern_file(file, carrier_hz=carrier_hz)
         text = exported(pattern, file.stem, out, carrier_hz)
         output.write(text.encode("utf-8") if bare else sealed(text))
     return JobOutcome(folder=out.parent, files=(out,))

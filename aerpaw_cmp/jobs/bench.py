@@ -193,7 +193,7 @@ class _Case:
         """The replay of all poses by an engine."""
         sionna = search.engine == "sionna"
         if sionna:
-            replay(self.site, self.link, _take(self.poses, slice(BATCH)), search, run=Run(cache_dir=""))
+            replay(self.site, self.link, self.poses[:BATCH], search, run=Run(cache_dir=""))
         result, spent = _measured(lambda: replay(self.site, self.link, self.poses, search, run=Run(cache_dir="")))
         difference = compare(result, self.reference, np.arange(len(self.poses)), RANK_K)
         path_counts = {"missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths}
@@ -210,13 +210,13 @@ class _Case:
 
         explicit = kind == "explicit"
         rays = Rays(max_depth=_DEPTH, samples=samples, batch=_EXPLICIT_BATCH if explicit else BATCH)
-        poses = _take(self.poses, chosen)
+        poses = self.poses[chosen]
         scene = Scene.of(self.site, self.link, poses)
 
         def channels(some: Poses) -> ComplexArray:
             return own_channels(scene.faces, scene.links_to(some), some.rotation, self.link, rays, explicit=explicit)
 
-        channels(_take(poses, slice(rays.batch)))
+        channels(poses[: rays.batch])
         h, spent = _measured(lambda: channels(poses))
         level = rss_dbm(mean_pair_power(h), self.link.transmit_power_dbm)
         expected = self.reference.h[chosen], self.reference.rss_dbm[chosen]
@@ -244,10 +244,6 @@ def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:
     started = time.perf_counter()
     result = action()
     return result, {"seconds": time.perf_counter() - started, "peak_mib": peak_mib()}
-
-
-def _take(poses: Poses, chosen: Any) -> Poses:
-    return Poses(poses.position_m[chosen], poses.rotation[chosen])
 
 
 # --- beside the peers -----------------------------------------------------------------------------------------------
@@ -285,7 +281,7 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
 
     search()
     times = [search() for _ in range(repeats)]
-    replay(site, link, _take(some, slice(BATCH)), rays, run=alone)  # compiles the kernels
+    replay(site, link, some[:BATCH], rays, run=alone)  # compiles the kernels
     theirs = replay(site, link, some, rays, run=alone)
     times += [search() for _ in range(repeats)]
     difference = compare(replay(site, link, some), theirs, np.arange(poses))

@@ -19,15 +19,15 @@ from ..common.outputs import OutputFolder
 from ..common.provenance import union
 from ..common.stages import Stages
 from ..common.units import FloatArray
-from ..flight.data import FlightData, choose_site, ground_nodes, load_data, site_place
+from ..flight.data import FlightData, load_data, unread
 from ..flight.gains.memory import load_with_learned
-from ..flight.pose.track import interpolated
+from ..flight.pose.track import interpolated, velocities_mps
 from ..flight.replay import replay_poses, valid_poses
 from ..flight.settings import FlightFile, LinkSettings
 from ..flight.training import flight_logs
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.options import Job
-from ..propagation.path_table import check_band, subcarriers_hz, velocities_mps
+from ..propagation.path_table import check_band, subcarriers_hz
 from ..report.exports.channel import FORMATS, STREAMED, Along, Channel, write_channel
 from ..report.exports.formats import chosen_formats
 from ..site.antenna.learned import BAND
@@ -250,13 +250,12 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
 
 def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> Callable[[Poses], dict[str, Any]]:
     """Calibrated levels of poses by remembered antennas, as :class:`Channel` has them; nothing without memory."""
-    towers = tuple(link.tower_arrays)
+    towers, sources = tuple(link.tower_arrays), dict[str, Source]()
     try:
         memory = memory_of(data.site_place, data.site)
     except UsageError:
         remarks.append("No calibrated level: no flight taught the site its antennas (aerpaw-cmp calibrate).")
         return lambda _: {}
-    sources: dict[str, Source] = {}
     for source in sorted(memory.sources().values(), key=lambda s: s.channel != name):
         near = abs(source.link.carrier_hz / link.carrier_hz - 1.0) <= BAND
         if source.tower in towers and near and source.tower not in data.nodes:
@@ -299,10 +298,7 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
     -------
     JobOutcome
     """
-    if unknown := [name for name in chosen.formats if name not in FORMATS]:
-        raise UsageError(f"--format {unknown[0]!r}", expected="one of " + ", ".join(FORMATS))
-    if "netcdf" in chosen.formats:
-        chosen_formats("netcdf")  # told before the replay where its libraries are missing
+    formats = chosen_formats(chosen.formats, FORMATS)
     settings, stages = load_with_learned(flight), Stages(options.progress)
     root, route = options.logs_root or flight.parent, chosen.route
     if route is None and settings.flight.plan and not all((root / log.path).exists() for log in settings.logs):
@@ -312,18 +308,15 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
     folder = options.out or Path("reports") / f"channel-{settings.flight.name}"
     with OutputFolder(folder, job="channel", inputs=inputs, force=options.force) as output:
         with stages("read"):
-            if route is None:
-                data = load_data(settings, flight.parent, options.logs_root)
-            else:
-                known = site_place(settings.site.file, flight.parent)
-                site, nodes = ground_nodes(choose_site(settings.site, flight.parent), settings, root)
-                data = FlightData(settings=settings, folder=root, site_place=known, site=site, nodes=nodes)
-                chosen = replace(chosen, route=route)
-        in_memory = not STREAMED.issuperset(chosen.formats)
+            data = (load_data if route is None else unread)(settings, flight.parent, options.logs_root)
+        in_memory = not STREAMED.issuperset(formats)
         with output.filling() as place:
-            parts = channel_parts(data, chosen, stages, in_memory=in_memory, room=shutil.disk_usage(place).free)
-            written, metrics = write_channel(parts, place, tuple(dict.fromkeys(chosen.formats)), stages)
+            parts = channel_parts(
+                data, replace(chosen, route=route), stages, in_memory=in_memory, room=shutil.disk_usage(place).free
+            )
+            written, metrics = write_channel(parts, place, formats, stages)
         files = output.placed(written)
-        warnings = [*data.warnings, *metrics.pop("warnings")]
+        # of a route: its towers stand, and what is said of nodes that move along a track is not of it
+        warnings = [*(data.warnings if route is None else ()), *metrics.pop("warnings")]
         metrics |= {"files": [*map(str, files)], "warnings": warnings, "stages": stages.seconds}
         return JobOutcome(folder=folder, metrics=metrics, files=files)

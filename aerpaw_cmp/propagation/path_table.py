@@ -51,8 +51,7 @@ class Ends:
 
     def part(self, rows: slice) -> Ends:
         """Those of some poses."""
-        poses = Poses(self.poses.position_m[rows], self.poses.rotation[rows])
-        return replace(self, poses=poses, sources_m=self.sources_m[rows] if self.moving else self.sources_m)
+        return replace(self, poses=self.poses[rows], sources_m=self.sources_m[rows] if self.moving else self.sources_m)
 
     @property
     def moving(self) -> bool:
@@ -109,8 +108,9 @@ class PathTable:
         """Delay (paths,) between the centres of the arrays."""
         return np.asarray(self.length_m / SPEED_OF_LIGHT_MPS)
 
-    def by_link(self, values: AnyArray, links: tuple[int, ...], fill: Any = np.nan) -> AnyArray:
-        """Values per path (paths, ...) as (most paths of a link, poses, towers, ...) of ``links``: poses and towers."""
+    def by_link(self, values: AnyArray, ends: Ends, fill: Any = np.nan) -> AnyArray:
+        """Values per path (paths, ...) as (most paths of a link, poses, towers, ...)."""
+        links = len(ends.poses), len(ends.link.tower_arrays)
         out = np.full((self.most, *links, *values.shape[1:]), fill, values.dtype)
         out[self.number, self.pose, self.tower] = values
         return out
@@ -221,10 +221,9 @@ def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> C
         rows = np.flatnonzero(item.tower == tower)
         # each path at a pose of its own: H of that pose is then its gain, by the one law there is
         some, own, link = item.select(rows), np.arange(len(rows)), replace(ends.link, tower_arrays={name: array})
-        poses = Poses(ends.poses.position_m[some.pose], ends.poses.rotation[some.pose])
         places, lost = sources_of(some, ends.sources_m)[:, None], None if loss_db is None else loss_db[rows]
         alone = replace(some, pose=own, tower=0 * own)
-        pieces.append(fields_of(alone, faces, places, poses, link, lost).h[:, 0])
+        pieces.append(fields_of(alone, faces, places, ends.poses[some.pose], link, lost).h[:, 0])
         order.append(rows)
     return np.concatenate(pieces)[np.argsort(np.concatenate(order))]
 
@@ -249,14 +248,14 @@ def impulse_responses(
     tau : (rx, tx, paths)
         Delay [s]; zero where there is no path.
     """
-    links, turned = (len(ends.poses), len(ends.link.tower_arrays)), table.gain[..., None]
+    turned = table.gain[..., None]
     if velocity_mps is not None:
         cycles = table.doppler_hz(ends.link.carrier_hz, velocity_mps)[:, None] * unmasked(times_s)
         turned = turned * np.exp(2j * np.pi * cycles)[:, None, None, :]
     # by path, pose, tower (, rx_ant, tx_ant, time)
     rx, tx = (2, 1) if ends.link.uav_transmits else (1, 2)
-    a, tau = table.by_link(turned, links, 0.0).transpose(rx, 3, tx, 4, 0, 5), table.by_link(table.delay_s, links, 0.0)
-    return np.ascontiguousarray(a), np.ascontiguousarray(tau.transpose(rx, tx, 0))
+    a, tau = (table.by_link(values, ends, 0.0) for values in (turned, table.delay_s))
+    return np.ascontiguousarray(a.transpose(rx, 3, tx, 4, 0, 5)), np.ascontiguousarray(tau.transpose(rx, tx, 0))
 
 
 def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> ComplexArray:
@@ -314,32 +313,3 @@ def subcarriers_hz(bandwidth_hz: float, count: int) -> FloatArray:
     """
     # as np.fft.fftshift orders them: with an even count the lowest has no partner
     return np.asarray((np.arange(count) - count // 2) * (bandwidth_hz / count))
-
-
-def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1.0, gap_s: float = 3.0) -> FloatArray:
-    """Velocity (n, 3) by the central difference of positions over twice ``span_s``, linear between them.
-
-    Parameters
-    ----------
-    time_s : (n,)
-        Ascending.
-    position_m : (n, 3)
-    span_s : float
-        Before and after; at the ends and beside gaps one side alone.
-    gap_s : float
-        Longer steps are not bridged.
-
-    Returns
-    -------
-    (n, 3)
-        NaN where an instant has no neighbour.
-    """
-    velocity = np.full(position_m.shape, np.nan)
-    for part in np.split(np.arange(len(time_s)), np.flatnonzero(~(np.diff(time_s) <= gap_s)) + 1):
-        t = time_s[part]
-        if len(part) < 2 or not (np.diff(t) > 0.0).all():
-            continue
-        early, late = np.maximum(t - span_s, t[0]), np.minimum(t + span_s, t[-1])
-        for axis, values in enumerate(position_m[part].T):
-            velocity[part, axis] = (np.interp(late, t, values) - np.interp(early, t, values)) / (late - early)
-    return velocity

@@ -7,7 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.flight.pose import track as tracks
-from aerpaw_cmp.flight.pose.track import Track, good_positions
+from aerpaw_cmp.flight.pose.track import Track, good_positions, velocities_mps
 from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
 
 FRAME = SiteFrame(35.7275, -78.6960)
@@ -315,3 +315,14 @@ def test_a_gap_of_sparse_telemetry_stays_a_gap() -> None:
     seconds = np.append(14.0 * np.arange(20), 14.0 * np.arange(20) + 600.0)
     track = Track(telemetry(seconds, 0.5 * seconds, 0, 40), FRAME)
     assert track.pose_at(at([20.0, 400.0, 640.0])).valid.tolist() == [True, False, True]
+
+
+def test_velocity_is_the_central_difference_and_bridges_no_gap():
+    time = np.concatenate([np.arange(0.0, 10.0, 0.5), np.arange(60.0, 65.0, 0.5), [90.0]])
+    position = np.outer(time, [4.0, -3.0, 0.0])
+    position[:, 2] = 0.5 * time**2
+    velocity = velocities_mps(time, position)
+    assert velocity[:-1, :2] == pytest.approx(np.tile([4.0, -3.0], (30, 1)))
+    assert velocity[5:15, 2] == pytest.approx(time[5:15])  # exact for constant acceleration
+    assert np.isnan(velocity[-1]).all()
+    assert np.isnan(velocities_mps(np.zeros(4), position[:4])).all()

@@ -20,7 +20,7 @@ from aerpaw_cmp.propagation.geometry.arrays import (
     uav_comparison_array,
 )
 from aerpaw_cmp.propagation.options import Field, Run, Search
-from aerpaw_cmp.propagation.path_table import subcarriers_hz, velocities_mps
+from aerpaw_cmp.propagation.path_table import subcarriers_hz
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
 
@@ -196,17 +196,6 @@ def test_links_without_a_path_have_no_row(scenes):
     assert a.shape == (1, 1, 1, 1, 0, 1)
     assert tau.shape == (1, 1, 0)
     assert not result.cfr([0.0, 1e6]).any()
-
-
-def test_velocity_is_the_central_difference_and_bridges_no_gap():
-    time = np.concatenate([np.arange(0.0, 10.0, 0.5), np.arange(60.0, 65.0, 0.5), [90.0]])
-    position = np.outer(time, [4.0, -3.0, 0.0])
-    position[:, 2] = 0.5 * time**2
-    velocity = velocities_mps(time, position)
-    assert velocity[:-1, :2] == pytest.approx(np.tile([4.0, -3.0], (30, 1)))
-    assert velocity[5:15, 2] == pytest.approx(time[5:15])  # exact for constant acceleration
-    assert np.isnan(velocity[-1]).all()
-    assert np.isnan(velocities_mps(np.zeros(4), position[:4])).all()
 
 
 @pytest.mark.sionna

@@ -504,15 +504,45 @@ def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> Floa
     """
     if len(t) < 2:
         return np.where(np.isfinite(logged), logged, 0.0)
-    early, late = np.maximum(t - _COURSE_SPAN_S, t[0]), np.minimum(t + _COURSE_SPAN_S, t[-1])
-    early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))
-    # by at least one row on either side: sparse telemetry has none within the span
-    moved = np.column_stack([np.interp(late, t, p) - np.interp(early, t, p) for p in position.T])
-    derived = moved / (late - early)[:, None]
+    derived = _differences_mps(t, position, _COURSE_SPAN_S)
     missing = np.asarray(~np.isfinite(logged).all(axis=1))
     if not np.any(logged[~missing]):  # converters write (0, 0, 0) for "unknown"
         missing[:] = True
     return np.where(missing[:, None], derived, logged)
+
+
+def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1.0, gap_s: float = 3.0) -> FloatArray:
+    """Velocity (n, 3) by the central difference of positions over twice ``span_s``, linear between them.
+
+    Parameters
+    ----------
+    time_s : (n,)
+        Ascending.
+    position_m : (n, 3)
+    span_s : float
+        Before and after; at the ends and beside gaps one side alone.
+    gap_s : float
+        Longer steps are not bridged.
+
+    Returns
+    -------
+    (n, 3)
+        NaN where an instant has no neighbour.
+    """
+    velocity = np.full(position_m.shape, np.nan)
+    for part in np.split(np.arange(len(time_s)), np.flatnonzero(~(np.diff(time_s) <= gap_s)) + 1):
+        if len(part) >= 2 and (np.diff(time_s[part]) > 0.0).all():
+            velocity[part] = _differences_mps(time_s[part], position_m[part], span_s)
+    return velocity
+
+
+def _differences_mps(t: FloatArray, position_m: FloatArray, span_s: float) -> FloatArray:
+    """Velocity (n, 3) at ascending times by positions some seconds, or else a row, before and after."""
+    early, late = np.maximum(t - span_s, t[0]), np.minimum(t + span_s, t[-1])
+    # by at least one row on either side: sparse telemetry has none within the span
+    early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))
+    moved = interpolated(late, t, position_m) - interpolated(early, t, position_m)
+    return np.asarray(moved / (late - early)[:, None])
 
 
 def _courses(velocity: FloatArray) -> FloatArray:

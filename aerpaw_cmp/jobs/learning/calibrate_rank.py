@@ -92,8 +92,7 @@ class RankSamples:
 
     def part(self, rows: Any) -> RankSamples:
         """Some of the samples."""
-        poses = Poses(self.poses.position_m[rows], self.poses.rotation[rows])
-        return dataclasses.replace(self, poses=poses, rank=self.rank[rows], time_s=self.time_s[rows])
+        return dataclasses.replace(self, poses=self.poses[rows], rank=self.rank[rows], time_s=self.time_s[rows])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -233,7 +232,7 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
         flight=data.settings.flight.name,
         tower=series.tower,
         tower_m=np.asarray(data.site.towers[series.tower].position_m),
-        poses=Poses(poses.position_m[high], np.ascontiguousarray(poses.rotation[high])),
+        poses=poses[high],
         rank=series.rank[keep],
         link=link,
         time_s=seconds(series.time[keep]),

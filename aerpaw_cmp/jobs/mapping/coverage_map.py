@@ -24,7 +24,6 @@ from ...common.jsonable import named
 from ...common.outputs import file_digest
 from ...common.stages import PlannedStage, Progress, Stages, share_of
 from ...common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, db_from_power, finite_mean, wavelength_m
-from ...common.versions import utc_now, versions
 from ...compare.rank import singular_values
 from ...maps import export, job
 from ...maps import grid as cells
@@ -824,8 +823,6 @@ def _about_maps(site: Site) -> dict[str, str]:
     about = file_attributes(
         title=site.name,
         source="ray tracing",
-        generated=utc_now(),
-        version=versions()["aerpaw-cmp"],
         comment="A missing level has no path. A rank of 0 is a code: no path.",
     )
     return about | ({"acknowledgement": site.credit} if site.credit else {})

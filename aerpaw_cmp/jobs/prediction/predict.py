@@ -21,7 +21,7 @@ from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ...compare.gains.direction_gain import LinkSamples
 from ...compare.gains.spread import BAND
 from ...compare.learning.correction import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
-from ...flight.data import FlightData, choose_site, ground_nodes, site_place
+from ...flight.data import FlightData, site_place, unread
 from ...flight.drafting.remembered import remembered
 from ...flight.settings import FlightFile, LinkSettings, LinksSettings
 from ...flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
@@ -250,8 +250,8 @@ def site_of(
     elif known:
         site, place = known[0].site, site_place(flights[0].settings.site.file, flights[0].path.parent)
     elif where is not None and planned is not None:
-        site, _ = ground_nodes(choose_site(planned.site, where.parent), planned, where.parent)
-        place = site_place(planned.site.file, where.parent)
+        asked = unread(planned, where.parent)
+        site, place = asked.site, asked.site_place
     else:
         raise UsageError("the site is not named", expected="--site SITE, or --with a flight")
     for data in known:

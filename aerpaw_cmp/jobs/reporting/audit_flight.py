@@ -32,7 +32,6 @@ from ...propagation.check import reference
 from ...propagation.check.audit import Audit, Second, audit
 from ...propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
 from ...propagation.drivers.moving import site_with_tower_at
-from ...propagation.geometry.arrays import Poses
 from ...propagation.native.llvm import SionnaMissingError
 from ...propagation.options import Field, Run, Search
 from ...propagation.replay import PER_LINK
@@ -191,7 +190,7 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
         (tower,) = replayed.link.tower_arrays
         count = len(replayed.poses)
         for at in spread_out(count, _MOMENTS).tolist():
-            pose = Poses(replayed.poses.position_m[at : at + 1], replayed.poses.rotation[at : at + 1])
+            pose = replayed.poses[at : at + 1]
             moment = dataclasses.replace(
                 replayed,
                 poses=pose,

@@ -226,8 +226,7 @@ def _pose(
     poses, valid, _ = rank_poses(data, series)
     _check_pose(valid[at : at + 1], series, at)
     row = int(valid[:at].sum())
-    pose = Poses(poses.position_m[row : row + 1], np.ascontiguousarray(poses.rotation[row : row + 1]))
-    return link, pose, notes, series.time[at : at + 1]
+    return link, poses[row : row + 1], notes, series.time[at : at + 1]
 
 
 def _check_pose(valid: Any, series: RssSeries | RankSeries, at: int) -> None:

@@ -11,7 +11,6 @@ from ...common.units import FloatArray, IntArray, spread_out
 from ...compare.rank import channel_rank
 from ...flight.data import FlightData
 from ...flight.replay import Replayed, replay_poses
-from ...propagation.geometry.arrays import Poses
 from ...site.relief.dem import Dem
 from ...site.site import Site
 from ...site.siteyaml import ground_surface, site_model
@@ -46,7 +45,7 @@ def agreement_by_ground(
     if not model.ground_points or data.site.scene is not None or replayed.tower_m is not None or not len(known):
         return {}
     known = known[spread_out(len(known), _POSES)]
-    some = Poses(replayed.poses.position_m[poses[known]], replayed.poses.rotation[poses[known]])
+    some = replayed.poses[poses[known]]
     agreed = []
     for ground in ground_surface(model, data.site.frame).dems(map(np.random.default_rng, range(_DRAWS))):
         h = replay_poses(_on(data.site, ground), data.settings.rt, replayed.link, some).h[:, 0]

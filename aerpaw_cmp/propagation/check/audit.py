@@ -142,7 +142,7 @@ def audit(
     engine: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
     search = replace(search, engine=engine)
     # on few poses, for the other engine is some hundred times slower
-    few = Poses(poses.position_m[chosen], poses.rotation[chosen])
+    few = poses[chosen]
     checked = run_replay(site, link, few, search, Field(field.loss), run)
     rays = checked.samples or (_FIELD_SAMPLES if search.samples == "auto" else search.samples)
     fields, ks, expected = None, second.ks, second.expected

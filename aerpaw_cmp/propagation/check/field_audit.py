@@ -417,7 +417,7 @@ def against_sionna(
     FieldAudit
         Counts and largest errors over the paths that both have.
     """
-    few = Poses(poses.position_m[chosen], poses.rotation[chosen])
+    few = poses[chosen]
     scene = Scene.of(site, link, few)
     probe, covered = _probe(link)
     turns = (
@@ -503,7 +503,7 @@ def _paths_against_sionna(
     # each path alone: a pose of its own
     # H of a pose with one path is that path's coefficient
     alone = replace(ours, pose=np.arange(count))
-    spots = Poses(few.position_m[ours.pose], few.rotation[ours.pose])
+    spots = few[ours.pose]
     h = channel_matrices(alone, replay.faces, scene.sources_m, spots, probe).h[np.arange(count), ours.tower]
     turn = (h * theirs.gain.conj()).sum(axis=(1, 2))
     # a coefficient of zero has no phase

@@ -162,7 +162,7 @@ def _scene_of(
     towers = {n: _moved(site, site.towers[name], n, at) for n, at in zip(names, block.places_m, strict=True)}
     moved_site = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
     several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
-    some = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
+    some = poses[block.rows]
     # each place has links to its own poses alone: all others would be searched for nothing
     links = None if len(names) == 1 else np.arange(len(names))[:, None] == block.place[None, :]
     return moved_site, several, some, links

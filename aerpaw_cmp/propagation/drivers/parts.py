@@ -43,7 +43,7 @@ def replay_in_parts(
     progress, run = run.progress, replace(run, progress=None, job=Job.of(poses.position_m, links, pairs))
 
     def of(at: IntArray) -> Replay:
-        return replay(site, link, Poses(poses.position_m[at], poses.rotation[at]), search, field, run)
+        return replay(site, link, poses[at], search, field, run)
 
     result = in_turn(rows, map(of, rows), progress)
     return replace(result, ends=replace(result.ends, poses=poses))

@@ -62,7 +62,7 @@ def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache
     known = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
     some = known[spread_out(len(known), search.batch)]
     part = replace(scene, excluded=scene.excluded[:, some])
-    few = Poses(poses.position_m[some], poses.rotation[some])
+    few = poses[some]
 
     def pilot(samples: int) -> PathSet:
         # through the cache, or each report would cast the pilots anew

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -82,6 +82,9 @@ class Poses:
 
     def __len__(self) -> int:
         return len(self.position_m)
+
+    def __getitem__(self, rows: Any) -> Poses:
+        return Poses(self.position_m[rows], self.rotation[rows])
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -19,7 +19,7 @@ from ...common.jsonable import named
 from ...common.provenance import KEY
 from ...common.stages import Stages
 from ...common.units import AnyArray, FloatArray
-from ...common.versions import tool_version, utc_now
+from ...common.versions import tool_version
 from ...propagation.drivers.parts import added_up
 from ...propagation.geometry.arrays import Poses
 from ...propagation.path_table import PathTable, frequency_responses, impulse_responses
@@ -64,7 +64,7 @@ class Along:
         """Some of the poses."""
         arrays = named(self, "time_s towers_m velocity_mps tower_mps")
         some: Any = {name: None if values is None else values[rows] for name, values in arrays.items()}
-        return replace(self, poses=Poses(self.poses.position_m[rows], self.poses.rotation[rows]), **some)
+        return replace(self, poses=self.poses[rows], **some)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -115,11 +115,6 @@ class Channel:
         return None if own is None else self.table.doppler_hz(self.carrier_hz, own, 0.0 if other is None else other)
 
     @property
-    def gain_db(self) -> FloatArray:
-        """Received over sent power (poses, towers) [dB]; NaN without a path."""
-        return np.asarray(self.replay.level_dbm(self.summed) - self.replay.ends.link.transmit_power_dbm)
-
-    @property
     def warnings(self) -> list[str]:
         """Sentences on what the numbers lack."""
         words = (
@@ -129,7 +124,7 @@ class Channel:
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
         """Values per path (paths, ...) as (most paths of a link, poses, towers, ...); None of None."""
-        return None if values is None else self.table.by_link(values, self.replay.has_path.shape, fill)
+        return None if values is None else self.table.by_link(values, self.replay.ends, fill)
 
 
 def channel_dataset(channel: Channel) -> Dataset:
@@ -142,8 +137,6 @@ def channel_dataset(channel: Channel) -> Dataset:
     written = file_attributes(
         title=f"Channel along {channel.along.name}, link {channel.link}",
         source="ray tracing along a flight",
-        generated=utc_now(),
-        version=tool_version(),
         comment=" ".join(channel.warnings),
     )
     ends = {"transmitter": "UAV" if link.uav_transmits else "tower", "trained_on": " ".join(channel.trained_on)}
@@ -237,13 +230,13 @@ def write_channel(
     poses, paths, guesses = 0, 0, 0
     omitted: list[Any] = []
     with ExitStack() as stack:
-        writers = [stack.enter_context(FORMATS[name](folder)) for name in formats]
+        writers = [_WRITERS.get(name) or stack.enter_context(_netcdf(folder)) for name in formats]
         for channel in parts:
             poses, paths = poses + len(channel.along.time_s), paths + len(channel.table.pose)
             guesses, omitted = guesses + channel.guesses, added_up([*omitted, *channel.replay.omitted])
             latest = replace(channel, guesses=guesses, replay=replace(channel.replay, omitted=omitted))
             with stages("write"):
-                files = [write(latest) for write in writers]
+                files = [write(latest, folder) for write in writers]
     return files, {
         "flight": latest.along.name,
         **named(latest, "link carrier_hz"),
@@ -259,14 +252,13 @@ def write_channel(
 
 @contextmanager
 def _netcdf(folder: Path) -> Any:
-    path = folder / "channel.nc"
-    with GrowingNetcdf(path, _GROWS) as book:
+    with GrowingNetcdf(folder / "channel.nc", _GROWS) as book:
 
-        def write(channel: Channel) -> Path:
+        def write(channel: Channel, folder: Path) -> Path:
             data = channel_dataset(channel)
             book.append(data)
-            book.describe(comment=data.attrs["comment"])
-            return path
+            book.describe(comment=data.attrs["comment"])  # of all parts so far
+            return folder / "channel.nc"
 
         yield write
 
@@ -302,7 +294,7 @@ def _write_mat(channel: Channel, folder: Path) -> Path:
 
 def _write_csv(channel: Channel, folder: Path) -> Path:
     """A row per instant and tower: the level of the link, delay and Doppler shift of its strongest path."""
-    path, table, (poses, towers) = folder / "channel.csv", channel.table, channel.gain_db.shape
+    path, table, (poses, towers) = folder / "channel.csv", channel.table, channel.replay.has_path.shape
     # the strongest path of a link comes last, the first of equals
     order = np.argsort(-(np.abs(table.gain) ** 2).mean(axis=(1, 2)), kind="stable")[::-1]
     strongest = np.full((poses, towers), -1)
@@ -311,11 +303,12 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
     if channel.along.start is not None:
         instants = channel.along.start + np.round(channel.along.time_s * 1e9).astype("timedelta64[ns]")
         time = np.char.add(np.datetime_as_string(instants, unit="ms"), "Z")
-    shown = {"time": np.repeat(time, towers), "tower": np.tile(channel.replay.towers, poses)}
-    shown["gain_db"] = channel.gain_db.ravel().round(3)
+    gain_db = channel.replay.level_dbm(channel.summed) - channel.replay.ends.link.transmit_power_dbm
+    shown: dict[str, Any] = {"time": np.repeat(time, towers), "tower": np.tile(channel.replay.towers, poses)}
+    shown["gain_db"] = gain_db.ravel().round(3)
     for name, values in (("delay_s", table.delay_s), ("doppler_hz", channel.doppler_hz)):
-        known = np.full(len(order), np.nan) if values is None else values
-        shown[name] = np.append(known, np.nan)[strongest].ravel()
+        # row -1, of no path, is the appended one
+        shown[name] = np.nan if values is None else np.append(values, np.nan)[strongest].ravel()
     pd.DataFrame(shown).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
     return path
 
@@ -343,8 +336,8 @@ def _write_deepmimo(channel: Channel, folder: Path) -> Path:
             np.savez_compressed(scenario / f"{name}_t000_tx{number:03}_r001.npz", **{name: values})
     covered = int(channel.replay.has_path.any(axis=1).sum())
     about = _deepmimo_parameters(channel, {"tx": (len(sources), len(sources)), "rx": (len(ends.poses), covered)})
-    (scenario / "params.json").write_text(json.dumps(about, indent=1), encoding="utf-8")
-    (scenario / "objects.json").write_text("[]", encoding="utf-8")
+    for name, content in (("params", about), ("objects", [])):
+        (scenario / f"{name}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
     np.savez_compressed(scenario / "vertices.npz", vertices=np.zeros((0, 3)))
     return scenario / "params.json"
 
@@ -361,18 +354,9 @@ def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]
     return {"version": "4.0", "rt_params": rays, "scene": {"num_scenes": 1}, "materials": {}, "txrx_sets": sets}
 
 
-def _each(write: Callable[[Channel, Path], Path]) -> Callable[[Path], Any]:
-    return lambda folder: nullcontext(lambda channel: write(channel, folder))
-
-
-# Writers by the name of their format, as a context of a folder; each gives the file to open.
-FORMATS: dict[str, Callable[[Path], AbstractContextManager[Callable[[Channel], Path]]]] = {
-    "netcdf": _netcdf,
-    "npz": _each(_write_npz),
-    "deepmimo": _each(_write_deepmimo),
-    "mat": _each(_write_mat),
-    "csv": _each(_write_csv),
-}
+# Writers of a part by the name of their format; each gives the file to open. A NetCDF file grows.
+_WRITERS = {"npz": _write_npz, "deepmimo": _write_deepmimo, "mat": _write_mat, "csv": _write_csv}
+FORMATS = ("netcdf", *_WRITERS)
 
 # Those that take a channel part by part; the others are held in memory.
 STREAMED = {"netcdf", "csv"}

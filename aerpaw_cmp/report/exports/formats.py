@@ -21,8 +21,8 @@ ALL = "all"
 FOLDER = "exports"
 
 
-def chosen_formats(names: str | Iterable[str]) -> tuple[str, ...]:
-    """The formats that a user writes: names, also joined by commas; ``all`` for every one.
+def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tuple[str, ...]:
+    """The formats that a user writes: names of known ones, also joined by commas; ``all`` for every one.
 
     Raises
     ------
@@ -34,18 +34,16 @@ def chosen_formats(names: str | Iterable[str]) -> tuple[str, ...]:
     >>> chosen_formats(["netcdf,kmz", "kmz"])
     ('kmz', 'netcdf')
     """
-    listed = [names] if isinstance(names, str) else names
-    chosen = [part.strip().lower() for name in listed for part in name.split(",") if part.strip()]
-    unknown = [name for name in chosen if name not in (*FORMATS, ALL)]
-    if unknown:
-        raise UsageError(f"export {unknown[0]!r}", expected=", ".join((*FORMATS, ALL)))
+    chosen = [part.strip().lower() for name in names for part in name.split(",") if part.strip()]
+    if unknown := [name for name in chosen if name not in (*known, ALL)]:
+        raise UsageError(f"format {unknown[0]!r}", expected=", ".join((*known, ALL)))
     for name in chosen:
         if name != ALL and (missing := _missing_module(name)):
             raise UsageError(
-                f"export {name} needs {missing}, which is not installed",
+                f"format {name} needs {missing}, which is not installed",
                 expected="pip install 'aerpaw-cmp[geo]', or another format",
             )
-    return tuple(name for name in FORMATS if name in chosen or ALL in chosen)
+    return tuple(name for name in known if name in chosen or ALL in chosen)
 
 
 def _missing_module(name: str) -> str:

@@ -60,8 +60,6 @@ def _points_dataset(export: Export, points: Points) -> Dataset:
     about = file_attributes(
         title=f"{_TITLES.get(points.kind, points.kind)}: {export.title}",
         source="field logs, replayed by ray tracing",
-        generated=export.attributes.get("generated", ""),
-        version=export.attributes.get("version", ""),
         comment=" ".join(export.remarks),
     )
     return Dataset(variables, {**about, "featureType": "trajectory"})

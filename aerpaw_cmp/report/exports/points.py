@@ -7,7 +7,7 @@ missing number is NaN; a rank of 0 is a code, "no path".
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -119,8 +119,6 @@ class Export:
     clock : bool
         Instants are UTC; else they count from 1970-01-01, because the logs have relative times and no origin.
     synthetic : bool
-    attributes : mapping
-        What made it: generated, version.
     """
 
     flight: str
@@ -130,7 +128,6 @@ class Export:
     track: Track | None
     clock: bool
     synthetic: bool
-    attributes: Mapping[str, str]
 
     @property
     def remarks(self) -> tuple[str, ...]:
@@ -233,5 +230,4 @@ def of_report(data: ReportData) -> Export:
         **named(data, "flight title site track synthetic"),
         sets=sets,
         clock=bool(known) and has_wall_clock(min(known)),
-        attributes={"generated": data.generated, "version": data.versions.get("aerpaw-cmp", "")},
     )

@@ -139,8 +139,6 @@ def _dataset(data: PredictionPage) -> Dataset:
     about = file_attributes(
         f"Predicted levels, {data.name}",
         f"{data.chosen['title']}, learned from {', '.join(data.flights)}",
-        data.generated,
-        str(data.versions.get("aerpaw-cmp", "")),
         data.verdict,
     )
     return Dataset(variables, about)

@@ -8,7 +8,7 @@ and Williams, Gaussian Processes for Machine Learning, algorithm 2.1).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -115,36 +115,6 @@ class Factor:
         # LAPACK fills one triangle and leaves what was in the other
         triangle = np.tril(dpotri(self.lower, lower=True)[0])
         return np.asarray(triangle + np.tril(triangle, -1).T)
-
-    def left_out(self, values: FloatArray, part: IntArray) -> Iterator[tuple[IntArray, FloatArray, FloatArray]]:
-        """Each part of the values, predicted from all others.
-
-        Parameters
-        ----------
-        values : (n,)
-        part : (n,) int
-            Values of one code are left out together.
-
-        Yields
-        ------
-        index : (k,) int
-            Of the values of a part.
-        mean : (k,)
-        covariance : (k, k)
-            Noise included.
-
-        Notes
-        -----
-        One inverse P serves all parts: the part b given the rest has the covariance ``inv(P_bb)`` and the error
-        ``inv(P_bb) (P y)_b`` (Rasmussen and Williams, eq. 5.10-5.12, for blocks).
-        """
-        inverse = self.inverse()
-        # once: every part takes its rows of it
-        right = inverse @ values
-        for code in np.unique(part):
-            index = np.flatnonzero(part == code)
-            covariance = np.linalg.inv(inverse[np.ix_(index, index)]).astype(np.float64, copy=False)
-            yield index, values[index] - covariance @ right[index], covariance
 
 
 def determining(

@@ -18,7 +18,7 @@ from ..common.counting import counted
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..logs.ingest import Held, IngestedFile, ingest, read_log
-from ..logs.records import Stream
+from ..logs.records import COLUMNS, Stream
 from ..propagation.geometry.arrays import Link
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
@@ -288,10 +288,8 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
     raise InputError("no positions in this log", expected=f"those of towers.{name}", path=path)
 
 
-_TELEMETRY = (
-    "latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg",
-    "velocity_north_mps", "velocity_east_mps", "velocity_down_mps",
-)  # fmt: skip
+# All but fix and satellites, which are no numbers of a pose.
+_TELEMETRY = COLUMNS["telemetry"][:-2]
 
 
 def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> tuple[IngestedFile, ...]:
@@ -472,8 +470,7 @@ def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     logs_root : Path, optional
         Where logs and antenna files resolve, in place of ``folder``.
     """
-    files = read_logs(settings, folder, logs_root)
-    return gather(settings, folder, files, logs_root)
+    return gather(settings, folder, read_logs(settings, folder, logs_root), logs_root)
 
 
 def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
@@ -724,17 +721,15 @@ def _check_overlap(data: FlightData) -> None:
             cause="'skip', or a log left out",
         )
     for kind, series in data.series:
-        if isinstance(series, RankSeries) and series.position_m is not None:
-            continue
-        if data.track is None:
+        what, placed = f"{kind} of {series.tower}", isinstance(series, RankSeries) and series.position_m is not None
+        if data.track is None and not placed:
             raise UsageError(
-                f"{kind} of {series.tower} has no positions of its own and there is no telemetry log",
+                f"{what} has no positions of its own and there is no telemetry log",
                 expected="a telemetry log (vehicle_out, say) under 'logs'",
             )
-        _check_shared(data, f"{kind} of {series.tower}", series.time, data.track)
-    for kind, series in data.series:
+        if data.track is not None and not placed:
+            _check_shared(data, what, series.time, data.track)
         if series.tower in data.nodes and len(series.time):
-            what = f"{kind} of {series.tower}"
             _check_shared(data, what, series.time, data.nodes[series.tower], node=series.tower)
 
 
@@ -761,12 +756,8 @@ def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: 
 
 
 def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: np.datetime64) -> str:
-    trap = None
-    if len(time):
-        trap = clock_trap((time.min(), time.max()), (start, end), timezone)
-    if trap is None:
-        return "logs of different flights, or a wrong 'timezone' or 'clock'"
-    return trap.advice()
+    trap = clock_trap((time.min(), time.max()), (start, end), timezone) if len(time) else None
+    return "logs of different flights, or a wrong 'timezone' or 'clock'" if trap is None else trap.advice()
 
 
 def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray, BoolArray]:

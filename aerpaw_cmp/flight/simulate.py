@@ -38,6 +38,8 @@ from .settings import FlightFile, LogSettings, PlanSettings, files_of
 _TRUTH = "truth.json"
 # The flight file, beside the logs that it names.
 FLIGHT = "flight.yaml"
+# Readers of the logs that can be written.
+_WRITTEN = ("vehicle_out", "sounder_log", "quectel_ri")
 # Below this the simulated level is no signal.
 _LOWEST_DBM = -400.0
 
@@ -333,14 +335,9 @@ class FlightSimulator:
 
     def _writer(self, log: LogSettings) -> Callable[[], bytes]:
         """Function that computes a log; UsageError for one that cannot be."""
-        writers = {
-            "vehicle_out": self._telemetry_log,
-            "sounder_log": self._rss_log,
-            "quectel_ri": self._rank_log,
-        }
-        if log.reader not in writers:
+        if log.reader not in _WRITTEN:
             raise UsageError(
-                f"no writer for log {log.path!r} with reader {log.reader!r}", expected="one of " + ", ".join(writers)
+                f"no writer for log {log.path!r} with reader {log.reader!r}", expected="one of " + ", ".join(_WRITTEN)
             )
         if log.reader == "vehicle_out":
             return partial(self._telemetry_log, log)

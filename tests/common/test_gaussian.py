@@ -37,10 +37,6 @@ def test_two_values_in_closed_form():
     alone = Factor.of(np.array([[1.0]]))
     mean, explained = alone.condition(np.array([[r]]), alone.whiten(np.array([2.0])))
     assert (mean[0], explained[0]) == (pytest.approx(2.0 * r), pytest.approx(r**2))
-    both = Factor.of(np.array([[1.0, r], [r, 1.0]]))
-    parts = list(both.left_out(np.array([2.0, 5.0]), np.array([0, 1])))
-    assert [float(mean[0]) for _, mean, _ in parts] == pytest.approx([5.0 * r, 2.0 * r])
-    assert [float(covariance[0, 0]) for *_, covariance in parts] == pytest.approx([1 - r**2] * 2)
 
 
 def test_several_columns_are_each_alone():
@@ -49,20 +45,6 @@ def test_several_columns_are_each_alone():
     mean, _ = factor.condition(across, factor.whiten(columns))
     alone, _ = factor.condition(across, factor.whiten(columns[:, 1].copy()))
     np.testing.assert_allclose(mean[:, 1], alone, rtol=1e-12)
-
-
-def test_a_part_left_out_is_what_the_rest_says_of_it():
-    matrix, _, values = known()
-    part = np.arange(12) // 5  # 5, 5 and 2 values
-    left = list(Factor.of(matrix.copy()).left_out(values, part))
-    assert [len(index) for index, *_ in left] == [5, 5, 2]
-    for index, mean, covariance in left:
-        rest = np.setdiff1d(np.arange(12), index)
-        factor = Factor.of(matrix[np.ix_(rest, rest)])
-        across = matrix[np.ix_(index, rest)]
-        np.testing.assert_allclose(mean, across @ factor.solve(values[rest]), rtol=1e-8)
-        expected = matrix[np.ix_(index, index)] - across @ factor.solve(across.T)
-        np.testing.assert_allclose(covariance, expected, rtol=1e-7, atol=1e-9)
 
 
 @pytest.mark.parametrize("bad", [[[1.0, 2.0], [2.0, 1.0]], [[1.0, np.nan], [np.nan, 1.0]], [[np.inf, 0.0], [0.0, 1.0]]])

@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.compare.learning import field_gp
-from aerpaw_cmp.compare.learning.field_gp import PARTS, FieldFit, FieldModel, Rows, fit_field, left_out
+from aerpaw_cmp.compare.learning.field_gp import PARTS, FieldFit, FieldModel, Rows, fit_field
 
 STILL = FieldModel(
     place_sd_db=3.0, length_m=40.0, height_m=20.0, turn=math.inf, offset_sd_db=0.0, drift_sd_db=0.0, noise_sd_db=1e-4
@@ -95,21 +95,6 @@ def test_agrees_with_plain_loops():
     np.testing.assert_allclose(mean, across @ np.linalg.solve(matrix, value), atol=1e-6)
     np.testing.assert_allclose(sd**2, prior - np.diag(across @ np.linalg.solve(matrix, across.T)), atol=1e-6)
     assert np.array_equal(FieldFit(MOVING, rows).predict(targets)[1], sd)  # a planned flight has no values
-
-
-def test_a_block_left_out_is_what_a_fit_without_it_says():
-    generator = np.random.default_rng(4)
-    rows = flights(generator, count=3, each=30)
-    value = generator.normal(0.0, 2.0, len(rows))
-    mean, sd, own = left_out(MOVING, rows, value, rows.flight)
-    for flight in range(3):
-        mine = rows.flight == flight
-        fit = FieldFit(MOVING, rows.part(~mine), value[~mine])
-        asked = dataclasses.replace(rows.part(mine), flight=np.full(30, -1))
-        alone, alone_sd = fit.predict(asked)
-        np.testing.assert_allclose(mean[mine], alone, atol=1e-6)
-        np.testing.assert_allclose(sd[mine], np.hypot(alone_sd, MOVING.noise_sd_db), rtol=1e-6)
-    assert (own < sd).all()
 
 
 def test_nearest_rows_stand_in_for_all():

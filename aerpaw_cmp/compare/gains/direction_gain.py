@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from itertools import groupby, product
@@ -322,14 +322,14 @@ class GainFit:
             _factor=Factor(self._factor.lower * s),
         )
 
-    def predict(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> tuple[FloatArray, FloatArray]:
+    def predict(self, samples: LinkSamples, frames: Sequence[Frame] | None = None) -> tuple[FloatArray, FloatArray]:
         """Gain of all terms together along samples, about its mean over the samples it was learned from.
 
         Parameters
         ----------
         samples : LinkSamples
             Of a fitted antenna; their residual is not used.
-        frames : iterable of Frame, optional
+        frames : sequence of Frame, optional
             Terms that count; all by default.
 
         Returns
@@ -343,7 +343,8 @@ class GainFit:
             If no flight of the fit had this tower and channel.
         """
         gain, sd = np.full(len(samples), np.nan), np.full(len(samples), np.nan)
-        terms, known = self._terms(frames), self._known_rows(samples)
+        terms = [t for t in self.model.terms if frames is None or t.frame in frames]
+        known = self._known_rows(samples)
         for start in range(0, len(known), AT_ONCE):
             part = known[start : start + AT_ONCE]
             gain[part], sd[part] = self._moments(terms, samples.part(part), self._rows_of(samples.antenna))
@@ -378,10 +379,6 @@ class GainFit:
         """
         self._rows_of(samples.antenna)
         return self._moments(self.model.terms, samples, [samples])[1]
-
-    def _terms(self, frames: Iterable[Frame] | None) -> tuple[Term, ...]:
-        chosen = None if frames is None else set(frames)
-        return tuple(t for t in self.model.terms if chosen is None or t.frame in chosen)
 
     def _rows_of(self, antenna: str) -> list[LinkSamples]:
         """Rows of an antenna."""

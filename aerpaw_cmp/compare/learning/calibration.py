@@ -272,11 +272,6 @@ class Simple:
     constant_db: FloatArray
     line_db: FloatArray
 
-    @classmethod
-    def unknown(cls, samples: int) -> Simple:
-        """Nothing predicted yet."""
-        return cls(*np.full((3, samples), np.nan))
-
     def predict(self, o: Observed, inside: BoolArray, outside: BoolArray) -> None:
         """Fill in the samples of a part, every number of it from samples outside."""
         measured = o.samples.residual_db + o.free_space_db
@@ -416,7 +411,7 @@ def parts_left_out(
     flights = spread_flights(flights_of(observed))
     of = {flight: [o for o in observed if o.samples.flight == flight] for flight in flights}
     stitched = {flight: [np.full(len(o.samples), np.nan) for o in of[flight]] for flight in flights}
-    simple = {flight: [Simple.unknown(len(o.samples)) for o in of[flight]] for flight in flights}
+    simple = {flight: [Simple(*np.full((3, len(o.samples)), np.nan)) for o in of[flight]] for flight in flights}
     # one part after the other: what the flights learn from is much the same, and kept
     for k in range(max(len(parts(mine[0], mine[0])) for mine in of.values())):
         for flight, mine in of.items():

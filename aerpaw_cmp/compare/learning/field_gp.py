@@ -363,36 +363,6 @@ def _noisy(model: FieldModel, matrix: FloatArray) -> FloatArray:
     return matrix
 
 
-def left_out(
-    model: FieldModel, rows: Rows, value_db: FloatArray, block: IntArray
-) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Each row predicted from the rows of other blocks: mean, standard deviation with noise, and mean error of blocks.
-
-    Parameters
-    ----------
-    model : FieldModel
-    rows : Rows
-        At most :data:`_EXACT_ROWS`.
-    value_db : (n,)
-    block : (n,) int
-        Rows of one code are left out together.
-
-    Returns
-    -------
-    mean_db, sd_db : (n,)
-        Of ``value_db``, noise included.
-    own_sd_db : (n,)
-        Of a row about the mean of its block, where a block's own mean is taken off.
-    """
-    factor = Factor.of(_noisy(model, covariance(model, rows, rows)))
-    mean, sd, own_sd = np.empty((3, len(rows)))
-    for mine, mean_of_block, spread in factor.left_out(value_db, block):
-        mean[mine], sd[mine] = mean_of_block, np.sqrt(np.diag(spread))
-        about = spread - spread.mean(axis=0) - spread.mean(axis=1)[:, None] + spread.mean()
-        own_sd[mine] = np.sqrt(np.maximum(np.diag(about), 0.0))
-    return mean, sd, own_sd
-
-
 # --- scales --------------------------------------------------------------------------------------------------------
 
 

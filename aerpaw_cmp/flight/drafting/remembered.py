@@ -143,17 +143,14 @@ def propose(known: learned.Learned, site: str, series: Sequence[_SeriesKey], nod
         antennas["uav"] = f"{site}/{best}_uav"
         carrier = alike[0].carrier_hz
     ranked = {(tower, quantity) for tower, channel, quantity in series if channel == "rank"}
-    receivers = [
-        (name, entry)
-        for name, entry in known.entries.items()
-        if any((r.tower, r.quantity) in ranked for r in entry.receivers)
-    ]
+    fitted = (n for n, entry in known.entries.items() if any((r.tower, r.quantity) in ranked for r in entry.receivers))
+    receiver = next(fitted, None)
     return Proposal(
         antennas=antennas,
         antennas_about=about,
         carrier_hz=carrier,
-        receiver=f"{site}/{receivers[0][0]}" if receivers else None,
-        receiver_about=receivers[0][1].about() if receivers else "",
+        receiver=f"{site}/{receiver}" if receiver else None,
+        receiver_about=known.entries[receiver].about() if receiver else "",
     )
 
 

@@ -147,6 +147,7 @@ def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
         except KeyboardInterrupt as error:
             raise Interrupted(error) from None  # typer would make a silent exit code of it
 
+    # resolved: annotations are texts here, which typer would evaluate in its own module
     hints = {name: _bare(hint) for name, hint in get_type_hints(function, include_extras=True).items()}
     hints["quiet"] = Quiet
     kind = inspect.Parameter.KEYWORD_ONLY

@@ -24,6 +24,7 @@ def guarded(table: Any) -> Any:
             if words:
                 texts = table[name].astype(object)
                 guarded_columns[name] = texts.replace({word: guarded_text(word) for word in words})
+    # the table of the caller stays as it is: numbers are read from it afterwards
     return table.assign(**guarded_columns) if guarded_columns else table
 
 

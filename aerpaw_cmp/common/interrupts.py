@@ -102,6 +102,7 @@ def _set(numbers: tuple[int, ...], handler: _Handler, *untouched: _Handler) -> l
     """Take the signals that nobody else handles or ignores; gives their handlers of before."""
     if threading.current_thread() is not threading.main_thread():
         return []
+    # a program that embeds this one may handle its signals: those stay its own
     untouched = untouched or (signal.SIG_DFL, signal.default_int_handler)
     ours = [(number, signal.getsignal(number)) for number in numbers if signal.getsignal(number) in untouched]
     for number, _ in ours:
@@ -165,6 +166,7 @@ def held() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in SIGNALS}
     ours = {number: handler for number, handler in before.items() if callable(handler)}
     for number in ours:
+        # not blocked by a mask: a thread of a library would take the signal in this one's place
         signal.signal(number, lambda number, _frame: signals.append(number))
     try:
         yield

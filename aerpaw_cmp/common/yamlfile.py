@@ -57,6 +57,7 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 class StrictModel(pydantic.BaseModel):
     """Base of all settings: nothing unknown, every number one, no change after loading."""
 
+    # neither NaN nor infinity: no comparison refuses NaN, and JSON holds neither
     # deferred: the validator of a part is made with that of the whole, once, and of what nobody asks for never
     model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True
@@ -315,6 +316,7 @@ class _Builder:
                 merges.append((value, line))
             else:
                 content[key] = value
+        # last: keys of the mapping itself win, wherever '<<' stands
         for merged, line in merges:
             for part in merged if isinstance(merged, list) else [merged]:
                 if not isinstance(part, dict):

@@ -595,6 +595,7 @@ def record_columns(
         if what is None or what.quantity.role not in ("position", "height", "angle", "velocity", "count"):
             continue
         row = what.quantity
+        # the same names in decimals are those of a converter, which has scaled them already
         unit = "" if unit in OF_INTEGERS and name not in integers else unit
         # 65535 mm are a height: of these only the ends of the type are none
         none = np.abs(fields[name]) >= UNAVAILABLE[0] if unit in ("mm", "e7") else is_none(row, fields[name])

@@ -226,6 +226,7 @@ class _Check:
         timed = ~np.isnat(time)
         if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= _APART_S * 1e9:
             return
+        # NaT last: it is the smallest of all integers
         order = np.argsort(np.where(timed, stamp, np.iinfo(np.int64).max), kind="stable")[: int(timed.sum())]
         group = np.concatenate(([0], np.cumsum(np.diff(stamp[order].astype(np.float64)) > _APART_S * 1e9)))
         size = np.bincount(group)

@@ -24,7 +24,8 @@ from aerpaw_cmp.readers import dictionary
 
 from . import _cells, _pose, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri
 
-_TOWER_SNR = re.compile(r"snr (lw\d)")
+# A tower of Lake Wheeler that a column is named by.
+_TOWER = re.compile(r"\blw ?([1-5])\b")
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
 _NO, _YES = ("false", "0", "no"), ("true", "1", "yes")
 _NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected", "monitored")
@@ -263,10 +264,9 @@ _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero
 
 def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     values, name = sheet.numbers(column), sheet.plain[column]
-    if tower := _TOWER_SNR.fullmatch(name):
-        return _rows.snr(rows, tower[1].upper(), values)
-    node = re.search(r"\blw ?([1-5])\b", name)
-    about = {"node": f"LW{node[1]}"} if node else None
+    about = {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(name)) else {}
+    if tower and name == f"snr {tower[0]}":
+        return _rows.snr(rows, about["node"], values)
     return _cells.named(rows, name, values, unit=sheet.unit_read(column), where=np.isfinite(values), about=about)
 
 

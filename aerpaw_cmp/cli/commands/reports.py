@@ -62,6 +62,7 @@ def _print_explanation(explanation: Any) -> None:
     heads = ["path", "m", "ns", "departure az / el deg", "arrival az / el deg", "dBm", "phase deg"]
     if rows:
         table(heads, rows, f"{counted(len(rows), 'path')} by engine {explanation.engine}")
+        # the deepest path has all terms, in the order in which they are met
         deepest_first = sorted(explanation.paths, key=lambda path: -path.depth)
         names = list(dict.fromkeys(name for path in deepest_first for name in path.terms_db))
         power = f"{explanation.transmit_power_dbm:+.2f}"

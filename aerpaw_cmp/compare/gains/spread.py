@@ -132,6 +132,7 @@ class LostLock:
         reach = 6.0 * max(self.locked_sd_db, self.lost_sd_db)
         low = np.minimum(self.locked_db, self.lost_db) - reach
         high = np.maximum(self.locked_db, self.lost_db) + reach
+        # from some hundred decibels to two thousandths
         for _ in range(16):  # no closed form: each step halves what is left of some 130 dB
             middle = 0.5 * (low + high)
             below = sum(p * ndtr((middle - mean) / sd) for p, mean, sd in self.parts)

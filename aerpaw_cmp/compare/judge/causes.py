@@ -302,6 +302,7 @@ def _models(e: LevelEvidence) -> _Models:
         return [model(*m.trials, at=at) for m in likely]
 
     alone = best_of(((trial,) for trial in _candidates(e)), sound.memories)
+    # the best first: pairs are made of it with each other
     alone.sort(key=lambda m: -m.gain)
     models, likely = [model(climb=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
     pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
@@ -741,6 +742,7 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
 
 def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     """Levels to which the power of a limit adds, or which come no nearer than that to a ceiling."""
+    # the median: samples at the limit do not move it
     offset = float(np.median(e.measured_db - e.predicted_db))
     for _ in range(5):
         level = e.predicted_db + offset
@@ -826,6 +828,7 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     starts = np.arange(_LEAST_BINS * 2, n - _LEAST_BINS * 2)
     if not len(starts):
         return
+    # every so many: a step is seen from the bins beside its own
     starts = starts[:: 1 + len(starts) // _MOST_STARTS]
     masks = (np.arange(n)[None, :] >= starts[:, None]).astype(np.float64)
     for phi in _SEARCHED_PHI:

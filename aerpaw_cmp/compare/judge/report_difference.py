@@ -170,6 +170,7 @@ def rank_difference(
     RankDifference
         Samples whose rank changed, and the change of agreement and kappa with intervals.
     """
+    # no report and no path are both 0 here, and a change to or from it counts
     pairs = [np.nan_to_num(np.column_stack(pair)) for pair in (first, second)]
     usable = np.column_stack([*pairs])
     ranked = (usable >= 1).all(axis=1) & (usable <= MAX_RANK).all(axis=1)
@@ -193,6 +194,7 @@ def _agreement_change(first: IntArray, second: IntArray) -> tuple[Changed, Chang
     if len(first) < 2:
         return _changed(*agree), _changed(*kappa)
     (columns, influence), (other_columns, other_influence) = (kappa_parts(*pairs.T) for pairs in (first, second))
+    # both reports in one table: a resample then draws the same poses of both
     joined, width = np.column_stack([columns, other_columns]), columns.shape[1]
 
     # one resample for both reports: what they share cancels in the difference

@@ -129,6 +129,7 @@ class _Stretch:
     def alike(self) -> float:
         """Variance of a mean of nights in a row, over that of independent nights; correlation one error higher."""
         about = np.array(self.values) - np.mean(self.values)
+        # one standard error higher: independent nights must not look better than they are
         known = float(about[1:] @ about[:-1] / max(about @ about, 1e-12)) + len(about) ** -0.5
         correlation = float(min(max(known, 0.0), 0.9))
         return (1.0 + correlation) / (1.0 - correlation)

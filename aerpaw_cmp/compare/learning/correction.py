@@ -159,6 +159,7 @@ class Correction:
         exact = fit.fits(max(len(targets), all_targets))
         mean, sd = fit.predict(targets, exact=exact)
         if own_mean:
+            # about its own mean a flight's offset is no error
             _, sd = fit.predict(targets, ("place", "drift"), exact=exact)
         variance = sd**2 + (gain_sds**2).mean(axis=0) + gains.var(axis=0) + self.model.noise_sd_db**2
         return gains.mean(axis=0) + mean, self.sd_factor * np.sqrt(variance)
@@ -312,6 +313,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
                 many = len({s.flight for s in series}) > MOST_GROUPS
                 _score_fold(fold, base, models, {t: tallies[name, t] for t in titles}, keep=many)
     joined = {key: _joined(parts) for key, parts in tallies.items() if parts}
+    # scaled before they are scored: CRPS then compares errors, not how badly spreads are stated
     factors = {key: _sd_factor(*errors) for key, errors in joined.items()}
     held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
     crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*errors)) for key, errors in held_out.items()}

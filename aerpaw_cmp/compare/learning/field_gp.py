@@ -423,6 +423,7 @@ def _evenly(rows: Rows, value: FloatArray) -> tuple[Rows, FloatArray]:
     """Whole stretches of at most :data:`FIT_ROWS` rows: thinning would hide short scales."""
     if len(rows) <= FIT_ROWS:
         return rows, value
+    # seven stretches over the flight: near and far, climbing and landing
     stretch = FIT_ROWS // 7
     starts = np.linspace(0, len(rows) - stretch, 7).astype(int)
     keep = np.unique(np.concatenate([np.arange(s, s + stretch) for s in starts]))
@@ -434,6 +435,7 @@ def _offset_sd_of(channels: Sequence[tuple[Rows, FloatArray]], otherwise_db: flo
 
     Two flights say little: the guess counts as two more (the mean of an inverse-gamma posterior).
     """
+    # the guess as two observations
     squares, count = 2.0 * otherwise_db**2, 2.0
     for rows, value in channels:
         means = np.array([value[rows.flight == code].mean() for code in np.unique(rows.flight)])

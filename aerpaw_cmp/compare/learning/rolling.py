@@ -141,6 +141,7 @@ class RouteAhead:
 
     def _judge(self, time: float, place: FloatArray, level: float, trends: Mapping[str, float]) -> None:
         """Score every trend on a bin by what it said :data:`AHEAD_S` before."""
+        # only what was known so long before: else a trend is judged by levels beside it
         known = int(np.searchsorted(self._bins.time_s, time - AHEAD_S))
         if known < LEAST:
             return
@@ -183,6 +184,7 @@ class RouteAhead:
         self._reached += int(np.linalg.norm(self.route_m[window] - place, axis=1).argmin())
         index = np.arange(self._reached, len(self.route_m))
         known = {key: total / weight for key, (total, weight) in self._scores.items()}
+        # before anything was judged: no trend, and the longer memory
         trend, length = min(known, key=lambda key: known[key], default=(NONE, LENGTHS_M[-1]))
         now = self._bins.time_s[-1]
         steps = np.linalg.norm(np.diff(self.route_m[index], axis=0, prepend=place[None]), axis=1)

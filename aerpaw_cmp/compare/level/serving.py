@@ -71,12 +71,14 @@ def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence
     >>> compare_serving([0, 1, 1, -1], [[-70, -80], [-75, -71], [-60, -90], [-60, -90]], ["a", "b"]).confusion.tolist()
     [[1, 0, 0], [1, 1, 0]]
     """
+    # unknown is no cell: -1 would be the last one as an index
     index = np.nan_to_num(unmasked(served), nan=-1.0).astype(np.int64)
     level: FloatArray = unmasked(predicted_dbm)
     known = index >= 0
     filled = np.where(np.isnan(level), -np.inf, level)
     strongest = np.where(np.isnan(level).all(axis=1), len(cells), filled.argmax(axis=1) if len(cells) else 0)
     confusion = np.zeros((len(cells), len(cells) + 1), dtype=np.int64)
+    # add.at counts a pair as often as it comes; += would count it once
     np.add.at(confusion, (index[known], strongest[known]), 1)
     return ServingComparison(cells=tuple(cells), confusion=confusion, n=int(known.sum()))
 

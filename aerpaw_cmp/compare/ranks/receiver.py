@@ -222,6 +222,7 @@ def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[
 
 def _standard(x: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Mean and scale per feature; a constant feature keeps scale 1 and says nothing."""
+    # over the samples: the axis before the last, whatever stands in front
     scale = x.std(axis=-2)
     return x.mean(axis=-2), np.asarray(np.where(scale > 1e-9, scale, 1.0))
 
@@ -521,6 +522,7 @@ def choose_features(
     x, y, group = _training(features, rank, groups)
     step = max(1, _HELD // (x.shape[1] * (x.shape[2] + 1) * MAX_RANK))
     rough = np.concatenate([_own_losses(x[i : i + step], y) for i in range(0, len(x), step)])
+    # stable: of equal candidates the one listed first stays, on every machine
     final = np.argsort(rough, kind="stable")[:finalists]
     losses = np.concatenate([_left_out_losses(x[final[i : i + step]], y, group) for i in range(0, len(final), step)])
     score = losses.mean(axis=1)

@@ -187,6 +187,7 @@ class PassTable:
         PassPair
         """
         rule = radius_m, heading_within_deg
+        # the searches of a pair of flights are shared by its links, and forgotten after it
         for first, second in combinations(self._flights, 2):
             known: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
             shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}

@@ -129,6 +129,7 @@ class Placer:
         """About ``count`` positions (n, 3) of the flight [m], spread over it, above the ground."""
         times = self.telemetry.frame["time"]
         place = self.track.pose_at(times.iloc[spread_out(len(times), count)]).position_m
+        # in the air: on the ground everything is behind something
         return place[place[:, 2] > self.track.ground_m + _LOW_M]
 
     def levels(
@@ -187,6 +188,7 @@ class Placer:
         known -= estimate.anywhere + _TAUGHT_MORE
         odds_tower = np.maximum(odds_tower, known)
         if len(listed) and odds_listed.max() >= max(_TOWER_ODDS, odds_tower.max()):
+            # a list of rover places holds neighbours some metres apart: all likely lines are named
             order = np.argsort(-odds_listed)
             place, least = listed[order[0]], odds_listed[order[0]] - _UNDECIDED
             undecided = [listed[i] for i in order[1:] if odds_listed[i] > least]

@@ -98,6 +98,7 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
             expected="a site with a ground plane, or reflection_loss_db",
             cause="no face of the scene is known to be its ground",
         )
+    # the planes of tower_ground: offsets stand beside the origin's
     heights = np.array(sorted({0.0, *(tower.ground_m for tower in site.towers.values())}))
     wavelength = wavelength_m(carrier_hz)
 

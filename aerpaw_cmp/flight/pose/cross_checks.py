@@ -153,6 +153,7 @@ def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
     starts = []
     stem = path.name.split(".")[0]
     for name, head in _tables_beside(path):
+        # a folder may hold the summaries of several measurements
         if name.startswith(stem) and (match := _NEMO_START.search(head)) is not None:
             time = datetime.strptime(match[1], "%Y %b %d %H:%M").replace(tzinfo=zones.utc)
             starts.append((f"Measurement start in {name}", time, "%Y-%m-%d %H:%M", _OF_THE_MINUTE))
@@ -182,6 +183,7 @@ def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool)
         # a date is its noon, give or take
         return abs(start - time - timedelta(hours=12))
     if zone is not None:
+        # that of the day: a zone has two in a year
         offset = start.astimezone(zone).utcoffset() or timedelta(0)
         return min(abs(start - time), abs(start + offset - time))
     # every zone that there is, by half hours

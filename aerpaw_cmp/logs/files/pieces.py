@@ -29,6 +29,7 @@ def join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
     joined: dict[str, IngestedFile | None] = {}
     for (folder, _), group in groups.items():
         if len(group) > 1:
+            # the first of them stands for all, where it stood in the order
             joined |= {file.path: None for file in group[1:]}
             joined[group[0].path] = _joined(folder, group)
     replaced = [joined.get(file.path, file) for file in files]

@@ -168,6 +168,7 @@ class Rejects:
         """Lines (0-based) of a piece, for one reason; of each reason and piece the first are kept."""
         if not len(numbers):
             return
+        # numbers count from the first piece of the file
         low, high = int(min(numbers)) + self.before + 1, int(max(numbers)) + self.before + 1
         self._reasons.append(RejectedReason(reason, len(numbers), low, high))
         # more come in the order of the file, but for the reasons of a piece

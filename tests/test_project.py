@@ -52,25 +52,26 @@ def test_classifiers_are_known_and_name_every_python_that_set_up_looks_for() -> 
     assert (ROOT / "aerpaw_cmp/py.typed").is_file()
 
 
-@pytest.mark.parametrize("source", ["", "https://forge.example/lab/aerpaw-cmp/"], ids=["no address", "an address"])
-def test_the_readme_of_a_package_index_needs_no_file_of_ours(source: str, tmp_path: Path) -> None:
-    """Without a public address the README is as it stands; with one, no link is left that leads nowhere there."""
+@pytest.mark.parametrize("owner", ["<owner>", "lab"], ids=["no owner", "an owner"])
+def test_the_readme_of_a_package_index_needs_no_file_of_ours(owner: str, tmp_path: Path) -> None:
+    """Without an owner the README is as it stands; with one, no link is left that leads nowhere there."""
     pytest.importorskip("hatchling", reason="hatchling is not installed")
     for name in ("README.md", "LICENSE", "aerpaw_cmp/__init__.py", "tools/readme_links.py"):
         (tmp_path / name).parent.mkdir(exist_ok=True)
         shutil.copy(ROOT / name, tmp_path / name)
-    text = re.sub(r'^Source = ".*"\n', "", (ROOT / "pyproject.toml").read_text(), flags=re.MULTILINE)
-    assert text.count("[project.urls]\n") == 1
-    line = f'Source = "{source}"\n' if source else ""
-    (tmp_path / "pyproject.toml").write_text(text.replace("[project.urls]\n", f"[project.urls]\n{line}"))
+    source, text = f"https://github.com/{owner}/aerpaw-cmp", (ROOT / "pyproject.toml").read_text()
+    (tmp_path / "pyproject.toml").write_text(text.replace("/<owner>/", f"/{owner}/"))
     code = "from hatchling.build import prepare_metadata_for_build_wheel as make; print(make('.'))"
     done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     metadata = email.message_from_bytes((tmp_path / done.stdout.strip() / "METADATA").read_bytes())
     assert metadata["Description-Content-Type"] == "text/markdown"
-    assert "Paper, https://arxiv.org/abs/2502.10324" in metadata.get_all("Project-URL")
+    addresses = dict(line.split(", ") for line in metadata.get_all("Project-URL"))
+    assert addresses.pop("Paper") == "https://arxiv.org/abs/2502.10324"
+    assert addresses.keys() == {"Source", "Documentation", "Issues", "Changelog"}
+    assert all(address.startswith(source) for address in addresses.values())
     readme, shown = (ROOT / "README.md").read_text(), metadata.get_payload()
-    if not source:
+    if owner == "<owner>":
         assert shown.strip() == readme.strip()
         return
     links = re.findall(r"(!?)\[[^\]\[]*\]\(([^)]+)\)", readme)
@@ -78,7 +79,7 @@ def test_the_readme_of_a_package_index_needs_no_file_of_ours(source: str, tmp_pa
     tag = f"v{metadata['Version']}"
     for (image, target), (also, address) in zip(links, seen, strict=True):
         kind = "raw" if image else "blob"
-        own = f"https://forge.example/lab/aerpaw-cmp/{kind}/{tag}/{target}"
+        own = f"{source}/{kind}/{tag}/{target}"
         assert (also, address) == (image, target if "://" in target else own)
     assert sum(bool(image) for image, _ in links) >= 3
 

@@ -1,8 +1,8 @@
 """The README as a package index shows it: a link into this project must name its whole address there.
 
 Hatchling runs this where metadata are made. The address is that of ``Source`` under ``[project.urls]``, the links are
-those of the version's tag, ``/raw/`` for images and ``/blob/`` for pages, GitHub's way. Without a ``Source``
-the README stays as it is.
+those of the version's tag, ``/raw/`` for images and ``/blob/`` for pages, GitHub's way. While it names
+no owner the README stays as it is.
 """
 
 from __future__ import annotations
@@ -32,6 +32,6 @@ class ReadmeLinks(MetadataHookInterface):
     def update(self, metadata: dict[str, Any]) -> None:
         """Set the README, with whole addresses where the project has one."""
         text = Path(self.root, "README.md").read_text(encoding="utf-8")
-        source = metadata.get("urls", {}).get("Source")
-        text = with_addresses(text, source, metadata["version"]) if source else text
+        source = metadata["urls"]["Source"]
+        text = text if "<owner>" in source else with_addresses(text, source, metadata["version"])
         metadata["readme"] = {"content-type": "text/markdown", "text": text}

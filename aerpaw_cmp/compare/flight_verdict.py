@@ -31,11 +31,28 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Channels with enough samples for a sentence about their error; of some with the same levels the first."""
-    enough = [panel for panel in panels if panel.score.n >= FEWEST and math.isfinite(panel.score.rmse_db)]
-    levels = [panel.measured_db for panel in enough]
-    copied = [any(np.array_equal(of, earlier, equal_nan=True) for earlier in levels[:i]) for i, of in enumerate(levels)]
-    return [panel for panel, copy in zip(enough, copied, strict=True) if not copy]
+    """Channels with enough samples for a sentence about their error, without copies and, where one lives, the dead."""
+    enough = [p for p in without_copies(panels) if p.score.n >= FEWEST and math.isfinite(p.score.rmse_db)]
+    return [panel for panel in enough if not is_dead(panel)] or enough
+
+
+def without_copies(panels: Iterable[RssResult]) -> list[RssResult]:
+    """Channels, and of some with the same levels the first."""
+    return list({panel.measured_db.tobytes(): panel for panel in reversed(list(panels))}.values())[::-1]
+
+
+# Fading alone makes a received level vary by more [dB], also where no model does.
+_DEAD_DB = 1.0
+
+
+def is_dead(panel: RssResult) -> bool:
+    """True of a level whose middle 80 % span less than a decibel, and a fifth of what is predicted: a dead input."""
+    known = panel.posed & np.isfinite(panel.measured_db) & np.isfinite(panel.simulated_dbm)
+    if not known.any():
+        return False
+    both = np.percentile([panel.measured_db[known], panel.simulated_dbm[known]], (10, 90), axis=1)
+    measured_db, predicted_db = np.ptp(both, axis=0)
+    return bool(measured_db < min(_DEAD_DB, 0.2 * predicted_db))
 
 
 def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:

@@ -6,7 +6,13 @@ import itertools
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.flight_verdict import baseline_errors, flight_verdict, pooled_db, with_corrected_verdicts
+from aerpaw_cmp.compare.flight_verdict import (
+    baseline_errors,
+    flight_verdict,
+    pooled_db,
+    with_corrected_verdicts,
+    without_copies,
+)
 from aerpaw_cmp.compare.judge.causes import MOST_CAUSE_WORDS, Cause
 from aerpaw_cmp.compare.level.detection import DetectionScore, floored_fit
 from aerpaw_cmp.compare.level.field_difference import FieldAudit
@@ -313,6 +319,21 @@ def test_two_channels_of_the_same_levels_are_told(report_data):
     pooled = flight_verdict(twice.rss)
     assert pooled is not None
     assert (pooled.channels, pooled.ci95_db) == (1, flight_verdict([panel]).ci95_db)
+    other = dataclasses.replace(panel, measured_db=panel.measured_db + 1.0, channel="other")
+    assert [p.channel for p in without_copies([*twice.rss, other])] == [panel.channel, "other"]
+
+
+def test_a_dead_channel_takes_no_part_in_the_verdict_of_one_that_lives(report_data):
+    panel, rng = report_data.rss[0], np.random.default_rng(8)
+    silent = rng.normal(-120.0, 0.2, len(panel.measured_db))
+    dead = dataclasses.replace(panel, channel="dead", measured_db=np.where(panel.posed, silent, np.nan))
+    both = dataclasses.replace(report_data, rss=(panel, dead))
+    assert flight_verdict(both.rss) == flight_verdict([panel])
+    said = f"{dead.name} stays within 1 dB, whatever is predicted: it does not count in the first sentence."
+    assert said in cautions(both)
+    alone = dataclasses.replace(report_data, rss=(dead,))  # of a flight without any other it is the error
+    assert flight_verdict(alone.rss) is not None
+    assert said not in cautions(alone)
 
 
 @pytest.mark.parametrize("shift_db", [0.0, 1.0])

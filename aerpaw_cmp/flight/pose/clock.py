@@ -122,6 +122,15 @@ class ClockChannel:
     measured_db: FloatArray
     along: Along
 
+    @property
+    def flat(self) -> bool:
+        """True if the levels hardly vary where every model predicts that they do."""
+        at = (self.time_s - self.along.start_s) / self.along.step_s
+        known = np.isfinite(self.measured_db)
+        models = (np.interp(at[known], np.arange(len(p)), p) for p in self.along.predicted_db.values())
+        spans = [np.ptp(np.percentile(v, (10, 90))) for v in (self.measured_db[known], *models) if len(v)]
+        return bool(spans and spans[0] < _FLAT * min(spans[1:]))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockEstimate:
@@ -205,7 +214,10 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     lag, excludes nothing. A level that depends on no position must be less likely than that. A shift must be shown
     without any fifth of the flight, too: one dip, jump of the position or frozen track decides nothing.
     """
-    channels = _same_models(channels)
+    alive = [channel for channel in channels if not channel.flat]  # a dead input knows no time
+    if not alive:
+        return _nothing(_FLAT_LEVEL, window_s)
+    channels = _same_models(alive)
     models = list(channels[0].along.predicted_db)
     groups = _at_one_time(channels)
     places = {place: group[0].along for (place, *_), group in groups.items()}
@@ -217,8 +229,6 @@ def judge_clock(channels: Sequence[ClockChannel], *, window_s: float = 15.0) -> 
     }
     if not bins:
         return _nothing(_NO_OVERLAP, window_s)
-    if all(b.flat for b in bins.values()):
-        return _nothing(_FLAT_LEVEL, window_s)
     steps = int(window_s / _STEP_S + 1e-9)
     lags = np.asarray(np.arange(-steps, steps + 1) * _STEP_S, dtype=np.float64)
     # with one guess of the memory: it finds the likely lags, at which the memory is fitted then
@@ -366,13 +376,6 @@ class _Bins:
     @property
     def n(self) -> int:
         return len(self.mean_s)
-
-    @property
-    def flat(self) -> bool:
-        """True if the levels hardly vary where every model predicts that they do."""
-        predicted = self._between(self.mean_s, self.levels)
-        measured, expected = (np.ptp(np.percentile(v, (10, 90), axis=0), axis=0) for v in (self.mean_db, predicted))
-        return bool(measured.max() < _FLAT * expected.min())
 
     @classmethod
     def of(cls, channels: Sequence[ClockChannel], features: FloatArray, window_s: float) -> _Bins | None:

@@ -10,6 +10,7 @@ from typing import TypeVar
 import numpy as np
 
 from ...common.units import FloatArray
+from ...compare.flight_verdict import without_copies
 from ...compare.judge.causes import Cause, LevelEvidence, flight_cause
 from ...compare.level import rss
 from ...compare.result import RssResult
@@ -43,11 +44,12 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     """
     if any(is_simulated(stream) for file in data.files for stream in file.result.streams):
         return SIMULATED
+    names = {result.name for result in without_copies(results)}  # a copy is replayed with antennas of another channel
     return flight_cause(
         [
             _evidence(data, series, replayed, result)
             for series, replayed, result in zip(data.rss, replays.rss, results, strict=True)
-            if replayed.tower_m is None and not result.training
+            if replayed.tower_m is None and not result.training and result.name in names
         ]
     )
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...common.counting import counted
 from ...common.units import AnyArray, Printed
-from ...compare.flight_verdict import lock_lost, pooled_db
+from ...compare.flight_verdict import is_dead, lock_lost, pooled_db
 from ...compare.judge.ladder import LadderRow, costs
 from ...compare.level.detection import DetectionScore
 from ...compare.level.rss import ErrorSpan
@@ -419,6 +419,11 @@ def cautions(data: ReportData) -> list[str]:
     texts += [f"{text}." for text in data.doubts]
     for panel in data.rss:
         texts += _rss_cautions(panel)
+    texts += [
+        f"{panel.name} stays within 1 dB, whatever is predicted: it does not count in the first sentence."
+        for panel in data.rss
+        if is_dead(panel) and not all(map(is_dead, data.rss))
+    ]
     texts += [
         f"{panel.name} and {copy.name} hold the same levels: they are one measurement."
         for panel, copy in combinations(data.rss, 2)

@@ -43,6 +43,19 @@ def logged(text: str, fraction: float | None = None, /) -> None:
         logging.getLogger(room).debug("%s %.0f %%", text, 100 * fraction)
 
 
+def duration(seconds: float) -> str:
+    """Seconds in a unit that is read at a glance.
+
+    Examples
+    --------
+    >>> duration(12), duration(600), duration(9000)
+    ('12 s', '10 min', '2.5 h')
+    """
+    if seconds < 90:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
+
+
 def share_of(progress: Progress, text: str) -> Callable[[float], None]:
     """The progress of one step, for code that knows its share and not its name."""
 

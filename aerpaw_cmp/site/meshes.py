@@ -54,7 +54,18 @@ def building_mesh(building: Building) -> Mesh:
 
 
 def rectangle(west_m: float, east_m: float, south_m: float, north_m: float, up_m: float) -> Mesh:
-    """A level rectangle that looks up: two triangles."""
+    """A level rectangle that looks up.
+
+    Parameters
+    ----------
+    west_m, east_m, south_m, north_m, up_m : float
+        Its sides and its height.
+
+    Returns
+    -------
+    Mesh
+        Two triangles.
+    """
     corners = [(west_m, south_m, up_m), (east_m, south_m, up_m), (east_m, north_m, up_m), (west_m, north_m, up_m)]
     return np.array(corners), np.array([[0, 1, 2], [0, 2, 3]])
 

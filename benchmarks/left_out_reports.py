@@ -60,7 +60,7 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
     shutil.copyfile(packaged.with_suffix(".yaml"), site)
     settings = load_calibration(path)
     flights, _ = read_flights(settings, path.parent, field)
-    ranked = None if settings.rank is None else fit_rank(samples_by_tower(flights), settings.rank)
+    ranked = fit_rank(samples_by_tower(flights)) if settings.rank else None
     observed, _ = observe(flights)
     chosen = recipe_of(settings, observed, field)
     scores: dict[str, tuple[Score, ...]] = dict.fromkeys(SPLITS, ())

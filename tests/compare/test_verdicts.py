@@ -181,7 +181,7 @@ def test_chance_is_shared_by_all_that_is_tried_and_two_decibels_are_small(
     chances: tuple[float, ...], effect: float, cause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two false alarms in a hundred campaigns, whatever the number of shifts that are tried."""
-    shifts = [verdicts._Shift(chance, Verdict(cause="gain step", effect=effect)) for chance in chances]
+    shifts = [(chance, Verdict(cause="gain step", effect=effect)) for chance in chances]
     monkeypatch.setattr(verdicts, "_shifts", lambda *_: iter(shifts))
     assert campaign_verdict({}, {}, []).cause == cause
 
@@ -193,7 +193,7 @@ def test_every_shift_of_a_campaign_is_tried() -> None:
         "LW1": dict(zip(names, (1.0, 2.0, 1.5, 4.0, 5.0, 4.5), strict=True)),
         "LW2": {"A": 1.0, "B": np.nan, "C": 2.0},
     }
-    tried = [shift.verdict for shift in verdicts._shifts(errors, links, names)]
+    tried = [verdict for _, verdict in verdicts._shifts(errors, links, names)]
     assert [shift.where for shift in tried] == [*"ABCDE", *(f"LW1 from {name}" for name in "CDE"), *names]
     assert tried[3].effect == pytest.approx(8.0 / (2.0 * 2.2 * 1.9 * 2.1) ** 0.25)
     assert tried[3].interval[0] < tried[3].effect < tried[3].interval[1]
@@ -201,7 +201,7 @@ def test_every_shift_of_a_campaign_is_tried() -> None:
     a, c = (1.0 - 3.0 - 0.5) / 2, (1.5 - 3.0 + 0.5) / 2  # about the mean of each link, then of the links
     rest = (c - 1.0 + 1.0 + 2.0 + 1.5) / 5
     assert tried[8].effect == pytest.approx(a - rest)
-    low = [shift.chance for shift in verdicts._shifts(errors, {}, names)]
+    low = [chance for chance, _ in verdicts._shifts(errors, {}, names)]
     assert np.isnan(low).tolist() == [True, True, True, False, True]  # a small error accuses nobody
 
 

@@ -60,10 +60,8 @@ class Verdict:
 # --- campaign -------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, slots=True)
-class _Shift:
-    chance: float
-    verdict: Verdict
+# The chance of a shift that is no larger by accident, and what is said of it.
+_Shift = tuple[float, Verdict]
 
 
 def campaign_verdict(
@@ -91,12 +89,10 @@ def campaign_verdict(
     Each candidate splits the flights in two; its two-sample t test with pooled variance is that of the externally
     Studentised residual for one flight. The smallest chance counts times the number of candidates (Bonferroni).
     """
-    shifts = [shift for shift in _shifts(errors_db, offsets_db, order) if math.isfinite(shift.chance)]
-    best = min(shifts, key=lambda candidate: candidate.chance, default=None)
-    if best is None or best.chance * len(shifts) >= _FALSE_ALARMS:
-        return Verdict()
-    small = best.verdict.cause != "outlying error" and abs(best.verdict.effect) < LEAST_DB
-    return Verdict() if small else best.verdict
+    shifts = [shift for shift in _shifts(errors_db, offsets_db, order) if math.isfinite(shift[0])]
+    chance, best = min(shifts, key=lambda shift: shift[0], default=(1.0, Verdict()))
+    small = best.cause != "outlying error" and abs(best.effect) < LEAST_DB
+    return Verdict() if small or chance * len(shifts) >= _FALSE_ALARMS else best
 
 
 def _shifts(
@@ -107,7 +103,7 @@ def _shifts(
         low, high = np.exp(ends)
         ratio = Verdict(cause="outlying error", effect=math.exp(effect), interval=(low, high), where=names[i])
         # a flight that errs less than the others is no trouble
-        yield _Shift(chance if effect > 0.0 else math.nan, ratio)
+        yield (chance if effect > 0.0 else math.nan), ratio
     about: dict[str, list[float]] = {}
     for link, of in offsets_db.items():
         flown_here = [name for name in order if math.isfinite(of.get(name, math.nan))]
@@ -118,10 +114,10 @@ def _shifts(
         for k in range(2, len(flown_here) - 1):
             chance, effect, ends = _split(values, np.arange(len(flown_here)) >= k)
             where = f"{link} from {flown_here[k]}"
-            yield _Shift(chance, Verdict(cause="gain step", effect=effect, interval=ends, where=where))
+            yield chance, Verdict(cause="gain step", effect=effect, interval=ends, where=where)
     flown = [name for name in order if name in about]
     for i, chance, effect, ends in _each_alone(np.array([np.mean(about[name]) for name in flown])):
-        yield _Shift(chance, Verdict(cause="outlying offset", effect=effect, interval=ends, where=flown[i]))
+        yield chance, Verdict(cause="outlying offset", effect=effect, interval=ends, where=flown[i])
 
 
 def _each_alone(values: FloatArray) -> Iterator[tuple[int, float, float, Interval]]:

@@ -109,11 +109,6 @@ class Correction:
         """True if a residual field is added."""
         return self.title != OFF
 
-    def rows_of(self, samples: LinkSamples, flight: str | None = None) -> Rows:
-        """Samples as targets; of a flight that is not known they are a new one."""
-        code = self.flights.index(flight) if flight in self.flights else NEW_FLIGHT
-        return Rows.of(samples, code)
-
     def predict(
         self, samples: LinkSamples, flight: str | None = None, *, own_mean: bool = False
     ) -> tuple[FloatArray, FloatArray]:
@@ -148,7 +143,7 @@ class Correction:
         if channel is None:
             raise InputError(f"no flight has {samples.antenna}", expected="one of " + ", ".join(self.channels))
         gains, gain_sds = (np.stack(part) for part in zip(*map(self.predictor, each), strict=True))
-        targets = self.rows_of(samples, flight)
+        targets = Rows.of(samples, self.flights.index(flight) if flight in self.flights else NEW_FLIGHT)
         if len(each) > 1:
             targets = dataclasses.replace(targets, direction=np.stack([s.at_uav for s in each], axis=1))
         if not self.on and flight not in self.flights and len(targets):

@@ -305,10 +305,6 @@ class Regions:
         density = (weights[0] * share) @ weights[1].T
         return cls(axes[0], axes[1], density / density.sum())
 
-    def holding(self, part: float) -> BoolArray:
-        """The smallest set of cells (columns, rows) that holds a part of the posterior."""
-        return self.likelier() < part
-
     def likelier(self) -> FloatArray:
         """Part of the posterior in all cells that are likelier than each (columns, rows)."""
         order = np.argsort(-self.share, axis=None)
@@ -321,7 +317,7 @@ class Regions:
         from scipy.ndimage import label
 
         # cells that touch at a corner are of one region
-        marks, count = label(self.holding(part), structure=np.ones((3, 3)))
+        marks, count = label(self.likelier() < part, structure=np.ones((3, 3)))
         out = []
         for number in range(1, count + 1):
             cells = np.argwhere(marks == number)

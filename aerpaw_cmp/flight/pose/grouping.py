@@ -39,7 +39,7 @@ class Flight:
     def complete(self) -> bool:
         """True if it holds something to compare, and positions to compare it at."""
         measured = self.measured
-        tracked = any(_has_track(file) for file in self.files)
+        tracked = any(_tracks(file) for file in self.files)
         return bool(measured) and (tracked or any("latitude_deg" in stream.frame for stream in measured))
 
 
@@ -58,7 +58,7 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     timed = [(file, span) for file in files if (span := _span_of(file)) is not None]
     groups: list[Flight] = []
     # tracks first, in the order of time: radio logs then find their flight
-    for file, span in sorted(timed, key=lambda entry: (not _has_track(entry[0]), entry[1][0])):
+    for file, span in sorted(timed, key=lambda entry: (not _tracks(entry[0]), entry[1][0])):
         place = _place(file)
         near = [flight for flight in groups if _meet(flight, span, place)]
         flight = max(near, key=lambda group: _shared(group.span, span), default=None)
@@ -66,7 +66,7 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
             flight = Flight(span=span, place=place)
             groups.append(flight)
         flight.files.append(file)
-        if _has_track(file) or not any(_has_track(member) for member in flight.files):
+        if _tracks(file) or not any(_tracks(member) for member in flight.files):
             assert flight.span is not None
             # a radio that was left on does not stretch a flight that has a track
             flight.span = (min(flight.span[0], span[0]), max(flight.span[1], span[1]))
@@ -98,10 +98,6 @@ def meet(first: Span, second: Span) -> bool:
 
 def _tracks(file: IngestedFile) -> list[Stream]:
     return [stream for stream in file.result.streams if stream.kind == "telemetry"]
-
-
-def _has_track(file: IngestedFile) -> bool:
-    return bool(_tracks(file))
 
 
 def _place(file: IngestedFile) -> tuple[float, float] | None:

@@ -41,7 +41,6 @@ def run_antenna_export(
     JobOutcome
     """
     inputs = [file, *([] if elevation is None else [elevation])]
-    bare = out.suffix == ".msi"  # the format begins with NAME: no line in front
     with OutputFile(out, own=is_sealed, inputs=inputs, force=force) as output:
         if variable is not None or file.suffix == ".mat":
             if elevation is not None:
@@ -52,5 +51,6 @@ def run_antenna_export(
         else:
             pattern = read_pattern_file(file, carrier_hz=carrier_hz)
         text = exported(pattern, file.stem, out, carrier_hz)
-        output.write(text.encode("utf-8") if bare else sealed(text))
+        # MSI begins with NAME: no line may stand in front
+        output.write(text.encode("utf-8") if out.suffix == ".msi" else sealed(text))
     return JobOutcome(folder=out.parent, files=(out,))

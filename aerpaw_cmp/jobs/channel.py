@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -77,9 +76,7 @@ def channel_parts(
     data: FlightData,
     chosen: ChannelOptions,
     stages: Stages | None = None,
-    *,
-    in_memory: bool = False,
-    room: int = sys.maxsize,
+    room: int | None = None,
 ) -> Iterator[Channel]:
     """The channel along a flight in parts that follow each other.
 
@@ -90,10 +87,8 @@ def channel_parts(
     chosen : ChannelOptions
     stages : Stages, optional
         Times "replay" and "paths".
-    in_memory : bool
-        One part alone.
-    room : int
-        Bytes that the parts may have together.
+    room : int, optional
+        Bytes that the parts may have together; None: one part alone, in memory.
 
     Yields
     ------
@@ -125,7 +120,7 @@ def channel_parts(
     size = _size(pairs, _PATHS, offsets)
     at_once = 1 << max(0, (_PART_BYTES * count // size).bit_length() - 1)
     further = " of disk"
-    if (drawn := settings.rt.engine != "image") or in_memory:  # Sionna draws its rays for all poses at once
+    if (drawn := settings.rt.engine != "image") or room is None:  # Sionna draws its rays for all poses at once
         at_once, room, size = count, MOST_BYTES, size + _PATH_BYTES * links * _PATHS
         further = ", or netcdf and csv alone" + (" with rt.engine: image" if drawn else "")
     _refuse(size, f"{counted(count, 'pose')}, {counted(len(towers), 'tower')}", room, further)
@@ -140,11 +135,9 @@ def channel_parts(
         with stages("paths"):
             table = replayed.path_table(names)
         size = _size(replayed.h.size, table.most, offsets)
-        _refuse(
-            size, f"{counted(len(part.poses), 'pose')}, {counted(table.most, 'path')} of a link", MOST_BYTES, further
-        )
-        if job is not None:
-            stages.progress("channel", min(1.0, (start + at_once) / count))
+        what = f"{counted(len(part.poses), 'pose')}, {counted(table.most, 'path')} of a link"
+        _refuse(size, what, MOST_BYTES, further)
+        stages.progress("channel", min(1.0, (start + at_once) / count))
         yield Channel(
             along=part,
             link=name,
@@ -269,16 +262,14 @@ def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> C
     units = ", ".join(dict.fromkeys(source.unit for source in sources.values()))
 
     def levels(poses: Poses) -> dict[str, Any]:
-        """Level and standard deviation (poses, towers), and how many are guesses."""
+        """Level and standard deviation (poses, towers)."""
         level, sd = np.full((2, len(poses), len(towers)), np.nan)
-        heading, guesses = bearing_deg(poses.rotation[:, :, 0]), 0
+        heading = bearing_deg(poses.rotation[:, :, 0])
         for tower, source in sources.items():
-            gain, slow, guess = memory.levels([source.targets(poses.position_m, heading)], len(poses))
+            gain, slow, _ = memory.levels([source.targets(poses.position_m, heading)], len(poses))
             level[:, towers.index(tower)] = gain + source.free_space_db(poses.position_m)
             sd[:, towers.index(tower)] = memory.fading(source.antenna).total_db(slow)
-            guesses += int(guess.sum())
-        known = {"level_db": level, "level_sd_db": sd, "level_unit": units}
-        return known | {"trained_on": trained_on, "guesses": guesses}
+        return {"level_db": level, "level_sd_db": sd, "level_unit": units, "trained_on": trained_on}
 
     return levels
 
@@ -303,17 +294,14 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
     root, route = options.logs_root or flight.parent, chosen.route
     if route is None and settings.flight.plan and not all((root / log.path).exists() for log in settings.logs):
         route = flight  # not flown yet: its plan
-    read = settings if route is None else settings.model_copy(update={"logs": []})
-    inputs = [*inputs_of_flight(read, flight, root), *([] if route is None else target_files(route, None, root))]
+    inputs = [*inputs_of_flight(settings, flight, root), *([] if route is None else target_files(route, None, root))]
     folder = options.out or Path("reports") / f"channel-{settings.flight.name}"
     with OutputFolder(folder, job="channel", inputs=inputs, force=options.force) as output:
         with stages("read"):
             data = (load_data if route is None else unread)(settings, flight.parent, options.logs_root)
-        in_memory = not STREAMED.issuperset(formats)
         with output.filling() as place:
-            parts = channel_parts(
-                data, replace(chosen, route=route), stages, in_memory=in_memory, room=shutil.disk_usage(place).free
-            )
+            room = shutil.disk_usage(place).free if STREAMED.issuperset(formats) else None
+            parts = channel_parts(data, replace(chosen, route=route), stages, room)
             written, metrics = write_channel(parts, place, formats, stages)
         files = output.placed(written)
         # of a route: its towers stand, and what is said of nodes that move along a track is not of it

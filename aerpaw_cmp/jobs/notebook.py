@@ -248,7 +248,7 @@ class Flight:
         from ..report.exports.channel import channel_dataset
         from .channel import ChannelOptions, channel_parts
 
-        (channel,) = channel_parts(self.data, ChannelOptions(**options), in_memory=True)
+        (channel,) = channel_parts(self.data, ChannelOptions(**options))
         return channel_dataset(channel).to_xarray()
 
     def plot(self, axes: Any = None) -> Any:

@@ -283,13 +283,11 @@ def frequency_responses(table: PathTable, ends: Ends, offsets_hz: ArrayLike) -> 
     """
     offsets = unmasked(offsets_hz)
     check_band(float(np.ptp(offsets)) if len(offsets) else 0.0, ends.link.carrier_hz)
-    links = len(ends.poses), len(ends.link.tower_arrays)
-    h = np.zeros((*links, *table.gain.shape[1:], len(offsets)), dtype=np.complex128)
-    # a loop over the paths of a link: an array of all poses, paths and frequencies may not fit
-    for number in range(table.most):  # one path a link: no row is added to twice
-        rows = np.flatnonzero(table.number == number)
-        phase = np.exp(-2j * np.pi * table.delay_s[rows][:, None] * offsets)
-        h[table.pose[rows], table.tower[rows]] += table.gain[rows][..., None] * phase[:, None, None, :]
+    gains, delays = (table.by_link(values, ends, 0.0) for values in (table.gain, table.delay_s))
+    h = np.zeros((*gains.shape[1:], len(offsets)), dtype=np.complex128)
+    # a path of each link at a time: the product over all paths would take memory for each of them
+    for gain, delay in zip(gains, delays, strict=True):
+        h += gain[..., None] * np.exp(-2j * np.pi * delay[..., None] * offsets)[:, :, None, None]
     return h
 
 

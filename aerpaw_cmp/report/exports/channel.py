@@ -14,7 +14,6 @@ import numpy as np
 import pandas as pd
 
 from ...common.cf import Dataset, GrowingNetcdf, file_attributes
-from ...common.counting import counted
 from ...common.jsonable import named
 from ...common.provenance import KEY
 from ...common.stages import Stages
@@ -85,8 +84,6 @@ class Channel:
     level_unit : str
     trained_on : tuple of str
         SHA-256 of the logs that taught the level.
-    guesses : int
-        Levels where no flight taught the antennas.
     offsets_hz : (subcarriers,), optional
         Of the frequency response.
     """
@@ -100,7 +97,6 @@ class Channel:
     level_sd_db: FloatArray | None = None
     level_unit: str = ""
     trained_on: tuple[str, ...] = ()
-    guesses: int = 0
     offsets_hz: FloatArray | None = None
 
     @property
@@ -117,10 +113,7 @@ class Channel:
     @property
     def warnings(self) -> list[str]:
         """Sentences on what the numbers lack."""
-        words = (
-            f"Where no flight taught the antennas: {counted(self.guesses, 'level')}, of a larger standard deviation."
-        )
-        return [*self.along.remarks, *([words] if self.guesses else []), *self.replay.left_out]
+        return [*self.along.remarks, *self.replay.left_out]
 
     def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
         """Values per path (paths, ...) as (most paths of a link, poses, towers, ...); None of None."""
@@ -171,7 +164,7 @@ def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[
         meaning = f"{angle} towards the path at its {end}: {_ARRAY if array else _SITE}"
         yield name, of(values), _PATH, "degree", meaning
     yield "level_db", channel.level_db, _LINK, "1", "level that the receiver would log, of antennas that flights taught"
-    yield "level_sd_db", sd, _LINK, "1", "standard deviation of level_db [dB]"
+    yield "level_sd_db", sd, _LINK, "1", "standard deviation of level_db [dB], larger where no flight taught"
     yield "cfr", cfr, (*ports, "subcarrier"), "1", "channel matrix at the subcarriers"
     yield "subcarrier_hz", offsets, ("subcarrier",), "Hz", "offset of a subcarrier from the carrier"
     yield "time", channel.along.time_s, ("pose",), "s", "since the start of the route"
@@ -227,14 +220,13 @@ def write_channel(
     dict
         What was written, for ``--json``.
     """
-    poses, paths, guesses = 0, 0, 0
-    omitted: list[Any] = []
+    poses, paths, omitted = 0, 0, list[Any]()
     with ExitStack() as stack:
         writers = [_WRITERS.get(name) or stack.enter_context(_netcdf(folder)) for name in formats]
         for channel in parts:
             poses, paths = poses + len(channel.along.time_s), paths + len(channel.table.pose)
-            guesses, omitted = guesses + channel.guesses, added_up([*omitted, *channel.replay.omitted])
-            latest = replace(channel, guesses=guesses, replay=replace(channel.replay, omitted=omitted))
+            omitted = added_up([*omitted, *channel.replay.omitted])
+            latest = replace(channel, replay=replace(channel.replay, omitted=omitted))
             with stages("write"):
                 files = [write(latest, folder) for write in writers]
     return files, {

@@ -42,13 +42,9 @@ def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: floa
     lines = tuple(line.lstrip("# ") for line in notes.splitlines())
     if target.suffix == ".msi":
         frequency = pattern.frequency_hz or carrier_hz
-        if not frequency:
-            raise UsageError("the pattern has no frequency", expected="--carrier HZ", path=target)
-        # the antenna of another band is another antenna
-        if abs((carrier_hz or frequency) / frequency - 1.0) > BAND:
-            raise UsageError(
-                f"a pattern of {frequency / 1e9:g} GHz", expected="--carrier within 2 % of it", path=target
-            )
+        if not frequency or abs((carrier_hz or frequency) / frequency - 1.0) > BAND:
+            found = f"the pattern has {f'{frequency / 1e9:g} GHz' if frequency else 'no frequency'}"
+            raise UsageError(found, expected="--carrier HZ, within 2 % of the pattern's own", path=target)
         return planning_cuts(pattern, name, frequency, lines)
     theta, phi, _ = sphere_grid(_STEP_DEG)
     if target.suffix == ".csv":

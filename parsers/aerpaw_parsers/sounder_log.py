@@ -74,8 +74,7 @@ class _Samples:
         return joined.take(np.argsort(joined.line, kind="stable"))
 
 
-_COLUMNS = ("line", "wall", "offset", "value")
-_KINDS = (np.int64, np.int64, np.int64, np.float64)
+_COLUMNS = {"line": np.int64, "wall": np.int64, "offset": np.int64, "value": np.float64}
 _NONE = np.zeros(0, dtype=np.int64)
 
 
@@ -122,13 +121,19 @@ def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
 
 @dataclass
 class _Piece:
-    """Content of a piece of a log: samples; ``*`` and foot lines (value NaN) with their texts; the account."""
+    """Content of a piece or section of a log: samples; ``*`` and foot lines (value NaN) with their texts; the account.
+
+    Of a section the first ``known`` samples are also the last of the one before, and ``lines`` are all so far; ``torn``
+    is the 0-based line without an end.
+    """
 
     samples: _Samples
     marks: _Samples
     texts: dict[int, str]
     lines: int
     blank: int
+    known: int = 0
+    torn: int = -1
 
 
 def _piece(lines: _lines.Lines, rejects: _lines.Rejects) -> _Piece:
@@ -276,27 +281,11 @@ def read_sections(pieces: Iterable[bytes], options: ReadOptions, most: float = n
     )  # fmt: skip
 
 
-@dataclass
-class _Section:
-    """Samples of some lines, the first ``known`` of them also the last of the section before; marks between them.
-
-    ``lines`` are all so far, ``texts`` those of marks; ``torn`` is the 0-based line without an end (-1: none).
-    """
-
-    samples: _Samples
-    marks: _Samples
-    texts: dict[int, str]
-    known: int
-    lines: int
-    blank: int
-    torn: int
-
-
-def _sections(pieces: Iterable[bytes], rejects: _lines.Rejects, most: float) -> Iterator[_Section]:
+def _sections(pieces: Iterable[bytes], rejects: _lines.Rejects, most: float) -> Iterator[_Piece]:
     """Sections that end with a sample: its offset, time and value are all that the next one needs of it."""
     marks, texts = _Samples.none(), dict[int, str]()
     known, before, blank, unterminated = 0, 0, 0, False
-    columns = [Column(kind) for kind in _KINDS]
+    columns = [Column(kind) for kind in _COLUMNS.values()]
     for data in pieces:
         lines = _lines.split(data)
         rejects.before = before
@@ -311,18 +300,17 @@ def _sections(pieces: Iterable[bytes], rejects: _lines.Rejects, most: float) -> 
         if len(columns[0]) > most:
             samples = _Samples(*(column.array() for column in columns))
             last, inside = samples.take(np.array([-1])), marks.line < samples.line[-1]
-            between = marks.take(inside)
-            yield _Section(samples=samples, marks=between, texts=texts, known=known, lines=before, blank=blank, torn=-1)
-            columns = [Column(kind, getattr(last, name)) for kind, name in zip(_KINDS, _COLUMNS, strict=True)]
+            yield _Piece(samples, marks.take(inside), texts, before, blank, known=known)
+            columns = [Column(kind, getattr(last, name)) for name, kind in _COLUMNS.items()]
             known, blank, marks = 1, 0, marks.take(~inside)
     samples = _Samples(*(column.array() for column in columns))
     del columns  # logs may have 1 GB: what is taken out of the samples goes at once
     torn = before - 1 if unterminated else -1
-    yield _Section(samples=samples, marks=marks, texts=texts, known=known, lines=before, blank=blank, torn=torn)
+    yield _Piece(samples, marks, texts, before, blank, known=known, torn=torn)
 
 
 def _stream(
-    section: _Section, repeats: _Samples, options: ReadOptions, tally: Counter[str], notes: list[str]
+    section: _Piece, repeats: _Samples, options: ReadOptions, tally: Counter[str], notes: list[str]
 ) -> Stream | None:
     """The stream with its flags, ``None`` without samples; ``notes`` receives what its times are warned of."""
     samples = section.samples

@@ -198,8 +198,13 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("MCS", "kpi", (r"\bmcs\b",), can_be=(0.0, 100.0)),
     Quantity("BLER", "kpi", (r"\bbler\b",), "%"),
 )  # fmt: skip
-# Patterns as one expression per row: most names are none of them.
-_COMPILED = tuple((re.compile("|".join(f"(?:{pattern})" for pattern in row.names)), row) for row in QUANTITIES)
+
+
+@cache
+def _forms() -> tuple[tuple[re.Pattern[str], Quantity], ...]:
+    """Patterns as one expression per row, for most names are none of them; a binary log asks about no name."""
+    return tuple((re.compile("|".join(f"(?:{pattern})" for pattern in row.names)), row) for row in QUANTITIES)
+
 
 _NEIGHBOUR = re.compile(
     r"\b(detected|neigh(bou?rs?)?\d{0,2}|ngh?br?s?\d{0,2}|nbr?\d{0,2}|nc(ell)? ?\d{0,2}|n ?\d{1,2}|nrx|nlte\w*"
@@ -299,7 +304,7 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     if texts[0] == plain(name):
         # 'Time (+02:00)'; 'heightAboveGround'
         texts += [bare, plain(in_brackets(name)[2]), plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))]
-    hits = ((row, text) for text in dict.fromkeys(texts) for form, row in _COMPILED if form.search(text))
+    hits = ((row, text) for text in dict.fromkeys(texts) for form, row in _forms() if form.search(text))
     row, text = next(hits, (None, ""))
     if row is None or row.role == "other":
         return None

@@ -10,8 +10,6 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from shapely.geometry import Polygon
 
 from ..common.counting import counted
@@ -211,6 +209,9 @@ def _encloses(corners_m: FloatArray, place_m: FloatArray) -> bool:
 
 def _media(scene: TriangleScene, number: int) -> Iterator[Forest]:
     """Connected parts of a mesh of vegetation as media."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
     corners = scene.vertices_m[scene.triangles[scene.shape == number]]
     point = np.unique(corners.reshape(-1, 3).round(4), axis=0, return_inverse=True)[1].reshape(-1, 3)
     size = int(point.max()) + 1

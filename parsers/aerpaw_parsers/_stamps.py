@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from datetime import datetime
+from functools import cache
 from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
@@ -37,14 +38,21 @@ _DATES = (
     rf"(?P<day>\d{{1,2}})[-/._ ]?{_WORD}[-/._, ]{{0,2}}(?P<year>\d{{4}}|\d\d)",
     rf"{_WORD} (?P<day>\d{{1,2}})(?:st|nd|rd|th)?,? (?P<year>\d{{4}})",
 )
-_FORMS = (
-    *(re.compile(_DAY + date + rf"(?:{_GAP}{_CLOCK})?{_ZONE}") for date in _DATES),
-    re.compile(_DAY + rf"{_WORD} {{1,2}}(?P<day>\d{{1,2}}) {_CLOCK}{_ZONE} (?P<year>\d{{4}})"),
-    re.compile(r"(?P<year>20\d\d)(?P<month>\d\d)(?P<day>\d\d)[T_ -]?(?P<hour>\d\d):?(?P<minute>\d\d):?(?P<second>\d\d)"
-               r"(?:\.?(?P<fraction>\d{1,9}))?" + _ZONE),
-    *(re.compile(rf"{_CLOCK}{_ZONE}[ ,]{{1,2}}" + date) for date in _DATES),
-)  # fmt: skip
-_DIGITS = _FORMS[len(_DATES) + 1]
+_DIGITS = re.compile(
+    r"(?P<year>20\d\d)(?P<month>\d\d)(?P<day>\d\d)[T_ -]?(?P<hour>\d\d):?(?P<minute>\d\d):?(?P<second>\d\d)"
+    r"(?:\.?(?P<fraction>\d{1,9}))?" + _ZONE
+)
+
+
+@cache
+def _forms() -> tuple[re.Pattern[str], ...]:
+    """All forms of a date and its clock, compiled for the first log that has such times."""
+    before = (re.compile(_DAY + date + rf"(?:{_GAP}{_CLOCK})?{_ZONE}") for date in _DATES)
+    within = re.compile(_DAY + rf"{_WORD} {{1,2}}(?P<day>\d{{1,2}}) {_CLOCK}{_ZONE} (?P<year>\d{{4}})")
+    behind = (re.compile(rf"{_CLOCK}{_ZONE}[ ,]{{1,2}}" + date) for date in _DATES)
+    return (*before, within, _DIGITS, *behind)
+
+
 _OF_DAY = re.compile(r"T?" + _CLOCK.replace("[:.h-]", ":", 1).replace("[:.m-](?P<second>", ":(?P<second>") + _ZONE)
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")
 # An epoch that a spreadsheet shortened, ``1.74093E+12``: fewer than nine digits behind the first leave out seconds.
@@ -161,7 +169,7 @@ def _year(digits: str) -> str:
 
 
 def _match(text: str) -> re.Match[str] | None:
-    matches = (form.fullmatch(text) for form in _FORMS)
+    matches = (form.fullmatch(text) for form in _forms())
     known = (match for match in matches if match and (match.groupdict().get("word") is None or _month(match["word"])))
     return next(known, None)
 

@@ -6,6 +6,7 @@ from collections.abc import Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -13,7 +14,6 @@ from ...common.errors import InputError, UsageError
 from ...common.units import FloatArray
 from ...compare.gains.direction_gain import LinkSamples
 from ...compare.gains.spread import NO_SPREAD, Spread
-from ...compare.learning.locate import LevelModel
 from ...site.antenna import learned
 from ...site.antenna.named import check_logs
 from ...site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
@@ -22,7 +22,9 @@ from ..gains.learned_gain import pair_and_sd_db, sphere_angles
 from ..gains.memory import with_learned
 from ..marks import among
 from ..settings import FlightFile
-from .node import Taught
+
+if TYPE_CHECKING:
+    from .node import Taught
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -192,6 +194,9 @@ def taught(site: str | Path, series: tuple[str, str], log: tuple[str, str]) -> d
     log : (SHA-256, mark)
         Of the log, which must not have been learned from.
     """
+    from ...compare.learning.locate import LevelModel  # a draft's alone, and a report loads this module
+    from .node import Taught
+
     with suppress(InputError, UsageError):
         fit = [
             known

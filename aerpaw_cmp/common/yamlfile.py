@@ -85,10 +85,10 @@ def nearest_zone(name: str) -> str | None:
 
     Examples
     --------
-    >>> nearest_zone("America/NewYork"), nearest_zone("new york")
-    ('America/New_York', 'America/New_York')
+    >>> nearest_zone("America/NewYork"), nearest_zone("new york"), nearest_zone("EDT")
+    ('America/New_York', 'America/New_York', None)
     """
-    zones = available_timezones()
+    zones = available_timezones() if len(name) > 4 else ()  # abbreviations are like too many
     if "/" in name:
         return nearest(name, zones)
     cities = {zone.rpartition("/")[2]: zone for zone in sorted(zones)}

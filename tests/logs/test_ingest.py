@@ -85,6 +85,8 @@ def test_the_account_for_people_names_lines_and_files(tmp_path: Path) -> None:
     row = dict(zip(ACCOUNT, first, strict=True))
     assert (row["lines"], row["accepted"], row["rejected"], row["blank"]) == ("3", "2", "1", "0")
     assert (row["streams (rows)"], row["start UTC"], row["s"]) == ("telemetry: vehicle 2", "2025-03-02 15:00:00", "1.0")
+    account["files"][0]["streams"][0]["rate_hz"] = 5.9e-5
+    assert account_rows(account)[1][0][7] == "1 in 4.7 h"
     notes = account_notes(account)
     assert any("a/vehicle.txt:2: rejected: " in note and "torn," in note for note in notes)
     assert any("notes.md: skipped: " in note for note in notes)

@@ -8,7 +8,7 @@ from matplotlib import colormaps
 
 from aerpaw_cmp.report.content.maps import JOINT
 from aerpaw_cmp.report.pages import maps as maps_html
-from tests.report.browsing import PageLaws, choose, frame, needs_browser, open_page, papers, start
+from tests.report.browsing import PageLaws, choose, frame, needs_browser, open_page, papers, set_scheme, start
 
 pytest.importorskip("selenium", reason="selenium is not installed")
 pytestmark = needs_browser
@@ -139,19 +139,23 @@ def test_the_pointer_reads_value_and_position(driver, data):
     assert f"110 m: {at:.1f} dBm".replace("-", "−") in text
 
 
-def test_the_picture_lies_where_the_values_do(driver, data):
-    """The colour under a cell's middle is that of its value, north up and east right."""
+@pytest.mark.parametrize(("scheme", "begun"), [("dark", 0.25), ("light", 0.0)])
+def test_the_picture_lies_where_the_values_do(driver, data, scheme, begun):
+    """The colour under a cell's middle is that of its value, north up and east right; none is lost in the night."""
+    set_scheme(driver, scheme)
     pick(driver, tower="LW4", antennas="SISO", foliage="none", height="30 m")
     colours = driver.execute_script(
         "const p = mapExplorer.project(), c = document.getElementById('map'), pen = c.getContext('2d'), k = c.width / c.clientWidth; "
         "return arguments[0].map(([e, n]) => Array.from(pen.getImageData(Math.round(p.x(e) * k), Math.round(p.y(n) * k), 1, 1).data).slice(0, 3))",
         [[-405.0, -630.0], [405.0, -630.0], [-405.0, 630.0], [405.0, 930.0]],
     )  # fmt: skip
+    set_scheme(driver)
     ends = driver.execute_script("return mapExplorer.limits()")
     layer = of(data, "LW4", "SISO", "none", 30.0)
     for (east, north), colour in zip([(-405, -630), (405, -630), (-405, 630), (405, 930)], colours, strict=True):
         value = layer.rss_dbm[np.abs(data.north_m - north).argmin(), np.abs(data.east_m - east).argmin()]
-        place = int(np.clip((value - ends[0]) / (ends[1] - ends[0]), 0, 0.9999) * 128)
+        share = begun + (1.0 - begun) * np.clip((value - ends[0]) / (ends[1] - ends[0]), 0, 0.9999)
+        place = int(share * 128)
         expected = 255 * np.array(colormaps["viridis"](place / 127)[:3])
         assert np.abs(np.array(colour) - expected).max() <= 8
 

@@ -126,8 +126,9 @@ def test_round_trip_through_site_yaml(tmp_path: Path) -> None:
 
 def test_geofence_and_untagged_areas(tmp_path: Path) -> None:
     plain = geojson(tmp_path / "plain.json", ([square(0, 0)], {}))
-    with pytest.raises(InputError, match=r"no building, forest, geofence or tree found in plain.json"):
+    with pytest.raises(InputError, match=r"no building, forest, geofence or tree found in plain.json") as raised:
         import_footprints([plain], FRAME)
+    assert str(raised.value).count("plain.json") == 1
     assert len(import_footprints([plain], FRAME, untagged="forest").forests) == 1
     fence = tmp_path / "fence.kml"
     fence.write_text(kml(fence).read_text().replace("<ExtendedData>", "<x>").replace("</ExtendedData>", "</x>"))

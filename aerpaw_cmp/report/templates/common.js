@@ -140,10 +140,14 @@ const common = (() => {
     plasma: "0d088713078919068c1d068e2206902605912a05932e059531059735049838049a3c049b3f049c43039e46039f4903a04c02a15002a25302a35601a45901a55c01a66001a66300a76600a76900a86c00a86f00a87201a87501a87801a87b02a87e03a88104a78405a78707a68a09a58d0ba58f0da4920fa39511a19814a09a169f9d189da01a9ca21d9aa51f99a72197aa2395ac2694ae2892b12a90b32c8eb52f8cb7318aba3388bc3587be3885c03a83c23c81c43e7fc6417dc8437bca457acc4977ce4b75d04d73d24f71d45270d5546ed7566cd9586ada5b69dc5d67de5f65df6263e16462e26660e4695ee56b5de76e5be87059e97257eb7556ec7754ed7a52ef7c51f07f4ff1814df2844bf3874af48948f58c46f68f44f79143f89441f9973ff99a3efa9c3cfb9f3afba238fca537fca835fdab33fdae32fdb130fdb42ffeb72dfeba2cfebd2afec029fdc328fdc627fdca26fccd25fcd025fbd324fbd724fada24f9dd25f8e125f7e425f6e826f5eb27f3ee27f2f227f1f525f0f921",
     RdBu_r: "05306107346709386d0c3d730e417910457e124984144e8a1752901956961b5a9c1d5fa21f63a82267ac246aae276eb02a71b22c75b42f79b5327cb73480b93783bb3a87bd3c8abe3f8ec04291c24695c44c99c6529dc859a1ca5fa5cd65a9cf6bacd171b0d378b4d57eb8d784bcd98ac0db90c4dd96c7df9bc9e0a0cce2a5cee3a9d1e5aed3e6b3d6e8b8d8e9bddbeac2ddecc7e0edcce2efd1e5f0d4e6f1d7e8f1dae9f2ddebf2e0ecf3e3edf3e6eff4e9f0f4ecf2f5eff3f5f2f5f6f5f6f7f7f5f4f8f3f0f8f1edf9efe9f9ede5faeae1fae8defbe6dafbe4d6fce2d2fcdfcffdddcbfddbc7fcd7c2fcd3bcfbceb7facab1f9c6acf9c2a7f8bda1f7b99cf7b596f6b191f5ac8bf5a886f3a481f19e7def9979ec9374ea8e70e8896ce58368e37e64e17860de735cdc6e57da6853d7634fd55d4cd25849cf5246cc4c44c94741c6413ec43b3cc13639be3036bb2a34b82531b61f2eb3192cae172aa81529a213289c1127960f27900d268a0b258409247f08237906227304216d022067001f",
   };
+  // at night a ramp begins where it can be told from the page: a quarter of the way up, its order as it is
+  const night = matchMedia("(prefers-color-scheme: dark)"), theme = document.documentElement.dataset;
+  const lifted = t => (theme.theme ? theme.theme === "dark" : night.matches) ? 0.25 + 0.75 * t : t;
   function ramp(name) {
     const hex = RAMPS[name], n = hex.length / 6, parts = [];
     for (let i = 0; i < n; i++) parts.push([0, 2, 4].map(k => parseInt(hex.slice(i * 6 + k, i * 6 + k + 2), 16)));
-    return t => parts[Math.max(0, Math.min(n - 1, Math.floor(t * n)))];
+    const begun = name === "RdBu_r" ? t => t : lifted;
+    return t => parts[Math.max(0, Math.min(n - 1, Math.floor(begun(t) * n)))];
   }
 
   function quantile(sorted, share) {
@@ -159,7 +163,7 @@ const common = (() => {
       const d = 2 * x - 1, k = Math.abs(d), to = d < 0 ? [33, 102, 172] : [178, 24, 43], mid = [208, 208, 198];
       return `rgb(${to.map((t, i) => Math.round(mid[i] + (t - mid[i]) * Math.sqrt(k))).join(",")})`;
     }
-    const stops = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], i = Math.min(3, Math.floor(x * 4)), f = x * 4 - i;
+    const stops = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], y = lifted(x), i = Math.min(3, Math.floor(y * 4)), f = y * 4 - i;
     return `rgb(${stops[i].map((a, j) => Math.round(a + (stops[i + 1][j] - a) * f)).join(",")})`;
   }
 
@@ -253,7 +257,7 @@ const common = (() => {
   function whenResized(element, job) {
     let width = 0;
     new ResizeObserver(() => { if (element.clientWidth !== width) { width = element.clientWidth; later(job); } }).observe(element);
-    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => later(job));
+    night.addEventListener("change", () => later(job));
   }
 
   // charts of the sections, from marks over two axes; ``get`` gives the array of a number

@@ -364,7 +364,7 @@
     else if (e.key === "+" || e.key === "=") zoom(1.25);
     else if (e.key === "-") zoom(0.8);
   });
-  whenResized(root, () => { drawMap(); drawLegend(); drawProfile(); drawHistogram(); });
+  whenResized(root, () => { image = null; drawMap(); drawLegend(); drawProfile(); drawHistogram(); });
 
   common.plots(data.plots, i => i === undefined ? null : arrays[i]);
   document.documentElement.classList.add("live");

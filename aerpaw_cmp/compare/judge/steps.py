@@ -15,7 +15,8 @@ from ..statistics.intervals import Interval
 # Nights over which a step is looked for, and its chance on a night without one, at all nodes of a season together: the
 # last night, and the last seven, whose mean shows what one night cannot. Nominal: the tails of a robust fit with links
 # missing are longer than Student's, and the interval of a mean knows roughly how alike nights in a row are
-# (``python -m tests.compare.test_steps 500``: one false step in a hundred nights).
+# (``python -m tests.compare.test_steps 500``: one false step in a hundred nights; as many where nights in a row
+# correlate by .7, half at .5).
 _CHANCES = {1: 0.0025, 7: 0.0005}
 
 # Fewer nights than this tell no standard deviation that a step could be judged by.
@@ -141,7 +142,10 @@ class _Stretch:
         square, freedom = self.pooled()
         if freedom < _FEWEST_NIGHTS - 1:
             return 0.0, np.inf, 1.0
-        share = (self.alike() if len(nights) > 1 else 1.0) / len(nights) + 1.0 / len(self.values)
+        alike = self.alike()
+        # the level before is a mean of nights in a row, too; one or two tell no memory, and rain must be able to end
+        level = (alike if len(self.values) > 2 else 1.0) / len(self.values)
+        share = (alike if len(nights) > 1 else 1.0) / len(nights) + level
         error = float(np.sqrt(max(square, 1e-12) / freedom * share))
         step = float(np.mean(nights) - np.mean(self.values))
         return step, float(stdtrit(freedom, 0.975)) * error, 2.0 * float(stdtr(freedom, -abs(step) / error))
@@ -154,7 +158,7 @@ class _Stretch:
         if freedom < _FEWEST_NIGHTS - 1:
             return float("nan")
         reach = -float(stdtrit(freedom, chance / 2.0)) - float(stdtrit(freedom, 0.1))
-        return reach * float(np.sqrt(square / freedom * (1.0 + 1.0 / len(self.values))))
+        return reach * float(np.sqrt(square / freedom * (1.0 + self.alike() / len(self.values))))
 
 
 def stepped(node: str, night: Sequence[str], offset_db: FloatArray, nodes: int) -> NodeOffset:

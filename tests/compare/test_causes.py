@@ -106,6 +106,14 @@ def test_each_trouble_comes_back_with_its_number_and_a_step(name: str) -> None:
         assert "00:02:01 UTC" in cause.sentence
 
 
+@pytest.mark.parametrize("step_db", [0.05, 6.0])
+def test_an_error_that_no_page_shows_has_no_cause(step_db: float) -> None:
+    """Exact levels but for a step of 0.05 dB: as sure as one of 6 dB, and nobody need do anything about it."""
+    sound = _sound()
+    stepped = replace(sound, measured_db=sound.predicted_db + MEASURED_DB + step_db * (sound.time_s > 120.0))
+    assert _named(stepped) == ("gain step" if step_db > 1.0 else NONE)
+
+
 def test_a_loss_that_rests_on_undetected_samples_is_none() -> None:
     """What looks like an obstacle is the level that a receiver writes where it detects nothing."""
     sound = _sound()

@@ -40,6 +40,8 @@ MOST_CAUSE_WORDS = 28
 # A trouble that takes less than this share off the RMSE is no cause of the error, unless it gains so much a channel:
 # a floor where the flight fades leaves the error of all that is above it.
 _LEAST_SHARE, _CERTAIN = 0.1, 30.0
+# The sentence states the error without a cause and with it: they must differ in print, however certain the cause.
+_SHOWN_DB = 0.1
 # Learned antennas miss some decibels of each flight by themselves: less is no trouble of this one.
 _OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
 # Half of the 95 % point of chi-squared with one degree of freedom.
@@ -258,7 +260,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         certain, least_share = lead[name] >= _CERTAIN * len(channels), _LEAST_SHARE
         if name in _OF_ANTENNA and any(table[_SOUND].evidence.antenna == "learned" for table in shown):
             certain, least_share = False, _LEARNED_SHARE
-        if alone <= 1.0 and (share <= 1.0 - least_share or certain):
+        fall_db = (1.0 - alone) * _rmse_db([table[_SOUND] for table in shown])
+        if fall_db >= _SHOWN_DB and (share <= 1.0 - least_share or certain):
             named[name] = shown
     if not named:
         return None

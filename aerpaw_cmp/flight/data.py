@@ -407,6 +407,7 @@ def gather(
                 f"{log.path}: nothing is skipped by {', '.join(unknown)}: its streams are {', '.join(names)}"
             )
         warnings += _of_ratios(settings.link, log, file.result.streams)
+        warnings += _of_carriers(settings.link, log, streams)
     if rank and settings.link.rank.bandwidth_hz is None:
         warnings.append(
             "link.rank: no bandwidth_hz: ranks count as in coverage down to the thermal noise of 1 Hz (-174 dBm)"
@@ -485,6 +486,22 @@ def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]
         f"'noise_figure_db' of link.rss make an SNR absolute; 'skip: [{', '.join(blind)}]' beside the path leaves "
         "it out)"
     ]
+
+
+def _of_carriers(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
+    """Remarks on levels of a frequency that is not the one at which their link is replayed."""
+    carriers = [
+        (s.name, float(s.attributes["frequency_hz"]), links.of(_channel_of(log, s)).carrier_hz)
+        for s in streams if s.kind == "rss" and isinstance(s.attributes.get("frequency_hz"), float)
+    ]  # fmt: skip
+    return [
+        f"{log.path}: {name!r} was measured at {log_hz / 1e6:g} MHz and is replayed at carrier_hz {hz / 1e6:g} MHz"
+        for name, log_hz, hz in carriers if abs(log_hz / hz - 1.0) > _CARRIER_SHARE
+    ]  # fmt: skip
+
+
+# Free space differs by 0.4 dB where carriers differ by so much.
+_CARRIER_SHARE = 0.05
 
 
 def _channel_of(log: LogSettings, stream: Stream) -> str:

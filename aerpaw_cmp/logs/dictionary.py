@@ -19,6 +19,7 @@ from ..common.units import BoolArray, FloatArray
 from .records import Kind
 
 # What Android, modems and autopilots write for "not available".
+# Ends of integer types, of 28 bits (a cell's number of LTE) and of MAVLink's 16 bits (heading, voltage); -999 by hand.
 UNAVAILABLE = (2147483647.0, -2147483648.0, 9223372036854775807.0, 268435455.0, 65535.0, -32768.0, -999.0, -9999.0)
 _ANY = (-np.inf, np.inf)
 
@@ -55,16 +56,12 @@ class Quantity:
     datum: str = ""
 
     @property
-    def bounded(self) -> bool:
-        """True of what tells by its values that a row does not fit its header."""
-        return self.role in ("position", "height", "cell", "rss") and self.can_be[1] < np.inf
-
-    @property
     def kind(self) -> Kind:
         """Kind of the stream that a level, rank or KPI gives."""
         return "rss" if self.role == "rss" else "rank" if self.role == "rank" else "kpi"
 
 
+# Where a row takes _UP[2:], a word stands in front and the mark of a word's beginning is left out.
 _UP = r"\b(alt|altitude|height|hgt|elevation|ele|hoehe|h he)"
 _ANGLE = (-360.0, 360.0)
 _SPEED = (-400.0, 400.0)
@@ -173,6 +170,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("power", "rss", (r"^link power$",), "dB re full scale"),
     Quantity("quality", "rss", (r"^link quality$",), "dB"),
     Quantity("SNR", "rss", (r"^link snr$",), "dB"),
+    # 'rank' alone may be that of any list: described() takes it where levels stand beside; 0 is no report
     Quantity("rank", "rank", (
         r"\b((pdsch|dl|nr|lte|[45]g|mimo|csi) rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b",
     ), none=(0.0,), can_be=(0.0, 16.0)),
@@ -188,9 +186,11 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("PCI", "cell", (
         r"\b(\w{0,5}pci\d{0,2}|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci|phy ?id)\b",
         r"\bpsc or pci\b",
+    # NR has 1008 identities (3GPP TS 38.211, 7.4.2.1), LTE 504
     ), none=(-1.0,), can_be=(0.0, 1007.0)),
     Quantity("ARFCN", "cell", (
         r"\b(nr ?|e ?|u ?)?arfcn\d{0,2}\b|\bchannel number\b|\bfreq(uency)? channel\b",
+    # the last NR-ARFCN (3GPP TS 38.104, table 5.4.2.1-1)
     ), none=(-1.0,), can_be=(0.0, 3_279_165.0)),
     Quantity("CQI", "kpi", (r"\bcqi\b",), none=(255.0,), can_be=(0.0, 100.0)),
     Quantity("path loss", "kpi", (r"\bpath ?loss\b",), "dB"),
@@ -255,11 +255,6 @@ class Meaning:
     rat: str = ""
     place: str = "serving"
     indirect: bool = False
-
-    @property
-    def neighbour(self) -> bool:
-        """True of a cell that does not serve."""
-        return self.place.startswith("n")
 
 
 def plain(name: str) -> str:
@@ -384,6 +379,7 @@ def angle_form(values: FloatArray, quantity: Quantity) -> str:
     # zeros are rows before the first fix
     known = np.abs(values[np.isfinite(values) & ~is_none(quantity, values) & (values != 0)])
     most = quantity.can_be[1]
+    # the median: a few damaged rows are no other unit
     if not len(known) or np.median(known) <= most:
         return ""
     if (known == np.round(known)).all() and np.median(known) > 1e5 and known.max() <= most * 1e7:
@@ -403,6 +399,7 @@ def _times(factor: float) -> Callable[[FloatArray], FloatArray]:
 
 def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
     def convert(values: FloatArray) -> FloatArray:
+        # no power has no level in dB, and a negative one is no power
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(values >= 0, 10 * np.log10(np.where(values > 0, values, np.nan) * per_unit), np.nan)
 

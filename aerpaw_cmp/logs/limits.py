@@ -171,6 +171,7 @@ class _Check:
         """Say where positions that can be would lie at a site of AERPAW, were they written otherwise."""
         if not {*PLACE[:2]} <= set(self.frame.columns):
             return
+        # the median: one receiver's jump is no other way of writing
         place = self.frame[[*PLACE[:2]]].median().to_numpy(dtype=np.float64)
         for how, other in (
             ("latitude and longitude exchanged", place[::-1]),
@@ -210,6 +211,7 @@ class _Check:
         if len(level) < _FEW_ALTERNATE:
             return
         step, back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in (1, 2))
+        # with the next record but one it is back: fading does not come back so closely
         if step > _APART_DB and back < _BACK_SHARE * step:
             self._said.append(
                 f"{self._what}: its levels alternate, {step:.0f} dB apart from record to record: two devices, SIMs "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -89,6 +88,7 @@ def streams(
     """
     rows_or_table = readings if isinstance(readings, pd.DataFrame) else [*readings]
     table = pd.DataFrame(rows_or_table, columns=list(Reading._fields))
+    # stable: of two readings of a row the second is the one flagged cell_twice
     table = table[np.isfinite(table["rsrp_dbm"].to_numpy(np.float64))].sort_values("row", kind="stable")
     table = table.assign(served=_serving(table), pci=table["pci"].where(table["pci"] >= 0, -1.0))
     per_cell: list[Stream] = []
@@ -99,33 +99,20 @@ def streams(
         for carrier in [*carriers, np.nan] if several else [*carriers, np.nan][:1]:
             mine = cell_rows["arfcn"].eq(carrier) | (cell_rows["arfcn"].isna() & np.isnan(carrier))
             part = cell_rows[mine] if several else cell_rows
-            cell = Cell(rat, identity, carrier, several=several, quantity=quantity)
-            per_cell += [_stream(rows, part, cell, source)] if len(part) else []
+            about: dict[str, Attribute | None] = {"quantity": quantity, "rat": rat or None}
+            about["pci"] = int(identity) if identity >= 0 else None
+            about["arfcn"] = int(carrier) if np.isfinite(carrier) else None
+            words = [rat, f"pci{about['pci']}" if identity >= 0 else "rsrp"]
+            words += [f"arfcn{about['arfcn']}"] if several and np.isfinite(carrier) else []
+            name = "_".join(word for word in words if word)
+            per_cell += [_stream(rows, part, name, {**about, "source": source})] if len(part) else []
     return per_cell
-
-
-@dataclass(frozen=True)
-class Cell:
-    """A cell: radio access, PCI (-1: unknown), carrier (NaN: unknown), if others share its PCI, what is measured."""
-
-    rat: str
-    pci: float
-    arfcn: float
-    several: bool
-    quantity: str
-
-    @property
-    def name(self) -> str:
-        """Name of its stream."""
-        parts = [self.rat, f"pci{int(self.pci)}" if self.pci >= 0 else "rsrp"]
-        if self.several and np.isfinite(self.arfcn):
-            parts.append(f"arfcn{int(self.arfcn)}")
-        return "_".join(part for part in parts if part)
 
 
 def _serving(table: pd.DataFrame) -> FloatArray:
     """1 where the reading is of the cell that serves, 0 where another does, NaN where nothing is known."""
     row, rats, serving = (table[name].to_numpy() for name in ("row", "rat", "serving"))
+    # NaN equals nothing: cells without a carrier are compared as -1
     cell = np.stack([table["pci"], table["arfcn"].fillna(-1.0)])
     served = np.full(len(table), np.nan)
     for rat in np.unique(rats[serving.astype(bool)]).tolist():
@@ -138,19 +125,19 @@ def _serving(table: pd.DataFrame) -> FloatArray:
     return served
 
 
-def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: Cell, source: str) -> Stream:
+def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str, Attribute | None]) -> Stream:
     """Readings of one cell, in the order of the log."""
     row, level = table["row"].to_numpy(), table["rsrp_dbm"].to_numpy(np.float64, copy=True)
     flag = rows.flag[row]
     outside = ~((level >= _RANGE_DBM[0]) & (level <= _RANGE_DBM[1]))
     if 2 * outside.sum() > len(level):
         rows.warnings.append(
-            f"{cell.name}: {outside.sum()} of {counted(len(level), 'level')} outside {_RANGE_DBM[0]:g} .. "
+            f"{cell}: {outside.sum()} of {counted(len(level), 'level')} outside {_RANGE_DBM[0]:g} .. "
             f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
             "read as out of coverage"
         )
-    if cell.quantity == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
-        rows.warnings.append(f"{cell.name}: RSSI lies below RSRP, which cannot be: are the columns exchanged?")
+    if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
+        rows.warnings.append(f"{cell}: RSSI lies below RSRP, which cannot be: are the columns exchanged?")
     _lines.add_flag(flag, outside, "out_of_coverage")
     _lines.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
     level[outside] = np.nan
@@ -161,10 +148,8 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: Cell, source: str) -> S
         if finite.any():
             values[name] = np.where(finite, quality, np.nan)
     stream = rows.stream(
-        "rss", cell.name, values, pick=row, flag=flag, channel=rows.options.channel or cell.name,
-        unit=rows.options.unit or "dBm", quantity=cell.quantity, rat=cell.rat or None,
-        pci=int(cell.pci) if cell.pci >= 0 else None, arfcn=int(cell.arfcn) if np.isfinite(cell.arfcn) else None,
-        source=source,
+        "rss", cell, values, pick=row, flag=flag, channel=rows.options.channel or cell, unit=rows.options.unit or "dBm",
+        about=about,
     )  # fmt: skip
     assert stream is not None
     return stream
@@ -194,7 +179,7 @@ def named(
     meaning = dictionary.meaning(name)
     quantity = dictionary.Quantity(name, "kpi", ()) if meaning is None else meaning.quantity
     short = re.sub(r"\W+", "_", dictionary.plain(name))
-    if quantity.kind == "rss" and meaning is not None and not meaning.indirect and not meaning.neighbour:
+    if quantity.kind == "rss" and meaning is not None and not meaning.indirect and not meaning.place.startswith("n"):
         level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))
         return rows.stream(
             "rss", short, {"rss_db": level}, where=where, flag=flag, channel=rows.options.channel or short,

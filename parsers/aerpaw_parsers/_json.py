@@ -84,6 +84,7 @@ def _loaded(text: bytes) -> tuple[Any, bool]:
     try:
         return json.loads(text), False
     except json.JSONDecodeError as error:
+        # the error at the very end: what is missing may stand on the next lines
         return None, text.startswith(b"{") and error.pos >= len(error.doc)
     except (ValueError, RecursionError):
         return None, False
@@ -120,6 +121,7 @@ def first(head: bytes) -> dict[str, Any] | None:
 
 def number(value: Any) -> float:
     """A number or the text of one; what stands for 'unavailable' is NaN."""
+    # a bool is an int in Python, and no measurement
     if isinstance(value, bool) or value is None:
         return float("nan")
     try:

@@ -20,13 +20,8 @@ VELOCITIES = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
 # Attributes of a stream that say how its heights are known.
 Height = dict[str, Attribute | None]
 # No count is so large.
+# Integers hold neither NaN nor infinity: what is no count becomes -1.
 _MOST = 1e9
-
-
-def has_position(names: list[str]) -> bool:
-    """Check whether names hold a latitude and a longitude."""
-    known = {meaning.quantity.name for name in names if (meaning := dictionary.meaning(name)) is not None}
-    return {"latitude_deg", "longitude_deg"} <= known
 
 
 def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
@@ -47,7 +42,9 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
             text = "a position on a grid (UTM, ECEF), which is not read: add columns of latitude and longitude"
             rows.warnings.append(f"column {sheet.names[grid]!r}: {text}")
         return None
-    alike = sheet.alike(latitude)
+    known = [(i, what.quantity) for i, what in enumerate(sheet.meanings) if what and what.quantity.name == PLACE[0]]
+    surest = min(dictionary.rank_of(quantity, sheet.plain[i]) for i, quantity in known)
+    alike = [sheet.names[i] for i, quantity in known if dictionary.rank_of(quantity, sheet.plain[i]) == surest]
     if len(alike) > 1:
         rows.warnings.append(f"several columns of positions ({', '.join(alike)}): {alike[0]!r} was read, a guess")
     values: dict[str, AnyArray] = {key: sheet.numbers(i) for key, i in zip(PLACE, (latitude, longitude), strict=False)}
@@ -75,6 +72,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
 def refuse_whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> None:
     """Refuse positions of which one angle has whole degrees alone: the values stand beside their names."""
     known = [angle[np.isfinite(angle)] for angle in (values[key] for key in PLACE[:2])]
+    # a receiver writes decimals even at rest; an index or a count does not
     coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
     if coarse[0] != coarse[1]:
         raise _sheet.shifted(f"{names[coarse.index(True)]!r} has whole degrees alone", "positions")
@@ -186,6 +184,7 @@ def above_takeoff(
     rest = _ground(*(column[known] for column in (rows.time, *(values[name] for name in PLACE))))
     first = float(altitude[known[0]]) if rest is None else rest
     climbs = rest is not None
+    # a hover may begin anywhere: its lowest height says whether 0 was the ground
     if datum == "unknown" and abs(first if climbs else np.abs(altitude[known]).min()) < _NEAR_ZERO_M:
         return altitude, about | {"height_datum": "take-off"}
     if datum == "unknown" and not climbs:
@@ -212,6 +211,7 @@ def _without_first_zeros(altitude: FloatArray, time: AnyArray | None) -> FloatAr
 
     Of heights above nobody knows what, with their times, only where no aircraft climbs so fast.
     """
+    # of heights that are 0 throughout argmax is 0 as well: nothing is left out
     begun = int(np.argmax(np.nan_to_num(altitude) != 0))
     if not begun or np.nanmin(np.abs(altitude[begun:])) < _NEAR_ZERO_M:
         return altitude
@@ -262,6 +262,7 @@ def _attitude(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:
     elif not named and not set(ANGLES) <= set(values) and are_small(values):
         rows.warnings.append(small_angles(values))
     yaw = values.get("yaw_deg")
+    # no aircraft keeps due north to the last digit
     if yaw is not None and len(yaw) > 2 and np.isfinite(yaw).any() and not np.nan_to_num(yaw).any():
         rows.warnings.append("the yaw is 0 throughout: read as not known")
         values["yaw_deg"] = np.full(len(yaw), np.nan)

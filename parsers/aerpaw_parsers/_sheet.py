@@ -44,6 +44,7 @@ def split_row(line: bytes, separator: str) -> list[str]:
     if '"' not in text:
         return text.split(separator)
     try:
+        # csv refuses NUL (Python 3.10) and a bare carriage return
         return next(csv.reader([text.replace("\0", "\ufffd").replace("\r", " ")], delimiter=separator), [])
     except csv.Error:
         return text.split(separator)
@@ -58,6 +59,7 @@ def _header_of(lines: Sequence[bytes], is_header: _IsHeader) -> tuple[int, str, 
         Of the names as written.
     """
     for i, line in enumerate(lines[:TITLES]):
+        # no header is so long: another kind of file
         if len(line) > 65_536 or b"\0" in line:
             return None
         for separator in SEPARATORS:
@@ -78,6 +80,7 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
     at, separator, names = header
     below = [line for line in lines[at + 1 :] if line.strip()][:5]
     widths = [len(split_row(line, separator)) for line in below]
+    # rows may miss trailing cells, or have one more behind a separator at their end
     return 2 * sum(len(names) < 2 * width and width <= len(names) + 1 for width in widths) >= len(widths)
 
 
@@ -191,13 +194,6 @@ class Sheet:
             if meaning is not None and meaning.quantity.name in quantities
         ]
         return min(known)[2] if known else None
-
-    def alike(self, column: int) -> list[str]:
-        """Names of the columns that hold the quantity of one as surely as that, in the order of the table."""
-        what = self.meanings[column]
-        both = [(i, other) for i, other in enumerate(self.meanings) if what is not None and other is not None]
-        rank = {i: dictionary.rank_of(other.quantity, self.plain[i]) for i, other in both}
-        return [self.names[i] for i, place in rank.items() if place == rank[column]]
 
     def named(self, *names: str) -> int | None:
         """The first column of one of some plain names, as the file has them."""
@@ -317,6 +313,7 @@ class Sheet:
         positive, negative = "NS" if quantity.name == "latitude_deg" else "EW"
         own = _HEMISPHERE.search(self.names[column])
         if own is not None and own[1] in (positive, negative):
+            # west of a negative number is no east: some write both the letter and the sign
             return -np.abs(values) if own[1] == negative else values
         for i, name in enumerate(self.names):
             letters = {cells[i].strip().upper() for cells in self.cells[:50]} - {""}
@@ -328,6 +325,7 @@ class Sheet:
     @cached_property
     def _has_points(self) -> bool:
         """Check whether the first row has a decimal point and no comma that parts no thousands: no comma is decimal."""
+        # of the first row alone: a table keeps to one form
         first = [cell.strip() for cell in self.cells[0]] if self.cells else []
         commas = [cell for cell in first if _DECIMAL_COMMA.fullmatch(cell)]
         return any(_DECIMAL_POINT.fullmatch(cell) for cell in first) and all(map(_THOUSANDS.fullmatch, commas))
@@ -388,11 +386,6 @@ def cut(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> Sheet
     for i, fields in _fitted([(i, split_row(lines.raw(i), separator)) for i in numbers], names):
         table.add(i, fields)
     return table.sheet(lines, numbers[-1] if numbers else at)
-
-
-def _kind_of(name: str) -> tuple[str, str, str] | None:
-    what = dictionary.meaning(name)
-    return None if what is None or what.indirect else (what.quantity.name, what.rat, what.place)
 
 
 def _unlike(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:
@@ -457,10 +450,7 @@ class _Table:
         for j, name in enumerate(self.names):
             spare.setdefault(dictionary.without_unit(name)[0], []).append(j)
         self._place, self._unit, self._turned = [], [], True
-        of = {_kind_of(own): dictionary.without_unit(own)[0] for own in reversed(self.names)}
         for (name, unit), text in zip(bare, texts, strict=True):
-            if not spare.get(name) and spare.get(synonym := of.get(_kind_of(text), "")):
-                name = synonym  # the table of another program goes on: 'Timestamp' is 'time' here
             if not spare.get(name):
                 spare[name] = [len(self.names)]
                 self.names.append(text)
@@ -481,7 +471,9 @@ class _Table:
 
     def sheet(self, lines: _lines.Lines, last_line: int) -> Sheet:
         """The table; rows shorter than their header are read where that is a habit of the program."""
+        # the last line may be cut short in every file
         inner, full = [i for i, _ in self._short if i != last_line], bool(self._row)
+        # one short row is torn; a twentieth of all is a program's habit
         if len(inner) >= max(2, len(self._row) // 20):
             meanings = [dictionary.meaning(name) for name in self.names]
             read = {i for i, cells in self._short if not _torn(cells, meanings)}
@@ -557,7 +549,8 @@ def rows(
     """
     known = {i: m.quantity for i, m in enumerate(sheet.meanings) if m is not None and not m.indirect}
     _refuse_positions_beside(sheet)
-    _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in known.items() if q.bounded])
+    bounded = {i: q for i, q in known.items() if q.role in ("position", "cell", "rss") and q.can_be[1] < np.inf}
+    _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
     mapped = column is not None
     column = _time_column(sheet) if column is None else column
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
@@ -591,12 +584,14 @@ def rows(
 
 
 def _time_column(sheet: Sheet) -> int | None:
-    """The surest column of times; where that is a local one, the one beside it that is UTC."""
+    """The surest column of times; where that is a local one, or has no zone, the one beside it that is UTC."""
     column = sheet.find("time")
-    if column is None or "local" not in sheet.plain[column]:
+    if column is None or "utc" in sheet.plain[column].split():
         return column
-    utc = (i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name == "time")
-    return next((i for i in utc if re.search(r"\butc\b", sheet.plain[i])), column)
+    times = [i for i, meaning in enumerate(sheet.meanings) if meaning and meaning.quantity.name == "time"]
+    utc = [i for i in times if "utc" in sheet.plain[i].split()]
+    both = [i for i in utc if all(_ZONELESS.fullmatch(text) for j in (i, column) for text in sheet.texts(j)[:3])]
+    return next(iter(utc if "local" in sheet.plain[column] else both), column)
 
 
 def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> tuple[str, FloatArray, list[str]]:
@@ -625,6 +620,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     )  # fmt: skip
 
 
+_ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
 # The order that a name gives: 'date (dd/mm/yyyy)'.
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
@@ -645,6 +641,7 @@ def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:
             expected="weeks since 1980, such as 2370",
             cause="the receiver counts them modulo 1024: add 1024 or 2048 to the column",
         )
+    # a week has 604 800 s: larger counts are milliseconds
     scale = 1e-3 if np.nanmax(seconds) > 604_800 else 1.0
     return np.asarray(weeks * 604_800.0 + seconds * scale + _stamps.GPS_S - _stamps.LEAP_S)
 
@@ -663,18 +660,16 @@ def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray
     InputError
         If some rows have several values that their columns cannot have, or the identities of cells are fractions.
     """
-    wrong = [
-        (name, values, dictionary.impossible(quantity, values))
-        for name, quantity, values in columns if quantity.role != "height"
-    ]  # fmt: skip
+    wrong = [(name, values, dictionary.impossible(quantity, values)) for name, quantity, values in columns]
     if not wrong or not len(wrong[0][1]):
         return
     count = np.sum([mask for *_, mask in wrong], axis=0)
+    # three rows or a twentieth: fewer are damaged, not shifted
     few = max(3, len(count) // 20)
     alone = [
         mask for name, values, mask in wrong
-        if ("pci" in name.lower() and (mask & (values < 0)).sum() >= few)
-        or ("pci" in name.lower() and 2 * mask.sum() > np.isfinite(values).sum())
+        if "pci" in name.lower()
+        and ((mask & (values < 0)).sum() >= few or 2 * mask.sum() > np.isfinite(values).sum())
     ]  # fmt: skip
     if not alone and (count > 1).sum() < few:
         return
@@ -701,6 +696,7 @@ def _is_angle(values: FloatArray) -> bool:
     """Check whether numbers are written as positions of one flight: of four decimals and more, and near each other."""
     known = values[np.isfinite(values)]
     near = len(known) and np.ptp(known) < NEAR_DEG and 1 < np.abs(known).max() <= 180
+    # more than three decimals: a thousandth of a degree is 100 m, too coarse for any receiver
     return bool(near and (np.abs(known * 1e3 % 1 - 0.5) < 0.499999).mean() > 0.5)
 
 
@@ -712,6 +708,7 @@ def shifted(found: str, expected: str) -> InputError:
 BESIDE = "a column is missing in the header or in the rows, and all values stand beside their names"
 
 
+# Whole seconds and a counter that go together differ by less than one; half of one more for rounding.
 _MOST_APART_NS = 1_500_000_000
 # Half of what a time stamp holds.
 _MOST_NS = 2.0**62
@@ -723,6 +720,7 @@ def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
     known = np.isfinite(milliseconds)
     if rows.relative or not known.any() or (time % 1_000_000_000).any():
         return
+    # rounded before it is an integer: 0.1 ms is no whole number of ns in binary
     counted_ns = np.round(np.where(known, milliseconds, 0.0) * 1e6)
     fits = np.abs(counted_ns).max() < _MOST_NS
     counted = counted_ns.astype(np.int64) if fits else np.zeros_like(time)
@@ -753,9 +751,7 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
         The name is empty where the table has one part.
     """
     columns = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name == key]
-    marks = None if key != "network" else _names_cells(sheet)
-    if marks is None and not columns and (key == "network" or (key == "device" and _in_two_places(rows, sheet))):
-        marks = _tells_apart(rows, sheet)
+    marks = None if columns or key not in ("device", "network") else _tells_apart(rows, sheet, key)
     if marks is not None:
         columns.append(marks)
         rows.warnings.append(f"column {sheet.names[marks]!r} tells the rows apart: a series for each of its values")
@@ -780,32 +776,29 @@ def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows
         yield label, replace(rows.part(where), about=about), sheet.part(where)
 
 
-def _in_two_places(rows: _rows.Rows, sheet: Sheet) -> bool:
-    """Check whether rows of one instant often have several positions."""
-    column, time = sheet.find("latitude_deg"), pd.Series(rows.time)
-    if column is None or (repeated := time.duplicated().mean()) < _REPEATED:
-        return False
-    return bool(repeated - pd.DataFrame({"time": time, "at": sheet.texts(column)}).duplicated().mean() > _REPEATED)
-
-
-def _names_cells(sheet: Sheet) -> int | None:
-    """The column that says whose level a row holds where no PCI does: tower, number of a cell, carrier; else None."""
-    if sheet.find("PCI") is not None:
-        return None
-    known = (i for i, words in enumerate(sheet.plain) if sheet.meanings[i] is None and _OF_A_CELL.fullmatch(words))
-    return next((i for i in known if 1 < len({*sheet.texts(i)} - {""}) <= _MOST_MARKS), None)
-
-
 _OF_A_CELL = re.compile(
     r"(tower|node|site|base ?station|bs|[eg]nb|cell|sector|e?ci|nci|[en]?cgi|channel|port|antenna|pol(ari[sz]ation)?"
     r"|freq(uency)?|band) ?(id|identity|name|no|idx|index|[mgk]?hz)?"
 )
 
 
-def _tells_apart(rows: _rows.Rows, sheet: Sheet) -> int | None:
-    """The unknown column (a node, a beam, a direction) without which most instants have several rows; None if none."""
-    if pd.Series(rows.time).duplicated().mean() < _REPEATED:  # most tables: no column of theirs is read for it
+def _tells_apart(rows: _rows.Rows, sheet: Sheet, key: str) -> int | None:
+    """The column of no known name whose values are networks or devices of their own; None if none.
+
+    Of networks it says whose level a row holds where no PCI does (a tower, a cell's number, a carrier), or is that
+    without which most instants have several rows (a node, a beam, a direction); of devices, several positions.
+    """
+    if key == "network" and sheet.find("PCI") is None:
+        named = (i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and _OF_A_CELL.fullmatch(words))
+        if (i := next((i for i in named if 1 < len({*sheet.texts(i)} - {""}) <= _MOST_PARTS), None)) is not None:
+            return i
+    time, place = pd.Series(rows.time), sheet.find("latitude_deg")
+    if (repeated := time.duplicated().mean()) < _REPEATED:  # most tables: no column of theirs is read for it
         return None
+    if key == "device":
+        at = pd.DataFrame({"time": time, "at": "" if place is None else sheet.texts(place)})
+        if repeated - at.duplicated().mean() < _REPEATED:
+            return None
     cells = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name in _CELL]
     keys = pd.DataFrame({"time": rows.time, **{str(i): sheet.texts(i) for i in cells}})
     if keys.duplicated().mean() < _REPEATED:
@@ -843,6 +836,7 @@ def _says(text: str, key: str) -> bool:
 
 
 def _label(name: str, value: str) -> str:
+    # a name begins with a letter: 'sim1', not '1'
     word = re.sub(r"\W+", "_", value).strip("_")
     return word if word[:1].isalpha() else name.split()[0] + word
 

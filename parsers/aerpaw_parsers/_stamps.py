@@ -22,6 +22,7 @@ from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 
 _NAMED_ZONE = r"Z|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
+# A zone is not the AM or PM that stands in the same place.
 _ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
 _CLOCK = (
     r"(?P<hour>\d{1,2})[:.h-](?P<minute>\d\d)(?:[:.m-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,9}))?)?"
@@ -67,6 +68,7 @@ _IN_NAME = (
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
 )
 # Hours east of UTC of the abbreviations that say it, and the zone whose clock they are a part of.
+# Winter zones stand in clocks.WINTER: EST in summer is a question, and CST is that of several countries.
 _HOURS = {
     "Z": 0.0, "UT": 0.0, "UTC": 0.0, "GMT": 0.0, "EDT": -4.0, "CDT": -5.0, "MDT": -6.0, "PDT": -7.0,
     "HST": -10.0, "CEST": 2.0, "MESZ": 2.0, "EEST": 3.0, "BST": 1.0, "JST": 9.0, "KST": 9.0, "AKDT": -8.0, "AEDT": 11.0,
@@ -114,6 +116,7 @@ class _Order:
         self._year(dates)
         keys = ("b", "c") if self.year_first else ("a", "b")
         firsts = [(int(match[keys[0]]), int(match[keys[1]])) for match in dates]
+        # points are the marks of countries that write the day first
         if all(match["mark"] == "." for match in dates) and not self.year_first:
             return  # 02.03.2025: where points stand, the day comes first
         if any(first > 12 for first, _ in firsts):
@@ -293,6 +296,7 @@ def beside(text: str) -> str:
     if number is None or re.fullmatch(r"[+-]\d{4}", text):
         return text if re.fullmatch(_NAMED_ZONE, text) else ""
     hours = float(text)
+    # no zone is further than 14 h from UTC: larger numbers are minutes (840) or seconds
     hours /= 1 if abs(hours) <= 14 else 60 if abs(hours) <= 840 else 3600
     return _shown(hours)
 
@@ -336,6 +340,7 @@ def read(
         filled = [text for text in shown if text]
     refuse_spreadsheets(filled)
     counts = sum(_NUMBER.fullmatch(text) is not None for text in filled)
+    # 20250610140000 is a number, too
     if counts * 2 > len(filled) and not any(_DIGITS.fullmatch(text) for text in filled[:3]):
         return _numbers(shown, unit, options, gps=gps)
     if sum(_OF_DAY.fullmatch(text) is not None for text in filled) * 2 > len(filled):
@@ -396,6 +401,7 @@ def _numbers(
     value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in texts])
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
+        # 0.9e9 s is July 1998: a clock that shows less counts from another origin
         if middle >= 0.9 * scale and (unit is None or scale >= _time.COUNTS[unit].least_epoch):
             if gps and middle < 1.58 * scale:  # as an epoch of 1970 before 2020, as one of 1980 before 2030
                 value, warnings = value + (GPS_S - LEAP_S) * scale / 1e9, [_GPS_COUNT]
@@ -403,6 +409,7 @@ def _numbers(
                 warnings = ["the times are called GPS time and count from 1970: read as UTC"] if gps else []
             return (form, value, warnings) if form else ("epoch_us", value / 1e3, warnings)
     if unit is None and 86_400 < middle < 86_400_000 and not (value % 1 > 0).any():
+        # a log that begins within the first hour counts from its start, a later one from midnight
         if np.nanmin(value) < 3_600_000:
             return "relative_ms", value, [_MILLISECONDS]
         return _on_a_date(value / 1e3, options, [_MILLISECONDS + " of the day"])
@@ -435,6 +442,7 @@ def _of_day(texts: Sequence[str], options: ReadOptions, zone: str) -> tuple[str,
     """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
     matches = [_OF_DAY.fullmatch(text) for text in texts]
     seconds = np.array([_seconds(item.groupdict()) if item else np.nan for item in matches], dtype=np.float64)
+    # back by more than half a day is midnight; less is a clock that was set
     seconds += 86_400.0 * np.cumsum(np.nan_to_num(np.diff(seconds, prepend=np.nan)) < -43_200)
     written = next((item["zone"] for item in matches if item and item["zone"]), None) or zone
     first = seconds[np.isfinite(seconds)][:1]
@@ -473,6 +481,7 @@ def _on_a_date(
     date = options.time_origin[:10] if options.time_origin else _date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
         return "relative_s", seconds, [*warnings, "the times have no date and the file name has none either"]
+    # at noon, since clocks change at night
     offset = _Zones(options, zone).offset(None, f"{date} 12:00:00").encode()
     cells = _wall_cells(np.datetime64(date, "us"), seconds)
     source = "time_origin" if options.time_origin else "the file name"

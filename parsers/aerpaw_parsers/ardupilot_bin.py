@@ -174,6 +174,7 @@ def _named(series: _autopilot.Series, *names: str) -> _autopilot.Series:
 def _offset(gps: _autopilot.Series) -> float | None:
     if "GWk" not in gps.columns or "GMS" not in gps.columns:
         return None
+    # week 1000 is March 1999: a receiver without time writes 0 or counts modulo 1024
     known = gps.columns["GWk"] > 1000
     utc_s = _autopilot.gps_utc_s(gps.columns["GWk"][known], gps.columns["GMS"][known])
     return _autopilot.offset_s(utc_s, gps.time_s[known])

@@ -38,6 +38,7 @@ def is_header(names: list[str]) -> bool:
 
 def sniff(head: bytes) -> bool:
     """Check whether a header of such names stands in front, and it is none of the narrower formats."""
+    # their headers hold a time and a level, too, and their readers know units that no name tells
     narrower = [module.READER.sniff for module in (nemo_csv, quectel_ri, aadm_snr)]
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
@@ -135,6 +136,7 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> pd.DataFrame:
         level = sheet.numbers(cell.columns["rsrp_dbm"])
         values = {name: _or_nan(sheet, cell.columns.get(name), len(level)) for name in _FIELDS.values()}
         none = np.isnan(values["rsrp_dbm"]) & ~(values["pci"] > 0) if cell.rat == "nr" or not cell.serving else False
+        # refused above where most are fractions; here a single damaged cell
         pci = np.where(values["pci"] == np.round(values["pci"]), values["pci"], np.nan)  # a fraction is no identity
         rat = of_row if technology is not None and not cell.rat else cell.rat
         about = {"row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle}
@@ -231,6 +233,7 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
     if sheet.program is None or "level" not in sheet.program.words:
         return
     texts = sheet.texts(column) if (column := sheet.find("technology")) is not None else []
+    # older phones count the RSSI in steps from 0: no dBm is above
     if (rssi := sheet.named("lterssi")) is not None:
         sheet.silence(sheet.numbers(rssi) >= 0, [rssi])
     level, quality = sheet.named("level"), sheet.named("qual")
@@ -255,8 +258,9 @@ def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
         text = f"0 beside a CQI in {counted(idle, 'row')}, read as no report: do its ranks count from 0?"
         rows.warnings.append(f"column {sheet.names[column]!r}: {text} Then give it with --map and --ri-base zero")
     source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"
-    base = "zero" if zero else "one"
-    return rows.stream("rank", name, values, where=np.isfinite(ri), flag=flag, ri_base=base, source=source)
+    return rows.stream(
+        "rank", name, values, where=np.isfinite(ri), flag=flag, ri_base=("one", "zero")[zero], source=source
+    )
 
 
 _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero)\b")

@@ -84,7 +84,8 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
             valid = valid & right
         else:
             epoch = _numeric(table[name], name)
-            valid = np.isfinite(epoch) & (epoch > _LEAST_S) & (epoch < 9.2e9)
+            # less than 1e8 are day numbers of MATLAB, or seconds of a computer whose clock was never set
+            valid = np.isfinite(epoch) & (epoch > 1e8) & (epoch < 9.2e9)
             # double precision resolves 2.4e-7 s here: microseconds are what the file can hold
             wall = np.round(np.where(valid, epoch, 0) * 1e6).astype(np.int64) * 1000
         if valid.any() or name in _EPOCHS:
@@ -97,8 +98,6 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
     raise InputError("the MATLAB file has no clock", expected=f"a variable {clocks}", cause="not a flight")
 
 
-# Less are day numbers of MATLAB, or seconds of a computer whose clock was never set.
-_LEAST_S = 1e8
 # Clock of files that have none.
 _COUNTED = "row number"
 

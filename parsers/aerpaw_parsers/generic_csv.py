@@ -126,6 +126,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         return ReadResult("generic_csv", (), len(lines), 0, len(lines))
     first = int(np.argmin(lines.blank))
     line = lines.raw(first).removeprefix(b"\xef\xbb\xbf")
+    # the user has named the columns: the first line is the header, whatever its words
     separator = max(_sheet.SEPARATORS, key=lambda sign: line.count(sign.encode()))
     header = [name.strip() for name in _sheet.split_row(line, separator)]
     kind, where = _checked(options, header)
@@ -197,6 +198,7 @@ def _stream(
         about = {"ri_base": options.ri_base, **about}
     else:
         latitude, longitude, altitude = (values[key] for key in _pose.PLACE)
+        # -999 is what loggers write without a fix, here within rounding
         lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
         _lines.add_flag(flag, lost, "no_fix")
         values |= {key: np.where(lost, np.nan, values[key]) for key in _pose.PLACE}

@@ -36,16 +36,15 @@ def sniff(head: bytes) -> bool:
 
 def _points(data: bytes) -> list[tuple[int, dict[bytes, bytes]]]:
     """Place and values of each whole point."""
-    points: list[tuple[int, dict[bytes, bytes], bool]] = []
+    points, tracked = [], b"<trkpt" in data
     for point in _POINT.finditer(data):
-        if _START.search(point[2]):
-            continue  # torn: the next point begins inside
+        # torn, where the next begins inside; beside a track, places that somebody marked
+        if _START.search(point[2]) or (tracked and b"trkpt" not in point[0]):
+            continue
         values = dict(_ATTRIBUTE.findall(point[1]))
         values |= dict(_INSIDE.findall(point[2]))
-        points.append((point.start(), values, b"trkpt" in point[0]))
-    tracked = any(of_track for *_, of_track in points)
-    # beside a track, points of the way and of a route are places that somebody marked
-    return [(at, values) for at, values, of_track in points if of_track or not tracked]
+        points.append((point.start(), values))
+    return points
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -80,6 +79,7 @@ def _stream(rows: _rows.Rows, name: str) -> Stream | None:
     texts = {key: rows.columns[key].tolist() for key in names}
     values = dictionary.record_columns({key: np.array([_json.number(cell) for cell in texts[key]]) for key in names})
     lost = _pose.clean(rows, values)
+    # GPX has one height, ele, which receivers give above sea level
     rows.height_from = "program"
     values["altitude_m"], about = _pose.above_takeoff(rows, values, "sea level", lost)
     return rows.stream("telemetry", name, values, where=~lost, source="GPX", about=about)
@@ -87,8 +87,9 @@ def _stream(rows: _rows.Rows, name: str) -> Stream | None:
 
 def _torn(lines: _lines.Lines, data: bytes, row: object) -> list[RejectedLine]:
     """Lines on which a point begins that is not whole."""
-    starts = [start for start in _START.finditer(data) if b"<trkpt" not in data or b"trkpt" in start[0]]
-    begun = np.unique(lines.number_at(start.start() for start in starts))
+    tracked = b"<trkpt" in data
+    starts = (start.start() for start in _START.finditer(data) if b"trkpt" in start[0] or not tracked)
+    begun = np.unique(lines.number_at(starts))
     return lines.reject_all(np.setdiff1d(begun, np.asarray(row)), "a point without position or time (torn?)")
 
 

@@ -11,7 +11,7 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common import kml
-from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
+from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.logs.jumps import FASTEST_MPS
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
@@ -61,7 +61,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     in_seconds = _in_seconds(*(_lines.numbers(column[name]) for name in ("time", *_POSITION[:2])))
     rows = _rows.built(
         lines, row, column, options, reader="nemo_kml", reason=_reason,
-        clock="relative_s" if in_seconds else "relative_ms", markup=_markup(lines, row),
+        clock="relative_s" if in_seconds else "relative_ms",
     )  # fmt: skip
     if in_seconds:
         rows.warnings.append("the times say ms, but then the phone would fly faster than any aircraft: read as seconds")
@@ -87,6 +87,7 @@ def _in_seconds(time_ms: FloatArray, latitude: FloatArray, longitude: FloatArray
     step_s = np.abs(np.diff(time_ms)) / 1e3
     moving = (step_s > 0) & (step_m > 0)
     speed_mps = float(np.median(step_m[moving] / step_s[moving])) if moving.sum() >= _FEW else 0.0
+    # a thousand times slower it is a flight: then the unit is wrong, else the positions are
     return FASTEST_MPS < speed_mps <= 1e3 * FASTEST_MPS
 
 
@@ -103,14 +104,6 @@ def _measured(rows: _rows.Rows, name: str, where: BoolArray) -> Stream | None:
     short = f"nr {name.removesuffix(_SERVING)}" if name.endswith(_SERVING) else name
     about = {"rat": "nr"} if short != name else None
     return _cells.named(rows, short, rows.number("value"), unit=unit, where=where, about=about)
-
-
-def _markup(lines: _lines.Lines, row: IntArray) -> IntArray:
-    """Lines without a hint of a report, which is nearly all of the file: they need no second look."""
-    plain = np.ones(len(lines), dtype=bool)
-    plain[lines.number_at(hint.start() for hint in _HINT.finditer(lines.data))] = False
-    plain[row] = False
-    return np.flatnonzero(plain)
 
 
 READER = Reader(

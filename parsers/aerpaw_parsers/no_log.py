@@ -54,6 +54,7 @@ def _refuse(what: str) -> Callable[[bytes, ReadOptions], ReadResult]:
 
 
 # Name, what it is, and the tests of which all hold.
+# The first whose tests hold names the file: narrow kinds stand in front of wide ones.
 _KINDS: tuple[tuple[str, str, tuple[_Test, ...]], ...] = (
     ("antenna_pattern", "a measured antenna pattern (for 'antenna: {model: file}' in flight.yaml)",
      (rb"(?im)\A[^\0]{0,380}?(?:Frequency ?= ?\d{1,6} ?\(MHz\)|Phi ?= ?-?\d{1,3}(?:\.\d{1,6})? ?\(deg\))"

@@ -133,6 +133,7 @@ def _placed(rows: _rows.Rows, latitude: FloatArray, longitude: FloatArray, altit
     values: dict[str, AnyArray] = {"latitude_deg": latitude, "longitude_deg": longitude}
     lost = _pose.clean(rows, values)
     values["altitude_m"], rows.height_from = altitude, "program"
+    # Android's Location.getAltitude counts from the WGS 84 ellipsoid
     values["altitude_m"], about = _pose.above_takeoff(rows, values, "ellipsoid", lost)
     return rows.stream("telemetry", "phone", values, where=~lost, source="PawPrints location", about=about)
 

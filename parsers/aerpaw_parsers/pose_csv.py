@@ -22,7 +22,7 @@ _LIKE_A_LEVEL = re.compile(
 
 def is_header(names: list[str]) -> bool:
     """Check whether names hold a position and a time, and no quantity of a radio."""
-    return _pose.has_position(names) and has_time(names) and not has_radio(names)
+    return {*_pose.PLACE[:2]} <= _quantities(names) and has_time(names) and not has_radio(names)
 
 
 def has_radio(names: list[str]) -> bool:
@@ -33,9 +33,13 @@ def has_radio(names: list[str]) -> bool:
     )
 
 
+def _quantities(names: list[str]) -> set[str]:
+    return {meaning.quantity.name for name in names if (meaning := dictionary.meaning(name)) is not None}
+
+
 def has_time(names: list[str]) -> bool:
     """Check whether a name is that of a time, a date, or GPS weeks."""
-    known = {meaning.quantity.name for name in names if (meaning := dictionary.meaning(name)) is not None}
+    known = _quantities(names)
     return not known.isdisjoint(("time", "date")) or {"gps_week", "gps_seconds"} <= known
 
 

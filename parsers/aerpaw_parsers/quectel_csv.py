@@ -174,6 +174,7 @@ def _levels(rows: _rows.Rows, rat: str, where: BoolArray) -> Iterator[Stream | N
         _lines.add_flag(flag, good & ~fits & ~np.isnan(sinr), "sinr_out_of_range")
         values["sinr_db"] = np.where(fits, sinr, np.nan)
     named = where & (pci >= 0) & (pci <= _MOST_PCI)
+    # infinity sorts behind every carrier and is none
     carrier = np.where(arfcn > 0, arfcn, np.inf)
     cells = sorted(set(zip(pci[named].tolist(), carrier[named].tolist(), strict=True)))
     common: dict[str, Attribute | None] = {"unit": rows.options.unit or "dBm", "quantity": "RSRP", "rat": rat}

@@ -183,9 +183,11 @@ def _powers(
     common = _json.inside(meta, "global")
     samples, full_scale = _samples(common, _json.listed(meta, "captures"), options)
     rate = _json.number(common.get("core:sample_rate"))
+    # without a rate nobody knows how long 20 ms are
     if samples is None or not rate > 0:
         return
     size, zero = max(1, round(_BURST_S * rate)), _integer(common.get("core:offset"))
+    # 0 lies between the two middle codes: 127.5 of 0 .. 255
     middle = full_scale - 0.5 if samples.dtype.kind == "u" else 0.0
     bursts: list[tuple[str, float, float]] = []  # stamp of the capture, seconds behind it, frequency
     powers: list[FloatArray] = []
@@ -195,6 +197,7 @@ def _powers(
         if stamp is None:
             warnings.append("captures without core:datetime: when they were taken is unknown; they are left out")
             continue
+        # less than half a burst at the end of a capture gives no level
         for at in range(start, end - size // 2, size):
             piece = samples[at : min(at + size, end)].astype(np.float64) - middle
             bursts.append((str(stamp), (at - start) / rate, _json.number(capture.get("core:frequency"))))

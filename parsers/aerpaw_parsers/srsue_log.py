@@ -24,6 +24,7 @@ from . import _cells
 _N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMGmun]?|n/a|-?inf|nan)"
 _ROW = re.compile(
     rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *(?P<cc>\d{1,2}|lte|nr)"
+    # a PCI only where three more numbers stand before the bar: srsLTE before 2020 printed none
     + rb"(?:" + _N % b"pci" + rb"(?=(?: +\S+){3} \|))?" + _N % b"rsrp" + _N % b"pl" + _N % b"cfo"
     + rb"(?: \|)?" + _N % b"mcs" + _N % b"snr" + rb"[^\n|]{0,80}(?:\|[^\n]{0,80})?$", re.MULTILINE,
 )  # fmt: skip

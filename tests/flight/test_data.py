@@ -94,6 +94,16 @@ def test_a_ratio_is_known_by_its_channel_and_the_report_warns(
     assert f"warning: {warning}" in capsys.readouterr().err
 
 
+def test_levels_of_another_carrier_than_that_of_their_replay_are_told(tmp_path: Path) -> None:
+    rows = "".join(f"2025-06-01T10:01:{s:02d},{2100 + 1200 * (s % 2)},{-80 - s % 3}\n" for s in range(40))
+    (tmp_path / "l.csv").write_text("time,freq_mhz,p\n" + rows)
+    columns = "columns: {time: time, rss_db: p}, reader: generic_csv, kind: rss, unit: dBm, node: LW1"
+    texts = _flight(tmp_path, f"path: l.csv, {columns}").warnings
+    assert [text for text in texts if "measured at" in text] == [
+        "l.csv: 'rss_freq2100' was measured at 2100 MHz and is replayed at carrier_hz 3300 MHz"
+    ]
+
+
 def test_the_site_lies_by_the_flight_file_and_the_logs_elsewhere(tmp_path: Path) -> None:
     """Its grounds and antennas are read from there again: --logs-root does not move them."""
     track = next(SAMPLE.glob("UAV/*vehicleOut.txt")).relative_to(SAMPLE)

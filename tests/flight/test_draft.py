@@ -398,6 +398,8 @@ def test_of_quantities_of_one_cell_the_power_of_its_signal_leads() -> None:
     )
     assert drafting._leading([rssi, rsrq, other, rsrp]) == {"c": "a", "b": "a"}
     assert drafting._leading([rssi, other, stream("rank", [1.0])]) == {}
+    second = stream("rss", [1.0], name="e", quantity="RSRP", part="sim2", **cell)  # another receiver of that cell
+    assert drafting._leading([rsrp, second]) == {}
 
 
 @pytest.mark.parametrize(("share", "known"), [(0.5, False), (0.51, True)])

@@ -755,7 +755,7 @@ def _leading(streams: Sequence[Stream]) -> dict[str, str]:
     for stream in sorted(streams, key=lambda s: s.attributes.get("quantity") != "RSRP"):
         if stream.kind != "rss" or "quantity" not in stream.attributes:
             continue
-        cell = tuple(stream.attributes.get(key) for key in ("node", "rat", "pci", "arfcn"))
+        cell = tuple(stream.attributes.get(key) for key in ("node", "rat", "pci", "arfcn", "part"))
         if stream.attributes["quantity"] == "RSRP" and cell not in leaders:
             leaders[cell] = stream.name
         elif cell in leaders and not is_ratio(stream):

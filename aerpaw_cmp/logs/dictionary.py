@@ -91,11 +91,11 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"|destination|take ?off|launch)\b.* (lat|latitude|lon|lng|long|longitude)\b",
     )),
     Quantity("latitude_deg", "position", (
-        r"^(osd |gps )?(lat|latitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67])?$", r" (lat|latitude)( deg)?$",
+        r"^(osd |gps )?(lat|latitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67]| [ns])?$", r" (lat|latitude)( deg)?$",
         r"^(breite|breitengrad|latitud)( deg)?$",
     ), "deg", can_be=(-90.0, 90.0)),
     Quantity("longitude_deg", "position", (
-        r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67])?$",
+        r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67]| [ew])?$",
         r" (lon|lng|longitude)( deg)?$",
         r"^(l nge|laenge|l ngengrad|laengengrad|longitud)( deg)?$",
     ), "deg", can_be=(-180.0, 180.0)),
@@ -123,8 +123,9 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"ellips", r"\b(hae|wgs ?84)\b",
     ), "m", can_be=(-1000.0, 20_000.0), datum="ellipsoid"),
     Quantity("altitude_m", "height", (
-        r"^(alt|altitude)( m| meters| metres| ft| feet)?$", r"^(height|hgt|hoehe|h he)( m| meters| metres| ft| feet)?$",
-        r"^(baro(metric)?|pressure) " + _UP[2:], _UP + r" baro$",
+        r"^((uav|drone|vehicle|aircraft) )?(alt|altitude)( m| meters| metres| ft| feet)?$",
+        r"^(height|hgt|hoehe|h he)( m| meters| metres| ft| feet)?$", r"^(baro(metric)?|pressure) " + _UP[2:],
+        _UP + r" baro$",
     ), "m", can_be=(-1000.0, 20_000.0), datum="unknown"),
     # how it lies; a gimbal's or camera's angles are not the aircraft's
     Quantity("gimbal", "other", (r"\b(gimbal|camera|mount|payload|des|desired|target|setpoint|sp)\b",)),

@@ -48,6 +48,9 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     if len(alike) > 1:
         rows.warnings.append(f"several columns of positions ({', '.join(alike)}): {alike[0]!r} was read, a guess")
     values: dict[str, AnyArray] = {key: sheet.numbers(i) for key, i in zip(PLACE, (latitude, longitude), strict=False)}
+    fix = sheet.find("fix")
+    if fix is not None and (sheet.numbers(fix) > 0).any():  # some leave the column at 0 throughout
+        values[PLACE[0]] = np.where(sheet.numbers(fix) == 0, np.nan, values[PLACE[0]])
     lost = clean(rows, values)
     refuse_whole_degrees([sheet.names[latitude], sheet.names[longitude]], values)
     datum, height = _height(rows, sheet)

@@ -14,8 +14,10 @@ import pandas as pd
 import pytest
 import yaml
 
+from aerpaw_cmp.cli import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.jobs.run import mapping
+from aerpaw_cmp.logs import frames
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
@@ -214,6 +216,14 @@ def test_the_summary_beside_a_log_says_its_hours_and_its_name_does_not(tmp_path:
     assert read(place, (), NEW_YORK).streams[0].frame["time"][0] == pd.Timestamp("2025-03-02T14:00:01")
     place.with_suffix(".csv").write_text("x\nMeasurement start;2025 Mar 02 10:00\n")
     assert read(place, (), NEW_YORK).streams[0].frame["time"][0] == pd.Timestamp("2025-03-02T15:00:01")
+
+
+def test_the_number_of_rank_one_is_the_users_beside_a_mapping(tmp_path: Path) -> None:
+    (tmp_path / "x.csv").write_text("t,ri\n1749564000,0\n1749564001,3\n")
+    mapped = ["--map", "t=time", "--map", "ri=ri_raw", "--ri-base", "zero"]
+    assert main(["ingest", str(tmp_path / "x.csv"), *mapped, "-o", str(tmp_path / "x.h5")]) == 0
+    (frame,) = frames.read(tmp_path / "x.h5").values()
+    assert frame["rank"].tolist() == [1, 4]
 
 
 def test_captures_of_several_frequencies_are_several_series(tmp_path: Path) -> None:

@@ -49,7 +49,8 @@ def ingest(
 
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
     if columns:
-        options |= run.mapping(columns)
+        # what the user says outweighs what a mapping implies, such as the number of rank 1
+        options = run.mapping(columns) | {key: value for key, value in options.items() if value is not None}
         reader = reader or "generic_csv"
     summary = run.run_ingest(paths, out=out, draft=draft, site=site, reader=reader, force=force, **options)
     if as_json:

@@ -237,7 +237,7 @@ def test_a_line_over_distance_is_the_one_that_least_squares_finds_outside() -> N
         for shift_db in (0.0, 100.0):
             samples = dataclasses.replace(base.samples, residual_db=measured - free - shift_db)
             shown = dataclasses.replace(base, samples=samples, free_space_db=free + shift_db)
-            simple = calibration.Simple.unknown(len(free))
+            simple = calibration.Simple(*np.full((3, len(free)), np.nan))
             simple.predict(shown, ~outside, outside)
             level = measured[outside].mean()
             line = level + expected * (free[~outside] - free[outside].mean())

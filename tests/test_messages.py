@@ -118,3 +118,13 @@ def test_every_message_stands_in_the_page() -> None:
 
 if __name__ == "__main__":
     PAGE.write_text(table(), encoding="utf-8")
+
+
+def test_a_folder_in_place_of_its_settings_is_answered_by_the_file_or_by_how_to_write_it(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "logs").mkdir()
+    assert main(["report", "logs"]) == 2
+    assert "Next: 'aerpaw-cmp ingest logs --draft flight.yaml' writes one from its logs" in capsys.readouterr().err
+    (tmp_path / "logs/mine.yaml").write_text("flight: a\n")
+    assert main(["report", "logs"]) == 2
+    assert "Next: the same command with logs/mine.yaml" in capsys.readouterr().err

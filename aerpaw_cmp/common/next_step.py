@@ -39,6 +39,12 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if place is not None and place.suffix in _SETTINGS and _exists(place) and words[:1] != ["ingest"]:
         line = "" if error.line is None else f", line {error.line},"
         return f"mend {one_line(place.name)}{line} and run the same command"
+    if place is not None and error.expected == "a YAML file" and _exists(place) and place.is_dir():
+        settings = sorted(path for path in place.iterdir() if path.suffix in _SETTINGS)
+        if len(settings) == 1:
+            return f"the same command with {one_line(str(settings[0]))}"
+        if not settings and words[:1] in _OF_LOGS:
+            return f"'aerpaw-cmp ingest {one_line(str(place))} --draft flight.yaml' writes one from its logs"
     if place is None or not isinstance(error, InputError):
         return f"'{command} --help' lists the options"
     if not _exists(place):

@@ -152,7 +152,7 @@ def test_a_place_wants_odds_of_two_and_a_listed_one_as_many_as_any_tower(
     odds[:2] = towers
     at = np.array([30.0, 40.0, 10.0]) if listed else np.array([*SITE.towers["LW1"].position_m[:2], 10.0])
     estimate = NodeEstimate(
-        anywhere=0.0,
+        anywhere=0.0, placed=True,
         place_m=at, radius90_m=77.0, height_m=(1.5, 10.0), slope=3.0, slope_sd=0.2,
         log_odds=np.array([*odds, *listed]), at_edge=False, regions=Regions.of(at[None], np.ones(1)),
     )  # fmt: skip

@@ -118,6 +118,7 @@ def channel_parts(
     count, links = len(along.poses), len(along.poses) * len(towers)
     pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
     size = _size(pairs, _PATHS, offsets)
+    # a power of two, as the chunks of the file: a part that ended within a chunk would have it deflated twice
     at_once = 1 << max(0, (_PART_BYTES * count // size).bit_length() - 1)
     further = " of disk"
     if (drawn := settings.rt.engine != "image") or room is None:  # Sionna draws its rays for all poses at once
@@ -193,6 +194,7 @@ def _steps_s(length_s: float, step_s: float) -> FloatArray:
         raise UsageError(
             f"{length_s / step_s:.3g} poses", expected=f"at most {_MOST_POSES}", cause="a small --step, no seconds"
         )
+    # the end counts as an instant, though sums of steps may round beyond it
     return np.arange(0.0, length_s + 1e-9, step_s)
 
 
@@ -249,6 +251,7 @@ def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> C
     except UsageError:
         remarks.append("No calibrated level: no flight taught the site its antennas (aerpaw-cmp calibrate).")
         return lambda _: {}
+    # antennas of the link's own channel come first (False before True): another near the carrier fills in
     for source in sorted(memory.sources().values(), key=lambda s: s.channel != name):
         near = abs(source.link.carrier_hz / link.carrier_hz - 1.0) <= BAND
         if source.tower in towers and near and source.tower not in data.nodes:

@@ -301,6 +301,7 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
     for name, values in (("delay_s", table.delay_s), ("doppler_hz", channel.doppler_hz)):
         # row -1, of no path, is the appended one
         shown[name] = np.nan if values is None else np.append(values, np.nan)[strongest].ravel()
+    # parts follow each other in one file, which the first one begins
     pd.DataFrame(shown).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
     return path
 

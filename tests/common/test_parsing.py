@@ -125,6 +125,7 @@ OWN = {
     "common/kml.py": "writes; reads inside routes and map files",
     "common/native.py": "the child, whose every exception becomes a message",
     "common/yamlfile.py": "settings: errors of their own, at the line",
+    "compare/gains/direction_gain.py": "bytes of its own keys",
     "compare/statistics/memory.py": "a packaged table",
     "flight/marks.py": "text that is compared, never parsed",
     "flight/training.py": "any file is asked for its head; what cannot be read names no log",
@@ -134,9 +135,8 @@ OWN = {
     "logs/matfile.py": "inside ingest",
     "propagation/native/llvm.py": "the answer of a child",
     "propagation/engine/engines.py": "sealed by this user",
-    "propagation/check/reference.py": "tables that the run has read",
+    "maps/kriging.py": "bytes of its own arguments",
     "site/relief/surface.py": "bytes of its own arguments",
-    "jobs/reporting/audit_flight.py": "tables that the run has read",
 }
 
 

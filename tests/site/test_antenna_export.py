@@ -111,7 +111,7 @@ def test_what_a_pattern_is_not_is_refused(cuts, tmp_path, capsys):
     for words, said in (
         ([str(grid)], "expected one of SA"),
         ([str(grid), "--variable", "SA", "--elevation", str(cuts[1])], "beside a gain grid"),
-        ([str(tmp_path / "out.msi"), "--carrier", "6e9"], "a pattern of 3.4 GHz"),
+        ([str(tmp_path / "out.msi"), "--carrier", "6e9"], "the pattern has 3.4 GHz"),
     ):
         assert main(["antenna", "export", *words, "-o", str(tmp_path / "new.msi")]) == 2
         assert said in capsys.readouterr().err

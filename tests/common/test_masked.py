@@ -14,7 +14,7 @@ from aerpaw_cmp.compare import rank
 from aerpaw_cmp.compare.judge import season
 from aerpaw_cmp.compare.level import rss
 from aerpaw_cmp.compare.statistics import intervals as statistics
-from aerpaw_cmp.maps import grid, variogram
+from aerpaw_cmp.maps import variogram
 from aerpaw_cmp.maps.biexponential import fit_biexponential
 from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
 
@@ -59,7 +59,6 @@ CASES: dict[str, tuple[Callable[[Any], Any], Any]] = {
     "correlation": (lambda z: statistics.correlation(z, TIMES), LEVELS),
     "mean of flights": (season.mean_of_flights, LEVELS),
     "mean": (finite_mean, LEVELS),
-    "shares": (grid.class_shares, RANKS),
     "places": (traced, np.column_stack([PLACES, np.full(40, 30.0)])),
 }  # fmt: skip
 

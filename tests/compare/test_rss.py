@@ -42,6 +42,20 @@ def test_a_planted_offset_comes_back():
     assert fit.rmse_ci95_db[0] < 3.0 < fit.rmse_ci95_db[1]
 
 
+@pytest.mark.parametrize("away_db", [30.04, 80.0])
+def test_an_interval_is_of_the_error_that_is_stated(away_db):
+    """Beside the mean by a rounding of the offset, and by an offset beyond the span, 30 dB."""
+    time, measured, simulated = flight(60, sigma=0.0)
+    noise = np.random.default_rng(1).normal(0, 0.01, 60)
+    fit = compare_rss(time, measured + noise + away_db - 30.0, simulated, baselines={"free_space": simulated})
+    for low, high in (fit.rmse_ci95_db, fit.baseline_intervals["free_space"]):
+        assert low < fit.rmse_db < high
+    away = np.nanmean(fit.residual_db)
+    spread = error_intervals(measured + noise, simulated).rmse_db
+    assert fit.rmse_ci95_db == pytest.approx(np.hypot(spread, away), rel=1e-6)
+    assert abs(away) == pytest.approx(away_db % 0.1 if away_db < 50.0 else away_db - 50.0, abs=0.01)
+
+
 def numbers(comparison):
     """Everything of a comparison but the residual, which has the order of the samples."""
     return {name: value for name, value in json_safe(comparison).items() if name != "residual_db"}

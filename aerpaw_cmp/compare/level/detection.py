@@ -11,7 +11,7 @@ from ...common.units import BoolArray, FloatArray, IntArray
 from ..offset import OffsetFit, offset_grid
 from ..ranks.forecast import brier_losses, log_losses
 from ..ranks.receiver import out_of_group
-from ..statistics.intervals import NO_INTERVAL, Interval, spread_interval
+from ..statistics.intervals import NO_INTERVAL, Interval, rmse_interval
 
 # Held-out segments of a flight, equally long.
 _SEGMENTS = 10
@@ -184,7 +184,7 @@ def score_detection(
         constant_log_score=float(log_losses(constant, outcome).mean()),
         offset_db=fit.offset_db,
         rmse_db=fit.rmse_db,
-        rmse_ci95_db=spread_interval(residual[np.argsort(time, kind="stable")]),
+        rmse_ci95_db=rmse_interval(residual[np.argsort(time, kind="stable")], fit.rmse_db),
         free_space_rmse_db=floored_fit(measured, free_space_db[finite], floor_db).rmse_db,
         detected_rmse_db=float(np.sqrt(np.mean(residual[detected] ** 2))),
         reliability=_reliability(stated[:, 1], detected),

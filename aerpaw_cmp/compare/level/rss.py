@@ -18,7 +18,7 @@ from ...common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray, db_from_power, power_from_db, unmasked
 from ..offset import SPAN_DB, OffsetFit, grid_offset, identifiable_range, offset_curve
-from ..statistics.intervals import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals
+from ..statistics.intervals import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
 
 # Two channels of one receiver "part" where they differ by more than this [dB].
 PART_DB = 10.0
@@ -131,7 +131,8 @@ def compare_rss(
     m, s = measured[order], simulated[order]
     fit = grid_offset(m, s, span_db=span_db)
     offsets, curve = offset_curve(m, s, span_db=span_db)
-    simple = {name: _levels(levels) for name, levels in (baselines or {}).items()}
+    simple = {name: _levels(levels)[order] for name, levels in (baselines or {}).items()}
+    fits = {name: grid_offset(m, level, span_db=span_db) for name, level in simple.items()}
     return RssComparison(
         **named(fit, "offset_db rmse_db n at_edge"),
         n_out_of_coverage=int((has_pose & ~use).sum()),
@@ -139,10 +140,10 @@ def compare_rss(
         n_simulated_out=int((has_pose & ~np.isfinite(simulated)).sum()),
         n_no_pose=int((~has_pose).sum()),
         correlation=correlation(m, s),
-        intervals=error_intervals(m, s),
+        intervals=replace(error_intervals(m, s), rmse_db=_rmse_interval(m - s, fit)),
         identifiable_db=identifiable_range(offsets, curve),
-        baselines={name: grid_offset(m, level[order], span_db=span_db) for name, level in simple.items()},
-        baseline_intervals={name: _rmse_interval(m, level[order]) for name, level in simple.items()},
+        baselines=fits,
+        baseline_intervals={name: _rmse_interval(m - level, fits[name]) for name, level in simple.items()},
         residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
     )
 
@@ -195,9 +196,9 @@ def _levels(values: ArrayLike) -> FloatArray:
     return np.where(np.isfinite(array), array, np.nan)
 
 
-def _rmse_interval(measured: FloatArray, simulated: FloatArray) -> Interval:
-    ok = np.isfinite(simulated)
-    return error_intervals(measured[ok], simulated[ok]).rmse_db
+def _rmse_interval(difference: FloatArray, fit: OffsetFit) -> Interval:
+    known = difference[np.isfinite(difference)]
+    return rmse_interval(known + fit.offset_db, fit.rmse_db)
 
 
 # --- both sides averaged over the same window ----------------------------------------------------------------------

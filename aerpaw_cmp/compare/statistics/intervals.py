@@ -377,6 +377,18 @@ def spread_interval(values: FloatArray) -> Interval:
     return low, np.inf if high - low > _BOUND * values.std() else high
 
 
+def rmse_interval(residual: FloatArray, rmse: float) -> Interval:
+    """95 % interval of the root mean square of residuals (n,) in time order, whose value is ``rmse``.
+
+    An offset from a grid, at the edge of its span or beside a floor leaves a mean, which moves both ends as it moves
+    the RMSE.
+    """
+    if len(residual) < FEWEST:
+        return NO_INTERVAL
+    low, high = np.hypot(spread_interval(residual), residual.mean())
+    return float(min(low, rmse)), float(max(high, rmse))
+
+
 def _around(estimate: float, drawn: FloatArray) -> Interval:
     """95 % interval from draws; it holds the estimate."""
     if not np.isfinite(estimate) or not np.isfinite(drawn).any():

@@ -36,7 +36,7 @@ def _refused(error: Any) -> UsageError:
 
 def main(arguments: list[str]) -> int:
     """Run the command line and give its exit code; ``__main__`` turns exceptions into messages."""
-    say.quiet = False
+    say.quiet = say.as_json = False
     try:
         # click would print errors and exit by itself
         result = _program()(args=arguments, prog_name="aerpaw-cmp", standalone_mode=False)

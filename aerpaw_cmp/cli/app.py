@@ -3,11 +3,11 @@
 A command is a function in a module of this package::
 
     @command("diff", examples=["aerpaw-cmp diff reports/a reports/b"])
-    def diff(first: Annotated[Path, Argument(help="...")], as_json: Json = False) -> int:
+    def diff(first: Annotated[Path, Argument(help="...")], force: Force = False) -> int:
         from ..jobs.diff import run_diff  # here, so that help and completion load nothing
 
-and a line of :mod:`aerpaw_cmp.common.commands`. What it returns is the exit code; nothing is 0. ``-h``, ``--quiet``
-and the examples below the options come with the decorator.
+and a line of :mod:`aerpaw_cmp.common.commands`. What it returns is the exit code; nothing is 0. ``-h``, ``--json``,
+``--quiet`` and the examples below the options come with the decorator; :func:`.answered` prints the object.
 """
 
 from __future__ import annotations
@@ -108,7 +108,7 @@ def command(
     register = of.command(name, cls=kind, help=COMMANDS[name] if text is None else text, epilog=epilog)
 
     def take(function: _Function) -> _Function:
-        register(_with_quiet(function))
+        register(_with_manners(function))
         return function
 
     return take
@@ -128,12 +128,12 @@ def _bare(hint: Any) -> Any:
     return inner[0] if get_origin(hint) is Union and get_origin(inner[0]) is Annotated else hint
 
 
-def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The function with the option ``--quiet`` and an interrupt that reaches :func:`aerpaw_cmp.cli.main`."""
+def _with_manners(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with ``--json``, ``--quiet`` and an interrupt that reaches :func:`aerpaw_cmp.cli.main`."""
 
     @functools.wraps(function)
-    def run(*, quiet: bool = False, **arguments: Any) -> Any:
-        say.quiet = quiet
+    def run(*, as_json: bool = False, quiet: bool = False, **arguments: Any) -> Any:
+        say.as_json, say.quiet = as_json, quiet
         for option, value in arguments.items():
             for number in value if isinstance(value, (list, tuple)) else (value,):
                 # click reads 'nan' as a number, and no comparison with a least or largest value refuses it
@@ -142,18 +142,18 @@ def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
         try:
             return function(**arguments)
         except NotRun as ended:
-            print_plan(ended.plan, arguments["as_json"])
+            print_plan(ended.plan)
             return 0
         except KeyboardInterrupt as error:
             raise Interrupted(error) from None  # typer would make a silent exit code of it
 
     # resolved: annotations are texts here, which typer would evaluate in its own module
     hints = {name: _bare(hint) for name, hint in get_type_hints(function, include_extras=True).items()}
-    hints["quiet"] = Quiet
+    hints |= {"as_json": Json, "quiet": Quiet}
     kind = inspect.Parameter.KEYWORD_ONLY
     parameters = [
         *inspect.signature(function).parameters.values(),
-        inspect.Parameter("quiet", kind, default=False),
+        *(inspect.Parameter(name, kind, default=False) for name in ("as_json", "quiet")),
     ]
     typed = [parameter.replace(kind=kind, annotation=hints[parameter.name]) for parameter in parameters]
     run.__signature__ = inspect.Signature(typed)  # type: ignore[attr-defined]  # typer reads the options here

@@ -27,7 +27,7 @@ class ProgressLines:
 
     On a terminal a share is a bar with the time left; elsewhere every quarter is a line. What stands behind a tab in
     the text may change from call to call: it is shown with the bar, and elsewhere every half minute. With ``quiet``
-    nothing is said but what :meth:`warn` gets.
+    nothing is said but what :meth:`warn` gets; with ``as_json`` standard output holds one object.
     """
 
     def __init__(self) -> None:
@@ -35,7 +35,7 @@ class ProgressLines:
         self._quarters: dict[str, int] = {}
         self._name = ""
         self._last = time.monotonic()
-        self.quiet = False
+        self.quiet = self.as_json = False
 
     def __call__(self, text: str, fraction: float | None = None, /) -> None:
         """Show a line, or how far something is."""
@@ -109,29 +109,28 @@ def warn_all(texts: Sequence[str]) -> None:
 SCHEMA = 1
 
 
-def print_json(value: dict[str, Any]) -> None:
-    """One object on standard output, which begins with the version of its schema."""
-    # NaN is no JSON, and a browser refuses all of it: whoever calls makes null of it
-    print(json.dumps({"schema": SCHEMA, **value}, indent=1, allow_nan=False), flush=True)
+def answered(value: dict[str, Any]) -> bool:
+    """Print the one object, with the version of its schema, where ``--json`` asks for it; False where lines are."""
+    if say.as_json:
+        # NaN is no JSON, and a browser refuses all of it: whoever calls makes null of it
+        print(json.dumps({"schema": SCHEMA, **value}, indent=1, allow_nan=False), flush=True)
+    return say.as_json
 
 
-def print_plan(plan: Any, as_json: bool = False) -> None:
+def print_plan(plan: Any) -> None:
     """Print what a command would do: a table of stages with their seconds, or one object."""
-    if as_json:
-        print_json(plan.as_dict())
+    if answered(plan.as_dict()):
         return
     rows = [[stage.name, stage.work, number(stage.seconds, "{:.1f}")] for stage in plan.stages]
     table(["stage", "work", "s"], rows, f"{plan.job}, not run")
     show(f"reads {counted(len(plan.inputs), 'file')}; would write {plan.output}")
 
 
-def print_files(paths: Sequence[Path], as_json: bool = False) -> None:
+def print_files(paths: Sequence[Path]) -> None:
     """Print the files that were written: a line each, or one object."""
-    if as_json:
-        print_json({"files": [str(path) for path in paths]})
-        return
-    for path in paths:
-        show(path)
+    if not answered({"files": [str(path) for path in paths]}):
+        for path in paths:
+            show(path)
 
 
 # Columns up to this width (numbers, times) are never broken.

@@ -519,7 +519,7 @@ def run_campaign(
     nodes = soundings(sounded, campaign.timezone) if sounded else ()
     folder = options.out or Path("reports") / campaign.campaign
     stages = options.stages("campaign", inputs, folder)
-    store = None if fresh else _outcomes_in(keep)
+    store = None if fresh else keep or cache_folder("outcomes")
     note = f"finished tasks are kept in {store}, and the same command computes the rest" if store else "nothing is kept"
     with (
         OutputFolder(folder, job="campaign", inputs=inputs, force=options.force) as output,
@@ -536,13 +536,6 @@ def run_campaign(
     failed += [text for text in warnings(data) if "edge of the searched span" in text]
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=tuple(failed))
-
-
-def _outcomes_in(keep: Path | None) -> Path:
-    """Folder of outcomes: as asked, else in the user's cache."""
-    if keep is not None and ":/" in str(keep):  # of an address; a path has one slash there
-        raise UsageError(f"--keep {keep}", expected="a folder")
-    return keep or cache_folder("outcomes")
 
 
 def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:

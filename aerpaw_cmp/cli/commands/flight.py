@@ -10,8 +10,8 @@ from typer import Argument, Option
 
 from ...common.counting import counted
 from ...jobs.tasks.options import RunOptions
-from ..app import DryRun, Export, Force, Json, LogsRoot, command, output
-from ..shown import number, print_files, print_json, records, say, show, table, warn_all
+from ..app import DryRun, Export, Force, LogsRoot, command, output
+from ..shown import answered, number, print_files, records, say, show, table, warn_all
 
 
 @command(
@@ -56,7 +56,6 @@ def report(
     export: Export = None,
     dry_run: DryRun = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> int:
     """Replay a flight, calibrate, compare, report."""
     from ...jobs import run
@@ -72,9 +71,7 @@ def report(
     )
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     outcome = run.run_report(flight, chosen, options)
-    if as_json:
-        print_json(outcome.metrics)
-    else:
+    if not answered(outcome.metrics):
         _print_report_summary(outcome)
     return max(_verdict(outcome, strict), _nothing_compared(outcome.metrics))
 
@@ -188,15 +185,13 @@ def calibrate(
     ] = None,
     dry_run: DryRun = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Learn antennas and ground from several flights."""
     from ...jobs import run
 
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     outcome = run.run_calibrate(calibration_yaml, options, into_site=into_site, score=score or ())
-    if as_json:
-        print_json(outcome.metrics)
+    if answered(outcome.metrics):
         return
     from ...compare.learning.calibration import BASELINES
 
@@ -237,13 +232,12 @@ def simulate(
     out: Annotated[Path | None, output("Output folder  [default: simulated/<flight>]")] = None,
     dry_run: DryRun = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Forward-simulate a planned flight into logs of the real formats."""
     from ...jobs import run
 
     options = RunOptions(out=out, force=force, progress=say, dry=dry_run)
-    print_files(run.run_simulate(flight, options).files, as_json)
+    print_files(run.run_simulate(flight, options).files)
 
 
 @command(
@@ -256,14 +250,12 @@ def simulate(
 def sample(
     out: Annotated[Path, output("Folder for flight.yaml and the logs.")] = Path("sample"),
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Copy the sample flight into a folder of your own."""
     from ...jobs.sample import write_sample
 
     flight = write_sample(out, force=force)
-    if as_json:
-        print_json({"flight": str(flight)})
+    if answered({"flight": str(flight)}):
         return
     show(f"flight: {flight}")
     show(f"next: aerpaw-cmp report {flight}")

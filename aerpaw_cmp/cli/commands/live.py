@@ -11,8 +11,8 @@ from typer.core import TyperCommand
 
 from ...common.counting import counted
 from ...common.errors import UsageError, one_line
-from ..app import Json, command, output
-from ..shown import print_files, print_json, say, show
+from ..app import command, output
+from ..shown import answered, print_files, say, show
 
 WEB = "127.0.0.1:8765"
 
@@ -60,7 +60,6 @@ def tap(
     ] = None,
     flight: Annotated[Path | None, Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
     telemetry: Annotated[Path | None, Option(help="The growing vehicleOut file that --flight follows.")] = None,
-    as_json: Json = False,
 ) -> int:
     """Log the modem's rank indicator until interrupted."""
     _needs_posix("tap")
@@ -90,9 +89,7 @@ def tap(
             f"{line.end}ended: {summary.reason}; {counted(summary.records, 'record')}{lost}, "
             f"{counted(summary.gaps, 'gap')}; {rates}"
         )
-    if as_json:
-        print_json(json_safe(summaries[0] if len(summaries) == 1 else {"modems": summaries}))
-    else:
+    if not answered(json_safe(summaries[0] if len(summaries) == 1 else {"modems": summaries})):
         print_files([path for summary in summaries for path in summary.segments])
     return max(summary.exit_code for summary in summaries)
 
@@ -157,7 +154,6 @@ def modem_sim(
     telemetry: Annotated[
         Path | None, Option(help="New telemetry file for --flight; it grows during the flight.")
     ] = None,
-    as_json: Json = False,
 ) -> int:
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
     _needs_posix("modem-sim")
@@ -173,9 +169,7 @@ def modem_sim(
     modem = FlightModem() if flown is None else FlightModem(flown.rank, rsrp=flown.rsrp)
 
     def ready(port: object) -> None:
-        if as_json:
-            print_json({"port": str(port)})
-        else:
+        if not answered({"port": str(port)}):
             show(port)
 
     return run_modem_sim(ModemSimulator(modem, link=link), on_ready=ready, meanwhile=flown)

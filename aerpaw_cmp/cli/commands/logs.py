@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 from typer import Argument, Option
 
-from ..app import Force, Json, command, output
-from ..shown import print_json, records, say, show, table
+from ..app import Force, command, output
+from ..shown import answered, records, say, show, table
 
 
 @command(
@@ -41,7 +41,6 @@ def ingest(
     unit: Annotated[str | None, Option(help="Unit of levels, if the file does not state it.")] = None,
     every_stream: Annotated[bool, Option("--all", help="Name every stream of a wide table.")] = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Read logs, account for every line, write the flight file."""
     from ...jobs import run
@@ -53,8 +52,7 @@ def ingest(
         options = run.mapping(columns) | {key: value for key, value in options.items() if value is not None}
         reader = reader or "generic_csv"
     summary = run.run_ingest(paths, out=out, draft=draft, site=site, reader=reader, force=force, **options)
-    if as_json:
-        print_json(summary)
+    if answered(summary):
         return
     folder, rows = account_rows(summary, every_stream)
     table(list(ACCOUNT), rows, f"files below {folder}" if folder else None)
@@ -78,14 +76,13 @@ def ingest(
         "aerpaw-cmp formats --json",
     ],
 )
-def formats(as_json: Json = False) -> None:
+def formats() -> None:
     """List the readers with a sample line each."""
     from ...logs.readers import catalogue
 
     readers = sorted(catalogue(), key=lambda r: r.name)
     listed = [{"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers]
-    if as_json:
-        print_json({"readers": listed})
+    if answered({"readers": listed}):
         return
     columns = {"reader": "name", "what": "title", "streams": "kinds", "a line of it": "sample"}
     records([{**item, "kinds": ", ".join(item["kinds"])} for item in listed], columns)

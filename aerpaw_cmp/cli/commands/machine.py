@@ -10,8 +10,8 @@ from typer import Option
 
 from ...common import files as cached
 from ...common.counting import counted
-from ..app import Json, command
-from ..shown import print_json, records, say, show
+from ..app import command
+from ..shown import answered, records, say, show
 
 
 @command(
@@ -26,7 +26,6 @@ def bench(
     poses: Annotated[int, Option(min=2, help="Poses of the flight that is replayed.")] = 200,
     quick: Annotated[bool, Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
     report: Annotated[Path | None, Option(help="Folder of a report: what accuracy costs on its flight, too.")] = None,
-    as_json: Json = False,
 ) -> None:
     """Speed against error on this machine."""
     from ...jobs import bench as job
@@ -35,8 +34,7 @@ def bench(
         result = job.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, report=report, progress=say)
     else:
         result = job.run_bench(poses=poses, report=report, progress=say)
-    if as_json:
-        print_json(result)
+    if answered(result):
         return
     rows = [
         {**row, "ranks": ", ".join(f"{k}: {share:.3f}" for k, share in row["rank_disagreement"].items())}
@@ -73,7 +71,6 @@ def _conditions(at: Mapping[str, Any]) -> str:
 )
 def doctor(
     clear_cache: Annotated[bool, Option("--clear-cache", help="First empty the cache of this program.")] = False,
-    as_json: Json = False,
 ) -> int:
     """Check this machine."""
     if clear_cache:
@@ -82,8 +79,6 @@ def doctor(
     from ...machine import doctor as doctor_room
 
     checks = doctor_room.checks()
-    if as_json:
-        print_json(doctor_room.as_dict(checks))
-    else:
+    if not answered(doctor_room.as_dict(checks)):
         records(checks, {"check": "name", "status": "status", "found": "found", "remedy": "remedy"})
     return 1 if any(c.status == "fail" for c in checks) else 0

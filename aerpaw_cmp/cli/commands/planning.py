@@ -10,8 +10,8 @@ from typer import Argument, Option
 
 from ...common.counting import counted
 from ...jobs.tasks.options import RunOptions
-from ..app import DryRun, Flights, Force, Json, LogsRoot, command, output
-from ..shown import print_files, print_json, records, say, show, warn_all
+from ..app import DryRun, Flights, Force, LogsRoot, command, output
+from ..shown import answered, print_files, records, say, show, warn_all
 
 
 @command(
@@ -47,7 +47,6 @@ def predict(
     logs_root: LogsRoot = None,
     dry_run: DryRun = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Predict level and rank with error bars where nobody has flown yet."""
     from ...jobs.prediction.predict import run_predict
@@ -59,7 +58,8 @@ def predict(
         TargetOptions(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading, site=site),
         RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run),
     )
-    print_json(outcome.metrics) if as_json else _print_prediction(outcome)
+    if not answered(outcome.metrics):
+        _print_prediction(outcome)
 
 
 def _print_prediction(outcome: Any) -> None:
@@ -112,7 +112,6 @@ def plan(
     logs_root: LogsRoot = None,
     dry_run: DryRun = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Rank candidate flights by the standard deviation that they would leave."""
     from ...jobs.prediction.next_flight import PlanOptions, run_plan
@@ -132,7 +131,8 @@ def plan(
     outcome = run_plan(
         target, flights or (), options, RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
     )
-    print_json(outcome.metrics) if as_json else _print_plan(outcome)
+    if not answered(outcome.metrics):
+        _print_plan(outcome)
 
 
 def _in_km(route: dict[str, Any]) -> dict[str, Any]:
@@ -178,7 +178,6 @@ def channel(
     subcarriers: Annotated[int, Option(min=1, max=65536, help="Subcarriers of the band.")] = 1024,
     logs_root: LogsRoot = None,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Write the channel along a flight or a route for the next simulation."""
     from ...jobs.channel import ChannelOptions, run_channel
@@ -195,13 +194,12 @@ def channel(
     outcome = run_channel(flight, chosen, RunOptions(out=out, logs_root=logs_root, force=force, progress=say))
     m = outcome.metrics
     size = f"{counted(m['paths'], 'path')}, {counted(m['poses'], 'pose')}"
-    _print(outcome, f"{size}, towers {', '.join(m['towers'])}, link {m['link']}", as_json)
+    _print(outcome, f"{size}, towers {', '.join(m['towers'])}, link {m['link']}")
 
 
-def _print(outcome: Any, sentence: str, as_json: bool) -> None:
+def _print(outcome: Any, sentence: str) -> None:
     """Print a sentence, warnings and files, or the metrics alone."""
-    if as_json:
-        print_json(outcome.metrics)
+    if answered(outcome.metrics):
         return
     show(sentence)
     warn_all(outcome.metrics["warnings"])
@@ -219,7 +217,6 @@ def locate(
     follow: Annotated[bool, Option("--follow", help="Again every 10 s while the logs grow, until Ctrl-C.")] = False,
     logs_root: LogsRoot = None,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Place an unknown node on the ground by the levels of a flight."""
     from ...jobs.locate import run_locate
@@ -227,7 +224,7 @@ def locate(
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say)
     while True:
         outcome = run_locate(flight, options, channel)
-        _print(outcome, outcome.metrics["sentence"], as_json)
+        _print(outcome, outcome.metrics["sentence"])
         if not follow:
             return
         time.sleep(10.0)

@@ -11,8 +11,8 @@ from typer import Argument, Option
 from ...common.counting import counted
 from ...common.errors import one_line
 from ...jobs.tasks.options import RunOptions
-from ..app import DryRun, Force, Json, LogsRoot, Scheduler, Workers, command, output
-from ..shown import number, print_json, records, say, show, table
+from ..app import DryRun, Force, LogsRoot, Scheduler, Workers, command, output
+from ..shown import answered, number, records, say, show, table
 
 
 @command(
@@ -31,7 +31,6 @@ def explain(
     ] = None,
     engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: rt.engine]")] = None,
     logs_root: LogsRoot = None,
-    as_json: Json = False,
 ) -> int:
     """List every path of a link at an instant, term by term."""
     from ...jobs.reporting.explain import run_explain
@@ -39,9 +38,7 @@ def explain(
     explanation = run_explain(
         flight, time=time, tower=tower, channel=channel, engine=engine, logs_root=logs_root, progress=say
     )
-    if as_json:
-        print_json(explanation.as_dict())
-    else:
+    if not answered(explanation.as_dict()):
         _print_explanation(explanation)
     return 0
 
@@ -98,16 +95,13 @@ def diff(
     out: Annotated[Path | None, output("Folder for diff.html and diff.json  [default: none is written]")] = None,
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a number differs by more than 0.01 dB.")] = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> int:
     """Differences between two reports of a flight: settings, inputs, versions, numbers on common samples."""
     from ...jobs.diff_reports import run_diff
     from ...report.pages.diff import diff_metrics
 
     comparison = run_diff(first, second, out=out, force=force)
-    if as_json:
-        print_json(diff_metrics(comparison))
-    else:
+    if not answered(diff_metrics(comparison)):
         _print_diff(comparison)
         if out is not None:
             show(f"page: {out / 'diff.html'}")
@@ -176,7 +170,6 @@ def campaign(
     dry_run: DryRun = False,
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a flight or a stated check failed.")] = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> int:
     """Many flights and settings, with what can be said only of several flights."""
     from ...jobs import run
@@ -185,9 +178,7 @@ def campaign(
         out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say, dry=dry_run
     )
     outcome = run.run_campaign(campaign_yaml, options, keep=keep, fresh=fresh)
-    if as_json:
-        print_json(outcome.metrics)
-    else:
+    if not answered(outcome.metrics):
         _print_campaign_summary(outcome)
     for check in outcome.failed_checks:
         say.warn(f"failed: {check}")

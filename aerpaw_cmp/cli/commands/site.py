@@ -9,8 +9,8 @@ from typer import Argument, Option
 
 from ...common.errors import UsageError
 from ...jobs.tasks.options import RunOptions
-from ..app import DryRun, Flights, Force, Json, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
-from ..shown import print_files, print_json, say, show, table
+from ..app import DryRun, Flights, Force, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
+from ..shown import answered, print_files, say, show, table
 
 
 @command(
@@ -47,7 +47,6 @@ def site_import(
     ] = None,
     trees: Annotated[bool, Option("--trees", help="Woods as single trees at random places, not as media.")] = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Import footprints, or a scene."""
     from ...jobs import run
@@ -67,8 +66,7 @@ def site_import(
     else:
         base = base or "lake_wheeler"
         actions = run.run_site_import(files, out, base=base, untagged=untagged, trees=trees, force=force)
-    if as_json:
-        print_json({"file": str(out), "base": base, "actions": actions})
+    if answered({"file": str(out), "base": base, "actions": actions}):
         return
     for line in actions:
         say(line)
@@ -85,13 +83,12 @@ def site_export(
     site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")],
     out: Annotated[Path, output("Output folder.")],
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Write a site for Sionna."""
     from ...jobs.mapping.site_scene import run_site_export
 
     files = run_site_export(site, out, force=force).files
-    print_files(files if as_json else files[:1], as_json)
+    print_files(files if say.as_json else files[:1])
 
 
 @command(
@@ -107,18 +104,17 @@ def site_show(
     site: Annotated[str, Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
     out: Annotated[Path | None, output("Output folder  [default: reports/site-<site>]")] = None,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Look at a site."""
     from ...jobs import run
 
     shown = run.run_site_show(site, RunOptions(out=out, force=force))
-    if not as_json:
+    if not say.as_json:
         from ...site.antenna.learned import memory_lines
 
         for line in memory_lines(site):
             say(line)
-    print_files(shown.files, as_json)
+    print_files(shown.files)
 
 
 @command(
@@ -142,13 +138,12 @@ def antenna_export(
         float | None, Option(min=1.0, help="Frequency [Hz]: which of several, and that of .msi.")
     ] = None,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Write a pattern for another program."""
     from ...jobs.antenna import run_antenna_export
 
     outcome = run_antenna_export(file, out, elevation=elevation, variable=variable, carrier_hz=carrier, force=force)
-    print_files(outcome.files, as_json)
+    print_files(outcome.files)
 
 
 @command(
@@ -196,7 +191,6 @@ def map_(
     scheduler: Scheduler = None,
     dry_run: DryRun = False,
     force: Force = False,
-    as_json: Json = False,
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
     from ...jobs import run
@@ -219,8 +213,7 @@ def map_(
         out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say, dry=dry_run
     )
     outcome = run.run_map(site, settings, options, flights=flights or (), figures=figures)
-    if as_json:
-        print_json(outcome.metrics)
+    if answered(outcome.metrics):
         return
     rows = [[p["where"], p["what"], p["paper"], p["ours"]] for p in outcome.metrics["paper"]]
     if rows:

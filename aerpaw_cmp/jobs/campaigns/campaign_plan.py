@@ -8,10 +8,9 @@ from contextlib import suppress
 from ...common.counting import counted
 from ...common.errors import AerpawCmpError
 from ...common.stages import PlannedStage, Progress
-from ...report.content.campaign import Failure
 from ..tasks.outcomes import OutcomeStore
 from ..tasks.workers import Lost, Workers
-from .campaign_tasks import Order, Outcome, Task, carry_out, digest_of, fitted_to
+from .campaign_tasks import Order, Outcome, Task, carry_out, digest_of, failed_task, fitted_to
 
 
 def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: int) -> list[PlannedStage]:
@@ -83,8 +82,7 @@ def compute(
         nonlocal failed
         order = orders[numbers[place]]
         if isinstance(result, Lost):
-            task = order.task
-            result = Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=result.message))
+            result = failed_task(order.task, result.message)
         if store is not None and order.key is not None and result.failure is None:
             store.save(order.key, result)
         outcomes[numbers[place]] = fitted_to(order.task, result)

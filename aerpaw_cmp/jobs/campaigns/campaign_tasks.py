@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import os
 import platform
 import time
 import traceback
@@ -29,6 +28,7 @@ from ...flight.settings import FlightFile, RssSettings
 from ...flight.training import logs_of, series_mark
 from ...report.content.campaign import Failure, RankRow, RssRow
 from ..reporting.flight_run import run_flight
+from ..tasks.manifest import stamp
 from ..tasks.outcomes import OutcomeStore, task_inputs, task_key
 
 
@@ -72,23 +72,11 @@ def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Out
         if copied := next((mark for mark in others if any(among(own, [mark]) for own in marks)), ""):
             message = f"readings of {marked[copied]} in another log"
         if message:
-            failure = Failure(
-                flight=task.flight, setting=task.setting, message=f"it holds {message}: it is counted once"
-            )
-            outcome = Outcome(failure=failure)
+            outcome = failed_task(task, f"it holds {message}: it is counted once")
         else:
             marked |= dict.fromkeys(marks, task.flight)
         counted.append(outcome)
     return counted
-
-
-def _stamp(path: Path) -> tuple[int, int]:
-    """Size and time of a file: a worker that lives for days must see that it was changed; zeros where there is none."""
-    try:
-        status = os.stat(path)  # noqa: PTH116
-    except OSError:
-        return 0, 0
-    return status.st_size, status.st_mtime_ns
 
 
 @lru_cache(maxsize=512)
@@ -115,10 +103,10 @@ class _Logs:
 
 def flight_data(task: Task) -> FlightData:
     """Read and gather the flight of a task; errors as in :mod:`aerpaw_cmp.flight.data`."""
-    settings = overridden(_flight_file(task.path, *_stamp(task.path)), task.overrides)
+    settings = overridden(_flight_file(task.path, *stamp(task.path)), task.overrides)
     folder, root = task.path.parent, task.logs_root
     text = "\n".join([str(settings.timezone), *(log.model_dump_json() for log in settings.logs)])
-    stamps = tuple(_stamp((root or folder) / log.path) for log in settings.logs)
+    stamps = tuple(stamp((root or folder) / log.path) for log in settings.logs)
     return gather(settings, folder, _logs(_Logs(folder, root, text, stamps, settings)), root)
 
 
@@ -128,9 +116,9 @@ def run_task(task: Task) -> Outcome:
         flight_run = run_flight(flight_data(task), audit=False)
         return _rows_of(task, flight_run.data, flight_run.result)
     except AerpawCmpError as error:
-        return _failed(task, str(error), error)
+        return failed_task(task, str(error), error)
     except Exception as error:  # one flight's fault must not cost the others their numbers
-        return _failed(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
+        return failed_task(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
 
 
 def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
@@ -148,8 +136,9 @@ def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
     )
 
 
-def _failed(task: Task, message: str, error: BaseException) -> Outcome:
-    text = "".join(traceback.format_exception(error))
+def failed_task(task: Task, message: str, error: BaseException | None = None) -> Outcome:
+    """The outcome of a task without numbers; the traceback of an error goes into a file of its own."""
+    text = "" if error is None else "".join(traceback.format_exception(error))
     return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message, traceback=text))
 
 
@@ -177,20 +166,17 @@ def carry_out(order: Order) -> Outcome:
     try:
         same = order.key is None or digest_of(task) == order.key
     except (AerpawCmpError, OSError) as error:
-        return _failed(task, f"an input can no longer be read: {error}", error)
+        return failed_task(task, f"an input can no longer be read: {error}", error)
     if not same:
-        return _not_the_same(task)
+        return failed_task(
+            task,
+            f"the worker on {platform.node()} sees other inputs, or runs another version of the program, than the "
+            f"process that planned the campaign (aerpaw-cmp {versions()['aerpaw-cmp']} there); expected the same "
+            "everywhere",
+        )
     start = time.perf_counter()
     outcome = run_task(task)
     return dataclasses.replace(outcome, seconds=time.perf_counter() - start)
-
-
-def _not_the_same(task: Task) -> Outcome:
-    message = (
-        f"the worker on {platform.node()} sees other inputs, or runs another version of the program, than the process "
-        f"that planned the campaign (aerpaw-cmp {versions()['aerpaw-cmp']} there); expected the same everywhere"
-    )
-    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))
 
 
 def digest_of(task: Task) -> str:
@@ -201,7 +187,7 @@ def digest_of(task: Task) -> str:
     AerpawCmpError, OSError
         If an input cannot be read.
     """
-    settings = overridden(_flight_file(task.path, *_stamp(task.path)), task.overrides)
+    settings = overridden(_flight_file(task.path, *stamp(task.path)), task.overrides)
     return task_key(settings, task_inputs(settings, task.path, task.logs_root))
 
 

@@ -53,14 +53,8 @@ def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], li
 
 
 def _group(row: RssRow, per: Pooling) -> str:
-    names = {
-        "link": f"{row.flight} {row.link}",
-        "tower": row.tower,
-        "channel": row.channel,
-        "flight": row.flight,
-        "all": "all",
-    }
-    return names[per]
+    joined = {"link": f"{row.flight} {row.link}", "all": "all"}
+    return joined[per] if per in joined else str(getattr(row, per))
 
 
 def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]) -> PooledOffset:

@@ -410,23 +410,6 @@ def _detection(data: FlightData, series: RssSeries, levels: Levels, free_space_d
     return None if score is None else dataclasses.replace(score, locks=series.locked is not None)
 
 
-def _halves(
-    time: Any, position_m: FloatArray, values: FloatArray, heading_deg: FloatArray | None
-) -> dict[str, tuple[Visit, Visit]]:
-    """Both halves of a flight, whose second passes places of the first: with headings that count, and without."""
-    elapsed = rss.seconds(time)
-    with np.errstate(invalid="ignore"):
-        late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
-    headings = {"same_heading": heading_deg, "any_heading": None}
-    if heading_deg is None:
-        del headings["same_heading"]
-
-    def half(rows: BoolArray, turned: FloatArray | None) -> Visit:
-        return Visit(position_m[rows], values[rows], None if turned is None else turned[rows])
-
-    return {name: (half(~late, turned), half(late, turned)) for name, turned in headings.items()}
-
-
 def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
     """Every two channels of a tower against each other, where they have instants in common."""
     out = []
@@ -619,5 +602,12 @@ def _repeated_rank(
     time: Any, position_m: FloatArray, rank: FloatArray, heading_deg: FloatArray | None
 ) -> dict[str, ranks.RankRepeat]:
     """Agreement of the modem with itself where the second half of the flight passes places of the first."""
-    passes = _halves(time, position_m, rank, heading_deg)
-    return {name: ranks.repeat_rank(*pair, _PASSES_WITHIN_M) for name, pair in passes.items()}
+    elapsed = rss.seconds(time)
+    with np.errstate(invalid="ignore"):
+        late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
+    headings: dict[str, FloatArray | None] = {} if heading_deg is None else {"same_heading": heading_deg}
+    repeats = {}
+    for name, turn in {**headings, "any_heading": None}.items():
+        early, again = (Visit(position_m[at], rank[at], None if turn is None else turn[at]) for at in (~late, late))
+        repeats[name] = ranks.repeat_rank(early, again, _PASSES_WITHIN_M)
+    return repeats

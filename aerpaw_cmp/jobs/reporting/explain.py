@@ -261,19 +261,9 @@ def _paths(
 
 def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterator[tuple[str, str]]:
     traced = {tuple(row[row >= 0].tolist()) for row in replayed.paths.faces}
+    otherwise = "geometry allows it: stopped by the terrain, or the ground of another tower"
+    if replayed.engine == "sionna":  # its rays are drawn: too few of them miss paths
+        otherwise = f"nothing is in its way: not found with {replayed.samples} samples per tower"
     for words, sequence in simple_paths(replayed):
         if tuple(sequence.tolist()) not in traced:
-            yield (
-                words,
-                why_not(replayed.faces, source, target, sequence, replayed.surfaces) or _otherwise(replayed),
-            )
-
-
-def _otherwise(replayed: Replay) -> str:
-    if replayed.engine == "sionna":
-        return f"nothing is in its way: not found with {replayed.samples} samples per tower"
-    stopped = "stopped by the terrain, or the ground of another tower"
-    return f"geometry allows it: {stopped}"
-
-
-__all__ = ["Explanation", "run_explain"]
+            yield words, why_not(replayed.faces, source, target, sequence, replayed.surfaces) or otherwise

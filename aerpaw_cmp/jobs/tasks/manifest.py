@@ -73,9 +73,22 @@ def inputs_of_flights(flights: Iterable[Path], logs_root: Path | None = None) ->
     return files
 
 
+def stamp(path: Path) -> tuple[int, int]:
+    """Size and time of a file: a worker that lives for days must see that it was changed; zeros where there is none."""
+    try:
+        status = os.stat(path)  # noqa: PTH116
+    except OSError:
+        return 0, 0
+    return status.st_size, status.st_mtime_ns
+
+
+def digest_of(place: Path) -> str:
+    """SHA-256 of a file, computed once for its size and time: a campaign asks with every task."""
+    return _digest(place, *stamp(place))
+
+
 @lru_cache(maxsize=1024)
-def digest_of(place: Path, _size: int, _mtime_ns: int) -> str:
-    """SHA-256 of a file as it was when its size and time were those: a campaign asks with every task."""
+def _digest(place: Path, _size: int, _mtime_ns: int) -> str:
     return file_digest(place)
 
 
@@ -88,10 +101,4 @@ def _learned_on(place: Path, size: int, _mtime_ns: int) -> tuple[str, ...]:
 
 
 def _entry(name: str, place: Path, role: str) -> InputFile:
-    status = os.stat(place)  # noqa: PTH116
-    return InputFile(
-        path=name,
-        sha256=digest_of(place, status.st_size, status.st_mtime_ns),
-        role=role,
-        learned_on=_learned_on(place, status.st_size, status.st_mtime_ns),
-    )
+    return InputFile(path=name, sha256=digest_of(place), role=role, learned_on=_learned_on(place, *stamp(place)))

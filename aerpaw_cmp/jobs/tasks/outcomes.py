@@ -158,7 +158,7 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
     ]
     for log in settings.logs:
         path = (logs_root or flight.parent) / log.path
-        entries.append({"role": "log", "path": log.path, "sha256": _content(path)})
+        entries.append({"role": "log", "path": log.path, "sha256": digest_of(path)})
     return entries
 
 
@@ -173,11 +173,6 @@ def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: o
     for entry in inputs:
         digest.update(f"{entry['role']} {entry['sha256']}\n".encode())
     return digest.hexdigest()
-
-
-def _content(path: Path) -> str:
-    status = os.stat(path)  # noqa: PTH116  the times make the key of the cache
-    return digest_of(path, status.st_size, status.st_mtime_ns)
 
 
 @cache

@@ -326,7 +326,6 @@ class WorkerFacts:
     """Facts that a worker states about itself."""
 
     host: str
-    python: str
     version: str
     code: str
     missing: tuple[str, ...]
@@ -338,7 +337,6 @@ def _worker_facts(paths: Sequence[str]) -> WorkerFacts:
 
     return WorkerFacts(
         host=platform.node(),
-        python=platform.python_version(),
         version=__version__,
         code=code_digest(),
         missing=tuple(path for path in paths if not os.access(path, os.R_OK)),

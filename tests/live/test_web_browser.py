@@ -16,7 +16,16 @@ from aerpaw_cmp.live.feed import Feed
 from aerpaw_cmp.live.session import TapStatus
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
 from aerpaw_cmp.report.pages.live import LiveMap, live_page
-from tests.report.browsing import complaints, extents, frame, needs_browser, serious_findings, set_scheme, start
+from tests.report.browsing import (
+    complaints,
+    extents,
+    frame,
+    needs_browser,
+    saves_every_chart,
+    serious_findings,
+    set_scheme,
+    start,
+)
 from tests.report.conftest import make_site
 
 pytest.importorskip("selenium", reason="selenium is not installed")
@@ -193,6 +202,8 @@ def test_the_map_shows_the_flight_over_the_prediction_and_is_linked(driver, fly)
     driver.execute_script("document.getElementById('closer').click()")
     frame(driver)
     assert driver.execute_script("return live.view.zoom") > 1
+    table = saves_every_chart(driver)["map.csv"].splitlines()
+    assert (len(table), table[0].split(",")[-3:]) == (21, ["east", "north", "up"])
 
 
 def test_without_predictions_the_page_shows_what_was_measured(driver, fly):

@@ -68,6 +68,17 @@ def saved(driver, buttons: str) -> dict[str, str]:
     return driver.execute_script("return files")
 
 
+def saves_every_chart(driver) -> dict[str, str]:
+    """One button for SVG a canvas that is shown and no scale of another, each giving a picture with marks."""
+    shown = "[...document.querySelectorAll('canvas:not(#legend)')].filter(c => c.checkVisibility()).length"
+    files = saved(driver, ".saves button, .key button")
+    drawn = [text for name, text in files.items() if name.endswith(".svg")]
+    assert len(drawn) == driver.execute_script(f"return {shown}") > 0
+    for text in drawn:
+        assert {"path", "text"} <= {e.tag.split("}")[1] for e in ElementTree.fromstring(text).iter()}
+    return files
+
+
 def complaints(driver) -> list[dict]:
     """What the console says; but not that pixels are read often: tests do, no page does."""
     said = [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
@@ -178,15 +189,7 @@ class PageLaws:
         assert max(rights) <= width
 
     def test_every_chart_can_be_saved(self, driver):
-        """One button for SVG a canvas that is shown and no scale of another, each giving a picture with marks."""
-        shown = "[...document.querySelectorAll('canvas:not(#legend)')].filter(c => c.checkVisibility()).length"
-        drawn = {
-            name: text for name, text in saved(driver, ".saves button, .key button").items() if name[-4:] == ".svg"
-        }
-        assert len(drawn) == driver.execute_script(f"return {shown}")
-        assert all(
-            {"path", "text"} <= {e.tag.split("}")[1] for e in ElementTree.fromstring(t).iter()} for t in drawn.values()
-        )
+        saves_every_chart(driver)
 
     def test_dark_and_light(self, driver):
         assert [paper[:3] for paper in self.papers(driver)] == [[255, 255, 255], [23, 23, 23]]

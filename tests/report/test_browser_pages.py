@@ -9,7 +9,8 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from tests.report.browsing import needs_browser, open_page, set_scheme, set_width, start
+from aerpaw_cmp.report.pages.site import viewer
+from tests.report.browsing import complaints, needs_browser, open_page, saves_every_chart, set_scheme, set_width, start
 from tests.report.shown import PAGES
 
 pytestmark = needs_browser
@@ -65,3 +66,16 @@ def test_no_page_is_wider_than_its_window_or_light_in_the_dark(
             pixels = matplotlib.image.imread(io.BytesIO(shown.screenshot_as_png))[..., :3]
             assert (np.median(pixels) < 0.2) == (scheme == "dark")
     set_scheme(driver)
+
+
+def test_the_view_of_a_site_can_be_saved(driver: Any, tmp_path: Path, report_data: Any) -> None:
+    """Round crowns of trees too; the table has the corners of all that stands there."""
+    path = tmp_path / "site.html"
+    path.write_text(viewer(report_data.site), encoding="utf-8")
+    open_page(driver, path, "shape")
+    files = saves_every_chart(driver)
+    (picture,) = (text for name, text in files.items() if name.endswith(".svg"))
+    assert picture.count(" A ") >= 2 * (len(report_data.site.trees) + len(report_data.site.towers))
+    (table,) = (text.splitlines() for name, text in files.items() if name.endswith(".csv"))
+    assert {row.split(",")[0] for row in table[1:]} == {"tower", "building", "tree", "forest", "geofence"}
+    assert complaints(driver) == []

@@ -81,6 +81,7 @@ def viewer(site: Site) -> str:
     content = _view_of(site)
     return rendered(
         "site_view",
+        ("common.js", "site_view.js"),
         site=site,
         scene=embedded(content),
         trees_shown=len(content["trees"]),

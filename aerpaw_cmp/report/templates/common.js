@@ -186,9 +186,10 @@ const common = (() => {
   // commands of a path in the words of SVG; an arc is two, as SVG has none that ends where it began
   const SPELLED = {
     closePath: () => ["Z"], moveTo: (x, y) => ["M", x, y], lineTo: (x, y) => ["L", x, y], rect: (x, y, w, h) => ["M", x, y, "h", w, "v", h, "h", -w, "Z"],
-    arc: (x, y, r, from, to) => [0, 0.5, 1].flatMap(part => {
+    arc: (x, y, r, from, to) => SPELLED.ellipse(x, y, r, r, 0, from, to),
+    ellipse: (x, y, wide, high, _, from, to) => [0, 0.5, 1].flatMap(part => { // ours lie along the axes
       const angle = from + part * Math.min(to - from, 2 * Math.PI);
-      return [...(part ? ["A", r, r, 0, 0, 1] : ["L"]), x + r * Math.cos(angle), y + r * Math.sin(angle)];
+      return [...(part ? ["A", wide, high, 0, 0, 1] : ["L"]), x + wide * Math.cos(angle), y + high * Math.sin(angle)];
     }),
   };
   const spell = (name, values) => SPELLED[name](...values).map(v => Number.isFinite(v) ? +v.toFixed(2) : v).join(" ") + " ";

@@ -272,12 +272,13 @@
     chart("chart-sinr", [dots(m.t, m.sinr, blue)], { low: least, high: most, label: "dB" });
   }
 
+  // names of columns and a row an answer, of what is measured ("rows") or predicted at poses ("predictions")
+  function listed(kind) { const c = state.modems[state.chosen][kind].columns; return [Object.keys(c), ...c.t.map((_, i) => Object.values(c).map(list => list[i]))]; }
   for (const id of ["chart-rank", "chart-rsrp", "chart-residual", "chart-sinr"]) {
     const canvas = at(id);
     if (!canvas) continue;
-    const rows = () => { const c = state.modems[state.chosen].rows.columns; return [Object.keys(c), ...c.t.map((_, i) => Object.values(c).map(list => list[i]))]; };
     const saves = Object.assign(document.createElement("p"), { className: "saves" });
-    saves.append(...common.downloads(canvas, id.slice(6), rows, () => scales.get(id)?.again()));
+    saves.append(...common.downloads(canvas, id.slice(6), () => listed("rows"), () => scales.get(id)?.again()));
     canvas.previousElementSibling.before(saves); // floats beside the heading: no line is lost in the field
     canvas.addEventListener("pointermove", e => {
       const s = scales.get(id);
@@ -414,6 +415,7 @@
   }
 
   if (canvas) {
+    common.saves(canvas, "map", () => listed("predictions"), drawMap);
     const fingers = new Map();
     const zoom = by => { view.zoom = Math.min(40, Math.max(0.2, view.zoom * by)); later(draw); };
     canvas.addEventListener("pointerdown", e => { canvas.setPointerCapture(e.pointerId); fingers.set(e.pointerId, [e.clientX, e.clientY]); });

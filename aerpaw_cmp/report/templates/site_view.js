@@ -1,4 +1,3 @@
-"use strict";
 // A painter's-algorithm view: everything becomes polygons, lines and labels, sorted by depth, drawn far to near.
 const scene = JSON.parse(document.getElementById("scene").textContent);
 const canvas = document.getElementById("view"), pen = canvas.getContext("2d");
@@ -37,19 +36,7 @@ function view(turn, tilt) {
   redraw();
 }
 
-function polygon(points, fill, line) {
-  pen.beginPath();
-  points.forEach((p, i) => i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1]));
-  pen.closePath();
-  if (fill) { pen.fillStyle = fill; pen.fill(); }
-  if (line) { pen.strokeStyle = line; pen.lineWidth = 0.7; pen.stroke(); }
-}
-
-function polyline(points, colour, width, dash) {
-  pen.beginPath();
-  points.forEach((p, i) => i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1]));
-  pen.strokeStyle = colour; pen.lineWidth = width; pen.setLineDash(dash || []); pen.stroke(); pen.setLineDash([]);
-}
+const polygon = (...given) => common.polygon(pen, ...given), polyline = (...given) => common.polyline(pen, ...given);
 
 function label(text, p, colour) {
   pen.font = "bold 13px system-ui, sans-serif"; pen.lineWidth = 3; pen.strokeStyle = "rgba(255,255,255,.9)";
@@ -113,8 +100,7 @@ function draw() {
   label("N", [x + (b[0] - a[0]) * k - 6, y + (b[1] - a[1]) * k], "#333");
 }
 
-let waiting = false;
-function redraw() { if (!waiting) { waiting = true; requestAnimationFrame(() => { waiting = false; draw(); }); } }
+const redraw = () => common.later(draw);
 function turn(dx, dy) { eye.turn += dx; eye.tilt = Math.min(1.57, Math.max(0.03, eye.tilt + dy)); redraw(); }
 function zoom(by) { eye.zoom = Math.min(30, Math.max(0.4, eye.zoom * by)); redraw(); }
 function move(dx, dy) {
@@ -148,4 +134,12 @@ box("stretch").addEventListener("input", e => { eye.stretch = +e.target.value; b
 box("above").addEventListener("click", () => view(0, 1.57));
 box("side").addEventListener("click", () => view(0, 0.12));
 new ResizeObserver(redraw).observe(canvas);
+// corners of everything that stands there, whatever is drawn
+function corners() {
+  const of = (kind, name, points) => points.map(p => [kind, name, p[0], p[1], p[2] ?? 0]), all = (kind, rings) => rings.flatMap((ring, i) => of(kind, i + 1, ring));
+  return [["kind", "name", "east_m", "north_m", "up_m"], ...scene.towers.flatMap(t => of("tower", t.name, [t.at, [t.at[0], t.at[1], t.top]])),
+    ...scene.buildings.flatMap(b => of("building", b.name, b.faces.flat())), ...scene.trees.flatMap(([e, n, g, high], i) => of("tree", i + 1, [[e, n, g], [e, n, g + high]])),
+    ...all("forest", scene.forests), ...all("geofence", scene.fences)];
+}
+box("saves").append(...common.downloads(canvas, document.title, corners, draw));
 view(-0.45, 0.55);

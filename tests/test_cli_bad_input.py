@@ -105,3 +105,47 @@ def test_nan_positions_are_left_out_not_fatal(run: Run) -> None:
     lines[7] = lines[7].replace("35.7274", "-999").replace("-78.69", "-999.69")
     code, err = run(vehicleOut="".join(lines))
     assert code == 0, err
+
+
+KINDS = {
+    "report": FLIGHT,
+    "calibrate": "calibration: a\nflights: [x.yaml]\n",
+    "campaign": "campaign: a\nflights: [x.yaml]\ncalibration: tower\n",
+    "map": "name: a\norigin: {}\ntowers: {}\n",
+}
+
+
+@pytest.mark.parametrize("command", KINDS)
+def test_settings_of_another_kind_are_told_as_such(
+    command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Not key by key; and the next step names the command that reads them."""
+    for reader, text in KINDS.items():
+        (file := tmp_path / "file.yaml").write_text(text)
+        if reader != command:
+            assert main([command, str(file)]) == 2
+            err = capsys.readouterr().err
+            assert f"Next: 'aerpaw-cmp {reader} {file}'" in err
+            assert "unknown key" not in err
+
+
+def test_only_the_log_that_lacks_a_zone_has_no_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "a.txt").write_text(GOOD_POWER)
+    row = "2024-07-02T15:37:1{0}Z,-8{0},35.72,-78.69,30\n"
+    (tmp_path / "b.csv").write_text("time,rsrp_dbm,latitude,longitude,altitude\n" + row.format(0) + row.format(1))
+    assert main(["ingest", str(tmp_path)]) == 2
+    out, err = capsys.readouterr()
+    assert "b.csv" in out
+    assert "drive_test" in out
+    assert "a.txt: no time zone" in err
+    assert main(["ingest", str(tmp_path), "--timezone", "America/NewYork"]) == 2
+    assert "a.txt" not in (err := capsys.readouterr().err)
+    assert "did you mean 'America/New_York'" in err
+
+
+def test_a_line_without_end_is_offered_no_columns(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "huge.csv").write_text("time,power," + "level," * 20_000)
+    assert main(["ingest", str(tmp_path / "huge.csv")]) == 3
+    err = capsys.readouterr().err
+    assert "no line ends" in err
+    assert "--map" not in err

@@ -275,6 +275,8 @@ class UsageError(AerpawCmpError):
     """The command line or a configuration file is wrong."""
 
     exit_code = 2
+    others: Any = ()
+    """Logs that were read all the same, beside the log that lacks an option."""
 
 
 class InputError(AerpawCmpError):

@@ -36,6 +36,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return "read the page, or run without the check"
     if isinstance(error, OutputError) or re.search(r"after -o\b|a new name", error.expected or ""):
         return "the same command with another name after -o"
+    if place is not None and (reader := re.search(r"'(aerpaw-cmp [a-z]+) FILE' reads", error.found)):
+        return f"'{reader[1]} {one_line(str(place))}'"
     if place is not None and place.suffix in _SETTINGS and _exists(place) and words[:1] != ["ingest"]:
         line = "" if error.line is None else f", line {error.line},"
         return f"mend {one_line(place.name)}{line} and run the same command"

@@ -364,6 +364,11 @@ def _plain_value(text: str) -> Any:
 def _explain(
     error: pydantic.ValidationError, model: type[pydantic.BaseModel], document: _Document, path: str | Path | None
 ) -> UsageError:
+    if (kind := _kind(document.value)) and kind != _kind(_field_names(model)):
+        # no near name mends what is all unknown
+        return UsageError(
+            f"these are the settings of a {kind}", expected=_KEYS.format(_listed(_field_names(model)[:4])), path=path
+        )
     findings: list[tuple[int | None, str, str | None]] = []
     for item in error.errors(include_url=False):
         problem, cause = _finding(item, model)
@@ -380,6 +385,19 @@ def _explain(
     # a file of another kind has hundreds of mistakes
     shown = lines[:20] + ([f"and {len(lines) - 20} more"] if len(lines) > 20 else [])
     return UsageError(f"{len(findings)} problems\n  " + "\n  ".join(shown), path=path)
+
+
+# Kinds of settings files by keys that only they have all of; a campaign may say how its flights share a calibration.
+_SIGNS = {
+    "campaign, which 'aerpaw-cmp campaign FILE' reads": {"campaign"},
+    "calibration, which 'aerpaw-cmp calibrate FILE' reads": {"calibration", "flights"},
+    "site, which 'aerpaw-cmp map FILE' reads": {"origin", "towers"},
+    "flight, which 'aerpaw-cmp report FILE' reads": {"flight", "logs"},
+}
+
+
+def _kind(keys: Iterable[str]) -> str | None:
+    return next((kind for kind, signs in _SIGNS.items() if signs.issubset(keys)), None)
 
 
 # Parts of a location that say which member of a union was tried; no key of ours has such a name.

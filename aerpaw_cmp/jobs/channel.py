@@ -292,7 +292,8 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
     -------
     JobOutcome
     """
-    formats = chosen_formats(chosen.formats, FORMATS)
+    # the second time "all" is spelled out, so that a missing library is told before hours of replay
+    formats = chosen_formats(chosen_formats(chosen.formats, FORMATS), FORMATS)
     settings, stages = load_with_learned(flight), Stages(options.progress)
     root, route = options.logs_root or flight.parent, chosen.route
     if route is None and settings.flight.plan and not all((root / log.path).exists() for log in settings.logs):

@@ -84,7 +84,10 @@ def run_ingest(
     from ..logs.flight_file import fill, is_flight_file
     from ..logs.ingest import ingest, summary
     from ..logs.readers import ReadOptions
+    from ..logs.text.clocks import zone
 
+    if name := options.get("timezone"):
+        zone(name, needed_by="--timezone")  # misspelt, it is no fault of the first log
     if out is not None and draft is not None and os.path.realpath(out) == os.path.realpath(draft):
         raise UsageError("-o and --draft name the same file", expected="two names", path=draft)
     inputs = [*paths, *([] if site is None else [Path(site)])]

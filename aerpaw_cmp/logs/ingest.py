@@ -47,6 +47,8 @@ class Skipped:
 
     path: str
     reason: str
+    lacks: UsageError | None = None
+    """The option without which it cannot be read: of the folder's other files it says nothing."""
 
 
 class Ingested(list[IngestedFile]):
@@ -128,6 +130,9 @@ def ingest(
         inside, skipped_below = _below(Path(path), options, chosen)
         files += inside
         skipped += skipped_below
+    if lacking := [item.lacks for item in skipped if item.lacks]:
+        lacking[0].others = Ingested(files, [item for item in skipped if not item.lacks])
+        raise lacking[0]
     return Ingested(files, skipped)
 
 
@@ -139,7 +144,7 @@ def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> t
         return [replace(_of_kind(item, chosen, place), holder=str(place)) for item in read_flight(place)], []
     else:
         return [read_file(place, options=options, reader=chosen)], []
-    if not inside:
+    if not inside and not any(item.lacks for item in skipped):
         known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
         looked = counted(len(skipped), "file")
         first = f"; {one_line(Path(skipped[0].path).name)}: {skipped[0].reason}" if skipped else ""
@@ -307,6 +312,8 @@ def _archive(
             files.append(_member(path, member, content, options, chosen))
         except InputError as error:
             skipped.append(Skipped(str(path), _samples_of(name, content) or error.found))
+        except UsageError as error:
+            skipped.append(Skipped(str(path), error.found, error))
     return files, skipped
 
 
@@ -504,6 +511,8 @@ def _folder(
             meta = place.with_suffix(".sigmf-meta")
             names = {place.name, meta.name} if meta.exists() else set()
             skipped.append(Skipped(str(place), _samples_of(place.name, names) or error.found))
+        except UsageError as error:
+            skipped.append(Skipped(str(place), error.found, error))
     return files, skipped
 
 

@@ -226,6 +226,8 @@ def _way_out(head: bytes) -> str:
     sign = max(",;\t|", key=first.count)
     names = [name.strip().strip('"') for name in first.split(sign)]
     if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
+        if len(head) == HEAD_BYTES and b"\n" not in head:
+            return f"no line ends in the first {HEAD_BYTES >> 10} KiB: an aborted copy, or no table"
         fits = {quantity: [name for name in names if _looks_like(name, words)] for quantity, words in _LIKE.items()}
         pairs = [f"--map {named[0]!r}={quantity}" for quantity, named in fits.items() if named]
         lacking = [quantity for quantity in ("time", "rss_db") if not fits[quantity]]

@@ -278,9 +278,11 @@ def test_a_node_of_the_flight_itself_and_a_step_longer_than_it(folder, tmp_path)
     assert "no point has a neighbour in time" in book.attrs["comment"]
 
 
-def test_a_missing_library_is_told_before_the_replay(folder, capsys, tmp_path, monkeypatch):
+@pytest.mark.parametrize("name", ["netcdf", "all"])
+def test_a_missing_library_is_told_before_the_replay(name, folder, capsys, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "netCDF4", None)
-    assert main(["channel", str(folder / "plan.yaml"), "-o", str(tmp_path / "out")]) == 2
+    monkeypatch.setattr(channel, "channel_parts", None)
+    assert main(["channel", str(folder / "plan.yaml"), "--format", name, "-o", str(tmp_path / "out")]) == 2
     said = capsys.readouterr().err
     assert "aerpaw-cmp[geo]" in said
     assert "replay" not in said

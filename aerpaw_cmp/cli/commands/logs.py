@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
+from ...common.errors import UsageError
 from ..app import Force, command, output
 from ..shown import answered, records, say, show, table
 
@@ -44,20 +46,22 @@ def ingest(
 ) -> None:
     """Read logs, account for every line, write the flight file."""
     from ...jobs import run
-    from ...logs.ingest import ACCOUNT, account_notes, account_rows
+    from ...logs.ingest import summary as account
 
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
     if columns:
         # what the user says outweighs what a mapping implies, such as the number of rank 1
         options = run.mapping(columns) | {key: value for key, value in options.items() if value is not None}
         reader = reader or "generic_csv"
-    summary = run.run_ingest(paths, out=out, draft=draft, site=site, reader=reader, force=force, **options)
+    try:
+        summary = run.run_ingest(paths, out=out, draft=draft, site=site, reader=reader, force=force, **options)
+    except UsageError as error:
+        if error.others and not say.as_json:
+            _show(account(error.others), every_stream)
+        raise
     if answered(summary):
         return
-    folder, rows = account_rows(summary, every_stream)
-    table(list(ACCOUNT), rows, f"files below {folder}" if folder else None)
-    for note in account_notes(summary):
-        say(note)
+    _show(summary, every_stream)
     if out is not None:
         flights = summary["flights"]
         several = f": {len(flights)} flights, {', '.join(flights)}" if len(flights) > 1 else ""
@@ -67,6 +71,15 @@ def ingest(
             say(remark)
         for place in summary["drafts"]:
             show(f"wrote {place}")
+
+
+def _show(summary: Mapping[str, Any], every_stream: bool) -> None:
+    from ...logs.ingest import ACCOUNT, account_notes, account_rows
+
+    folder, rows = account_rows(summary, every_stream)
+    table(list(ACCOUNT), rows, f"files below {folder}" if folder else None)
+    for note in account_notes(summary):
+        say(note)
 
 
 @command(

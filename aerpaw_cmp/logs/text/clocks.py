@@ -107,7 +107,7 @@ def zone(name: str | None, *, needed_by: str) -> tzinfo:
         near = nearest_zone(name)
         raise UsageError(
             f"unknown time zone {name!r}",
-            expected="an IANA name under 'timezone:', e.g. America/New_York",
+            expected="an IANA name for 'timezone:' or --timezone, e.g. America/New_York",
             cause=f"did you mean '{near}'?" if near else "a misspelt name, or no zone database on this machine",
         ) from error
 

@@ -186,6 +186,8 @@ def blank_pictures() -> Iterator[None]:
 
     For tests that run a command to its end and look at no picture.
     """
+    from matplotlib.figure import Figure
+
     from aerpaw_cmp.report.kit import canvas
 
     def save_as(fig: Any, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
@@ -193,7 +195,7 @@ def blank_pictures() -> Iterator[None]:
 
     @cache
     def blank(size: tuple[float, float], formats: tuple[str, ...], kind: str) -> dict[str, bytes]:
-        return real(canvas.figure(size), formats, kind)
+        return real(Figure(figsize=size), formats, kind)
 
     real = canvas.save_as
     with pytest.MonkeyPatch.context() as patch:
@@ -204,11 +206,13 @@ def blank_pictures() -> Iterator[None]:
 @pytest.fixture(scope="module")
 def few_pictures(blank_pictures: None) -> Iterator[None]:
     """Also, a figure is made from its data once per module: for usual flights that many tests of a module report."""
+    from matplotlib.figure import Figure
+
     from aerpaw_cmp.report.kit import canvas
 
     def render(spec: Any, *how: Any) -> Any:
         if spec.name in made:
-            spec = dataclasses.replace(spec, draw=canvas.figure)
+            spec = dataclasses.replace(spec, draw=Figure)
         made.add(spec.name)
         return real(spec, *how)
 

@@ -48,6 +48,10 @@ _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
 
+# What the page shows of a status as it is.
+_STATUS = ("connected", "records", "bytes_written", "disk_free_bytes", "disk_fault", "gaps", "missed", "predicts")
+
+
 class Rows:
     """The last rows of a table of 32-bit floats, in memory taken once; rows count from zero for ever."""
 
@@ -247,20 +251,15 @@ class Feed:
         return (mono_ns + modem.shift_ns - self.start_ns) / 1e9
 
     def _status(self, modem: _Modem, status: TapStatus) -> None:
-        modem.connected = status.connected
-        modem.records, modem.bytes_written = status.records, status.bytes_written
-        modem.disk_free_bytes, modem.disk_fault = status.disk_free_bytes, status.disk_fault
-        modem.gaps, modem.missed, modem.predicts = status.gaps, status.missed, status.predicts
+        for name in _STATUS:
+            setattr(modem, name, getattr(status, name))
         if status.message and status.message not in _alarms_of(modem, self.now()).values():
             self._note(modem, "message", status.message)
 
     def _take(self, modem: _Modem, item: Record | TapStatus) -> None:
         if isinstance(item, TapStatus):
             self._status(modem, item)
-        else:
-            self._record(modem, item)
-
-    def _record(self, modem: _Modem, record: Record) -> None:
+            return
         takers = {
             "header": self._take_header,
             "exchange": self._take_exchange,
@@ -269,8 +268,8 @@ class Feed:
             "clock": self._take_clock,
             "end": self._take_end,
         }
-        if (take := takers.get(record["kind"])) is not None:
-            take(modem, record)
+        if (take := takers.get(item["kind"])) is not None:
+            take(modem, item)
 
     def _take_header(self, modem: _Modem, record: Record) -> None:
         modem.port = str(record.get("port", {}).get("device", ""))
@@ -324,7 +323,7 @@ class Feed:
         modem.gap_text = "" if modem.connected else f"no modem: {record['reason']}"
         if modem.connected:
             modem.rank_s = self._seconds(modem, record["mono_ns"])
-        if not modem.connected:
+        else:
             modem.rank = modem.rsrp_dbm = modem.sinr_db = None  # what was last measured is not what is now
 
     def _take_clock(self, modem: _Modem, record: Record) -> None:
@@ -340,8 +339,7 @@ class Feed:
 
     def _note(self, modem: _Modem, kind: str, text: str) -> None:
         """Put a line without duration into the history."""
-        now = self.now()
-        self._raise(modem, kind, text).end_s = now
+        self._raise(modem, kind, text).end_s = self.now()
 
     def _raise(self, modem: _Modem, kind: str, text: str) -> Alarm:
         alarm = Alarm(self._alarm_count, self._modems.index(modem), kind, text[:_LONGEST_TEXT], self.now(), version=-1)

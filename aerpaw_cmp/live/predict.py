@@ -157,10 +157,7 @@ class PredictionWorker:
 
     def results(self) -> list[dict[str, Any]]:
         """Finished predictions, each with measured rank and residual (measured minus predicted)."""
-        finished = []
-        while self._done:
-            finished.append(self._done.popleft())
-        return finished
+        return [self._done.popleft() for _ in range(len(self._done))]
 
     def close(self) -> None:
         """Finish what is asked for, at most 2 s long."""

@@ -65,14 +65,6 @@ def _not_a_modem(path: Path, received: bytes) -> InputError:
     return InputError(sign, expected=expected, cause=cause, path=path)
 
 
-def _no_port(error: PortGoneError) -> InputError:
-    return InputError(
-        str(error),
-        expected="the modem's AT port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
-        cause="the modem is not plugged in or still starts; see 'aerpaw-cmp doctor'",
-    )
-
-
 class Tap:
     """One session of the tap; see :func:`run_tap`."""
 
@@ -128,10 +120,6 @@ class Tap:
         """Connect, poll until asked to stop, end cleanly."""
         try:
             self._first_connection()
-        except BaseException:
-            self._close_helpers()
-            raise
-        try:
             if not self._stop.count:
                 self._log.open()
                 self._log_open = True
@@ -149,12 +137,6 @@ class Tap:
             summary = self._finish()
         return summary
 
-    def _close_helpers(self) -> None:
-        if self._worker is not None:
-            self._worker.close()
-        if self._notifier is not None:
-            self._notifier.close()
-
     def _first_connection(self) -> None:
         deadline = self._clock.mono_ns() + int(self._settings.wait_for_port_s * 1e9)
         while not self._stop.count:
@@ -164,7 +146,11 @@ class Tap:
                 return
             except PortGoneError as error:
                 if last:
-                    raise _no_port(error) from None
+                    raise InputError(
+                        str(error),
+                        expected="the modem's AT port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
+                        cause="the modem is not plugged in or still starts; see 'aerpaw-cmp doctor'",
+                    ) from None
             except InputError:
                 if last:
                     raise
@@ -199,8 +185,9 @@ class Tap:
             return
         self._schedule.started(name, now)
         decoded = self._exchange(name)[1]
-        if name == RI_QUERY:
-            self._advise(decoded)
+        if name == RI_QUERY and decoded.values.get("rank") is not None:
+            self._last_csi_ns = self._clock.mono_ns()
+            self._alarm = False
 
     def _finish(self) -> TapSummary:
         restored = self._restore_csi()
@@ -234,8 +221,8 @@ class Tap:
         return TapSummary(
             **said,
             exit_code=1 if self._log.lost else 0,
-            segments=self._log.paths,
-            records=self._log.records,
+            segments=tuple(self._log.log.paths),
+            records=self._log.log.records,
             lost_records=self._log.lost,
             alarms=self._alarms,
         )
@@ -411,11 +398,6 @@ class Tap:
                 self._say("CSI reporting was switched on; its old state is unknown and will not be restored")
         elif state[1] == 0:
             self._say("CSI reporting is off, so no rank will come: run with --enable-csi")
-
-    def _advise(self, decoded: Decoded) -> None:
-        if decoded.values.get("rank") is not None:
-            self._last_csi_ns = self._clock.mono_ns()
-            self._alarm = False
 
     # one exchange -----------------------------------------------------------------------------------------
 
@@ -649,8 +631,8 @@ class Tap:
             sinr_db=self._last["sinr_db"],
             ri_rate_hz=len(self._ri_times) / window_s,
             gaps=self._gaps,
-            records=self._log.records,
-            bytes_written=self._log.bytes_written,
+            records=self._log.log.records,
+            bytes_written=self._log.log.bytes_written,
             disk_free_bytes=self._log.free_bytes,
             disk_fault=self._log.fault,
             missed=sum(self._schedule.missed.values()),

@@ -21,7 +21,6 @@ import selectors
 import socket
 import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -176,7 +175,7 @@ class WebServer:
         self.feed.digest()
         self.closing = True
         until = time.monotonic() + wait_s
-        while self._server.streams and time.monotonic() < until:
+        while self._server.browsers and time.monotonic() < until:
             time.sleep(0.02)
         self._server.ended = True
         self._threads[0].join()
@@ -203,12 +202,11 @@ class _Server(ThreadingHTTPServer):
 
     def __init__(self, web: WebServer) -> None:
         self.web = web
-        self.streams = 0
         self.ended = False
         self._lock = threading.Lock()
         self._secrets = quote(web.token).encode(), web.pass_word.encode()
         self._waiting: dict[socket.socket, tuple[tuple[Any, ...], float]] = {}
-        self._open: set[socket.socket] = set()
+        self.browsers: set[socket.socket] = set()
         self._allowances: dict[str, tuple[float, float]] = {}
         self.address_family = socket.AF_INET6 if ":" in web.address.host else socket.AF_INET
         super().__init__((web.address.host, web.address.port), _Handler)
@@ -289,31 +287,20 @@ class _Server(ThreadingHTTPServer):
     def shutdown_request(self, request: Any) -> None:
         """Forget the connection, then close it."""
         with self._lock:
-            self._open.discard(request)
+            self.browsers.discard(request)
         super().shutdown_request(request)
-
-    @contextlib.contextmanager
-    def streaming(self) -> Iterator[None]:
-        """Count a stream of events while it runs."""
-        with self._lock:
-            self.streams += 1
-        try:
-            yield
-        finally:
-            with self._lock:
-                self.streams -= 1
 
     def let_in(self, request: Any) -> bool:
         """Note a connection that showed the token; False where too many of these are open."""
         with self._lock:
-            if len(self._open) >= self.web.limits.connections:
+            if len(self.browsers) >= self.web.limits.connections:
                 return False
-            self._open.add(request)
+            self.browsers.add(request)
             return True
 
     def close_all(self) -> None:
         """End every connection."""
-        for request in list(self._open):
+        for request in list(self.browsers):
             with contextlib.suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
 
@@ -352,8 +339,7 @@ class _Handler(BaseHTTPRequestHandler):
             self._pieces(body)
         else:
             self._head("text/event-stream", None)
-            with self.server.streaming():
-                self._events(self.headers.get("Last-Event-ID") or query.get("from", ""))
+            self._events(self.headers.get("Last-Event-ID") or query.get("from", ""))
 
     def _refusal(self, path: str, query: dict[str, str]) -> tuple[HTTPStatus, str] | None:
         """Status and reason with which the request is refused, None if it is answered."""
@@ -398,8 +384,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._pieces(text.encode("ascii"))
             time.sleep(0.0 if web.closing else web.limits.tick_s)
 
-    def _head(self, kind: str, length: int | None, *, cookie: bool = False) -> None:
-        self.send_response(HTTPStatus.OK)
+    def _head(self, kind: str, length: int | None, status: HTTPStatus = HTTPStatus.OK, *, cookie: bool = False) -> None:
+        self.send_response(status)
         self.send_header("Content-Type", kind)
         if cookie:
             secret = self.server.web.pass_word
@@ -428,10 +414,7 @@ class _Handler(BaseHTTPRequestHandler):
 
     def _text(self, status: HTTPStatus, text: str) -> None:
         body = f"{text}\n".encode()
-        self.send_response(status)
-        self.send_header("Content-Type", "text/plain; charset=utf-8")
-        self.send_header("Content-Length", str(len(body)))
-        self.end_headers()
+        self._head("text/plain; charset=utf-8", len(body), status)
         self._pieces(body)
 
     def _pieces(self, data: bytes) -> None:

@@ -1,5 +1,6 @@
 """Framing: the same events however the bytes are cut, a bounded buffer, nothing lost."""
 
+import pickle
 from itertools import pairwise
 
 import pytest
@@ -100,7 +101,7 @@ def test_ten_megabytes_without_line_end_stay_bounded():
     framer = sent(CSI)
     for _ in range(160):
         assert framer.feed(b"x" * 65_536) == []
-        assert framer.buffered <= 65_536
+        assert len(pickle.dumps(framer)) < 70_000
     events = framer.feed(b'\r\n+QNWCFG: "nr5g_csi",13,2,8,896\r\nOK\r\n')
     assert isinstance(events[0], Unsolicited)
     assert len(events[0].text) + events[0].dropped == 160 * 65_536
@@ -115,11 +116,6 @@ def test_endless_answer_stays_bounded():
     (answer,) = framer.feed(b"OK\r\n")
     assert len(answer.lines) == 10
     assert "too_many_lines:9990" in answer.flags
-
-
-def test_two_commands_in_flight_are_refused():
-    with pytest.raises(ValueError, match="still in flight"):
-        sent(CSI).send(*QENG)
 
 
 @settings(max_examples=200, deadline=None)

@@ -226,7 +226,7 @@ def test_a_flood_of_an_address_keeps_neither_others_out_nor_who_has_the_token(to
 def test_browsers_with_the_token_are_bounded(tools):
     with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", 0), limits=Limits(connections=2)) as web:
         browsers = [tools.Browser.of(web) for _ in range(2)]
-        until(lambda: web._server.streams == 2, 10.0)
+        until(lambda: len(web._server.browsers) == 2, 10.0)
         assert ask(web)[0] == 503
         for browser in browsers:
             browser.close()
@@ -281,7 +281,7 @@ def test_a_browser_that_takes_nothing_is_dropped_and_others_miss_nothing(tools):
         def streams(wanted):
             assert time.monotonic() < until
             time.sleep(0.01)
-            return web._server.streams == wanted
+            return len(web._server.browsers) == wanted
 
         while not streams(2):
             pass

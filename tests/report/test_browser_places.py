@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report.kit.canvas import rank_colour
+from aerpaw_cmp.common.kml import CLASS_COLOURS
 from aerpaw_cmp.report.kit.page import embedded
 from aerpaw_cmp.report.pages.places import BAND, COMPASS, LIKELIEST, Places, payload
 from tests.report.browsing import PageLaws, choose, frame, needs_browser, open_page, papers, saved, start
@@ -84,7 +84,7 @@ def test_directions_lie_on_a_sphere_that_turns(driver):
         "return Array.from(pen.getImageData(arguments[0] * r, arguments[1] * r, 1, 1).data).slice(0, 3)"
     )
     top, bottom = (driver.execute_script(colour, wide / 2 + 12, share * high) for share in (0.22, 0.78))
-    assert [top, bottom] == [list(bytes.fromhex(rank_colour(rank)[1:])) for rank in (4, 1)]
+    assert [top, bottom] == [list(bytes.fromhex(CLASS_COLOURS[rank][1:])) for rank in (4, 1)]
     driver.find_element("id", "view-side").click()
     frame(driver)
     assert "270°" in point_at(driver, wide / 2 + 22, high / 2)

@@ -5,6 +5,7 @@ import json
 import re
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from aerpaw_cmp.report.content.campaign import Repeat
@@ -91,7 +92,7 @@ def test_campaign_json_has_the_telling_pairs_and_a_file_has_all(data, tmp_path):
     assert [p["first"] for p in campaign_html.campaign_metrics(few)["repeatability"]["pairs"]] == [
         pair.first for pair in few.repeats
     ]
-    table = campaign_html.pair_frame(season)
+    table = pd.DataFrame(map(campaign_html.cells, season.repeats))
     assert table["n"].tolist() == [pair.n for pair in season.repeats]
     assert table["rmse_low_db"].notna().sum() == 20_000
 

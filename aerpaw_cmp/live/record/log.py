@@ -297,18 +297,16 @@ class SegmentLog:
                 self._backlog_bytes -= len(self._backlog.popleft())
                 self.records += 1
             if self.fault is not None:
-                self._recover()
+                self._recover(self.fault)
         except OSError as error:
             self._fail(error)
             return False
         return True
 
-    def _recover(self) -> None:
+    def _recover(self, fault: DiskFault) -> None:
         """The disk took everything: record the fault as past."""
         os.fdatasync(self._fd)
-        fault, self.fault = self.fault, None
-        if fault is None:
-            return
+        self.fault = None
         record = {
             "kind": "disk",
             "reason": fault.reason,
@@ -355,17 +353,12 @@ class SegmentLog:
     def _rotate(self) -> None:
         try:
             self._write(encode_record({"kind": "rotate", "next_segment": self._segment + 1, "n": self._number}))
-        except OSError as error:
-            self._fail(error)
-            return
-        self._number += 1
-        self.records += 1
-        self.sync()
-        if self.fault is not None:
-            return
-        self._close_fd()
-        try:
-            self._new_segment()
+            self._number += 1
+            self.records += 1
+            self.sync()
+            if self.fault is None:
+                self._close_fd()
+                self._new_segment()
         except OSError as error:
             self._fail(error)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import threading
 from collections import deque
-from pathlib import Path
 
 from ...common.counting import counted
 from ...logs.files.checksums import Record
@@ -26,7 +25,7 @@ class LogWriter:
     """
 
     def __init__(self, log: SegmentLog) -> None:
-        self._log = log
+        self.log = log
         log.on_fault = self._tell
         self._messages: deque[str] = deque(maxlen=100)
         self._queue: deque[tuple[Record, int]] = deque()
@@ -34,57 +33,36 @@ class LogWriter:
         self._dropped = 0
         self._changed = threading.Condition()
         self._busy = self._closing = self._sync_wanted = False
-        self._free: int | None = None
+        self.free_bytes: int | None = None
+        """Space left on the disk, as last seen."""
         self._thread = threading.Thread(target=self._run, name="tap-log", daemon=True)
-
-    @property
-    def records(self) -> int:
-        """Records on disk."""
-        return self._log.records
-
-    @property
-    def bytes_written(self) -> int:
-        """Bytes on disk."""
-        return self._log.bytes_written
-
-    @property
-    def paths(self) -> tuple[Path, ...]:
-        """Segments so far."""
-        return tuple(self._log.paths)
 
     @property
     def lost(self) -> int:
         """Records that memory could not hold while the disk took none."""
-        return self._log.lost + self._dropped
-
-    @property
-    def free_bytes(self) -> int | None:
-        """Space left on the disk, as last seen."""
-        return self._free
+        return self.log.lost + self._dropped
 
     @property
     def fault(self) -> str:
         """Reason why the disk takes no records now; empty while it does."""
-        fault = self._log.fault
+        fault = self.log.fault
         return "" if fault is None else fault.reason
 
     def messages(self) -> list[str]:
         """Messages about the disk since the last call."""
-        texts = []
-        while self._messages:
-            texts.append(self._messages.popleft())
-        return texts
+        # by number: the writing thread may add to them meanwhile
+        return [self._messages.popleft() for _ in range(len(self._messages))]
 
     def open(self) -> None:
         """Open the log; raises ``InputError`` as :meth:`SegmentLog.open` does."""
-        self._log.open()
-        self._free = self._log.free_bytes()
+        self.log.open()
+        self.free_bytes = self.log.free_bytes()
         self._thread.start()
 
     def append(self, record: Record) -> bool:
         """Hand over one record; True once the kernel has it, False if it waits in memory."""
         size = 500 + sum(len(line) for line in record.get("lines", ()) if isinstance(line, str))
-        settings = self._log.settings
+        settings = self.log.settings
         with self._changed:
             stalled = self._busy or bool(self._queue)
             self._queue.append((record, size))
@@ -95,14 +73,14 @@ class LogWriter:
             self._changed.notify_all()
             # during a stall that was waited for once, do not wait again
             done = not stalled and self._changed.wait_for(self._idle, settings.patience_s)
-        return done and self._log.fault is None
+        return done and self.log.fault is None
 
     def sync(self) -> None:
         """``fdatasync`` soon; waits for it at most ``patience_s``."""
         with self._changed:
             self._sync_wanted = True
             self._changed.notify_all()
-            self._changed.wait_for(self._idle, self._log.settings.patience_s)
+            self._changed.wait_for(self._idle, self.log.settings.patience_s)
 
     def close(self, timeout_s: float = 30.0) -> None:
         """Write what waits and close; a disk that still hangs after the time is left alone."""
@@ -114,7 +92,7 @@ class LogWriter:
             self._dropped += len(self._queue)
             self._tell(f"the disk hangs: {counted(len(self._queue), 'record')} lost")
         else:
-            self._log.close()
+            self.log.close()
 
     # inside -----------------------------------------------------------------------------------------------
 
@@ -125,7 +103,7 @@ class LogWriter:
         return not (self._queue or self._busy or self._sync_wanted)
 
     def _run(self) -> None:
-        pause_s = min(1.0, max(0.02, self._log.settings.sync_interval_s / 2))
+        pause_s = min(1.0, max(0.02, self.log.settings.sync_interval_s / 2))
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: not self._idle() or self._closing, pause_s)
@@ -147,12 +125,12 @@ class LogWriter:
     def _work(self, record: Record | None, sync: bool) -> None:
         try:
             if record is not None:
-                self._log.append(record)
+                self.log.append(record)
             elif sync:
-                self._log.sync()
+                self.log.sync()
             else:
-                self._log.tick()
-                self._free = self._log.free_bytes()
+                self.log.tick()
+                self.free_bytes = self.log.free_bytes()
         except Exception as error:  # one bad record must not end the log
             self._dropped += record is not None
             self._tell(f"a record could not be written: {type(error).__name__}: {error}")

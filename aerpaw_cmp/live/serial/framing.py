@@ -1,7 +1,7 @@
 """Bytes of an AT port to answers and unsolicited lines: no file, no port, no clock.
 
 :class:`Framer` knows the command in flight. It gives the same events however the bytes are cut into pieces, and holds
-a bounded buffer: a line is kept up to ``max_line_bytes``, an answer up to ``max_lines``; the rest is counted, not
+a bounded buffer: a line is kept up to :data:`_MAX_LINE_BYTES`, an answer up to ``max_lines``; the rest is counted, not
 stored.
 
 A line ends at any run of CR and LF (a modem with echo ends the echo with CR CR LF). Bytes become text as Latin-1,
@@ -137,16 +137,9 @@ def unglue(text: str) -> tuple[str, ...]:
 
 
 class LineBuffer:
-    """Bytes to lines with a bounded buffer.
+    """Bytes to lines with a bounded buffer: of a longer line the rest is counted in :attr:`Line.dropped`."""
 
-    Parameters
-    ----------
-    max_line_bytes : int
-        Longer lines keep this many bytes; the rest is counted in :attr:`Line.dropped`.
-    """
-
-    def __init__(self, max_line_bytes: int = _MAX_LINE_BYTES) -> None:
-        self._max = max_line_bytes
+    def __init__(self) -> None:
         self._buffer = bytearray()
         self._dropped = 0
 
@@ -160,7 +153,7 @@ class LineBuffer:
         self._keep(data, start, len(data))
 
     def _keep(self, data: bytes, start: int, stop: int) -> None:
-        room = max(0, self._max - len(self._buffer))
+        room = max(0, _MAX_LINE_BYTES - len(self._buffer))
         self._buffer += data[start : min(stop, start + room)]
         self._dropped += max(0, stop - start - room)
 
@@ -168,17 +161,13 @@ class LineBuffer:
         """The unfinished line."""
         return self._buffer.decode("latin-1")
 
-    def flush(self) -> Iterator[Line]:
-        """The unfinished line as a line, if it is not blank."""
+    def flush(self) -> list[Line]:
+        """The unfinished line as a line, if it is not blank; the buffer is empty then."""
         text = self._buffer.decode("latin-1").strip(" \t")
         line = Line(text, self._dropped)
         self._buffer.clear()
         self._dropped = 0
-        if text or line.dropped:
-            yield line
-
-    def __len__(self) -> int:
-        return len(self._buffer)
+        return [line] if text or line.dropped else []
 
 
 _LINE_END = re.compile(rb"[\r\n]+")
@@ -210,8 +199,8 @@ class Framer:
 
     Parameters
     ----------
-    max_line_bytes, max_lines : int
-        Bounds of the buffer.
+    max_lines : int
+        Of an answer that are kept.
 
     Examples
     --------
@@ -221,21 +210,13 @@ class Framer:
     ('+QNWCFG: "nr5g_csi",13,2,8,896',)
     """
 
-    def __init__(self, *, max_line_bytes: int = _MAX_LINE_BYTES, max_lines: int = _MAX_LINES) -> None:
-        self._buffer = LineBuffer(max_line_bytes)
+    def __init__(self, *, max_lines: int = _MAX_LINES) -> None:
+        self._buffer = LineBuffer()
         self._max_lines = max_lines
         self._open: _Open | None = None
         self._owed: list[_Open] = []
         self._stray: list[str] = []
         self._echo_seen = False
-
-    @property
-    def buffered(self) -> int:
-        """Bytes and lines held now; bounded whatever comes in."""
-        count = sum(len(x) for x in self._stray)
-        if self._open is not None:
-            count += sum(len(x) for x in self._open.lines)
-        return count + len(self._buffer)
 
     def send(self, command: str, prefixes: tuple[str, ...] | None) -> None:
         """A command goes out.
@@ -246,14 +227,7 @@ class Framer:
             As written to the port, without its end.
         prefixes : tuple of str, or None
             Starts of its information lines, without blanks; ``()`` if it has none, None if any line may be one.
-
-        Raises
-        ------
-        ValueError
-            If another command is in flight (a bug of the caller).
         """
-        if self._open is not None:
-            raise ValueError(f"{self._open.command!r} is still in flight")
         self._open = _Open(command, prefixes, [], [])
 
     def feed(self, data: bytes) -> list[Event]:
@@ -272,8 +246,7 @@ class Framer:
 
         After ``timeout`` its answer is owed and may come late; after ``lost`` the buffer is emptied.
         """
-        if self._open is None:
-            raise ValueError("no command in flight")
+        assert self._open is not None
         now, self._open = self._open, None
         answer = Answer(
             command=now.command,
@@ -285,8 +258,7 @@ class Framer:
         )
         self._echo_seen = now.echoed  # a reset modem may have stopped echoing
         if status == "lost":
-            for _ in self._buffer.flush():
-                pass
+            self._buffer.flush()
             self._owed.clear()
         else:
             self._owed.append(now)
@@ -297,8 +269,7 @@ class Framer:
         """Return and forget what is held and belongs to nothing: lines of owed answers, and the unfinished line."""
         lines, self._stray = tuple(self._stray), []
         partial = self._buffer.peek()
-        for _ in self._buffer.flush():
-            pass
+        self._buffer.flush()
         self._owed.clear()
         return lines, partial
 

@@ -259,7 +259,7 @@ class SerialPort:
         self.path = path
 
     @classmethod
-    def open(cls, path: Path, baud: int = termios.B115200) -> SerialPort:
+    def open(cls, path: Path) -> SerialPort:
         """Open a port for us alone.
 
         Raises
@@ -281,7 +281,7 @@ class SerialPort:
                 raise _busy(path, users)
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             fcntl.ioctl(fd, termios.TIOCEXCL)
-            make_raw(fd, baud)
+            make_raw(fd, termios.B115200)
             users = holders(path)  # again: someone may have come between
             if users:
                 raise _busy(path, users)
@@ -349,21 +349,9 @@ class SerialPort:
 
 def make_raw(fd: int, baud: int) -> None:
     """No echo, no line editing, 8N1, no flow control; what waits in the queue stays."""
-    iflag, oflag, cflag, lflag, _, _, cc = termios.tcgetattr(fd)
-    iflag &= ~(
-        termios.IGNBRK
-        | termios.BRKINT
-        | termios.PARMRK
-        | termios.ISTRIP
-        | termios.INLCR
-        | termios.IGNCR
-        | termios.ICRNL
-        | termios.IXON
-        | termios.IXOFF
-    )
-    oflag &= ~termios.OPOST
-    lflag &= ~(termios.ECHO | termios.ECHONL | termios.ICANON | termios.ISIG | termios.IEXTEN)
-    cflag &= ~(termios.CSIZE | termios.PARENB | termios.CSTOPB | termios.CRTSCTS)
-    cflag |= termios.CS8 | termios.CREAD | termios.CLOCAL
+    _, _, cflag, _, _, _, cc = termios.tcgetattr(fd)
+    # HUPCL stays as it was: whether a modem is told that its port closes is the system's choice, not ours
+    cflag = (cflag & termios.HUPCL) | termios.CS8 | termios.CREAD | termios.CLOCAL
     cc[termios.VMIN], cc[termios.VTIME] = 1, 0
-    termios.tcsetattr(fd, termios.TCSANOW, [iflag, oflag, cflag, lflag, baud, baud, cc])
+    # every flag of input, output and local mode changes or holds back bytes: none is wanted
+    termios.tcsetattr(fd, termios.TCSANOW, [0, 0, cflag, 0, baud, baud, cc])

@@ -252,32 +252,25 @@ def framed(lines: Iterable[str]) -> bytes:
 def run_modem_sim(
     simulator: ModemSimulator,
     *,
-    on_ready: Callable[[Path], None] | None = None,
+    on_ready: Callable[[Path], None],
     meanwhile: Callable[[], None] | None = None,
-) -> int:
+) -> None:
     """Serve a simulated modem until a signal comes.
 
     Parameters
     ----------
     simulator : ModemSimulator
-    on_ready : callable, optional
+    on_ready : callable
         Gets the port's name.
     meanwhile : callable, optional
         Called several times a second, e.g. to write the telemetry of the same flight.
-
-    Returns
-    -------
-    int
-        Exit code 0.
     """
     stop = Stop()
     try:
         with stop.on_signals(), simulator:
-            if on_ready is not None:
-                on_ready(simulator.port)
-            beat = meanwhile or (lambda: None)
+            on_ready(simulator.port)
             while not stop.wait(0.1 if meanwhile else 1.0):
-                beat()
+                if meanwhile is not None:
+                    meanwhile()
     finally:
         stop.close()
-    return 0

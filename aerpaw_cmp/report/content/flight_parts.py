@@ -170,15 +170,11 @@ def waypoints_of(data: FlightData) -> tuple[record.Waypoint, ...]:
     track = track_of(data)
     if track is None:
         return ()
-    out, start = [], 0
+    out, start, line_m = [], 0, np.column_stack([track.east_m, track.north_m, track.up_m])
     for point in points:
         if not point.label:
             continue
-        distance = np.sqrt(
-            (track.east_m[start:] - point.east_m) ** 2
-            + (track.north_m[start:] - point.north_m) ** 2
-            + (track.up_m[start:] - point.height_m) ** 2
-        )
+        distance = np.linalg.norm(line_m[start:] - (point.east_m, point.north_m, point.height_m), axis=1)
         # the first moment it comes as near as it ever will (within 2 m): later visits belong to later waypoints
         near = np.flatnonzero(distance <= np.nanmin(distance) + 2.0)
         index = start + int(near[0])

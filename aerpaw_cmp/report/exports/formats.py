@@ -48,14 +48,7 @@ def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tupl
 
 def _missing_module(name: str) -> str:
     """The module that a format needs and that is not there."""
-    return next((module for module in _NEEDS.get(name, ()) if not _installed(module)), "")
-
-
-def _installed(module: str) -> bool:
-    try:
-        return importlib.util.find_spec(module) is not None
-    except ValueError:  # a module that is set to None, as an import of it would fail
-        return False
+    return next((module for module in _NEEDS.get(name, ()) if importlib.util.find_spec(module) is None), "")
 
 
 def write_exports(export: Export, folder: Path, formats: Iterable[str], progress: Progress = logged) -> list[Path]:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ...common.cf import WGS84, Dataset, file_attributes, netcdf_bytes
-from .points import LABELS, PLACES, Column, Export, Points
+from .points import LINK, PLACES, Column, Export, Points
 
 # Stands for a missing code in NetCDF; attribute ``_FillValue``.
 _NO_CODE = -1
@@ -32,9 +32,7 @@ def _points_dataset(export: Export, points: Points) -> Dataset:
     links = list(points.links())
     texts = {
         "link": ("flight, tower and channel", [f"{f} {f'{t} {c}'.strip()}" for f, t, c, _ in links]),
-        "flight": (LABELS["flight"], [flight for flight, *_ in links]),
-        "tower": (LABELS["tower"], [tower for _, tower, *_ in links]),
-        "channel": (LABELS["channel"], [channel for *_, channel, _ in links]),
+        **{name: (f"name of the {name}", [link[i] for link in links]) for i, name in enumerate(LINK)},
         "unit_of_measured": ("unit of the level as logged", [str(rows["unit"].iloc[0]) for *_, rows in links]),
     }
     variables: dict[str, Any] = {

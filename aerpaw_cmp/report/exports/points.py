@@ -63,19 +63,14 @@ class Column:
     flags: tuple[str, ...] = ()
 
 
-LABELS = {
-    "flight": "name of the flight",
-    "tower": "name of the tower",
-    "channel": "name of the channel",
-    "unit": "unit of measured_db",
-}
-UP = Column(name="up_m", unit="m", shown_unit="m", meaning="height above the ground at the site origin")
+# What names a link.
+LINK = ("flight", "tower", "channel")
 PLACES = {
     "latitude_deg": ("degrees_north", "WGS84 latitude"),
     "longitude_deg": ("degrees_east", "WGS84 longitude"),
     "east_m": ("m", "east of the site origin"),
     "north_m": ("m", "north of the site origin"),
-    "up_m": ("m", UP.meaning),
+    "up_m": ("m", "height above the ground at the site origin"),
 }
 
 
@@ -88,7 +83,7 @@ class Points:
     kind : str
         Name of files and layers: ``"rss"``, ``"rank"``.
     table : pandas.DataFrame
-        ``time`` (UTC), :data:`LABELS`, :data:`PLACES`, then ``columns``; links one below the other, each in time order.
+        ``time`` (UTC), :data:`LINK`, unit, :data:`PLACES`, ``columns``; links one below the other, each in time order.
     columns : tuple of Column
     """
 
@@ -101,7 +96,7 @@ class Points:
 
     def links(self) -> Iterator[tuple[str, str, str, Any]]:
         """Flight, tower, channel and table of each link, in their order."""
-        for key, rows in self.table.groupby(["flight", "tower", "channel"], sort=False, observed=True):
+        for key, rows in self.table.groupby(list(LINK), sort=False, observed=True):
             yield *map(str, key), rows
 
 
@@ -195,14 +190,14 @@ def points_table(
     table = pd.concat(parts, ignore_index=True)
     table["time"] = table["time"].to_numpy("datetime64[ns]")
     units = table["unit"].unique()
-    names = [name for name in table.columns if name not in {"time", *LABELS, *PLACES}]
+    names = [name for name in table.columns if name not in {"time", *LINK, "unit", *PLACES}]
     for name in ("east_m", "north_m", "up_m", *names):
         values = np.round(table[name].to_numpy(np.float64, na_value=np.nan), DECIMALS)
         table[name] = np.where(np.isfinite(values), values, np.nan)
     table["latitude_deg"], table["longitude_deg"] = latitude_longitude(
         frame, table["east_m"].to_numpy(), table["north_m"].to_numpy()
     )
-    table = table.astype(dict.fromkeys(LABELS, "category"))[["time", *LABELS, *PLACES, *names]]
+    table = table.astype(dict.fromkeys((*LINK, "unit"), "category"))[["time", *LINK, "unit", *PLACES, *names]]
     shared = str(units[0]) if len(units) == 1 else "dB, reference by link"
     yield Points(kind=kind, table=table, columns=tuple(column(name, shared) for name in names))
 

@@ -160,12 +160,12 @@ def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
 
 
 def rss_csv(series: Sequence[RssResult]) -> Iterator[str]:
-    """The text of :func:`rss_frame` in pieces of bounded size."""
+    """The text of rss.csv in pieces of bounded size."""
     return _text(rss_tables(series), RSS_COLUMNS)
 
 
 def rank_csv(series: Sequence[RankResult]) -> Iterator[str]:
-    """The text of :func:`rank_frame` in pieces of bounded size."""
+    """The text of rank.csv in pieces of bounded size."""
     return _text(rank_tables(series), RANK_COLUMNS)
 
 
@@ -243,16 +243,8 @@ def _number_columns(series: RankResult) -> dict[str, FloatArray]:
     return {name: np.where(np.isfinite(values), values, np.nan) for name, values in columns.items()}
 
 
-def joined_tables(tables: Iterator[_Table], columns: Iterable[str]) -> Any:
-    """Tables below each other, rounded; without any, the bare columns."""
-    import pandas as pd
-
-    frames = [_rows(table, slice(None)) for table in tables]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
-
-
 def _text(tables: Iterator[_Table], columns: Iterable[str]) -> Iterator[str]:
-    """The same as CSV, some rows at a time: a day of samples as text would not fit into memory."""
+    """Tables below each other as CSV, some rows at a time: a day of samples as text would not fit into memory."""
     head = True
     for table in tables:
         for start in range(0, len(table[0]), _ROWS):
@@ -260,7 +252,7 @@ def _text(tables: Iterator[_Table], columns: Iterable[str]) -> Iterator[str]:
             yield rows.to_csv(index=False, header=head, lineterminator="\n")
             head = False
     if head:
-        yield joined_tables(iter(()), columns).to_csv(index=False, lineterminator="\n")
+        yield ",".join(columns) + "\n"
 
 
 def _rows(table: _Table, part: slice) -> Any:

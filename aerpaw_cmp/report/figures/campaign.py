@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..content.campaign import CampaignData
-from ..kit.canvas import TOWER, FigureSpec, beyond, colour_bar, frame_around, plan_axes, subplots
+from ..kit.canvas import FigureSpec, beyond, colour_bar, draw_tower, frame_around, plan_axes, subplots
 from .charts import COLOURS
 
 if TYPE_CHECKING:
@@ -60,10 +60,7 @@ def season_places(data: CampaignData) -> Figure:
     known = {} if data.site is None else data.site.towers
     names = dict.fromkeys(row.tower for row in data.reference_rows if row.tower in known)
     for tower in names:
-        ax.plot(
-            known[tower].east_m, known[tower].north_m, marker="^", markersize=9, color=TOWER, markeredgecolor="white",
-            linestyle="none", zorder=5,
-        )  # fmt: skip
+        draw_tower(ax, known[tower])
     plan_axes(ax)
     at = [known[name].position_m[None, :2] for name in names]
     frame_around(ax, *np.concatenate([(cells + 0.5) * data.cell_m, *at]).T)
@@ -75,15 +72,13 @@ def figure_specs(data: CampaignData) -> Iterator[FigureSpec]:
     """Figures of the season, where the campaign has numbers for them."""
     if any(len(node.night) > 1 for node in data.season.nodes):
         yield FigureSpec(
-            "season_nodes", "season", "Offsets over the season",
+            "season_nodes", partial(season_nodes, data), "Offsets over the season",
             "Offset of each node over the dates, less what all nodes share (weather, a transmitter). A bar: the 95 % "
             f"interval of a step. Of more than {_NODES_SHOWN} nodes those that step, then those that vary most.",
-            partial(season_nodes, data),
         )  # fmt: skip
     if data.season.places is not None:
         yield FigureSpec(
-            "season_places", "season", "Where the simulation errs, over all flights",
+            "season_places", partial(season_places, data), "Where the simulation errs, over all flights",
             f"Mean over flights of the mean residual in cells of {data.cell_m:g} m, “{data.reference}”, all towers and "
             "channels.",
-            partial(season_places, data),
         )  # fmt: skip

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ...common.counting import counted
-from ...common.units import FloatArray
-from ...compare.level.rss import PART_DB
+from ...common.kml import CLASS_COLOURS
+from ...common.units import FloatArray, spread_out
 from ...compare.rank import RankFit
 from ...compare.result import PairResult, RankResult, RssResult
 from ...site.site import Site
@@ -36,12 +36,10 @@ from ..kit.canvas import (
     legend_of,
     lonely,
     plan_shape,
-    rank_colour,
     robust_limits,
     seconds_since,
     subplots,
     thinned,
-    thinned_plan,
     time_axis,
 )
 from ..names import k_key, safe_name
@@ -62,26 +60,22 @@ def figure_specs(data: ReportData) -> list[FigureSpec]:
     return result
 
 
-def _file(name: str, draw: Callable[..., Figure], *shown: Any) -> FigureSpec:
-    """A figure that stands on no page, and so has no words."""
-    return FigureSpec(name, "", "", "", partial(draw, *shown))
-
-
 def _track_and_level(data: ReportData) -> Iterator[FigureSpec]:
     if data.track is not None and len(data.track.time):
-        yield _file("trajectory", trajectory, data, data.track)
-        yield _file("altitude", altitude, data, data.track)
+        yield FigureSpec("trajectory", partial(trajectory, data, data.track))
+        yield FigureSpec("altitude", partial(altitude, data, data.track))
     for panel in data.rss:
         if len(panel.time):
-            yield _file(f"rss_{safe_name(panel.tower)}_{safe_name(panel.channel)}", rss_over_time, data, panel)
+            name = f"rss_{safe_name(panel.tower)}_{safe_name(panel.channel)}"
+            yield FigureSpec(name, partial(rss_over_time, data, panel))
 
 
 def _ranks(data: ReportData) -> Iterator[FigureSpec]:
     for panel in (panel for panel in data.rank if len(panel.time)):
         stem = safe_name(panel.tower)
-        yield _file(f"rank_histogram_{stem}", rank_histograms, panel)
-        yield _file(f"rank_map_{stem}", rank_maps, data, panel)
-        yield _file(f"rank_time_{stem}", rank_over_time, data, panel)
+        yield FigureSpec(f"rank_histogram_{stem}", partial(rank_histograms, panel))
+        yield FigureSpec(f"rank_map_{stem}", partial(rank_maps, data, panel))
+        yield FigureSpec(f"rank_time_{stem}", partial(rank_over_time, data, panel))
 
 
 def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
@@ -90,13 +84,8 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
     for pair in data.pairs:
         both = [panels[pair.tower, name] for name in (pair.first, pair.second) if (pair.tower, name) in panels]
         if len(both) == 2:
-            yield FigureSpec(
-                f"rss_channels_{safe_name(pair.tower)}_{safe_name(pair.first)}_{safe_name(pair.second)}",
-                "flights", f"{pair.tower}: {pair.first} and {pair.second}",
-                f"Both channels, the second moved by its offset less that of the first. Shaded: they part by more than "
-                f"{PART_DB:.0f} dB. Ray tracing is that of {pair.first}.",
-                partial(channels_over_time, data, pair, both),
-            )  # fmt: skip
+            name = "_".join(map(safe_name, ("rss_channels", pair.tower, pair.first, pair.second)))
+            yield FigureSpec(name, partial(channels_over_time, data, pair, both))
 
 
 # --- track --------------------------------------------------------------------------------------
@@ -104,9 +93,10 @@ def channel_specs(data: ReportData) -> Iterator[FigureSpec]:
 
 def _draw_node(ax: Axes, panel: RssResult | RankResult) -> None:
     """The way of a tower that moves; its mark stands in the middle of it."""
-    if panel.tower_m is not None:
-        ax.plot(*thinned_plan(*panel.tower_m[:, :2].T), color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5,
-                label=f"way of {panel.tower}")  # fmt: skip
+    if (way := panel.tower_m) is not None:
+        some = spread_out(len(way), POINTS_PER_LINE)
+        label = f"way of {panel.tower}"
+        ax.plot(*way[some, :2].T, color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5, label=label)
 
 
 def trajectory(data: ReportData, track: Track) -> Figure:
@@ -118,25 +108,21 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     for panel in nodes:
         _draw_node(site_plan, panel)
         _draw_node(close, panel)
-    site_plan.plot(*thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.0, label="flight", zorder=4)
+    flown = np.column_stack([track.east_m, track.north_m])
+    some = spread_out(len(flown), POINTS_PER_LINE)  # of a plan the shape counts, not the extremes
+    site_plan.plot(*flown[some].T, color="#0072B2", linewidth=1.0, label="flight", zorder=4)
     points = close.scatter(
         track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
         label="flight (colour: height)",
     )  # fmt: skip
-    towers = list(data.site.towers.values())
-    whole_east = np.concatenate([[t.east_m for t in towers], track.east_m[np.isfinite(track.east_m)]])
-    whole_north = np.concatenate([[t.north_m for t in towers], track.north_m[np.isfinite(track.north_m)]])
-    frame_around(site_plan, whole_east, whole_north, least_m=200.0, shape=0.75)
-    near = [data.site.towers[name] for name in used_towers(data)]
-    extent = float(np.nanmax([np.ptp(track.east_m), np.ptp(track.north_m), 100.0])) if len(track.east_m) else 100.0
-    centre = np.array([np.nanmean(track.east_m), np.nanmean(track.north_m)])
-    ways = [node.tower_m for node in nodes if node.tower_m is not None]
-    near = [t for t in near if np.hypot(t.east_m - centre[0], t.north_m - centre[1]) < extent]
-    frame_around(
-        close,
-        np.concatenate([track.east_m, [t.east_m for t in near], *(way[:, 0] for way in ways)]),
-        np.concatenate([track.north_m, [t.north_m for t in near], *(way[:, 1] for way in ways)]),
-    )
+    places = {name: tower.position_m[None, :2] for name, tower in data.site.towers.items()}
+    frame_around(site_plan, *np.concatenate([flown, *places.values()]).T, least_m=200.0, shape=0.75)
+    extent, centre = np.nanmax([*np.ptp(flown, axis=0), 100.0]), np.nanmean(flown, axis=0)
+    used = (places[name] for name in used_towers(data))
+    # a tower far from the flight would shrink it to a dot
+    near = [place for place in used if np.linalg.norm(place - centre) < extent]
+    ways = [node.tower_m[:, :2] for node in nodes if node.tower_m is not None]
+    frame_around(close, *np.concatenate([flown, *near, *ways]).T)
     for waypoint in data.waypoints:
         close.annotate(
             waypoint.label, (waypoint.east_m, waypoint.north_m), fontsize=8, ha="center", va="center", zorder=7,
@@ -276,7 +262,7 @@ def _rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: F
             continue
         style: dict[str, Any] = {"color": "black", "linewidths": 0.8}
         if value:
-            style = {"facecolor": rank_colour(value), "edgecolors": "#222222", "linewidths": 0.25}
+            style = {"facecolor": CLASS_COLOURS[value], "edgecolors": "#222222", "linewidths": 0.25}
         ax.scatter(
             east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **style,
             label=f"{'Z: no path' if value == 0 else f'rank {value}'} ({count(number)})",

@@ -15,15 +15,7 @@ from ...site.scenes import drawn_buildings
 from ...site.site import Site
 from ..content.flight import RANKS
 from ..content.maps import JOINT, Correlation, MapError, MapsData, RankMap, RssMap
-from ..kit.canvas import (
-    TOWER,
-    FigureSpec,
-    beyond,
-    colour_bar,
-    draw_credit,
-    placed,
-    rank_colour,
-)
+from ..kit.canvas import TOWER, FigureSpec, beyond, colour_bar, draw_credit, draw_tower, placed
 from ..names import k_key, safe_name
 from .charts import Chart, drawn
 from .flight import channel_specs
@@ -110,10 +102,7 @@ def _draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
     ax.add_collection(PolyCollection(outlines, facecolor="white", edgecolor="black", linewidth=0.7, zorder=2.2))
     for name, tower in site.towers.items():
         if highlight is None or name == highlight:
-            ax.plot(
-                tower.east_m, tower.north_m, marker="^", markersize=7, color=TOWER, markeredgecolor="white",
-                linestyle="none", zorder=5,
-            )  # fmt: skip
+            draw_tower(ax, tower, markersize=7)
 
 
 def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
@@ -187,12 +176,12 @@ def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
     from matplotlib.patches import Patch
 
     fig, axes = map_axes(data, len(maps))
-    colours = ListedColormap([rank_colour(r) for r in RANKS])
+    colours = ListedColormap([CLASS_COLOURS[r] for r in RANKS])
     norm = BoundaryNorm([0.5, 1.5, 2.5, 3.5, 4.5], 4)
     for ax, shown in zip(axes, maps, strict=True):
         draw_map(ax, data, np.where(shown.rank > 0, shown.rank, np.nan), cmap=colours, norm=norm)
         ax.set_title(f"{shown.altitude_m:g} m", fontsize=9)
-    entries = [Patch(facecolor=rank_colour(r), edgecolor="black", label=f"rank {r}") for r in RANKS]
+    entries = [Patch(facecolor=CLASS_COLOURS[r], edgecolor="black", label=f"rank {r}") for r in RANKS]
     fig.legend(handles=[*entries, *overlay_legend(data, borders=True)], loc="lower center", ncols=5)
     return fig
 
@@ -256,7 +245,7 @@ class Plate:
     @property
     def spec(self) -> FigureSpec:
         """The figure."""
-        return FigureSpec(self.name, self.section, self.title, self.caption, partial(drawn, self.panels))
+        return FigureSpec(self.name, partial(drawn, self.panels))
 
     @property
     def charts(self) -> list[Chart]:
@@ -323,7 +312,7 @@ def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
 def figure_specs(data: MapsData) -> list[FigureSpec]:
     """Every figure that the data allow, in reading order."""
     flown = [
-        replace(spec, name=f"{spec.name}_{safe_name(flight.flight)}", title=f"{flight.flight}, {spec.title}")
+        replace(spec, name=f"{spec.name}_{safe_name(flight.flight)}")
         for flight in data.flights for spec in channel_specs(flight)
     ]  # fmt: skip
     return [*_rss_specs(data), *flown, *_rank_specs(data), *(plate.spec for plate in plates(data))]
@@ -338,24 +327,13 @@ def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
     limits = _level_limits(levels)
     by_height = grouped(levels, lambda m: (f"{m.antennas}{_under(m.foliage)}", m.altitude_m))
     for (antennas, height), maps in by_height.items():
-        words = f"{antennas}, {height:g} m"
-        yield FigureSpec(
-            f"rss_map_{safe_name(words)}", "rss", f"RSS, {words}",
-            "Each tower alone and, where shown, jointly with the nearest tower serving. Percentages: positions in "
-            "coverage. One colour scale for all RSS maps.",
-            partial(rss_maps, data, maps, limits),
-        )  # fmt: skip
+        name = f"rss_map_{safe_name(f'{antennas}, {height:g} m')}"
+        yield FigureSpec(name, partial(rss_maps, data, maps, limits))
 
 
 def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
     for words, maps in grouped(data.rank, lambda m: f"{m.source}{_under(m.foliage)}").items():
-        yield FigureSpec(
-            f"rank_map_{safe_name(words)}", "rank", f"Rank, {words}", "The nearest tower serves. Hatched: no path.",
-            partial(rank_grid, data, maps),
-        )  # fmt: skip
+        yield FigureSpec(f"rank_map_{safe_name(words)}", partial(rank_grid, data, maps))
     for tower, maps in grouped(data.corrected_rank, lambda m: m.tower).items():
-        yield FigureSpec(
-            f"rank_map_learned_{safe_name(tower)}", "rank", f"Rank of {tower}, corrected",
-            "Most probable rank by the receiver that flights taught; all headings count alike.",
-            partial(rank_grid, data, [m for m in maps if m.k is None]),
-        )  # fmt: skip
+        learned = [m for m in maps if m.k is None]
+        yield FigureSpec(f"rank_map_learned_{safe_name(tower)}", partial(rank_grid, data, learned))

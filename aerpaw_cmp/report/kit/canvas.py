@@ -17,12 +17,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...common.kml import CLASS_COLOURS
 from ...common.stages import Progress, logged
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray, spread_out
 from ...logs.records import has_wall_clock
 from ...site.scenes import drawn_buildings
-from ...site.site import Site, Trees
+from ...site.site import Site, Tower, Trees
 from .files import write_file
 
 if TYPE_CHECKING:
@@ -46,23 +45,20 @@ _FOREST = "#B9D8B0"
 WAYPOINT = "#555555"
 
 RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
-RANK_HATCH = {1: "", 2: "///", 3: "xx", 4: ".."}
 
 POINTS_PER_LINE = 3000
 POINTS_PER_CLOUD = 30_000
 _RASTER_DPI = 130
-_WIDE = (9.2, 4.2)
 
 
 @dataclass(frozen=True, slots=True)
 class FigureSpec:
-    """A figure that can be drawn: file name, section of the page, its words, and the function that draws it."""
+    """A figure that can be drawn: file name, the function that draws it, and its words where a page shows it."""
 
     name: str
-    section: str
-    title: str
-    caption: str
     draw: Callable[[], Figure]
+    title: str = ""
+    caption: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,16 +128,11 @@ def style(kind: str = "screen") -> Iterator[None]:
         yield
 
 
-def figure(size: tuple[float, float] = _WIDE) -> Figure:
-    """An empty figure [inch] whose parts do not overlap."""
+def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Figure, Any]:
+    """A figure [inch] whose parts do not overlap, and its axes, as :meth:`matplotlib.figure.Figure.subplots` makes."""
     from matplotlib.figure import Figure
 
-    return Figure(figsize=size, layout="constrained")
-
-
-def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Figure, Any]:
-    """An empty figure [inch] and its axes, as :meth:`matplotlib.figure.Figure.subplots` makes them."""
-    fig = figure(size)
+    fig = Figure(figsize=size, layout="constrained")
     return fig, fig.subplots(*shape, **options)
 
 
@@ -521,11 +512,6 @@ def legend_below(ax: Axes, columns: int = 4) -> None:
         ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
 
 
-def rank_colour(rank: int) -> str:
-    """Colour of rank 1 to 4, from dark to light in even steps; black for the crosses of 0."""
-    return CLASS_COLOURS[rank] if rank else "black"
-
-
 # --- site ---------------------------------------------------------------------------------------
 
 
@@ -546,42 +532,33 @@ def draw_site(ax: Axes, site: Site) -> None:
     ----------
     ax : Axes
     site : Site
-    towers : sequence of str, optional
-        Only these towers; by default all.
     """
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
 
-    def patch(polygon: Any, **options: Any) -> None:
-        rings = [polygon.exterior, *polygon.interiors]
-        outline = Outline.make_compound_path(*(Outline(np.asarray(r.coords)[:, :2], closed=True) for r in rings))
-        ax.add_patch(PathPatch(outline, **options))
-
     draw_credit(ax, site)
     if not site.mapped:
         ax.text(0.5, 0.02, "no map here", transform=ax.transAxes, ha="center", color="#777777", fontsize=8, zorder=7)
-    for number, forest in enumerate(site.forests):
-        patch(
-            forest.area, facecolor=_FOREST, edgecolor="#7FA873", hatch="..", linewidth=0.6, alpha=0.7, zorder=0.3,
-            label="forest" if number == 0 else None,
-        )  # fmt: skip
+    areas: dict[str, tuple[list[Any], dict[str, Any]]] = {
+        "forest": ([forest.area for forest in site.forests],
+                   {"facecolor": _FOREST, "edgecolor": "#7FA873", "hatch": "..", "linewidth": 0.6, "alpha": 0.7,
+                    "zorder": 0.3}),
+        "building": ([building.footprint for building in drawn_buildings(site)],
+                     {"facecolor": _BUILDING, "edgecolor": "black", "linewidth": 0.7, "zorder": 0.6}),
+        "geofence": ([fence.area for fence in site.geofences],
+                     {"facecolor": "none", "edgecolor": "#333333", "linestyle": (0, (4, 3)), "linewidth": 0.9,
+                      "zorder": 0.6}),
+    }  # fmt: skip
+    for label, (polygons, look) in areas.items():
+        for number, polygon in enumerate(polygons):
+            # one path of all rings, so that holes stay empty
+            rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
+            outline = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
+            ax.add_patch(PathPatch(outline, **look, label=label if number == 0 else None))
     if len(site.trees):
-        _draw_crowns(ax, site.trees, "tree")
-    for number, building in enumerate(drawn_buildings(site)):
-        patch(
-            building.footprint, facecolor=_BUILDING, edgecolor="black", linewidth=0.7, zorder=0.6,
-            label="building" if number == 0 else None,
-        )  # fmt: skip
-    for number, fence in enumerate(site.geofences):
-        patch(
-            fence.area, facecolor="none", edgecolor="#333333", linestyle=(0, (4, 3)), linewidth=0.9, zorder=0.6,
-            label="geofence" if number == 0 else None,
-        )  # fmt: skip
+        _draw_crowns(ax, site.trees)
     for number, tower in enumerate(site.towers.values()):
-        ax.plot(
-            tower.east_m, tower.north_m, marker="^", markersize=9, color=TOWER, markeredgecolor="black",
-            linestyle="none", zorder=5, label="tower" if number == 0 else None,
-        )  # fmt: skip
+        draw_tower(ax, tower, markeredgecolor="black", label="tower" if number == 0 else None)
         ax.annotate(
             tower.name, (tower.east_m, tower.north_m), xytext=(6, 4), textcoords="offset points", zorder=6,
             fontsize=8, fontweight="bold", annotation_clip=True,
@@ -590,7 +567,13 @@ def draw_site(ax: Axes, site: Site) -> None:
     plan_axes(ax)
 
 
-def _draw_crowns(ax: Axes, trees: Trees, label: str) -> None:
+def draw_tower(ax: Axes, tower: Tower, **look: Any) -> None:
+    """The mark of a tower on a plan."""
+    look = {"marker": "^", "markersize": 9, "color": TOWER, "markeredgecolor": "white", "zorder": 5, **look}
+    ax.plot(tower.east_m, tower.north_m, linestyle="none", **look)
+
+
+def _draw_crowns(ax: Axes, trees: Trees) -> None:
     """Crowns to scale, each with a dot where the trunk stands."""
     from matplotlib.collections import EllipseCollection
 
@@ -602,7 +585,7 @@ def _draw_crowns(ax: Axes, trees: Trees, label: str) -> None:
     crowns.set_rasterized(True)
     ax.add_collection(crowns, autolim=False)
     ax.scatter(trees.east_m, trees.north_m, s=1.5, color="#2F5A25", linewidths=0, rasterized=True, zorder=0.45)
-    ax.plot([], [], marker="o", markersize=6, color="#5E8C4F", alpha=0.6, linestyle="none", label=label)
+    ax.plot([], [], marker="o", markersize=6, color="#5E8C4F", alpha=0.6, linestyle="none", label="tree")
 
 
 def plan_axes(ax: Axes) -> None:
@@ -685,12 +668,6 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
         bar.solids.set_rasterized(True)
         bar.solids.set_edgecolor("face")
     return bar
-
-
-def thinned_plan(east: FloatArray, north: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
-    """A plan line of at most ``limit`` points: shape matters there, not extremes."""
-    rows = spread_out(len(east), limit)
-    return east[rows], north[rows]
 
 
 def legend_of(ax: Axes, shown: Callable[[str], bool]) -> tuple[list[Any], list[str]]:

@@ -168,11 +168,6 @@ def coded(text: str) -> Markup:
     )
 
 
-def policy(script: str = "") -> str:
-    """The content policy of a page with one script, or none."""
-    return _CONTENT_POLICY.format(script=digest(script) if script else "'none'")
-
-
 def digest(text: str) -> str:
     """A script or style as a content policy names it."""
     return f"'sha256-{base64.b64encode(hashlib.sha256(text.encode()).digest()).decode('ascii')}'"
@@ -214,7 +209,8 @@ def rendered(template: str, scripts: Sequence[str] = (), **content: Any) -> str:
     """A page from its template, with its scripts and the content policy that lets a browser run them alone."""
     code = script(*scripts) if scripts else ""
     page = environment().get_template(f"{template}.html.jinja")
-    text: str = page.render(script=Markup(code), content_policy=policy(code), **content)
+    policy = _CONTENT_POLICY.format(script=digest(code) if code else "'none'")
+    text: str = page.render(script=Markup(code), content_policy=policy, **content)
     return text
 
 
@@ -252,11 +248,3 @@ def write_page(
     """
     page = rendered(name, ("common.js", "places.js"), explorer=embedded(shown), **content)
     return [write_file(folder / f"{name}.html", page), write_file(folder / "metrics.json", json_text(numbers))]
-
-
-def by_section(pictures: Sequence[Picture]) -> dict[str, list[Picture]]:
-    """Pictures in their order, by the section that they stand in."""
-    sections: dict[str, list[Picture]] = {}
-    for picture in pictures:
-        sections.setdefault(picture.spec.section, []).append(picture)
-    return sections

@@ -18,7 +18,7 @@ from ..figures import campaign as campaign_figures
 from ..kit import canvas
 from ..kit.canvas import Picture
 from ..kit.files import json_text, write_file
-from ..kit.page import by_section, rendered
+from ..kit.page import rendered
 from ..words import campaign as words
 from ..words.flight import pretty
 
@@ -61,7 +61,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "pairs_total": len(data.repeats),
             "links": by_link(data.repeats),
             "pairs": telling(data.repeats),
-            "table": f"{_PAIR_TABLE}.csv" if data.repeats else None,
+            "table": _PAIR_TABLE if data.repeats else None,
         },
         "season": {
             **named(data.season, "held_out started ranking nodes"),
@@ -100,14 +100,11 @@ _CSV_COLUMNS = [
 def _errors_of_pairs(data: CampaignData) -> list[tuple[Any, float, float]]:
     """Each pair of flights with the RMSE of both under the reference setting."""
     rmse = {row.key: row.rmse_db for row in data.reference_rows}
-    return [
-        (
-            pair,
-            rmse.get((pair.first, pair.tower, pair.channel), float("nan")),
-            rmse.get((pair.second, pair.tower, pair.channel), float("nan")),
-        )
-        for pair in data.repeats
-    ]
+
+    def error(pair: Repeat, flight: str) -> float:
+        return rmse.get((flight, pair.tower, pair.channel), float("nan"))
+
+    return [(pair, error(pair, pair.first), error(pair, pair.second)) for pair in data.repeats]
 
 
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
@@ -115,7 +112,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
     return rendered(
         "campaign",
         data=data,
-        sections=by_section(pictures),
+        pictures=pictures,
         mean_rmse=words.mean_rmse(data),
         pair_errors=_errors_of_pairs(data),
         headline=words.headline(data),
@@ -145,30 +142,20 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < _COMPACT_ROWS else None
-    table = _campaign_frame(data)
-    written = [
-        write_file(folder / "campaign.json", json_text(campaign_metrics(data), indent)),
-        write_file(folder / "campaign.csv", guarded(table).to_csv(index=False, lineterminator="\n")),
-    ]
-    if data.repeats:
-        pairs = pair_frame(data)
-        written.append(
-            write_file(folder / f"{_PAIR_TABLE}.csv", guarded(pairs).to_csv(index=False, lineterminator="\n"))
-        )
-    if data.season.nodes:
-        nodes = pd.DataFrame(
-            [[n.node, *date] for n in data.season.nodes for date in zip(n.night, n.offset_db, strict=True)]
-        )
-        columns = ["node", "date", "offset_db"]
-        text = guarded(nodes.set_axis(columns, axis=1)).to_csv(index=False, lineterminator="\n")
-        written.append(write_file(folder / "offsets.csv", text))
-    tables = [path.name for path in written]
-    drawn, pictures = canvas.write_figures(
-        list(campaign_figures.figure_specs(data)), folder / "figures", ("svg", "png")
-    )
-    written += pictures
-    page = write_file(folder / "campaign.html", campaign_page(data, drawn, tables))
-    return [page, *written]
+    dates = [(n.node, *date) for n in data.season.nodes for date in zip(n.night, n.offset_db, strict=True)]
+    tables = {
+        "campaign.csv": _campaign_frame(data),
+        _PAIR_TABLE: pd.DataFrame([cells(pair) for pair in data.repeats]),
+        "offsets.csv": pd.DataFrame(dates, columns=["node", "date", "offset_db"]),
+    }
+    written = [write_file(folder / "campaign.json", json_text(campaign_metrics(data), indent))]
+    for name, table in tables.items():
+        if name == "campaign.csv" or len(table):
+            written.append(write_file(folder / name, guarded(table).to_csv(index=False, lineterminator="\n")))
+    specs = list(campaign_figures.figure_specs(data))
+    drawn, pictures = canvas.write_figures(specs, folder / "figures", ("svg", "png"))
+    page = write_file(folder / "campaign.html", campaign_page(data, drawn, [path.name for path in written]))
+    return [page, *written, *pictures]
 
 
 # --- pairs of flights at the same places -----------------------------------------------------------------------------
@@ -176,8 +163,8 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
 # Pairs that campaign.json lists; of more, those with the most places.
 LISTED_PAIRS = 1000
 
-# The file with all of them, less its ending.
-_PAIR_TABLE = "pairs"
+# The file with all of them.
+_PAIR_TABLE = "pairs.csv"
 
 
 def telling(pairs: Sequence[Repeat], most: int = LISTED_PAIRS) -> list[Repeat]:
@@ -208,12 +195,6 @@ def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
             }
         )
     return rows
-
-
-def pair_frame(data: CampaignData) -> pd.DataFrame:
-    """One row per pair of flights, tower and channel."""
-    table: pd.DataFrame = pd.DataFrame([cells(pair) for pair in data.repeats])
-    return table
 
 
 def cells(record: Any) -> dict[str, Any]:

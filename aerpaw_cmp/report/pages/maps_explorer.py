@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 
 from ...common.geodesy import SiteFrame
+from ...common.kml import CLASS_COLOURS
 from ...common.units import FloatArray
 from ..content.flight import RANKS
 from ..content.maps import JOINT, MapLayer, MapsData, RankMap, RssMap, at_height
 from ..figures.charts import Chart
 from ..figures.maps import grouped, half_width
-from ..kit.canvas import rank_colour
 from ..kit.packed import NONE, PackedArrays, step_for
 from ..kit.shapes import listed
 from ..names import k_key
@@ -132,8 +132,7 @@ def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer],
     return {
         "east": arrays.add(east, "f8"),
         "north": arrays.add(north, "f8"),
-        "half": [half_width(east) if len(east) > 1 else half_width(data.east_m),
-                 half_width(north) if len(north) > 1 else half_width(data.north_m)],
+        "half": [stride * half_width(axis) for axis in (data.east_m, data.north_m)],
         "degrees": geographic(data.site.frame, data.east_m, data.north_m),
         "site": plan_of(data.site),
         "borders": [listed(line) for line in data.borders_m],
@@ -161,7 +160,8 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
     for layer in layers:
         cells = layer.values[::stride, ::stride].ravel()
         key = ",".join(str(axes[axis].index(layer.axes[axis])) if axis in layer.axes else "0" for axis in axes)
-        stored[key] = arrays.add_steps(cells, step) if kind != _CLASSES else arrays.add(_codes(cells), "u1")
+        classes = np.nan_to_num(cells, nan=NONE["u1"])
+        stored[key] = arrays.add(classes, "u1") if kind == _CLASSES else arrays.add_steps(cells, step)
     return {
         "name": name,
         "unit": layers[0].unit,
@@ -182,10 +182,6 @@ def _place(axis: str, value: str) -> float:
     return float(value.removesuffix(" m")) if axis in ("Height", "K") else 0.0
 
 
-def _codes(values: FloatArray) -> Any:
-    return np.where(np.isfinite(values), values, NONE["u1"]).astype(np.uint8)
-
-
 def _range(values: FloatArray, kind: str) -> list[float]:
     """Ends of the colour scale that all layers of a quantity share: 1 and 99.5 %, even about zero for differences."""
     if kind == DIFFERENCE and len(values):
@@ -203,7 +199,7 @@ def ends_of_scale(values: FloatArray, most: float) -> list[float]:
 def _class_colours(classes: Sequence[str]) -> list[str]:
     """A colour per class: those of ranks, else well apart in hue and lightness."""
     if tuple(classes) == _RANK_CLASSES:
-        return ["", *(rank_colour(rank) for rank in RANKS)]
+        return ["", *(CLASS_COLOURS[rank] for rank in RANKS)]
     if not classes:
         return []
     hues = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#555555")

@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from ...common.kml import CLASS_COLOURS
 from ...common.units import FloatArray, spread_out
 from ...site.site import Site
 from ..content.flight import RANKS
-from ..kit.canvas import rank_colour
 from ..kit.packed import PackedArrays, step_for
 from ..kit.shapes import listed
 from .explorer import plan_of
@@ -94,7 +94,7 @@ def payload(
         "lines": [listed(np.round(np.asarray(line)[spread_out(len(line), 2000), :2], 1)) for line in lines],
         "rings": [listed(np.round(ring[:, :2], 1)) for ring in rings],
         "groups": [_group(group, arrays, total, ranges) for group in groups],
-        "ranks": {str(rank): rank_colour(rank) for rank in RANKS},
+        "ranks": {str(rank): CLASS_COLOURS[rank] for rank in RANKS},
         "packed": arrays.content(),
     }
 

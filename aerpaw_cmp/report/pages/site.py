@@ -29,11 +29,10 @@ TREES_IN_PAGE = 5000
 def view_limits(site: Site) -> FloatArray:
     """(3, 2) lowest and highest east, north, up of everything that stands there, with a margin [m]."""
     points = [tower.position_m for tower in site.towers.values()]
-    for building in drawn_buildings(site):
-        for corner in np.asarray(building.footprint.exterior.coords)[:, :2]:
-            points.append(np.array([*corner, building.base_m + building.height_m]))
-    for area in (*(forest.area for forest in site.forests), *(fence.area for fence in site.geofences)):
-        points += list(at_height(np.asarray(area.exterior.coords)[:, :2], 0.0))
+    areas = [(b.footprint, b.base_m + b.height_m) for b in drawn_buildings(site)]
+    areas += [(forest.area, 0.0) for forest in site.forests] + [(fence.area, 0.0) for fence in site.geofences]
+    for area, top_m in areas:
+        points += list(at_height(np.asarray(area.exterior.coords)[:, :2], top_m))
     if len(trees := site.trees):
         points += list(np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m]))
     if not points:
@@ -55,7 +54,6 @@ def plan(site: Site) -> Figure:
     shape = float(np.clip(width / height, 0.45, 2.2))
     fig, ax = canvas.subplots((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
     canvas.draw_site(ax, site)
-    ax.set_axisbelow(True)
     ax.set_xlim(*limits[0])
     ax.set_ylim(*limits[1])
     ax.set_title(site.name, wrap=True)

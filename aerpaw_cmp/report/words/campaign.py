@@ -59,11 +59,10 @@ def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
         if np.isfinite(row.rmse_db):
             known.setdefault((row.setting, row.flight), []).append(row.rmse_db)
     flights, nan = rss_flights(data), float("nan")
-    table = {
+    return {
         setting: {name: float(np.mean(known[setting, name])) if (setting, name) in known else nan for name in flights}
         for setting in data.settings
     }
-    return table
 
 
 def headline(data: CampaignData) -> list[str]:

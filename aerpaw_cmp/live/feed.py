@@ -342,6 +342,7 @@ class Feed:
         self._raise(modem, kind, text).end_s = self.now()
 
     def _raise(self, modem: _Modem, kind: str, text: str) -> Alarm:
+        # version -1: numbered by the next _bump, as the present version may have been sent
         alarm = Alarm(self._alarm_count, self._modems.index(modem), kind, text[:_LONGEST_TEXT], self.now(), version=-1)
         self._alarm_count += 1
         self._alarms.append(alarm)

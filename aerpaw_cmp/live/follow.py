@@ -143,6 +143,7 @@ class TelemetryFollower:
             return b""
         except OSError as error:
             raise InputError(f"cannot be read ({error.strerror})", expected="a telemetry log", path=self.path) from None
+        # the last line may be half written: it waits for its rest
         end = data.rfind(b"\n") + 1
         self._position += end
         return data[:end]

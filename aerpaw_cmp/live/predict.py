@@ -103,6 +103,7 @@ class RunningInterval:
         n = len(self._sorted)
         if n < self._least or self._tails <= 0.0:
             return None
+        # the two order statistics must not cross, however wide the tails have grown
         beyond = min((n - 1) // 2, max(0, math.floor(0.5 * self._tails * (n + 1)) - 1))
         return self._sorted[beyond], self._sorted[n - 1 - beyond]
 

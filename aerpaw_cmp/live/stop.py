@@ -16,6 +16,7 @@ class Stop:
     """A request to end, from a signal or another thread; wakes the waiting tap."""
 
     def __init__(self) -> None:
+        # a full pipe must not block a signal handler
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self.reason = ""
         self.count = 0

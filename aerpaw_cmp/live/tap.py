@@ -415,6 +415,7 @@ class Tap:
         query = QUERIES[name]
         text = command or query.text
         data = encode(text, allow_csi=self._settings.enable_csi)
+        # what came unasked must not be read as part of the answer
         self._drain()
         sent_utc, sent = self._clock.utc_ns(), self._clock.mono_ns()
         timeout_ns = int((timeout_s or self._settings.answer_timeout_s) * 1e9)
@@ -437,8 +438,10 @@ class Tap:
             now = self._clock.mono_ns()
             if self._stop.count and not stopped_at:
                 stopped_at = now
+                # one second for the answer in flight, so that its record is complete; a second stop gives it none
                 deadline = min(deadline, now + 1_000_000_000)
             if now >= deadline or self._stop.count > 1:
+                # its answer may still come: until a bare AT is answered nothing else is asked
                 self._in_step = False
                 return self._framer.give_up(), now
             if self._select((deadline - now) / 1e9):

@@ -198,6 +198,7 @@ class _Server(ThreadingHTTPServer):
 
     daemon_threads = True
     block_on_close = False
+    # the default of 5 would turn browsers away during a flood
     request_queue_size = 128
 
     def __init__(self, web: WebServer) -> None:
@@ -318,6 +319,7 @@ class _Handler(BaseHTTPRequestHandler):
     def setup(self) -> None:
         super().setup()
         self.connection.settimeout(self.server.web.limits.send_s)
+        # what the kernel buffers hides a browser that reads nothing: the less, the sooner it is dropped
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 * _PIECE)
 
     def do_GET(self) -> None:
@@ -366,6 +368,7 @@ class _Handler(BaseHTTPRequestHandler):
         """Check whether a request has the token in its address, or the cookie of an earlier visit."""
         pairs = (item.strip().partition("=") for item in self.headers.get("Cookie", "").split(";"))
         cookie = next((value for name, _, value in pairs if name == self._cookie), "")
+        # compared in constant time: how long a refusal takes must not tell how much was right
         given = (query.get("token", ""), self.server.web.token), (cookie, self.server.web.pass_word)
         return any(hmac.compare_digest(text.encode(), secret.encode()) for text, secret in given)
 

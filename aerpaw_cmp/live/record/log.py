@@ -322,6 +322,7 @@ class SegmentLog:
 
     def _write(self, line: bytes) -> None:
         """One write; a short one is taken back, so that no torn line stays inside the file."""
+        # what could not be cut off becomes a line of its own, which its checksum refuses
         data = b"\n" + line if self._torn else line
         written = os.write(self._fd, data)
         if written < len(data):
@@ -365,6 +366,7 @@ class SegmentLog:
     def _new_segment(self) -> None:
         self._segment += 1
         path = self.folder / f"{self._stem}_{self._segment:04d}.jsonl"
+        # O_EXCL: never into the segment of another session
         fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o644)
         self._fd, self._size, self._torn = fd, 0, False
         record = self.header()
@@ -373,6 +375,7 @@ class SegmentLog:
         try:
             self._write(encode_record(record))
             os.fdatasync(fd)
+            # the name of a new file survives a power loss only once its folder is synced
             _sync_directory(self.folder)
         except OSError:
             self._close_fd()

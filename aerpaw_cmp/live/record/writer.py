@@ -61,6 +61,7 @@ class LogWriter:
 
     def append(self, record: Record) -> bool:
         """Hand over one record; True once the kernel has it, False if it waits in memory."""
+        # about what the other fields of a record take as text
         size = 500 + sum(len(line) for line in record.get("lines", ()) if isinstance(line, str))
         settings = self.log.settings
         with self._changed:

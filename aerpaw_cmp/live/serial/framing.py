@@ -262,6 +262,7 @@ class Framer:
             self._owed.clear()
         else:
             self._owed.append(now)
+            # a modem that never answers must not fill the memory
             del self._owed[:-16]
         return answer
 
@@ -313,6 +314,7 @@ class Framer:
     def _is_echo(self, text: str, now: _Open) -> bool:
         # rubbish from before may stand in front of the echo on the same line
         upper, command = text.upper(), now.command.upper()
+        # a short command, as AT, ends many lines that are no echo
         if now.echoed or not (upper == command or (len(command) > 6 and upper.endswith(command))):
             return False
         now.echoed = self._echo_seen = True

@@ -280,6 +280,7 @@ class SerialPort:
             if users:
                 raise _busy(path, users)
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # the lock keeps out other taps alone; this refuses every further open, but for root
             fcntl.ioctl(fd, termios.TIOCEXCL)
             make_raw(fd, termios.B115200)
             users = holders(path)  # again: someone may have come between

@@ -174,6 +174,7 @@ class ModemSimulator:
             node = Path(os.ttyname(slave))
         finally:
             os.close(slave)  # only the tap shall hold the port
+        # a reader that stops reading must not hold the thread for ever
         os.set_blocking(master, False)
         self._master = master
         link = self.link

@@ -221,6 +221,7 @@ def _round_step(step: float) -> float:
     if not step > 0:
         return 1.0
     power = 10.0 ** np.floor(np.log10(step))
+    # a step that is 2 but for rounding must not become 5
     return float(next(m for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9)) * power)
 
 

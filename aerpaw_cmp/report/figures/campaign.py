@@ -45,6 +45,7 @@ def season_places(data: CampaignData) -> Figure:
     shown = data.season.places
     assert shown is not None
     cells = shown.cells
+    # a few outlying cells would leave one colour to all others
     reach = max(float(np.percentile(np.abs(shown.mean_db), 98)), 0.1)
     first, last = cells.min(axis=0), cells.max(axis=0) + 1
     image = np.full(tuple(last - first)[::-1], np.nan)

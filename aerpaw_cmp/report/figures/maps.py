@@ -305,6 +305,7 @@ def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
     finite = np.concatenate(parts) if parts else np.zeros(0)
     if not len(finite):
         return -100.0, -50.0
+    # a few cells beside a tower are far above all others and would take most colours
     low, high = np.percentile(finite, [1.0, 99.5])
     return float(5 * np.floor(low / 5)), float(max(5 * np.ceil(high / 5), 5 * np.floor(low / 5) + 5))
 

@@ -331,8 +331,10 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
     n = len(values[0])
     if n <= limit:
         return np.arange(n)
+    # each stretch gives two samples per array, its smallest and its largest
     per = -(-n // max(1, limit // (2 * len(values))))
     starts = np.arange(0, n, per)
+    # a thinned line must end where the flight ends
     rows = [np.array([0, n - 1])]
     for array in values:
         table = np.pad(np.asarray(array, dtype=np.float64), (0, -n % per), constant_values=np.nan).reshape(-1, per)
@@ -445,6 +447,7 @@ def draw_out_of_coverage(
     """
     if not mask.any():
         return
+    # a sample stands for half a step to each side: one lost sample alone would have no width
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     spans = [(seconds[a] - step / 2, seconds[b] - seconds[a] + step) for a, b in _apart(runs(mask), seconds)]
     bars = ax.broken_barh(

@@ -13,6 +13,7 @@ from ...common.units import AnyArray, FloatArray
 # What stands for NaN in an array of each integer kind.
 NONE = {"u1": 255, "u2": 65_535, "i2": -32_768}
 
+# the most negative number stands for NaN, so the range is even about zero
 LARGEST = 32_767
 
 
@@ -41,6 +42,7 @@ class PackedArrays:
         if key not in self._known:
             self._known[key] = len(self._table)
             self._table.append((kind, self._size, np.size(values)))
+            # a typed array of JavaScript must begin at a multiple of its own size
             padded = raw + bytes(-len(raw) % 8)
             self._parts.append(padded)
             self._size += len(padded)
@@ -81,5 +83,6 @@ def step_for(values: FloatArray, finest: float = 0.01) -> float:
     """
     array = np.asarray(values, dtype=np.float64)
     reach = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
+    # less a rounding of the logarithm: what fits exactly must not get a step ten times as coarse
     tens = int(np.ceil(np.log10(max(reach / (LARGEST * finest), 1.0)) - 1e-12))
     return float(finest * 10.0**tens)

@@ -81,6 +81,7 @@ def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) 
 def packed(value: Any, arrays: PackedArrays) -> Any:
     """A chart with its arrays in the page's block."""
     if isinstance(value, np.ndarray):
+        # 32-bit floats have seven digits: beyond 1e5 a time would lose hundredths of a second
         return arrays.add(value, "f8" if value.max(initial=0.0) > 1e5 else "f4")
     if isinstance(value, dict):
         return {key: packed(each, arrays) for key, each in value.items()}

@@ -113,6 +113,7 @@ def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST
     while True:
         for words, chosen, every in tries:
             content = _packed(data, charts, chosen, every)
+            # measured after packing: how far the block deflates depends on the maps
             if len(content["packed"]["data"]) <= most_bytes:
                 return content | {"left_out": words, "stride": every}
         stride += 1
@@ -223,6 +224,7 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
     """
     ends = np.array([[east_m[0], east_m[-1]], [north_m[0], north_m[-1]]], dtype=np.float64)
     middle = ends.mean(axis=1)
+    # of one row of cells the reach is 0, by which the script would divide
     reach = np.maximum(np.ptp(ends, axis=1) / 2, 100.0)
     u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, _LATTICE), np.linspace(-1, 1, _LATTICE)))
     east, north = middle[0] + u * reach[0], middle[1] + v * reach[1]

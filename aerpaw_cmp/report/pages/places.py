@@ -113,6 +113,7 @@ def _group(
     layers = []
     for name, column in group.values.items():
         values = np.asarray(column, dtype=np.float64)[pick]
+        # probabilities lie between 0 and 1, where steps of a hundredth can be seen
         step = step_for(values, 1e-4 if "probability" in name else 0.01)
         packed = {"step": step, "values": arrays.add_steps(values, step)}
         layers.append({"name": name, "range": ranges[_scale(group.name, name)], **packed})

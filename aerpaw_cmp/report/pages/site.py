@@ -41,6 +41,7 @@ def view_limits(site: Site) -> FloatArray:
     cloud = cloud[np.isfinite(cloud).all(axis=1)]
     low, high = cloud.min(axis=0), cloud.max(axis=0)
     margin = 0.05 * max(high[0] - low[0], high[1] - low[1], 100.0)
+    # a site may lie below its origin
     ground = min(0.0, float(low[2]))
     return np.array(
         [[low[0] - margin, high[0] + margin], [low[1] - margin, high[1] + margin], [ground, max(high[2] * 1.1, 30.0)]]

@@ -117,9 +117,12 @@ def test_an_error_that_no_page_shows_has_no_cause(step_db: float) -> None:
 def test_a_loss_that_rests_on_undetected_samples_is_none() -> None:
     """What looks like an obstacle is the level that a receiver writes where it detects nothing."""
     sound = _sound()
-    sector = np.abs(sound.tower_azimuth_deg - 40.0) < 12.0
-    silent = replace(sound, measured_db=np.where(sector, -90.0, sound.measured_db))
-    assert _named(silent) == "no detection"
+    sector = (np.abs(sound.tower_azimuth_deg - 40.0) < 45.0) | (sound.time_s % 50.0 < 2.0)
+    for spread_db in (0.0, 0.15):
+        silence = -90.0 + np.random.default_rng(2).normal(0.0, spread_db, len(sector))
+        cause = flight_cause([replace(sound, measured_db=np.where(sector, silence, sound.measured_db))])
+        assert cause is not None
+        assert cause.name == "no detection"
 
 
 @pytest.mark.parametrize("spread_db", [0.0, 0.4])

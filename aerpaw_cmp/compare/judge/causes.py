@@ -122,7 +122,7 @@ class LevelEvidence:
     serving: FloatArray | None = None
     clock: JudgedClock | None = None
     least: BoolArray | None = None
-    """Samples at the least level of the log, where it has that again and again."""
+    """Samples at the least level of the log, where it has that again and again, exactly or within its noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -394,12 +394,34 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
     changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
     at = level == level.min()
     often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level))
-    changed["least"] = np.bincount(place, at) > 0.5 * count if often else None
+    changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
     return LevelEvidence(**changed)  # type: ignore[arg-type]
 
 
 # A receiver that clips writes one level in so many samples, and in so large a share of them.
 _AT_END, _SHARE_AT_END = 10, 0.01
+
+
+def _undetected(level_db: FloatArray) -> BoolArray | None:
+    """Samples (n,) about the densest level and below it, where links are lost into that at once: a detector's noise.
+
+    None where the level fades into it, as it does near a floor and where a UAV hovers.
+    """
+    ordered, step = np.sort(level_db), np.abs(np.diff(level_db))
+    within = np.searchsorted(ordered, ordered + 2.0 * _PILE_DB, "right") - np.arange(len(ordered))
+    low = ordered[within.argmax()]
+    under = level_db < low + 3.0 * _PILE_DB
+    dense = under & (level_db >= low)
+    inside, outside, between = dense[1:] & dense[:-1], ~(under[1:] | under[:-1]), under[1:] != under[:-1]
+    if inside.sum() < _LEAST_PILE * len(level_db) or min(outside.sum(), between.sum()) < _LEAST_BINS:
+        return None
+    fading_db = float(np.median(step[outside]))
+    at_once = np.median(step[between]) > _LOST * fading_db
+    return under if at_once and np.median(step[inside]) < _MOST_FADING * fading_db else None
+
+
+# A link is lost by so many times the steps that it fades by: 9 on a receiver with a noisy least level, elsewhere 3.
+_LOST = 5.0
 
 
 def _fitted(e: LevelEvidence, *trials: Trial, at: _Memories = _START, climb: bool = True) -> _Fit:
@@ -680,11 +702,12 @@ def _lock(e: LevelEvidence) -> Iterator[Trial]:
 def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
     """The least level, written again and again: nothing was detected there."""
     if e.least is not None and e.least.any() and not e.least.all():
-        level, share = float(e.measured_db[e.least].min()), 100 * e.least.mean()
+        level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
+        top = level + 3.0 * float(np.median(np.abs(e.measured_db[e.least] - level)))
         yield Trial(
             name="no detection", cost=0.0, clipped=e.least, estimate=(level, level, level),
             sentence=f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: nothing was detected",
-            next_step=f"`floor_db: {math.ceil(level * 100.0 + 1.0) / 100.0:.2f}` for this log",
+            next_step=f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` for this log",
         )  # fmt: skip
 
 

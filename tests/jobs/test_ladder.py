@@ -87,6 +87,18 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     assert as_set.rmse_heldout_db == pytest.approx(rows["free space"]["rmse_heldout_db"], abs=1e-6)
 
 
+def test_a_hover_recommends_no_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """At one place antennas that flights left out prefer fit as a constant does: no reason to change the settings."""
+    path, t = remembering(tmp_path, 3.5), np.arange(0.0, 121.0)
+    eastwards(tmp_path, t, 200.0 + 4.0 * np.sin(t / 7.0))
+    at = np.arange(0.0, 120.0, 0.2)
+    rss_log(tmp_path, "A", at, -80.0 + 0.3 * np.random.default_rng(1).normal(size=len(at)))
+    rows = {row["model"]: row for row in report(path, capsys)["ladder"]}
+    as_set, learned = rows["as set in flight.yaml"], rows["learned sphere + heading"]
+    assert as_set["rmse_heldout_db"] > learned["rmse_heldout_db"] + 0.1
+    assert [as_set["recommended"], learned["recommended"]] == [True, False]
+
+
 def test_a_replay_that_loses_to_a_line_says_so_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Levels that fall by 40 dB per decade: the two-parameter line beats every replay, in report, ladder and words."""
     metrics = report(flight(tmp_path, 4.0), capsys)
@@ -244,13 +256,13 @@ def test_channels_that_share_a_replay_cost_its_seconds_once() -> None:
     assert _Climber._of_flight(SimpleNamespace(_data=SimpleNamespace(rss=other)), [5.0, 4.0, 3.0]) == 8.0  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize(("share", "gains"), [(0.98, False), (0.9, True)])
-def test_a_gain_that_no_page_could_show_is_no_advice(share: float, gains: bool) -> None:
-    """Of 3 dB, 0.06 and 0.3 dB less: both are significant."""
+@pytest.mark.parametrize(("share", "line", "gains"), [(0.98, 2, False), (0.9, 2, True), (0.9, 0.9, False)])
+def test_a_gain_that_no_page_could_show_is_no_advice(share: float, line: float, gains: bool) -> None:
+    """Of 3 dB, 0.06 and 0.3 dB less: both are significant; and no gain on a constant level, as at one place."""
     error_db = 3.0 * np.random.default_rng(1).normal(size=3000)
     climber = _Climber.__new__(_Climber)
     climber._series = [SimpleNamespace(time_s=np.arange(3000.0))]  # type: ignore[list-item]
-    ladder = SimpleNamespace(recommended=0, rungs=(0, 1), error_db=([share * error_db], [error_db]))
+    ladder = SimpleNamespace(recommended=1, error_db=([line * error_db], [share * error_db], [error_db]))
     assert paired_difference(share * error_db, error_db).verdict == "better"
     assert climber._is_better(ladder) == gains  # type: ignore[arg-type]
 

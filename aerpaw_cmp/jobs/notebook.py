@@ -195,10 +195,7 @@ class Flight:
         if engine is not None:
             keys["rt.engine"] = engine
         settings = overridden(self.settings, keys)
-        data = self.data
-        if keys:
-            root = self.logs_root
-            data = gather(settings, self.path.parent, data.files, root)
+        data = gather(settings, self.path.parent, self.data.files, self.logs_root) if keys else self.data
         return ReplayedFlight(data, replay_flight(data))
 
     def compare(self, engine: str | None = None, **overrides: Any) -> Comparison:

@@ -195,10 +195,7 @@ class ReportOptions:
     export: Sequence[str] = ()
 
 
-_AS_IT_COMES = ReportOptions()
-
-
-def run_report(flight: Path, chosen: ReportOptions = _AS_IT_COMES, options: RunOptions = DEFAULT) -> JobOutcome:
+def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: RunOptions = DEFAULT) -> JobOutcome:
     """Replay a flight, calibrate, compare, report.
 
     Parameters
@@ -273,8 +270,14 @@ def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[
     for word, words in ((chosen.figures, FIGURES), (chosen.style, STYLES)):
         if word not in words:
             raise UsageError(f"found {word!r}", expected="one of " + ", ".join(words), cause="--figures or --style")
-    if chosen.recommend is not None:
-        _require_same_folder(chosen.recommend, flight, options.logs_root)
+    beside, home = (chosen.recommend or flight).parent, flight.parent
+    if options.logs_root is None and os.path.realpath(beside) != os.path.realpath(home):
+        # paths in a flight file are relative to its folder
+        raise UsageError(
+            f"--recommend in another folder than {flight}",
+            expected="a name beside the flight file, whose paths are relative to its folder; or --logs-root",
+            path=chosen.recommend,
+        )
     return chosen_formats(chosen.export)
 
 
@@ -287,16 +290,6 @@ def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> 
     settings = _with_audit(load_with_learned(flight, learned), chosen.audit)
     inputs = [*inputs_of_flight(settings, flight, options.logs_root), *([] if learned is None else [learned])]
     return settings, inputs, options.out or Path("reports") / settings.flight.name
-
-
-def _require_same_folder(recommend: Path, flight: Path, logs_root: Path | None) -> None:
-    """Paths in a flight file are relative to its folder: a changed one must stand beside it."""
-    if logs_root is None and os.path.realpath(recommend.parent) != os.path.realpath(flight.parent):
-        raise UsageError(
-            f"--recommend in another folder than {flight}",
-            expected="a name beside the flight file, whose paths are relative to its folder; or --logs-root",
-            path=recommend,
-        )
 
 
 def _with_audit(settings: Any, audit: str | None) -> Any:

@@ -31,7 +31,7 @@ def explain(
     ] = None,
     engine: Annotated[Literal["image", "sionna"] | None, Option(help="Path search  [default: rt.engine]")] = None,
     logs_root: LogsRoot = None,
-) -> int:
+) -> None:
     """List every path of a link at an instant, term by term."""
     from ...jobs.reporting.explain import run_explain
 
@@ -40,7 +40,6 @@ def explain(
     )
     if not answered(explanation.as_dict()):
         _print_explanation(explanation)
-    return 0
 
 
 def _print_explanation(explanation: Any) -> None:

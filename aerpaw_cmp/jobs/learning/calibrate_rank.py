@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -97,14 +96,10 @@ class RankSamples:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Timing:
-    """Time relation of reports to the positions of a log: see :func:`~aerpaw_cmp.compare.ranks.receiver.time_means`.
-
-    ``log_score`` is that of the choice on sectors of the training flights left out [nat]; NaN where nothing was chosen.
-    """
+    """Time relation of reports to the positions of a log: see :func:`~aerpaw_cmp.compare.ranks.receiver.time_means`."""
 
     shift_s: float = 0.0
     average_s: float = 0.0
-    log_score: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -381,18 +376,8 @@ class Tried:
         """Least log score of the mean forecast of some geometries, on sectors left out within the flights."""
         thinned = [self.thinned[i] for i in flights]
         rank, groups = np.concatenate([item.rank for item in thinned]), _groups(thinned)
-        candidates = [
-            Timing(
-                shift_s=shift_s,
-                average_s=average_s,
-                log_score=receiver.mixture_loss(
-                    self.features(flights, Timing(shift_s=shift_s, average_s=average_s), which), rank, groups
-                ),
-            )
-            for shift_s in self.grid.shift_s
-            for average_s in self.grid.average_s
-        ]
-        return min(candidates, key=lambda timing: timing.log_score)
+        timings = [Timing(shift_s=s, average_s=mean_s) for s in self.grid.shift_s for mean_s in self.grid.average_s]
+        return min(timings, key=lambda t: receiver.mixture_loss(self.features(flights, t, which), rank, groups))
 
     def features(
         self, flights: Sequence[int] | range, timing: Timing, which: IntArray | slice = slice(None)

@@ -295,7 +295,15 @@ def site_entry(calibrated: Calibrated, command: str) -> tuple[Entry, dict[str, b
     entry : Entry
     tables : dict of str to bytes
     """
-    made = Entry(**_provenance(calibrated.settings, calibrated.flights, command))
+    begins = [s.time.min() for data in calibrated.flights for _, s in data.series]
+    made = Entry(
+        command=command,
+        made=datetime.now(timezone.utc).date().isoformat(),
+        flights=[data.settings.flight.name for data in calibrated.flights],
+        flown=sorted({str(begin.astype("datetime64[D]")) for begin in begins if has_wall_clock(begin)}),
+        trained_on=list(union(*map(flight_logs, calibrated.flights))),
+        source=calibrated.settings.source,
+    )
     tables: dict[str, bytes] = {}
     if calibrated.calibration is not None:
         series, tables = _learned_series(calibrated.calibration)
@@ -322,19 +330,19 @@ def _learned_series(calibration: Calibration) -> tuple[list[LearnedSeries], dict
             notes = (f"aerpaw-cmp calibrate: {name}, {antenna} {end}", *_notes(calibration, antenna, end))
             tables[files[end]] = sphere_csv(gains.gain_dbi, gains.sd_db, notes, decimals=2).encode()
         samples = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
-        first, ends = calibration.first_series(antenna), (maps[antenna, "uav"], maps[antenna, "tower"])
+        (data, first), ends = calibration.first_series(antenna), (maps[antenna, "uav"], maps[antenna, "tower"])
         sds = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), _SD_SAMPLES)))[1] for o in samples])
         series.append(
             LearnedSeries(
                 tower=samples[0].tower,
                 channel=samples[0].channel,
-                reader=_reader_of(*first),
-                carrier_hz=first[1].link.carrier_hz,
+                reader=receiver_of(data.files[int(first.log[0])].result.reader),  # or the first of its receiver's
+                carrier_hz=first.link.carrier_hz,
                 tower_file=files["tower"],
                 uav_file=files["uav"],
                 sd_db=round(float(np.nanmean(sds)), 2),
                 lock=_at_unit_gain(calibration.locks.get(antenna), *ends),
-                level=_level(calibration, first[1], *ends),
+                level=_level(calibration, first, *ends),
             )
         )
     return series, tables
@@ -392,28 +400,10 @@ def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, f
     return receivers
 
 
-def _reader_of(data: FlightData, series: RssSeries | RankSeries) -> str:
-    """Reader of the log that holds a series, or the first of its receiver's."""
-    return receiver_of(data.files[int(series.log[0])].result.reader)
-
-
 def _quantity_of(data: FlightData, series: RankSeries) -> str:
     """Rank that a series holds, as its log calls it."""
     file = data.files[int(series.log[0])]
     return next(rank_quantity(stream, file.result.reader) for stream in file.result.streams if stream.kind == "rank")
-
-
-def _provenance(settings: CalibrationFile, flights: Sequence[FlightData], command: str) -> dict[str, Any]:
-    begins = [s.time.min() for data in flights for _, s in data.series]
-    days = {str(begin.astype("datetime64[D]")) for begin in begins if has_wall_clock(begin)}
-    return {
-        "command": command,
-        "made": datetime.now(timezone.utc).date().isoformat(),
-        "flights": [data.settings.flight.name for data in flights],
-        "flown": sorted(days),
-        "trained_on": list(union(*map(flight_logs, flights))),
-        "source": settings.source,
-    }
 
 
 def _errors(calibration: Calibration) -> Errors | None:

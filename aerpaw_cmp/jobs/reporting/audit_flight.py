@@ -146,7 +146,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         return None
     free_memory()
     errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
-    links = sum(p.links for p in parts)
+    links, rays = sum(p.links for p in parts), max(parts, key=lambda p: p.samples).samples_reason
     fields = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))
     return AuditResult(
         reference=parts[0].reference,
@@ -157,7 +157,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         rank_disagreement={k: sum(p.rank_disagreement[k] * p.links for p in parts) / links for k in ks},
         seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
         reference_seconds=sum(p.reference_seconds for p in parts),
-        note=" ".join([_TIMES, *_rays(parts)]),
+        note=_TIMES + (f" Rays were raised until two pilots agreed: {rays}." if rays else ""),
         fields=dataclasses.replace(fields, not_covered=(*fields.not_covered, *_NOT_COVERED)),
     )
 
@@ -200,12 +200,6 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
                 tower_m=None,
             )
             yield site_with_tower_at(site, tower, replayed.tower_m[at]), moment, expected
-
-
-def _rays(parts: Sequence[Audit]) -> list[str]:
-    """Number of rays that PathSolver shot, and why, in the words of the series that needed most."""
-    most = max(parts, key=lambda p: p.samples)
-    return [f"Rays were raised until two pilots agreed: {most.samples_reason}."] if most.samples_reason else []
 
 
 # --- what the settings say -------------------------------------------------------------------------------------------

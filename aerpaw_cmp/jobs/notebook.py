@@ -268,17 +268,14 @@ class Flight:
 
     def __repr__(self) -> str:
         """Name, series and track in one line."""
-        name = self.settings.flight.name
-        return f"Flight({name!r}: {len(self.data.rss)} RSS series, {len(self.data.rank)} rank series, {self._span()})"
+        name, span = self.settings.flight.name, counted(len(self.track), "pose") if len(self.track) else "no track"
+        return f"Flight({name!r}: {len(self.data.rss)} RSS series, {len(self.data.rank)} rank series, {span})"
 
     def _repr_html_(self) -> str:
         """A table of the series for notebooks."""
         rows = [(s.tower, s.channel, f"RSS [{s.unit}]", len(s.time)) for s in self.data.rss]
         rows += [(s.tower, "", "rank", len(s.time)) for s in self.data.rank]
         return html_table(("tower", "channel", "quantity", "samples"), rows, self.settings.flight.name)
-
-    def _span(self) -> str:
-        return "no track" if self.data.track is None else f"{counted(len(self.track), 'pose')}"
 
 
 @from_python

@@ -288,14 +288,14 @@ _SURE_M = 100.0
 
 def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
     """Fitting part of the site's memory; nothing, and a remark, where the memory cannot be read."""
-    series = [(tower, channel, reader) for tower, channel, reader in entries.series]
     try:
         known = read_learned(site_place(site, folder))
     except (InputError, UsageError) as error:
         entries.out.append(f"what site {site} remembers: {error.found}")
         known = Learned()
-    fixed = () if entries.placer is None else tuple(entries.placer.site.towers)
-    return propose(known, str(Path(site).with_suffix("")), series, Nodes(placed=frozenset(entries.sure), fixed=fixed))
+    towers = () if entries.placer is None else tuple(entries.placer.site.towers)
+    nodes = Nodes(placed=frozenset(entries.sure), fixed=towers)
+    return propose(known, str(Path(site).with_suffix("")), entries.series, nodes)
 
 
 def _learned_lines(known: Proposal, link: str) -> list[str]:
@@ -438,7 +438,7 @@ class _Entries:
     lines: dict[str, str] = field(default_factory=dict)
     """By the path as it was given."""
     kinds: set[str] = field(default_factory=set)
-    series: list[tuple[str, ...]] = field(default_factory=list)
+    series: list[tuple[str, str, str]] = field(default_factory=list)
     """Tower, channel and reader of each level and rank."""
     out: list[str] = field(default_factory=list)
     without_track: bool = False
@@ -763,7 +763,7 @@ def _leading(streams: Sequence[Stream]) -> dict[str, str]:
     return same
 
 
-def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, ...]:
+def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, str]:
     """Key by which a report tells series apart."""
     tower = str(entry.get("node") or stream.attributes.get("node"))
     if stream.kind == "rank":

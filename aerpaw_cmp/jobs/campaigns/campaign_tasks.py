@@ -16,7 +16,6 @@ import numpy as np
 
 from ...common.errors import AerpawCmpError
 from ...common.jsonable import named
-from ...common.units import AnyArray
 from ...common.versions import versions
 from ...compare import offset
 from ...compare.result import FlightResult, RankResult, RssResult
@@ -228,10 +227,6 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
 # --- rows -----------------------------------------------------------------------------------------------------------
 
 
-def _start_ns(time: AnyArray) -> int:
-    return int(time[0].astype("datetime64[ns]").astype(np.int64)) if len(time) else 0
-
-
 def _identity(data: FlightData, series: RssSeries | RankSeries) -> dict[str, Any]:
     """Fields of a row that say which log it is of, whatever the log is called or packed in."""
     return {"logs": logs_of(data, series), "mark": series_mark(series)}
@@ -260,7 +255,7 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mappin
         },
         span_db=rules.span_db,
         measured_db=measured_db,
-        start_ns=_start_ns(result.time),
+        start_ns=int(result.time[0].astype("datetime64[ns]").astype(np.int64)) if len(result.time) else 0,
         heading_deg=result.geometry.get("heading_deg"),
         difference=offset.difference_moments(measured_db, result.simulated_dbm),
         **identity,

@@ -208,18 +208,8 @@ def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Si
 def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected]:
     """For each replay what the settings say of its link and losses."""
     settings = [*(s.link for s in data.rss), *[data.settings.link.rank] * len(data.rank)]
-    loss = _expected_loss(data.settings.rt)
-    if len(settings) != len(replays):  # part of the flight: from the links themselves
-        return [Expected.of(r.link, loss) for r in replays]
-    return [
-        Expected(expected_link(link, list(r.link.tower_arrays), data.folder), loss)
-        for link, r in zip(settings, replays, strict=True)
-    ]
-
-
-def _expected_loss(rt: RtSettings) -> reference.ExpectedLoss:
-    """Foliage and reflection loss as ``rt`` has them."""
-    return reference.ExpectedLoss(
+    rt = data.settings.rt
+    loss = reference.ExpectedLoss(
         model=rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
         gamma_db_per_m=rt.advanced.gamma_db_per_m,
         maximum_db=rt.advanced.maximum_loss_db,
@@ -227,6 +217,12 @@ def _expected_loss(rt: RtSettings) -> reference.ExpectedLoss:
         reflection_db=rt.reflection_loss_db,
         ground_roughness_m=rt.ground_roughness_m,
     )
+    if len(settings) != len(replays):  # part of the flight: from the links themselves
+        return [Expected.of(r.link, loss) for r in replays]
+    return [
+        Expected(expected_link(link, list(r.link.tower_arrays), data.folder), loss)
+        for link, r in zip(settings, replays, strict=True)
+    ]
 
 
 def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -> reference.ExpectedLink:

@@ -134,10 +134,6 @@ class _Case:
     simple: Mapping[str, FloatArray]
     trained: tuple[str, ...]
 
-    @property
-    def settings(self) -> RssSettings:
-        return self.data.settings.rss
-
 
 def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> RssResult:
     """Offset, RMSE, correlation, intervals and baselines of one tower and channel."""
@@ -241,7 +237,7 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
     -------
     RssFurther
     """
-    settings, levels, series, replayed = case.settings, case.levels, case.series, case.replayed
+    settings, levels, series, replayed = case.data.settings.rss, case.levels, case.series, case.replayed
     wild = rss.outliers(levels.measured_db)
     detection = None if case.trained else _detection(case.data, series, levels, case.simple["free_space"])
     further = RssFurther(

@@ -188,7 +188,9 @@ class _Climber:
         patterns = [p for s in series for a in _arrays(s.replayed.link) for p in a.patterns]
         self._offer = offered(data) if all(p.name == "iso" for p in patterns) else None
         links = [s.replayed.link for s in series]
-        self._links = links if self._offer is None else [_link_of(self._offer, data, s) for s in data.rss]
+        if (offer := self._offer) is not None:
+            links = [offer.link.of(s.channel).build([s.tower], data.folder) for s in data.rss]
+        self._links = links
         ways = [
             (link.carrier_hz, self._sources(s, data.site).tobytes(), self._poses(s, "ignored").position_m.tobytes())
             for link, s in zip(self._links, series, strict=True)
@@ -254,7 +256,7 @@ class _Climber:
         if len(known) < len(errors) or not known:
             return climbed
         learned, free = (
-            _root_mean_square([getattr(e, key) for e in known]) for key in ("rmse_db", "free_space_rmse_db")
+            float(np.sqrt(np.mean([getattr(e, key) ** 2 for e in known]))) for key in ("rmse_db", "free_space_rmse_db")
         )
         for attitude in ("logged", "level"):
             model = Model(antennas="learned", attitude=attitude)
@@ -444,15 +446,6 @@ class _Climber:
         poses, track = series.replayed.poses, series.replayed.track
         turn = poses.rotation if track is None else attitude_rotation(track, attitude)
         return Poses(poses.position_m[series.picked], np.ascontiguousarray(turn[series.picked]))
-
-
-def _root_mean_square(values: Sequence[float]) -> float:
-    return float(np.sqrt(np.mean(np.square(values))))
-
-
-def _link_of(settings: FlightFile, data: FlightData, series: RssSeries) -> Link:
-    """The link of a series as other settings have it."""
-    return settings.link.of(series.channel).build([series.tower], data.folder)
 
 
 def _arrays(link: Link) -> list[Any]:

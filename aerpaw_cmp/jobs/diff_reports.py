@@ -140,6 +140,7 @@ def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
     texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
     with parsing(path, f"the table {kind}.csv beside metrics.json", "a damaged or edited file"):
         content = read_bounded(path, LARGEST_TABLE, f"{kind}.csv")
+        # a tower may be named NA or nan; read in chunks, a column could get two types
         table = pd.read_csv(BytesIO(content), dtype=texts, keep_default_na=False, na_values=[""], low_memory=False)
     if not content.endswith(b"\n"):
         raise InputError("the last line does not end", cause="a torn copy", path=path, line=len(table) + 1)

@@ -264,6 +264,7 @@ class Flight:
         track = self.data.track
         assert track is not None
         inside = (times.view("int64") >= track.start_ns) & (times.view("int64") <= track.end_ns)
+        # two logs of one vehicle hold the same instants, and the axis of a table must rise
         return np.unique(times[inside])
 
     def __repr__(self) -> str:

@@ -917,6 +917,7 @@ def _also(comment: str, question: str) -> str:
 
 def _plain(entry: Mapping[str, Any]) -> str:
     """A mapping of plain names on one line."""
+    # never wrapped: a question follows the entry on its line
     return str(yaml.safe_dump(dict(entry), default_flow_style=True, sort_keys=False, width=10_000)).strip()
 
 

@@ -75,6 +75,7 @@ class GroundFit:
     @property
     def likely_m(self) -> tuple[float, float]:
         """Heights within 2 of the best log likelihood (some 95 %)."""
+        # two standard deviations of a normal likelihood
         least = max(self.log_likelihood) - 2.0
         near = [r for r, v in zip(self.roughness_m, self.log_likelihood, strict=True) if v > least]
         return min(near), max(near)

@@ -369,6 +369,7 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
     ]
     return LearnedLevel(
         offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
+        # what is usual counts as two flights beside those that were left out
         sd_db=round(math.sqrt((2.0 * _OFFSET_SD_DB**2 + sum(squares)) / (2 + len(squares))), 2),
         transmit_power_dbm=sent,
         unit=series.unit,

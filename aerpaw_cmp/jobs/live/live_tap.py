@@ -127,6 +127,7 @@ def _together(sessions: Sequence[Callable[[], TapSummary]], stop: Stop) -> list[
     def run(number: int) -> None:
         try:
             results[number] = sessions[number]()
+        # whatever ends one session ends all, and the main thread raises it again
         except BaseException as error:
             results[number] = error
             stop("error")

@@ -214,7 +214,9 @@ class FlownAgain:
         random = np.random.default_rng(7)
         fading = np.zeros(len(level))
         for i in range(1, len(fading)):
+            # 0.36 + 0.64 = 1: the variance stays that of one step
             fading[i] = 0.6 * fading[i - 1] + 0.8 * _DEMO_FADING_DB * random.standard_normal()
+        # -140 dBm is the least RSRP that a modem can report
         return np.asarray(np.nan_to_num(level + _DEMO_OFFSET_DB + fading, nan=-140.0))
 
     @staticmethod

@@ -311,6 +311,7 @@ def _corners(points: Sequence[Waypoint]) -> list[Waypoint]:
     corners = [points[0]]
     for i in range(1, len(points) - 1):
         before, after = place[i] - place[i - 1], place[i + 1] - place[i]
+        # the cosine of about one degree
         straight = float(before @ after) > 0.9998 * float(np.linalg.norm(before) * np.linalg.norm(after))
         if not straight or abs(points[i].yaw_deg - corners[-1].yaw_deg) > 2.0:
             corners.append(points[i])
@@ -335,6 +336,7 @@ def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, s
         if points is None:
             direction = _even_directions(800)
             direction = direction[(direction[:, 2] > 0.03) & (direction[:, 2] < 0.98)]
+            # turns by the golden angle spread headings as evenly as the directions
             place, yaw = tower + _SPHERE_AWAY_M * direction, 137.508 * np.arange(len(direction)) % 360.0
         else:
             place, yaw = points.position_m[points.known], points.yaw_deg[points.known]

@@ -474,8 +474,10 @@ def _serving(level: AnyArray, slow: AnyArray, channels: Sequence[str]) -> AnyArr
     """
     from scipy.special import ndtr
 
+    # the mean over the normal spread of a level of its own; rivals are independent at each of its values
     nodes, weight = np.polynomial.hermite_e.hermegauss(24)
     out: AnyArray = np.where(np.isfinite(level), np.float32(1.0), np.float32(np.nan))
+    # a tower without a path never serves
     filled, sd = np.nan_to_num(level, nan=-1e9), np.nan_to_num(slow, nan=1.0)
     for k, channel in enumerate(channels):
         rivals = [j for j, name in enumerate(channels) if name == channel and j != k]
@@ -537,6 +539,7 @@ def _ranks(
                 poses=Poses(position, rotation_from_aircraft(0.0 * heading, 0.0 * heading, heading)),
                 rank=np.full(len(some), np.nan),
                 link=link,
+                # points of a grid lie hours apart: a receiver that averages over seconds averages none of them
                 time_s=targets.time_s[some] if targets.kind == "route" else 1e4 * np.arange(float(len(some))),
             )
             each.append(receiver.forecast(samples, [turn - together[0] for turn in together])[0])

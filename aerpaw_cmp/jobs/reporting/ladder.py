@@ -343,6 +343,7 @@ class _Climber:
     def _lines(self) -> list[Rung]:
         zeros = tuple(np.zeros(len(s.rows)) for s in self._series)
         ray_m = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s, self._data.site) for s in self._series)
+        # a pose in the place of the antenna has no logarithm
         range_db = tuple(10.0 * np.log10(np.maximum(np.linalg.norm(a, axis=1), 0.1)) for a in ray_m)
         return [
             Rung(model=name, level_db=zeros, seconds=0.0, regressor_db=x)

@@ -81,6 +81,7 @@ class OutcomeStore:
         if content is None:
             return None
         try:
+            # a pickle in a shared folder would run whatever its writer wanted
             with parsing(file, any_shape=True), np.load(io.BytesIO(content), allow_pickle=False) as parts:
                 arrays = {name: parts[name] for name in parts.files}
                 return self._kind.validate_python([_with_arrays(json.loads(arrays["content"].tobytes()), arrays)])[0]

@@ -1,11 +1,14 @@
 """Every bad input is one clear message and exit code 2 or 3, through the command line; never a traceback."""
 
+import re
+import shlex
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from tests.parsers.autopilots import dataflash
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
@@ -149,3 +152,15 @@ def test_a_line_without_end_is_offered_no_columns(tmp_path: Path, capsys: pytest
     err = capsys.readouterr().err
     assert "no line ends" in err
     assert "--map" not in err
+
+
+def test_named_columns_are_those_of_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A table beside an autopilot's binary log: the options that its line names are taken for the folder, too."""
+    (tmp_path / "1.BIN").write_bytes(dataflash())
+    (tmp_path / "levels.csv").write_text("Time (UTC),Received power (dBm)\n2025-03-02T15:00:01,-80\n")
+    assert main(["ingest", str(tmp_path)]) == 0
+    words = re.search(r"levels.csv: skipped: .*?(--map .*)", capsys.readouterr().err)
+    assert words
+    assert main(["ingest", str(tmp_path), *shlex.split(words[1]), "--draft", str(tmp_path / "f.yaml")]) == 0
+    assert "ardupilot_bin" in (draft := (tmp_path / "f.yaml").read_text())
+    assert "generic_csv" in draft

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.counting import counted
-from ..common.errors import InputError, UsageError, one_line, parsing
+from ..common.errors import AerpawCmpError, InputError, UsageError, one_line, parsing
 from ..common.jsonable import named
 from ..common.stages import duration
 from .files import archives, chunks, packed
@@ -47,8 +47,14 @@ class Skipped:
 
     path: str
     reason: str
-    lacks: UsageError | None = None
-    """The option without which it cannot be read: of the folder's other files it says nothing."""
+    error: AerpawCmpError | None = None
+    """A usage error names an option without which it cannot be read: of the folder's other files it says nothing."""
+
+    @classmethod
+    def of(cls, path: Path, names: Collection[str], error: AerpawCmpError) -> Skipped:
+        """Of a file beside files of these names; a table's reason says how to read it."""
+        way_out = f"; {error.cause}" if "--map" in (error.cause or "") else ""
+        return cls(str(path), _samples_of(path.name, names) or error.found + way_out, error)
 
 
 class Ingested(list[IngestedFile]):
@@ -130,8 +136,8 @@ def ingest(
         inside, skipped_below = _below(Path(path), options, chosen)
         files += inside
         skipped += skipped_below
-    if lacking := [item.lacks for item in skipped if item.lacks]:
-        lacking[0].others = Ingested(files, [item for item in skipped if not item.lacks])
+    if lacking := [item.error for item in skipped if isinstance(item.error, UsageError)]:
+        lacking[0].others = Ingested(files, [item for item in skipped if item.error not in lacking])
         raise lacking[0]
     return Ingested(files, skipped)
 
@@ -144,7 +150,7 @@ def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> t
         return [replace(_of_kind(item, chosen, place), holder=str(place)) for item in read_flight(place)], []
     else:
         return [read_file(place, options=options, reader=chosen)], []
-    if not inside and not any(item.lacks for item in skipped):
+    if not inside and not any(isinstance(item.error, UsageError) for item in skipped):
         known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
         looked = counted(len(skipped), "file")
         first = f"; {one_line(Path(skipped[0].path).name)}: {skipped[0].reason}" if skipped else ""
@@ -310,10 +316,8 @@ def _archive(
         path = place / name
         try:
             files.append(_member(path, member, content, options, chosen))
-        except InputError as error:
-            skipped.append(Skipped(str(path), _samples_of(name, content) or error.found))
-        except UsageError as error:
-            skipped.append(Skipped(str(path), error.found, error))
+        except AerpawCmpError as error:
+            skipped.append(Skipped.of(path, content, error))
     return files, skipped
 
 
@@ -506,13 +510,12 @@ def _folder(
                 inside, skipped_inside = _archive(place, options, chosen)
                 files, skipped = files + inside, skipped + skipped_inside
             else:
-                files.append(read_file(place, options=options, reader=chosen))
-        except InputError as error:
+                # columns that were named are those of tables: a binary log beside them keeps its reader
+                binary = chosen is not None and chosen.name == "generic_csv" and b"\0" in _beginning(place, HEAD_BYTES)
+                files.append(read_file(place, options=options, reader=None if binary else chosen))
+        except AerpawCmpError as error:
             meta = place.with_suffix(".sigmf-meta")
-            names = {place.name, meta.name} if meta.exists() else set()
-            skipped.append(Skipped(str(place), _samples_of(place.name, names) or error.found))
-        except UsageError as error:
-            skipped.append(Skipped(str(place), error.found, error))
+            skipped.append(Skipped.of(place, {meta.name} if meta.exists() else (), error))
     return files, skipped
 
 

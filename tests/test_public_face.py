@@ -87,6 +87,8 @@ def test_logs_are_selected_written_and_opened_again_as_a_flight(tmp_path: Path) 
     logs = ac.read([SAMPLE / "UAV", SAMPLE / "LW1"], timezone="America/New_York")
     assert {frame.attrs["kind"] for frame in logs.select(kind="rss").values()} == {"rss"}
     assert set(logs.select(kind="rss", node="nowhere")) == set()
+    named = ac.read(f"{SAMPLE}/LW*/*.txt", timezone="America/New_York").select(kind="rss", node="LW1")
+    assert [Path(name).parent.name for name in named] == ["LW1", "LW1"]
     logs.write(tmp_path / "flight.h5")
     again = ac.read(tmp_path / "flight.h5")
     assert set(again) == set(logs)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import glob
 import os
 import tempfile
+from collections import Counter
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,10 +19,14 @@ from ..common.errors import InputError, from_python
 from ..common.htmltable import html_table
 from .flight_file import IngestedFile, write_flight
 from .ingest import Ingested, account_notes, ingest, summary
+from .origins import named_tower
 from .readers import ReadOptions
 
 # A file, a folder, a pattern such as ``"logs/*.txt"``, or an open binary file; ``~`` is the home folder.
 Source: TypeAlias = str | os.PathLike[str] | BinaryIO
+
+
+_TOWERS = ("LW1", "LW2", "LW3", "LW4", "LW5")
 
 
 @from_python
@@ -29,7 +34,9 @@ class Logs(dict[str, pd.DataFrame]):
     """Frames by the name of their stream, with the account of every file.
 
     ``frame.attrs`` holds what is true of a whole stream (node, channel, unit, frequency) and its ``reader``, ``file``
-    and ``kind``. A name that several files use becomes ``<file>:<stream>`` for all of them.
+    and ``kind``; the node of a level or rank that the log does not name is the tower in its path (``LW1/power.txt``).
+    A name that several files use becomes ``<file>:<stream>`` for all of them, with the folder where files are called
+    alike.
 
     Parameters
     ----------
@@ -45,13 +52,15 @@ class Logs(dict[str, pd.DataFrame]):
     def __init__(self, files: Ingested) -> None:
         self.files = files
         streams = [(Path(file.path).name, file, stream) for file in files for stream in file.result.streams]
-        names = [stream.name for _, _, stream in streams]
+        names = Counter(stream.name for _, _, stream in streams)
+        alike = Counter((file_name, stream.name) for file_name, _, stream in streams)
         frames: dict[str, pd.DataFrame] = {}
         for file_name, file, stream in streams:
-            key = stream.name if names.count(stream.name) == 1 else f"{file_name}:{stream.name}"
-            if key in frames:  # two files of one name in two folders
-                key = f"{file.path}:{stream.name}"
+            place = file_name if alike[file_name, stream.name] == 1 else file.path
+            key = stream.name if names[stream.name] == 1 else f"{place}:{stream.name}"
             frame = _in_utc(stream.frame)
+            if stream.kind in ("rss", "rank") and (node := named_tower("/".join(Path(file.path).parts[-2:]), _TOWERS)):
+                frame.attrs["node"] = node
             frame.attrs.update(stream.attributes)
             frame.attrs |= {"kind": stream.kind, "reader": file.result.reader, "file": file.path}
             frames[key] = frame

@@ -7,6 +7,8 @@ What a user states in flight.yaml counts as written. What is assumed is a questi
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -51,3 +53,16 @@ def _split(what: str, text: str) -> dict[str, Attribute]:
     """``program: datetime.now()`` as two attributes."""
     word, _, source = text.partition(": ")
     return {f"{what}_from": word, **({f"{what}_source": source} if source else {})}
+
+
+def named_tower(path: str, towers: Sequence[str]) -> str | None:
+    """The tower of the site whose name stands in a path, the last where several do; ``lw-1`` is LW1."""
+    places = {}
+    for tower in towers:
+        letters = "[-_ ]?".join(map(re.escape, re.findall(r"\d+|[^\W\d_]+", tower)))
+        # LW1 is not in LW12, nor CC in ACCESS
+        ends = r"(?!\d)" if tower[-1:].isdigit() else r"(?![^\W_])"
+        for match in re.finditer(rf"(?<![^\W_]){letters}{ends}" if letters else r"(?!)", path, re.IGNORECASE):
+            places[match.start()] = tower
+    # the last: file names stand behind folders
+    return places[max(places)] if places else None

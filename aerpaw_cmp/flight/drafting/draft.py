@@ -18,6 +18,7 @@ from ...common.errors import InputError, UsageError, one_line
 from ...common.geodesy import rough_m
 from ...common.yamlfile import parse_yaml
 from ...logs.ingest import IngestedFile, name_inside, read_log
+from ...logs.origins import named_tower
 from ...logs.records import Stream, has_wall_clock
 from ...site.antenna.learned import Learned, read_learned
 from ...site.site import Site
@@ -884,9 +885,9 @@ def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[s
         return entry, ""
     here = Path(file.path).resolve()
     # a home folder may be called after a tower, too
-    near = _named_tower("/".join(here.parts[-2:]), towers)  # of the file or its folder
+    near = named_tower("/".join(here.parts[-2:]), towers)  # of the file or its folder
     alone = towers[0] if len(towers) == 1 else None
-    entry["node"] = near or _named_tower(path, towers) or alone or next(iter(towers), "LW1")
+    entry["node"] = near or named_tower(path, towers) or alone or next(iter(towers), "LW1")
     if cells := _cells(need):
         entry["cells"] = dict.fromkeys(cells, entry["node"])
         if all("pci" in stream.attributes for stream in need):
@@ -895,19 +896,6 @@ def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[s
     if (radio := _RADIO.findall(path)) and len(need) == 1 and need[0].kind == "rss":
         entry["channel"] = f"USRP{radio[-1]}"
     return entry, "" if near or alone else "  # which tower?"
-
-
-def _named_tower(path: str, towers: Sequence[str]) -> str | None:
-    """The tower of the site whose name stands in a path, the last where several do; ``lw-1`` is LW1."""
-    places = {}
-    for tower in towers:
-        letters = "[-_ ]?".join(map(re.escape, re.findall(r"\d+|[^\W\d_]+", tower)))
-        # LW1 is not in LW12, nor CC in ACCESS
-        ends = r"(?!\d)" if tower[-1:].isdigit() else r"(?![^\W_])"
-        for match in re.finditer(rf"(?<![^\W_]){letters}{ends}" if letters else r"(?!)", path, re.IGNORECASE):
-            places[match.start()] = tower
-    # the last: file names stand behind folders
-    return places[max(places)] if places else None
 
 
 def _also(comment: str, question: str) -> str:

@@ -36,16 +36,19 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # Nothing kept on this machine decides a test, and no test leaves anything in the user's cache. Workers of pytest-xdist
-# have a folder each.
+# have a folder each; that this machine's LLVM works is found out once for all of them.
 _OF_ALL = os.environ.get("AERPAW_CMP_CACHE", "") if "PYTEST_XDIST_WORKER" in os.environ else ""
 _OWN = os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-tests-")
+if _OF_ALL:
+    Path(_OF_ALL, "llvm").mkdir(exist_ok=True)
+    Path(os.environ["AERPAW_CMP_CACHE"], "llvm").symlink_to(Path(_OF_ALL, "llvm"))
 
 
 # Files that take longest, by and large in that order.
 DEAREST = (
     "propagation/test_growth.py",  # compiles for half a minute where nothing is kept yet; the other worker needs it later
     "field/test_learned_site.py",
-    "test_field.py",
+    "test_field.py",  # the first that needs Sionna: by now one worker knows whether this machine's LLVM works
     "jobs/test_map_store.py",
     "parsers/test_law.py",
     "jobs/test_workers.py",

@@ -69,7 +69,7 @@ def cache_folder(*parts: str) -> Path:
 
 # Entries of the cache by their place: the name alone would fit a Git object, where the folder is one of the user's.
 _ENTRY = re.compile(
-    r"[0-9a-f]{64}\.npz|(outcomes|audits)/[0-9a-f]{64}\.(npz|json)"
+    r"[0-9a-f]{64}\.npz|llvm/[0-9a-f]{24}|(outcomes|audits)/[0-9a-f]{64}\.(npz|json)"
     r"|compiled/kernels-[0-9a-f]{16}/[^\n]+\.(nb[ci]|compiled)"
 )
 
@@ -80,7 +80,7 @@ def clear_cache() -> tuple[int, int]:
     for place, below, names in os.walk(folder):  # follows no link
         if Path(place) == folder:
             # AERPAW_CMP_CACHE may name a folder with other things: only ours are entered
-            below[:] = sorted({"outcomes", "audits", "compiled"}.intersection(below))
+            below[:] = sorted({"llvm", "outcomes", "audits", "compiled"}.intersection(below))
         for path in (Path(place, name) for name in names):
             if _ENTRY.fullmatch(path.relative_to(folder).as_posix()) and not path.is_symlink():
                 size, files = size + path.stat().st_size, files + 1

@@ -168,6 +168,7 @@ def test_prepare_points_drjit_to_what_works(
 ) -> None:
     folder, environ = folders
     put(folder, "libLLVM.so.19.1", "libLLVM-15.so.1")
+    monkeypatch.setenv("AERPAW_CMP_CACHE", str(folder / "cache"))
     monkeypatch.setenv(llvm.FOLDERS_VARIABLE, environ[llvm.FOLDERS_VARIABLE])
     monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "")
     made: list[Path] = []
@@ -178,12 +179,17 @@ def test_prepare_points_drjit_to_what_works(
         return llvm.Trial(library, True)
 
     monkeypatch.setattr(llvm, "try_library", attempt)
-    llvm._trials.cache_clear()
     for _ in range(2):
+        llvm._trials.cache_clear()
         assert llvm.prepare_llvm() == folder / "libLLVM.so.19.1"
         assert os.environ[llvm.LIBRARY_VARIABLE] == str(folder / "libLLVM.so.19.1")
         monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "")
-    assert len(made) == 1, "a process tries once"
+    assert len(made) == 1, "a good trial is remembered"
+    put(folder, "libLLVM.so.19.1")
+    os.utime(folder / "libLLVM.so.19.1", ns=(1, 1))
+    llvm._trials.cache_clear()
+    llvm.prepare_llvm()
+    assert len(made) == 2, "a new file is tried anew"
     llvm._trials.cache_clear()
 
 

@@ -20,9 +20,12 @@ import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from hashlib import sha256
 from pathlib import Path
 
 from ...common.errors import CheckError
+from ...common.files import cache_folder
+from ...common.versions import version
 
 # 14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine.
 MINIMUM_MAJOR = 17
@@ -310,11 +313,41 @@ def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], 
     return trials
 
 
+def _verdict_file(library: Library) -> Path:
+    """File where a good trial is remembered: it holds for this library file, these versions and this processor."""
+    try:
+        processor = next(
+            (line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))),
+            platform.processor(),
+        )
+    except OSError:
+        processor = platform.processor()
+    stat = library.path.stat()
+    versions = [version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
+    # the nodes of a cluster share home folders: hence the processor in the key
+    key = repr((str(library.path), stat.st_size, stat.st_mtime_ns, versions, processor, sys.prefix))
+    return cache_folder("llvm", sha256(key.encode()).hexdigest()[:24])
+
+
+def _remembered_trial(library: Library) -> Trial:
+    """As :func:`try_library` without Sionna, once per machine where it is good. Failures are tried anew each time."""
+    note = _verdict_file(library)
+    if note.is_file() and not _too_old(library.version):
+        return Trial(library, True)
+    trial = try_library(library, program=TRIAL_PROGRAM)
+    if trial.ok:
+        try:
+            note.parent.mkdir(parents=True, exist_ok=True)
+            note.write_text(f"{library.label}\n")
+        except OSError:
+            pass  # an unwritable cache costs half a second per run, nothing else
+    return trial
+
+
 @cache
 def _trials() -> tuple[Trial, ...]:
     """The trials that led to this process's choice, made once."""
-    # without loading Sionna, which takes three times as long and tells no more of an LLVM
-    return tuple(first_that_works(candidates(), lambda library: try_library(library, program=TRIAL_PROGRAM)))
+    return tuple(first_that_works(candidates(), _remembered_trial))
 
 
 class SionnaMissingError(CheckError):

@@ -22,7 +22,10 @@ import re
 import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 from weakref import WeakSet
 
@@ -100,6 +103,7 @@ def _missing(error: ImportError) -> SionnaMissingError:
 def _variant(kinds: Sequence[str]) -> str:
     """The first of the kinds that serves, now in use."""
     let_sionna_load()
+    _leave_for_later()
     without_llvm: SionnaMissingError | None = None
     if "llvm" in kinds:
         try:
@@ -127,6 +131,34 @@ def _variant(kinds: Sequence[str]) -> str:
     raise UsageError(
         f"Dr.Jit finds no {' and no '.join(kinds)} device", cause="'aerpaw-cmp doctor' says what is missing"
     )
+
+
+# Modules of Sionna RT with a class that no search makes.
+_LATER = {
+    "preview": "Previewer",
+    "rcs.scattering_model_viewer": "ScatteringModelViewer",
+    "radio_map_solvers.radio_map_solver": "RadioMapSolver",
+    "path_solvers.sb_deterministic": "SBDeterministicCandidateGenerator",
+}
+
+
+def _leave_for_later() -> None:
+    """Let Sionna load its viewers for notebooks and its other solvers when one is made, not with the package.
+
+    With the viewers come ipywidgets, pythreejs and IPython: a sixth of the time of ``import sionna.rt``.
+    """
+    if "sionna.rt" in sys.modules:
+        return
+    for name, kind in _LATER.items():
+        later = sys.modules[f"sionna.rt.{name}"] = ModuleType(f"sionna.rt.{name}")
+        vars(later)[kind] = partial(_loaded, later, kind)
+
+
+def _loaded(later: ModuleType, kind: str, *arguments: Any, **named: Any) -> Any:
+    """Load a class in place of the module that stood for its own, and make an object of it."""
+    if sys.modules.get(later.__name__) is later:
+        del sys.modules[later.__name__]
+    return getattr(import_module(later.__name__), kind)(*arguments, **named)
 
 
 def free_memory() -> None:

@@ -515,6 +515,8 @@ def run_campaign(
     nodes = soundings(sounded, campaign.timezone) if sounded else ()
     folder = options.out or Path("reports") / campaign.campaign
     stages = options.stages("campaign", inputs, folder)
+    if keep is not None and ":/" in str(keep):  # of an address; a path has one slash there
+        raise UsageError(f"--keep {keep}", expected="a folder")
     store = None if fresh else keep or cache_folder("outcomes")
     note = f"finished tasks are kept in {store}, and the same command computes the rest" if store else "nothing is kept"
     with (

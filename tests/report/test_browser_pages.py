@@ -78,4 +78,9 @@ def test_the_view_of_a_site_can_be_saved(driver: Any, tmp_path: Path, report_dat
     assert picture.count(" A ") >= 2 * (len(report_data.site.trees) + len(report_data.site.towers))
     (table,) = (text.splitlines() for name, text in files.items() if name.endswith(".csv"))
     assert {row.split(",")[0] for row in table[1:]} == {"tower", "building", "tree", "forest", "geofence"}
+    for scheme in ("light", "dark"):
+        set_scheme(driver, scheme)
+        drawn = matplotlib.image.imread(io.BytesIO(driver.find_element("id", "view").screenshot_as_png))[..., :3]
+        assert (np.median(drawn) < 0.2) == (scheme == "dark")
+    set_scheme(driver)
     assert complaints(driver) == []

@@ -39,7 +39,7 @@ function view(turn, tilt) {
 const polygon = (...given) => common.polygon(pen, ...given), polyline = (...given) => common.polyline(pen, ...given);
 
 function label(text, p, colour) {
-  pen.font = "bold 13px system-ui, sans-serif"; pen.lineWidth = 3; pen.strokeStyle = "rgba(255,255,255,.9)";
+  pen.font = "bold 13px system-ui, sans-serif"; pen.lineWidth = 3; pen.strokeStyle = common.css("--paper");
   pen.strokeText(text, p[0] + 6, p[1] - 4); pen.fillStyle = colour; pen.fillText(text, p[0] + 6, p[1] - 4);
 }
 
@@ -49,14 +49,14 @@ function ground() {
   for (const axis of [0, 1]) {
     for (let v = Math.ceil(L[axis][0] / pace) * pace; v <= L[axis][1]; v += pace) {
       const a = axis ? [L[0][0], v, 0] : [v, L[1][0], 0], b = axis ? [L[0][1], v, 0] : [v, L[1][1], 0];
-      polyline([shape(a), shape(b)], "#E0E0E0", 1);
+      polyline([shape(a), shape(b)], common.css("--line"), 1);
       const p = shape(a);
-      pen.font = "11px system-ui, sans-serif"; pen.fillStyle = "#707070";
+      pen.font = "11px system-ui, sans-serif"; pen.fillStyle = common.css("--soft");
       pen.fillText(v + " m " + (axis ? "N" : "E"), p[0] - 14, p[1] + 13);
     }
   }
-  scene.forests.forEach(ring => polygon(ring.map(p => shape([p[0], p[1], 0])), "rgba(150,195,135,.45)", "#7FA873"));
-  scene.fences.forEach(ring => polyline(ring.map(p => shape([p[0], p[1], 0])), "#333", 1.2, [6, 4]));
+  scene.forests.forEach(ring => polygon(ring.map(p => shape([p[0], p[1], 0])), common.css("--forest"), "#7FA873"));
+  scene.fences.forEach(ring => polyline(ring.map(p => shape([p[0], p[1], 0])), common.css("--ink"), 1.2, [6, 4]));
 }
 
 function solids() {
@@ -91,13 +91,13 @@ function draw() {
     canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio);
   }
   pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.lineJoin = "round";
-  pen.fillStyle = "#fff"; pen.fillRect(0, 0, w, h);
+  pen.fillStyle = common.css("--paper"); pen.fillRect(0, 0, w, h);
   prepare(); ground(); solids();
-  scene.towers.forEach(t => label(t.name, shape([t.at[0], t.at[1], t.top]), "#8f0f18"));
+  scene.towers.forEach(t => label(t.name, shape([t.at[0], t.at[1], t.top]), common.css("--accent")));
   const n = [0, 1].map(i => centre[i] + (i ? eye.north : eye.east)), a = shape([n[0], n[1], 0]), b = shape([n[0], n[1] + size * 0.05, 0]);
   const k = 26 / (Math.hypot(b[0] - a[0], b[1] - a[1]) || 1), x = 40, y = h - 40;
-  polyline([[x, y], [x + (b[0] - a[0]) * k, y + (b[1] - a[1]) * k]], "#333", 2);
-  label("N", [x + (b[0] - a[0]) * k - 6, y + (b[1] - a[1]) * k], "#333");
+  polyline([[x, y], [x + (b[0] - a[0]) * k, y + (b[1] - a[1]) * k]], common.css("--ink"), 2);
+  label("N", [x + (b[0] - a[0]) * k - 6, y + (b[1] - a[1]) * k], common.css("--ink"));
 }
 
 const redraw = () => common.later(draw);
@@ -134,6 +134,7 @@ box("stretch").addEventListener("input", e => { eye.stretch = +e.target.value; b
 box("above").addEventListener("click", () => view(0, 1.57));
 box("side").addEventListener("click", () => view(0, 0.12));
 new ResizeObserver(redraw).observe(canvas);
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", redraw);
 // corners of everything that stands there, whatever is drawn
 function corners() {
   const of = (kind, name, points) => points.map(p => [kind, name, p[0], p[1], p[2] ?? 0]), all = (kind, rings) => rings.flatMap((ring, i) => of(kind, i + 1, ring));

@@ -11,7 +11,7 @@ import numpy as np
 from ..common.units import FloatArray
 from .level.detection import DetectionScore, floored_fit
 from .result import FlightVerdict, RssResult
-from .statistics.intervals import corrected, pooled_difference
+from .statistics.intervals import corrected, is_flat, middle_span, pooled_difference
 from .statistics.memory import FEWEST
 
 
@@ -46,13 +46,12 @@ _DEAD_DB = 1.0
 
 
 def is_dead(panel: RssResult) -> bool:
-    """True of a level whose middle 80 % span less than a decibel, and a fifth of what is predicted: a dead input."""
+    """True of a level whose middle 80 % span less than a decibel, and little of what is predicted: a dead input."""
     known = panel.posed & np.isfinite(panel.measured_db) & np.isfinite(panel.simulated_dbm)
     if not known.any():
         return False
-    both = np.percentile([panel.measured_db[known], panel.simulated_dbm[known]], (10, 90), axis=1)
-    measured_db, predicted_db = np.ptp(both, axis=0)
-    return bool(measured_db < min(_DEAD_DB, 0.2 * predicted_db))
+    measured_db = panel.measured_db[known]
+    return middle_span(measured_db) < _DEAD_DB and is_flat(measured_db, [panel.simulated_dbm[known]])
 
 
 def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:

@@ -8,7 +8,7 @@ the statistic over the draws, corrected for the finite number of blocks, gives t
 
 from __future__ import annotations
 
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -395,6 +395,20 @@ def _around(estimate: float, drawn: FloatArray) -> Interval:
         return NO_INTERVAL
     low, high = np.nanquantile(drawn, [0.025, 0.975])
     return float(min(low, estimate)), float(max(high, estimate))
+
+
+def middle_span(values: FloatArray) -> float:
+    """Width of the middle 80 % of values (n,)."""
+    return float(np.ptp(np.percentile(values, (10, 90))))
+
+
+# A level that spans less than this share of the predicted ones is flat: a floor, a dead input.
+_FLAT = 0.2
+
+
+def is_flat(measured_db: FloatArray, predicted_db: Iterable[FloatArray]) -> bool:
+    """True of a level (n,), n > 0, that hardly varies where every prediction (n,) of it does [dB]."""
+    return middle_span(measured_db) < _FLAT * min(map(middle_span, predicted_db))
 
 
 def correlation(first: ArrayLike, second: ArrayLike) -> float:

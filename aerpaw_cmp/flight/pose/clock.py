@@ -17,6 +17,7 @@ from ...common.gaussian import Factor, determining, gaussian_kernel
 from ...common.jsonable import fields_of
 from ...common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed
 from ...compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
+from ...compare.statistics.intervals import is_flat
 
 # Verdicts.
 OK, SHIFTED, CANNOT_TELL = "ok", "shifted", "cannot tell"
@@ -57,9 +58,6 @@ _GAIN = (0.05, 0.5, 1.0, 2.0)
 # Parts of the flight of which any two neighbours may be left out: a shift must be shown without them, too, by so much
 # [nat]. A dip, a jump of the position or a frozen track shifts no clock.
 _LEFT_OUT, _WITHOUT_NAT = 10, 2.0
-
-# A level whose middle 80 % span less than this share of the predicted ones is flat: a floor, a dead input.
-_FLAT = 0.2
 
 # A mean so many (robust) standard deviations from the median of as many neighbours counts as one so far.
 _LONE, _NEIGHBOURS = 4.0, 9
@@ -128,8 +126,7 @@ class ClockChannel:
         at = (self.time_s - self.along.start_s) / self.along.step_s
         known = np.isfinite(self.measured_db)
         models = (np.interp(at[known], np.arange(len(p)), p) for p in self.along.predicted_db.values())
-        spans = [np.ptp(np.percentile(v, (10, 90))) for v in (self.measured_db[known], *models) if len(v)]
-        return bool(spans and spans[0] < _FLAT * min(spans[1:]))
+        return bool(known.any() and is_flat(self.measured_db[known], models))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

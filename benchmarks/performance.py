@@ -308,8 +308,6 @@ def reports(run: dict[str, Any]) -> list[str]:
             f"| {name} | {row['cpu_s']:.1f} | {row['ratio']:.2f} | {row['ratio_light']:.2f} | {row['peak_mib']:.0f} |"
             for name, row in rows
         ),
-        "", f"With audit and the caches of this machine: {short['ratio_cpu']:.2f} x the imports, "
-        f"{short['peak_mib']:.0f} MiB.",
         "",
     ]  # fmt: skip
 

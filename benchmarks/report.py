@@ -1,11 +1,10 @@
-"""Whole reports as processes: time as a ratio to a peer of the same run, and peak memory.
+"""Whole reports as processes, the first and the next: time as a ratio to a peer of the same run, and peak memory.
 
-1. A two-channel flight of 3304 samples, image engine: processor time over that of importing what it is made of
-   (``import sionna.rt, matplotlib.pyplot, pandas``). The real one where AERPAW_CMP_FIELD_DATA is set, else a simulated.
-2. The first and the next report of part 1, as it comes and with ``--audit none``: every cache of the program, of Dr.Jit
-   and of matplotlib is empty before the first, whose time holds the trial of an LLVM. Bytecode is compiled before.
-   Ratios are to those imports, and to the imports without Sionna, which a report without audit does not load: the
-   median of all that the run measured, one before and one after each report.
+A two-channel flight of 3304 samples, image engine (the real one where AERPAW_CMP_FIELD_DATA is set, else a simulated),
+as it comes and with ``--audit none``: every cache of the program, of Dr.Jit and of matplotlib is empty before the
+first, whose time holds the trial of an LLVM. Bytecode is compiled before. Ratios are to importing what it is made of
+(``import sionna.rt, matplotlib.pyplot, pandas``), and to the imports without Sionna, which a report without audit does
+not load: the median of all that the run measured, one before and one after each report. waits.py has later reports.
 
     python benchmarks/report.py [--quick] [--json]
 """
@@ -75,7 +74,7 @@ def report(flight: Path, out: Path, *options: str) -> list[str]:
 
 
 def two_channels(folder: Path) -> tuple[Path, list[str], str]:
-    """The flight of part 1, its options, and where it comes from."""
+    """The flight, its options, and where it comes from."""
     field = os.environ.get("AERPAW_CMP_FIELD_DATA")
     if field:
         return ROOT / "tests" / "field" / "dataset12_40m.yaml", ["--logs-root", field], "dataset12 40 m"
@@ -105,7 +104,7 @@ def cold_and_warm(flight: Path, options: list[str], folder: Path, repeats: int) 
 
 
 def main() -> None:
-    """Print both parts."""
+    """Print the first and the next report."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="one run of each")
     parser.add_argument("--json", action="store_true")
@@ -117,32 +116,22 @@ def main() -> None:
         for text in (IMPORTS, LIGHT):  # not counted: bytecode and what the machine has not read from its disk yet
             run([sys.executable, "-c", text])
         run(report(flight, folder / "unmeasured", *options))
-        reports = []
-        for number in range(repeats):
-            IMPORTED.take()
-            reports.append(run(report(flight, folder / f"r{number}", *options)))
         now = cold_and_warm(flight, options, folder / "now", repeats)
         later = cold_and_warm(flight, [*options, "--audit", "none"], folder / "later", repeats)
     now, later = ({name: IMPORTED.ratios(row) for name, row in rows.items()} for rows in (now, later))
     result = {
         "two_channels": {
             "flight": source,
-            "report_s": statistics.median(r["wall_s"] for r in reports),
             "imports_cpu_s": IMPORTED.seconds[IMPORTS],
             "imports_light_cpu_s": IMPORTED.seconds[LIGHT],
-            "ratio_cpu": statistics.median(IMPORTED.ratios(r)["ratio"] for r in reports),
-            "peak_mib": max(r["peak_mib"] for r in reports),
         },
         "now": now, "later": later,
     }  # fmt: skip
     if arguments.json:
         print(json.dumps(result, indent=1))
         return
-    short = result["two_channels"]
-    print(
-        f"report of {short['flight']}: {short['report_s']:.1f} s, {short['ratio_cpu']:.2f} x the imports of "
-        f"{statistics.median(short['imports_cpu_s']):.2f} s in processor time ({len(short['imports_cpu_s'])} times)"
-    )
+    taken = IMPORTED.seconds[IMPORTS]
+    print(f"{source}, imports: {statistics.median(taken):.2f} s of processor time ({len(taken)} times)")
     for name, row in {**now, **{f"{key}, --audit none": row for key, row in later.items()}}.items():
         print(f"{name}: {row['cpu_s']:.1f} s of processor ({row['wall_s']:.1f} s), {row['ratio']:.2f} x "
               f"the imports, {row['ratio_light']:.2f} x the imports without Sionna")  # fmt: skip

@@ -1,6 +1,8 @@
 """Whole commands that a user waits for, as processes: processor seconds and peak memory of the next run.
 
-Each runs once before, so that every cache is warm. Those on real logs need AERPAW_CMP_FIELD_DATA.
+Each runs once before, so that every cache is warm, then in turns with ``import sionna.rt, matplotlib.pyplot, pandas``:
+machines differ in speed, and one moves by a fifth within minutes, so that the ratio of the two medians decides. Those
+on real logs need AERPAW_CMP_FIELD_DATA.
 
     python benchmarks/waits.py [--only NAME] [--json]
 """
@@ -8,6 +10,7 @@ Each runs once before, so that every cache is warm. Those on real logs need AERP
 import argparse
 import json
 import os
+import statistics
 import sys
 import tempfile
 from pathlib import Path
@@ -15,10 +18,12 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
-from benchmarks.report import ROOT, run
+from benchmarks.report import IMPORTS, ROOT, run
 
 FIELD = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
 REAL = ["--logs-root", FIELD]
+# The imports where the seconds below were asked for: the report of dataset 12 took 5.1 s there, 3.2 times the imports.
+ASKED_IMPORTS_S = 5.1 / 3.2
 # Of each: seconds before the work began, seconds asked for, the command, and whether it needs the field's logs.
 COMMANDS: dict[str, tuple[float, float, list[str], bool]] = {
     "report of dataset 12": (5.1, 3.2, ["report", str(ROOT / "tests/field/dataset12_40m.yaml"), *REAL], True),
@@ -39,22 +44,26 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         turn = np.linspace(0.0, 20.0 * np.pi, 1800)
         places = np.column_stack([35.7275 + 0.003 * np.cos(turn / 7), -78.6961 + 0.003 * np.sin(turn), 0.0 * turn + 40])
-        lines = (f"{latitude:.7f},{longitude:.7f},{height:.1f}" for latitude, longitude, height in places)
-        (Path(folder) / "route.csv").write_text("\n".join(["lat,lon,alt", *lines, ""]), encoding="utf-8")
+        np.savetxt(f"{folder}/route.csv", places, "%.7f", ",", header="lat,lon,alt", comments="")
         for name, (before_s, asked_s, command, real) in COMMANDS.items():
             if (arguments.only and name != arguments.only) or (real and not FIELD):
                 continue
             text = [sys.executable, "-m", "aerpaw_cmp", *(part.format(folder=folder) for part in command)]
             text += ["-o", f"{folder}/out.yaml" if command[0] == "calibrate" else f"{folder}/{command[0]}", "--force"]
-            if command[0] != "map":  # 51 figures: nothing that the first run keeps
-                run(text)
-            rows.append({"command": name, "before_s": before_s, "asked_s": asked_s, **run(text)})
+            runs = []
+            # The map has 51 figures, nothing that a first run keeps, and is long enough to be measured by one.
+            for _ in range(1 if command[0] == "map" else 4):
+                imports = run([sys.executable, "-c", IMPORTS])
+                runs.append({"imports_s": imports["cpu_s"], **run(text)})
+            medians = {key: statistics.median(row[key] for row in runs[-3:]) for key in runs[0]}
+            rows.append({"command": name, "before_s": before_s, "asked_s": asked_s, **medians})
     if arguments.json:
         print(json.dumps({"rows": rows}))
         return
     for row in rows:
         print(f"{row['command']}: {row['cpu_s']:.1f} s of processor (asked for {row['asked_s']:g}), "
-              f"{row['peak_mib']:.0f} MiB")  # fmt: skip
+              f"{row['cpu_s'] / row['imports_s']:.2f} x the imports of {row['imports_s']:.2f} s (asked for "
+              f"{row['asked_s'] / ASKED_IMPORTS_S:.2f}), {row['peak_mib']:.0f} MiB")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -195,7 +195,7 @@ def _score_rank(bench: Bench, task: str, joined: pd.DataFrame) -> dict[str, Any]
     constant = constant_forecast(known) if len(known) else np.full(4, 0.25)
     decided = p.argmax(axis=1) + 1
     score = score_forecast(joined["measured"].to_numpy(np.float64), p / p.sum(axis=1)[:, None], decided, constant)
-    return {name: tuple(v) if isinstance(v, np.ndarray) else v for name, v in fields_of(score).items()}
+    return fields_of(score)
 
 
 def block_of(series: LevelSeries) -> int:

@@ -1,8 +1,8 @@
 """Forecasts of rank: a probability for each rank, and what they are worth against the reports of a modem.
 
-A probability forecast is judged by proper scores (nobody gains by saying what he does not believe): the log score and
-the Brier score, each beside that of a constant forecast, the histogram of the training flights. Kappa and agreement
-judge the one rank that a decision makes of the probabilities, beside what always saying the commonest rank agrees.
+A probability forecast is judged by a proper score (nobody gains by saying what he does not believe), the log score,
+beside that of a constant forecast, the histogram of the training flights. Kappa and agreement judge the one rank that
+a decision makes of the probabilities, beside what always saying the commonest rank agrees.
 """
 
 from __future__ import annotations
@@ -82,12 +82,8 @@ class ForecastScore:
         Share by which the forecast is below the constant one.
     log_score_difference_ci95 : (low, high)
         Of forecast minus constant [nat], on the same samples.
-    brier_score, constant_brier_score : float
     total_variation_expected : float
-        Between the mean probabilities and the measured histogram; ``constant_total_variation`` that of the constant.
-    expected_histogram, measured_histogram : (ranks,)
-    expected_histogram_ci95 : tuple of (low, high)
-        Of the expected histogram, by blocks.
+        Between the mean probabilities and the measured histogram.
     kappa_ci95, log_score_ci95, total_variation_ci95 : (low, high)
     """
 
@@ -101,14 +97,8 @@ class ForecastScore:
     constant_log_score: float = np.nan
     log_score_gain: float = np.nan
     log_score_difference_ci95: Interval = NO_INTERVAL
-    brier_score: float = np.nan
-    constant_brier_score: float = np.nan
     total_variation_expected: float = np.nan
     total_variation_ci95: Interval = NO_INTERVAL
-    constant_total_variation: float = np.nan
-    expected_histogram: FloatArray
-    expected_histogram_ci95: tuple[Interval, ...]
-    measured_histogram: FloatArray
 
 
 def score_forecast(
@@ -143,10 +133,7 @@ def score_forecast(
     counts = (ri >= 1) & (decision >= 1) & np.isfinite(probability).all(axis=1)
     rank, choice, p = ri[counts].astype(np.int64), decision[counts].astype(np.int64), probability[counts]
     if not len(rank):
-        absent = np.full(MAX_RANK, np.nan)
-        return ForecastScore(
-            n=0, expected_histogram=absent, expected_histogram_ci95=(NO_INTERVAL,) * MAX_RANK, measured_histogram=absent
-        )
+        return ForecastScore(n=0)
     flat = np.broadcast_to(constant, p.shape)
     reported, chosen = one_hot(rank), one_hot(choice)
     log, log_constant = log_losses(p, rank), log_losses(flat, rank)
@@ -172,14 +159,6 @@ def score_forecast(
         constant_log_score=float(log_constant.mean()),
         log_score_gain=float(1.0 - mean[0] / log_constant.mean()),
         log_score_difference_ci95=interval(float(mean[1]), drawn[:, 1], memory),
-        brier_score=float(brier_losses(p, rank).mean()),
-        constant_brier_score=float(brier_losses(flat, rank).mean()),
         total_variation_expected=spread,
         total_variation_ci95=interval(spread, varied, memory, bounds=(0.0, 1.0)),
-        constant_total_variation=total_variation(share, constant),
-        expected_histogram=expected,
-        expected_histogram_ci95=tuple(
-            interval(float(expected[r]), drawn_p[:, r], memory, bounds=(0.0, 1.0)) for r in range(MAX_RANK)
-        ),
-        measured_histogram=share,
     )

@@ -30,12 +30,12 @@ ROOT = Path(__file__).resolve().parents[1]
 HISTORY = ROOT / "benchmarks" / "history.jsonl"
 # What is run, each in a process of its own; ``scaling`` an axis at a time.
 COMMANDS: dict[str, list[str]] = {
-    "scaling": ["benchmarks/scaling.py", "--json", "--axes"],
+    "scaling": ["benchmarks/scaling.py", "--axes"],
     "peers": ["benchmarks/peers.py"],
     "report": ["benchmarks/report.py", "--quick", "--json"],
     "waits": ["benchmarks/waits.py", "--json"],
-    "replay": ["benchmarks/replay.py", "--quick", "--no-sionna", "--json"],
-    "kriging": ["benchmarks/kriging.py", "--pairs", "60", "--json"],
+    "replay": ["benchmarks/replay.py", "--quick", "--no-sionna"],
+    "kriging": ["benchmarks/kriging.py", "--pairs", "60"],
     "town": ["benchmarks/scenes.py", "--scenes", "munich", "--depths", "2,3", "--sionna", "1e5,1e6", "--json", "-"],
     "country": ["benchmarks/country.py", "--receivers", "1e5,1e6", "--json"],
     "pages": ["benchmarks/pages.py", "--only", "long,campaign", "--repeats", "1", "--json"],

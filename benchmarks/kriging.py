@@ -7,7 +7,7 @@ time is scaled per pair; ``--full`` runs them all. A second, kinder comparison g
 moving window (``n_closest_points``, the compiled back end, which knows only built-in variograms, so both sides use an
 exponential) at targets off the grid: totals, and the marginal cost of a target.
 
-    python benchmarks/kriging.py [--quick] [--full] [--pairs N] [--json]
+    python benchmarks/kriging.py [--quick] [--full] [--pairs N]
 """
 
 import argparse
@@ -29,15 +29,15 @@ M, RADIUS_M, SEED = 20, 150.0, 20250210
 FIELDS = 27  # 9 altitudes x 3 K
 
 
-def peer_semivariogram(_parameters, distance):
-    return 1.0 - PAPER(distance)
-
-
 def pykrige_model(points, values):
     from pykrige.ok import OrdinaryKriging as Peer
 
     return Peer(
-        *points.T, values, variogram_model="custom", variogram_parameters=[0.0], variogram_function=peer_semivariogram
+        *points.T,
+        values,
+        variogram_model="custom",
+        variogram_parameters=[0.0],
+        variogram_function=lambda _parameters, distance: 1.0 - PAPER(distance),
     )
 
 
@@ -164,13 +164,12 @@ def moving_window(quick, repeats):
     return row | {"compiled_load_s": load_s, "largest_difference_C": worst}
 
 
-def main(argv=None):
+def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="100 positions")
     parser.add_argument("--full", action="store_true", help="PyKrige on every target and field")
     parser.add_argument("--pairs", type=int, default=1000, help="pairs of target and field that PyKrige runs")
-    parser.add_argument("--json", action="store_true")
-    options = parser.parse_args(argv)
+    options = parser.parse_args()
     warnings.filterwarnings("ignore", category=DeprecationWarning)
     report = {
         "conditions": {"machine": platform.processor() or platform.machine(), "numpy": np.__version__, "M": M},
@@ -178,14 +177,7 @@ def main(argv=None):
         "grid": on_the_grid(options.quick),
         "moving_window": moving_window(options.quick, 1 if options.quick else 5),
     }
-    if options.json:
-        print(json.dumps(report, indent=2))
-        return report
-    for part, rows in report.items():
-        print(part)
-        for name, value in rows.items():
-            print(f"  {name:28s} {value:.6g}" if isinstance(value, float) else f"  {name:28s} {value}")
-    return report
+    print(json.dumps(report, indent=2))
 
 
 if __name__ == "__main__":

@@ -4,7 +4,7 @@
 2. time and memory of 10 000 poses x 5 towers x 4 x 4;
 3. a second replay by the sionna engine, whose paths are kept.
 
-Run: python benchmarks/replay.py [--quick] [--json] [--no-sionna]
+Run: python benchmarks/replay.py [--quick] [--no-sionna]
 ``aerpaw-cmp bench`` prints speed against error and the ratio to PathSolver.
 """
 
@@ -124,7 +124,6 @@ def cached(poses: int, folder: str) -> dict[str, float]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="small sizes")
-    parser.add_argument("--json", action="store_true")
     parser.add_argument("--no-sionna", action="store_true")
     parser.add_argument("--only-size", type=int, help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -144,11 +143,7 @@ def main() -> None:
 
         with tempfile.TemporaryDirectory() as folder:
             result["cache"] = cached(50 if quick else 500, folder)
-    if options.json:
-        print(json.dumps(result))
-        return
-    for name, value in result.items():
-        print(f"{name}: {value}")
+    print(json.dumps(result))
 
 
 if __name__ == "__main__":

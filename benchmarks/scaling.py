@@ -8,7 +8,7 @@ report    report of a flight of two channels without audit, by its samples; --la
 flights   campaign of ever more flights of 130 s, one tower, two channels, two settings, one worker
 workers   the campaign of the most flights with one and with two workers
 
-    python benchmarks/scaling.py [--axes poses faces ...] [--large] [--json]
+    python benchmarks/scaling.py [--axes poses faces ...] [--large]
 
 Seconds of the processor, and of the wall where work is shared out, without imports; MiB are the peak of the process.
 A power is that between the two largest sizes; a size that is refused is told with its reason.
@@ -231,27 +231,12 @@ def run(axes: list[str], *, large: bool = False, seconds: float = 240.0) -> dict
     return by_axis
 
 
-def show(by_axis: dict[str, Any]) -> None:
-    """A table per axis."""
-    for axis, result in by_axis.items():
-        fitted = result["power_cpu"]
-        print(f"{axis}" + ("" if fitted is None else f": processor time grows with power {fitted:.2f} at the end"))
-        for row in result["rows"]:
-            if "refused" in row:
-                print(f"  {row['size']:>10g}  {row['refused']}")
-            else:
-                extra = "".join(f"  {k} {row[k]}" for k in ("samples", "faces") if k in row)
-                print(f"  {row['size']:>10g}  {row['cpu_s']:8.2f} s ({row['wall_s']:.2f} wall) "
-                      f"{row['peak_mib']:7.0f} MiB{extra}")  # fmt: skip
-
-
 def main() -> None:
-    """Print the tables, or JSON."""
+    """Print JSON, of which benchmarks/performance.py makes tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--axes", nargs="+", choices=list(SIZES), default=list(SIZES))
     parser.add_argument("--large", action="store_true", help="the sizes of a season and of a city")
     parser.add_argument("--seconds", type=float, default=240.0, help="limit of one size")
-    parser.add_argument("--json", action="store_true")
     parser.add_argument("--one", nargs=2, metavar=("AXIS", "SIZE"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.one:
@@ -260,7 +245,7 @@ def main() -> None:
         return
     print(f"{os.cpu_count()} processors, load {os.getloadavg()[0]:.1f}", file=sys.stderr)
     by_axis = run(arguments.axes, large=arguments.large, seconds=arguments.seconds)
-    print(json.dumps(by_axis, indent=1)) if arguments.json else show(by_axis)
+    print(json.dumps(by_axis, indent=1))
 
 
 if __name__ == "__main__":

@@ -67,7 +67,8 @@ class FaultyModem(ModemSimulator):
         self._pending: Served | None = None
         self._random = random.Random(faults.seed)
         self._speaking = threading.Lock()
-        super().__init__(FlightModem(rank, csi_on), link=link)
+        super().__init__(FlightModem(rank), link=link)
+        self._modem.csi = [int(csi_on)] * 2
 
     def __enter__(self) -> FaultyModem:
         super().__enter__()

@@ -1,10 +1,8 @@
-"""Speed against error of the engines, and the tool beside its peers, for ``aerpaw-cmp bench``."""
+"""Speed against error of the engines, and the path search beside Sionna's, for ``aerpaw-cmp bench``."""
 
 from __future__ import annotations
 
-import io
 import os
-import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -45,9 +43,6 @@ BATCH = 50
 # The same with explicit arrays, which multiply sources and targets, and how many poses of them are replayed.
 _EXPLICIT_BATCH, _EXPLICIT_POSES = 10, 50
 
-# Lines of a real channel-sounder flight.
-LINES = 20_523
-
 T = TypeVar("T")
 
 Row: TypeAlias = "dict[str, Any]"
@@ -61,7 +56,7 @@ def run_bench(
     report: Path | None = None,
     progress: Progress = logged,
 ) -> dict[str, Any]:
-    """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
+    """Speed against error of the replay, and how many times faster than PathSolver its search is, from one run.
 
     Parameters
     ----------
@@ -70,7 +65,7 @@ def run_bench(
     samples : tuple of int
         Rays per tower of the sionna engine.
     ratios : bool
-        Compare with the peers, too.
+        Compare with PathSolver, too.
     report : Path, optional
         Folder of a report, whose ladder of models is a table, too.
     progress : Progress
@@ -83,12 +78,19 @@ def run_bench(
     ladder = {} if report is None else {"ladder": _costs(report)}
     site, link, some = random_scene(poses)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
-    measured = _against_peers(progress) if ratios else {}
+    measured: dict[str, Any] = {}
+    if ratios:
+        progress("path search against PathSolver, at equal error and at 1e6 samples")
+        searches = path_search_ratios()
+        measured = {
+            "path_search_image_vs_sionna_equal_error": searches["equal_error"],
+            "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
+        }
     about = {"poses": poses, "towers": list(link.tower_arrays), "buildings": len(site.buildings)}
     return {
         "conditions": {**about, "cpus": os.cpu_count()},
         "replay": {"rows": rows},
-        "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None},
+        "ratios": {name: value["ratio"] for name, value in measured.items()},
         "details": measured,
         **ladder,
     }
@@ -110,23 +112,6 @@ def _costs(report: Path) -> list[Row]:
             for row in rows
         ]  # fmt: skip
     return [named(at, "model seconds rmse_heldout_db knee") for at in costs(models)]
-
-
-def _against_peers(progress: Progress) -> dict[str, Any]:
-    """Ratios to each peer; at equal error and with the same work on both sides first."""
-    progress("path search against PathSolver, at equal error and at 1e6 samples")
-    searches = path_search_ratios()
-    progress("Kriging against PyKrige")
-    shared = kriging_shared_weights()
-    measured: dict[str, Any] = {
-        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
-        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
-        "kriging_vs_pykrige_one_field": shared and {**shared, "ratio": shared["ratio_one_field"]},
-        "kriging_vs_pykrige": shared,
-    }
-    progress("ingest against pandas")
-    measured["ingest_vs_pandas"] = ingest_vs_pandas()
-    return measured
 
 
 # --- speed against error --------------------------------------------------------------------------------------------
@@ -247,7 +232,7 @@ def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:
     return result, {"seconds": time.perf_counter() - started, "peak_mib": peak_mib()}
 
 
-# --- beside the peers -----------------------------------------------------------------------------------------------
+# --- beside PathSolver ----------------------------------------------------------------------------------------------
 
 
 def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5) -> dict[str, Any]:
@@ -303,18 +288,6 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
     }
 
 
-def median_seconds(action: Callable[[], Any], repeats: int = 5) -> float:
-    """Median processor time after a warm-up (none for a single run): other work on the machine does not count."""
-    if repeats > 1:
-        action()
-    times = []
-    for _ in range(repeats):
-        start = time.process_time()
-        action()
-        times.append(time.process_time() - start)
-    return statistics.median(times)
-
-
 def path_search_ratios(
     poses: int = 1000, samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000)
 ) -> dict[str, Any]:
@@ -335,67 +308,6 @@ def path_search_ratios(
             break
     enough = min(n for n, measured in at.items() if measured["extra_paths"] <= most["extra_paths"])
     return {"at": {f"{n:.0e}": measured for n, measured in sorted(at.items())}, "equal_error": at[enough]}
-
-
-def kriging_shared_weights(fields: int = 27) -> dict[str, Any] | None:
-    """Prediction at 2556 targets with one set of weights for all fields on our side and PyKrige's compiled back end.
-
-    Both have the same neighbours and the same exponential variogram. PyKrige has no several fields: one run is timed,
-    which for ``ratio`` counts as many times as there are fields; ``ratio_one_field`` gives us one field, too.
-    """
-    try:
-        from pykrige.ok import OrdinaryKriging as Peer
-    except ImportError:
-        return None
-    from ..maps.grid import Grid
-    from ..maps.kriging import OrdinaryKriging
-
-    generator, neighbours = np.random.default_rng(2), 20
-    grid = Grid.over_area((-540.0, 540.0, -1065.0, 1065.0))
-    points = grid.points_m + generator.uniform(-5, 5, (len(grid), 2))
-    targets = points + generator.uniform(5, 10, points.shape)
-    values = generator.integers(1, 5, (len(grid), fields)).astype(np.float64)
-
-    def correlation(distance: Any) -> Any:
-        return 0.9 * np.exp(-3.0 * distance / 900.0)
-
-    def ours(count: int) -> float:
-        model = OrdinaryKriging(correlation, neighbours=neighbours, radius_m=np.inf).fit(points, values[:, :count])
-        return median_seconds(lambda: model.predict(targets), 3)
-
-    def peer() -> Any:
-        model = Peer(*points.T, values[:, 0], "exponential", {"psill": 0.9, "range": 900.0, "nugget": 0.1})
-        return model.execute("points", *targets.T, backend="C", n_closest_points=neighbours)
-
-    theirs, single, every = median_seconds(peer, 3), ours(1), ours(fields)
-    return {
-        "ratio": fields * theirs / every,
-        "ratio_one_field": theirs / single,
-        "seconds_pykrige_one_field": theirs,
-        "seconds_ours_one_field": single,
-        "seconds_ours_all_fields": every,
-        "fields": fields,
-    }
-
-
-def ingest_vs_pandas(lines: int = LINES, repeats: int = 5) -> dict[str, Any]:
-    """Reading a synthetic power log, against ``pandas.read_csv(engine="c")`` on the same bytes.
-
-    Ours gives UTC times, levels, flags and the account of every line; pandas columns of text and numbers.
-    """
-    import pandas as pd
-
-    from ..logs.readers import ReadOptions, by_name
-    from ..logs.writers import format_power_log
-
-    zone = "America/New_York"
-    generator = np.random.default_rng(1)
-    times = np.datetime64("2025-03-02T15:00:00", "ns") + np.arange(lines) * np.timedelta64(32_760_000, "ns")
-    data = format_power_log(times, generator.normal(-40, 12, lines), zone)
-    reader, options = by_name("sounder_log"), ReadOptions(timezone=zone)
-    ours = median_seconds(lambda: reader.read(data, options), repeats)
-    theirs = median_seconds(lambda: pd.read_csv(io.BytesIO(data), engine="c", header=None, sep=r"\s+"), repeats)
-    return {"ratio": theirs / ours, "seconds_ours": ours, "seconds_pandas": theirs, "lines": lines}
 
 
 def random_scene(poses: int, *, buildings: int = 12, towers: int = 1, seed: int = 1) -> tuple[Site, Link, Poses]:

@@ -1,7 +1,5 @@
 """What the ratios of ``bench`` stand for; the times themselves are not tested."""
 
-import pytest
-
 from aerpaw_cmp.jobs import bench
 
 
@@ -25,15 +23,3 @@ def test_where_only_the_most_samples_find_all_that_is_equal_error(monkeypatch):
         bench, "path_search", lambda _poses, samples, **_: {"ratio": 1.0, "extra_paths": 10 // len(str(samples))}
     )
     assert bench.path_search_ratios(samples=(1_000, 10_000_000_000))["equal_error"]["extra_paths"] == 0
-
-
-def test_both_sides_of_kriging_and_of_ingest_are_there():
-    pytest.importorskip("pykrige")
-    kriging = bench.kriging_shared_weights(fields=3)
-    assert kriging["ratio"] == pytest.approx(
-        3 * kriging["seconds_pykrige_one_field"] / kriging["seconds_ours_all_fields"]
-    )
-    assert kriging["ratio_one_field"] == pytest.approx(
-        kriging["seconds_pykrige_one_field"] / kriging["seconds_ours_one_field"]
-    )
-    assert bench.ingest_vs_pandas(500)["lines"] == 500

@@ -48,8 +48,6 @@ class FlightModem:
     ----------
     rank : callable, optional
         ``rank(seconds) -> int``, 0 for no CSI; None: that of a built-in flight.
-    csi_on : bool
-        Whether CSI reporting is on at the start.
     rsrp : callable, optional
         ``rsrp(seconds) -> dBm``; None: that of a built-in flight.
     """
@@ -57,11 +55,10 @@ class FlightModem:
     def __init__(
         self,
         rank: Callable[[float], int] | None = None,
-        csi_on: bool = True,
         rsrp: Callable[[float], float] | None = None,
     ) -> None:
         self._rank, self._rsrp = rank or _flight_rank, rsrp or _flight_rsrp
-        self.csi = [int(csi_on), int(csi_on)]
+        self.csi = [1, 1]
         self._start = time.monotonic()
         self._asked = 0
 

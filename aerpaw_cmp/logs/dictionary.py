@@ -180,7 +180,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     ), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0, 99.0, 255.0), can_be=(-60.0, 3.0)),
     Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", none=(99.0, 255.0), can_be=_DB),
-    Quantity("RSSI", "rss", (r"\brssi\d{0,2}\b",), "dBm", none=(0.0,), can_be=_DBM),
+    Quantity("RSSI", "rss", (r"\brss(i\d{0,2})?\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RSCP", "rss", (r"\brscp\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RxLev", "rss", (r"\brx ?lev\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("Ec/N0", "kpi", (r"\bec ?(n0|no|io)\b",), "dB", can_be=_DB),

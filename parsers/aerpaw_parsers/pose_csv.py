@@ -57,7 +57,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         return _sheet.nothing(data, "pose_csv", "no header with a time, a latitude and a longitude")
     unread = [name for name in sheet.names if _LIKE_A_LEVEL.search(dictionary.plain(name))]
     if unread:
-        rows.warnings.append(f"columns that are not read: {', '.join(unread[:5])}; '--map' reads a level")
+        rows.warnings.append(f"columns that are not read: {', '.join(unread[:5])}; '--map' of all reads a level")
     tracks = [
         _pose.from_sheet(part, cells, name=f"vehicle_{label}" if label else "vehicle", source="table of positions")
         for label, part, cells in _sheet.parts(rows, sheet, "device")

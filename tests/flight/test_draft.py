@@ -261,6 +261,10 @@ def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) 
 def test_nothing_to_compare_is_said(logs: Path) -> None:
     with pytest.raises(UsageError, match="no log of RSS or rank"):
         draft(ingest(logs.glob("UAV/*vehicleOut.txt"), options=OPTIONS), logs)
+    table = logs / "table.csv"
+    table.write_text("time,lat,lon,power_dbm\n2025-06-01T14:00:00Z,35.7,-78.7,-60\n")
+    with pytest.raises(UsageError, match="power_dbm; '--map' of all reads a level"):
+        draft(ingest(table, options=OPTIONS), logs)
 
 
 def test_the_place_is_looked_at_before_the_logs(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -131,8 +131,10 @@ def draft(
         entries.enter(file)
     entries.sort(files)
     if not entries.kinds & {"rss", "rank"}:
+        # a table of positions says which of its columns may be levels under a name that nobody knows
+        unread = [text for file in files for text in file.result.warnings if "--map" in text]
         raise UsageError(
-            "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in entries.out),
+            "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in (*entries.out, *unread)),
             expected="telemetry and levels or ranks of one flight",
         )
     parts = [

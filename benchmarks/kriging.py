@@ -12,18 +12,17 @@ exponential) at targets off the grid: totals, and the marginal cost of a target.
 
 import argparse
 import json
-import os
 import platform
+import subprocess
+import sys
 import time
 import warnings
-from unittest import mock
 
 import numpy as np
 
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.kriging import OrdinaryKriging
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL as PAPER
-from aerpaw_cmp.propagation.native import compiled
 
 M, RADIUS_M, SEED = 20, 150.0, 20250210
 FIELDS = 27  # 9 altitudes x 3 K
@@ -114,54 +113,61 @@ def on_the_grid(quick):
     return {"complete_s": complete_s, "five_percent_gaps_s": gaps_s}
 
 
-def moving_window(quick, repeats):
-    """Plain prediction off the samples, 20 neighbours, one exponential variogram: CPU seconds of both sides in turn.
-
-    Totals hold what each side sets up (PyKrige: statistics of its fit and all distances between samples; ours: a tree).
-    The marginal cost is the slope between the two largest numbers of targets, without it. PyKrige has no several
-    fields: one run is timed and counts 27 times. Ours runs in NumPy, as small jobs do, compiled, and as it comes once
-    the code is loaded; what a process pays to load the compiled code stands apart.
-    """
+def window_jobs(quick):
+    """Numbers of targets off the samples, and what each side does with so many of them: its estimates."""
     _, points, values = samples(quick)
     rng, low, high = np.random.default_rng(3), points.min(axis=0), points.max(axis=0)
     counts = (len(points), 200, 400) if quick else (len(points), 20_000, 100_000)
     targets = {n: rng.uniform(low, high, (n, 2)) for n in counts}
 
-    def ours(n, fields, switch="never"):
-        with mock.patch.dict(os.environ, {compiled.SWITCH: switch}):
-            model = OrdinaryKriging(exponential, M, np.inf).fit(points, values[:, :fields])
-            return model.predict(targets[n])[0]
+    def ours(n, fields=1):
+        model = OrdinaryKriging(exponential, M, np.inf).fit(points, values[:, :fields])
+        return model.predict(targets[n])[0]
 
     def peer(n):
         model = pykrige_exponential(points, values[:, 0])
         return model.execute("points", *targets[n].T, backend="C", n_closest_points=M)[0]
 
-    sides = {"ours": "never", "compiled": "always", "auto": "auto"}
-    jobs = {("pykrige", n): (peer, (n,)) for n in counts}
-    jobs |= {(side, n): (ours, (n, 1, way)) for side, way in sides.items() for n in counts}
-    jobs["ours", f"{counts[0]}_27_fields"] = ours, (counts[0], FIELDS)
+    return counts, {"ours": ours, "pykrige": peer}
+
+
+def cpu_s(job, *arguments):
+    """CPU seconds of a call."""
     start = time.process_time()
-    compiled.load(compiled.TRIANGLES)
-    load_s = time.process_time() - start
+    job(*arguments)
+    return time.process_time() - start
+
+
+def first_call_s(side, quick):
+    """CPU seconds of the first call of a process of its own, with what it imports."""
+    command = [sys.executable, __file__, "--first", side, *["--quick"] * quick]
+    return float(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+def moving_window(quick, repeats):
+    """Plain prediction off the samples, 20 neighbours, one exponential variogram: CPU seconds of both sides in turn.
+
+    Totals hold what each side sets up (PyKrige: statistics of its fit and all distances between samples; ours: a tree).
+    The marginal cost is the slope between the two largest numbers of targets, without it. PyKrige has no several
+    fields: one run is timed and counts 27 times. The first call of a process holds imports (SciPy's on both sides).
+    """
+    counts, sides = window_jobs(quick)
+    jobs = {(side, n): (job, n) for n in counts for side, job in sides.items()}
+    jobs["ours", f"{counts[0]}_27_fields"] = sides["ours"], counts[0], FIELDS
+    jobs |= {(side, "first"): () for side in sides}
     least = dict.fromkeys(jobs, np.inf)
     for _ in range(repeats):
-        for key, (job, arguments) in jobs.items():
-            start = time.process_time()
-            job(*arguments)
-            least[key] = min(least[key], time.process_time() - start)
-    marginal = {
-        side: (least[side, counts[2]] - least[side, counts[1]]) / (counts[2] - counts[1])
-        for side in ("ours", "compiled", "pykrige")
-    }
+        for (side, n), job in jobs.items():
+            least[side, n] = min(least[side, n], cpu_s(*job) if job else first_call_s(side, quick))
+    marginal = {s: (least[s, counts[2]] - least[s, counts[1]]) / (counts[2] - counts[1]) for s in sides}
     every = least["ours", f"{counts[0]}_27_fields"]
     row = {f"{side}_{n}_s": seconds for (side, n), seconds in least.items()}
-    row |= {f"ratio_total_{n}": least["pykrige", n] / least["ours", n] for n in counts}
-    row |= {f"ratio_total_{side}_{n}": least["pykrige", n] / least[side, n] for side in [*sides][1:] for n in counts}
+    row |= {f"ratio_total_{n}": least["pykrige", n] / least["ours", n] for n in (*counts, "first")}
     row |= {f"ratio_total_{counts[0]}_27_fields": FIELDS * least["pykrige", counts[0]] / every}
     row |= {f"{side}_marginal_us": 1e6 * slope for side, slope in marginal.items()}
-    row |= {f"ratio_marginal_{side}": marginal["pykrige"] / marginal[side] for side in ("ours", "compiled")}
-    worst = float(np.abs(np.asarray(peer(counts[0])) - ours(counts[0], 1)[:, 0]).max())
-    return row | {"compiled_load_s": load_s, "largest_difference_C": worst}
+    row |= {"ratio_marginal": marginal["pykrige"] / marginal["ours"]}
+    worst = float(np.abs(np.asarray(sides["pykrige"](counts[0])) - sides["ours"](counts[0])[:, 0]).max())
+    return row | {"largest_difference_C": worst}
 
 
 def main():
@@ -169,8 +175,13 @@ def main():
     parser.add_argument("--quick", action="store_true", help="100 positions")
     parser.add_argument("--full", action="store_true", help="PyKrige on every target and field")
     parser.add_argument("--pairs", type=int, default=1000, help="pairs of target and field that PyKrige runs")
+    parser.add_argument("--first", choices=("ours", "pykrige"), help="print seconds of the first call of one side")
     options = parser.parse_args()
     warnings.filterwarnings("ignore", category=DeprecationWarning)
+    if options.first:
+        counts, sides = window_jobs(options.quick)
+        print(cpu_s(sides[options.first], counts[-1]))
+        return
     report = {
         "conditions": {"machine": platform.processor() or platform.machine(), "numpy": np.__version__, "M": M},
         "leave_one_out": leave_one_out(options.quick, options.full, 50 if options.quick else options.pairs),

@@ -75,10 +75,6 @@ _BEAMS = (
 )  # fmt: skip
 # Of compiled code no line is seen running: these tests call it, and it is interpreted for each mutant.
 COMPILED = {
-    "aerpaw_cmp/maps/triangle_kernels.py": (
-        "tests/maps/test_kriging.py::test_many_targets_among_few_samples_equal_the_textbook[always-7]",
-        "tests/maps/test_kriging.py::test_weights_are_those_of_fifty_digits[always-with_nugget-doubted0]",
-    ),
     "aerpaw_cmp/propagation/field/kernels.py": (
         f"{_ALIKE}compiled_equals_numpy[False-one each]", f"{_ALIKE}compiled_equals_numpy[True-foreign]",
         f"{_ALIKE}more_pairs_than_lanes_and_paths_in_any_order",

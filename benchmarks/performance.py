@@ -257,26 +257,23 @@ def kriging(history: list[dict[str, Any]]) -> list[str]:
     """Kriging in totals and by the marginal cost of a target, set-up apart."""
     when, result = last_result(history, "kriging")
     row = result.get("moving_window", {})
-    if "compiled_100000_s" not in row:  # a quick run: too few targets for a slope
+    if "ours_first_s" not in row:
         return []
-    counts = [int(key.split("_")[1]) for key in row if key.startswith("pykrige_") and key.endswith("_s")]
+    counts = [int(key.split("_")[1]) for key in row if key.startswith("pykrige_") and key[8:-2].isdigit()]
+    sizes = {f"{number(n)}": str(n) for n in counts} | {f"{number(counts[-1])}, first call of a process": "first"}
     return [
-        f"Kriging of one field, 20 neighbours ({when}), processor seconds. Totals hold what each side sets up; the "
-        f"last line does not. Compiled code serves jobs and processes that NumPy would keep busy for longer than it "
-        f"takes to load ({row['compiled_load_s']:.1f} s here, not in the table):",
+        f"Kriging of one field, 20 neighbours ({when}), processor seconds, least of five in turn. Totals hold what "
+        "each side sets up, the first call of a process its imports too; the last line holds neither:",
         "",
-        "| targets | ours in NumPy | ours compiled | PyKrige's C back end | times: NumPy; compiled | as it comes |",
-        "| ---: | ---: | ---: | ---: | ---: | ---: |",
+        "| targets | ours | PyKrige's C back end | times faster |",
+        "| ---: | ---: | ---: | ---: |",
         *(
-            f"| {number(n)} | {row[f'ours_{n}_s']:.3f} | {row[f'compiled_{n}_s']:.3f} | {row[f'pykrige_{n}_s']:.3f} "
-            f"| {row[f'ratio_total_{n}']:.2f}; {row[f'ratio_total_compiled_{n}']:.2f} "
-            f"| {power(row.get(f'ratio_total_auto_{n}'))} |"
-            for n in counts
+            f"| {name} | {row[f'ours_{n}_s']:.3f} | {row[f'pykrige_{n}_s']:.3f} | {row[f'ratio_total_{n}']:.2f} |"
+            for name, n in sizes.items()
         ),
-        f"| one more [us] | {row['ours_marginal_us']:.1f} | {row['compiled_marginal_us']:.1f} "
-        f"| {row['pykrige_marginal_us']:.1f} "
-        f"| {row['ratio_marginal_ours']:.2f}; {row['ratio_marginal_compiled']:.2f} | - |",
-        "", f"27 fields at {number(counts[0])} targets, in NumPy: {row[f'ratio_total_{counts[0]}_27_fields']:.0f} "
+        f"| one more [us] | {row['ours_marginal_us']:.1f} | {row['pykrige_marginal_us']:.1f} "
+        f"| {row['ratio_marginal']:.2f} |",
+        "", f"27 fields at {number(counts[0])} targets: {row[f'ratio_total_{counts[0]}_27_fields']:.0f} "
         "times faster than 27 runs of PyKrige.", "",
     ]  # fmt: skip
 

@@ -31,14 +31,13 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError, from_python
 from ..common.units import BoolArray, FloatArray, IntArray, unmasked
-from ..propagation.native.compiled import triangles_for
 from . import neighbours as choose
 
 # Correlation as a function of distance [m]; vectorised.
@@ -52,10 +51,12 @@ LARGEST_WEIGHTS = 100.0
 _SHARE_M = 1e-9
 # Below this bound of the condition number a Cholesky solution has 9 digits and more, and needs no second look.
 SOUND_CONDITION = 1e6
-# Targets that may share weights; bounds the memory.
-CHUNK = 2048
-# Systems factored at once: enough to hide the calls, few enough for a processor's cache.
-LANES, COMPILED_LANES = 512, 128
+# Pivots alone bound nothing, but of 40 000 systems of six correlations, samples in lines and clusters among them, none
+# whose pivots gave less had a bound above 1e5; the bound itself takes as long as the solution.
+PLAINLY_SOUND = 3e3
+# Targets that may share weights and whose systems are factored at once: enough to hide the calls. Systems of many
+# neighbours are fewer, so that a factor stays at this many numbers.
+CHUNK, FACTOR_NUMBERS = 2048, 2**20
 
 
 @dataclass(frozen=True, slots=True)
@@ -252,16 +253,15 @@ class OrdinaryKriging:
         order, coordinates = choose.in_strips(targets, CHUNK), np.ascontiguousarray(samples.T)
         for m in np.unique(count[count > 0]):
             same = order[count[order] == m]
-            # asked anew for each m: the work of a system grows with its cube
-            kernels = triangles_for(len(same), m)
-            for start in range(0, len(same), CHUNK):
-                rows = same[start : start + CHUNK]
+            step = min(CHUNK, max(1, FACTOR_NUMBERS // int(m) ** 2))
+            for start in range(0, len(same), step):
+                rows = same[start : start + step]
                 # targets on the last axis: each operation runs along many systems at once
                 near = np.ascontiguousarray(chosen.index[rows, :m].T)
                 offset = coordinates[:, near]
                 offset -= targets[rows].T[:, None]
                 example, group = _same_geometry(offset)
-                w, v, r = self._solve(offset[:, :, example], samples, near[:, example], kernels)
+                w, v, r = self._solve(offset[:, :, example], samples, near[:, example])
                 weight[rows, :m], variance[rows], regularised[rows] = w.T[group], v[group], r[group]
         return Weights(chosen.index, weight, variance, regularised)
 
@@ -289,8 +289,8 @@ class OrdinaryKriging:
         # a correlation above 1, by rounding or by its author, counts as 1
         return np.asarray(np.maximum(gamma, 0.0))
 
-    def _between(self, samples: FloatArray, near: IntArray) -> Callable[[slice], FloatArray]:
-        """Semivariances (pairs, some targets) between the neighbours ``near`` (m, t), in the order of a lower triangle.
+    def _between(self, samples: FloatArray, near: IntArray) -> FloatArray:
+        """Semivariances (pairs, t) between the neighbours ``near`` (m, t), in the order of a lower triangle by columns.
 
         Targets close together share neighbours: there each distance between two samples is taken once.
         """
@@ -300,34 +300,27 @@ class OrdinaryKriging:
         used = np.flatnonzero(number)
         # a table of all pairs would be larger than what is asked of it
         if len(used) ** 2 > len(first) * near.shape[1]:
-            places = samples.T[:, near]
-            return lambda some: self._semivariance(places[:, :, some][:, second] - places[:, :, some][:, first])
+            return self._semivariance(samples.T[:, near[second]] - samples.T[:, near[first]])
         number[used] = np.arange(len(used))
         offset = samples[used].T[:, :, None] - samples[used].T[:, None]
         np.fill_diagonal(offset[0], 1.0)  # not asked for, and a correlation need not be finite at 0
         table = self._semivariance(offset).ravel()
         column, row = number[near], number[near] * len(used)
-        return lambda some: table[row[:, some][first] + column[:, some][second]]
+        return np.asarray(table[row[first] + column[second]])
 
     def _solve(
-        self, offset_m: FloatArray, samples: FloatArray, near: IntArray, kernels: Any
+        self, offset_m: FloatArray, samples: FloatArray, near: IntArray
     ) -> tuple[FloatArray, FloatArray, BoolArray]:
         """Weights (m, t), normalised variance (t,), near-singular flag (t,) of neighbours at offsets (dims, m, t)."""
         m, t = offset_m.shape[1:]
         to_target = self._semivariance(offset_m)
         here = np.einsum("dmt,dmt->mt", offset_m, offset_m) < choose.TIE_M**2
         to_target[here] = 0.0
-        weight, variance, regularised = np.empty((m, t)), np.empty(t), np.zeros(t, dtype=bool)
-        semivariances = self._between(samples, near)
-        solve, lanes = (solve_schur, LANES) if kernels is None else (kernels.solve_schur, COMPILED_LANES)
-        for start in range(0, t, lanes):
-            some = slice(start, start + lanes)
-            between, right = semivariances(some), to_target[:, some]
-            weight[:, some], variance[some], sound = solve(between, np.ascontiguousarray(right))
-            if not sound.all():
-                hard = start + np.flatnonzero(~sound)
-                w, v, r = _solve_doubtful(_square(between[:, ~sound], m), right.T[~sound])
-                weight[:, hard], variance[hard], regularised[hard] = w.T, v, r
+        between, regularised = self._between(samples, near), np.zeros(t, dtype=bool)
+        weight, variance, sound = solve_schur(between, to_target)
+        if len(hard := np.flatnonzero(~sound)):
+            w, variance[hard], regularised[hard] = _solve_doubtful(_square(between[:, hard], m), to_target.T[hard])
+            weight[:, hard] = w.T
         # beside a sample the true variance is 0, and rounding lies on either side of it
         variance = np.maximum(variance, 0.0)
         at = here.any(axis=0)  # the solution is known there; rounding must not blur it
@@ -355,34 +348,46 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
     Notes
     -----
     With ``C = 1 - gamma = L L'`` and ``c = 1 - gamma_0`` the bordered system is ``C w = c + mu 1``: a Cholesky factor,
-    and the Lagrange multiplier ``mu`` from the Schur complement ``1' C^-1 1``. The trace of ``C^-1``, the sum of
-    squares in ``L^-1``, bounds the condition number of C by ``m trace``. One system of 20 costs some 3 us of NumPy and
-    0.9 us compiled; LAPACK on one small matrix after the other costs as much as NumPy and bounds nothing.
+    and the Lagrange multiplier ``mu`` from the Schur complement ``1' C^-1 1``. The trace of ``C^-1`` bounds the
+    condition number of C by ``m trace``; it is taken where the pivots do not rule out that this is large.
     """
     m, t = to_target.shape
-    factor, inverse = np.empty((m + 2, m, t)), np.zeros((m, m, t))  # two rows more: L^-1 c and L^-1 1
+    # by columns, so that a step adds up planes that lie in a row in memory; two rows more: L^-1 c and L^-1 1
+    factor, weight, inverse_pivot = np.empty((m, m + 2, t)), np.empty((m, t)), np.empty((m, t))
     # a slice of ``gamma`` is one column of the lower triangle, in the order of _between
     end = 0
     with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # NaN where C is no covariance
         for j in range(m):
             start, end = end, end + m - 1 - j
-            column, known = factor[j:, j], factor[j, :j]
+            column = factor[j, j:]
             # C has ones on its diagonal; the last row is the right-hand side of ones
             column[0] = column[-1] = 1.0
             np.subtract(1.0, gamma[start:end], out=column[1:-2])
             np.subtract(1.0, to_target[j], out=column[-2])
-            column -= np.einsum("ikt,kt->it", factor[j:, :j], known)
-            pivot = 1.0 / np.sqrt(column[0])
-            column *= pivot
-            np.multiply(np.einsum("kt,kit->it", known, inverse[:j, :j]), -pivot, out=inverse[j, :j])
-            inverse[j, j] = pivot
-        of_target, of_ones = factor[m], factor[m + 1]
-        multiplier = (1.0 - (of_target * of_ones).sum(axis=0)) / (of_ones**2).sum(axis=0)
-        weight = np.einsum("kit,kt->it", inverse, of_target + multiplier * of_ones)
+            column -= np.einsum("kit,kt->it", factor[:j, j:], factor[:j, j])
+            inverse_pivot[j] = 1.0 / np.sqrt(column[0])
+            column *= inverse_pivot[j]
+        of_target, of_ones = factor[:, m], factor[:, m + 1]
+        multiplier = (1.0 - np.einsum("kt,kt->t", of_target, of_ones)) / np.einsum("kt,kt->t", of_ones, of_ones)
+        known = of_target + multiplier * of_ones
+        for j in reversed(range(m)):
+            weight[j] = known[j] - np.einsum("it,it->t", factor[j, j + 1 : m], weight[j + 1 :])
+            weight[j] *= inverse_pivot[j]
         # they add up to 1 by construction: this takes out rounding alone
         weight /= weight.sum(axis=0)
-        sound = m * np.einsum("kit,kit->t", inverse, inverse) < SOUND_CONDITION
-        return weight, (weight * to_target).sum(axis=0) + multiplier, sound
+        sound = m * (inverse_pivot**2).sum(axis=0) < PLAINLY_SOUND
+        if len(unclear := np.flatnonzero(~sound)):
+            sound[unclear] = m * _trace_of_inverse(factor[..., unclear], inverse_pivot[:, unclear]) < SOUND_CONDITION
+    return weight, (weight * to_target).sum(axis=0) + multiplier, sound
+
+
+def _trace_of_inverse(factor: FloatArray, inverse_pivot: FloatArray) -> FloatArray:
+    """Trace (t,) of ``C^-1``, the sum of squares in ``L^-1``; ``L`` by columns (m, m and more, t)."""
+    inverse = np.zeros((len(factor), *inverse_pivot.shape))
+    for j, pivot in enumerate(inverse_pivot):
+        np.multiply(np.einsum("kt,kit->it", factor[:j, j], inverse[:j, :j]), -pivot, out=inverse[j, :j])
+        inverse[j, j] = pivot
+    return np.asarray(np.einsum("kit,kit->t", inverse, inverse))
 
 
 def _solve_doubtful(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:

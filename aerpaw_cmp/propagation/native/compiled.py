@@ -36,18 +36,16 @@ from ...common.units import AnyArray
 ROOM = Path(__file__).parents[2]
 SWITCH = "AERPAW_CMP_COMPILED"
 FIELD, BEAMS = "propagation.field.kernels", "propagation.search.beams"
-TRIANGLES = "maps.triangle_kernels"
 # Files of kernels, and those whose functions and constants they take in.
-SOURCES = (
-    *(f"propagation/{name}.py" for name in (
+SOURCES = tuple(
+    f"propagation/{name}.py" for name in (
         "field/dyads", "field/fresnel", "field/kernels", "search/beams", "search/merging", "search/boxtree",
         "search/mirror", "native/compiled", "native/numba_options",
-    )),
-    "maps/triangle_kernels.py",
+    )
 )  # fmt: skip
 
 # CPU seconds of the first compilation on a machine.
-COMPILE_S = {FIELD: 10.0, BEAMS: 25.0, TRIANGLES: 1.6}
+COMPILE_S = {FIELD: 10.0, BEAMS: 25.0}
 # CPU seconds of NumPy from which numba's import and reading what was compiled before pay off.
 READ_S = 0.4
 # A job that NumPy does in less stays there, whatever is loaded.
@@ -57,9 +55,6 @@ LEAST_S = 0.25
 FIELD_S = 6e-7
 # CPU seconds of NumPy per link and face, sequences of two reflections.
 MIRRORS_S = 1.6e-7
-
-# CPU seconds of NumPy per system and cube of its size.
-TRIANGLE_S = 4e-10
 
 # Estimated seconds of this process so far.
 _in_numpy_s = dict.fromkeys(COMPILE_S, 0.0)
@@ -138,11 +133,6 @@ def beams() -> State:
     if switch() == "never":
         return State(None, f"{SWITCH}=never")
     return load(BEAMS)
-
-
-def triangles_for(systems: int, size: int) -> ModuleType | None:
-    """Compiled triangles of small systems, or None where NumPy is quicker."""
-    return _worth(TRIANGLES, systems * size**3 * TRIANGLE_S)
 
 
 def _worth(name: str, numpy_s: float, job_s: float = 0.0) -> ModuleType | None:

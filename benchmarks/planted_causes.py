@@ -243,7 +243,7 @@ def seen_by_the_tool(
     spin = {float(angle): used - np.array([np.radians(angle), 0.0, 0.0]) for angle in range(10, 360, 10)}
     return LevelEvidence(
         name="LW1", antenna="isotropic" if known is None else "measured", time_s=time,
-        measured_db=measured - 40.0, predicted_db=predicted,
+        measured_db=measured - 40.0, predicted_db=predicted, place_m=place,
         uav_azimuth_deg=np.degrees(np.arctan2(to_tower[:, 1], to_tower[:, 0])),
         uav_elevation_deg=np.degrees(np.arcsin(to_tower[:, 2])),
         tower_azimuth_deg=np.degrees(np.arctan2(*(place - tower)[:, :2].T)),

@@ -31,8 +31,9 @@ def with_corrected_verdicts(panels: Sequence[RssResult]) -> list[RssResult]:
 
 
 def scored(panels: Iterable[RssResult]) -> list[RssResult]:
-    """Channels with enough samples for a sentence about their error, without copies and, where one lives, the dead."""
-    enough = [p for p in without_copies(panels) if p.score.n >= FEWEST and math.isfinite(p.score.rmse_db)]
+    """Channels with an offset and enough samples for a sentence, without copies and, where one lives, the dead."""
+    some = [p for p in without_copies(panels) if not p.score.at_edge]
+    enough = [p for p in some if p.score.n >= FEWEST and math.isfinite(p.score.rmse_db)]
     return [panel for panel in enough if not is_dead(panel)] or enough
 
 
@@ -52,6 +53,13 @@ def is_dead(panel: RssResult) -> bool:
         return False
     measured_db = panel.measured_db[known]
     return middle_span(measured_db) < _DEAD_DB and is_flat(measured_db, [panel.simulated_dbm[known]])
+
+
+def is_one_place(panels: Iterable[RssResult]) -> bool:
+    """True of levels that no model lets vary by a decibel, as where a UAV hovers: each fits as a constant does."""
+    every = [[panel.simulated_dbm, *(b.level_dbm for b in panel.baselines.values())] for panel in scored(panels)]
+    levels = [level[np.isfinite(level)] for models in every for level in models if np.isfinite(level).any()]
+    return bool(levels) and max(map(middle_span, levels)) < _DEAD_DB
 
 
 def baseline_errors(panels: Sequence[RssResult]) -> dict[str, float]:

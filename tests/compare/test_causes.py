@@ -9,7 +9,7 @@ from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.stats import multivariate_normal
 
 from aerpaw_cmp.compare.judge import causes
-from aerpaw_cmp.compare.judge.causes import LevelEvidence, Trial, flight_cause
+from aerpaw_cmp.compare.judge.causes import LevelEvidence, Trial, flight_cause, gains_by_direction
 from aerpaw_cmp.compare.result import APPLIED, ESTIMATED, ClockResult
 from aerpaw_cmp.jobs.reporting.likely_cause import is_simulated
 from aerpaw_cmp.logs.readers import ReadOptions, identify
@@ -33,7 +33,7 @@ def _sound(seed: int = 3, n: int = 300) -> LevelEvidence:
         angle: 4.0 * (np.cos(np.radians(azimuth + angle)) - np.cos(np.radians(azimuth))) for angle in (90.0, 180.0)
     }
     return LevelEvidence(
-        name="LW1 A", time_s=time, predicted_db=predicted,
+        name="LW1 A", time_s=time, predicted_db=predicted, place_m=np.outer(time, [5.0, 0.0, 0.0]),
         measured_db=predicted + generator.normal(0.0, 1.0, n) + MEASURED_DB,
         uav_azimuth_deg=azimuth, uav_elevation_deg=-20.0 - 10.0 * np.sin(time / 31.0),
         tower_azimuth_deg=90.0 * np.sin(time / 53.0), turned_db=turned,
@@ -112,6 +112,30 @@ def test_an_error_that_no_page_shows_has_no_cause(step_db: float) -> None:
     sound = _sound()
     stepped = replace(sound, measured_db=sound.predicted_db + MEASURED_DB + step_db * (sound.time_s > 120.0))
     assert _named(stepped) == ("gain step" if step_db > 1.0 else NONE)
+
+
+def test_a_calibration_is_for_an_error_that_directions_tell() -> None:
+    sound, pattern = _sound(), _planted()["pattern"]
+    twin = replace(pattern, measured_db=pattern.predicted_db + 0.02 * (pattern.measured_db - pattern.predicted_db))
+    assert [gains_by_direction([e]) for e in (sound, pattern, twin)] == [False, True, False]
+    assert gains_by_direction([sound, pattern])
+
+
+@pytest.mark.parametrize("spread_db", [3.0, 5.0])
+def test_fading_that_stands_where_a_uav_hovers_is_no_trouble(spread_db: float) -> None:
+    """Fading of places, in two hovers of 80 s each: as time goes on it looks like ceilings, steps and shadows."""
+    sound = _sound()
+    at = np.interp(sound.time_s, [0.0, 70.0, 150.0, 180.0, 260.0, 300.0], [0.0, 70.0, 70.0, 100.0, 100.0, 140.0])
+    there = {
+        name: np.interp(at, sound.time_s, getattr(sound, name))
+        for name in ("predicted_db", "uav_azimuth_deg", "uav_elevation_deg", "tower_azimuth_deg")
+    }
+    for seed in range(6):
+        draw = np.random.default_rng(seed)
+        fading = spread_db * np.interp(at, np.arange(150.0), draw.normal(size=150)) + 0.3 * draw.normal(size=300)
+        level = there["predicted_db"] + fading
+        hover = replace(sound, **there, turned_db={}, place_m=np.outer(at, [5.0, 0.0, 0.0]), measured_db=level)
+        assert _named(hover) == NONE
 
 
 def test_a_loss_that_rests_on_undetected_samples_is_none() -> None:
@@ -299,8 +323,8 @@ def test_a_second_is_the_mean_of_its_samples_and_directions_turn_the_short_way()
     level[5] = np.nan
     around = 180.0 + 20.0 * np.cos(5.0 * time)  # on both sides of where angles jump
     evidence = LevelEvidence(
-        time_s=time, measured_db=level, predicted_db=2.0 * time, uav_azimuth_deg=(around + 180.0) % 360.0 - 180.0,
-        uav_elevation_deg=time, tower_azimuth_deg=around, turned_db={10.0: time}, other_towers_db={"LW2": -time},
+        time_s=time, measured_db=level, predicted_db=2.0 * time, place_m=np.outer(time, [9.0, 0.0, 0.0]),
+        uav_azimuth_deg=(around + 180.0) % 360.0 - 180.0, uav_elevation_deg=time, tower_azimuth_deg=around, turned_db={10.0: time}, other_towers_db={"LW2": -time},
     )  # fmt: skip
     binned = causes._binned(evidence)
     assert binned is not None

@@ -23,6 +23,7 @@ from aerpaw_cmp.report.exports.tables import metrics
 from aerpaw_cmp.report.pages.diff import DIFFERENCE
 from aerpaw_cmp.report.words.flight import (
     OFFSETS,
+    ONE_PLACE,
     Judged,
     cautions,
     first_sentence,
@@ -242,6 +243,24 @@ def test_a_single_sample_is_no_result(report_data):
     assert paragraph(with_cause(data)) == f"{first} {CAUSE.sentence} Next: {CAUSE.next_step}."
     assert "at most 1" in first
     assert "0.01" not in first
+
+
+def test_an_offset_beyond_the_span_is_no_error_and_its_dead_neighbour_has_no_offset(report_data):
+    step = "`rss: {span_db: [-120, 50]}`"
+    panels = tuple(with_numbers(panel, at_edge=True, offset_db=-50.0) for panel in report_data.rss)
+    data = dataclasses.replace(report_data, rss=panels, rank=(), next_step=step)
+    assert paragraph(data) == f"No error can be given: the best offset lies beyond the searched span. Next: {step}."
+    assert offset_sentences(panels) == []
+
+
+def test_a_flight_at_one_place_tells_no_models_apart(report_data):
+    panels = []
+    for panel in report_data.rss:
+        still = np.full(len(panel.time), -60.0)
+        models = {name: dataclasses.replace(b, level_dbm=still) for name, b in panel.baselines.items()}
+        panels.append(dataclasses.replace(panel, simulated_dbm=still, baselines=models))
+    assert ONE_PLACE in paragraph(dataclasses.replace(report_data, rss=tuple(panels), likely_cause=None))
+    assert ONE_PLACE not in paragraph(dataclasses.replace(report_data, likely_cause=None))
 
 
 def test_at_most_four_numbers_each_with_something_beside_it(report_data):

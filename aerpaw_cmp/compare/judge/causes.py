@@ -27,11 +27,13 @@ from typing import Protocol
 
 import numpy as np
 
-from ...common.units import BoolArray, FloatArray, Printed
+from ...common.units import BoolArray, FloatArray, IntArray, Printed
 from ..statistics.intervals import Interval
 
 # Samples are averaged over so long [s], over longer where a flight has more than so many seconds.
 BIN_S, _MOST_BINS = 1.0, 2000
+# And as long as the UAV stays so near [m] and turns no further [deg]: fading that stands still is one number, not many.
+_NEAR_M, _NEAR_DEG = 2.0, 5.0
 _FEWEST_BINS, _ENOUGH_BINS = 24, 100
 # A trouble is in one flight of ten; named where the odds for it are five to one.
 _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
@@ -81,6 +83,8 @@ class LevelEvidence:
         In order.
     measured_db, predicted_db : (n,)
         Before any offset; NaN where there is none.
+    place_m : (n, 3)
+        Of the UAV.
     uav_azimuth_deg, uav_elevation_deg : (n,)
         Direction of the tower in the frame of the UAV's antenna.
     tower_azimuth_deg : (n,)
@@ -107,6 +111,7 @@ class LevelEvidence:
     time_s: FloatArray
     measured_db: FloatArray
     predicted_db: FloatArray
+    place_m: FloatArray
     uav_azimuth_deg: FloatArray
     uav_elevation_deg: FloatArray
     tower_azimuth_deg: FloatArray
@@ -270,6 +275,17 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
     return _named(name, named[name], lead[name])
 
 
+def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
+    """Check that a gain over directions, which antennas learn, takes off a channel an error that a page shows."""
+    for evidence in filter(None, map(_binned, channels)):
+        sound, (antenna,) = _fitted(evidence), _pattern(evidence)
+        learned = _fitted(evidence, antenna, at=sound.memories)
+        fall_db = float(sound.residual_db.std() - learned.residual_db.std())
+        if learned.log_likelihood > sound.log_likelihood + _SELDOM and fall_db >= _SHOWN_DB:
+            return True
+    return False
+
+
 def _names(model: _Model) -> frozenset[str]:
     return frozenset(trial.name for trial in model.trials)
 
@@ -364,20 +380,20 @@ _ANGLES = ("uav_azimuth_deg", "tower_azimuth_deg")
 
 
 def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
-    """Means over :data:`BIN_S` of the samples with both levels; None where they are too few."""
+    """Means over :data:`BIN_S`, and over hovers, of the samples with both levels; None where they are too few."""
     finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
     if not finite.any():
         return None
     time, level = evidence.time_s[finite], evidence.measured_db[finite]
     width = max(min(BIN_S, float(np.ptp(time)) / _ENOUGH_BINS), float(np.ptp(time)) / _MOST_BINS, 1e-3)
     _, place = np.unique(np.floor(time / width), return_inverse=True)
+    place = _standing(evidence, finite, place)[place]
     count = np.bincount(place).astype(np.float64)
     if len(count) < _FEWEST_BINS:
         return None
 
     def mean(values: FloatArray) -> FloatArray:
-        values = values[finite]
-        return np.asarray(np.bincount(place, values) / count)
+        return _mean(values[finite], place)
 
     def binned(name: str, value: object) -> object:
         if isinstance(value, Mapping):
@@ -396,6 +412,27 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
     often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level))
     changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
     return LevelEvidence(**changed)  # type: ignore[arg-type]
+
+
+def _mean(values: FloatArray, place: IntArray) -> FloatArray:
+    """Means of values (n,) or (n, k) over the samples of each place."""
+    sums = [np.bincount(place, column) for column in values.reshape(len(values), -1).T]
+    return np.asarray(np.column_stack(sums) / np.bincount(place)[:, None]).reshape(-1, *values.shape[1:])
+
+
+def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
+    """Number of the place of each second: seconds at which the UAV neither moves nor turns are one."""
+    azimuth, elevation = np.radians(e.uav_azimuth_deg[finite]), np.radians(e.uav_elevation_deg[finite])
+    flat = np.cos(elevation)
+    towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+    at, towards = _mean(e.place_m[finite], second), _mean(towards, second)
+    number, begin = np.zeros(len(at), dtype=np.int64), 0
+    for i in range(1, len(at)):
+        turned = np.linalg.norm(towards[i] - towards[begin]) > np.radians(_NEAR_DEG)
+        moved = turned or np.linalg.norm(at[i] - at[begin]) > _NEAR_M
+        begin = i if moved else begin
+        number[i] = number[i - 1] + moved
+    return number
 
 
 # A receiver that clips writes one level in so many samples, and in so large a share of them.

@@ -75,10 +75,12 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
         results.append(compare_rss_series(data, series, replayed))
         give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
     results = with_corrected_verdicts(results)
+    cause, step = cause_of(data, replays, results)
     return FlightResult(
         rss=tuple(results),
         verdict=flight_verdict(results),
-        likely_cause=cause_of(data, replays, results),
+        likely_cause=cause,
+        next_step=step,
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
         pairs=tuple(pairs_of(results)),
         serving=serving_of(data.rss, results),

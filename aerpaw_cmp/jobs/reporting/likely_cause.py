@@ -11,7 +11,7 @@ import numpy as np
 
 from ...common.units import FloatArray
 from ...compare.flight_verdict import without_copies
-from ...compare.judge.causes import Cause, LevelEvidence, flight_cause
+from ...compare.judge.causes import Cause, LevelEvidence, flight_cause, gains_by_direction
 from ...compare.level import rss
 from ...compare.result import RssResult
 from ...flight.data import FlightData, RssSeries
@@ -28,8 +28,10 @@ _ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
 _RISES_M = (-150.0, -100.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 100.0, 150.0)
 
 
-def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResult]) -> Cause | None:
-    """The likely cause of the error of a flight over its scored channels; towers that move have none.
+def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResult]) -> tuple[Cause | None, str | None]:
+    """The likely cause of the error of a flight over its scored channels, and its step; towers that move have none.
+
+    Without a cause the step is a calibration, where directions of the UAV's antenna tell some of the error.
 
     Parameters
     ----------
@@ -40,18 +42,24 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
 
     Returns
     -------
-    Cause or None
+    Cause or None, str or None
     """
     if any(is_simulated(stream) for file in data.files for stream in file.result.streams):
-        return SIMULATED
+        return SIMULATED, SIMULATED.next_step
     names = {result.name for result in without_copies(results)}  # a copy is replayed with antennas of another channel
-    return flight_cause(
-        [
-            _evidence(data, series, replayed, result)
-            for series, replayed, result in zip(data.rss, replays.rss, results, strict=True)
-            if replayed.tower_m is None and not result.training and result.name in names
-        ]
-    )
+    evidence = [
+        _evidence(data, series, replayed, result)
+        for series, replayed, result in zip(data.rss, replays.rss, results, strict=True)
+        if replayed.tower_m is None and not result.training and result.name in names
+    ]
+    cause = flight_cause(evidence)
+    if cause is not None:
+        return cause, cause.next_step
+    # learned antennas miss some decibels of any flight
+    return None, _CALIBRATE if not data.settings.antennas and gains_by_direction(evidence) else None
+
+
+_CALIBRATE = "`aerpaw-cmp calibrate` with two flights of this site"
 
 
 def is_simulated(telemetry: Stream) -> bool:
@@ -108,6 +116,7 @@ def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: R
         time_s=time_s[order],
         measured_db=result.measured_db[order],
         predicted_db=predicted,
+        place_m=result.position_m[order],
         uav_azimuth_deg=at_samples(directions["uav_azimuth_deg"]),
         uav_elevation_deg=at_samples(directions["uav_elevation_deg"]),
         tower_azimuth_deg=at_samples(directions["azimuth_deg"]),

@@ -11,19 +11,17 @@ import numpy as np
 
 from ...common.counting import counted
 from ...common.units import AnyArray, Printed
-from ...compare.flight_verdict import is_dead, lock_lost, pooled_db
+from ...compare.flight_verdict import is_dead, lock_lost, pooled_db, scored
 from ...compare.judge.ladder import LadderRow, costs
 from ...compare.level.detection import DetectionScore
 from ...compare.level.rss import ErrorSpan
 from ...compare.result import BASELINE_TITLE, AuditResult, FlightVerdict, RankResult, RssResult
 from ...compare.statistics.intervals import Interval, paired_verdict
+from ...compare.statistics.memory import FEWEST
 from ..content.flight import ReportData
 
 # Name of the ladder's rung with the settings of the flight file.
 AS_SET = "as set in flight.yaml"
-
-# Below this a panel is called too short for a verdict.
-FEW_SAMPLES = 30
 
 
 def pretty(name: str) -> str:
@@ -199,6 +197,8 @@ def expected_sentence(panels: Sequence[RssResult]) -> str:
 
 
 NO_CAUSE = "No likely cause was identified."
+ONE_PLACE = "No model predicts a change of 1 dB, as at one place: this flight tells no models apart."
+BEYOND_SPAN = "No error can be given: the best offset lies beyond the searched span."
 
 
 def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetime64]:
@@ -451,7 +451,7 @@ def _rss_cautions(panel: RssResult) -> list[str]:
             f"{panel.name} lost its lock in {share:.0f} % of the samples; levels below {floor} {panel.unit} count as "
             f"{floor} in the first sentence."
         )
-    if 0 < score.n < FEW_SAMPLES:
+    if 0 < score.n < FEWEST:
         texts.append(f"{panel.name}: only {counted(score.n, 'sample')} scored, too few for a verdict.")
     if score.n_out_of_coverage > 0.2 * len(panel.time):
         share = 100 * score.n_out_of_coverage / len(panel.time)
@@ -483,7 +483,7 @@ def offset_sentences(panels: Sequence[RssResult]) -> list[str]:
     []
     """
     known: dict[str, list[float]] = {}
-    for panel in panels:
+    for panel in scored(panels):
         if panel.score.offset_db < 0.0 or panel.score.offset_db >= _LARGE_OFFSET_DB:
             known.setdefault(panel.unit, []).append(panel.score.offset_db)
     return [

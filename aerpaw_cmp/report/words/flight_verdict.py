@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from ...common.counting import counted
 from ...common.units import Printed
-from ...compare.flight_verdict import baseline_errors, lock_lost, pooled_db, scored
+from ...compare.flight_verdict import baseline_errors, is_one_place, lock_lost, pooled_db, scored
 from ...compare.ranks.forecast import ForecastScore
 from ...compare.result import AuditResult, FlightVerdict, RankResult, RssResult
 from ...compare.statistics.intervals import Interval
@@ -47,8 +47,11 @@ def paragraph(data: ReportData) -> str:
     elif error and data.against is not None and data.against.scores:
         parts = [error, before_flight(data.against.scores), advice]
     elif error:
-        cause = data.cause or (words.NO_CAUSE if panels else "")
+        none = words.ONE_PLACE if is_one_place(panels) else words.NO_CAUSE if panels else ""
+        cause = data.cause or none
         parts = [error, words.expected_sentence(panels), cause, advice]
+    elif any(panel.score.at_edge for panel in data.rss):
+        parts = [words.BEYOND_SPAN, advice]
     else:
         most = max([panel.score.n for panel in data.rss], default=0)
         none = words.TOO_FEW_COMPARED.format(n=most) if most else words.NOTHING_COMPARED

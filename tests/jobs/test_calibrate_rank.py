@@ -126,8 +126,8 @@ def test_channels_of_a_mount_are_evaluated_once_in_whatever_order(monkeypatch):
     mixed = [every[i] for i in (0, 6, 3, 5, 1, 7)]
     alone = np.concatenate([features_of([g], flown) for g in mixed])
     calls = []
-    field = geometries.channel_matrices
-    monkeypatch.setattr(geometries, "channel_matrices", lambda *a, **k: calls.append(1) or field(*a, **k))
+    columns = geometries.geometry
+    monkeypatch.setattr(geometries, "geometry", lambda *a: calls.append(1) or columns(*a))
     np.testing.assert_allclose(features_of(mixed, flown), alone, rtol=1e-12)
     assert len(calls) == 4  # two mounts, direct and off the ground
     features_of([g for g in mixed if g.ground == 0.0], flown)

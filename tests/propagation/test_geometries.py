@@ -58,15 +58,15 @@ def test_power_sum_is_the_mean_over_the_phases_of_the_ground_ray():
     centre = np.array([0.0, 0.0, HEIGHT_M])
     (geometry, *_) = some("power_sum", 0.7)
     (sigma, *_) = singular_values_of([geometry], tower, centre, uav, at, CARRIER_HZ)
-    from aerpaw_cmp.propagation.drivers.geometries import slant_basis
+    from aerpaw_cmp.propagation.drivers.geometries import slanted
     from aerpaw_cmp.propagation.geometry.arrays import rotation_from_yaw_pitch_roll
 
     turn = rotation_from_yaw_pitch_roll(*np.radians([geometry.uav_yaw_deg, 0.0, geometry.uav_roll_deg]))
     los, ground = basis_fields(tower, centre, dataclasses.replace(uav, mount=turn), at, CARRIER_HZ)
-    left, right = slant_basis(geometry.uav_slant_deg), slant_basis(geometry.tower_slant_deg).T
+    los, ground = (slanted(part, geometry.uav_slant_deg, geometry.tower_slant_deg) for part in (los, ground))
     mean = 0.0
     for phase in np.exp(2j * np.pi * np.arange(8) / 8):
-        h = left @ (los + 0.7 * phase * ground) @ right
+        h = los + 0.7 * phase * ground
         mean = mean + h @ np.conj(np.swapaxes(h, 1, 2)) / 8
     np.testing.assert_allclose(sigma**2, np.linalg.eigvalsh(mean)[:, ::-1], rtol=1e-6, atol=1e-22)
 

@@ -3,7 +3,7 @@
 Which way a modem's antennas point and how its ports are slanted is hardly ever written down. Trying thousands of
 geometries takes no thousand replays: the field of an element slanted by ``s`` is ``cos s`` times that of a vertical
 plus ``sin s`` times that of a horizontal one at the same place, so one evaluation with both at every port
-(:func:`aerpaw_cmp.propagation.field.sum.channel_matrices`, float64, every pair of elements) serves all slants, and the
+(:func:`aerpaw_cmp.propagation.field.sum.of_one_depth`, float64, every pair of elements) serves all slants, and the
 ground reflection is one ray that is added at any strength.
 
 The rank that a modem reports is for its whole band. Over 100 MHz the ground ray turns against the direct one by about a
@@ -21,8 +21,10 @@ from typing import Literal
 
 import numpy as np
 
-from ...common.units import ComplexArray, FloatArray
-from ..field.sum import channel_matrices
+from ...common.units import ComplexArray, FloatArray, wavelength_m
+from ..field.fresnel import FaceMaterials
+from ..field.geometry import Elements, geometry
+from ..field.sum import PAIRS_PER_CHUNK, of_one_depth, pattern_ends
 from ..geometry.arrays import Array, Link, Poses, rotation_from_yaw_pitch_roll
 from ..geometry.paths import Faces, PathSet
 
@@ -138,17 +140,14 @@ def singular_values_of(
     the mean of ``H H^H`` over a band in which the ground ray takes all phases against the direct one.
     """
     runs = [(mount, list(run)) for mount, run in groupby(geometries, lambda g: g.mount_deg)]
-    # two rays, and both slants at either end: four pairs for one
-    work = 2 * len(runs) * len(poses) * 4 * len(tower) * len(uav)
     for mount, run in runs:
         turned = dataclasses.replace(uav, mount=np.asarray(rotation_from_yaw_pitch_roll(*map(np.radians, mount))))
-        fields = basis_fields(tower, tower_m, turned, poses, carrier_hz, any(g.ground for g in run), work)
+        fields = basis_fields(tower, tower_m, turned, poses, carrier_hz, any(g.ground for g in run))
         for g in run:
-            at_uav, at_tower = slant_basis(g.uav_slant_deg), slant_basis(g.tower_slant_deg).T
-            # two small products instead of a field for each slant
-            los, ground = (at_uav @ field @ at_tower for field in fields)
+            los, ground = (slanted(field, g.uav_slant_deg, g.tower_slant_deg) for field in fields)
             ground *= g.ground
-            yield np.linalg.svd(los + ground, compute_uv=False) if g.sum == "coherent" else _of_power_sum(los, ground)
+            coherent = g.sum == "coherent"
+            yield np.asarray(np.linalg.svd(los + ground, compute_uv=False)) if coherent else _of_power_sum(los, ground)
 
 
 def _of_power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
@@ -162,17 +161,9 @@ def _hermitian(matrix: ComplexArray) -> ComplexArray:
 
 
 def basis_fields(
-    tower: Array,
-    tower_m: FloatArray,
-    uav: Array,
-    poses: Poses,
-    carrier_hz: float,
-    with_ground: bool = True,
-    work: int = 0,
+    tower: Array, tower_m: FloatArray, uav: Array, poses: Poses, carrier_hz: float, with_ground: bool = True
 ) -> tuple[ComplexArray, ComplexArray]:
-    """Channel matrices (n, 2 uav ports, 2 tower ports) of line of sight and of the ground reflection alone.
-
-    Each port is there twice, vertical then horizontal: :func:`slant_basis` combines them.
+    """Channel matrices of line of sight and of the ground reflection alone, ports vertical and horizontal.
 
     Parameters
     ----------
@@ -184,45 +175,34 @@ def basis_fields(
     carrier_hz : float
     with_ground : bool
         Otherwise the second is all zeros.
-    work : int
-        See :func:`~aerpaw_cmp.propagation.field.sum.channel_matrices`.
 
     Returns
     -------
-    direct, bounced : (n, 2 uav ports, 2 tower ports) complex
+    direct, bounced : (2, 2, n, uav ports, tower ports) complex
+        Vertical, then horizontal, at the UAV and at the tower: :func:`slanted` combines them.
     """
-    link = Link(carrier_hz, {"tower": _both_slants(tower)}, _both_slants(uav), uav_transmits=False)
+    link, wavelength = Link(carrier_hz, {"tower": tower}, uav, uav_transmits=False), wavelength_m(carrier_hz)
     faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (_GROUND_MATERIAL,), ("ground",))
-    n = len(poses)
-    index, zero = np.arange(n), np.zeros(n, dtype=np.int64)
-    fields = []
+    table, elements = FaceMaterials.of(faces, carrier_hz).table(wavelength), Elements.of(link)
+    n, ports = len(poses), (len(uav), len(tower))
+    index, zero, step = np.arange(n), np.zeros(n, dtype=np.int64), max(1, PAIRS_PER_CHUNK // (len(uav) * len(tower)))
+    # cosine and sine of the two slants, against (tower's slant, paths, pairs) and (UAV's, tower's, paths, pairs)
+    upright, level = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    slants = [(upright.reshape(shape), level.reshape(shape)) for shape in ((2, 1, 1), (2, 1, 1, 1))]
+    fields = np.zeros((2, 2, 2, n, *ports), dtype=np.complex128)
     for depth in (0, 1) if with_ground else (0,):
         # the reflection point is NaN: the field asks for images alone, never for points
         path = PathSet(index, zero, zero + depth, np.full((n, 1), depth - 1), np.full((n, 1, 3), np.nan))
-        fields.append(channel_matrices(path, faces, np.asarray(tower_m)[None, :], poses, link, work=work).h[:, 0])
-    return fields[0], fields[1] if with_ground else np.zeros_like(fields[0])
+        columns = geometry(path, faces, table, np.asarray(tower_m)[None, :], poses, link)
+        for start in range(0, n, step):
+            some = columns.some(slice(start, start + step))
+            parts = of_one_depth(some, elements, pattern_ends(some, elements, link), (slants[0], slants[1]), wavelength)
+            fields[depth, :, :, start : start + step] = parts.view(np.complex128).reshape(2, 2, -1, *ports)
+    return fields[0], fields[1]
 
 
-def _both_slants(array: Array) -> Array:
-    return dataclasses.replace(
-        array,
-        # port by port, vertical before horizontal, as slant_basis reads them
-        positions_m=np.repeat(array.positions_m, 2, axis=0),
-        slant_rad=np.tile([0.0, np.pi / 2.0], len(array)),
-        patterns=array.patterns if len(array.patterns) == 1 else tuple(p for p in array.patterns for _ in range(2)),
-    )
-
-
-def slant_basis(slant_deg: Sequence[float]) -> FloatArray:
-    """Matrix (ports, 2 ports) from vertical and horizontal elements to slanted ones.
-
-    Examples
-    --------
-    >>> slant_basis([0.0, 90.0]).round(6).tolist()
-    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-    """
-    slant = np.radians(np.asarray(slant_deg, dtype=np.float64))
-    result = np.zeros((len(slant), 2 * len(slant)))
-    port = np.arange(len(slant))
-    result[port, 2 * port], result[port, 2 * port + 1] = np.cos(slant), np.sin(slant)
-    return result
+def slanted(field: ComplexArray, uav_slant_deg: Sequence[float], tower_slant_deg: Sequence[float]) -> ComplexArray:
+    """Channel matrices (n, uav ports, tower ports) of :func:`basis_fields` for slants of the ports [deg]."""
+    at_uav, at_tower = (np.radians(slant) for slant in (uav_slant_deg, tower_slant_deg))
+    upright, level = field[:, 0] * np.cos(at_tower) + field[:, 1] * np.sin(at_tower)
+    return np.asarray(np.cos(at_uav)[:, None] * upright + np.sin(at_uav)[:, None] * level)

@@ -30,8 +30,8 @@ class Geometry(NamedTuple):
     place_m: FloatArray
     axes: FloatArray
 
-    def some(self, rows: AnyArray) -> Geometry:
-        """Those of a mask or of indices."""
+    def some(self, rows: AnyArray | slice) -> Geometry:
+        """Those of a mask, of indices or of a slice."""
         return Geometry._make(column[rows] for column in self)
 
 

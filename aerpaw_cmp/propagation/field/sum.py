@@ -239,22 +239,33 @@ def amplitudes(
         for start in range(0, len(rows), step):
             few = rows[start : start + step]
             tower, uav = (None if e is None else e[few] for e in ends)
-            out[few] = _of_one_depth(g.some(few), elements, (tower, uav), wavelength, record)
+            slant = elements.tower_slant[g.tower[few]]
+            slants = (slant[:, 0], slant[:, 1]), elements.uav_slant
+            out[few] = of_one_depth(g.some(few), elements, (tower, uav), slants, wavelength, record)
     return out
 
 
-def _of_one_depth(
-    g: Geometry, elements: Elements, ends: Ends, wavelength: float, record: Callable[[str, AnyArray], None] | None
+def of_one_depth(
+    g: Geometry,
+    elements: Elements,
+    ends: Ends,
+    slants: tuple[Any, Any],
+    wavelength: float,
+    record: Callable[[str, AnyArray], None] | None = None,
 ) -> FloatArray:
+    """As :func:`amplitudes`, of paths of one depth, by cosine and sine of the elements' slants at tower and UAV.
+
+    Further axes of the slants come first in the answer: what does not depend on them is evaluated once.
+    """
     x, y, z, length = directions(g, elements)
-    toward, slant = (x, y, z), elements.tower_slant[g.tower]
-    re, im = _vectors(rows_of(g.frame), toward, ends[0], slant[:, 0], slant[:, 1])
+    toward = x, y, z
+    re, im = _vectors(rows_of(g.frame), toward, ends[0], *slants[0])
     for step in range(g.depth[0]):
         if record is not None:
             record("wave", _power(re, im))
         normal, face = parts_of(g.normal[:, step]), parts_of(g.face[:, step])
         re, im = dyads.reflected(re, im, toward, normal, *coefficients(dyads.incidence(toward, normal), face))
-    uav = _vectors(rows_of(g.axes), (-x, -y, -z), ends[1], *elements.uav_slant)
+    uav = _vectors(rows_of(g.axes), (-x, -y, -z), ends[1], *slants[1])
     cycles = length / wavelength
     with np.errstate(divide="ignore"):
         if record is not None:

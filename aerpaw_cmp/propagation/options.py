@@ -32,7 +32,7 @@ class Search:
         Largest number of reflections, 0 to 3.
     samples : int or "auto"
         ``sionna`` only: rays per tower; "auto" raises the number until two pilots find the same paths
-        (:mod:`aerpaw_cmp.propagation.search.samples`).
+        (:func:`aerpaw_cmp.propagation.engine.engines.enough_samples`).
     batch : int
         ``sionna`` only: poses per call.
     further : tuple of callable

@@ -20,8 +20,17 @@ from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import sample
 from aerpaw_cmp.jobs.campaigns import campaign_tasks
-from aerpaw_cmp.jobs.campaigns.campaign_plan import compute, kept_outcomes, planned_tasks
-from aerpaw_cmp.jobs.campaigns.campaign_tasks import Order, Outcome, Task, carry_out, digest_of, outcome_store
+from aerpaw_cmp.jobs.campaigns.campaign_tasks import (
+    Order,
+    Outcome,
+    Task,
+    carry_out,
+    compute,
+    digest_of,
+    kept_outcomes,
+    outcome_store,
+    planned_tasks,
+)
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
 from aerpaw_cmp.jobs.tasks.workers import InProcess, Processes, Workers
 from aerpaw_cmp.report.content.campaign import Failure
@@ -249,7 +258,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from aerpaw_cmp.jobs.campaigns import campaign_tasks
-from aerpaw_cmp.jobs.campaigns.campaign_plan import compute, kept_outcomes
+from aerpaw_cmp.jobs.campaigns.campaign_tasks import compute, kept_outcomes
 from aerpaw_cmp.jobs.tasks.workers import InProcess
 from tests.jobs.campaign_rows import rss_row
 
@@ -302,7 +311,7 @@ def test_a_lost_worker_costs_its_own_task_one_more_try(
 ) -> None:
     """Fails on one pool for everything: there a killed worker loses all tasks."""
     monkeypatch.setenv("AERPAW_CMP_TEST_MARKS", str(tmp_path))
-    monkeypatch.setattr("aerpaw_cmp.jobs.campaigns.campaign_plan.carry_out", lethal)
+    monkeypatch.setattr("aerpaw_cmp.jobs.campaigns.campaign_tasks.carry_out", lethal)
     monkeypatch.setattr("aerpaw_cmp.jobs.tasks.workers.get_context", lambda _kind: multiprocessing.get_context("fork"))
     tasks = [*tasks_of(flight, 6), Task(flight, "poison", "as written", {}, None)]
     outcomes = run_tasks(tasks, Processes(2))

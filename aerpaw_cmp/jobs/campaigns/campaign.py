@@ -22,8 +22,7 @@ from ...flight.settings import FlightFile
 from ...report.content.campaign import CampaignData, Failure
 from ..tasks.options import DEFAULT, RunOptions
 from ..tasks.workers import open_workers
-from .campaign_plan import compute, kept_outcomes, planned_tasks
-from .campaign_tasks import Task, counted_once, flight_data, outcome_store
+from .campaign_tasks import Task, compute, counted_once, flight_data, kept_outcomes, outcome_store, planned_tasks
 from .over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 
 # Label of the only setting of a campaign that names none.

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import io
 import time
-from dataclasses import replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -16,20 +17,31 @@ import numpy as np
 
 from ... import __version__
 from ...common.content import content_digest
+from ...common.counting import counted
 from ...common.files import cache_folder, read_sealed, write_sealed
 from ...common.jsonable import named
 from ...common.units import FloatArray, spread_out
 from ...common.versions import version
 from ..geometry.arrays import Link, Poses
-from ..geometry.paths import PathSet
+from ..geometry.paths import Faces, PathSet
 from ..native.compiled import beams, beams_for, switch, warn_once
 from ..options import Run, Search
 from ..scene import Scene
 from ..search import mirror
-from ..search.samples import Choice, enough_samples
 
 # Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same.
 MANY_FACES = 400
+
+# PathSolver finds a wall of solid angle W with the chance ``1 - exp(-N W / 4 pi)``, so what a scene needs depends on
+# its smallest and farthest walls: pilots on a batch of poses, each with more rays than the one before, until two find
+# the same paths. A wall that both miss and that other poses see can still be lost: the audit says so.
+# Rays per tower of the first pilot.
+FIRST = 10_000
+
+_FACTOR = 4
+
+# Rays per tower at which pilots end in any case.
+MOST = 2_560_000
 
 
 def path_cache(search: Search, run: Run) -> PathCache | None:
@@ -41,6 +53,44 @@ def path_cache(search: Search, run: Run) -> PathCache | None:
             return None
         folder = cache_folder()
     return PathCache(Path(folder)) if str(folder) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Rays per tower and why."""
+
+    samples: int
+    reason: str
+
+
+def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) -> Choice:
+    """The number of rays at which two pilots agree.
+
+    Parameters
+    ----------
+    pilot : callable
+        ``pilot(samples)`` gives the paths of the pilot's poses.
+    faces : Faces
+    poses : int
+        Of the pilot, for the words.
+
+    Returns
+    -------
+    Choice
+    """
+    plane = mirror.planes_of(faces)
+    samples = FIRST
+    before = pilot(samples)
+    while samples < MOST:
+        samples *= _FACTOR
+        paths = pilot(samples)
+        # the paths themselves, not their number: one may be lost while another is found
+        if set(mirror.plane_keys(paths, plane)) == set(mirror.plane_keys(before, plane)):
+            words = f"{samples // _FACTOR:,} and {samples:,} rays a tower found the same {counted(len(paths), 'path')}"
+            return Choice(samples, f"{words} at {counted(poses, 'pose')}".replace(",", " "))
+        before = paths
+    words = f"{samples:,} rays a tower still found other paths than {samples // _FACTOR:,} at {counted(poses, 'pose')}"
+    return Choice(samples, words.replace(",", " "))
 
 
 def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache: PathCache | None) -> Choice | None:

@@ -64,7 +64,7 @@ def report_page(folder: Path) -> Path:
 
 def long_page(folder: Path, samples: int = 50_000) -> Path:
     """A made-up flight of ten channels with so many samples together, from the records alone."""
-    from aerpaw_cmp.report.pages import flight_folder as write
+    from aerpaw_cmp.report.pages import flight as write
     from benchmarks.fabricated import long_flight
 
     return write.write_report(long_flight(samples), folder / "long").files[0]

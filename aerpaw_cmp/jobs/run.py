@@ -214,7 +214,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     from ..flight.settings import load_flight
     from ..report.content.flight_parts import report_data
     from ..report.exports.tables import metrics as metrics_of
-    from ..report.pages.flight_folder import write_report
+    from ..report.pages.flight import write_report
     from .reporting.flight_run import report_stages, run_flight
     from .reporting.foliage_notes import foliage_notes
     from .reporting.ladder import recommended_text
@@ -265,7 +265,8 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
 def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[str, ...]:
     """Refuse options that no report can follow; returns the formats of its exports."""
     from ..report.exports.formats import chosen_formats
-    from ..report.pages.flight_folder import FIGURES, STYLES
+    from ..report.kit.canvas import STYLES
+    from ..report.pages.flight import FIGURES
 
     for word, words in ((chosen.figures, FIGURES), (chosen.style, STYLES)):
         if word not in words:

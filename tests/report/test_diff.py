@@ -13,7 +13,7 @@ from aerpaw_cmp.common.outputs import OutputFolder
 from aerpaw_cmp.compare.statistics.intervals import pooled_difference
 from aerpaw_cmp.jobs.diff_reports import run_diff
 from aerpaw_cmp.report.pages.diff import diff_page, verdict
-from aerpaw_cmp.report.pages.flight_folder import write_report
+from aerpaw_cmp.report.pages.flight import write_report
 from tests.json_page import unlisted
 
 LINK = ("LW1", "USRP1")

@@ -7,7 +7,7 @@ import pytest
 
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.report.figures.flight import figure_specs
-from aerpaw_cmp.report.pages import flight_folder as write
+from aerpaw_cmp.report.pages import flight as write
 
 
 def test_whole_report(small_report, tmp_path):

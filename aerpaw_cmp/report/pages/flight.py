@@ -1,15 +1,23 @@
-"""report.html of a flight: what its template shows, in one record."""
+"""report.html of a flight: what its template shows, in one record; and the folder of the results around it."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
+from ...common.stages import Stages
 from ...compare.judge.ladder import LadderRow
 from ...compare.level.rss import PART_DB
 from ...logs.records import has_wall_clock
 from ..content.flight import RANKS, ReportData, start_of
-from ..exports.tables import further_numbers
+from ..exports.formats import FOLDER
+from ..exports.tables import further_numbers, metrics, rank_csv, rss_csv
+from ..figures import flight as figures
 from ..figures.charts import charts_of, shown_confusion
+from ..kit.canvas import FORMATS, write_figures
+from ..kit.files import json_text, write_file
 from ..kit.page import embedded, environment, rendered
 from ..names import RANK_COLUMNS, RSS_COLUMNS
 from ..words import flight as words
@@ -18,6 +26,9 @@ from .explorer import payload
 
 # Rejected lines shown per file; the flight file holds all.
 _REJECTED_SHOWN = 20
+
+# Figures that are drawn as files: none, or every one in a format or in all.
+FIGURES = ("none", "svg", "png", "pdf", "all")
 
 # what the templates of a flight's page alone use
 _FILTERS = {"audit_summary": words.audit_summary, "further": further_numbers, "instants": words.instants}
@@ -73,3 +84,74 @@ def page(data: ReportData, files: Sequence[str]) -> str:
         rejected_shown=_REJECTED_SHOWN,
         pretty=words.pretty,
     )
+
+
+# --- the folder -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrittenReport:
+    """The files, ``report.html`` first, and the record with the seconds that its writing took."""
+
+    files: tuple[Path, ...]
+    data: ReportData
+
+
+def write_report(
+    data: ReportData,
+    folder: str | Path,
+    *,
+    drawn: str = "none",
+    style: str = "screen",
+    exports: Sequence[str] = (),
+    stages: Stages | None = None,
+) -> WrittenReport:
+    """Write the files of a report.
+
+    Parameters
+    ----------
+    data : ReportData
+    folder : path
+        Empty; that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`, say.
+    drawn : str
+        One of :data:`FIGURES`.
+    style : {"screen", "paper"}
+    exports : sequence of str
+        Formats of :data:`aerpaw_cmp.report.exports.formats.FORMATS` for the samples, besides the CSVs.
+    stages : Stages, optional
+        Times the stage "report"; all its seconds are then those of the record.
+
+    Returns
+    -------
+    WrittenReport
+        Files: ``report.html`` first, the CSVs (header only when they have no rows), the figures, ``metrics.json``.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written.
+    """
+    folder, stages = Path(folder), stages or Stages(seconds=dict(data.stages_s))
+    written: list[Path] = []
+    with stages("report"):
+        specs = [] if drawn == "none" else figures.figure_specs(data)
+        formats = FORMATS if drawn == "all" else (drawn,)
+        for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
+            # written even without rows: a reader finds the same files in every report
+            written.append(write_file(folder / name, text))
+        _, paths = write_figures(specs, folder / "figures", formats, style, stages.progress)
+    written += paths
+    if exports:
+        from ..exports.formats import write_exports
+        from ..exports.points import of_report
+
+        with stages("exports"):
+            written += write_exports(of_report(data), folder, exports, stages.progress)
+    data = dataclasses.replace(data, stages_s=dict(stages.seconds))
+    offered = (folder, folder / FOLDER)
+    files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in offered)]
+    with stages("report"):
+        html = write_file(folder / "report.html", page(data, files))
+    data = dataclasses.replace(data, stages_s=dict(stages.seconds))
+    numbers = write_file(folder / "metrics.json", json_text(metrics(data)))
+    return WrittenReport(files=(html, *written, numbers), data=data)

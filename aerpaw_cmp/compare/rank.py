@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, power_from_db, unmasked
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, unmasked
 from .statistics.inertia import LANES, LARGEST, certain_rank
 from .statistics.intervals import (
     NO_INTERVAL,
@@ -434,67 +434,6 @@ def _central(values: FloatArray, k: FloatArray) -> Interval:
     return float(min(k[first], low)), float(max(k[last], high))
 
 
-# Of the condition number at which srsUE reports two layers.
-_LIMIT_DB = 17.0
-
-
-def condition_number_rank(sigma: ArrayLike) -> IntArray:
-    """Rank by the condition-number rule of an open UE: singular values (..., n) within a limit of the strongest.
-
-    srsUE reports two layers when the condition number of its 2 x 2 channel is below 17 dB (``srsran_ue_dl_select_ri``
-    in ``lib/src/phy/ue/ue_dl.c``); for more ports the same limit is put on each singular value, 20 log10 of the
-    ratio. In terms of K that is 10^(17/20) = 7.08.
-    """
-    return rank_from_singular_values(sigma, float(amplitude_from_db(_LIMIT_DB)))
-
-
-def capacity_rank(h: ArrayLike, sinr_db: ArrayLike) -> IntArray:
-    """Number of layers that maximises rate at the reported SINR.
-
-    Parameters
-    ----------
-    h : array_like, complex, (..., n_rx, n_tx)
-        Channel matrices, any scale.
-    sinr_db : array_like, (...)
-        Mean SINR per receive port with the whole transmit power spread over all ports [dB]; NaN gives rank 0.
-
-    Returns
-    -------
-    ndarray of int, (...)
-        0 = no channel or no SINR. Ties go to fewer layers.
-
-    Notes
-    -----
-    Rate of L layers with equal power on the L strongest singular directions: ``sum_i log2(1 + snr g_i / L)`` with
-    ``g_i = n_rx n_tx sigma_i^2 / |H|_F^2``. A modem chooses from a codebook and hears estimation noise, so this
-    is an upper bound of what it could choose (3GPP TS 38.214 clause 5.2.2.2).
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> capacity_rank(np.diag([1.0, 0.5, 0.1, 0.1]), [-10.0, 5.0])
-    array([1, 2])
-    """
-    matrix = unmasked(h, np.complex128)
-    sigma = singular_values(matrix)
-    power = sigma**2
-    total = power.sum(axis=-1, keepdims=True)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        # 0 / 0 without a channel, which is not alive below
-        gain = matrix.shape[-1] * matrix.shape[-2] * power / total
-    snr = power_from_db(sinr_db)
-    shape = np.broadcast_shapes(gain.shape[:-1], snr.shape)
-    rates = []
-    for layers in range(1, gain.shape[-1] + 1):
-        rate = np.log2(1.0 + snr[..., None] * gain[..., :layers] / layers).sum(axis=-1)
-        rates.append(np.broadcast_to(rate, shape))
-    # argmax takes the first of equal rates: that of fewer layers
-    stacked = np.stack(rates, axis=-1)
-    alive = np.isfinite(stacked).all(axis=-1)
-    best = np.argmax(np.where(alive[..., None], stacked, 0.0), axis=-1) + 1
-    return np.where(alive, best, 0).astype(np.int64)
-
-
 @dataclass(frozen=True, slots=True)
 class Staleness:
     """Time that the modem's report was held.
@@ -579,7 +518,7 @@ def _period_starts(ri: FloatArray) -> BoolArray:
 
 @dataclass(frozen=True, slots=True)
 class RankFit:
-    """Simulated ranks of one rule against the measured ones.
+    """Simulated ranks at one K against the measured ones.
 
     Parameters
     ----------
@@ -624,8 +563,6 @@ class RankComparison:
         Measured shares of rank 1 to 4, with intervals in ``histogram_ci95``.
     simulated : mapping of float to RankFit
         Per K.
-    rules : mapping of str to RankFit
-        Other rules: ``"condition_number"``, and ``"capacity"`` where an SINR was given.
     curve : KCurve
         Continuous K.
     staleness : Staleness
@@ -638,7 +575,6 @@ class RankComparison:
     histogram: FloatArray
     histogram_ci95: list[Interval]
     simulated: Mapping[float, RankFit]
-    rules: Mapping[str, RankFit]
     curve: KCurve
     staleness: Staleness
 
@@ -670,14 +606,14 @@ def compare_rank(
     time_s : array_like, (n,), optional
         Instants [s], for the hold time of stale RI; by default the row number.
     sinr_db : array_like, (n,), optional
-        Reported SINR [dB], for the capacity rule.
+        Reported SINR [dB]: a rank that is held repeats it, too.
     replicates : int
         Bootstrap.
 
     Returns
     -------
     RankComparison
-        Histograms, agreement and distances per K and rule, the curve over K, and what was stale.
+        Histograms, agreement and distances per K, the curve over K, and what was stale.
 
     Raises
     ------
@@ -692,11 +628,6 @@ def compare_rank(
         raise ValueError(f"H must have shape ({len(ri)}, n_rx, n_tx), found {matrix.shape}")
     sigma = singular_values(matrix)
     simulated = {float(k): rank_from_singular_values(sigma, k) for k in ks}
-    rules = {"condition_number": condition_number_rank(sigma)}
-    report: dict[str, ArrayLike] = {}
-    if sinr_db is not None:
-        rules["capacity"] = capacity_rank(matrix, sinr_db)
-        report["sinr_db"] = sinr_db
     known = autocorrelation(ri[np.isfinite(ri)])
     time = np.arange(len(ri)) if time_s is None else time_s
     return RankComparison(
@@ -706,9 +637,8 @@ def compare_rank(
         histogram=histogram(ri),
         histogram_ci95=_histogram_intervals(ri[np.isfinite(ri)], replicates),
         simulated={k: compare_ranks(ri, rank, replicates=replicates) for k, rank in simulated.items()},
-        rules={name: compare_ranks(ri, rank, replicates=replicates) for name, rank in rules.items()},
         curve=k_curve(ri, sigma, replicates=replicates),
-        staleness=stale_reports(time, ri, report),
+        staleness=stale_reports(time, ri, {} if sinr_db is None else {"sinr_db": sinr_db}),
     )
 
 

@@ -50,7 +50,6 @@ CASES: dict[str, tuple[Callable[[Any], Any], Any]] = {
     "offset": (lambda z: ac.grid_offset(z, LEVELS + 2.0), LEVELS),
     "offset of a list": (lambda z: ac.grid_offset([z, z], [LEVELS, LEVELS]), LEVELS),
     "rank": (lambda h: ac.channel_rank(h, 10.0), H),
-    "capacity": (lambda h: rank.capacity_rank(h, np.full(40, 10.0)), H),
     "histogram": (rank.histogram, RANKS),
     "agreement": (lambda r: (rank.agreement(r, RANKS), rank.cohen_kappa(RANKS, r)), np.roll(RANKS, 1)),
     "comparison": (lambda z: rss.compare_rss(TIMES, z, LEVELS), LEVELS + CHANCE.normal(size=40)),

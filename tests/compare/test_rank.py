@@ -266,15 +266,6 @@ def test_rank_intervals_hold_the_truth_of_a_known_process():
     assert (hits >= 0.85 * runs).all()
 
 
-def test_the_rules_beside_k_are_compared_where_an_sinr_is_known():
-    rng = np.random.default_rng(2)
-    h = with_profile(np.sort(rng.random((50, 4)))[:, ::-1])
-    comparison = compare_rank(channel_rank(h, 5).astype(float), h, replicates=50, sinr_db=rng.normal(10, 3, 50))
-    assert set(comparison.simulated) == {10.0, 100.0, 1000.0}
-    assert set(comparison.rules) == {"condition_number", "capacity"}
-    assert np.isfinite([rule.agreement for rule in comparison.rules.values()]).all()
-
-
 def test_repeat_kappa_of_two_passes():
     rng = np.random.default_rng(3)
     here = np.column_stack([np.linspace(0, 900, 900), np.zeros((900, 2))])
@@ -435,36 +426,6 @@ def test_an_interval_of_k_reaches_one_step_further(ratio, low, high, expected):
     grid = ratio ** np.arange(5)
     ends = ranks._central(np.array([ratio**low, ratio**high] * 50), grid)
     assert ends == pytest.approx([ratio**end for end in expected])
-
-
-def test_capacity_counts_bits_of_layers_with_equal_power():
-    rng = np.random.default_rng(3)
-    h = rng.normal(size=(40, 4, 2)) + 1j * rng.normal(size=(40, 4, 2))
-    h[3] = 0.0
-    sinr = rng.uniform(-10, 30, 40)
-    sinr[7] = np.nan
-    expected = []
-    for matrix, level in zip(h, sinr, strict=True):
-        power = np.abs(matrix) ** 2
-        if np.isnan(level) or not power.sum():
-            expected.append(0)
-            continue
-        gains = np.linalg.eigvalsh(matrix.conj().T @ matrix)[::-1] * power.size / power.sum()
-        snr = 10 ** (level / 10)
-        best, rate = 1, np.log2(1 + snr * gains[0])
-        for layers in range(2, len(gains) + 1):
-            more = sum(np.log2(1 + snr * g / layers) for g in gains[:layers])
-            if more - rate > 1e-9:
-                best, rate = layers, more
-        expected.append(best)
-    assert ranks.capacity_rank(h, sinr).tolist() == expected
-    assert set(expected) >= {0, 1, 2}
-
-
-def test_the_condition_number_is_put_on_every_singular_value():
-    limit = 10 ** (17 / 20)
-    sigma = np.array([[1.0, 1.01 / limit, 0.99 / limit, 0.0], [1.0, 0.9 / limit, 0, 0], [0, 0, 0, 0]])
-    assert ranks.condition_number_rank(sigma).tolist() == [2, 1, 0]
 
 
 def test_profiles_without_a_value_have_no_rank():

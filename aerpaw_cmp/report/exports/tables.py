@@ -134,10 +134,6 @@ def further_numbers(series: RssResult | RankResult) -> dict[str, Any]:
             "best_k_total_variation": curve.best_k_total_variation,
             "best_k_total_variation_ci95": curve.best_k_total_variation_interval,
             "stale": named(series.score.staleness, "verdict n_reports hold_s"),
-            "rules": {
-                name: fields_of(fit) | _histogram(fit.histogram, fit.histogram_ci95)
-                for name, fit in series.score.rules.items()
-            },
         }
     safe: dict[str, Any] = json_safe(numbers | fields_of(series.further))
     return safe

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
 
@@ -18,10 +17,9 @@ from ..common.errors import parsing
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import named
 from ..common.stages import Progress, begin_peak, logged, peak_mib
-from ..common.units import ComplexArray, IntArray, spread_out, wavelength_m
+from ..common.units import wavelength_m
 from ..compare.judge.ladder import LadderRow, costs
-from ..propagation.check.audit import RANK_K, Difference, channels_differ, compare
-from ..propagation.field.sum import mean_pair_power, rss_dbm
+from ..propagation.check.audit import RANK_K, compare
 from ..propagation.geometry.arrays import (
     Link,
     Poses,
@@ -39,9 +37,6 @@ _DEPTH = 2
 
 # Poses per PathSolver call.
 BATCH = 50
-
-# The same with explicit arrays, which multiply sources and targets, and how many poses of them are replayed.
-_EXPLICIT_BATCH, _EXPLICIT_POSES = 10, 50
 
 T = TypeVar("T")
 
@@ -131,7 +126,7 @@ def speed_against_error(
     Parameters
     ----------
     site, link, poses
-        What to replay. Rows of Sionna's own arrays need isotropic elements.
+        What to replay.
     samples : sequence of int
         Rays of the Sionna rows; empty for none.
     depths : sequence of int
@@ -143,85 +138,43 @@ def speed_against_error(
     -------
     list of dict
         Image engine first: once Sionna is loaded the process stays larger. Each row has ``engine``, ``samples`` (rays
-        per tower and batch), ``arrays`` (who evaluates H: this package in ``float64``, Sionna with ``synthetic`` plane
-        waves or with every element traced, ``explicit``), ``depth``, ``seconds`` (wall time, warm), ``links_per_s``
-        (pose-tower pairs answered), ``peak_mib`` (of the whole process; 0 where the system does not say it),
-        ``missing_paths`` and ``extra_paths`` (None where there is no path list), ``rss_max_error_db`` and
-        ``rss_rms_error_db`` over links that both cover (None without one), ``coverage_differs`` (links that one covers)
-        and ``rank_disagreement`` by K.
+        per tower and batch), ``depth``, ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs answered),
+        ``peak_mib`` (of the whole process; 0 where the system does not say it), ``missing_paths`` and ``extra_paths``,
+        ``rss_max_error_db`` and ``rss_rms_error_db`` over links that both cover (None without one),
+        ``coverage_differs`` (links that one covers) and ``rank_disagreement`` by K.
     """
-    case = _Case(site, link, poses, replay(site, link, poses, Search(max_depth=_DEPTH)))
+    reference = replay(site, link, poses, Search(max_depth=_DEPTH))
     rows = []
     for depth in depths:
         progress(f"image engine, depth {depth}")
-        rows.append(case.replayed(Search(max_depth=depth)))
+        rows.append(_replayed(site, link, poses, reference, Search(max_depth=depth)))
     for count in samples:
-        for kind in ("synthetic", "explicit"):
-            progress(f"sionna, {counted(count, 'sample')}, its own {kind} arrays")
-            chosen = spread_out(len(poses), len(poses) if kind == "synthetic" else _EXPLICIT_POSES)
-            rows.append(case.own_arrays(count, kind, chosen))
         progress(f"sionna, {counted(count, 'sample')}")
-        rows.append(case.replayed(Search("sionna", max_depth=_DEPTH, samples=count, batch=BATCH)))
+        search = Search("sionna", max_depth=_DEPTH, samples=count, batch=BATCH)
+        rows.append(_replayed(site, link, poses, reference, search))
     return rows
 
 
-@dataclass(frozen=True)
-class _Case:
-    """Case that every row replays, and the reference."""
-
-    site: Site
-    link: Link
-    poses: Poses
-    reference: Replay
-
-    def replayed(self, search: Search) -> Row:
-        """The replay of all poses by an engine."""
-        sionna = search.engine == "sionna"
-        if sionna:
-            replay(self.site, self.link, self.poses[:BATCH], search, run=Run(cache_dir=""))
-        # without the cache: the time of a search that was stored would be that of reading it
-        result, spent = _measured(lambda: replay(self.site, self.link, self.poses, search, run=Run(cache_dir="")))
-        difference = compare(result, self.reference, np.arange(len(self.poses)), RANK_K)
-        path_counts = {"missing_paths": difference.missing_paths, "extra_paths": difference.extra_paths}
-        about: dict[str, Any] = {
-            "engine": search.engine,
-            "samples": search.samples if sionna else None,
-            "depth": search.max_depth,
-        }
-        return self._row(difference, spent, **about, **path_counts)
-
-    def own_arrays(self, samples: int, kind: str, chosen: IntArray) -> Row:
-        """Channels as Sionna evaluates them."""
-        from ..propagation.search.sionna import Rays, own_channels
-
-        explicit = kind == "explicit"
-        rays = Rays(max_depth=_DEPTH, samples=samples, batch=_EXPLICIT_BATCH if explicit else BATCH)
-        poses = self.poses[chosen]
-        scene = Scene.of(self.site, self.link, poses)
-
-        def channels(some: Poses) -> ComplexArray:
-            return own_channels(scene.faces, scene.links_to(some), some.rotation, self.link, rays, explicit=explicit)
-
-        channels(poses[: rays.batch])
-        h, spent = _measured(lambda: channels(poses))
-        level = rss_dbm(mean_pair_power(h), self.link.transmit_power_dbm)
-        expected = self.reference.h[chosen], self.reference.rss_dbm[chosen]
-        apart = channels_differ((h, level), expected, RANK_K)  # paths are not compared
-        difference = Difference(missing_paths=-1, extra_paths=-1, reference_paths=0, **apart)
-        return self._row(difference, spent, poses=len(chosen), engine="sionna", samples=samples, arrays=kind)
-
-    def _row(self, difference: Difference, spent: Mapping[str, Any], poses: int | None = None, **about: Any) -> Row:
-        plain: dict[str, Any] = {"engine": "image", "samples": None, "arrays": "float64", "depth": _DEPTH}
-        links = (len(self.poses) if poses is None else poses) * len(self.link.tower_arrays)
-        errors = {name: getattr(difference, name) for name in ("rss_max_error_db", "rss_rms_error_db")}
-        return {
-            **{**plain, "missing_paths": None, "extra_paths": None, **about},
-            **{name: value if np.isfinite(value) else None for name, value in errors.items()},
-            **spent,
-            "coverage_differs": difference.coverage_differs,
-            "rank_disagreement": {f"{k:g}": share for k, share in difference.rank_disagreement.items()},
-            "links_per_s": links / max(spent["seconds"], 1e-9),
-        }
+def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: Search) -> Row:
+    """The replay of all poses by an engine."""
+    sionna = search.engine == "sionna"
+    # without the cache: the time of a search that was stored would be that of reading it
+    alone = Run(cache_dir="")
+    if sionna:
+        replay(site, link, poses[:BATCH], search, run=alone)  # compiles the kernels
+    result, spent = _measured(lambda: replay(site, link, poses, search, run=alone))
+    difference = compare(result, reference, np.arange(len(poses)), RANK_K)
+    errors = named(difference, "rss_max_error_db rss_rms_error_db")
+    return {
+        "engine": search.engine,
+        "samples": search.samples if sionna else None,
+        "depth": search.max_depth,
+        **named(difference, "missing_paths extra_paths coverage_differs"),
+        **{name: value if np.isfinite(value) else None for name, value in errors.items()},
+        **spent,
+        "rank_disagreement": {f"{k:g}": share for k, share in difference.rank_disagreement.items()},
+        "links_per_s": len(poses) * len(link.tower_arrays) / max(spent["seconds"], 1e-9),
+    }
 
 
 def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:

@@ -41,7 +41,7 @@ def bench(
         for row in result["replay"]["rows"]
     ]
     columns = {
-        "engine": "engine", "samples": "samples:.0e", "arrays": "arrays", "depth": "depth", "s": "seconds:.3g",
+        "engine": "engine", "samples": "samples:.0e", "depth": "depth", "s": "seconds:.3g",
         "links/s": "links_per_s:.3g", "peak MiB": "peak_mib:.0f", "missing": "missing_paths", "extra": "extra_paths",
         "RSS error dB max": "rss_max_error_db:.2g", "rms": "rss_rms_error_db:.2g", "rank disagreement per K": "ranks",
     }  # fmt: skip

@@ -32,10 +32,10 @@ from weakref import WeakSet
 import numpy as np
 
 from ...common.errors import CheckError, UsageError
-from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
+from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ...common.versions import version
 from ...site.materials import material
-from ..geometry.arrays import Array, Link
+from ..geometry.arrays import Link
 from ..geometry.faces import inside, triangles
 from ..geometry.paths import Faces, Links, PathSet, Surfaces, path_lengths
 from ..native.llvm import INSTALL_AGAIN, SionnaMissingError, let_sionna_load, prepare_llvm
@@ -289,36 +289,26 @@ def _points(values: FloatArray) -> Any:
     return mi.Point3f(*(mi.Float(column) for column in values.T.astype(np.float32).tolist()))
 
 
-# An array of one element.
-_CENTRE = np.zeros((1, 3))
-
-
 @dataclass(frozen=True, slots=True)
 class _Ends:
-    """Devices as PathSolver wants them: centres (devices, 3), turns (devices, 3, 3) and the array they carry."""
+    """Devices of one element as PathSolver wants them: centres (devices, 3) and turns (devices, 3, 3)."""
 
     centres_m: FloatArray
     turns: FloatArray
-    elements_m: FloatArray
 
     @classmethod
     def points(cls, centres_m: FloatArray) -> _Ends:
-        """Single elements, not turned."""
-        return cls(centres_m, np.tile(np.eye(3), (len(centres_m), 1, 1)), _CENTRE)
+        """Devices that are not turned."""
+        return cls(centres_m, np.tile(np.eye(3), (len(centres_m), 1, 1)))
 
-    def arguments(self, synthetic: bool) -> tuple[Any, Any, Any]:
-        """Positions, orientations and element offsets; with explicit arrays each element is an end."""
-        offsets = np.einsum("dij,ej->dei", self.turns, self.elements_m)
-        angles = _euler(self.turns)
-        if synthetic:
-            return _points(self.centres_m), _points(angles), _points(offsets.reshape(-1, 3))
-        places = (self.centres_m[:, None] + offsets).reshape(-1, 3)
-        return _points(places), _points(np.repeat(angles, len(self.elements_m), axis=0)), None
+    def arguments(self) -> tuple[Any, Any, Any]:
+        """Positions, orientations and element offsets."""
+        return _points(self.centres_m), _points(_euler(self.turns)), _points(np.zeros_like(self.centres_m))
 
     def padded(self, count: int) -> _Ends:
         """The last device repeated until there are ``count``."""
         rows = np.minimum(np.arange(count), len(self.centres_m) - 1)
-        return _Ends(self.centres_m[rows], self.turns[rows], self.elements_m)
+        return _Ends(self.centres_m[rows], self.turns[rows])
 
 
 def _euler(turns: FloatArray) -> FloatArray:
@@ -336,11 +326,7 @@ class _Finder:
     ----------
     built : _Scene
     sources : _Ends
-    elements_m : (elements, 3)
-        Array of the targets.
     batch : int
-    synthetic : bool
-        Plane waves over the arrays, or each element its own end.
     patterns : (str, str)
         Sionna's names of the elements' patterns at the sources and at the targets.
     """
@@ -349,37 +335,29 @@ class _Finder:
         self,
         built: _Scene,
         sources: _Ends,
-        elements_m: FloatArray,
         batch: int,
         *,
-        synthetic: bool = True,
         patterns: tuple[str, str] = ("iso", "iso"),
     ) -> None:
         import sionna.rt as rt
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
-        self.built, self.batch, self.synthetic = built, batch, synthetic
+        self.built, self.batch = built, batch
         scene = built.scene
-        arrays = (("tx_array", sources.elements_m, patterns[0]), ("rx_array", elements_m, patterns[1]))
-        for name, elements, kind in arrays:
+        for name, kind in zip(("tx_array", "rx_array"), patterns, strict=True):
             # both polarisations: slants are made of them afterwards, without another search
             pattern = rt.antenna_pattern.antenna_pattern_registry.get(kind)(polarization="VH")
-            wavelength = float(np.asarray(scene.wavelength).ravel()[0])
-            setattr(scene, name, rt.AntennaArray(pattern, _points(elements / wavelength)))
+            setattr(scene, name, rt.AntennaArray(pattern, _points(np.zeros((1, 3)))))
         for i in range(len(sources.centres_m)):
             # places come later, as arrays; Sionna only counts these
             scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
-        self.limit, self.slots = MAXIMUM_PATHS, _slots(built, batch * len(elements_m))
+        self.limit, self.slots = MAXIMUM_PATHS, _slots(built, batch)
         self.candidates: Any = None  # PathSolver fills it
-        if not synthetic:  # each element of a tower is a source, with a table and room of its own
-            # slots and limits are powers of two
-            elements = 2 ** int(np.ceil(np.log2(len(sources.elements_m))))
-            self.slots, self.limit = self.slots // elements, self.limit // elements
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = self.slots
-        self.sources = sources.arguments(synthetic)
-        self.targets = _Ends.points(np.zeros((batch, 3))).arguments(True)
+        self.sources = sources.arguments()
+        self.targets = _Ends.points(np.zeros((batch, 3))).arguments()
         self._replace_endpoints(len(sources.centres_m))
         self.solver = rt.PathSolver()
         self._watch_candidates()
@@ -442,7 +420,7 @@ class _Finder:
 
     def trace(self, targets: _Ends, max_depth: int, samples: int) -> Any:
         """Sionna's paths of one batch, padded, searched until there was room for all."""
-        self.targets = targets.padded(self.batch).arguments(self.synthetic)
+        self.targets = targets.padded(self.batch).arguments()
         paths = self._solved(max_depth, samples)
         # lines of sight alone need no table
         while max_depth and self._more_room():
@@ -455,7 +433,7 @@ class _Finder:
             max_depth=max_depth,
             max_num_paths_per_src=self.limit,
             samples_per_src=samples,
-            synthetic_array=self.synthetic,
+            synthetic_array=True,
             los=True,
             specular_reflection=max_depth > 0,
             diffuse_reflection=False,
@@ -597,7 +575,7 @@ def _refined(
     builder = _Builder(faces=faces, links=links, carrier_hz=carrier_hz, surfaces=surfaces)
 
     def make(towers: IntArray, chosen: IntArray) -> _Finder:
-        return _Finder(builder.scene(chosen), _Ends.points(sources_m[towers]), _CENTRE, batch)
+        return _Finder(builder.scene(chosen), _Ends.points(sources_m[towers]), batch)
 
     groups, alive, traced = list(_groups(faces, sources_m, links.usable)), searched_links(links), 0
     count = sum(int(alive[towers].any(axis=0).sum()) for towers, _ in groups)
@@ -665,9 +643,9 @@ def own_coefficients(
     builder = _Builder(faces=faces, links=links, carrier_hz=probe.carrier_hz, surfaces=surfaces, own_table=True)
 
     def make(towers: IntArray, chosen: IntArray) -> _Finder:
-        ends = _Ends(sources_m[towers], turns[0][towers], _CENTRE)
+        ends = _Ends(sources_m[towers], turns[0][towers])
         names = str(pattern[towers[0]]), probe.uav_array.patterns[0].name
-        return _Finder(builder.scene(chosen), ends, _CENTRE, rays.batch, patterns=names)
+        return _Finder(builder.scene(chosen), ends, rays.batch, patterns=names)
 
     groups = (
         (sharing[pattern[sharing] == name], chosen)
@@ -679,7 +657,7 @@ def own_coefficients(
     slants = np.stack([array.slant_parts for array in arrays])
     every = np.ones((len(sources_m), len(targets_m)), np.bool_)
     for finder, towers, some in _each_batch(make, groups, every):
-        part, gain = _raw_paths(finder, _Ends(targets_m[some], turns[1][some], _CENTRE), some, towers, rays)
+        part, gain = _raw_paths(finder, _Ends(targets_m[some], turns[1][some]), some, towers, rays)
         gains.append(np.einsum("pab,au,pbv->puv", gain, probe.uav_array.slant_parts, slants[part.tower]))
         pieces.append(part)
     paths = PathSet.one_after_another(pieces) if pieces else PathSet.empty(rays.max_depth)
@@ -711,66 +689,6 @@ def _raw_paths(
     points[sequence < 0] = np.nan
     gain = (real + 1j * imaginary)[receiver, :, tower, :, path].astype(np.complex128)
     return PathSet(pose, source, (sequence >= 0).sum(axis=1), sequence, points), gain
-
-
-def own_channels(
-    faces: Faces,
-    links: Links,
-    rotation: FloatArray,
-    link: Link,
-    rays: Rays,
-    *,
-    explicit: bool,
-    surfaces: Surfaces | None = None,
-) -> ComplexArray:
-    """Channel matrices as Sionna itself gives them, for comparison only: float32 phases.
-
-    Parameters
-    ----------
-    faces, links, rays, surfaces
-        As in :func:`find_paths`; links without a path are searched as well.
-    rotation : (poses, 3, 3)
-        Device to site, of the UAV at each pose.
-    link : Link
-        Isotropic elements; all towers with the same element positions and slants.
-    explicit : bool
-        Spherical waves, each element pair traced; else plane waves over each array.
-
-    Returns
-    -------
-    (poses, towers, n_rx, n_tx) complex
-    """
-    load_variant()
-    sources_m, targets_m = links.sources_m, links.targets_m
-    arrays, uav = list(link.tower_arrays.values()), link.uav_array
-    for array in (*arrays, uav):
-        if any(pattern.name != "iso" for pattern in array.patterns):
-            raise UsageError("a pattern that is not isotropic", expected="isotropic elements in Sionna's own arrays")
-    h = np.zeros((len(targets_m), len(arrays), len(uav), len(arrays[0])), dtype=np.complex128)
-    builder = _Builder(faces=faces, links=links, carrier_hz=link.carrier_hz, surfaces=surfaces)
-
-    def make(towers: IntArray, chosen: IntArray) -> _Finder:
-        sources = _Ends(sources_m[towers], np.stack([arrays[t].mount for t in towers]), arrays[0].positions_m)
-        return _Finder(builder.scene(chosen), sources, uav.positions_m, rays.batch, synthetic=not explicit)
-
-    every = np.ones((len(sources_m), len(targets_m)), np.bool_)
-    for finder, towers, rows in _each_batch(make, _groups(faces, sources_m, links.usable), every):
-        targets = _Ends(targets_m[rows], rotation[rows] @ uav.mount, uav.positions_m)
-        a, _ = finder.trace(targets, rays.max_depth, rays.samples).cir(normalize_delays=False, out_type="numpy")
-        mixed = _slanted(a[: len(rows), ..., 0].sum(axis=-1), uav, arrays[0])
-        h[np.ix_(rows, towers)] = np.moveaxis(mixed, 2, 1)
-    return np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
-
-
-def _slanted(a: AnyArray, uav: Array, tower: Array) -> ComplexArray:
-    """(rx, uav ports, tx, tower ports) from V and H halves (rx, 2 uav elements, tx, 2 tower elements).
-
-    Slanted elements are sums of both: model 2 of 3GPP TR 38.901 section 7.3.2.
-    """
-    n_uav, n_tower = len(uav), len(tower)
-    # Sionna counts polarisations outside, elements inside
-    halves = a.reshape(len(a), 2, n_uav, a.shape[2], 2, n_tower).astype(np.complex128)
-    return np.asarray(np.einsum("rautbv,au,bv->rutv", halves, uav.slant_parts, tower.slant_parts))
 
 
 def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> Iterator[tuple[IntArray, IntArray]]:

@@ -407,7 +407,6 @@ settings:
   one: {}
   two: {rt.max_depth: 0, link.rss.uav.yaw_deg: 315}
 calibration: channel
-repeatability: {radius_m: 3, heading_within_deg: null}
 """
 
 

@@ -12,7 +12,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, run
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Task, digest_of, outcome_store
-from aerpaw_cmp.jobs.campaigns.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
+from aerpaw_cmp.jobs.campaigns.over_flights import pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.jobs.tasks.options import RunOptions
 from aerpaw_cmp.report.content.campaign import RankRow
 from tests.jobs.campaign_rows import rss_row
@@ -246,7 +246,7 @@ def test_repeatability_is_the_noise_of_both_flights_after_one_constant() -> None
     level = -60 + 10 * np.sin(np.arange(n) / 40)
     first = rss_row("a", "USRP1", level + rng.normal(0, 2.0, n), level)
     second = rss_row("b", "USRP1", level + 6.0 + rng.normal(0, 1.5, n), level)
-    (pair,) = repeats([first, second], RepeatSettings(heading_within_deg=None))
+    (pair,) = repeats([first, second])
     assert pair.n == n
     assert pair.share == 1.0
     assert pair.rmse_db == pytest.approx(2.5, rel=0.05)
@@ -255,7 +255,7 @@ def test_repeatability_is_the_noise_of_both_flights_after_one_constant() -> None
     assert abs(pair.place_correlation) < 0.2  # nothing but noise comes back
     wrong = np.where(np.arange(n) % 400 < 200, 5.0, -5.0)
     (pair,) = repeats(
-        [rss_row("a", "USRP1", level + wrong, level), rss_row("b", "USRP1", level + wrong, level)], RepeatSettings()
+        [rss_row("a", "USRP1", level + wrong, level), rss_row("b", "USRP1", level + wrong, level)],
     )
     assert pair.rmse_db == pytest.approx(0.0, abs=1e-9)
     assert pair.place_correlation == pytest.approx(1.0)
@@ -287,11 +287,11 @@ def test_flights_that_never_meet_have_no_floor() -> None:
     low, high = rss_row("a", "USRP1", np.zeros(50), np.zeros(50)), rss_row("b", "USRP1", np.zeros(50), np.zeros(50))
     up = high.position_m + np.array([0.0, 0.0, 30.0])
     high = rss_row("b", "USRP1", np.zeros(50), np.zeros(50), position_m=up)
-    (pair,) = repeats([low, high], RepeatSettings())
+    (pair,) = repeats([low, high])
     assert pair.n == 0
     assert np.isnan(pair.rmse_db)
     assert pair.height_difference_m == 30.0
-    assert repeats([low, rss_row("b", "USRP2", np.zeros(50), np.zeros(50))], RepeatSettings()) == []
+    assert repeats([low, rss_row("b", "USRP2", np.zeros(50), np.zeros(50))]) == []
 
 
 def test_flights_without_a_sample_that_counts_give_no_number_and_end_nothing(folder: Path) -> None:

@@ -13,7 +13,6 @@ from typing import Annotated, Any, Literal
 from pydantic import Field
 
 from ...common.errors import InputError, UsageError, one_line
-from ...common.jsonable import named
 from ...common.stages import PlannedStage, Stages
 from ...common.yamlfile import StrictModel, load_yaml
 from ...flight.gains.memory import load_with_learned
@@ -23,7 +22,7 @@ from ...report.content.campaign import CampaignData, Failure
 from ..tasks.options import DEFAULT, RunOptions
 from ..tasks.workers import open_workers
 from .campaign_tasks import Task, compute, counted_once, flight_data, kept_outcomes, outcome_store, planned_tasks
-from .over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
+from .over_flights import pool_offsets, repeats, transfer_ranks
 
 # Label of the only setting of a campaign that names none.
 _AS_WRITTEN = "as written"
@@ -39,7 +38,6 @@ class CampaignFile(StrictModel):
     timezone: str | None = None  # of soundings with local times
     settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
     calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
-    repeatability: RepeatSettings = RepeatSettings()
 
 
 def load_campaign(path: Path) -> CampaignFile:
@@ -112,7 +110,7 @@ def run(
     failures += [o.failure for o in results if o.failure is not None]
     with stages("pool"):
         rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
-        repeated = repeats([r for r in rows if r.setting == next(iter(settings))], campaign.repeatability)
+        repeated = repeats([r for r in rows if r.setting == next(iter(settings))])
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
     return CampaignData(
         name=campaign.campaign,
@@ -126,7 +124,6 @@ def run(
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(repeated),
-        **named(campaign.repeatability, "radius_m heading_within_deg cell_m"),
         site=flight_data(good[0]).site if good else None,
         synthetic=tuple(name for name, (_, f) in files.items() if f.flight.synthetic),
         workers=options.workers,

@@ -10,20 +10,9 @@ import numpy as np
 
 from ...common.jsonable import named
 from ...common.units import finite_mean
-from ...common.yamlfile import StrictModel
 from ...compare.offset import Pooling, pooled_moments
 from ...compare.statistics.passes import Pass, PassPair, PassTable
-from ...flight.settings import Positive
-from ...report.content.campaign import PooledOffset, RankRow, RankTransfer, Repeat, RssRow
-
-
-class RepeatSettings(StrictModel):
-    """Settings for when two samples count as taken at the same place, and how residuals are gathered by place."""
-
-    radius_m: Positive = 3.0
-    heading_within_deg: Positive | None = 20.0
-    """Headings of a pair agree within this; null: any heading."""
-    cell_m: Positive = 20.0
+from ...report.content.campaign import CampaignData, PooledOffset, RankRow, RankTransfer, Repeat, RssRow
 
 
 def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], list[PooledOffset]]:
@@ -75,7 +64,7 @@ def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]
     )
 
 
-def repeats(rows: Sequence[RssRow], settings: RepeatSettings) -> list[Repeat]:
+def repeats(rows: Sequence[RssRow]) -> list[Repeat]:
     """Every pair of flights that share a tower and channel, of the rows of one setting, in their order."""
     passes = [
         Pass(
@@ -85,9 +74,8 @@ def repeats(rows: Sequence[RssRow], settings: RepeatSettings) -> list[Repeat]:
         )
         for row in rows
     ]
-    pairs = PassTable(passes, settings.cell_m).pairs(
-        radius_m=settings.radius_m, heading_within_deg=settings.heading_within_deg
-    )
+    rule = named(CampaignData, "radius_m heading_within_deg")
+    pairs = PassTable(passes, CampaignData.cell_m).pairs(**rule)
     known = [int(np.isfinite(row.measured_db).sum()) for row in rows]
     ordered = sorted(pairs, key=lambda pair: (pair.first, pair.second))
     return [_repeat(pair, rows[pair.first], rows[pair.second], known[pair.first]) for pair in ordered]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, ClassVar
 
 from ...common.units import FloatArray, IntArray
 from ...compare.judge.steps import NodeOffset
@@ -279,7 +279,15 @@ class Season:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignData(Made):
-    """Everything the page shows. ``settings`` are overrides by label; ``flights`` the names in order."""
+    """Everything the page shows. ``settings`` are overrides by label; ``flights`` the names in order.
+
+    Two samples count as taken at the same place within ``radius_m`` with headings that agree within
+    ``heading_within_deg``; residuals are gathered by place in cells of ``cell_m``.
+    """
+
+    radius_m: ClassVar[float] = 3.0
+    heading_within_deg: ClassVar[float] = 20.0
+    cell_m: ClassVar[float] = 20.0
 
     name: str
     title: str
@@ -292,9 +300,6 @@ class CampaignData(Made):
     pooled: tuple[PooledOffset, ...] = ()
     repeats: tuple[Repeat, ...] = ()
     rank_transfers: tuple[RankTransfer, ...] = ()
-    radius_m: float = 3.0
-    heading_within_deg: float | None = 20.0
-    cell_m: float = 20.0
     site: Site | None = None
     synthetic: tuple[str, ...] = ()
     workers: int = 1

@@ -250,6 +250,7 @@ def test_what_cannot_be_is_refused_in_one_line(folder, options, expected, capsys
 def test_times_nodes_and_sizes_that_do_not_fit_are_refused(folder, capsys, tmp_path):
     (folder / "late.csv").write_text("east_m,north_m,height_m,time_s\n50,0,30,0\n50,40,30,1e8\n")
     late, flight = ["--route", str(folder / "late.csv"), "--format"], folder / "plan.yaml"
+    wide = ["--step", "400", "--link", "rank", *(word for n in "1234" for word in ("--tower", f"LW{n}"))]
     drawn = folder / "drawn.yaml"
     drawn.write_text(PLAN + "rt: {engine: sionna}\n")
     (folder / "moves.csv").write_text("latitude,longitude,altitude,time\n35.727,-78.696,0,2025-06-01T14:00:00Z\n"
@@ -258,8 +259,8 @@ def test_times_nodes_and_sizes_that_do_not_fit_are_refused(folder, capsys, tmp_p
     moving.write_text(PLAN + "towers: {N: {track: {path: moves.csv}, height: ground, antenna_height_m: 2}}\n")
     for path, options, expected in (
         (flight, [*late, "csv"], "at most 10000000"),
-        (flight, [*late, "npz", "--step", "20"], "netcdf and csv alone."),
-        (drawn, [*late, "csv", "--step", "20"], "netcdf and csv alone with rt.engine: image"),
+        (flight, [*late, "npz", *wide], "netcdf and csv alone."),
+        (drawn, [*late, "csv", *wide], "netcdf and csv alone with rt.engine: image"),
         (moving, ["--tower", "N", "--format", "csv"], "it alone, along the track"),
     ):
         assert main(["channel", str(path), "-o", str(tmp_path / "out"), *options]) == 2

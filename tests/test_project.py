@@ -2,7 +2,6 @@
 
 import ast
 import email
-import functools
 import itertools
 import re
 import runpy
@@ -18,6 +17,8 @@ import yaml
 
 import aerpaw_cmp
 from aerpaw_cmp.common.commands import COMMANDS
+from tests.test_words import FILES, faults, texts_of
+from tests.trees import parsed
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -229,11 +230,6 @@ def modules() -> list[Path]:
     return sorted([*(ROOT / "aerpaw_cmp").rglob("*.py"), *(ROOT / "parsers" / "aerpaw_parsers").rglob("*.py")])
 
 
-@functools.cache
-def parsed(path: Path) -> ast.Module:
-    return ast.parse(path.read_text())
-
-
 def sections(docstring: str) -> dict[str, list[str]]:
     """Lines of each section of a NumPy docstring."""
     by_title: dict[str, list[str]] = {}
@@ -329,7 +325,19 @@ def test_docstrings_begin_with_the_thing_or_a_verb() -> None:
     """Not with What, Whether and the like, which tell the reader nothing before the verb comes."""
     asked = {"What", "Whether", "How", "Where", "Why", "Which", "Whose", "Who", "When"}
     for path in [*(ROOT / "aerpaw_cmp").rglob("*.py"), *(ROOT / "parsers").rglob("*.py")]:
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        for node in ast.walk(parsed(path)):
             if isinstance(node, (ast.FunctionDef, ast.ClassDef, ast.Module)):
                 first = (ast.get_docstring(node) or "").split(" ")[0]
                 assert first not in asked, f"{path.name}: {getattr(node, 'name', 'module')} begins with {first!r}"
+
+
+def test_no_user_reads_a_banned_word() -> None:
+    by_line = {
+        f"{path.relative_to(ROOT)}:{line}": wrong
+        for path in FILES
+        if path.name != "uplot.min.js"
+        for line, text in texts_of(path)
+        if (wrong := faults(text))
+    }
+    assert by_line == {}
+    assert len(FILES) > 300

@@ -131,7 +131,7 @@ def test_the_gain_of_the_airframe_keeps_the_node_from_moving_to_where_the_nose_p
 
 def test_odds_tell_the_right_place_from_wrong_ones() -> None:
     wrong = np.array([[600.0, 0.0, 10.0], [0.0, -700.0, 10.0]])
-    odds = [locate(track, [[*truth, 1.5], *wrong]).log_odds for track, truth in _flights(8, -np.inf)]
+    odds = [locate(track, [[*truth, 1.5], *wrong]).log_odds for track, truth in _flights(6, -np.inf)]
     assert np.median([o[0] for o in odds]) > 2.0
     assert all(o[0] > o[1:].max() + 1.0 for o in odds)
 
@@ -232,12 +232,12 @@ def test_a_straight_flight_leaves_two_places_and_both_are_regions() -> None:
 
 
 def test_levels_that_do_not_fall_with_the_distance_place_no_node() -> None:
-    time, position = _lawnmower(120)
-    noise = np.random.default_rng(4).normal(0.0, 3.0, 120)
+    time, position = _lawnmower(75)
+    noise = np.random.default_rng(4).normal(0.0, 3.0, 75)
     near, far = (-30.0 * np.log10(np.linalg.norm(position - [east, 40.0, 1.5], axis=1)) for east in (80.0, 9000.0))
     for way, level, placed in (
-        (position, near + noise, True), (position, far + noise, False), (position, np.full(120, -60.0), False),
-        (4.0 * position, np.full(120, -60.0), False), (0.0 * position + 30.0, noise, False),
+        (position, near + noise, True), (position, far + noise, False), (position, np.full(75, -60.0), False),
+        (4.0 * position, np.full(75, -60.0), False), (0.0 * position + 30.0, noise, False),
     ):  # fmt: skip
         assert locate(level_track(2.0 * time, way, level)).placed == placed
 

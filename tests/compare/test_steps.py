@@ -59,15 +59,15 @@ def test_a_step_shows_the_same_night_a_night_of_rain_comes_back_and_few_nights_s
 def test_the_smallest_step_that_is_stated_shows_nine_times_in_ten() -> None:
     rng = np.random.default_rng(3)
     shown = false = 0
-    for _ in range(200):
+    for _ in range(120):
         before = rng.normal(0.0, 0.2, 50)
         quiet = _one(before)
         false += len(quiet.steps)
         last = before[-1 - len(quiet.steps) :].mean() if quiet.steps else before.mean()
         after = _one(np.append(before, last + quiet.smallest_db + rng.normal(0.0, 0.2)))
         shown += any(s.shown == "050" for s in after.steps)
-    assert 0.84 < shown / 200 < 0.96
-    assert false < 12  # one node of ten, 40 nights each: eight at one in a hundred
+    assert 0.84 < shown / 120 < 0.96  # of 120 shares of .9 vary by .027
+    assert false < 8  # one node of ten, 40 nights each: five at one in a hundred
 
 
 def seasons(count: int, link_sd_db: float, seed: int, step_db: float = 1.0) -> dict[str, float]:
@@ -96,7 +96,7 @@ def seasons(count: int, link_sd_db: float, seed: int, step_db: float = 1.0) -> d
 
 
 def test_steps_of_a_decibel_show_the_same_night_and_false_ones_are_rare() -> None:
-    shares = seasons(12, 0.35, seed=4)
+    shares = seasons(8, 0.35, seed=4)
     assert shares["same night"] >= 0.9
     assert shares["false in 100 nights"] < 1.5  # of 2 000 seasons: see the command above
 

@@ -67,6 +67,24 @@ class Watched(InProcess):
             done(place, function(item))
 
 
+# The computed tile of an order: what becomes of it, in a store, is what most of these tests are about.
+COMPUTED = {}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def each_tile_is_computed_once():
+    def tile(self, order, **progress):
+        key = repr((self.settings, order))
+        if key not in COMPUTED:
+            COMPUTED[key] = real(self, order, **progress)
+        return COMPUTED[key]
+
+    real = mapping.SiteChannels.tile
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(mapping.SiteChannels, "tile", tile)
+        yield
+
+
 def test_a_store_holds_the_map_in_one_piece(tmp_path):
     both = replace(SETTINGS, foliage=("none", "opaque"))
     in_one_piece = mapping.make_maps(load_site(SITE), replace(both, tile_m=None), Stages(), name=SITE)

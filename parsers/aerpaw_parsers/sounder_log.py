@@ -12,8 +12,8 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import dropwhile
 
 import numpy as np
 
@@ -35,7 +35,6 @@ _MOST_REPEATS = 5_000_000  # two days at 30 samples a second: a damaged offset c
 _HEAD = rb"^\[(" + _time.TIME + rb")\] "
 _ODD = re.compile(_HEAD + rb"+([0-7]{7,12}) +(" + _lines.NUMBER + rb"|-?nan|-?inf)[ \t]*$")
 _STAR = re.compile(_HEAD + rb"+\*[ \t]*$")
-_PLAIN = re.compile(rb" *-?\d+(?:\.\d+)?")
 _FOOT = re.compile(_HEAD + rb"+([0-7]{7,12})[ \t]*$")
 
 
@@ -78,22 +77,31 @@ _COLUMNS = {"line": np.int64, "wall": np.int64, "offset": np.int64, "value": np.
 _NONE = np.zeros(0, dtype=np.int64)
 
 
-def _octal(cells: AnyArray) -> tuple[IntArray, BoolArray]:
-    """Octal digits, ``(n, w)`` uint8, to integers."""
-    digit = cells - np.uint8(48)
-    weight = 8 ** np.arange(cells.shape[1] - 1, -1, -1)
-    return digit.astype(np.int64) @ weight, np.all(digit <= 7, axis=1)
+_POWERS = 10.0 ** np.arange(_VALUE)
 
 
 def _decimals(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
-    """Right-aligned decimals, ``(n, w)`` uint8, to numbers; what is not plain is left to the line's own pattern."""
-    text, raw = cells.view(f"S{cells.shape[1]}")[:, 0], cells.tobytes()
-    odd = raw.translate(None, b" -.0123456789") or b" ." in raw or b"-." in raw or (cells[:, -1] < 48).any()
-    with suppress(ValueError):  # of such characters, but no number: 1-2
-        if not odd:
-            return text.astype(np.float64), np.ones(len(cells), dtype=bool)
-    plain = np.array([_PLAIN.fullmatch(cell) is not None for cell in text.tolist()])
-    return np.where(plain, text, b"0").astype(np.float64), plain
+    """Right-aligned decimals, ``(n, 16)`` uint8, to numbers; what is not plain is left to the line's own pattern.
+
+    At most fifteen digits beside a point: as a whole number they are exact, and so is the power of ten that divides
+    them, so that the quotient is the double nearest to what was written, as ``float`` gives it.
+    """
+    whole, places = np.zeros(len(cells)), np.zeros(len(cells), dtype=np.uint8)
+    negative, point, strange = np.zeros((3, len(cells)), dtype=bool)
+    open_, after_digit = np.ones(len(cells), dtype=bool), np.zeros(len(cells), dtype=bool)
+    columns = np.ascontiguousarray(cells.T)
+    for column in dropwhile(lambda column: (column == 32).all(), columns):
+        value = column - np.uint8(48)  # what is no digit wraps to more than 9
+        digit, minus, dot, space = value <= 9, column == 45, column == 46, column == 32
+        # a space or a minus stands behind spaces only, a point behind a digit and once
+        strange |= ~(digit | ((minus | space) & open_) | (dot & after_digit & ~point))
+        negative |= minus
+        places += point
+        point |= dot
+        whole = np.where(digit, 10.0 * whole + value, whole)
+        open_, after_digit = space, digit
+    plain = after_digit & ~strange
+    return np.where(plain, np.where(negative, -whole, whole) / _POWERS[places], 0.0), plain
 
 
 def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
@@ -109,13 +117,12 @@ def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
             continue
         cells = lines.fixed(rows, _STAMP + 1 + width + _VALUE)
         wall, valid = _time.parse_digits(cells[:, 1 : _STAMP - 1], 6)
-        offset, octal = _octal(cells[:, _STAMP + 1 : _STAMP + 1 + width])
-        value, plain = _decimals(np.ascontiguousarray(cells[:, _STAMP + 1 + width :]))
+        offset, worst = _time.integers(cells[:, _STAMP + 1 : _STAMP + 1 + width], 8)
+        value, plain = _decimals(cells[:, _STAMP + 1 + width :])
         valid &= plain & (cells[:, 0] == 91) & (cells[:, _STAMP - 1] == 93) & (cells[:, _STAMP] == 32)
         valid &= cells[:, _STAMP + 1 + width] == 32
-        digits = (cells[:, _STAMP + 1 : _STAMP + 1 + width] - np.uint8(48) <= 9).all(axis=1)
-        wrong.append(rows[valid & ~octal & digits])
-        parts.append(_Samples(rows, wall, offset, value).take(valid & octal))
+        wrong.append(rows[valid & (worst > 7) & (worst <= 9)])
+        parts.append(_Samples(rows, wall, offset, value).take(valid & (worst <= 7)))
     return _Samples.none().join(*parts), np.concatenate(wrong)
 
 

@@ -1,5 +1,7 @@
 """Sounder logs: the fast way takes od's own lines and no other, runs of '*' have the length their ends say."""
 
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -60,6 +62,19 @@ def test_lines_with_one_sign_changed_are_left_to_the_strict_way(row: int, place:
     assert len(sounder_log._fixed_layout(_lines.split(bad.encode()))[0].line) == 0
     result = read(*GOOD, bad)
     assert (result.accepted, len(result.rejected)) == (3, 1)
+
+
+def test_levels_are_the_numbers_that_python_reads() -> None:
+    """Bit by bit, among texts of the same characters that are no numbers."""
+    rng = np.random.default_rng(0)
+    texts = [f"{value:16.{n}f}"[-16:] for n in range(10) for value in rng.normal(0.0, 10.0 ** (5 - n), 200)]
+    texts += ["".join(rng.choice(list("   -.0123456789e"), 9)).rjust(16) for _ in range(20_000)]
+    values, plain = sounder_log._decimals(np.array(texts, dtype="S16").view(np.uint8).reshape(-1, 16))
+    expected = [re.fullmatch(r" *-?\d+(?:\.\d+)?", text) is not None for text in texts]
+    assert 2000 < sum(expected) < len(texts) - 10_000
+    assert plain.tolist() == expected
+    read_by_python = [float(text) if good else 0.0 for text, good in zip(texts, expected, strict=True)]
+    assert values.tobytes() == np.array(read_by_python).tobytes()
 
 
 def test_why_lines_are_rejected() -> None:

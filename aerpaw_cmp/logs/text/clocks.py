@@ -247,28 +247,28 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
     length = np.diff(np.append(starts, count))
     minute, dated = _minutes(cells[starts, :16])
     valid = np.repeat(dated, length)
-    second, good = _integers(cells[:, 17:19])
+    second, worst = integers(cells[:, 17:19])
     # a leap second (60) is no second of datetime64
-    valid &= good & (second < 60) & (cells[:, 16] == 58)
+    valid &= (worst <= 9) & (second < 60) & (cells[:, 16] == 58)
     wall = np.repeat(minute, length) + second * np.int64(1_000_000_000)
     if fraction:
-        part, good = _integers(cells[:, 20 : 20 + fraction])
-        valid &= good & (cells[:, 19] == 46)
+        part, worst = integers(cells[:, 20 : 20 + fraction])
+        valid &= (worst <= 9) & (cells[:, 19] == 46)
         wall += part * np.int64(10 ** (9 - fraction))
     wall[~valid] = 0
     return wall, valid
 
 
-def _integers(cells: AnyArray) -> tuple[IntArray, BoolArray]:
-    """Digits, uint8 of shape (n, up to 9), as whole numbers; second, whether they are digits."""
+def integers(cells: AnyArray, base: int = 10) -> tuple[IntArray, AnyArray]:
+    """Digits, uint8 of shape (n, some), as whole numbers; second, the largest digit, above 9 where one is none."""
     total, worst = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells), dtype=np.uint8)
     for column in cells.T:
         # what is no digit wraps to more than 9
         digit = column - np.uint8(48)
         np.maximum(worst, digit, out=worst)
-        total *= 10
+        total *= base
         total += digit
-    return total, worst <= 9
+    return total, worst
 
 
 def _minutes(cells: AnyArray) -> tuple[IntArray, BoolArray]:

@@ -89,12 +89,13 @@ class Lines:
         """Bytes of equally long lines as a ``(len(numbers), width)`` uint8 array."""
         if len(numbers) == 0:
             return np.empty((0, width), dtype=np.uint8)
-        stride = np.unique(np.diff(self.starts[numbers])) if len(numbers) > 1 else np.array([width])
-        if len(stride) == 1:  # one block of equal lines: no gather, a view is enough
+        starts = self.starts[numbers]
+        stride = int(starts[1] - starts[0]) if len(numbers) > 1 else width
+        if (np.diff(starts) == stride).all():  # one block of equal lines: no gather, a view is enough
             return np.lib.stride_tricks.as_strided(
-                self.buffer[self.starts[numbers[0]] :], (len(numbers), width), (int(stride[0]), 1), writeable=False
+                self.buffer[starts[0] :], (len(numbers), width), (stride, 1), writeable=False
             )
-        return np.asarray(self.buffer[self.starts[numbers][:, None] + np.arange(width)])
+        return np.asarray(self.buffer[starts[:, None] + np.arange(width)])
 
 
 # Bytes that a look at each byte takes at a time: they stay in the processor's cache.

@@ -253,9 +253,19 @@ def of_one_depth(
     wavelength: float,
     record: Callable[[str, AnyArray], None] | None = None,
 ) -> FloatArray:
-    """As :func:`amplitudes`, of paths of one depth, by cosine and sine of the elements' slants at tower and UAV.
+    """As :func:`amplitudes`, of paths of one depth.
 
-    Further axes of the slants come first in the answer: what does not depend on them is evaluated once.
+    Parameters
+    ----------
+    g, elements, ends, wavelength, record
+        As there.
+    slants : twice (cosine, sine)
+        Of tower and UAV against (paths, pairs). Further axes in front of these come first in the answer, and what does
+        not depend on them is evaluated once.
+
+    Returns
+    -------
+    (..., paths, pairs, 2)
     """
     x, y, z, length = directions(g, elements)
     toward = x, y, z

@@ -95,6 +95,7 @@ def test_an_unseen_flight_of_the_sounder_is_told_its_lock_by_other_flights(tmp_p
     assert main([*flown, "--audit", "none", "--figures", "none", "-o", str(tmp_path / "flown")]) == 0
     (score,) = json.loads((tmp_path / "flown" / "metrics.json").read_text())["against"]["scores"].values()
     assert 0.85 < score["coverage_90"] < 0.95
+    assert score["crps_db"] < 6.7  # 7.0 in level flight
     drafted = yaml.safe_load((tmp_path / "flight.yaml").read_text(encoding="utf-8"))["towers"]["NODE"]
     surveyed = yaml.safe_load((HERE / "../calibrations/afar300_loc_2.yaml").read_text(encoding="utf-8"))["towers"][
         "ROVER"

@@ -22,7 +22,7 @@ from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.against import score_against
 from aerpaw_cmp.jobs.prediction.sources import named_flights
 from aerpaw_cmp.jobs.prediction.where import TargetOptions, Targets, find_targets
-from aerpaw_cmp.propagation.geometry.arrays import Link, single_element
+from aerpaw_cmp.propagation.geometry.arrays import Link, rotation_from_aircraft, single_element
 from aerpaw_cmp.propagation.trace import trace
 from aerpaw_cmp.report.kit.page import coded
 from aerpaw_cmp.report.pages.prediction import prediction_metrics, write_prediction
@@ -283,13 +283,18 @@ def test_a_grid_has_its_heights_one_after_the_other():
     assert np.isnan(targets.yaw_deg).all()
 
 
-def test_a_planned_flight_faces_its_course():
+def test_a_planned_flight_faces_its_course_and_leans_into_it(prediction):
     targets = find_targets(SAMPLE, load_site("lake_wheeler"), TargetOptions())
     east = targets.position_m[:, 0]
     leg = (targets.time_s > 30) & (targets.time_s < 40)
     step = np.diff(targets.position_m[leg][:, :2], axis=0)[0]
     assert targets.yaw_deg[leg][0] == pytest.approx(np.degrees(np.arctan2(step[0], step[1])) % 360.0, abs=1e-6)
     assert east.min() < -375
+    seen = prediction.sources["LW1.USRP1"].targets(targets.position_m[leg], targets.yaw_deg[leg], targets.up[leg])
+    down = 0.6 * np.linalg.norm(step) * np.ones(leg.sum())  # nose down, as all nine field flights were logged
+    leaning = rotation_from_aircraft(0 * down, -down, targets.yaw_deg[leg])
+    at_uav = np.einsum("nji,nj->ni", leaning, -seen.at_tower)
+    np.testing.assert_allclose(seen.at_uav, at_uav, atol=1e-3)
 
 
 def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(prediction):

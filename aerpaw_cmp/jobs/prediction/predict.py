@@ -444,7 +444,8 @@ def _levels(
     for k, source in enumerate(sources.values()):
         for rows, share in _in_parts(targets):
             position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
-            each = [source.targets(position, np.where(np.isfinite(yaw), yaw, turn)) for turn in _turns(yaw)]
+            up = np.broadcast_to(targets.up, targets.position_m.shape)[rows]
+            each = [source.targets(position, np.where(np.isfinite(yaw), yaw, turn), up) for turn in _turns(yaw)]
             level[k, rows], slow[k, rows], guess[k, rows] = model.levels(each, int(targets.known.sum()))
             level[k, rows] += source.free_space_db(position)
             progress(f"predict {source.antenna}", share)

@@ -29,7 +29,7 @@ from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
 from ...site.site import Site
 from ..learning.calibrate import load_calibration
 from ..tasks.manifest import inputs_of_flight
-from .where import is_settings, level_samples
+from .where import UPRIGHT, is_settings, level_samples
 
 _REPLAYED_AT_ONCE = 20_000
 
@@ -121,9 +121,10 @@ class Source:
         place, link = self.tower_m[None, :], self.link
         return np.asarray(free_space_dbm(place, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
 
-    def targets(self, position_m: FloatArray, yaw_deg: FloatArray) -> LinkSamples:
-        """Targets (n,) of a level aircraft as samples without a level."""
-        return level_samples((self.tower, self.channel), self.tower_m, position_m, yaw_deg, np.zeros(len(yaw_deg)))
+    def targets(self, position_m: FloatArray, yaw_deg: FloatArray, up: FloatArray = UPRIGHT) -> LinkSamples:
+        """Targets (n,) of an aircraft of an upward axis (3,) or (n, 3) as samples without a level."""
+        time_s = np.zeros(len(yaw_deg))
+        return level_samples((self.tower, self.channel), self.tower_m, position_m, yaw_deg, time_s, up)
 
     def replayed_db(self, samples: LinkSamples) -> FloatArray:
         """Replayed level above free space (n,) of a level aircraft [dB]; NaN without a path."""

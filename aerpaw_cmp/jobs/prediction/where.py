@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +18,10 @@ from ...flight.gains.memory import load_with_learned
 from ...flight.pose.heights import raised
 from ...flight.pose.track import interpolated
 from ...flight.settings import FlightFile
-from ...flight.simulate import planned_poses
+from ...flight.simulate import LEAN_DEG_PER_MPS, planned_poses
 from ...logs.route import read_route
 from ...maps.grid import Grid
-from ...propagation.geometry.arrays import rotation_from_aircraft
+from ...propagation.geometry.arrays import rotation_from_axes
 from ...site.inputs import inputs_of_site
 from ...site.site import Site
 from ..tasks.manifest import inputs_of_flight
@@ -33,6 +33,9 @@ STEP_M = 10.0
 SPEED_MPS = 8.0
 
 _MOST_POINTS = 2_000_000
+
+# Upward axis of level flight.
+UPRIGHT = np.array([0.0, 0.0, 1.0])
 
 # Points further away are none [m].
 NEAR_M = 1e6
@@ -52,6 +55,8 @@ class Targets:
         Clockwise from north; NaN: unknown, all headings count alike.
     time_s : (n,)
         Since the first point.
+    up : (3,) or (n, 3), optional
+        Upward axis of the aircraft; level flight without.
     grid : Grid, optional
         Of a grid: the points are its positions, height after height.
     heights_m : tuple of float
@@ -63,6 +68,7 @@ class Targets:
     position_m: FloatArray
     yaw_deg: FloatArray
     time_s: FloatArray
+    up: FloatArray = field(default_factory=lambda: UPRIGHT)
     grid: Grid | None = None
     heights_m: tuple[float, ...] = ()
     remarks: tuple[str, ...] = ()
@@ -99,9 +105,14 @@ class TargetOptions:
 
 
 def level_samples(
-    end: tuple[str, str], tower_m: FloatArray, position_m: FloatArray, yaw_deg: FloatArray, time_s: FloatArray
+    end: tuple[str, str],
+    tower_m: FloatArray,
+    position_m: FloatArray,
+    yaw_deg: FloatArray,
+    time_s: FloatArray,
+    up: FloatArray = UPRIGHT,
 ) -> LinkSamples:
-    """Points of a level aircraft as samples without a level.
+    """Poses of an aircraft as samples without a level.
 
     Parameters
     ----------
@@ -113,13 +124,14 @@ def level_samples(
     yaw_deg : (n,)
         Clockwise from north.
     time_s : (n,)
+    up : (n, 3), optional
+        Upward axis; level flight without.
 
     Returns
     -------
     LinkSamples
     """
-    rotation = rotation_from_aircraft(0.0 * yaw_deg, 0.0 * yaw_deg, yaw_deg)
-    at_uav, at_tower = link_directions(tower_m, position_m, rotation)
+    at_uav, at_tower = link_directions(tower_m, position_m, rotation_from_axes(yaw_deg, up))
     return LinkSamples(
         flight="",
         tower=end[0],
@@ -214,7 +226,20 @@ def _grid(site: Site, options: TargetOptions) -> Targets:
 def _planned(flight: FlightFile, site: Site) -> Targets:
     assert flight.flight.plan is not None
     time, position, yaw = planned_poses(flight.flight.plan, site.takeoff_ground_m, 1.0)
-    return Targets(kind="route", name=flight.flight.name, position_m=position, yaw_deg=yaw % 360.0, time_s=time)
+    up, name = _leaning(position, time), flight.flight.name
+    return Targets(kind="route", name=name, position_m=position, yaw_deg=yaw % 360.0, time_s=time, up=up)
+
+
+def _leaning(position_m: FloatArray, time_s: FloatArray) -> FloatArray:
+    """Upward axes (n, 3) of a multicopter on its way: it leans into its motion."""
+    time = np.maximum.accumulate(time_s)
+    # over two seconds: positions of a log are rounded, and aircraft lean no faster
+    begin, end = np.clip(time - 1.0, time[0], None), np.clip(time + 1.0, None, time[-1])
+    moved = interpolated(end, time, position_m) - interpolated(begin, time, position_m)
+    up = np.radians(LEAN_DEG_PER_MPS) * moved / np.maximum(end - begin, 1e-9)[:, None]
+    # the angle stands for its tangent: a jump of the positions turns no aircraft over
+    up[:, 2] = 1.0
+    return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
 
 
 def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
@@ -230,6 +255,7 @@ def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
         name=flight.flight.name,
         position_m=pose.position_m[pose.valid],
         yaw_deg=pose.heading_deg[pose.valid],
+        up=pose.rotation[pose.valid][:, :, 2],
         time_s=((time - time[0]) / np.timedelta64(1, "s"))[pose.valid],
         remarks=("The flight file has no plan: its track is the route. Its levels are not used.",),
     )
@@ -292,4 +318,5 @@ def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
         position = interpolated(at, along, position)
         yaw, time = yaw[leg], at / SPEED_MPS
         remarks += (f"Points every {STEP_M:g} m; times by a speed of {SPEED_MPS:g} m/s.",)
-    return Targets(kind="route", name=where.stem, position_m=position, yaw_deg=yaw, time_s=time, remarks=remarks)
+    up = _leaning(position, time)
+    return Targets(kind="route", name=where.stem, position_m=position, yaw_deg=yaw, time_s=time, up=up, remarks=remarks)

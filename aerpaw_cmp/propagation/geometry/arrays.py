@@ -166,6 +166,24 @@ def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg:
     return rotation_from_yaw_pitch_roll(np.pi / 2 - np.radians(yaw_deg), -np.radians(pitch_deg), np.radians(roll_deg))
 
 
+def rotation_from_axes(yaw_deg: FloatArray, up: FloatArray) -> FloatArray:
+    """Body-to-site rotation (n, 3, 3) of noses that head ``yaw_deg`` (n,) and upward axes ``up``, (3,) or (n, 3).
+
+    Examples
+    --------
+    >>> roll, pitch, yaw = np.array([[5.0], [-9.0], [70.0]])
+    >>> leaning = rotation_from_aircraft(roll, pitch, yaw)
+    >>> np.allclose(rotation_from_axes(yaw, leaning[:, :, 2]), leaning)
+    True
+    """
+    yaw, up = np.radians(yaw_deg), np.broadcast_to(up, (len(yaw_deg), 3))
+    nose = np.stack([np.sin(yaw), np.cos(yaw), 0.0 * yaw], axis=1)
+    # level, then down along the vertical until it is square to the upward axis: its bearing stays
+    nose[:, 2] = -(nose * up).sum(axis=1) / up[:, 2]
+    nose /= np.linalg.norm(nose, axis=1, keepdims=True)
+    return np.stack([nose, np.cross(up, nose), up], axis=2)
+
+
 # Ports of the measurement comparison in arXiv 2502.10324, section VII-D
 # Positions along the tower array: spacings 60 mm, 1.68 m, 60 mm.
 _TOWER_PORTS_M = (0.0, 0.060, 1.740, 1.800)

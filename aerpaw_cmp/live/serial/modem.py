@@ -303,28 +303,9 @@ def _decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind:
     return values
 
 
-def _decode_rows(lines: Sequence[str], flags: list[str], command: str, names: Sequence[str]) -> Values:
-    """Rows of text fields under names; for answers kept for the record, not computed with.
-
-    Parameters
-    ----------
-    lines, flags, command
-        As for :func:`_decode_antennas`.
-    names : sequence of str
-        Of the fields, in order.
-
-    Returns
-    -------
-    dict
-        ``{"rows": [{name: text or None}, ...]}``.
-    """
-    rows: list[Values] = []
-    for fields in _fields_of(lines, command, flags):
-        row: Values = dict(zip(names, fields, strict=False))
-        if len(fields) > len(names):
-            row["extra"] = fields[len(names) :]
-        rows.append(row)
-    return {"rows": rows}
+def _decode_text(lines: Sequence[str], _flags: list[str]) -> Values:
+    """For answers kept for the record, not computed with."""
+    return {"text": list(lines)}
 
 
 def _decode_csi_ctrl(lines: Sequence[str], flags: list[str]) -> Values:
@@ -359,7 +340,7 @@ QUERIES: Mapping[str, Query] = {
     for query in (
         Query("sync", "AT", (), _decode_nothing),
         Query("identity", "ATI", None, _decode_identity),
-        Query("firmware", "AT+CGMR", None, lambda lines, _flags: {"text": list(lines)}),
+        Query("firmware", "AT+CGMR", None, _decode_text),
         Query("csi_ctrl", 'AT+QNWCFG="csi_ctrl"', ('+QNWCFG:"csi_ctrl"',), _decode_csi_ctrl),
         Query("nr5g_csi", 'AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',), partial(_decode_csi, which="nr5g_csi")),
         Query("lte_csi", 'AT+QNWCFG="lte_csi"', ('+QNWCFG:"lte_csi"',), partial(_decode_csi, which="lte_csi")),
@@ -367,18 +348,8 @@ QUERIES: Mapping[str, Query] = {
         Query("qrsrp", "AT+QRSRP", ("+QRSRP:",), partial(_decode_antennas, command="+QRSRP", kind="rsrp_dbm")),
         Query("qrsrq", "AT+QRSRQ", ("+QRSRQ:",), partial(_decode_antennas, command="+QRSRQ", kind="rsrq_db")),
         Query("qsinr", "AT+QSINR", ("+QSINR:",), partial(_decode_antennas, command="+QSINR", kind="sinr_db")),
-        Query(
-            "qnwinfo",
-            "AT+QNWINFO",
-            ("+QNWINFO:",),
-            partial(_decode_rows, command="+QNWINFO", names=("act", "operator", "band", "channel")),
-        ),
-        Query(
-            "qcainfo",
-            "AT+QCAINFO",
-            ("+QCAINFO:",),
-            partial(_decode_rows, command="+QCAINFO", names=("role", "arfcn", "bandwidth", "band")),
-        ),
+        Query("qnwinfo", "AT+QNWINFO", ("+QNWINFO:",), _decode_text),
+        Query("qcainfo", "AT+QCAINFO", ("+QCAINFO:",), _decode_text),
     )
 }
 

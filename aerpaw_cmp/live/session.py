@@ -96,7 +96,6 @@ class TapStatus:
 
     Parameters
     ----------
-    elapsed_s : float
     connected : bool
     rank : int or None
         Of the last answer; None: no CSI.
@@ -120,7 +119,6 @@ class TapStatus:
         Something to be read once (a loss, a fault, an advice); empty on regular calls.
     """
 
-    elapsed_s: float
     connected: bool
     rank: int | None
     rsrp_dbm: int | None

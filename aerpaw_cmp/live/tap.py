@@ -627,7 +627,6 @@ class Tap:
             self._ri_times.popleft()
         window_s = min(RATE_WINDOW_S, max(1.0, (now - self._start_ns) / 1e9))
         status = TapStatus(
-            elapsed_s=(now - self._start_ns) / 1e9,
             connected=self._port is not None,
             rank=self._last["rank"],
             rsrp_dbm=self._last["rsrp_dbm"],

@@ -37,15 +37,14 @@ class Score:
 
     Parameters
     ----------
-    mae, rmse, bias : ndarray
-        Mean absolute, root mean square and mean (estimate - value) error; NaN where nothing was scored.
+    mae, rmse : ndarray
+        Mean absolute and root mean square error; NaN where nothing was scored.
     n : ndarray of int
         Scored positions.
     """
 
     mae: FloatArray
     rmse: FloatArray
-    bias: FloatArray
     n: IntArray
 
 
@@ -69,7 +68,6 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
     return Score(
         mean(np.abs(error)),
         np.sqrt(mean(error**2)),
-        mean(error),
         np.asarray(n, dtype=np.int64),
     )
 

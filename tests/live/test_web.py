@@ -56,7 +56,7 @@ class Hand:
 
     def status(self, **values):
         usual = dict.fromkeys(("rank", "rsrp_dbm", "sinr_db"))
-        usual |= {"elapsed_s": 1.0, "connected": True, "ri_rate_hz": 2.0, "gaps": 0, "records": 5, "bytes_written": 9}
+        usual |= {"connected": True, "ri_rate_hz": 2.0, "gaps": 0, "records": 5, "bytes_written": 9}
         self.put(TapStatus(**(usual | {"disk_free_bytes": 2**40} | values)))
 
     def open(self):

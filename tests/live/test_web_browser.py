@@ -78,7 +78,7 @@ class Flight:
                 self.feed.put(modem, record | fields)
 
     def status(self, modem=0, **values):
-        usual = {"elapsed_s": 1.0, "connected": True, "rank": 2, "rsrp_dbm": -90, "sinr_db": 12, "ri_rate_hz": 2.0, "gaps": 0,
+        usual = {"connected": True, "rank": 2, "rsrp_dbm": -90, "sinr_db": 12, "ri_rate_hz": 2.0, "gaps": 0,
                  "records": 5, "bytes_written": 9, "disk_free_bytes": 50 * 2**30, "predicts": True}  # fmt: skip
         self.feed.put(modem, TapStatus(**(usual | values)))
 

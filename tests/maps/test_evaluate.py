@@ -49,7 +49,6 @@ def test_score_closed_form():
     result = evaluate.score([[1.0, 2.0], [np.nan, 4.0], [3.0, np.nan]], [[2.0, np.nan], [9.0, 2.0], [0.0, 1.0]])
     assert result.mae.tolist() == [2.0, 2.0]
     assert result.rmse.tolist() == [np.sqrt(5.0), 2.0]
-    assert result.bias.tolist() == [-1.0, -2.0]
     assert result.n.tolist() == [2, 1]
     nothing = evaluate.score([np.nan], [1.0])
     assert np.isnan(nothing.mae)

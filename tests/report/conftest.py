@@ -122,7 +122,7 @@ def make_report() -> ReportData:
     )
     difference = rss[0].calibrated_db - rss[1].calibrated_db
     parted = ChannelDifference(
-        n=len(difference), mean_db=0.0, std_db=1.0, correlation=0.9, share_parted=0.0, interval_std_db=(0.9, 1.1),
+        n=len(difference), mean_db=0.0, std_db=1.0, correlation=0.9,
         spans=list(rss[0].spans),
     )  # fmt: skip
     pair = PairResult(

@@ -18,7 +18,7 @@ from ...common.geodesy import azimuth_rad, bearing_deg, elevation_rad
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray, db_from_power, power_from_db, unmasked
 from ..offset import SPAN_DB, OffsetFit, grid_offset, identifiable_range, offset_curve
-from ..statistics.intervals import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
+from ..statistics.intervals import ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
 
 # Two channels of one receiver "part" where they differ by more than this [dB].
 PART_DB = 10.0
@@ -472,10 +472,6 @@ class ChannelDifference:
         Samples that both have.
     mean_db, std_db, correlation : float
         Of first minus second.
-    share_parted : float
-        Share of samples at which they differ by more than the threshold after removing the mean.
-    interval_std_db : (low, high)
-        95 % interval of ``std_db``.
     spans : list of ErrorSpan
         Where they part, with the geometry there.
     """
@@ -484,8 +480,6 @@ class ChannelDifference:
     mean_db: float = float("nan")
     std_db: float = float("nan")
     correlation: float = float("nan")
-    share_parted: float = float("nan")
-    interval_std_db: Interval = NO_INTERVAL
     spans: list[ErrorSpan] = field(default_factory=list)
 
 
@@ -531,7 +525,5 @@ def channel_difference(
         mean_db=mean,
         std_db=float(residual[ok].std()),
         correlation=correlation(first, second),
-        share_parted=float(np.mean(np.abs(residual[ok]) > PART_DB)),
-        interval_std_db=error_intervals(second[ok], first[ok]).rmse_db,
         spans=spans,
     )

@@ -8,7 +8,6 @@ from pathlib import Path
 from ..common.counting import counted
 from ..common.errors import UsageError
 from .record.log import LogSettings
-from .serial.modem import OTHER_QUERIES, RI_QUERY, query_of
 from .serial.ports import Roots
 
 
@@ -25,9 +24,7 @@ class TapSettings:
     ri_hz : float
         Rate of ``nr5g_csi`` [Hz].
     other_hz : float
-        Rate of each query in ``queries`` [Hz].
-    queries : tuple of str
-        Names in :data:`~aerpaw_cmp.live.serial.modem.QUERIES`.
+        Rate of each of :data:`~aerpaw_cmp.live.serial.modem.OTHER_QUERIES` [Hz].
     pause_s : float
         Rest between an answer and the next command [s].
     answer_timeout_s : float
@@ -60,7 +57,6 @@ class TapSettings:
     port: str | None = None
     ri_hz: float = 2.0
     other_hz: float = 1.0
-    queries: tuple[str, ...] = OTHER_QUERIES
     pause_s: float = 0.02
     answer_timeout_s: float = 2.0
     probe_timeout_s: float = 1.0
@@ -84,10 +80,6 @@ class TapSettings:
                 raise UsageError(f"{name} is {getattr(self, name)}", expected="zero or a positive number")
         if self.no_csi_alarm_s is not None and not self.no_csi_alarm_s > 0:
             raise UsageError(f"no_csi_alarm_s is {self.no_csi_alarm_s}", expected="a positive number of seconds")
-        for name in self.queries:
-            query_of(name)
-        if RI_QUERY in self.queries:
-            raise UsageError(f"{RI_QUERY!r} stands in queries", expected="it only at its own rate, ri_hz")
 
 
 @dataclass(frozen=True, slots=True)

@@ -25,7 +25,7 @@ from .record.log import Clock, SegmentLog, boot_id, clock_synchronised
 from .record.writer import LogWriter
 from .schedule import Schedule
 from .serial.framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
-from .serial.modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
+from .serial.modem import OTHER_QUERIES, QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
 from .serial.ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
 from .session import TapSettings, TapStatus, TapSummary, format_status
 from .status_notifier import StatusNotifier
@@ -90,7 +90,7 @@ class Tap:
         self._log = LogWriter(SegmentLog(settings.folder, self._header, settings.log, self._clock))
         periods = {RI_QUERY: int(1e9 / settings.ri_hz)}
         if settings.other_hz > 0:
-            periods |= {name: int(1e9 / settings.other_hz) for name in settings.queries}
+            periods |= {name: int(1e9 / settings.other_hz) for name in OTHER_QUERIES}
         self._schedule = Schedule(periods)
         self._port: SerialPort | None = None
         self._info: PortInfo | None = None
@@ -689,7 +689,7 @@ class Tap:
             "settings": {
                 "ri_hz": settings.ri_hz,
                 "other_hz": settings.other_hz,
-                "queries": list(settings.queries),
+                "queries": list(OTHER_QUERIES),
                 "pause_s": settings.pause_s,
                 "answer_timeout_s": settings.answer_timeout_s,
                 "sync_interval_s": settings.log.sync_interval_s,

@@ -15,6 +15,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.predict import Prediction
 from aerpaw_cmp.live.record.log import Clock, LogSettings
 from aerpaw_cmp.live.schedule import Schedule
+from aerpaw_cmp.live.serial.modem import OTHER_QUERIES
 from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status, run_tap
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER
@@ -49,7 +50,7 @@ def test_every_answer_is_in_the_log_once(modem, tap, tools, tmp_path):
     assert summary.exit_code == 0
     assert summary.answers["nr5g_csi"] == {"ok": len(logged)}
     asked = {r["query"] for r in records if r["kind"] == "exchange"}
-    assert asked == {"sync", "identity", "firmware", "csi_ctrl", "nr5g_csi", *TapSettings(tmp_path).queries}
+    assert asked == {"sync", "identity", "firmware", "csi_ctrl", "nr5g_csi", *OTHER_QUERIES}
     for r in records:
         if r["kind"] == "exchange":
             assert r["sent_mono_ns"] < r["last_mono_ns"]
@@ -419,9 +420,9 @@ def test_schedule_of_a_slow_modem_prefers_the_first_and_tells_what_it_missed():
 
 
 def test_status_line():
-    status = TapStatus(1.0, True, 3, -90, 21, 1.98, 1, 100, 2**21, 2**33)
+    status = TapStatus(True, 3, -90, 21, 1.98, 1, 100, 2**21, 2**33)
     assert format_status(status) == "rank 3  RSRP -90 dBm  SINR 21 dB  2.0 Hz  1 gap  2.0 MiB  disk 8.0 GiB"
-    status = TapStatus(1.0, False, None, None, None, 0.0, 0, 0, 0, None, alarm=True)
+    status = TapStatus(False, None, None, None, 0.0, 0, 0, 0, None, alarm=True)
     assert format_status(status) == "NO PORT  RSRP -  SINR -  0.0 Hz  0 gaps  0.0 MiB  disk ?  NO CSI"
 
 
@@ -431,8 +432,6 @@ def test_status_line():
         {"ri_hz": 0},
         {"ri_hz": float("nan")},
         {"other_hz": -1},
-        {"queries": ("imei",)},
-        {"queries": ("nr5g_csi",)},
         {"no_csi_alarm_s": 0},
     ],
 )

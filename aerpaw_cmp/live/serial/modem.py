@@ -389,13 +389,6 @@ def encode(command: str, *, allow_csi: bool = False) -> bytes:
     )
 
 
-def query_of(name: str) -> Query:
-    """The query of that name, or ``UsageError`` naming the known ones."""
-    if name in QUERIES:
-        return QUERIES[name]
-    raise UsageError(f"unknown query {name[:40]!a}", expected="one of " + ", ".join(QUERIES))
-
-
 def decode(name: str, lines: Sequence[str]) -> Decoded:
     """Meaning of the information lines of a query's answer; never raises on what a modem sends.
 
@@ -405,7 +398,7 @@ def decode(name: str, lines: Sequence[str]) -> Decoded:
     2
     """
     flags: list[str] = []
-    values = query_of(name).decode(lines, flags)
+    values = QUERIES[name].decode(lines, flags)
     return Decoded(values, tuple(dict.fromkeys(flags)))
 
 

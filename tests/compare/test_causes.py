@@ -76,6 +76,7 @@ def _planted() -> dict[str, LevelEvidence]:
         "gain step": replace(sound, measured_db=level + 6.0 * (time > 120)),
         "heading": replace(sound, measured_db=level + sound.turned_db[90.0]),
         "attitude": replace(sound, measured_db=level + 5.0 * np.sin(time**2), attitude_db={"logged": 5.0 * np.sin(time**2)}),
+        "telemetry": replace(sound, measured_db=level + 5.0 * np.cos(time**2), misread_db={"in feet": 5.0 * np.cos(time**2)}),
         "height": replace(sound, measured_db=level + 5.0 * np.cos(time / 9.0), raised_db={60.0: 5.0 * np.cos(time / 9.0)}),
         "tower": replace(sound, measured_db=sound.other_towers_db["LW3"] + noise),
         "pattern": replace(sound, measured_db=level + 5.0 * np.sin(np.radians(2 * sound.uav_azimuth_deg))),
@@ -88,7 +89,7 @@ def _planted() -> dict[str, LevelEvidence]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [name for name in TROUBLES if name != "clock"])
+@pytest.mark.parametrize("name", ["telemetry", *(name for name in TROUBLES if name != "clock")])
 def test_each_trouble_comes_back_with_its_number_and_a_step(name: str) -> None:
     evidence = _planted()[name]
     cause = flight_cause([evidence])

@@ -56,6 +56,22 @@ def test_the_rotation_of_an_aircraft_is_that_of_scipy():
     np.testing.assert_allclose(body_rotation(roll, pitch, yaw), rotation_from_aircraft(roll, pitch, yaw), atol=1e-14)
 
 
+_LOGGED = [
+    (2, -5, -100), (2, -5, -10), (7, 9, 11), (2, 5, 100), (-2, -5, 100),
+    (2, 100, -5), (100, -5, 2), (-5, 2, 100), (100, 2, -5), (-5, 100, 2),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("misread", "logged"), list(zip(tracks.MISREAD, _LOGGED, strict=True)))
+def test_a_misread_attitude_is_brought_back(misread, logged):
+    """Roll 2, pitch -5, yaw 100 degrees in ten wrong ways; the third has the course alone."""
+    t, turn = np.arange(5.0), body_rotation(0, 0, 100) if logged == (7, 9, 11) else body_rotation(2, -5, 100)
+    way, (roll, pitch, yaw) = 9 * body_rotation(0, 0, 100)[:, 0], logged
+    track = Track(telemetry(t, way[0] * t, way[1] * t, 10, roll_deg=roll, pitch_deg=pitch, yaw_deg=yaw), FRAME)
+    np.testing.assert_allclose(track.rotations_if(misread, at(t)), np.stack([turn] * 5), atol=1e-4)
+    np.testing.assert_allclose(track.pose_at(at(t)).rotation[0], body_rotation(*logged), atol=1e-9)
+
+
 def test_attitude_goes_the_short_way_round_north():
     track = Track(telemetry([0, 1], 0, 0, 10, roll_deg=2.0, pitch_deg=-1.0, yaw_deg=[350.0, 10.0]), FRAME)
     np.testing.assert_allclose(track.pose_at(at([0.5])).heading_deg % 360, [0.0], atol=0.05)

@@ -100,6 +100,8 @@ class LevelEvidence:
         so many metres; ``turned_db`` is empty for antennas without a pattern.
     attitude_db : mapping of str to (n,)
         Change of the predicted level with other values of ``rt.attitude``.
+    misread_db : mapping of str to (n,)
+        Change of the predicted level where the telemetry means something else, by that in words.
     other_towers_db : mapping of str to (n,)
         Predicted level of each other tower of the site.
     locked, serving : (n,), optional
@@ -122,6 +124,7 @@ class LevelEvidence:
     turned_db: Mapping[float, FloatArray] = field(default_factory=dict)
     raised_db: Mapping[float, FloatArray] = field(default_factory=dict)
     attitude_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    misread_db: Mapping[str, FloatArray] = field(default_factory=dict)
     other_towers_db: Mapping[str, FloatArray] = field(default_factory=dict)
     locked: FloatArray | None = None
     serving: FloatArray | None = None
@@ -646,6 +649,15 @@ def _height(e: LevelEvidence) -> Iterator[Trial]:
         yield _tuned(e, e.raised_db, raised)
 
 
+def _misread(e: LevelEvidence) -> Iterator[Trial]:
+    """Telemetry with other units, signs or columns than its reader takes it for."""
+    for meaning, change in e.misread_db.items():
+        yield Trial(
+            name="telemetry", cost=math.log(len(e.misread_db)), sentence=meaning,
+            next_step="check the telemetry's columns and units", change_db=change,
+        )  # fmt: skip
+
+
 def _tower(e: LevelEvidence) -> Iterator[Trial]:
     """The log of another tower."""
     for name, level in e.other_towers_db.items():
@@ -908,6 +920,6 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
 
 
 CANDIDATES: tuple[Callable[[LevelEvidence], Iterator[Trial]], ...] = (
-    _clock, _heading, _attitude, _height, _tower, _pattern, _cell,
+    _clock, _heading, _attitude, _misread, _height, _tower, _pattern, _cell,
     _lock, _no_detection, _flat, _floor, _saturation, _blocked, _gain_step,
 )  # fmt: skip

@@ -7,6 +7,7 @@ along the course and flagged. Nothing is dropped silently: :class:`TrackAccount`
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -46,6 +47,22 @@ REASONS = (
     "", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time", "no position of the tower",
     "below the site's ground plane",
 )  # fmt: skip
+
+
+# What a log may mean by its attitude: the columns that hold roll, pitch and yaw, their signs, and degrees that
+# the yaw lacks. A yaw without a sign is the course.
+MISREAD = {
+    "the logged yaw has the wrong sign": ([0, 1, 2], [1.0, 1.0, -1.0], 0.0),
+    "the logged yaw counts from east, counter-clockwise": ([0, 1, 2], [1.0, 1.0, -1.0], 90.0),
+    "the nose follows the course, not the logged yaw": ([0, 1, 2], [0.0, 0.0, 0.0], 0.0),
+    "the logged pitch has the wrong sign": ([0, 1, 2], [1.0, -1.0, 1.0], 0.0),
+    "the logged roll has the wrong sign": ([0, 1, 2], [-1.0, 1.0, 1.0], 0.0),
+    "the columns of pitch and yaw are exchanged": ([0, 2, 1], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll and yaw are exchanged": ([2, 1, 0], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll and pitch are exchanged": ([1, 0, 2], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll, pitch and yaw are shifted by one": ([1, 2, 0], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll, pitch and yaw are shifted by two": ([2, 0, 1], [1.0, 1.0, 1.0], 0.0),
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -382,6 +399,15 @@ class Track:
         parts = [self._pose_at(part) for part in np.array_split(instant, -(-len(instant) // AT_ONCE))]
         names = [field.name for field in dataclasses.fields(TrackPoses)]
         return TrackPoses(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+    def rotations_if(self, misread: str, times: ArrayLike | pd.Series) -> FloatArray:
+        """Rotations (n, 3, 3) at instants inside the track, were the logged angles as one of :data:`MISREAD` says."""
+        order, signs, east_deg = MISREAD[misread]
+        other = copy.copy(self)
+        other._attitude = self._attitude[:, order] * signs + [0.0, 0.0, east_deg]
+        if signs[2] == 0.0:
+            other._attitude[:, 2] = self._course_deg
+        return other._rotations((nanoseconds(times) - self.start_ns) * 1e-9)[0]
 
     def why_not(self, pose: TrackPoses) -> str:
         """Reason for most of the instants that have no pose."""

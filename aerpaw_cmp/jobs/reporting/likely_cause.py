@@ -14,9 +14,10 @@ from ...compare.flight_verdict import without_copies
 from ...compare.judge.causes import Cause, LevelEvidence, flight_cause, gains_by_direction
 from ...compare.level import rss
 from ...compare.result import RssResult
-from ...flight.data import FlightData, RssSeries
+from ...flight.data import FlightData, RssSeries, Times
 from ...flight.gains.learned_gain import mean_gain_db
-from ...flight.replay import FlightReplay, Replayed, attitude_rotation
+from ...flight.pose.track import MISREAD
+from ...flight.replay import FlightReplay, Replayed, attitude_rotation, telemetry_time
 from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
 from ...site.antenna.antennas import Isotropic
@@ -123,6 +124,7 @@ def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: R
         turned_db=changed(link.turned_db()),
         raised_db=changed(link.raised_db()),
         attitude_db=changed(link.attitude_db(data.settings.rt.attitude)),
+        misread_db=changed(link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid])),
         other_towers_db={name: predicted + change for name, change in changed(link.other_towers_db()).items()},
         locked=None if series.locked is None else series.locked[order],
         serving=None if series.serving is None else series.serving[order],
@@ -179,6 +181,24 @@ class _Direct:
             if mode != used
         }
 
+    def misread_db(self, data: FlightData, time: Times) -> dict[str, FloatArray]:
+        """Levels with telemetry that means something else, at the instants of the poses (m,)."""
+        poses, track, used = self.replayed.poses, self.replayed.track, data.settings.rt.attitude
+        if data.track is None or track is None:
+            return {}
+        ground_m, levels = data.track.ground_m, {}
+        for meaning, scale in (
+            ("the logged heights are in feet", _FOOT_M),
+            ("the logged heights were divided by 3.28", 1 / _FOOT_M),
+        ):
+            place = np.column_stack([poses.position_m[:, :2], ground_m + scale * (poses.position_m[:, 2] - ground_m)])
+            levels[meaning] = self._level(self.place_m, place, poses.rotation)
+        if used != "ignored" and self._has_pattern and track.attitude_known.any():
+            for meaning in MISREAD:
+                turned = dataclasses.replace(track, rotation=data.track.rotations_if(meaning, time))
+                levels[meaning] = self._level(self.place_m, poses.position_m, attitude_rotation(turned, used))
+        return levels
+
     def other_towers_db(self) -> dict[str, FloatArray]:
         """Levels from each other tower of the site."""
         poses = self.replayed.poses
@@ -204,5 +224,6 @@ class _Direct:
         return np.asarray(free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0] + gain)
 
 
+_FOOT_M = 0.3048
 # A track under another datum may begin so far below the ground [m].
 _BELOW_GROUND_M = 20.0

@@ -31,17 +31,27 @@ settings.load_profile("fixed" if os.environ.get("CI") else "further")
 for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 
-# nohup, and shells for jobs in the background, leave signals ignored, which every child of a test would inherit.
-signal.signal(signal.SIGINT, signal.default_int_handler)
-signal.signal(signal.SIGHUP, signal.SIG_DFL)
+# nohup, and shells for jobs in the background, leave signals ignored, which every child of a test would inherit. What
+# ends a run from outside (timeout, a closed terminal) does so as Ctrl-C: pytest then takes its folders away.
+for _ending in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+    signal.signal(_ending, signal.default_int_handler)
 
 # Nothing kept on this machine decides a test, and no test leaves anything in the user's cache. Workers of pytest-xdist
-# have a folder each; that this machine's LLVM works is found out once for all of them.
+# have a folder each, in that of the run; that this machine's LLVM works is found out once for all of them.
 _OF_ALL = os.environ.get("AERPAW_CMP_CACHE", "") if "PYTEST_XDIST_WORKER" in os.environ else ""
-_OWN = os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-tests-")
+_NAME = "aerpaw-cmp-tests-"
+_OWN = os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix=f"{_NAME}{os.getpid()}-", dir=_OF_ALL or None)
 if _OF_ALL:
     Path(_OF_ALL, "llvm").mkdir(exist_ok=True)
-    Path(os.environ["AERPAW_CMP_CACHE"], "llvm").symlink_to(Path(_OF_ALL, "llvm"))
+    Path(_OWN, "llvm").symlink_to(Path(_OF_ALL, "llvm"))
+else:
+    for _left in Path(_OWN).parent.glob(f"{_NAME}*-*"):  # by runs that were killed
+        try:
+            os.kill(int(_left.name.removeprefix(_NAME).partition("-")[0]), 0)
+        except ProcessLookupError:
+            shutil.rmtree(_left, ignore_errors=True)
+        except (PermissionError, ValueError):  # somebody else's, or of another name
+            continue
 
 
 # Files that take longest, by and large in that order.
@@ -102,7 +112,7 @@ def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> Non
 
 
 def pytest_unconfigure() -> None:
-    """Field logs and paths are some ten megabytes; that of the first process goes last."""
+    """Field logs and paths are some ten megabytes; the folder of the run, with all others in it, goes last."""
     shutil.rmtree(_OWN, ignore_errors=True)
 
 

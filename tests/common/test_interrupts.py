@@ -136,11 +136,12 @@ def test_each_signal_is_told_and_ends_with_its_code(name, code, monkeypatch, cap
         raise AssertionError("not interrupted")
 
     monkeypatch.setattr(__main__, "_run", job)
+    before = signal.getsignal(signal.SIGTERM)
     assert __main__.main(["ingest"]) == code
     word = "interrupted" if name == "SIGINT" else f"ended by {name}"
     assert capsys.readouterr().err == f"aerpaw-cmp: {word}; {tmp_path / 'out'} was not written\n"
     assert list(tmp_path.iterdir()) == []
-    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+    assert signal.getsignal(signal.SIGTERM) == before
 
 
 # A signal comes during a call of compiled code that lasts ten minutes; ``held`` lets the one of a second go on.

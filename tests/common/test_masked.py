@@ -85,7 +85,8 @@ def test_no_function_of_arrays_looks_under_a_mask() -> None:
     """``np.asarray`` of what a caller gave drops its mask; only times, whose gaps are NaT, are taken so."""
     seen, wrong = 0, []
     for path in ROOM.rglob("*.py"):
-        for function in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        content = path.read_text(encoding="utf-8")
+        for function in ast.walk(ast.parse(content if "ArrayLike" in content else "")):
             if isinstance(function, ast.FunctionDef):
                 arguments = [*function.args.posonlyargs, *function.args.args, *function.args.kwonlyargs]
                 arrays = {a.arg for a in arguments if a.annotation and "ArrayLike" in ast.unparse(a.annotation)}

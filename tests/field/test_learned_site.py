@@ -150,7 +150,7 @@ def test_learned_antennas_need_fewer_samples_than_two_rays() -> None:
     """LTE at 50 m from 90 m: 50 samples with learned antennas leave less than 200 with two rays and patterns."""
     script = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "learned_map.py"))
     bench = script["Bench"](REAL)
-    rmse = script["lte_height"](bench, *script["LTE"], repeats=300)
+    rmse = script["lte_height"](bench, *script["LTE"], repeats=150)
     # root mean square over draws of 50 samples, their median; the same of 200
     learned, two_ray, free = (rmse[name] for name in ("learned", "two-ray + patterns", "free space"))
     assert learned[0] < min(two_ray[2], free[0])

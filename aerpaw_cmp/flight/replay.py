@@ -460,7 +460,6 @@ def replay_poses(
     alone = engine == "image" and site.dem is None
     long = alone and len(poses) > BLOCK
     run = Run(
-        cache_dir=None if rt.advanced.cache else "",
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" or long or towers_m is not None else None,
         job=job,

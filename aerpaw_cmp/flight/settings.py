@@ -324,8 +324,6 @@ class AdvancedRt(StrictModel):
     """Replace P.833's specific attenuation and largest loss at the carrier."""
     maximum_gap_s: Positive = 3.0
     """Telemetry gaps longer than this are not bridged."""
-    cache: bool = True
-    """Keep Sionna's paths and the audit for the next run."""
 
 
 class RtSettings(StrictModel):

@@ -180,7 +180,7 @@ def test_a_key_is_of_everything_that_matters_and_of_nothing_else(flight: Path) -
     assert key == key_of(load_flight(flight), flight)
     assert key != key_of(overridden(settings, {"rt.max_depth": 1}), flight)
     assert key != key_of(overridden(settings, {"rss.advanced.lag_window_s": 7}), flight)
-    for aside in ({"flight.title": "other"}, {"rt.audit_links": 3}, {"rt.advanced.cache": False}):
+    for aside in ({"flight.title": "other"}, {"rt.audit_links": 3}):
         assert key == key_of(overridden(settings, aside), flight), aside
     log = flight.parent / settings.logs[0].path
     before = log.read_bytes()

@@ -114,7 +114,7 @@ SINGLE = {"layout": "single"}
 FLIGHT = planned(
     "room", [(-18, 8.0, 12), (6, 8.0, 6)], {"T": {"USRP1": 12.3}}, plan={"speed_mps": 4.0, "rss_interval_s": 0.1},
     site={"file": "site.yaml"}, timezone="UTC", link={"rss": {"carrier_hz": 3.3e9, "tower": SINGLE, "uav": SINGLE}},
-    rt={"audit_links": 3, "advanced": {"samples": 10_000, "cache": False}},
+    rt={"audit_links": 3, "advanced": {"samples": 10_000}},
 )  # fmt: skip
 
 

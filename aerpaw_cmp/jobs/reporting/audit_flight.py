@@ -33,7 +33,7 @@ from ...propagation.check.audit import Audit, Second, audit
 from ...propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
 from ...propagation.drivers.moving import site_with_tower_at
 from ...propagation.native.llvm import SionnaMissingError
-from ...propagation.options import Field, Run, Search
+from ...propagation.options import Field, Search
 from ...propagation.replay import PER_LINK
 from ...propagation.search.sionna import free_memory
 from ...site.site import Site
@@ -103,8 +103,6 @@ def _audit_or_read(
     data: FlightData, replays: Sequence[Replayed], progress: Progress, *, anew: bool
 ) -> AuditResult | None:
     """The audit, kept by its inputs; read, unless it is to be made anew, where this machine has it."""
-    if not data.settings.rt.advanced.cache:
-        return _audit(data, replays, progress)
     store, key = OutcomeStore(cache_folder("audits"), AuditResult), _content_of(data, replays)
     known: AuditResult | None = None if anew else store.load(key)
     if known is None and (made := _audit(data, replays, progress)) is not None:
@@ -171,8 +169,7 @@ def _of_series(rt: RtSettings, site: Site, replayed: Replayed, second: Second) -
         replayed.replay,
         Search(max_depth=rt.max_depth, samples=rt.advanced.samples),
         Field(loss=path_loss(site, rt, replayed.link.carrier_hz)),
-        Run(cache_dir=None if rt.advanced.cache else ""),
-        second,
+        second=second,
     )
 
 

@@ -138,8 +138,8 @@ class _Arrays:
         return name
 
 
-# Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit, caches.
-_WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links": True, "advanced": {"cache"}}}
+# Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit.
+_WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links"}}
 
 
 def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> list[dict[str, str]]:

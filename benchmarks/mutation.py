@@ -47,7 +47,7 @@ ROOMS = ("propagation", "compare", "flight", "maps")
 # Modules of the room `jobs` that decide what is scored, and on what.
 RULES = (
     "learning/calibrate", "reporting/compare_flight", "reporting/levels", "reporting/audit_flight", "reporting/ladder",
-    "reporting/flight_run", "campaigns/over_flights",
+    "reporting/flight_run", "campaigns/campaign",
 )  # fmt: skip
 
 TESTS = (

@@ -27,8 +27,7 @@ from .schedule import Schedule
 from .serial.framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
 from .serial.modem import OTHER_QUERIES, QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
 from .serial.ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
-from .session import TapSettings, TapStatus, TapSummary, format_status
-from .status_notifier import StatusNotifier
+from .session import StatusNotifier, TapSettings, TapStatus, TapSummary, format_status
 from .stop import Stop
 
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]

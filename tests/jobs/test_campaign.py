@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, run
+from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, pool_offsets, repeats, run, transfer_ranks
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Task, digest_of, outcome_store
-from aerpaw_cmp.jobs.campaigns.over_flights import pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.jobs.tasks.options import RunOptions
 from aerpaw_cmp.report.content.campaign import RankRow
 from tests.jobs.campaign_rows import rss_row

@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aerpaw_cmp.jobs.campaigns.campaign import pool_offsets
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Outcome, Task, fitted_to
-from aerpaw_cmp.jobs.campaigns.over_flights import pool_offsets
 from tests.jobs.campaign_rows import rss_row
 
 

@@ -8,27 +8,18 @@ PyKrige is benchmarks/kriging.py.
 
 import argparse
 import json
-import statistics
 import sys
 import tempfile
-import timeit
-from collections.abc import Callable
 from pathlib import Path
-from time import process_time
 from typing import Any
 
 import numpy as np
 
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.jobs.bench import path_search_ratios
+from aerpaw_cmp.jobs.bench import median_seconds, path_search_ratios
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.ingest import contest, write_sounder
-
-
-def median_seconds(action: Callable[[], Any], repeats: int) -> float:
-    """Median processor time after a warm-up: other work on the machine does not count."""
-    return statistics.median(timeit.repeat(action, timer=process_time, number=1, repeat=repeats + 1)[1:])
 
 
 def ingest_vs_pandas(lines: int) -> float:

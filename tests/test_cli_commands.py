@@ -103,7 +103,7 @@ def test_bench_json(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pyt
 
     monkeypatch.setattr(bench, "run_bench", one_of_them)
     result = json.loads(out_of(capsys, "bench", "--quick", "--poses", "6", "--json", "--report", tmp_path))
-    wanted = {"engine", "samples", "depth", "seconds", "links_per_s", "peak_mib", "missing_paths"}
+    wanted = {"engine", "samples", "arrays", "depth", "seconds", "links_per_s", "peak_mib", "missing_paths"}
     wanted |= {"extra_paths", "rss_max_error_db", "rss_rms_error_db", "rank_disagreement"}
     assert result["ladder"] == [{"model": "rays", "seconds": 0.5, "rmse_heldout_db": 3.0, "knee": True}]
     rows = result["replay"]["rows"]

@@ -1,9 +1,12 @@
-"""Speed against error of the engines, and the path search beside Sionna's, for ``aerpaw-cmp bench``."""
+"""Speed against error of the engines, and the tool beside its peers, for ``aerpaw-cmp bench``."""
 
 from __future__ import annotations
 
+import io
 import os
+import statistics
 import time
+import timeit
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias, TypeVar
@@ -51,7 +54,7 @@ def run_bench(
     report: Path | None = None,
     progress: Progress = logged,
 ) -> dict[str, Any]:
-    """Speed against error of the replay, and how many times faster than PathSolver its search is, from one run.
+    """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
 
     Parameters
     ----------
@@ -60,7 +63,7 @@ def run_bench(
     samples : tuple of int
         Rays per tower of the sionna engine.
     ratios : bool
-        Compare with PathSolver, too.
+        Compare with the peers, too.
     report : Path, optional
         Folder of a report, whose ladder of models is a table, too.
     progress : Progress
@@ -73,19 +76,12 @@ def run_bench(
     ladder = {} if report is None else {"ladder": _costs(report)}
     site, link, some = random_scene(poses)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
-    measured: dict[str, Any] = {}
-    if ratios:
-        progress("path search against PathSolver, at equal error and at 1e6 samples")
-        searches = path_search_ratios()
-        measured = {
-            "path_search_image_vs_sionna_equal_error": searches["equal_error"],
-            "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
-        }
+    measured = _against_peers(progress) if ratios else {}
     about = {"poses": poses, "towers": list(link.tower_arrays), "buildings": len(site.buildings)}
     return {
         "conditions": {**about, "cpus": os.cpu_count()},
         "replay": {"rows": rows},
-        "ratios": {name: value["ratio"] for name, value in measured.items()},
+        "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None},
         "details": measured,
         **ladder,
     }
@@ -107,6 +103,19 @@ def _costs(report: Path) -> list[Row]:
             for row in rows
         ]  # fmt: skip
     return [named(at, "model seconds rmse_heldout_db knee") for at in costs(models)]
+
+
+def _against_peers(progress: Progress) -> dict[str, Any]:
+    """Ratios to each peer, None without it; at equal error first."""
+    progress("path search against PathSolver, at equal error and at 1e6 samples")
+    searches = path_search_ratios()
+    progress("Kriging against PyKrige, reading against pandas")
+    return {
+        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
+        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
+        "kriging_vs_pykrige": kriging_vs_pykrige(),
+        "ingest_vs_pandas": ingest_vs_pandas(),
+    }
 
 
 # --- speed against error --------------------------------------------------------------------------------------------
@@ -138,10 +147,11 @@ def speed_against_error(
     -------
     list of dict
         Image engine first: once Sionna is loaded the process stays larger. Each row has ``engine``, ``samples`` (rays
-        per tower and batch), ``depth``, ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs answered),
-        ``peak_mib`` (of the whole process; 0 where the system does not say it), ``missing_paths`` and ``extra_paths``,
-        ``rss_max_error_db`` and ``rss_rms_error_db`` over links that both cover (None without one),
-        ``coverage_differs`` (links that one covers) and ``rank_disagreement`` by K.
+        per tower and batch), ``arrays`` (H of each element pair in ``float64``, whoever finds the paths), ``depth``,
+        ``seconds`` (wall time, warm), ``links_per_s`` (pose-tower pairs answered), ``peak_mib`` (of the whole process;
+        0 where the system does not say it), ``missing_paths`` and ``extra_paths``, ``rss_max_error_db`` and
+        ``rss_rms_error_db`` over links that both cover (None without one), ``coverage_differs`` (links that one covers)
+        and ``rank_disagreement`` by K.
     """
     reference = replay(site, link, poses, Search(max_depth=_DEPTH))
     rows = []
@@ -168,6 +178,7 @@ def _replayed(site: Site, link: Link, poses: Poses, reference: Replay, search: S
     return {
         "engine": search.engine,
         "samples": search.samples if sionna else None,
+        "arrays": "float64",
         "depth": search.max_depth,
         **named(difference, "missing_paths extra_paths coverage_differs"),
         **{name: value if np.isfinite(value) else None for name, value in errors.items()},
@@ -185,7 +196,7 @@ def _measured(action: Callable[[], T]) -> tuple[T, dict[str, float]]:
     return result, {"seconds": time.perf_counter() - started, "peak_mib": peak_mib()}
 
 
-# --- beside PathSolver ----------------------------------------------------------------------------------------------
+# --- beside the peers -----------------------------------------------------------------------------------------------
 
 
 def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5) -> dict[str, Any]:
@@ -261,6 +272,60 @@ def path_search_ratios(
             break
     enough = min(n for n, measured in at.items() if measured["extra_paths"] <= most["extra_paths"])
     return {"at": {f"{n:.0e}": measured for n, measured in sorted(at.items())}, "equal_error": at[enough]}
+
+
+def median_seconds(action: Callable[[], Any], repeats: int) -> float:
+    """Median processor time after a warm-up: other work on the machine does not count."""
+    return statistics.median(timeit.repeat(action, timer=time.process_time, number=1, repeat=repeats + 1)[1:])
+
+
+def kriging_vs_pykrige(positions: int = 2556) -> Row | None:
+    """One field off its samples, the same 20 neighbours and exponential variogram, against PyKrige's compiled part."""
+    try:
+        from pykrige.ok import OrdinaryKriging as Peer
+    except ImportError:
+        return None
+    from ..maps.kriging import OrdinaryKriging
+
+    generator = np.random.default_rng(2)
+    points, targets = generator.uniform(-1000.0, 1000.0, (2, positions, 2))
+    rank = generator.integers(1, 5, positions).astype(np.float64)
+
+    def ours() -> Any:
+        return OrdinaryKriging(lambda d: 0.9 * np.exp(-3.0 * d / 900.0), 20, np.inf).fit(points, rank).predict(targets)
+
+    def peer() -> Any:
+        model = Peer(*points.T, rank, "exponential", {"psill": 0.9, "range": 900.0, "nugget": 0.1})
+        return model.execute("points", *targets.T, backend="C", n_closest_points=20)
+
+    return _beside(ours, peer, positions=positions)
+
+
+def ingest_vs_pandas(lines: int = 20_523) -> Row:
+    """Reading as many lines of a power log as a real flight has, against ``pandas.read_csv(engine="c")``.
+
+    Ours gives UTC times, levels, flags and the account of every line; pandas columns of text and numbers.
+    """
+    import pandas as pd
+
+    from ..logs.readers import ReadOptions, by_name
+    from ..logs.writers import format_power_log
+
+    zone = "America/New_York"
+    times = np.datetime64("2025-03-02T15:00:00", "ns") + np.arange(lines) * np.timedelta64(32_760_000, "ns")
+    data = format_power_log(times, np.random.default_rng(1).normal(-40, 12, lines), zone)
+    reader, options = by_name("sounder_log"), ReadOptions(timezone=zone)
+    return _beside(
+        lambda: reader.read(data, options),
+        lambda: pd.read_csv(io.BytesIO(data), engine="c", header=None, sep=r"\s+"),
+        lines=lines,
+    )
+
+
+def _beside(ours: Callable[[], Any], peer: Callable[[], Any], **about: int) -> Row:
+    """Seconds of both sides and how many times faster ours is."""
+    seconds, theirs = median_seconds(ours, 5), median_seconds(peer, 5)
+    return {"ratio": theirs / seconds, "seconds_ours": seconds, "seconds_peer": theirs, **about}
 
 
 def random_scene(poses: int, *, buildings: int = 12, towers: int = 1, seed: int = 1) -> tuple[Site, Link, Poses]:

@@ -1,5 +1,7 @@
 """What the ratios of ``bench`` stand for; the times themselves are not tested."""
 
+import pytest
+
 from aerpaw_cmp.jobs import bench
 
 
@@ -23,3 +25,15 @@ def test_where_only_the_most_samples_find_all_that_is_equal_error(monkeypatch):
         bench, "path_search", lambda _poses, samples, **_: {"ratio": 1.0, "extra_paths": 10 // len(str(samples))}
     )
     assert bench.path_search_ratios(samples=(1_000, 10_000_000_000))["equal_error"]["extra_paths"] == 0
+
+
+def test_bench_tells_a_ratio_to_each_peer_of_the_contract(monkeypatch):
+    pytest.importorskip("pykrige")
+    kriging, ingest, searched = bench.kriging_vs_pykrige, bench.ingest_vs_pandas, {"ratio": 2.0}
+    monkeypatch.setattr(bench, "path_search_ratios", lambda: {"equal_error": searched, "at": {"1e+06": searched}})
+    monkeypatch.setattr(bench, "kriging_vs_pykrige", lambda: kriging(100))
+    monkeypatch.setattr(bench, "ingest_vs_pandas", lambda: ingest(500))
+    result = bench.run_bench(poses=2, samples=())
+    assert {"path_search_image_vs_sionna_1e6", "kriging_vs_pykrige", "ingest_vs_pandas"} <= set(result["ratios"])
+    for row in (result["details"][name] for name in ("kriging_vs_pykrige", "ingest_vs_pandas")):
+        assert row["ratio"] == pytest.approx(row["seconds_peer"] / row["seconds_ours"])

@@ -24,7 +24,7 @@ from ..shown import answered, records, say, show
 )
 def bench(
     poses: Annotated[int, Option(min=2, help="Poses of the flight that is replayed.")] = 200,
-    quick: Annotated[bool, Option("--quick", help="Few poses, at most 1e4 samples, no ratios.")] = False,
+    quick: Annotated[bool, Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
     report: Annotated[Path | None, Option(help="Folder of a report: what accuracy costs on its flight, too.")] = None,
 ) -> None:
     """Speed against error on this machine."""

@@ -67,19 +67,15 @@ class Watched(InProcess):
             done(place, function(item))
 
 
-# The computed tile of an order: what becomes of it, in a store, is what most of these tests are about.
-COMPUTED = {}
-
-
 @pytest.fixture(autouse=True, scope="module")
 def each_tile_is_computed_once():
+    """What becomes of a tile in a store is what most of these tests are about."""
+
     def tile(self, order, **progress):
         key = repr((self.settings, order))
-        if key not in COMPUTED:
-            COMPUTED[key] = real(self, order, **progress)
-        return COMPUTED[key]
+        return computed.get(key) or computed.setdefault(key, real(self, order, **progress))
 
-    real = mapping.SiteChannels.tile
+    real, computed = mapping.SiteChannels.tile, {}
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(mapping.SiteChannels, "tile", tile)
         yield

@@ -45,6 +45,7 @@ MEASURED = ("t", "rank", "rsrp", "sinr")
 PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
 # Faults that a record of unforeseen content can raise: it is left out of the page, and no poll waits for it.
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
+# a version, then two rows for each of sixteen modems at most; a longer one is no cursor of ours
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
 
@@ -69,6 +70,7 @@ class Rows:
 
     def after(self, first: int, most: int = CHUNK) -> tuple[int, str]:
         """Number of the first row given, and the rows from it on as little-endian floats in base64."""
+        # what the ring has overwritten is gone; beyond the end, where only a crafted cursor lies, is nothing
         first = max(first, self.count - self._size) if first <= self.count else self.count
         last = min(self.count, first + most)
         a, b = first % self._size * self._columns, last % self._size * self._columns
@@ -227,6 +229,7 @@ class Feed:
                 "alarms": [asdict(alarm) for alarm in self._alarms if alarm.version > version],
                 "ended": self._ended,
             }
+            # a message that was cut at CHUNK rows leaves the version behind, so that the next poll does not wait
             reached_version = self._version if complete else version
             return message, "-".join(map(str, [self.epoch, reached_version, *following]))
 
@@ -254,7 +257,7 @@ class Feed:
         for name in _STATUS:
             setattr(modem, name, getattr(status, name))
         if status.message and status.message not in _alarms_of(modem, self.now()).values():
-            self._note(modem, "message", status.message)
+            self._raise(modem, "message", status.message).end_s = self.now()  # a line without duration
 
     def _take(self, modem: _Modem, item: Record | TapStatus) -> None:
         if isinstance(item, TapStatus):
@@ -284,6 +287,7 @@ class Feed:
             cell = decoded.get("nr") or {}
             modem.rsrp_dbm, modem.sinr_db = _finite(cell.get("rsrp_dbm")), _finite(cell.get("sinr_db"))
         elif record["query"] == RI_QUERY:
+            # the modem looked at its state somewhere between the question and the end of its answer
             t = self._seconds(modem, (record["sent_mono_ns"] + record["last_mono_ns"]) // 2)
             rank = _finite(decoded.get("rank"))
             modem.rank = None if rank is None else int(rank)
@@ -291,6 +295,7 @@ class Feed:
                 modem.rank_s = t
             if record["status"] == "ok":
                 modem.times.append(t)
+            # levels come with another query, at a slower rate: the last known ones stand beside each rank
             modem.measured.add((t, modem.rank, modem.rsrp_dbm, modem.sinr_db))
             modem.sent.append((record["sent_utc_ns"], t))
 
@@ -309,6 +314,7 @@ class Feed:
         low, high = record.get("rank_interval") or (None, None)
         level_low, level_high = record.get("level_interval_dbm") or (None, None)
         level, offset = record.get("level_dbm"), modem.offset_db
+        # without an offset the replay says a level of its own scale, which no axis of RSRP can show
         level = None if level is None or offset is None else level + offset
         modem.predicted.add(
             (
@@ -336,10 +342,6 @@ class Feed:
         modem.connected, modem.ended, modem.gap_text = False, True, ""
 
     # alarms -----------------------------------------------------------------------------------------------
-
-    def _note(self, modem: _Modem, kind: str, text: str) -> None:
-        """Put a line without duration into the history."""
-        self._raise(modem, kind, text).end_s = self.now()
 
     def _raise(self, modem: _Modem, kind: str, text: str) -> Alarm:
         # version -1: numbered by the next _bump, as the present version may have been sent
@@ -388,6 +390,7 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
         alarms["disk"] = f"less than {_DISK_LOW_BYTES // 2**20} MiB left on the log's disk"
     if modem.step_s is not None and now - modem.step_s < _STEP_SHOWN_S:
         alarms["step"] = modem.step_text
+    # a line may wait before it is written, but none comes before its time: less counts on that side
     if modem.delay_s is not None and (modem.delay_s < -_CLOCK_OFF_S / 4 or modem.delay_s > _CLOCK_OFF_S):
         ahead = "ahead of" if modem.delay_s < 0 else "behind"
         alarms["clock"] = f"the telemetry's clock is {abs(modem.delay_s):.1f} s {ahead} this computer's"

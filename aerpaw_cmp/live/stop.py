@@ -51,12 +51,9 @@ class Stop:
             yield
             return
         signals = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
-        before = [(number, signal.signal(number, self._on_signal)) for number in signals]
+        before = [(number, signal.signal(number, lambda by, _: self(signal.Signals(by).name))) for number in signals]
         try:
             yield
         finally:
             for number, handler in before:
                 signal.signal(number, handler)
-
-    def _on_signal(self, number: int, _frame: object) -> None:
-        self(signal.Signals(number).name)

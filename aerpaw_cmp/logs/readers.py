@@ -228,7 +228,8 @@ def _way_out(head: bytes) -> str:
     if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
         if len(head) == HEAD_BYTES and b"\n" not in head:
             return f"no line ends in the first {HEAD_BYTES >> 10} KiB: an aborted copy, or no table"
-        fits = {quantity: [name for name in names if _looks_like(name, words)] for quantity, words in _LIKE.items()}
+        plain = {name: name.lower().replace("_", " ") for name in names}
+        fits = {what: [name for name in names if re.search(words, plain[name])] for what, words in _LIKE.items()}
         pairs = [f"--map {named[0]!r}={quantity}" for quantity, named in fits.items() if named]
         lacking = [quantity for quantity in ("time", "rss_db") if not fits[quantity]]
         example = f": {' '.join(pairs)}" if pairs else ""
@@ -242,10 +243,6 @@ _LIKE = {
     "time": r"time|date|clock|stamp|epoch|utc", "rss_db": r"power|level|signal|strength|rss|dbm|rsrp",
     "latitude_deg": r"\blat", "longitude_deg": r"\b(lon|lng)", "altitude_m": r"\b(alt|height|elev)",
 }  # fmt: skip
-
-
-def _looks_like(name: str, words: str) -> bool:
-    return re.search(words, name.lower().replace("_", " ")) is not None
 
 
 def _excerpt(head: bytes) -> str:

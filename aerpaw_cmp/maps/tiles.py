@@ -145,7 +145,8 @@ class Reach:
 
     def of(self, box_m: FloatArray) -> Site:
         """The site as it reaches a box (lowest and highest corner, 3)."""
-        towers = {name: tower for name, tower in self.site.towers.items() if self._reaches(tower, box_m)}
+        every, reach = self.site.towers.items(), self._range_m
+        towers = {name: tower for name, tower in every if np.linalg.norm(_apart(tower, box_m)) <= reach}
         if not any(_apart(tower, box_m).max() <= REACH_M for tower in towers.values()):
             towers = {}
         if self._every:
@@ -155,9 +156,6 @@ class Reach:
             near |= self._buildings_in_reach(tower, box_m)
         buildings = tuple(self.site.buildings[number] for number in np.flatnonzero(near))
         return replace(self.site, towers=towers, buildings=buildings)
-
-    def _reaches(self, tower: Tower, box_m: FloatArray) -> bool:
-        return bool(np.linalg.norm(_apart(tower, box_m)) <= self._range_m)
 
     def _buildings_in_reach(self, tower: Tower, box_m: FloatArray) -> BoolArray:
         """Buildings (buildings,) that can mirror or shade what one tower sends into a box."""

@@ -11,8 +11,9 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, pool_offsets, repeats, run, transfer_ranks
-from aerpaw_cmp.jobs.campaigns.campaign_tasks import Task, digest_of, outcome_store
+from aerpaw_cmp.jobs.campaigns.campaign_tasks import Outcome, Task, digest_of
 from aerpaw_cmp.jobs.tasks.options import RunOptions
+from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore
 from aerpaw_cmp.report.content.campaign import RankRow
 from tests.jobs.campaign_rows import rss_row
 from tests.json_page import unlisted
@@ -348,7 +349,7 @@ def test_a_dry_run_says_what_is_kept(folder: Path, capsys: pytest.CaptureFixture
     assert main(["campaign", str(path), "--dry-run", "--json", "--workers", "2", *keep]) == 0
     plan = json.loads(capsys.readouterr().out)
     stages = {stage["name"]: stage for stage in plan["stages"]}
-    store = outcome_store(folder / "outcomes")
+    store = OutcomeStore(folder / "outcomes", Outcome)
     for label, setting in settings.items():
         stage = stages[f"flights, {label}"]
         assert stage["work"] == "2 tasks, 1 kept"

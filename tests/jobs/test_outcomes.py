@@ -28,7 +28,6 @@ from aerpaw_cmp.jobs.campaigns.campaign_tasks import (
     compute,
     digest_of,
     kept_outcomes,
-    outcome_store,
     planned_tasks,
 )
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
@@ -46,7 +45,7 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def run_tasks(tasks: list[Task], workers: Workers, keep: Path | None = None) -> list[Outcome]:
     """All tasks in order, as a campaign runs them."""
-    store = None if keep is None else outcome_store(keep)
+    store = None if keep is None else OutcomeStore(keep, Outcome)
     outcomes, orders = kept_outcomes(tasks, store, logged)
     compute(orders, workers, outcomes, store, logged)
     return [outcomes[number] for number in range(len(tasks))]
@@ -167,7 +166,7 @@ def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path
     (first,) = run_tasks([task], InProcess(), keep=tmp_path)
     assert first.failure is None
     key = digest_of(task)
-    again = outcome_store(tmp_path).load(key)
+    again = OutcomeStore(tmp_path, Outcome).load(key)
     assert repr(again.rank) == repr(first.rank)
     assert [row.rmse_db for row in again.rss] == [row.rmse_db for row in first.rss]
     assert np.array_equal(again.rss[0].measured_db, first.rss[0].measured_db, equal_nan=True)
@@ -270,7 +269,7 @@ def compute_but_f2(task):
 campaign_tasks.run_task = compute_but_f2
 flight = Path(sys.argv[1])
 tasks = [campaign_tasks.Task(flight, f"f{i}", "as written", {"rss.advanced.lag_window_s": 10.0 + i}, None) for i in range(4)]
-store = campaign_tasks.outcome_store(Path(sys.argv[2]))
+store = campaign_tasks.OutcomeStore(Path(sys.argv[2]), campaign_tasks.Outcome)
 outcomes, orders = kept_outcomes(tasks, store, print)
 compute(orders, InProcess(), outcomes, store, print)
 """

@@ -26,8 +26,9 @@ from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile
 from ...report.content.campaign import CampaignData, Failure, PooledOffset, RankRow, RankTransfer, Repeat, RssRow
 from ..tasks.options import DEFAULT, RunOptions
+from ..tasks.outcomes import OutcomeStore
 from ..tasks.workers import open_workers
-from .campaign_tasks import Task, compute, counted_once, flight_data, kept_outcomes, outcome_store, planned_tasks
+from .campaign_tasks import Outcome, Task, compute, counted_once, flight_data, kept_outcomes, planned_tasks
 
 # Label of the only setting of a campaign that names none.
 _AS_WRITTEN = "as written"
@@ -97,7 +98,7 @@ def run(
         folder, logs_root = folder.absolute(), None if logs_root is None else logs_root.absolute()
     tasks, files, failures = campaign_tasks(campaign, folder, logs_root)
     settings = campaign.settings or {_AS_WRITTEN: {}}
-    store = None if keep is None else outcome_store(keep)
+    store = None if keep is None else OutcomeStore(keep, Outcome)
     with stages("flights"):
         outcomes, orders = kept_outcomes(tasks, store, progress)
     unread = [PlannedStage(failure.flight, one_line(failure.message)) for failure in failures]
@@ -284,6 +285,7 @@ def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
             common = [k for k in fits if other_flights and all(k in at for at in other_flights)]
             if not common:
                 continue
+            # K that all other flights have: a mean over fewer of them would compare unlike flights
             chosen = min(common, key=lambda k: finite_mean([at[k].total_variation for at in other_flights]))
             best = min(fits, key=lambda k: fits[k].total_variation)
             out.append(

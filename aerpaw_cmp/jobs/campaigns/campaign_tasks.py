@@ -194,11 +194,6 @@ def digest_of(task: Task) -> str:
     return task_key(settings, task_inputs(settings, task.path, task.logs_root))
 
 
-def outcome_store(keep: Path) -> OutcomeStore:
-    """The outcomes of campaigns in a folder."""
-    return OutcomeStore(keep, Outcome)
-
-
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
     """An outcome under the names of this campaign; series of samples stay for the first setting alone.
 

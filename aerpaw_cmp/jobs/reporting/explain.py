@@ -33,6 +33,7 @@ from ...propagation.drivers.moving import site_with_tower_at
 from ...propagation.geometry.arrays import Link, Poses
 from ...propagation.options import Engine
 from ...propagation.replay import Replay
+from ...report.names import iso_time
 from ...site.site import Site
 
 
@@ -131,7 +132,7 @@ def run_explain(
         flight=settings.flight.name,
         tower=tower,
         channel=series.channel,
-        time_utc=str(np.datetime_as_string(series.time[at].astype("datetime64[ms]"))) + "Z",
+        time_utc=str(iso_time(series.time[at])),
         time_s=seconds,
         position_m=tuple(float(x) for x in pose.position_m[0]),  # type: ignore[arg-type]
         transmit_power_dbm=link.transmit_power_dbm,
@@ -176,14 +177,10 @@ def _sample(series: RssSeries | RankSeries, time: str, zone: str | None) -> tupl
         raise UsageError(
             f"--time {time} is {abs(after_s) if after_s < 0 else after_s - span:.1f} s "
             f"{'before the first' if after_s < 0 else 'after the last'} sample of {series.tower}",
-            expected=f"0 to {span:.1f} s, or {_iso(first)} to {_iso(last)}",
+            expected=f"0 to {span:.1f} s, or {iso_time(first)} to {iso_time(last)}",
         )
     at = int(np.argmin(np.abs(series.time - instant)))
     return at, float((series.time[at] - first) / np.timedelta64(1, "s"))
-
-
-def _iso(time: Any) -> str:
-    return f"{np.datetime_as_string(time.astype('datetime64[ms]'))}Z"
 
 
 def _instant(text: str, first: Any, zone: str | None) -> Any:
@@ -232,7 +229,7 @@ def _pose(
 def _check_pose(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
     if not valid[0]:
         raise UsageError(
-            f"no pose is known at {_iso(series.time[at])}",
+            f"no pose is known at {iso_time(series.time[at])}",
             expected="a time with telemetry",
             cause="the telemetry starts later, ends earlier or has a gap (rt.advanced.maximum_gap_s)",
         )

@@ -329,16 +329,11 @@ def _decode_identity(lines: Sequence[str], flags: list[str]) -> Values:
     return values
 
 
-def _decode_nothing(_lines: Sequence[str], _flags: list[str]) -> Values:
-    """For commands without information lines."""
-    return {}
-
-
 # All that the tap may ask, by name.
 QUERIES: Mapping[str, Query] = {
     query.name: query
     for query in (
-        Query("sync", "AT", (), _decode_nothing),
+        Query("sync", "AT", (), lambda _lines, _flags: {}),
         Query("identity", "ATI", None, _decode_identity),
         Query("firmware", "AT+CGMR", None, _decode_text),
         Query("csi_ctrl", 'AT+QNWCFG="csi_ctrl"', ('+QNWCFG:"csi_ctrl"',), _decode_csi_ctrl),

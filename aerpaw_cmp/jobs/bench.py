@@ -233,6 +233,7 @@ def path_search(poses: int = 1000, samples: int = 1_000_000, *, repeats: int = 5
     times = [search() for _ in range(repeats)]
     replay(site, link, some[:BATCH], rays, run=alone)  # compiles the kernels
     theirs = replay(site, link, some, rays, run=alone)
+    # half before and half after: a machine that grows slower meanwhile shifts both
     times += [search() for _ in range(repeats)]
     difference = compare(replay(site, link, some), theirs, np.arange(poses))
     seconds = float(np.median(times))

@@ -105,6 +105,7 @@ def channel_parts(
     check_band(chosen.bandwidth_hz or 0.0, link_settings.carrier_hz)
     link = link_settings.build(towers, data.folder)
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
+    # a speed over less than a second is the noise of the positions
     spans = max(1.0, chosen.step_s), max(3.0, 1.5 * chosen.step_s)  # steps of many seconds are no gaps
     velocity = velocities_mps(along.time_s, along.poses.position_m, *spans)
     if np.isfinite(velocity).any():
@@ -304,6 +305,7 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
         with stages("read"):
             data = (load_data if route is None else unread)(settings, flight.parent, options.logs_root)
         with output.filling() as place:
+            # formats that grow part by part are bounded by the disk, the others by the memory
             room = shutil.disk_usage(place).free if STREAMED.issuperset(formats) else None
             parts = channel_parts(data, replace(chosen, route=route), stages, room)
             written, metrics = write_channel(parts, place, formats, stages)

@@ -263,6 +263,7 @@ def _matched(mine: Any, theirs: Any) -> tuple[report_difference.Overlap, Any, An
         return table.assign(_key=instant, _turn=instant.groupby(instant).cumcount()).set_index(["_key", "_turn"])
 
     first, second = keyed(mine), keyed(theirs)
+    # most pairs: two reports of the same logs, whose join would take most of the time
     if first.index.equals(second.index):
         return report_difference.Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)

@@ -110,6 +110,7 @@ def run_ingest(
                 site = os.path.relpath(Path(site).resolve(), home.resolve())
             clock = {key: options.get(key) for key in ("timezone", "time_origin")}
             flights = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
+            # further flights of one folder: beside the first, since paths in a draft are relative to it
             numbered = (
                 draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(flights) + 1)
             )
@@ -297,6 +298,7 @@ def _with_audit(settings: Any, audit: str | None) -> Any:
     """The settings with as many audited links as the command line says."""
     if audit is None:
         return settings
+    # more links than any flight has
     numbers = {"full": 10**9, "none": 0}
     if audit not in numbers and not audit.isdecimal():
         raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
@@ -427,6 +429,7 @@ def run_map(
     from .prediction.sources import files_of, named_flights
     from .tasks.workers import open_workers
 
+    # before the site: a misspelt flight is told without reading a map
     known = named_flights(flights)
     place, progress = load_site(site), options.progress
     if flights and settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m)):
@@ -449,6 +452,7 @@ def run_map(
             outcome.corrected = corrected_maps(site, settings.spacing_m, heights, known, options.logs_root, stages)
         if outcome.settings.study:
             mapping.study_maps(outcome, stages)
+        # after the maps: what fails in them is told before minutes of replay
         outcome.flights = tuple(_compared(flight, options, stages) for flight in known)
         with output.filling() as part:
             with stages("export"):

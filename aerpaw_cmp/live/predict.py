@@ -113,6 +113,7 @@ class RunningInterval:
         outside = bounds is not None and not bounds[0] <= residual <= bounds[1]
         if bounds is not None:
             self.given += 1
+            # counted before the residual is taken in: an interval must not know what it is judged by
             self.inside += not outside
         if len(self._sorted) >= self._least:
             self._tails += self.STEP * (1.0 - self._share - outside)
@@ -142,6 +143,7 @@ class PredictionWorker:
 
     def __init__(self, predict: Predict) -> None:
         self._predict = predict
+        # one may wait: a prediction of the past would come too late for whoever flies
         self._wanted: queue.Queue[Asked | None] = queue.Queue(maxsize=1)
         self._done: deque[dict[str, Any]] = deque(maxlen=1000)
         self._rank, self._level = RunningInterval(), RunningInterval()

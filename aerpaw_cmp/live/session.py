@@ -78,6 +78,7 @@ class TapSettings:
     roots: Roots = field(default_factory=Roots)
 
     def __post_init__(self) -> None:
+        # asked this way round, NaN is refused as well
         for name in ("ri_hz", "answer_timeout_s", "probe_timeout_s", "silent_s", "status_s", "reconnect_min_s"):
             if not 0 < getattr(self, name) < 1e6:
                 raise UsageError(f"{name} is {getattr(self, name)}", expected="a positive number")
@@ -151,6 +152,7 @@ class StatusNotifier:
 
     def notify(self, status: TapStatus) -> None:
         """Pass a status on; a mere line is let go while others wait, a message only when memory is full."""
+        # a line is written over by the next one, a message is said once
         if status.message or self._queue.qsize() < 10:
             try:
                 self._queue.put_nowait(status)

@@ -387,6 +387,7 @@ class Tap:
         answer, decoded = self._exchange("csi_ctrl")
         state = (decoded.values.get("lte"), decoded.values.get("nr5g"))
         if self._settings.enable_csi and state != (1, 1):
+            # the state of the first connection: after a replug the modem may have forgotten it
             if None not in state and self._csi_before is None:
                 self._csi_before = (int(state[0] or 0), int(state[1] or 0))
             answer, _ = self._exchange("csi_ctrl", csi_write(1, 1))
@@ -457,6 +458,7 @@ class Tap:
         data = self._port.read()
         self._received += len(data)
         if self._first_bytes is not None:
+            # enough to tell NMEA and DIAG apart, however long a wrong port goes on
             self._first_bytes += data[: 4096 - len(self._first_bytes)]
         answer = None
         for event in self._framer.feed(data):
@@ -505,6 +507,7 @@ class Tap:
             if answer.status == "ok":
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
+                    # the pose at the middle of the exchange: nobody knows when in it the rank was taken
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
                     self._worker.ask(
                         Asked(middle, record["sent_utc_ns"], decoded.values.get("rank"), self._last["rsrp_dbm"])
@@ -522,12 +525,14 @@ class Tap:
             self._record({"kind": "late", "lines": lines, "status": event.status, "code": event.code, **self._now()})
         elif isinstance(event, Unsolicited):
             self._noise["lines"] += 1
+            # a port of another kind can fill the disk; lines of a modem are kept at any rate
             if self._noise["lines"] > _NOISE_LINES_PER_S and not is_unsolicited(event.text):
                 self._noise["bytes"] += len(event.text) + event.dropped
                 self._noise["not_kept"] += 1
                 return
             text = self._redactor.clean(event.text, cut=event.dropped > 0)
             self._record({"kind": "unsolicited", "lines": [text], "dropped_bytes": event.dropped, **self._now()})
+            # the modem restarted behind the same port: its CSI switch is as after power-on
             if event.text in ("RDY", "APP RDY"):
                 self._initialise_again = True
 
@@ -650,6 +655,7 @@ class Tap:
     def _record(self, record: Record) -> None:
         if self._log_open:
             self._append(record)
+        # before the log is open: a port that talks without end must not fill the memory
         elif len(self._early) < 10_000:
             self._early.append(record)
 

@@ -261,6 +261,7 @@ class _Server(ThreadingHTTPServer):
             head = request.recv(_PIECE, socket.MSG_PEEK)
         known = any(secret in head for secret in self._secrets)
         more = len(head) + 1
+        # a browser may send its head in pieces, the token in the last of them
         if head and not known and b"\r\n\r\n" not in head and request.getsockopt(*_LOW_WATER) < more <= _PIECE:
             request.setsockopt(*_LOW_WATER, more)  # readable again when more of it is there
             return
@@ -271,6 +272,7 @@ class _Server(ThreadingHTTPServer):
                 self.process_request(request, address)
                 return
             if head and self._allowed(address[0]):
+                # read first: closing a socket with unread bytes resets it, and the refusal would be lost
                 request.recv(_PIECE)
                 request.send(_NO_TOKEN)
         request.close()
@@ -279,6 +281,7 @@ class _Server(ThreadingHTTPServer):
         """Check whether an address may have one more refusal."""
         limits, now = self.web.limits, time.monotonic()
         if len(self._allowances) > _MOST_WAITING:
+            # a table without end would fill the memory; forgetting gives each address one more burst at most
             self._allowances.clear()
         left, counted = self._allowances.get(host, (limits.burst, now))
         left = min(limits.burst, left + (now - counted) * limits.per_second)

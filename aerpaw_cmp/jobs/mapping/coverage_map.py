@@ -426,6 +426,7 @@ def make_maps(
     crew = workers or InProcess()
     share = share_of(stages.progress, "maps")
     tile_cells = None if store is None else settings.tile_cells(grid)
+    # four tiles a worker: with one each all would wait for the slowest
     shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))
     tiling = Tiling(grid, tile_cells or (shared if crew.count > 1 else max(grid.shape)))
     with stages("maps"):
@@ -486,6 +487,7 @@ def _write_tiles(
     outcome.paths = int(store.paths().sum())
     step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
     outcome.maps |= store.read(empty, step)
+    # every n-th position has no neighbours at the distances that the study is about
     outcome.settings = replace(outcome.settings, study=False)
     outcome.tiles = {
         "store": str(store.path), "tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step,

@@ -270,6 +270,7 @@ def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
     out = []
     shapes = [("lawnmower", 0.0, False), ("lawnmower", 90.0, False), ("lawnmower", 0.0, True), ("cross", 0.0, False)]
     for height, (shape, azimuth, turns), nose in product(plan.heights_m, shapes, NOSES):
+        # where the aircraft turns on its legs all headings are flown already, whichever the nose
         if turns and nose != "along":
             continue
         pattern = Pattern(shape=shape, azimuth_deg=azimuth, height_m=height, nose=nose, turns=turns)  # type: ignore[arg-type]

@@ -47,6 +47,7 @@ def agreement_by_ground(
     known = known[spread_out(len(known), _POSES)]
     some = replayed.poses[poses[known]]
     agreed = []
+    # seeds 0, 1, ...: two reports of a flight draw the same grounds, and so state the same number
     for ground in ground_surface(model, data.site.frame).dems(map(np.random.default_rng, range(_DRAWS))):
         h = replay_poses(_on(data.site, ground), data.settings.rt, replayed.link, some).h[:, 0]
         agreed.append([float((channel_rank(h, k) == measured[known]).mean()) for k in ks])

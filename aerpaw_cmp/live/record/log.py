@@ -88,6 +88,7 @@ class _Syncer(threading.Thread):
 
     def _sync(self) -> None:
         with self._fd_lock:  # held while syncing: the descriptor must not be closed under it
+            # asked for twice while one sync ran, one more holds both
             fd, self._fd = self._fd, -1
             if fd >= 0:
                 os.fdatasync(fd)
@@ -253,6 +254,7 @@ class SegmentLog:
 
     def close(self) -> None:
         """Last attempt at what waits, sync, close."""
+        # the pause between attempts does not count any more
         self._retry_ns = 0
         if self.fault is not None:
             self._drain()
@@ -325,6 +327,7 @@ class SegmentLog:
         # what could not be cut off becomes a line of its own, which its checksum refuses
         data = b"\n" + line if self._torn else line
         written = os.write(self._fd, data)
+        # the disk filled up within the line
         if written < len(data):
             try:
                 os.ftruncate(self._fd, self._size)

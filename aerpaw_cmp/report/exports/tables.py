@@ -267,6 +267,7 @@ def _times(time: Any, part: slice) -> dict[str, Any]:
     known = instants[~np.isnat(instants)]
     if not len(known):
         return {"time_utc": "", "time_s": np.full(len(instants[part]), np.nan)}
+    # of the whole table, not of these rows: a part must count as the one before it did
     first = known.min()
     seconds = (instants[part] - first) / np.timedelta64(1, "s")
     return {"time_utc": iso_time(instants[part]) if has_wall_clock(first) else "", "time_s": seconds}

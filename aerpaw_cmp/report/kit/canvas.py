@@ -407,6 +407,7 @@ def runs(mask: BoolArray) -> list[tuple[int, int]]:
     >>> runs(np.array([True, False, True, True]))
     [(0, 0), (2, 3)]
     """
+    # zeros at both ends: a stretch that begins or ends with the flight has its edges, too
     edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
     return list(zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True))
 
@@ -620,6 +621,7 @@ def frame_around(
     east, north = east[good], north[good]
     width = max(float(np.ptp(east)) * (1 + 2 * margin), least_m)
     height = max(float(np.ptp(north)) * (1 + 2 * margin), least_m)
+    # equal scales: what one axis needs, the other gets in proportion
     width, height = max(width, height * shape), max(height, width / shape)
     middle_east, middle_north = (east.min() + east.max()) / 2, (north.min() + north.max()) / 2
     ax.set_xlim(middle_east - width / 2, middle_east + width / 2)

@@ -48,6 +48,7 @@ def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS)
     total = sum(len(p.time) for p in data.rss) + sum(len(p.time) for p in data.rank)
 
     def share(n: int) -> int:
+        # 200: a short series beside a very long one keeps its course
         return n if total <= limit else max(200, limit * n // total)
 
     rss_settings = data.settings.get("rss") or {}
@@ -94,6 +95,7 @@ AXES = ("east", "north", "up")
 def _rss(
     panel: RssResult, source: Source | None, start: np.datetime64, arrays: PackedArrays, limit: int
 ) -> dict[str, Any]:
+    # of the residual too: its largest errors are what a reader looks for
     pick = keep_extremes([panel.measured_db, panel.residual_db], limit) if len(panel.time) else np.arange(0)
     models = [{"name": "ray tracing", **_fit(panel.score), "level": arrays.add(panel.simulated_dbm[pick]),
                "learned_here": panel.training}]  # fmt: skip
@@ -120,6 +122,7 @@ def _rss(
         channel |= {
             "files": list(source.files),
             "file": arrays.add(source.file[pick]),
+            # a 32-bit float holds no line number beyond 16 million
             "line": arrays.add(source.line[pick], "f8"),
         }
     return channel

@@ -14,6 +14,7 @@ import typer
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.cli.app import app
+from benchmarks import performance
 
 ROOT = Path(__file__).parents[1]
 PAGES = [
@@ -191,3 +192,26 @@ def test_pages_that_a_user_reads_are_short() -> None:
         if name not in long and not name.startswith("research/"):
             assert len(page.read_text(encoding="utf-8").split()) <= 1200, name
     assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1300
+
+
+def test_each_claim_of_security_names_a_test_that_exists() -> None:
+    table = (ROOT / "docs" / "security.md").read_text(encoding="utf-8").split("| claim | test |")[1].split("\n\n")[0]
+    rows = [line for line in table.splitlines() if line.startswith("| ") and "---" not in line]
+    assert len(rows) > 15
+    for row in rows:
+        path = None
+        named = re.findall(r"`((?:tests|benchmarks)/[\w/]+\.py)?(?:::|\.\.\.)?(\w+)?`", row.split("|")[2])
+        assert named, row
+        for file, name in named:
+            path = file or path
+            assert path is not None, row
+            text = (ROOT / path).read_text(encoding="utf-8")
+            assert not name or name in text, (path, name)
+
+
+@pytest.mark.skipif(
+    not (ROOT / "benchmarks" / "history.jsonl").is_file(), reason="no history yet: make bench-all makes it"
+)
+def test_the_page_of_performance_is_made_from_the_history() -> None:
+    history = performance.runs(performance.HISTORY)
+    assert (ROOT / "docs" / "performance.md").read_text(encoding="utf-8") == performance.page(history)

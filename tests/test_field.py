@@ -44,11 +44,6 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
     return run
 
 
-@pytest.fixture
-def everything(field_logs: Ingested) -> Ingested:
-    return field_logs
-
-
 @pytest.mark.parametrize("name", FLIGHTS)
 def test_report_completes_with_baselines_and_audit(report: Report, name: str) -> None:
     metrics = report(name)
@@ -113,18 +108,18 @@ def test_which_rank_when_is_predicted_little_better_than_by_chance(report: Repor
     assert 0.1 < at_10["kappa"] < 0.35
 
 
-def test_every_folder_is_read_and_accounted_for(everything: Ingested) -> None:
-    assert len(everything) > 15
-    for file in everything:
+def test_every_folder_is_read_and_accounted_for(field_logs: Ingested) -> None:
+    assert len(field_logs) > 15
+    for file in field_logs:
         result = file.result
         assert result.lines == result.accepted + len(result.rejected) + result.blank, file.path
         assert sum(len(s.frame) for s in result.streams if s.kind == "telemetry") <= result.accepted
         assert all(line.reason and line.number >= 1 for line in result.rejected), file.path
 
 
-def test_what_no_reader_takes_is_named_with_a_reason(everything: Ingested) -> None:
-    read = {Path(file.path).resolve() for file in everything}
-    skipped = {Path(file.path).resolve(): file.reason for file in everything.skipped}
+def test_what_no_reader_takes_is_named_with_a_reason(field_logs: Ingested) -> None:
+    read = {Path(file.path).resolve() for file in field_logs}
+    skipped = {Path(file.path).resolve(): file.reason for file in field_logs.skipped}
     there = {path.resolve() for path in REAL.rglob("*") if path.is_file() and not path.name.startswith(".")}
     # a member of an archive stands for it
     outside = {next(p for p in (path, *path.parents) if p.exists()) for path in read | set(skipped)}
@@ -134,10 +129,10 @@ def test_what_no_reader_takes_is_named_with_a_reason(everything: Ingested) -> No
 
 
 def test_ingest_of_the_whole_folder_through_the_command_line(
-    everything: Ingested, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+    field_logs: Ingested, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     """What is read was read above; here it is asked for as there, told and, one of six, written."""
-    some = Ingested(everything[::6], everything.skipped)
+    some = Ingested(field_logs[::6], field_logs.skipped)
 
     def read_above(paths: list[Path], *, options: ReadOptions, reader: str | None) -> Ingested:
         assert (paths, options, reader) == ([REAL], OPTIONS, None)

@@ -1,6 +1,7 @@
 """Campaigns: many flights and settings, pooled offsets, held-out fits, repeatability, failures as rows."""
 
 import csv
+import dataclasses
 import json
 import sys
 from pathlib import Path
@@ -11,7 +12,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, pool_offsets, repeats, run, transfer_ranks
-from aerpaw_cmp.jobs.campaigns.campaign_tasks import Outcome, Task, digest_of
+from aerpaw_cmp.jobs.campaigns.campaign_tasks import Outcome, Task, digest_of, fitted_to
 from aerpaw_cmp.jobs.tasks.options import RunOptions
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore
 from aerpaw_cmp.report.content.campaign import RankRow
@@ -373,3 +374,25 @@ def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:
     text = (folder / "traced_out" / "failures" / "broken2__as_written.txt").read_text(encoding="utf-8")
     assert "there is no such log" in text
     assert "Traceback (most recent call last)" in text
+
+
+def test_many_settings_are_held_in_the_memory_of_one() -> None:
+    """Series of samples stay for the first setting; shared offsets of the others come from their moments."""
+    rng, n = np.random.default_rng(3), 5000
+    every, held = [], []
+    for number in range(40):
+        simulated = np.where(np.arange(n) % 7, rng.normal(-58, 3, n), np.nan)
+        row = rss_row("f", "USRP0", rng.normal(-60, 3, n), simulated, heading_deg=rng.normal(90.0, 5.0, n))
+        every.append(dataclasses.replace(row, setting=f"s{number}"))
+        task = Task(Path("f.yaml"), "f", f"s{number}", {}, None, reference=number == 0)
+        held.append(fitted_to(task, Outcome(rss=(row,))).rss[0])
+    values = [getattr(row, field.name) for row in held for field in dataclasses.fields(row)]
+    arrays = {id(value): value.nbytes for value in values if isinstance(value, np.ndarray)}
+    assert sum(arrays.values()) < 16 * 8 * n  # of one setting: at most sixteen numbers a sample
+    done, groups = pool_offsets(held, "tower")
+    pooled, same = pool_offsets(every, "tower")
+    for a, b in zip(done, pooled, strict=True):
+        assert (a.pooled_offset_db, a.pooled_rmse_db) == (b.pooled_offset_db, b.pooled_rmse_db)
+        difference = b.simulated_dbm - b.measured_db
+        assert a.pooled_rmse_db == pytest.approx(np.sqrt(np.nanmean((difference - a.pooled_offset_db) ** 2)), rel=1e-12)
+    assert repr(groups) == repr(same)

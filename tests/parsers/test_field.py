@@ -18,13 +18,8 @@ pytestmark = pytest.mark.field
 OPTIONS = ReadOptions(timezone="America/New_York")
 
 
-@pytest.fixture
-def everything(field_logs: Ingested) -> Ingested:
-    return field_logs
-
-
-def test_every_known_log_is_read_to_the_last_line(everything: Ingested) -> None:
-    results = {str(Path(file.path).relative_to(REAL)): file.result for file in everything}
+def test_every_known_log_is_read_to_the_last_line(field_logs: Ingested) -> None:
+    results = {str(Path(file.path).relative_to(REAL)): file.result for file in field_logs}
     expected = {
         "telemetry/2022-01-13_13_57_23_vehicleOut.txt": ("vehicle_out", 1089, 0),
         "telemetry/2022-06-10_19_52_44_vehicleOut.txt": ("vehicle_out", 1662, 0),
@@ -49,9 +44,9 @@ def test_every_known_log_is_read_to_the_last_line(everything: Ingested) -> None:
         assert (result.reader, result.accepted, len(result.rejected)) == account, path
 
 
-def test_two_ports_of_srsenb_report_rank_two(everything: Ingested) -> None:
+def test_two_ports_of_srsenb_report_rank_two(field_logs: Ingested) -> None:
     """`int(dl_ri)` is 0 without a report and never above the two ports that the console says it opened."""
-    (file,) = (f for f in everything if "two_ports" in f.path)
+    (file,) = (f for f in field_logs if "two_ports" in f.path)
     (stream,) = file.result.streams
     rank = stream.frame["rank"]
     assert ((rank == 2).sum(), (rank == 1).sum(), rank.isna().sum()) == (1277, 3, 331)
@@ -59,16 +54,16 @@ def test_two_ports_of_srsenb_report_rank_two(everything: Ingested) -> None:
     assert not stream.frame["flag"].str.contains("rank_above_ports").any()
 
 
-def test_no_real_value_is_beyond_the_limits(everything: Ingested) -> None:
+def test_no_real_value_is_beyond_the_limits(field_logs: Ingested) -> None:
     """Limits flag what cannot be: nothing in the real logs."""
-    flags = {w for file in everything for s in file.result.streams for t in s.frame["flag"] for w in t.split(";")}
+    flags = {w for file in field_logs for s in file.result.streams for t in s.frame["flag"] for w in t.split(";")}
     assert not flags & {limit.flag for limit in LIMITS} | flags & set(UNSCORED)
 
 
-def test_other_files_are_not_taken_for_logs(everything: Ingested) -> None:
-    skipped = {str(Path(file.path).relative_to(REAL)) for file in everything.skipped}
+def test_other_files_are_not_taken_for_logs(field_logs: Ingested) -> None:
+    skipped = {str(Path(file.path).relative_to(REAL)) for file in field_logs.skipped}
     assert {"telemetry/AERPAW_Big_Geofence.kml", "antennas/rad_pat.mat", "sounder/rover_positions.txt"} <= skipped
-    (ue,) = [file for file in everything if file.path.endswith("2022-06-10_19_52_44_radio_log.txt")]
+    (ue,) = [file for file in field_logs if file.path.endswith("2022-06-10_19_52_44_radio_log.txt")]
     assert {stream.kind for stream in ue.result.streams} == {"rss", "kpi"}, "srsUE prints no rank"
 
 
@@ -177,15 +172,15 @@ READINGS = {
 
 
 @pytest.mark.parametrize("path", READINGS)
-def test_every_reading_of_the_file_is_a_record(everything: Ingested, path: str) -> None:
+def test_every_reading_of_the_file_is_a_record(field_logs: Ingested, path: str) -> None:
     """Levels of cells, counted by other means."""
-    (file,) = [file for file in everything if file.path.endswith(path)]
+    (file,) = [file for file in field_logs if file.path.endswith(path)]
     levels = [s for s in file.result.streams if s.attributes.get("quantity") == "RSRP"]
     assert sum(len(stream.frame) for stream in levels) == READINGS[path](path) > 60
 
 
-def test_clocks_and_heights_of_the_new_dialects(everything: Ingested) -> None:
-    files = {str(Path(file.path).relative_to(REAL)): file.result for file in everything}
+def test_clocks_and_heights_of_the_new_dialects(field_logs: Ingested) -> None:
+    files = {str(Path(file.path).relative_to(REAL)): file.result for file in field_logs}
     merged = files["aadm/vehicleOut_snr_merged.csv"].streams[0]
     assert merged.frame["altitude_m"][0] == pytest.approx(24.3002636, abs=1e-6), "above take-off, begun in the air"
     assert merged.attributes["height_from"] == "program"

@@ -7,8 +7,7 @@ from pathlib import Path
 from ..common.errors import UsageError
 from ..common.outputs import OutputFile, is_sealed, sealed
 from ..site.antenna.antennas import read_gain_grid
-from ..site.antenna.export import exported
-from ..site.antenna.pattern_files import read_cut_files, read_pattern_file
+from ..site.antenna.pattern_files import exported, read_cut_files, read_pattern_file
 from .tasks.options import JobOutcome
 
 

@@ -62,15 +62,10 @@ class CalibrationFile(StrictModel):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GroundFit:
-    """Roughness of the ground: log likelihood against no ground ray, per height of roughness tried [m]."""
+    """Roughness of the ground: log likelihood against no ground ray, per height tried [m]; infinite: no such ray."""
 
     roughness_m: tuple[float, ...]
     log_likelihood: tuple[float, ...]
-
-    @property
-    def best_m(self) -> float:
-        """Most probable height; infinite: no coherent ground ray."""
-        return self.roughness_m[int(np.argmax(self.log_likelihood))]
 
     @property
     def likely_m(self) -> tuple[float, float]:
@@ -83,7 +78,7 @@ class GroundFit:
     @property
     def used_m(self) -> float | None:
         """Height that a replay is to take: the most probable one, or None where no ground ray is as likely."""
-        return None if math.isinf(self.likely_m[1]) else self.best_m
+        return None if math.isinf(self.likely_m[1]) else self.roughness_m[int(np.argmax(self.log_likelihood))]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,5 +1,7 @@
 """Antenna files of any kind that is known by its content: measured spheres, one great circle, planning tools' cuts.
 
+Written: Sionna RT's custom pattern, MSI Planet's cuts, a table over the sphere.
+
 Cuts say nothing between them: a sphere is made of a horizontal and a vertical one by horizontal projection
 interpolation (F. Gil et al., IEEE Trans. Antennas Propag. 47, 1999, doi:10.1109/8.774131), which gives both cuts back.
 """
@@ -12,12 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from ...common.counting import counted
-from ...common.errors import InputError, parsed
+from ...common.errors import InputError, UsageError, parsed
 from ...common.files import LARGEST_TABLE, read_input
 from ...common.provenance import marks, trained_on
 from ...common.units import FloatArray, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
-from .sphere_pattern import COLUMNS, read_sphere_csv
+from .learned import BAND
+from .sphere_pattern import COLUMNS, SpherePattern, planning_cuts, read_sphere_csv, sphere_csv, sphere_grid
 
 # A half-wave dipole over an isotropic antenna.
 _DBI_OF_DBD = 2.15
@@ -252,3 +255,62 @@ def _cut_file(path: Path, angles: tuple[str, ...]) -> FloatArray:
     rows = _pairs([line.replace(",", " ") for line in lines], len(lines), path)
     rows[:, 0] = _CUT_ANGLES[begin] * rows[:, 0] - (90.0 if begin in ("th", "zen") else 0.0)
     return _each_degree(rows, path.name, path)
+
+
+def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: float | None = None) -> str:
+    """Text of a pattern in the format that the ending of a file says: ``.py`` (Sionna RT), ``.msi``, ``.csv``.
+
+    What the pattern was learned from goes along as comments.
+
+    Parameters
+    ----------
+    pattern : MeasuredPattern
+    name : str
+    target : Path
+    carrier_hz : float, optional
+        For ``.msi``, where the pattern has no frequency of its own.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    UsageError
+        Another ending; ``.msi`` without a frequency.
+    """
+    notes = getattr(pattern, "notes", "") or f"trained_on: {' '.join(pattern.trained_on)}" * bool(pattern.trained_on)
+    lines = tuple(line.lstrip("# ") for line in notes.splitlines())
+    if target.suffix == ".msi":
+        frequency = pattern.frequency_hz or carrier_hz
+        if not frequency or abs((carrier_hz or frequency) / frequency - 1.0) > BAND:
+            found = f"the pattern has {f'{frequency / 1e9:g} GHz' if frequency else 'no frequency'}"
+            raise UsageError(found, expected="--carrier HZ, within 2 % of the pattern's own", path=target)
+        return planning_cuts(pattern, name, frequency, lines)
+    theta, phi, _ = sphere_grid(STEP_DEG)
+    if target.suffix == ".csv":
+        check_power(pattern, target)  # what the reader of spheres asks: two cuts may make more power than goes in
+        at = np.meshgrid(np.radians(theta), np.radians(phi), indexing="ij")
+        sd = pattern.gain_sd_db(*at) if isinstance(pattern, SpherePattern) else np.zeros(at[0].shape)
+        return sphere_csv(pattern.gain_dbi(*at), sd, lines)
+    if target.suffix == ".py":
+        return _sionna_module(pattern, name, target, lines)
+    raise UsageError(f"the ending {target.suffix!r}", expected=".py (Sionna RT), .msi or .csv", path=target)
+
+
+def _sionna_module(pattern: MeasuredPattern, name: str, target: Path, notes: tuple[str, ...]) -> str:
+    import base64
+
+    theta, phi, _ = sphere_grid(STEP_DEG)
+    # closed at 360 deg: the module that is written interpolates within its table, not round its end
+    at = np.meshgrid(np.radians(theta), np.radians(np.append(phi, 360.0)), indexing="ij")
+    table = np.stack([part for field in pattern.field(*at) for part in (field.real, field.imag)], axis=-1)
+    template = Path(__file__).with_name("sionna_pattern.txt").read_text(encoding="utf-8")
+    return template.format(
+        name=re.sub(r"\W", "_", name),
+        module=re.sub(r"\W", "_", target.stem),
+        # notes stand in a docstring: a quote or a backslash of a file name would end it
+        notes="\n".join(re.sub(r'["\\]', "'", note) for note in notes),
+        table=base64.b64encode(table.astype("<f4").tobytes()).decode("ascii"),
+        shape=table.shape,
+    )

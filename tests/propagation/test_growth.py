@@ -9,6 +9,7 @@ from shapely.geometry import box
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.jobs.mapping.site_scene import export_scene
 from aerpaw_cmp.propagation.check.explain import why_not
 from aerpaw_cmp.propagation.geometry.paths import Links
 from aerpaw_cmp.propagation.options import Run, Search
@@ -18,7 +19,6 @@ from aerpaw_cmp.propagation.search import beams, prisms
 from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search.beams import grow_paths, reflection_points
 from aerpaw_cmp.propagation.search.merging import merged
-from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
 from aerpaw_cmp.site.scenes import placed_scene
 from aerpaw_cmp.site.site import Building

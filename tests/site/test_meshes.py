@@ -10,7 +10,7 @@ import pytest
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.site.export import export_scene
+from aerpaw_cmp.jobs.mapping.site_scene import export_scene
 from aerpaw_cmp.site.meshes import WALL_DEPTH_M, building_mesh, site_meshes
 from aerpaw_cmp.site.site import Building
 from aerpaw_cmp.site.siteyaml import load_site

@@ -179,13 +179,13 @@ def _class_palette(layer: Layer) -> list[str]:
 
 def _picture(grid: Grid, layer: Layer, low: float, high: float) -> bytes:
     """PNG with a block of pixels per cell: viewers that smooth must not mix classes."""
-    from matplotlib.image import imsave
+    from PIL import Image
 
     colours = (255 * _colours(layer, low, high)).round().astype(np.uint8)
-    cells = grid.raster(colours)[::-1]  # pictures begin in the north
-    pixels = np.repeat(np.repeat(cells, PIXELS_PER_CELL, axis=0), PIXELS_PER_CELL, axis=1)
+    cells = Image.fromarray(np.ascontiguousarray(grid.raster(colours)[::-1]))  # pictures begin in the north
+    picture = cells.resize((PIXELS_PER_CELL * cells.width, PIXELS_PER_CELL * cells.height), Image.Resampling.NEAREST)
     buffer = io.BytesIO()
-    imsave(buffer, np.ascontiguousarray(pixels), format="png")
+    picture.save(buffer, "PNG")
     return buffer.getvalue()
 
 

@@ -87,6 +87,13 @@ def test_a_planted_lag_is_found_although_no_gain_is_known(lag_s):
     assert set(clock.channels_s) == {"one", "two"}
 
 
+def test_two_loggers_at_one_tower_have_no_common_clock():
+    clock = judge_clock([channel(0.0, 1), channel(4.0, 2, name="two")])
+    assert clock.verdict == CANNOT_TELL
+    assert clock.reason.startswith("its channels have clocks of their own, one +0.")
+    assert clock.correction_s == 0.0
+
+
 def test_clocks_that_agree_are_ok_and_their_intervals_hold():
     """Twelve flights: a shift is never called where there is none, and at most one interval misses."""
     inside = 0

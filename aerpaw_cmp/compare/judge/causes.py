@@ -269,6 +269,8 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         if name in _OF_ANTENNA and any(table[_SOUND].evidence.antenna == "learned" for table in shown):
             certain, least_share = False, _LEARNED_SHARE
         fall_db = (1.0 - alone) * _rmse_db([table[_SOUND] for table in shown])
+        if name == _CATCH_ALL and not all(_tells_more(table[frozenset([name])]) for table in shown):
+            continue
         if fall_db >= _SHOWN_DB and (share <= 1.0 - least_share or certain):
             named[name] = shown
     if not named:
@@ -283,10 +285,16 @@ def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
     for evidence in filter(None, map(_binned, channels)):
         sound, (antenna,) = _fitted(evidence), _pattern(evidence)
         learned = _fitted(evidence, antenna, at=sound.memories)
-        fall_db = float(sound.residual_db.std() - learned.residual_db.std())
+        left_db = float(learned.residual_db.std())
+        fall_db = min(float(sound.residual_db.std()), float(evidence.measured_db.std())) - left_db
         if learned.log_likelihood > sound.log_likelihood + _SELDOM and fall_db >= _SHOWN_DB:
             return True
     return False
+
+
+def _tells_more(model: _Model) -> bool:
+    """Check that a model leaves less than a constant level: a log of noise alone likes another antenna better, too."""
+    return bool(model.residual_db.std() < model.evidence.measured_db.std())
 
 
 def _names(model: _Model) -> frozenset[str]:
@@ -744,7 +752,7 @@ def _lock(e: LevelEvidence) -> Iterator[Trial]:
         yield Trial(
             name="lock", cost=0.0, clipped=lost,
             sentence=f"the receiver had no lock in {100 * lost.mean():.0f} % of the seconds",
-            next_step="trust the error with the floor",
+            next_step="",  # the first sentence has the error with the floor already
         )  # fmt: skip
 
 
@@ -792,7 +800,7 @@ def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
 
 
 # At a limit of the receiver: so near to the last levels [dB], so large a share of the samples, which fade so much less.
-_PILE_DB, _LEAST_PILE, _MOST_FADING = 1.2, 0.1, 0.35
+_PILE_DB, _LEAST_PILE, _LEAST_CLIPPED, _MOST_FADING = 1.2, 0.1, 0.04, 0.35
 
 
 def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
@@ -801,7 +809,7 @@ def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
     pile = side * (e.measured_db - end) < _PILE_DB
     step = np.abs(np.diff(e.measured_db))
     inside, outside = pile[1:] & pile[:-1], ~(pile[1:] | pile[:-1])
-    if inside.sum() < max(_LEAST_BINS, _LEAST_PILE * len(pile)) or outside.sum() < _LEAST_BINS:
+    if inside.sum() < max(_LEAST_BINS, _LEAST_CLIPPED * len(pile)) or outside.sum() < _LEAST_BINS:
         return None
     return pile if np.median(step[inside]) < _MOST_FADING * np.median(step[outside]) else None
 

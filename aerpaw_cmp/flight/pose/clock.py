@@ -31,6 +31,10 @@ _SAME_S = 0.5
 # Clocks agree where every lag beyond this is excluded [s].
 _AGREE_S = 1.0
 
+# A channel that refuses the lag of all together by more has a clock of its own [nat]: real ones refuse it by 1.1 at
+# most, two loggers 4 s apart by 350.
+_APART_NAT = 12.0
+
 # Autopilots and loggers stamp their rows no better [s]: the interval is wider by this on either side.
 STAMPS_S = 0.25
 
@@ -342,12 +346,17 @@ def _judged(lags: FloatArray, nats: FloatArray, names: Sequence[str], window_s: 
         verdict, reason = SHIFTED, ""
     elif agree:
         verdict, reason = OK, ""
+    alone = {name: float(lags[value.argmax()]) for name, value in zip(names, nats[:, best], strict=True)}
+    refused = nats[:, best].max(axis=1) - nats[:, best, total.argmax()]
+    if refused.max() > _APART_NAT and np.ptp(list(alone.values())) > _AGREE_S:
+        each = ", ".join(f"{name} {Printed(lag):+.1f} s" for name, lag in alone.items())
+        verdict, reason = CANNOT_TELL, f"its channels have clocks of their own, {each}"
     return ClockEstimate(
         radio_minus_telemetry_s=float(lags[total.argmax()]),
         ci95_s=(low, high),
         verdict=verdict,
         reason=reason,
-        channels_s={name: float(lags[value.argmax()]) for name, value in zip(names, nats[:, best], strict=True)},
+        channels_s=alone,
         window_s=window_s,
         against_zero_nat=against,
     )

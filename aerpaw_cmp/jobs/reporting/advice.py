@@ -47,7 +47,7 @@ def next_step(data: FlightData, result: FlightResult, climbed: FlightLadder | No
         )
         return f"`rss: {{span_db: [{ends[0]:.0f}, {ends[1]:.0f}]}}`"
     if result.likely_cause is not None:
-        return result.likely_cause.next_step
+        return result.likely_cause.next_step or None
     if any(panel.further.trained_on for panel in result.series):
         return None
     if is_one_place(result.rss):

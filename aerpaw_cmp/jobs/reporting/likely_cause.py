@@ -55,7 +55,7 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     ]
     cause = flight_cause(evidence)
     if cause is not None:
-        return cause, cause.next_step
+        return cause, cause.next_step or None
     # learned antennas miss some decibels of any flight
     return None, _CALIBRATE if not data.settings.antennas and gains_by_direction(evidence) else None
 

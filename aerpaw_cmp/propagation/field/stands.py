@@ -190,7 +190,7 @@ def _pieces(start: FloatArray, end: FloatArray, corner: FloatArray, last: IntArr
     crosses = left[:, 1:] != left[:, :-1]  # a corner belongs to one of its sides alone
     # from one ring to the next there is no side
     crosses[:, last] = False
-    line, edge = np.nonzero(crosses)
+    line, edge = np.divmod(np.flatnonzero(crosses), crosses.shape[1])  # nonzero of a table takes five times as long
     (east, north), (side_east, side_north) = (corner[edge] - start[line]).T, (corner[edge + 1] - corner[edge]).T
     way_east, way_north = way[line].T
     share = (east * side_north - north * side_east) / (way_east * side_north - way_north * side_east)

@@ -228,7 +228,8 @@ class _Growth:
             height = last_image @ faces.normal.T - faces.offset_m
             # the source itself may lie on the face, an image may not: its reflection would be an edge of two faces
             good = usable & (height > self.tolerance_m if depth else height >= -self.tolerance_m)
-            row, face = np.nonzero(good & self.facing[now[:, -1]] if depth else good)
+            hit = good & self.facing[now[:, -1]] if depth else good
+            row, face = np.divmod(np.flatnonzero(hit), len(faces))
             if depth:
                 before = now[row, -1]
                 beam = last_image[row], box.corners_m[before], box.centre_m[face], box.reach_m[face]
@@ -402,7 +403,7 @@ def _meets_last_face(
         # the ground as the last face meets every line: tracing each back would take most of a search
         often = np.flatnonzero(good.sum(axis=1) > _OFTEN * len(targets))
         good[often] &= _passes_first_faces(faces, sequence[often], image[often], targets)
-    row, column = np.nonzero(good)
+    row, column = np.divmod(np.flatnonzero(good), len(targets))
     return row, column
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import product
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -183,18 +182,18 @@ def _likeliest(points: bytes) -> tuple[float, float, float]:
     rows = np.frombuffer(points).reshape(-1, 4)
     place, height, error = rows[:, :2], rows[:, 2], rows[:, 3]
     apart = cdist(place, place)
-    length, deviation = max(
-        product(_LENGTHS_M, _DEVIATIONS_M), key=lambda sizes: _likelihood(apart, height, error, *sizes)[0]
-    )
-    return float(length), float(deviation), _likelihood(apart, height, error, length, deviation)[1]
+    tried = [
+        (*_likelihood(shape * deviation**2, height, error), float(length), float(deviation))
+        for length, shape in ((length, _matern(apart, length)) for length in _LENGTHS_M)
+        for deviation in _DEVIATIONS_M
+    ]
+    _, level, length, deviation = max(tried, key=lambda fit: fit[0])
+    return length, deviation, level
 
 
-def _likelihood(
-    apart_m: FloatArray, height_m: FloatArray, error_m: FloatArray, length_m: float, deviation_m: float
-) -> tuple[float, float]:
+def _likelihood(covariance: FloatArray, height_m: FloatArray, error_m: FloatArray) -> tuple[float, float]:
     """Log likelihood of the points under a process, and its most likely mean [m]."""
-    covariance = deviation_m**2 * _matern(apart_m, length_m) + np.diag(error_m**2)
-    factor = Factor.of(covariance)
+    factor = Factor.of(covariance + np.diag(error_m**2))
     # generalised least squares: near points count as one
     level = float(np.average(height_m, weights=factor.solve(np.ones(len(height_m)))))
     return factor.log_likelihood(height_m - level), level

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -18,7 +18,9 @@ from ...common.units import AnyArray, FloatArray, IntArray
 from ...compare.result import FlightResult
 from ...logs.records import RejectedLine
 from ...site.site import Site
-from .against import Against
+
+if TYPE_CHECKING:  # loads half of what a prediction is scored by
+    from .against import Against
 
 # Ranks of a 4 x 4 channel, the bars of every histogram.
 RANKS = (1, 2, 3, 4)

@@ -19,13 +19,14 @@ from ...compare.level.detection import DetectionScore
 from ...compare.level.serving import ServingComparison
 from ...compare.result import RankResult
 from ...logs.records import has_wall_clock
-from ..content.against import AgainstSeries
 from ..content.flight import RANKS, ReportData, start_of
 from ..kit.canvas import placed, seconds_since
 from ..words.flight import learned_on
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
+
+    from ..content.against import AgainstSeries
 
 # Means of a forecast along the flight: as many as a page can show.
 _FORECAST_COLUMNS = 600

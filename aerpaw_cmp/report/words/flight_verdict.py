@@ -14,7 +14,6 @@ from ...compare.result import AuditResult, FlightVerdict, RankResult, RssResult
 from ...compare.statistics.intervals import Interval
 from ..content.flight import ReportData
 from . import flight as words
-from .prediction import before_flight
 
 NO_INTERVAL = "no interval can be given"
 
@@ -45,6 +44,8 @@ def paragraph(data: ReportData) -> str:
         other = error if panels or not data.rss else _baseline_sentence(data.rss)
         parts = [learned, other, words.expected_sentence(data.rss)]
     elif error and data.against is not None and data.against.scores:
+        from .prediction import before_flight  # no report without a prediction loads how one is learned
+
         parts = [error, before_flight(data.against.scores), advice]
     elif error:
         none = words.ONE_PLACE if is_one_place(panels) else words.NO_CAUSE if panels else ""

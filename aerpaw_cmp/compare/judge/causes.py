@@ -33,7 +33,8 @@ from ..statistics.intervals import Interval
 # Samples are averaged over so long [s], over longer where a flight has more than so many seconds.
 BIN_S, _MOST_BINS = 1.0, 2000
 # And as long as the UAV stays so near [m] and turns no further [deg]: fading that stands still is one number, not many.
-_NEAR_M, _NEAR_DEG = 2.0, 5.0
+# A slow orbit of 1.5 m/s loses no second.
+_NEAR_M, _NEAR_DEG = 1.0, 5.0
 _FEWEST_BINS, _ENOUGH_BINS = 24, 100
 # A trouble is in one flight of ten; named where the odds for it are five to one.
 _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
@@ -807,7 +808,7 @@ def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
 
 
 # At a limit of the receiver: so near to the last levels [dB], so large a share of the samples, which fade so much less.
-_PILE_DB, _LEAST_PILE, _LEAST_CLIPPED, _MOST_FADING = 1.2, 0.1, 0.04, 0.35
+_PILE_DB, _LEAST_PILE, _LEAST_CLIPPED, _MOST_FADING = 1.2, 0.1, 0.06, 0.35
 
 
 def _pile(e: LevelEvidence, side: float) -> BoolArray | None:

@@ -9,7 +9,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.flight.drafting.node import Placer
-from aerpaw_cmp.flight.pose.cross_checks import questions
+from aerpaw_cmp.flight.pose.cross_checks import _lowest_m, questions
 from aerpaw_cmp.logs.ingest import IngestedFile
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
 from aerpaw_cmp.site.siteyaml import load_site
@@ -87,6 +87,14 @@ def test_a_track_that_does_not_begin_on_the_ground_is_asked_about(low_m: float, 
     assert bool(remarks) is asked
     if asked:
         assert f"the lowest height is {low_m:.0f} m" in remarks[0]
+
+
+@pytest.mark.parametrize(("step_m", "after_m", "low_m"), [(2.0, 28.0, 0.3), (0.0, 110.0, 110.0)])  # climb; no fix
+def test_a_log_that_ends_in_the_air_begins_on_the_ground(step_m: float, after_m: float, low_m: float) -> None:
+    height = np.concatenate([0.3 + step_m * np.arange(14), np.full(1400, after_m)])
+    log = _log("plain.csv", "2024-07-02T15:00:00").result.streams[0]
+    frame = log.frame.iloc[np.zeros(len(height), dtype=np.int64)].assign(altitude_m=height)
+    assert _lowest_m(replace(log, frame=frame)) == pytest.approx(low_m)
 
 
 def test_what_is_assumed_is_asked_and_what_is_written_is_not() -> None:

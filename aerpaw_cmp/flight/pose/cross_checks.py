@@ -198,5 +198,10 @@ def _source(streams: Sequence[Stream], what: str) -> str:
 def _lowest_m(stream: Stream) -> float | None:
     height = stream.frame["altitude_m"].to_numpy(np.float64)
     height = height[np.isfinite(height)]
+    if not len(height):
+        return None
     # not the least: one row of a receiver without a fix may be far below
-    return float(np.percentile(height, 1.0)) if len(height) else None
+    low = float(np.percentile(height, 1.0))
+    # a log may end in the air; a climb from its first row is no jump of a receiver that had no fix
+    begins = np.abs(np.diff(height[: len(height) // 100 + 2], prepend=0.0)).max() <= _GROUND_M
+    return min(low, float(height[0])) if begins else low

@@ -1,8 +1,8 @@
 """The tap: polls the modem, writes every answer down, survives what happens in a field.
 
 One polling thread, one command in flight. A record is in the kernel's hands before the next command goes out, unless
-the disk stalls (:mod:`~aerpaw_cmp.live.record.writer`). The port may vanish and come back under another number, the
-disk may fill, the clock may step, signals may come: each leaves its own record, and the polling goes on.
+the disk stalls (:class:`~aerpaw_cmp.live.record.log.LogWriter`). The port may vanish and come back under another
+number, the disk may fill, the clock may step, signals may come: each leaves its own record, and the polling goes on.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from ..common.errors import InputError
 from ..common.versions import tool_version
 from ..logs.files.checksums import SCHEMA, Record
 from .predict import Asked, Predict, PredictionWorker
-from .record.log import Clock, SegmentLog, boot_id, clock_synchronised
-from .record.writer import LogWriter
+from .record.log import Clock, LogWriter, SegmentLog, boot_id, clock_synchronised
 from .schedule import Schedule
 from .serial.framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
 from .serial.modem import OTHER_QUERIES, QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.live.record import log as log_module
-from aerpaw_cmp.live.record.log import Clock, LogSettings, SegmentLog
-from aerpaw_cmp.live.record.writer import LogWriter
+from aerpaw_cmp.live.record.log import Clock, LogSettings, LogWriter, SegmentLog
 from aerpaw_cmp.logs.files.checksums import SCHEMA, decode_record, encode_record
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER, decode_line

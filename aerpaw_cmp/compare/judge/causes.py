@@ -529,13 +529,14 @@ def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb:
     from scipy.linalg.lapack import dtbtrs  # scipy.signal would load for 0.4 s
 
     n, columns = len(residual), np.column_stack([residual, design])
-    before = columns[[0, 0, *range(n)]]  # as if it had always been what it is at first
+    # as if it had always been what it is at first; a column after the other, as LAPACK solves them
+    before = np.asfortranarray(columns[[0, 0, *range(n)]])
 
     def fit(memories: _Memories) -> tuple[float, FloatArray]:
         ahead, back, root = _whitening(memories)
         moved = ahead[0] * before[2:] + ahead[1] * before[1:-1] + ahead[2] * before[:-2]
         moved[0] /= 1.0 - back
-        white = dtbtrs(np.array([np.ones(n), np.full(n, -back)]), moved, uplo="L")[0]
+        white = dtbtrs(np.array([np.ones(n), np.full(n, -back)]), moved, uplo="L", overwrite_b=True)[0]
         white[0] = root * columns[0]
         gram = white.T @ white
         power, axes = np.linalg.eigh(gram[1:, 1:])

@@ -505,10 +505,7 @@ def _gain_features(direction: FloatArray, chords: Sequence[float]) -> FloatArray
     unit = direction[finite] / np.linalg.norm(direction[finite], axis=1, keepdims=True)
 
     def covariance(first: FloatArray, second: FloatArray) -> FloatArray:
-        total = gaussian_kernel(first, second, chords[0])
-        for chord in chords[1:]:
-            total += gaussian_kernel(first, second, chord)
-        return total / len(chords)
+        return np.asarray(sum(gaussian_kernel(first, second, chord) for chord in chords) / len(chords))
 
     # thinned: neighbours in time point to the same direction
     some = unit[:: max(1, len(unit) // 1500)]

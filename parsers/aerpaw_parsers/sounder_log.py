@@ -30,7 +30,7 @@ from . import _sheet
 
 _STAMP = 28  # "[" + 26 characters of time + "]"
 _VALUE = 16  # od -f: right-aligned in sixteen columns
-_WIDTHS = (7, 8, 9)  # octal digits of the offset; seven until 8 MiB, then it grows
+_WIDTHS = range(7, 13)  # octal digits of the offset; seven until 2 MiB of samples, ten from 128 MiB on
 _MOST_REPEATS = 5_000_000  # two days at 30 samples a second: a damaged offset claims more
 _HEAD = rb"^\[(" + _time.TIME + rb")\] "
 _ODD = re.compile(_HEAD + rb"+([0-7]{7,12}) +(" + _lines.NUMBER + rb"|-?nan|-?inf)[ \t]*$")

@@ -38,6 +38,7 @@ def seconds(result: ReadResult) -> list[float]:
 # --- the fast way -----------------------------------------------------------------------------------------------------
 
 GOOD = [sample(3, 0o17, -20.5), sample(4, 0o7777777, 3.25), line(5, f"10000000 {-788.5956:15.4f}")]
+LONG = [line(n, f"1{0:0{n}o} {-20.5:15.4f}") for n in range(9, 12)]  # 33 million samples have ten digits
 
 
 def test_lines_of_od_are_read_at_once() -> None:
@@ -46,6 +47,7 @@ def test_lines_of_od_are_read_at_once() -> None:
     assert layout.offset.tolist() == [0o17, 0o7777777, 0o10000000]
     assert layout.value.tolist() == [-20.5, 3.25, -788.5956]
     assert np.diff(layout.wall).tolist() == [10**9, 10**9]
+    assert sounder_log._fixed_layout(_lines.split("".join(LONG).encode()))[0].offset.tolist() == [8**9, 8**10, 8**11]
 
 
 @pytest.mark.parametrize("row", [0, 2], ids=["seven digits", "eight digits"])

@@ -130,6 +130,8 @@ class LevelEvidence:
     locked: FloatArray | None = None
     serving: FloatArray | None = None
     clock: JudgedClock | None = None
+    floored: bool = False
+    """True where the settings leave out what lies at the floor: of the lowest links those that fade upwards remain."""
     least: BoolArray | None = None
     """Samples at the least level of the log, where it has that again and again, exactly or within its noise."""
 
@@ -769,7 +771,8 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
     """The least level, written again and again: nothing was detected there."""
     if e.least is not None and e.least.any() and not e.least.all():
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
-        top = level + 3.0 * float(np.median(np.abs(e.measured_db[e.least] - level)))
+        # means of seconds spread less than samples do
+        top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
         yield Trial(
             name="no detection", cost=0.0, clipped=e.least, estimate=(level, level, level),
             sentence=f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: nothing was detected",
@@ -779,7 +782,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 def _floor(e: LevelEvidence) -> Iterator[Trial]:
     """A receiver that shows no level below its floor; what it shows there spreads less."""
-    if e.least is None and not _is_flat(e):  # else the log itself says where nothing was detected
+    if e.least is None and not e.floored and not _is_flat(e):  # else the log itself says where nothing was detected
         yield from _clipping(e, 1.0)
 
 
@@ -828,7 +831,10 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     if (side * (e.measured_db - limit) < -_BEYOND_DB).mean() > _MOST_BEYOND:
         return None
     name, words, step = _LIMITS[side]
-    sentence, next_step = words.format(level=f"{Printed(limit):.0f} {e.unit}"), step.format(typed=f"{limit:.0f}")
+    sentence, next_step = (
+        words.format(level=f"{Printed(limit):.0f} {e.unit}"),
+        step.format(typed=f"{limit + _OVER_FLOOR_DB:.0f}"),
+    )
     return Trial(name=name, cost=0.0, sentence=sentence, next_step=next_step)
 
 
@@ -849,6 +855,8 @@ def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
 
 
 _LEAST_FADING = 0.1
+# Half of a level so far above a floor is that floor [dB].
+_OVER_FLOOR_DB = 3.0
 
 
 _LIMITS = {

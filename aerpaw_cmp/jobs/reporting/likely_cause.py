@@ -129,6 +129,7 @@ def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: R
         locked=None if series.locked is None else series.locked[order],
         serving=None if series.serving is None else series.serving[order],
         clock=None if replayed.clock is None else replayed.clock.result,
+        floored=any("floor_db" in data.settings.logs[log].model_fields_set for log in np.unique(series.log)),
     )
 
 

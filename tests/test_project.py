@@ -17,8 +17,7 @@ import yaml
 
 import aerpaw_cmp
 from aerpaw_cmp.common.commands import COMMANDS
-from tests.test_words import FILES, faults, texts_of
-from tests.trees import parsed
+from tests.test_words import FILES, faults, parsed, texts_of
 
 if sys.version_info >= (3, 11):
     import tomllib

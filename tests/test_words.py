@@ -1,6 +1,7 @@
 """Words of user-visible text: field terms, no private metaphors (docs/vocabulary.md). The law: test_project.py."""
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,7 +11,6 @@ import pytest
 import typer
 
 from aerpaw_cmp.cli.app import app
-from tests.trees import parsed
 
 ROOT = Path(__file__).parents[1]
 # Pattern: what to write in its place.
@@ -28,6 +28,12 @@ BANNED = {
     r"[Oo]ffset of the (?:span|others)\b": "offset of the selection, of the training flights",
     r"\bno (?:remarks|progress and)\b": "results, warnings and failures only",
 }
+
+
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    """Syntax tree of a file, which several laws of test_project.py look through."""
+    return ast.parse(path.read_text(encoding="utf-8"))
 
 
 def texts_of(path: Path) -> Iterator[tuple[int, str]]:

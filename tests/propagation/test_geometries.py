@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.propagation.drivers.geometries import basis_fields, every_geometry, singular_values_of
+from aerpaw_cmp.propagation.drivers.geometries import basis_fields, every_geometry, singular_values_of, slanted
 from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
@@ -40,13 +40,13 @@ def test_equal_to_the_replay_with_those_arrays():
     tower, uav = tower_comparison_array(), uav_comparison_array(wavelength)
     singular_values = singular_values_of(some("coherent", 1.0), tower, site.towers["T"].position_m, uav, at, CARRIER_HZ)
     for geometry, sigma in zip(some("coherent", 1.0), singular_values, strict=True):
-        slanted = uav_comparison_array(wavelength, geometry.uav_yaw_deg, geometry.uav_roll_deg, geometry.uav_slant_deg)
+        turned = uav_comparison_array(wavelength, geometry.uav_yaw_deg, geometry.uav_roll_deg, geometry.uav_slant_deg)
         if geometry.uav_pitch_deg:
             from aerpaw_cmp.propagation.geometry.arrays import rotation_from_yaw_pitch_roll
 
             turn = np.radians([geometry.uav_yaw_deg, geometry.uav_pitch_deg, geometry.uav_roll_deg])
-            slanted = dataclasses.replace(slanted, mount=rotation_from_yaw_pitch_roll(*turn))
-        link = Link(CARRIER_HZ, {"T": tower_comparison_array(slant_deg=geometry.tower_slant_deg)}, slanted,
+            turned = dataclasses.replace(turned, mount=rotation_from_yaw_pitch_roll(*turn))
+        link = Link(CARRIER_HZ, {"T": tower_comparison_array(slant_deg=geometry.tower_slant_deg)}, turned,
                     uav_transmits=False)  # fmt: skip
         h = replay(site, link, at, Search(max_depth=1)).h[:, 0]
         np.testing.assert_allclose(sigma, np.linalg.svd(h, compute_uv=False), rtol=1e-8, atol=1e-15)
@@ -58,7 +58,6 @@ def test_power_sum_is_the_mean_over_the_phases_of_the_ground_ray():
     centre = np.array([0.0, 0.0, HEIGHT_M])
     (geometry, *_) = some("power_sum", 0.7)
     (sigma, *_) = singular_values_of([geometry], tower, centre, uav, at, CARRIER_HZ)
-    from aerpaw_cmp.propagation.drivers.geometries import slanted
     from aerpaw_cmp.propagation.geometry.arrays import rotation_from_yaw_pitch_roll
 
     turn = rotation_from_yaw_pitch_roll(*np.radians([geometry.uav_yaw_deg, 0.0, geometry.uav_roll_deg]))

@@ -18,7 +18,7 @@ import numpy as np
 from ...common.errors import InputError
 from ...common.jsonable import named
 from ...common.stages import give_memory_back
-from ...common.units import BoolArray, FloatArray, IntArray
+from ...common.units import BoolArray, FloatArray, IntArray, spread_out
 from ...compare import offset as offsets
 from ...compare import rank as ranks
 from ...compare.flight_verdict import flight_verdict, with_corrected_verdicts
@@ -46,14 +46,15 @@ from ...compare.statistics.passes import Visit
 from ...flight.data import FlightData, RankSeries, RssSeries
 from ...flight.drafting.remembered import errors_elsewhere, lock_elsewhere
 from ...flight.gains.losses import direct_foliage_m
-from ...flight.replay import FlightReplay, Replayed
+from ...flight.replay import FlightReplay, Replayed, replay_poses
 from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...flight.settings import RssSettings, RtSettings
 from ...flight.training import learned_here
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ...site.antenna.learned import LearnedLock
+from ...site.relief.dem import Dem
 from ...site.site import Site
-from .ground_error import agreement_by_ground
+from ...site.siteyaml import ground_surface, site_model
 from .levels import Levels, levels_of, stated_spread
 from .likely_cause import cause_of
 
@@ -63,6 +64,8 @@ _AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 # Two passes of one place, first and second half of a flight, come this near.
 _PASSES_WITHIN_M = 3.0
 
+# Grounds that are drawn for the error bar of rank agreement, and poses that are replayed over each.
+_DRAWS, _POSES = 6, 300
 
 # A shorter stretch of large error is a fade.
 _SHORTEST_S = 5.0
@@ -566,7 +569,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
             repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], heading),
             receiver=forecast,
             trained_on=trained or None,
-            agreement_sd_by_ground=agreement_by_ground(data, replayed, series.rank[rows], poses, settings.k) or None,
+            agreement_sd_by_ground=_agreement_by_ground(data, replayed, series.rank[rows], poses, settings.k) or None,
         ),
         probability=probability,
     )
@@ -609,3 +612,47 @@ def _repeated_rank(
         early, again = (Visit(position_m[at], rank[at], None if turn is None else turn[at]) for at in (~late, late))
         repeats[name] = ranks.repeat_rank(early, again, _PASSES_WITHIN_M)
     return repeats
+
+
+def _agreement_by_ground(
+    data: FlightData, replayed: Replayed, measured: FloatArray, poses: IntArray, ks: Sequence[float]
+) -> dict[str, float]:
+    """Standard deviation of a tower's rank agreement, by K, over grounds drawn within the errors of known heights.
+
+    Parameters
+    ----------
+    data : FlightData
+    replayed : Replayed
+        Of the rank of one tower.
+    measured : (n,)
+        Reported rank, NaN where the modem gave none.
+    poses : (n,)
+        The replayed pose of each report.
+    ks : sequence of float
+
+    Returns
+    -------
+    dict of str to float
+        Empty for sites without ``ground_points``, scenes of triangles and towers that move.
+    """
+    model = site_model(data.site_place)
+    known = np.flatnonzero(np.isfinite(measured))
+    if not model.ground_points or data.site.scene is not None or replayed.tower_m is not None or not len(known):
+        return {}
+    known = known[spread_out(len(known), _POSES)]
+    some = replayed.poses[poses[known]]
+    agreed = []
+    # seeds 0, 1, ...: two reports of a flight draw the same grounds, and so state the same number
+    for ground in ground_surface(model, data.site.frame).dems(map(np.random.default_rng, range(_DRAWS))):
+        h = replay_poses(_on(data.site, ground), data.settings.rt, replayed.link, some).h[:, 0]
+        agreed.append([float((ranks.channel_rank(h, k) == measured[known]).mean()) for k in ks])
+    return {f"{k:g}": float(sd) for k, sd in zip(ks, np.std(agreed, axis=0, ddof=1), strict=True)}
+
+
+def _on(site: Site, ground: Dem) -> Site:
+    """The site with towers, buildings and trees on another ground."""
+    towers = {
+        name: dataclasses.replace(tower, ground_m=float(np.nan_to_num(ground.ground_m(tower.east_m, tower.north_m))))
+        for name, tower in site.towers.items()
+    }
+    return dataclasses.replace(site, dem=ground, towers=towers)

@@ -67,20 +67,6 @@ class Watched(InProcess):
             done(place, function(item))
 
 
-@pytest.fixture(autouse=True, scope="module")
-def each_tile_is_computed_once():
-    """What becomes of a tile in a store is what most of these tests are about."""
-
-    def tile(self, order, **progress):
-        key = repr((self.settings, order))
-        return computed.get(key) or computed.setdefault(key, real(self, order, **progress))
-
-    real, computed = mapping.SiteChannels.tile, {}
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mapping.SiteChannels, "tile", tile)
-        yield
-
-
 def test_a_store_holds_the_map_in_one_piece(tmp_path):
     both = replace(SETTINGS, foliage=("none", "opaque"))
     in_one_piece = mapping.make_maps(load_site(SITE), replace(both, tile_m=None), Stages(), name=SITE)

@@ -297,6 +297,15 @@ def test_a_planned_flight_faces_its_course_and_leans_into_it(prediction):
     np.testing.assert_allclose(seen.at_uav, at_uav, atol=1e-3)
 
 
+@pytest.mark.parametrize(("attitude", "leans"), [("logged", True), ("level", False)])
+def test_a_flown_route_leans_where_the_settings_take_its_attitude(tmp_path, attitude, leans):
+    text = re.sub(r"(?s)  plan:.*?(?=site:)", "", SAMPLE.read_text()).replace("rt: {", f"rt: {{attitude: {attitude}, ")
+    (tmp_path / "flown.yaml").write_text(text)
+    site = load_site("lake_wheeler")
+    up = find_targets(tmp_path / "flown.yaml", site, TargetOptions(), logs_root=SAMPLE.parent).up
+    assert (np.degrees(np.arccos(up[:, 2].min())) > 3.0) == leans
+
+
 def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(prediction):
     targets = dataclasses.replace(prediction.targets, heights_m=(30.0,))
     on_grid = dataclasses.replace(prediction, targets=targets)

@@ -17,6 +17,7 @@ from ...flight.data import FAR_M, FlightData, load_data, nearest_m
 from ...flight.gains.memory import load_with_learned
 from ...flight.pose.heights import raised
 from ...flight.pose.track import interpolated
+from ...flight.replay import attitude_rotation
 from ...flight.settings import FlightFile
 from ...flight.simulate import LEAN_DEG_PER_MPS, planned_poses
 from ...logs.route import read_route
@@ -255,7 +256,7 @@ def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
         name=flight.flight.name,
         position_m=pose.position_m[pose.valid],
         yaw_deg=pose.heading_deg[pose.valid],
-        up=pose.rotation[pose.valid][:, :, 2],
+        up=attitude_rotation(pose, data.settings.rt.attitude)[pose.valid][:, :, 2],
         time_s=((time - time[0]) / np.timedelta64(1, "s"))[pose.valid],
         remarks=("The flight file has no plan: its track is the route. Its levels are not used.",),
     )

@@ -100,8 +100,6 @@ class OrdinaryKriging:
         The M nearest (ties by the rule of :mod:`~aerpaw_cmp.maps.neighbours`), or M drawn within the radius.
     seed : int
         Of the random selection.
-    sill : float or (fields,), optional
-        v^2 of the variance; by default the sample variance of each field.
     outside : {"nan", "nearest"}
         What happens where no sample lies within the radius.
 
@@ -114,7 +112,7 @@ class OrdinaryKriging:
     place_ : (samples,) int
         Place of each sample.
     sill_ : (fields,)
-        v^2 used.
+        v^2 of the variance: the sample variance of each field.
 
     Examples
     --------
@@ -132,7 +130,6 @@ class OrdinaryKriging:
         *,
         selection: Literal["nearest", "random"] = "nearest",
         seed: int = 0,
-        sill: ArrayLike | None = None,
         outside: Literal["nan", "nearest"] = "nan",
     ) -> None:
         self.correlation = correlation
@@ -140,7 +137,6 @@ class OrdinaryKriging:
         self.radius_m = radius_m
         self.selection = selection
         self.seed = seed
-        self.sill = sill
         self.outside = outside
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> OrdinaryKriging:
@@ -207,11 +203,6 @@ class OrdinaryKriging:
             raise UsageError("; ".join(wrong))
 
     def _sill_of(self, values: FloatArray) -> FloatArray:
-        if self.sill is not None:
-            sill = np.broadcast_to(np.asarray(self.sill, dtype=np.float64), (values.shape[1],)).copy()
-            if not (sill >= 0).all():
-                raise UsageError(f"a sill of {sill.min()}", expected="a variance of at least 0")
-            return np.asarray(sill)
         finite = np.isfinite(values)
         count = finite.sum(axis=0)
         # relative to a value of the field, so that a constant field has variance 0 and not 1e-32

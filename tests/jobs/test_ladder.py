@@ -17,8 +17,7 @@ from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.remembered import offered
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting.advice import unrivalled
-from aerpaw_cmp.jobs.reporting.flight_run import run_flight
+from aerpaw_cmp.jobs.reporting.flight_run import run_flight, unrivalled
 from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_changes
 from aerpaw_cmp.site.antenna.learned import Entry, Errors, LearnedSeries, folder_of, remember
 from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv, unit_mean_gain

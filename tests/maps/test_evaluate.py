@@ -85,7 +85,7 @@ def test_blocks_never_train_on_themselves():
 def test_kriging_wins_where_its_model_holds_and_its_variance_is_honest():
     """A Gaussian field with the model's correlation: best linear predictor, calibrated intervals."""
     values = simulated_field(GRID.points_m, 2, fields=40, noise=0.1)
-    model = OrdinaryKriging(lambda d: 0.9 * exponential(d), sill=1.0)
+    model = OrdinaryKriging(lambda d: 0.9 * exponential(d))
     models = {
         "kriging": model, "idw": InverseDistance(), "nearest": InverseDistance(1), "spline": IndexInterpolation("spline", GRID),
         "makima": IndexInterpolation("makima", GRID), "tower": ServingTowerMean([[100.0, 100.0], [500.0, 400.0]]),
@@ -94,7 +94,7 @@ def test_kriging_wins_where_its_model_holds_and_its_variance_is_honest():
     rmse = {name: float(s.rmse.mean()) for name, s in table.items()}
     assert min(rmse, key=lambda name: rmse[name]) == "kriging", rmse
     estimate, variance = model.fit(GRID.points_m, values).leave_one_out()
-    off = (values - estimate) / np.sqrt(variance)
+    off = (values - estimate) / np.sqrt(variance / model.sill_)
     assert np.mean(off**2) == pytest.approx(1.0, abs=0.05)
     for share in (0.5, 0.9, 0.95):
         assert np.mean(np.abs(off) <= norm.ppf((1 + share) / 2)) == pytest.approx(share, abs=0.02)

@@ -34,11 +34,16 @@ def textbook(points, values, target, correlation, v2=1.0):
     return solution[:n] @ values, solution @ right
 
 
+def of_variance_one(values):
+    """Scaled, so that the Kriging variance has the sill of the textbook."""
+    return values / values.std(ddof=1)
+
+
 def test_equals_pykrige_on_untied_data():
     """Moving neighbourhood of 20, an external implementation, 1e-9."""
     ok = pytest.importorskip("pykrige.ok")
     points, targets = scattered(300, 4, 1000.0), scattered(100, 5, 1000.0)
-    values = np.random.default_rng(6).normal(size=300)
+    values = of_variance_one(np.random.default_rng(6).normal(size=300))
     peer = ok.OrdinaryKriging(
         *points.T,
         values,
@@ -47,7 +52,7 @@ def test_equals_pykrige_on_untied_data():
         variogram_function=lambda _, d: 1 - PAPER(d),
     )
     expected, expected_variance = peer.execute("points", *targets.T, backend="loop", n_closest_points=20)
-    estimate, variance = OrdinaryKriging(PAPER, 20, np.inf, sill=1.0).fit(points, values).predict(targets)
+    estimate, variance = OrdinaryKriging(PAPER, 20, np.inf).fit(points, values).predict(targets)
     np.testing.assert_allclose(estimate, np.asarray(expected), atol=1e-9, rtol=0)
     np.testing.assert_allclose(variance, np.asarray(expected_variance), atol=1e-9, rtol=0)
 
@@ -55,8 +60,8 @@ def test_equals_pykrige_on_untied_data():
 def test_shared_weights_on_a_grid_equal_the_textbook():
     grid = Grid.over_area((0.0, 300.0, 0.0, 360.0))
     points = grid.points_m
-    values = np.random.default_rng(16).integers(1, 4, len(grid)).astype(float)
-    estimate, variance = OrdinaryKriging(PAPER, 12, 100.0, sill=1.0).fit(points, values).leave_one_out()
+    values = of_variance_one(np.random.default_rng(16).integers(1, 4, len(grid)).astype(float))
+    estimate, variance = OrdinaryKriging(PAPER, 12, 100.0).fit(points, values).leave_one_out()
     for i in range(len(grid)):
         offset = points - points[i]
         far = np.hypot(*offset.T)
@@ -123,7 +128,7 @@ def test_coincident_samples_are_one_place_with_their_mean(correlation):
     merged = values.copy()
     merged[:3] += 1.0
     targets = scattered(9, 18, 200.0)
-    model = OrdinaryKriging(correlation, 6, 400.0, sill=1.0)
+    model = OrdinaryKriging(correlation, 6, 400.0)
     expected = model.fit(points, merged).predict(targets)
     predicted = model.fit(doubled, more).predict(targets)
     np.testing.assert_array_equal(predicted[0], expected[0])
@@ -157,10 +162,10 @@ def test_constant_field_is_exact_with_variance_zero():
 
 def test_fewer_than_m_one_and_none_within_the_radius():
     points = np.array([[0.0, 0.0], [100.0, 0.0], [120.0, 0.0]])
-    model = OrdinaryKriging(exponential, 20, 50.0, sill=1.0).fit(points, [1.0, 2.0, 4.0])
+    model = OrdinaryKriging(exponential, 20, 50.0).fit(points, [1.0, 2.0, 4.0])
     estimate, variance = model.predict([[20.0, 0.0], [110.0, 10.0], [0.0, 500.0]])
     assert estimate[0] == 1.0  # one sample: its value
-    assert variance[0] == pytest.approx(2 * (1 - exponential(20.0)), rel=1e-12)
+    assert variance[0] == pytest.approx(2 * (1 - exponential(20.0)) * model.sill_[0], rel=1e-12)
     assert estimate[1] == pytest.approx(3.0, abs=1e-12)  # two samples, by symmetry their mean
     assert np.isnan(estimate[2])
     assert np.isnan(variance[2])
@@ -201,7 +206,7 @@ def test_collinear_samples():
     points = np.column_stack([np.arange(0, 300, 10.0), np.zeros(30)])
     values = np.sin(points[:, 0] / 50)
     estimate, variance = (
-        OrdinaryKriging(exponential, 10, 100.0, sill=1.0).fit(points, values).predict([[145.0, 0.0], [145.0, 40.0]])
+        OrdinaryKriging(exponential, 10, 100.0).fit(points, values).predict([[145.0, 0.0], [145.0, 40.0]])
     )
     # an exponential correlation on a line is Markov: between two samples only these two count
     expected, expected_variance = textbook(points[14:16], values[14:16], np.array([145.0, 0.0]), exponential)
@@ -238,8 +243,8 @@ def test_correlation_that_turns_negative():
         return np.exp(-d / 150.0) * np.cos(d / 70.0)
 
     points, targets = scattered(80, 27), scattered(30, 28)
-    values = np.random.default_rng(29).normal(size=80)
-    estimate, variance = OrdinaryKriging(damped, 15, 400.0, sill=1.0).fit(points, values).predict(targets)
+    values = of_variance_one(np.random.default_rng(29).normal(size=80))
+    estimate, variance = OrdinaryKriging(damped, 15, 400.0).fit(points, values).predict(targets)
     for t in range(30):
         near = np.argsort(np.linalg.norm(points - targets[t], axis=1))[:15]
         expected, expected_variance = textbook(points[near], values[near], targets[t], damped)
@@ -291,15 +296,15 @@ def test_a_correlation_above_one_counts_as_one():
 
 
 def test_nugget_is_a_jump_unless_it_is_noise():
-    points, values = scattered(40, 33, 200.0), np.random.default_rng(34).normal(size=40)
+    points, values = scattered(40, 33, 200.0), of_variance_one(np.random.default_rng(34).normal(size=40))
 
     def noisy(d):
         return 0.6 * np.exp(-d / 100.0)
 
-    at_sample, variance = OrdinaryKriging(noisy, sill=1.0).fit(points, values).predict(points)
+    at_sample, variance = OrdinaryKriging(noisy).fit(points, values).predict(points)
     np.testing.assert_array_equal(at_sample, values)
     assert (variance == 0).all()
-    near, variance = OrdinaryKriging(noisy, sill=1.0).fit(points, values).predict(points + 1e-3)
+    near, variance = OrdinaryKriging(noisy).fit(points, values).predict(points + 1e-3)
     assert (np.abs(near - values) > 1e-3).mean() > 0.9
     assert (variance > 0.4).all()
 
@@ -362,7 +367,6 @@ def test_random_leave_one_out_does_not_see_the_target():
         ({"neighbours": 0}, "neighbours = 0"),
         ({"radius_m": -1.0}, "radius_m"),
         ({"selection": "all"}, "selection"),
-        ({"sill": -1.0}, "sill"),
     ],
 )
 def test_wrong_settings_are_named(arguments, message):
@@ -445,7 +449,7 @@ def test_what_is_not_said_is_twenty_neighbours_within_150_m_the_nearest_and_exac
     rng = np.random.default_rng(3)
     points, values = rng.uniform(0, 300, (80, 2)), rng.normal(size=80)
     targets = np.concatenate([rng.uniform(0, 300, (10, 2)), points[:2], [[900.0, 0.0]]])
-    said = OrdinaryKriging(with_nugget, 20, 150.0, selection="nearest", seed=0, sill=None, outside="nan")
+    said = OrdinaryKriging(with_nugget, 20, 150.0, selection="nearest", seed=0, outside="nan")
     usual = OrdinaryKriging(with_nugget)
     for a, b in zip(usual.fit(points, values).predict(targets), said.fit(points, values).predict(targets), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -457,16 +461,6 @@ def test_what_is_not_said_is_twenty_neighbours_within_150_m_the_nearest_and_exac
     ]
     np.testing.assert_array_equal(drawn[0], drawn[1])
     assert (drawn[1] != drawn[2]).any()
-
-
-def test_a_sill_that_is_given_scales_the_variance_of_its_field():
-    rng = np.random.default_rng(4)
-    points, values = rng.uniform(0, 100, (12, 2)), rng.normal(size=(12, 2))
-    unit = OrdinaryKriging(with_nugget, sill=1.0).fit(points, values).predict([[50.0, 50.0]])[1]
-    scaled = OrdinaryKriging(with_nugget, sill=[2.0, 0.0]).fit(points, values).predict([[50.0, 50.0]])[1]
-    np.testing.assert_allclose(scaled, unit * [[2.0, 0.0]])
-    with pytest.raises(UsageError, match=r"a sill of -1\.0"):
-        OrdinaryKriging(with_nugget, sill=[1.0, -1.0]).fit(points, values)
 
 
 @pytest.mark.parametrize(
@@ -537,13 +531,13 @@ def test_many_targets_among_few_samples_equal_the_textbook(monkeypatch, m):
     """Each distance between samples is taken once, and never that of a sample to itself."""
     monkeypatch.setattr(kriging, "CHUNK", 128)
     points, targets = scattered(25, 51, 200.0), scattered(2 * kriging.CHUNK + 3, 52, 200.0)
-    values = np.random.default_rng(53).normal(size=25)
+    values = of_variance_one(np.random.default_rng(53).normal(size=25))
 
     def correlation(d):
         assert (d > 0).all()
         return exponential(d)
 
-    estimate, variance = OrdinaryKriging(correlation, m, np.inf, sill=1.0).fit(points, values).predict(targets)
+    estimate, variance = OrdinaryKriging(correlation, m, np.inf).fit(points, values).predict(targets)
     for t, target in enumerate(targets):
         near = np.argsort(np.linalg.norm(points - target, axis=1))[:m]
         expected = textbook(points[near], values[near], target, exponential)
@@ -557,7 +551,7 @@ def test_weights_are_those_of_fifty_digits(correlation, doubted):
 
     rng = np.random.default_rng(11)
     points, targets = rng.uniform(0, 150, (60, 2)), rng.uniform(0, 150, (40, 2))
-    model = OrdinaryKriging(correlation, 9, np.inf, sill=1.0).fit(points, np.zeros(60))
+    model = OrdinaryKriging(correlation, 9, np.inf).fit(points, np.zeros(60))
     rule = model.weights(targets)
     offset = points[rule.index] - targets[:, None]
     between = 1.0 - correlation(np.linalg.norm(offset[:, :, None] - offset[:, None], axis=-1))

@@ -213,13 +213,12 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     from ..flight.data import load_data
     from ..flight.replay import replay_flight
     from ..flight.settings import load_flight
-    from ..report.content.flight_parts import report_data
+    from ..report.content.flight_parts import pose_paths, report_data
     from ..report.exports.tables import metrics as metrics_of
     from ..report.pages.flight import write_report
     from .reporting.flight_run import report_stages, run_flight
     from .reporting.foliage_notes import foliage_notes
     from .reporting.ladder import recommended_text
-    from .reporting.pose_paths import pose_paths
     from .tasks.manifest import other_inputs
 
     formats = _checked(flight, chosen, options)

@@ -94,22 +94,18 @@ def _learned(
     if every is None or not scores:
         return None
 
-    def mean(name: str) -> float:
-        return round(float(np.mean([getattr(score, name) for score in scores])), 4)
-
+    names = ("brier", "constant_brier", "log_score", "constant_log_score", "rmse_db", "free_space_rmse_db")
+    mean = {name: round(float(np.mean([getattr(score, name) for score in scores])), 4) for name in names}
     return LearnedLock(
         gain_db=round(every.level_db, 2),
         per_db=round(every.per_db, 4),
         share=round(every.share, 3),
         **_two_parts(flights, every.level_db),
         flights=len(scores),
-        brier=mean("brier"),
-        constant_brier=mean("constant_brier"),
-        log_score=mean("log_score"),
-        constant_log_score=mean("constant_log_score"),
         floor_db=LOCK_FLOOR_DB,
-        floor_rmse_db=mean("rmse_db"),
-        free_space_floor_rmse_db=mean("free_space_rmse_db"),
+        floor_rmse_db=mean.pop("rmse_db"),
+        free_space_floor_rmse_db=mean.pop("free_space_rmse_db"),
+        **mean,
     )
 
 

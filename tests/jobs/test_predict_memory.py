@@ -176,8 +176,8 @@ def test_a_flight_is_predicted_before_it_from_the_memory_alone(flown: Path) -> N
     """Planted offsets are added to the measurement: 12 and 9 dB are remembered, 4 dB are flown."""
     level = read_learned(flown / "mine.yaml").entries["planted"].series[0].level
     assert level is not None
-    # a flight left out misses by the difference of both offsets; the prior of 1.5 dB counts as two more
-    assert level.sd_db == pytest.approx(np.sqrt((2 * 1.5**2 + 2 * 3.0**2) / 4), abs=0.4)
+    # t with 3 degrees of freedom: one difference of 3 dB, and a prior of 1.5 dB as two more; 90 % within 2.353 scales
+    assert level.sd_db == pytest.approx(2.353 / 1.645 * np.sqrt(1.5 * (2 * 1.5**2 + 3.0**2 / 2) / 3), abs=0.4)
     out, asked = flown / "before", ["--site", str(flown / "mine.yaml")]
     assert main(["predict", str(flown / "aside.yaml"), *asked, "-o", str(out)]) == 0
     assert main(["report", str(flown / "aside.yaml"), "--against", str(out), "--audit", "none", "-o",

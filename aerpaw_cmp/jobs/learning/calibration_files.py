@@ -18,6 +18,7 @@ from ...common.jsonable import named
 from ...common.provenance import KEY, MARKS, union
 from ...common.units import spread_out
 from ...compare.gains.direction_gain import Frame, directed
+from ...compare.gains.spread import BAND
 from ...compare.learning.calibration import mean_rmse
 from ...compare.learning.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries, rank_quantity
@@ -351,12 +352,21 @@ def _learned_series(calibration: Calibration) -> tuple[list[LearnedSeries], dict
 # Of a series: their standard deviations stand for its mean.
 _SD_SAMPLES = 200
 
-# Between flights, before any was left out: counts as two flights.
+# Between flights, before any was seen: counts as two. A guess, fitted to no campaign: three of dataset 12, LTE, AFAR
+# and NR are likeliest at 1.0 (without AFAR) to 2.8 dB (without dataset 12), too far apart to learn it from the others.
 _OFFSET_SD_DB = 1.5
 
 
 def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
-    """Mean level of the flights above the antennas as written; its error is that of flights left out."""
+    """Mean level of the flights above the antennas as written; its error is that of flights left out.
+
+    Notes
+    -----
+    The offset of a new flight about the mean of n has Student's t with n + 1 degrees of freedom, for the spread between
+    flights is itself known from n - 1 differences and a guess alone (Gelman et al., Bayesian Data Analysis, 3.3).
+    """
+    from scipy.special import ndtri, stdtrit
+
     mine = [o for o in calibration.observed if (o.samples.tower, o.samples.channel) == (series.tower, series.channel)]
     if mine[0].samples.antenna in calibration.locks:  # without lock a level says nothing of the path
         mine = [o.part(o.locked == 1.0) for o in mine if o.locked is not None]
@@ -367,10 +377,14 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
         for s in calibration.scores["flight_left_out"]
         if (s.tower, s.channel) == (series.tower, series.channel)
     ]
+    n = max(len(squares), 1)
+    # each was predicted by n - 1 others, and misses their mean by n / (n - 1) of what it misses the mean of all
+    variance_db2 = (2.0 * _OFFSET_SD_DB**2 + (1.0 - 1.0 / n) ** 2 * sum(squares)) / (n + 1.0)
+    # as the normal distribution with the same interval: two degrees of freedom have no variance
+    as_normal = stdtrit(n + 1.0, 0.5 + 0.5 * BAND) / ndtri(0.5 + 0.5 * BAND)
     return LearnedLevel(
         offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
-        # what is usual counts as two flights beside those that were left out
-        sd_db=round(math.sqrt((2.0 * _OFFSET_SD_DB**2 + sum(squares)) / (2 + len(squares))), 2),
+        sd_db=round(float(as_normal) * math.sqrt((1.0 + 1.0 / n) * variance_db2), 2),
         transmit_power_dbm=sent,
         unit=series.unit,
     )

@@ -67,13 +67,17 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
 @lru_cache(maxsize=4)
 def _faces(grounds: tuple[float, ...], ground_material: str, buildings: tuple[Building, ...]) -> Faces:
     """Faces of ground planes and buildings; kept, for a replay in parts asks again with each part."""
-    faces = [_ground(height, ground_material, len(grounds) > 1) for height in grounds]
-    for index, building in enumerate(buildings):
-        for part in _parts(building.footprint):
-            faces += [*_walls(building, part, index), _roof(building, part, index)]
+    faces = [*(_ground(height, ground_material, len(grounds) > 1) for height in grounds), *_solids(buildings)]
     columns: dict[str, Any] = dict(zip(_Face._fields, zip(*faces, strict=True), strict=True))
     numbers = {name: np.array(columns[name]) for name in _Face._fields if name not in ("material", "label", "polygon")}
     return Faces(**(columns | numbers))
+
+
+@lru_cache(maxsize=1)
+def _solids(buildings: tuple[Building, ...]) -> list[_Face]:
+    """Walls and roofs; each tower's ground asks for the same."""
+    parts = [(building, part, at) for at, building in enumerate(buildings) for part in _parts(building.footprint)]
+    return [face for part in parts for face in (*_walls(*part), _roof(*part))]
 
 
 def _ground(height_m: float, material: str, several: bool) -> _Face:
@@ -132,19 +136,17 @@ def _walls(building: Building, footprint: Polygon, solid: int) -> list[_Face]:
             normal = np.array([along[1], -along[0], 0.0])
             # in-plane coordinates count from the site's origin, not from the wall's corner
             first = float(along[:2] @ start)
-            label = f"{building.name} wall {len(faces) + 1}"
-            offset = float(normal[:2] @ start)
             faces.append(
                 # along x up = (along_north, -along_east, 0): the outward normal
                 _Face(
                     normal=normal,
                     along=along,
                     across=_UP,
-                    offset_m=offset,
+                    offset_m=float(normal[:2] @ start),
                     lower=(first, foot),
                     upper=(first + length, top),
                     material=building.material,
-                    label=label,
+                    label=f"{building.name} wall {len(faces) + 1}",
                     solid=solid,
                 )
             )
@@ -166,18 +168,16 @@ def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
     polygon = None if fills else turned
     if polygon is not None:
         shapely.prepare(polygon)
-    height = building.base_m + building.height_m
-    label = f"{building.name} roof"
     return _Face(
         normal=_UP,
         along=along,
         across=across,
-        offset_m=height,
+        offset_m=building.base_m + building.height_m,
         lower=(low_a, low_b),
         upper=(high_a, high_b),
         polygon=polygon,
         material=building.material,
-        label=label,
+        label=f"{building.name} roof",
         solid=solid,
     )
 

@@ -59,7 +59,7 @@ def checks() -> list[Check]:
     if "tried" in gpu.found and gpu.status == "ok":  # a GPU that works needs no LLVM
         compilers = [replace(check, status="warn") if check.status == "fail" else check for check in compilers]
     return [
-        python_check(),
+        Check("Python", "ok", f"{platform.python_version()} ({sys.executable})"),
         *package_checks(),
         *compilers,
         gpu,
@@ -80,14 +80,6 @@ def as_dict(checks: Sequence[Check]) -> dict[str, Any]:
 def ready(checks: Sequence[Check]) -> bool:
     """Check whether no check failed (warnings are allowed)."""
     return all(check.status != "fail" for check in checks)
-
-
-def python_check(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
-    """Python of 3.10 or newer."""
-    running = f"{'.'.join(map(str, version))} ({sys.executable})"
-    if version < (3, 10):
-        return Check("Python", "fail", running, "install Python 3.10 or newer, then 'make clean setup'")
-    return Check("Python", "ok", running)
 
 
 def package_checks() -> Iterator[Check]:

@@ -28,11 +28,6 @@ def test_every_unwell_check_has_a_remedy_and_the_whole_is_json(monkeypatch: pyte
     assert json.loads(json.dumps(doctor.as_dict(checks)))["checks"][0]["name"] == "Python"
 
 
-def test_python_too_old() -> None:
-    assert doctor.python_check((3, 9, 18)).status == "fail"
-    assert doctor.python_check((3, 10, 0)).status == "ok"
-
-
 def with_trials(monkeypatch: pytest.MonkeyPatch, *trials: llvm.Trial) -> list[doctor.Check]:
     monkeypatch.setattr(llvm, "candidates", list)
     monkeypatch.setattr(llvm, "first_that_works", lambda _: list(trials))

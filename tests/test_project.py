@@ -142,28 +142,6 @@ def test_setup_says_what_to_do_without_python(tmp_path: Path) -> None:
     assert not (tmp_path / "venv").exists()
 
 
-def test_the_keys_of_the_flight_file_page_are_real() -> None:
-    """docs/flight_yaml.md lists keys: each example must load, and each settings block must exist."""
-    from aerpaw_cmp.flight import settings as config
-
-    text = (ROOT / "docs" / "flight_yaml.md").read_text()
-    block = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
-    assert block is not None
-    stated = {
-        "rt": config.RtSettings,
-        "rss": config.RssSettings,
-        "rank": config.RankSettings,
-        "report": config.ReportSettings,
-    }
-    for name, model in stated.items():
-        part = re.search(rf"^{name}:(.*?)(?=^\w|\Z)", block[1], re.DOTALL | re.MULTILINE)
-        assert part is not None, name
-        keys = set(re.findall(r"(?:^  |[{,(] ?)([a-z_]+):", part[1], re.MULTILINE))
-        known = set(model.model_fields).union(config.Waypoint.model_fields)
-        assert keys <= known, (name, keys - known)
-        assert keys, name
-
-
 def test_the_page_lists_every_knob_with_its_default() -> None:
     from aerpaw_cmp.common.yamlfile import parse_yaml
     from aerpaw_cmp.flight import settings as config
@@ -171,6 +149,7 @@ def test_the_page_lists_every_knob_with_its_default() -> None:
     text = (ROOT / "docs" / "flight_yaml.md").read_text()
     first, block = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)[:2]
     usual = parse_yaml("flight: f\nlogs: [{path: a}]\n" + first[first.index("\nrt:") :], config.FlightFile)
+    assert {"rank", "report"} <= usual.model_fields_set  # no unknown key in them: models are strict
     for shown in (usual.rt, usual.rss):
         assert shown == type(shown)()
         assert shown.model_fields_set >= set(type(shown).model_fields) - {"advanced", "foliage_model"}

@@ -1,14 +1,14 @@
 """Outcomes of tasks: kept, taken again under any name, never taken when damaged or stale; tried twice, then told."""
 
 import io
-import multiprocessing
-import os
 import shutil
 import signal
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -31,7 +31,7 @@ from aerpaw_cmp.jobs.campaigns.campaign_tasks import (
     planned_tasks,
 )
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
-from aerpaw_cmp.jobs.tasks.workers import InProcess, Processes, Workers
+from aerpaw_cmp.jobs.tasks.workers import InProcess, Lost, Workers
 from aerpaw_cmp.report.content.campaign import Failure
 from tests.jobs.campaign_rows import rss_row
 
@@ -289,35 +289,14 @@ def test_after_sigkill_only_what_is_missing_is_computed(
     assert all(equal(outcome, outcome_of(float(i))) for i, outcome in enumerate(outcomes))
 
 
-def lethal(order: Order) -> Outcome:
-    """Ends its worker: once where a file says so, always for the task called poison."""
-    task = order.task
-    if task.flight == "poison" or (task.flight == "f1" and not _happened(task)):
-        os.kill(os.getpid(), signal.SIGKILL)
-    return outcome_of(float(task.flight[1:]))
+def test_a_lost_worker_costs_its_own_task_alone(flight: Path) -> None:
+    class Loses(InProcess):
+        def run(self, function: Any, items: Sequence[Any], on_result: Any) -> None:  # noqa: ARG002
+            lost = Lost("its worker process ended")
+            super().run(lambda order: lost if order.task.flight == "f1" else outcome_of(0.0), items, on_result)
 
-
-def _happened(task: Task) -> bool:
-    mark = Path(os.environ["AERPAW_CMP_TEST_MARKS"]) / task.flight
-    if mark.exists():
-        return True
-    mark.touch()
-    return False
-
-
-def test_a_lost_worker_costs_its_own_task_one_more_try(
-    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Fails on one pool for everything: there a killed worker loses all tasks."""
-    monkeypatch.setenv("AERPAW_CMP_TEST_MARKS", str(tmp_path))
-    monkeypatch.setattr("aerpaw_cmp.jobs.campaigns.campaign_tasks.carry_out", lethal)
-    monkeypatch.setattr("aerpaw_cmp.jobs.tasks.workers.get_context", lambda _kind: multiprocessing.get_context("fork"))
-    tasks = [*tasks_of(flight, 6), Task(flight, "poison", "as written", {}, None)]
-    outcomes = run_tasks(tasks, Processes(2))
-    assert [outcome.failure is None for outcome in outcomes] == [True] * 6 + [False]
-    assert outcomes[-1].failure is not None
-    assert "worker process ended" in outcomes[-1].failure.message
-    assert [row.flight for outcome in outcomes for row in outcome.rss] == [f"f{i}" for i in range(6)]
+    told = [outcome.failure and outcome.failure.message for outcome in run_tasks(tasks_of(flight, 3), Loses())]
+    assert told == [None, "its worker process ended", None]
 
 
 def test_a_fault_in_the_rows_of_a_flight_is_a_failure_of_that_flight(

@@ -20,10 +20,7 @@ ENDC = (
     "command",
     [
         "AT+CFUN=1,1",
-        "AT+QPOWD",
         'AT+EGMR=1,7,"0"',
-        "AT+CGSN",
-        "AT+CIMI",
         "AT+QRSRP;+CFUN=0",
         "AT+QRSRP\rAT+CFUN=0",
         "AT+QRSRP\n",

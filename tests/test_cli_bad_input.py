@@ -155,12 +155,14 @@ def test_a_line_without_end_is_offered_no_columns(tmp_path: Path, capsys: pytest
 
 
 def test_named_columns_are_those_of_tables(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """A table beside an autopilot's binary log: the options that its line names are taken for the folder, too."""
+    """A table beside other logs: the options that its line names are taken for the folder, too."""
     (tmp_path / "1.BIN").write_bytes(dataflash())
+    (tmp_path / "walk.csv").write_text("time,lat,lon,alt\n2025-03-02T15:00:01Z,35.73,-78.7,1\n")
     (tmp_path / "levels.csv").write_text("Time (UTC),Received power (dBm)\n2025-03-02T15:00:01,-80\n")
     assert main(["ingest", str(tmp_path)]) == 0
     words = re.search(r"levels.csv: skipped: .*?(--map .*)", capsys.readouterr().err)
     assert words
     assert main(["ingest", str(tmp_path), *shlex.split(words[1]), "--draft", str(tmp_path / "f.yaml")]) == 0
+    assert "pose_csv" in capsys.readouterr().out
     assert "ardupilot_bin" in (draft := (tmp_path / "f.yaml").read_text())
     assert "generic_csv" in draft

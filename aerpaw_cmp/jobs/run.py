@@ -109,7 +109,11 @@ def run_ingest(
             if site is not None and Path(site).is_file():
                 site = os.path.relpath(Path(site).resolve(), home.resolve())
             clock = {key: options.get(key) for key in ("timezone", "time_origin")}
-            flights = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
+            try:
+                flights = drafts(files, home, DraftOptions(mapping=mapping, site=site or SITE, **clock))
+            except UsageError as error:
+                error.others = files  # what was read of them, and why others were not, shows what is lacking
+                raise
             # further flights of one folder: beside the first, since paths in a draft are relative to it
             numbered = (
                 draft.with_name(f"{draft.stem}_{number}{draft.suffix}") for number in range(2, len(flights) + 1)

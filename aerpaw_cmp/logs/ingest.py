@@ -141,6 +141,15 @@ def ingest(
         inside, skipped_below = _below(Path(path), options, chosen)
         files += inside
         skipped += skipped_below
+    if any(file.result.reader == "generic_csv" for file in files):
+        # of one table's columns the files beside it know nothing: they keep their readers
+        refused = [item for item in skipped if isinstance(item.error, UsageError)]
+        skipped = [item for item in skipped if item not in refused]
+        for item in refused:
+            try:
+                files.append(read_file(item.path, options=options))
+            except AerpawCmpError as error:
+                skipped.append(Skipped.of(Path(item.path), (), error))
     if lacking := [item.error for item in skipped if isinstance(item.error, UsageError)]:
         lacking[0].others = Ingested(files, [item for item in skipped if item.error not in lacking])
         raise lacking[0]
@@ -515,9 +524,7 @@ def _folder(
                 inside, skipped_inside = _archive(place, options, chosen)
                 files, skipped = files + inside, skipped + skipped_inside
             else:
-                # columns that were named are those of tables: a binary log beside them keeps its reader
-                binary = chosen is not None and chosen.name == "generic_csv" and b"\0" in _beginning(place, HEAD_BYTES)
-                files.append(read_file(place, options=options, reader=None if binary else chosen))
+                files.append(read_file(place, options=options, reader=chosen))
         except AerpawCmpError as error:
             meta = place.with_suffix(".sigmf-meta")
             skipped.append(Skipped.of(place, {meta.name} if meta.exists() else (), error))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -157,7 +158,7 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str
 
 def named(
     rows: _rows.Rows, name: str, values: FloatArray, *, unit: str = "", where: BoolArray | None = None,
-    about: Mapping[str, Attribute | None] | None = None,
+    about: Mapping[str, Attribute | None] | None = None, alone: bool = False,
 ) -> Stream | None:  # fmt: skip
     """Level or KPI stream of a column by its name; of an unknown one, a KPI under its own name.
 
@@ -175,9 +176,13 @@ def named(
         Rows that count.
     about : mapping, optional
         Further attributes.
+    alone : bool
+        No level or rank stands beside it: a ratio to the noise is one.
     """
     meaning = dictionary.meaning(name)
     quantity = dictionary.Quantity(name, "kpi", ()) if meaning is None else meaning.quantity
+    if alone and quantity.name == "SINR":
+        quantity = replace(quantity, name="SNR", role="rss")
     short = re.sub(r"\W+", "_", dictionary.plain(name))
     if quantity.kind == "rss" and meaning is not None and not meaning.indirect and not meaning.place.startswith("n"):
         level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))

@@ -33,7 +33,7 @@ _NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected
 
 def is_header(names: list[str]) -> bool:
     """Check whether names hold a time and a level, ratio or rank."""
-    return len(names) > 2 and pose_csv.has_time(names) and pose_csv.has_radio(names)
+    return len(names) > 1 and pose_csv.has_time(names) and pose_csv.has_radio(names)
 
 
 def sniff(head: bytes) -> bool:
@@ -203,7 +203,10 @@ def _radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         for stream in _cells.streams(rows, _readings(sheet, part), source="drive test")
     ]
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
-    return [*levels, *((_rank if column in ranks else _other)(rows, sheet, column) for column in columns)]
+    direct = [what.quantity.role for what in sheet.meanings if what is not None and not what.indirect]
+    # alone, a ratio to the noise is what a receiver says of the level
+    alone = not {"rss", "rank"} & {*direct}
+    return [*levels, *(_rank(rows, sheet, i) if i in ranks else _other(rows, sheet, i, alone) for i in columns)]
 
 
 def _renamed(stream: Stream | None, suffix: str) -> Stream | None:
@@ -266,12 +269,13 @@ def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
 _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero)\b")
 
 
-def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
+def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream | None:
     values, name = sheet.numbers(column), sheet.plain[column]
     about = {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(name)) else {}
     if tower and name == f"snr {tower[0]}":
         return _rows.snr(rows, about["node"], values)
-    return _cells.named(rows, name, values, unit=sheet.unit_read(column), where=np.isfinite(values), about=about)
+    where, unit = np.isfinite(values), sheet.unit_read(column)
+    return _cells.named(rows, name, values, unit=unit, where=where, about=about, alone=alone)
 
 
 READER = Reader(

@@ -173,9 +173,9 @@ class Trial:
     """A trouble with its numbers: what it changes, what choosing them costs, and what is said of it.
 
     ``change_db`` (n,) is added to the predicted level; ``columns`` (n, k) have free coefficients, unit normals before
-    the flight; ``clipped`` (n,) are samples whose level is not that of the link, with a ``side``
-    because the link is below (1) or above (-1) ``estimate``; ``fading`` (n,) is the share of the link's fading that is
-    shown. ``cost`` is the log likelihood that goes where the numbers are averaged over all that they may be.
+    the flight; ``clipped`` (n,) are samples whose level is not that of the link; ``fading`` (n,) is the share of the
+    link's fading that is shown. ``cost`` is the log likelihood that goes where the numbers are averaged over all that
+    they may be.
     """
 
     name: str
@@ -185,7 +185,6 @@ class Trial:
     change_db: FloatArray | None = None
     columns: FloatArray | None = None
     clipped: BoolArray | None = None
-    side: float = 0.0
     fading: FloatArray | None = None
     estimate: _Estimate = _NOTHING
 
@@ -491,23 +490,18 @@ def _fitted(e: LevelEvidence, *trials: Trial, at: _Memories = _START, climb: boo
         return _Fit(-math.inf, target - target.mean(), _START)
     link = ~clipped
     scale = shown[link]
-    likelihood, coefficients, memories = _remembering(target[link] / scale, design[link] / scale[:, None], at, climb)
-    likelihood, residual = likelihood - float(np.log(scale).sum()), target - design @ coefficients
-    for trial in (trial for trial in trials if trial.side):
-        # picked by their own level, they look alike in any log: the link, too, must lie beyond the limit (logistic)
-        short = trial.side * (e.measured_db - residual - trial.estimate[0])[trial.clipped]
-        likelihood -= float(np.logaddexp(0.0, short / max(_LOGISTIC * residual[link].std(), _LEAST_SPREAD_DB)).sum())
+    fit = _remembering(target[link] / scale, design[link] / scale[:, None], at, climb)
+    likelihood, residual = fit.log_likelihood - float(np.log(scale).sum()), np.zeros(len(target))
+    residual[link] = fit.residual_db * scale
     if clipped.any():  # what a receiver writes beyond its limit remembers nothing of the link
         residual[clipped] = e.measured_db[clipped] - e.measured_db[clipped].mean()
         # their mean and spread are two numbers (Schwarz)
         spread = max(float(residual[clipped].std()), _LEAST_SPREAD_DB)
         likelihood -= float(clipped.sum()) * (math.log(spread) + 0.5) + math.log(float(clipped.sum()))
-    return _Fit(likelihood, residual, memories)
+    return _Fit(likelihood, residual, fit.memories)
 
 
 _LEAST_SPREAD_DB = 0.2
-# Scale of a logistic distribution over its standard deviation.
-_LOGISTIC = math.sqrt(3.0) / math.pi
 # Standard deviation of the offset of a log that nobody knows [dB].
 _OFFSET_DB = 100.0
 
@@ -528,12 +522,10 @@ def _whitening(memories: _Memories) -> tuple[tuple[float, float, float], float, 
     return (1.0, -slow - fast, slow * fast), theta, math.sqrt(innovation)
 
 
-def _remembering(
-    residual: FloatArray, design: FloatArray, at: _Memories, climb: bool
-) -> tuple[float, FloatArray, _Memories]:
-    """Likelihood and coefficients under noise of two memories: given ones, or climbed to from there or a start.
+def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb: bool) -> _Fit:
+    """Fit under noise of two memories: the given ones, or those climbed to from there or a start.
 
-    Coefficients of the design are unit normals: the likelihood is integrated over them, the coefficients are their
+    Coefficients of the design are unit normals: the likelihood is integrated over them, the residual is about their
     means. The noise has its likeliest size.
     """
     from scipy.linalg.lapack import dtbtrs  # scipy.signal would load for 0.4 s
@@ -567,7 +559,8 @@ def _remembering(
         last = best
         tried |= {memories: fit(memories) for memories in last.near if memories not in tried}
         best = max(tried, key=lambda memories: tried[memories][0])
-    return *tried[best], best
+    likelihood, coefficients = tried[best]
+    return _Fit(likelihood, residual - design @ coefficients, best)
 
 
 _LEAST_VARIANCE = 1e-12
@@ -811,7 +804,7 @@ def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
     if pile is not None:
         limit = float(e.measured_db[pile].mean())
         if (trial := _limited(e, limit, side)) is not None:
-            yield dataclasses.replace(trial, clipped=pile, side=side, estimate=(limit, limit, limit))
+            yield dataclasses.replace(trial, clipped=pile, estimate=(limit, limit, limit))
     limits = np.quantile(e.measured_db, np.linspace(0.02, 0.7, 18) if side > 0 else np.linspace(0.98, 0.3, 18))
     trials = {limit: trial for limit in limits.tolist() if (trial := _bent(e, limit, side)) is not None}
     if trials:

@@ -178,8 +178,8 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("RSRP", "rss", (
         r"\brs ?rp\b|\bss ?rsrp\b|\b(nrx)?rsrp\d{0,2}\b|\b(n|nb|nbr)\d{0,2}rsrp\b",
     ), "dBm", none=(0.0,), can_be=_DBM),
-    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(0.0, 99.0, 255.0), can_be=(-60.0, 3.0)),
-    Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", none=(99.0, 255.0), can_be=_DB),
+    Quantity("RSRQ", "kpi", (r"\b(nrx)?rsrq\d{0,2}\b",), "dB", none=(-99.0, 0.0, 99.0, 255.0), can_be=(-60.0, 3.0)),
+    Quantity("SINR", "kpi", (r"\b(rs ?)?s(i)?nr\d{0,2}\b|\brssnr\b",), "dB", none=(-99.0, 99.0, 255.0), can_be=_DB),
     Quantity("RSSI", "rss", (r"\brss(i\d{0,2})?\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RSCP", "rss", (r"\brscp\b",), "dBm", none=(0.0,), can_be=_DBM),
     Quantity("RxLev", "rss", (r"\brx ?lev\b",), "dBm", none=(0.0,), can_be=_DBM),
@@ -410,9 +410,9 @@ def _milliwatts(per_unit: float) -> Callable[[FloatArray], FloatArray]:
 # Each unit that a name or a cell may have: the unit in which it is read, and how it becomes that.
 UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     **{word: ("m", _times(factor)) for word, factor in (
-        ("ft", 0.3048), ("feet", 0.3048), ("foot", 0.3048), ("m", 1.0), ("meter", 1.0), ("meters", 1.0),
-        ("metres", 1.0), ("dm", 0.1), ("cm", 0.01), ("mm", 1e-3), ("km", 1e3), ("yd", 0.9144), ("in", 0.0254),
-        ("inch", 0.0254), ("inches", 0.0254))},
+        ("ft", 0.3048), ("feet", 0.3048), ("foot", 0.3048), ("kft", 304.8), ("m", 1.0), ("meter", 1.0),
+        ("meters", 1.0), ("metres", 1.0), ("dm", 0.1), ("cm", 0.01), ("mm", 1e-3), ("km", 1e3), ("yd", 0.9144),
+        ("in", 0.0254), ("inch", 0.0254), ("inches", 0.0254))},
     **{word: ("m/s", _times(factor)) for word, factor in (
         ("mph", 0.44704), ("m/s", 1.0), ("mps", 1.0), ("km/h", 1 / 3.6), ("kmh", 1 / 3.6), ("kph", 1 / 3.6),
         ("kts", 0.514444), ("kt", 0.514444), ("kn", 0.514444), ("knots", 0.514444), ("cm/s", 0.01), ("ft/s", 0.3048))},
@@ -425,6 +425,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
         ("bps", 1.0), ("bit/s", 1.0), ("kbps", 1e3), ("kbit/s", 1e3), ("mbps", 1e6), ("mbit/s", 1e6), ("gbps", 1e9),
         ("gbit/s", 1e9))},
     "db": ("dB", _times(1.0)),
+    "linear": ("dB", _milliwatts(1.0)),
     "mv": ("V", _times(1e-3)),
     "dbm": ("dBm", _times(1.0)),
     "dbw": ("dBm", lambda values: values + 30.0),
@@ -435,8 +436,8 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
 OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
 # Units that a name may have without brackets: 'alt_ft_agl', 'rsrp_dbm'.
-_SUFFIXES = ("ft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps", "dbm",
-             "dbw", "mw", "uw", "nw", "e6", "e7", "cdeg", "kbps", "mbps", "db")  # fmt: skip
+_SUFFIXES = ("ft", "kft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps",
+             "dbm", "dbw", "mw", "uw", "nw", "e6", "e7", "cdeg", "kbps", "mbps", "db", "linear")  # fmt: skip
 
 
 def is_unit(text: str) -> bool:

@@ -91,7 +91,7 @@ FAULTS = (
     Fault("nothing hides", f"{P}.search.occlusion", "Occlusion.segments", "if not self.pieces:", "if self.pieces:"),
     Fault("walls 5 m longer than they are", f"{P}.geometry.faces", "inside", "(faces.upper + tolerance_m)", "(faces.upper + 5.0)"),
     Fault("reflection points off by 1 % of the way", f"{P}.search.mirror", "trace_back", "share = behind / (behind + ahead)", "share = 0.99 * behind / (behind + ahead)"),
-    Fault("walls moved by 5 cm", f"{P}.geometry.faces", "_walls", "offset = float(normal[:2] @ start)", "offset = float(normal[:2] @ start) + 0.05"),
+    Fault("walls moved by 5 cm", f"{P}.geometry.faces", "_walls", "offset_m=float(normal[:2] @ start)", "offset_m=float(normal[:2] @ start) + 0.05"),
     Fault("antenna 30 cm higher", "aerpaw_cmp.site.site", "Tower.position_m", "self.ground_m + self.antenna_height_m", "self.ground_m + self.antenna_height_m + 0.3"),
     Fault("power summed over the receiving ports", f"{P}.field.sum", "mean_pair_power", "parts, parts) / pairs)", "parts, parts) / pairs * h.shape[-2])"),
     Fault("transmit power 1 dB more", f"{P}.field.sum", "rss_dbm", "transmit_power_dbm + db", "transmit_power_dbm + 1.0 + db"),
@@ -122,6 +122,7 @@ def _forget() -> None:
     from aerpaw_cmp.propagation.geometry import faces
 
     faces._faces.cache_clear()
+    faces._solids.cache_clear()
     foliage._last_index.clear()
 
 

@@ -522,11 +522,11 @@ def choose_features(
     x, y, group = _training(features, rank, groups)
     step = max(1, _HELD // (x.shape[1] * (x.shape[2] + 1) * MAX_RANK))
     rough = np.concatenate([_own_losses(x[i : i + step], y) for i in range(0, len(x), step)])
-    # stable: of equal candidates the one listed first stays, on every machine
-    final = np.argsort(rough, kind="stable")[:finalists]
+    # stable, to nine digits: of candidates equal but for rounding (mounts half a turn apart) the first listed stays
+    final = np.argsort(np.round(rough, 9), kind="stable")[:finalists]
     losses = np.concatenate([_left_out_losses(x[final[i : i + step]], y, group) for i in range(0, len(final), step)])
     score = losses.mean(axis=1)
-    rows = np.argsort(score, kind="stable")
+    rows = np.argsort(np.round(score, 9), kind="stable")
     tied = tuple(int(final[r]) for r in rows if _not_worse(losses[r] - losses[rows[0]], replicates))
     return FeatureChoice(
         best=int(final[rows[0]]), order=final[rows], log_score=score[rows], tied=tied, candidates=len(features)

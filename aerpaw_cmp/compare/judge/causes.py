@@ -27,7 +27,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ...common.units import BoolArray, FloatArray, IntArray, Printed
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed
 from ..statistics.intervals import Interval
 
 # Samples are averaged over so long [s], over longer where a flight has more than so many seconds.
@@ -407,7 +407,7 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
         return None
 
     def mean(values: FloatArray) -> FloatArray:
-        return _mean(values[finite], place)
+        return _mean(values[finite], place, count)
 
     def binned(name: str, value: object) -> object:
         if isinstance(value, Mapping):
@@ -428,10 +428,11 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
     return LevelEvidence(**changed)  # type: ignore[arg-type]
 
 
-def _mean(values: FloatArray, place: IntArray) -> FloatArray:
-    """Means of values (n,) or (n, k) over the samples of each place."""
-    sums = [np.bincount(place, column) for column in values.reshape(len(values), -1).T]
-    return np.asarray(np.column_stack(sums) / np.bincount(place)[:, None]).reshape(-1, *values.shape[1:])
+def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
+    """Means of values (n,) or (n, k) over the samples of each place, of which there are ``count``."""
+    if values.ndim == 1:
+        return np.asarray(np.bincount(place, values) / count)
+    return np.column_stack([_mean(column, place, count) for column in values.T])
 
 
 def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
@@ -439,7 +440,8 @@ def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray
     azimuth, elevation = np.radians(e.uav_azimuth_deg[finite]), np.radians(e.uav_elevation_deg[finite])
     flat = np.cos(elevation)
     towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-    at, towards = _mean(e.place_m[finite], second), _mean(towards, second)
+    count = np.bincount(second)
+    at, towards = _mean(e.place_m[finite], second, count), _mean(towards, second, count)
     number, begin = np.zeros(len(at), dtype=np.int64), 0
     for i in range(1, len(at)):
         turned = np.linalg.norm(towards[i] - towards[begin]) > np.radians(_NEAR_DEG)
@@ -831,10 +833,8 @@ def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
     if (side * (e.measured_db - limit) < -_BEYOND_DB).mean() > _MOST_BEYOND:
         return None
     name, words, step = _LIMITS[side]
-    sentence, next_step = (
-        words.format(level=f"{Printed(limit):.0f} {e.unit}"),
-        step.format(typed=f"{limit + _OVER_FLOOR_DB:.0f}"),
-    )
+    sentence = words.format(level=f"{Printed(limit):.0f} {e.unit}")
+    next_step = step.format(typed=f"{limit + _OVER_FLOOR_DB:.0f}")
     return Trial(name=name, cost=0.0, sentence=sentence, next_step=next_step)
 
 

@@ -30,9 +30,10 @@ _RISES_M = (-150.0, -100.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 
 
 
 def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResult]) -> tuple[Cause | None, str | None]:
-    """The likely cause of the error of a flight over its scored channels, and its step; towers that move have none.
+    """The likely cause of the error of a flight over its scored channels; towers that move have none.
 
-    Without a cause the step is a calibration, where directions of the UAV's antenna tell some of the error.
+    Without a cause the second is a next step: a calibration, where directions of the UAV's antenna tell some of the
+    error.
 
     Parameters
     ----------
@@ -46,7 +47,7 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     Cause or None, str or None
     """
     if any(is_simulated(stream) for file in data.files for stream in file.result.streams):
-        return SIMULATED, SIMULATED.next_step
+        return SIMULATED, None
     names = {result.name for result in without_copies(results)}  # a copy is replayed with antennas of another channel
     evidence = [
         _evidence(data, series, replayed, result)
@@ -54,10 +55,10 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
         if replayed.tower_m is None and not result.training and result.name in names
     ]
     cause = flight_cause(evidence)
-    if cause is not None:
-        return cause, cause.next_step or None
     # learned antennas miss some decibels of any flight
-    return None, _CALIBRATE if not data.settings.antennas and gains_by_direction(evidence) else None
+    if cause is not None or data.settings.antennas or not gains_by_direction(evidence):
+        return cause, None
+    return None, _CALIBRATE
 
 
 _CALIBRATE = "`aerpaw-cmp calibrate` with two flights of this site"

@@ -80,7 +80,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
     )),
     Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$", r"^(datum|fecha)$")),
-    Quantity("zone", "time", (r"^(time ?)?zone$", r"^tz$", r"^utc offset$", r"^gmt offset$")),
+    Quantity("zone", "time", (r"^((time ?)?zone|tz)( ?(name|id|offset))?$", r"^(utc|gmt) ?offset( (h|min|s))?$")),
     Quantity("gps_week", "time", (r"^gps ?(week|wk)( number| no)?$", r"^gwk$", r"^(week|wn)( number| no)?$")),
     Quantity("gps_seconds", "time", (
         r"^(gps ?)?(tow|i ?tow|seconds? of week|week seconds?|sow|gps seconds?)( s| ms)?$", r"^gms$",

@@ -346,6 +346,7 @@ _THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,12})?")
 # Cells that say that there is no value.
 NO_VALUE = {"", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null", "inf", "-inf", "-infinity", "unavailable",
             "unknown", "invalid"}  # fmt: skip
+_NO_ZONE = {*NO_VALUE, "local", "local time"}
 
 
 def _are_thousands(texts: Sequence[str]) -> bool:
@@ -596,8 +597,9 @@ def _time_column(sheet: Sheet) -> int | None:
 
 def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> tuple[str, FloatArray, list[str]]:
     texts = sheet.texts(column)
-    day = None if mapped else sheet.find("date")
-    if day is not None and day != column:
+    # of a mapped column, too, where it is the time of a day beside its date
+    day = sheet.find("date") if not mapped or column == _time_column(sheet) else None
+    if day is not None and day != column and not _stamps.is_dated(next(filter(None, texts), "")):
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
         texts = [f"{date} {time}".strip() for date, time in pairs]
     name, unit = dictionary.plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", sheet.names[column])), sheet.unit(column)
@@ -608,9 +610,8 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     zone = _stamps.header_zone(sheet.names[column], dictionary.in_brackets(sheet.names[column])[1])
     if day is not None and not zone:
         zone = _stamps.header_zone(sheet.names[day], dictionary.in_brackets(sheet.names[day])[1])
-    if (beside := None if mapped else sheet.find("zone")) is not None:
-        zones = [_stamps.beside(text) for text in sheet.texts(beside)]
-        texts = [f"{time} {own}".strip() for time, own in zip(texts, zones, strict=True)]
+    if (beside := sheet.find("zone")) is not None:
+        zone, texts = _zone_beside(sheet, beside, zone, texts, options)
     gps = re.search(r"\bgps", name) is not None
     heads = " ".join(sheet.names[i].lower() for i in (day, column) if i is not None)
     first = _DAY_OR_MONTH.search(heads)
@@ -620,9 +621,51 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     )  # fmt: skip
 
 
+def _zone_beside(sheet: Sheet, column: int, zone: str, texts: list[str], options: ReadOptions) -> tuple[str, list[str]]:
+    """Zone of the times by the column of zones beside them, and the times with their own where it names several."""
+    cells = sheet.texts(column)
+    known = {text: "" if text.lower() in _NO_ZONE else _stamps.beside(text) for text in cells}
+    word = next(filter(None, known.values()), "")
+    if unknown := next((text for text, own in known.items() if not own and text.lower() not in _NO_ZONE), ""):
+        sheet.notes[column] = f"column {sheet.names[column]!r}: {unknown[:30]!r} is no zone that is known: not used"
+    elif zone and word and word != zone:
+        sheet.notes[column] = f"column {sheet.names[column]!r} says {word}, the name of the times {zone}: read so"
+    elif word and options.timezone not in (None, word) and not all(map(_NUMBER.fullmatch, texts[:3])):
+        text = f"column {sheet.names[column]!r} gives the zone of the times, {word}: --timezone is for times without"
+        sheet.notes[column] = text
+    if zone or len({*known.values()}) == 1:
+        return zone or word, texts
+    both = zip(texts, (known[text] for text in cells), strict=True)
+    # an epoch is UTC whatever the zone
+    return "", [text if _NUMBER.fullmatch(text) else f"{text} {own}".strip() for text, own in both]
+
+
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
 # The order that a name gives: 'date (dd/mm/yyyy)'.
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
+
+
+_LIKE_A_LEVEL = re.compile(
+    r"^lw ?[1-5]$|^value$|\b(asu|csq)\b|^(?!.*(batt|volt|throttle|gps|water|fuel|noise|tx)).*"
+    r"(power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss\b|strength|ampl|magnitude)"
+)
+_MAPPED = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
+
+
+def way_to_level(sheet: Sheet) -> list[str]:
+    """A sentence with the options that read as the level a column whose name only looks like one, or the RSRQ."""
+    unknown = [i for i, meaning in enumerate(sheet.meanings) if meaning is None]
+    named = [i for i in unknown if _LIKE_A_LEVEL.search(dictionary.plain(sheet.names[i]))]
+    filled = [i for i in (*named, sheet.find("RSRQ")) if i is not None and np.isfinite(sheet.numbers(i)).any()]
+    time = _time_column(sheet) if sheet.find("time") is not None else sheet.find("gps_seconds")
+    if not filled or time is None:
+        return []
+    places = [(sheet.find(quantity), quantity) for quantity in _MAPPED]
+    pairs = [(time, "time"), *((i, quantity) for i, quantity in places if i is not None), (filled[0], "rss_db")]
+    options = " ".join(f"--map {sheet.names[i]!r}={quantity}" for i, quantity in pairs)
+    unit = sheet.unit_read(filled[0]) or ("dB" if sheet.meanings[filled[0]] else "dBm")
+    others = f" (so may {', '.join(repr(sheet.names[i]) for i in filled[1:5])})" if filled[1:] else ""
+    return [f"{sheet.names[filled[0]]!r} may be a level, and is not read as one{others}: {options} --unit {unit}"]
 
 
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:

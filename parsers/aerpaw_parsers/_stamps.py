@@ -21,7 +21,7 @@ from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 
-_NAMED_ZONE = r"Z|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
+_NAMED_ZONE = r"Z|[A-Z][A-Za-z]+/[A-Z][\w/]+|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
 # A zone is not the AM or PM that stands in the same place.
 _ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
 _CLOCK = (
@@ -177,6 +177,18 @@ def _match(text: str) -> re.Match[str] | None:
     return next(known, None)
 
 
+def is_dated(text: str) -> bool:
+    """Check whether a time holds its date: as an epoch does, and a date with a clock.
+
+    Examples
+    --------
+    >>> is_dated("1749564000"), is_dated("2025-06-10 10:00"), is_dated("10.00.00"), is_dated("100000.5")
+    (True, True, False, False)
+    """
+    match = _match(text)
+    return re.match(r"\d{9}", text) is not None or (match is not None and match["hour"] is not None)
+
+
 def _written(text: str, order: _Order, zones: _Zones) -> bytes:
     """One time in the common form; ``-`` where it is none."""
     match = _match(text)
@@ -289,12 +301,15 @@ def beside(text: str) -> str:
 
     Examples
     --------
-    >>> beside("EDT"), beside("-240"), beside("-14400"), beside("-0400"), beside("5.5"), beside("here")
+    >>> beside("edt"), beside("-240"), beside("-14400"), beside("-0400"), beside("5.5"), beside("at home")
     ('EDT', '-04:00', '-04:00', '-0400', '+05:30', '')
+    >>> beside("Asia/Tokyo"), beside("Asia/Nowhere")
+    ('Asia/Tokyo', '')
     """
     number = re.fullmatch(r"[+-]?\d{1,5}(?:\.\d{1,2})?", text)
     if number is None or re.fullmatch(r"[+-]\d{4}", text):
-        return text if re.fullmatch(_NAMED_ZONE, text) else ""
+        word = text if "/" in text else text.upper()
+        return word if re.fullmatch(_NAMED_ZONE, word) and ("/" not in word or _at(word, datetime.min)) else ""
     hours = float(text)
     # no zone is further than 14 h from UTC: larger numbers are minutes (840) or seconds
     hours /= 1 if abs(hours) <= 14 else 60 if abs(hours) <= 840 else 3600

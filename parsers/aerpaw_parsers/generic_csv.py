@@ -7,6 +7,7 @@ HH:MM:SS[.f][offset]``, or as tables of other programs have them: ``15.07.2024 1
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from difflib import get_close_matches
 
 import numpy as np
@@ -125,10 +126,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     if lines.blank.all():
         return ReadResult("generic_csv", (), len(lines), 0, len(lines))
     first = int(np.argmin(lines.blank))
-    line = lines.raw(first).removeprefix(b"\xef\xbb\xbf")
-    # the user has named the columns: the first line is the header, whatever its words
-    separator = max(_sheet.SEPARATORS, key=lambda sign: line.count(sign.encode()))
-    header = [name.strip() for name in _sheet.split_row(line, separator)]
+    # the user has named the columns: the line that has them is the header, else the first, whatever its words
+    known = (item for item in _tables(lines, first) if {*options.columns.values()} <= {*item[2]})
+    first, separator, header = next(known, next(_tables(lines, first)))
     kind, where = _checked(options, header)
     sheet = _sheet.cut(lines, first, separator, header)
     sheet.said = {where[name]: quantity for name, quantity in _QUANTITIES.items() if name in where}
@@ -153,6 +153,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             streams.append(_track(of_device, table, where, device))
     rows.warnings += sheet.unread()
     return rows.result(streams)
+
+
+def _tables(lines: _lines.Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
+    """Lines that may be the header, from the first on: place, separator and names."""
+    for i in range(first, min(first + _sheet.TITLES, len(lines))):
+        line = lines.raw(i).removeprefix(b"\xef\xbb\xbf")
+        separator = max(_sheet.SEPARATORS, key=lambda sign: line.count(sign.encode()))
+        yield i, separator, [name.strip() for name in _sheet.split_row(line, separator)]
 
 
 def _divided(rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind) -> list[tuple[str, _rows.Rows, _sheet.Sheet]]:

@@ -6,18 +6,11 @@ brought to heights above the first position. Times without a zone are local unle
 
 from __future__ import annotations
 
-import re
-
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_cmp.readers import dictionary
 
 from . import _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, vehicle_out
-
-_LIKE_A_LEVEL = re.compile(
-    r"^lw ?[1-5]$|^value$|\b(asu|csq)\b"
-    r"|^(?!.*(batt|volt|throttle|gps)).*(\b(rx|received?) ?power|signal|\bdb(m|fs)?\b|\brss\b|strength)"
-)
 
 
 def is_header(names: list[str]) -> bool:
@@ -55,9 +48,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows = None if sheet is None else _sheet.rows(sheet, options, reader="pose_csv")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "pose_csv", "no header with a time, a latitude and a longitude")
-    unread = [name for name in sheet.names if _LIKE_A_LEVEL.search(dictionary.plain(name))]
-    if unread:
-        rows.warnings.append(f"columns that are not read: {', '.join(unread[:5])}; '--map' of all reads a level")
+    rows.warnings += _sheet.way_to_level(sheet)
     tracks = [
         _pose.from_sheet(part, cells, name=f"vehicle_{label}" if label else "vehicle", source="table of positions")
         for label, part, cells in _sheet.parts(rows, sheet, "device")

@@ -1,6 +1,7 @@
 """A first flight.yaml from logs alone."""
 
 import os
+import shlex
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -258,13 +259,16 @@ def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) 
     )
 
 
-def test_nothing_to_compare_is_said(logs: Path) -> None:
+def test_nothing_to_compare_is_said_with_options_to_paste(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(UsageError, match="no log of RSS or rank"):
         draft(ingest(logs.glob("UAV/*vehicleOut.txt"), options=OPTIONS), logs)
     table = logs / "table.csv"
-    table.write_text("time,lat,lon,power_dbm\n2025-06-01T14:00:00Z,35.7,-78.7,-60\n")
-    with pytest.raises(UsageError, match="power_dbm; '--map' of all reads a level"):
+    table.write_text("by hand\nDate,Time,lat,lon,alt,rx's power\n2025-06-01,10:00:00,35.73,-78.7,30,-60\n")
+    with pytest.raises(UsageError, match="may be a level") as refused:
         draft(ingest(table, options=OPTIONS), logs)
+    options = shlex.split(str(refused.value).partition("read as one: ")[2].partition(";")[0])
+    assert main(["ingest", str(table), *options, "--timezone", ZONE, "--draft", str(logs / "flight.yaml")]) == 0
+    assert "1 sample can be compared" in capsys.readouterr().err
 
 
 def test_the_place_is_looked_at_before_the_logs(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:

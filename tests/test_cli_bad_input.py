@@ -125,7 +125,7 @@ def test_settings_of_another_kind_are_told_as_such(
     """Not key by key; and the next step names the command that reads them."""
     for reader, text in KINDS.items():
         (file := tmp_path / "file.yaml").write_text(text)
-        if reader != command:
+        if reader != command and (reader, command) != ("report", "calibrate"):  # which takes flight files, too
             assert main([command, str(file)]) == 2
             err = capsys.readouterr().err
             assert f"Next: 'aerpaw-cmp {reader} {file}'" in err

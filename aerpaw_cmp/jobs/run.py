@@ -558,16 +558,23 @@ def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
 
 
 def run_calibrate(
-    path: Path, options: RunOptions = DEFAULT, *, into_site: str | None = None, score: Sequence[Path] = ()
+    path: Path,
+    options: RunOptions = DEFAULT,
+    *,
+    further: Sequence[Path] = (),
+    into_site: str | None = None,
+    score: Sequence[Path] = (),
 ) -> JobOutcome:
     """Learn antennas from flights; write ``calibrated.yaml`` and, in the folder of its name, antennas and page.
 
     Parameters
     ----------
     path : Path
-        calibration.yaml.
+        calibration.yaml, or a flight file.
     options : RunOptions
         ``out`` is the file to write; the folder lies beside it.
+    further : sequence of Path
+        Flight files that are learned from, too.
     into_site : str, optional
         Site (site.yaml or packaged) whose memory gets what was learned, as an entry of the calibration's name.
     score : sequence of Path
@@ -586,7 +593,7 @@ def run_calibrate(
     from .learning.calibration_files import Calibrated, site_entry, write_files
     from .tasks.manifest import inputs_of_flights
 
-    settings = load_calibration(path)
+    settings = load_calibration(path, further)
     if into_site is not None:
         site_model(into_site)  # a misspelt one is told before the fit, and gets no memory of its own
         read_learned(into_site)

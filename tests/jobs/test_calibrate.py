@@ -52,6 +52,14 @@ def test_scores_are_those_of_what_was_left_out(metrics: dict) -> None:
     assert metrics["stages"]["fit_s"] > 0
 
 
+def test_flight_files_by_themselves_are_learned_from_as_a_list_of_them_is(folder: Path) -> None:
+    listed = load_calibration(folder / "calibration.yaml")
+    typed = load_calibration(folder / "first.yaml", [folder / "second.yaml"])
+    assert typed.calibration == "first"
+    assert [Path(name).name for name in typed.flights] == listed.flights
+    assert main(["calibrate", *(str(folder / name) for name in listed.flights), "--dry-run"]) == 0
+
+
 def test_the_planted_antenna_is_in_the_file(folder: Path, metrics: dict) -> None:
     """Where flights looked, the file is the sector antenna at its yaw, give or take its own standard deviation."""
     learned = read_sphere_csv(folder / "calibrated" / "LW1.USRP1.tower.csv")

@@ -17,7 +17,7 @@ from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.remembered import offered
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting.flight_run import run_flight, unrivalled
+from aerpaw_cmp.jobs.reporting.flight_run import next_step, run_flight, unrivalled
 from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_changes
 from aerpaw_cmp.site.antenna.learned import Entry, Errors, LearnedSeries, folder_of, remember
 from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv, unit_mean_gain
@@ -279,3 +279,12 @@ def test_a_loss_over_directions_is_no_cause_where_another_model_explains_as_much
     assert (unrivalled(cause, climbed) is cause) == stays
     climbed.recommended = None
     assert unrivalled(cause, climbed) is cause
+
+
+@pytest.mark.parametrize("logs", [None, ("ab" * 32,)])
+def test_a_training_flight_has_no_step_against_a_cause_that_its_first_words_leave_out(logs: Any) -> None:
+    panel = SimpleNamespace(score=SimpleNamespace(at_edge=False), further=SimpleNamespace(trained_on=logs))
+    cause = Cause(name="lock", sentence="", next_step="look there")
+    result: Any = SimpleNamespace(rss=[panel], series=[panel], likely_cause=cause, next_step=None)
+    data: Any = None
+    assert next_step(data, result, None) == (None if logs else "look there")

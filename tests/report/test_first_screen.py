@@ -86,7 +86,7 @@ def test_the_first_sentence_follows_from_the_interval_over_all_channels(report_d
     won = paragraph(judged_as(report_data, -4.9, -6.0, -3.9, 3.0))
     assert won.startswith(f"Ray tracing (RMSE 3.0 dB) is 4.90 dB better than {best} [3.90, 6.00] over")
     few = paragraph(judged_as(report_data, 0.5, np.nan, np.nan))
-    assert f"{best}: 7.9 dB. The flight is too short for an interval of the difference." in few
+    assert f"{best}: 7.9 dB. The flight is too short to tell the two apart." in few
     none = paragraph(dataclasses.replace(lost, verdict=None))
     assert none.startswith("Ray tracing: RMSE 8.4 dB. No baseline could be scored.")
 
@@ -179,8 +179,9 @@ def every_outcome(data):
             if number < learned:
                 changed = with_numbers(changed, trained_on=DIGEST, rmse_db=np.nan)
             panels.append(changed)
-        judged = dataclasses.replace(judged, rss=tuple(panels), next_step=step)
-        yield with_cause(judged) if cause else judged
+        judged = dataclasses.replace(judged, rss=tuple(panels))
+        judged = with_cause(judged) if cause else judged
+        yield dataclasses.replace(judged, next_step=step) if learned or not cause else judged
 
 
 def test_no_first_paragraph_has_more_than_sixty_words_and_all_have_one_order(report_data):
@@ -201,6 +202,8 @@ def test_no_first_paragraph_has_more_than_sixty_words_and_all_have_one_order(rep
 
 def test_a_training_flight_explains_its_dashes(report_data):
     panels = tuple(with_numbers(p, trained_on=DIGEST, rmse_db=np.nan) for p in report_data.rss)
+    step = "`rss: {span_db: [-50, 70]}`"
+    assert paragraph(dataclasses.replace(report_data, rss=panels, next_step=step)).endswith(f" Next: {step}.")
     text = paragraph(dataclasses.replace(report_data, rss=panels))
     assert text.startswith("Training flight: the antennas of 3 channels were learned from this flight's own log")
     assert "the tables show “–” instead of an error. For comparison, " in text

@@ -162,6 +162,7 @@ def _print_report_summary(outcome: Any) -> None:
 @command(
     "calibrate",
     examples=[
+        "aerpaw-cmp calibrate flight.yaml another.yaml",
         "aerpaw-cmp calibrate calibration.yaml -o learned.yaml",
         "aerpaw-cmp calibrate calibration.yaml --logs-root /data/flights --json",
         "aerpaw-cmp calibrate calibration.yaml --into-site my_site.yaml",
@@ -169,7 +170,7 @@ def _print_report_summary(outcome: Any) -> None:
     ],
 )
 def calibrate(
-    calibration_yaml: Annotated[Path, Argument(metavar="CALIBRATION", help="calibration.yaml")],
+    flights: Annotated[list[Path], Argument(metavar="FLIGHT", help="flight.yaml files, or a calibration.yaml.")],
     out: Annotated[
         Path | None, output("File for the learned settings  [default: <calibration>.calibrated.yaml]", "FILE")
     ] = None,
@@ -190,7 +191,7 @@ def calibrate(
     from ...jobs import run
 
     options = RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)
-    outcome = run.run_calibrate(calibration_yaml, options, into_site=into_site, score=score or ())
+    outcome = run.run_calibrate(flights[0], options, further=flights[1:], into_site=into_site, score=score or ())
     if answered(outcome.metrics):
         return
     from ...compare.learning.calibration import BASELINES

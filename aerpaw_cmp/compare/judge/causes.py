@@ -696,11 +696,11 @@ OF_DIRECTION = frozenset({"blocked", _CATCH_ALL})
 _PATTERN = {
     "isotropic": (
         "the antenna pattern of the UAV",
-        "`aerpaw-cmp calibrate`",
+        "`aerpaw-cmp calibrate FLIGHT FLIGHT`",
     ),
     "measured": (
         "the antenna file does not fit the UAV",
-        "check `antenna:` of this link, else `aerpaw-cmp calibrate`",
+        "check `antenna:`, else `aerpaw-cmp calibrate FLIGHT FLIGHT`",
     ),
     "learned": (
         "the learned antennas do not fit this UAV",

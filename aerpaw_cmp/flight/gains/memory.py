@@ -5,6 +5,7 @@ Reading flight.yaml opens no table; a job that replays or lists its inputs takes
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +20,14 @@ def load_with_learned(path: str | Path, learned: Path | None = None) -> FlightFi
     """A flight.yaml as :func:`~aerpaw_cmp.flight.settings.load_flight` reads it, with what its site remembers."""
     settings = load_flight(path, learned)
     return with_learned(settings, Path(path).parent)
+
+
+def flight_of(path: Path) -> FlightFile | None:
+    """The flight file that a path names; None of any other file."""
+    if path.suffix.lower() not in (".yaml", ".yml") or not path.is_file():
+        return None
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return load_with_learned(path) if re.search(r"^flight\s*:", text, re.MULTILINE) else None
 
 
 def with_learned(settings: FlightFile, folder: Path) -> FlightFile:

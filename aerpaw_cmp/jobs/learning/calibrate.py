@@ -26,7 +26,7 @@ from ...compare.learning.correction import BIN_S
 from ...compare.learning.learning_curve import CurvePoint, learning_curve
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ...flight.gains.learned_gain import mean_gain_db, sphere_angles
-from ...flight.gains.memory import load_with_learned
+from ...flight.gains.memory import flight_of, load_with_learned
 from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...flight.settings import AntennaSettings, load_pattern
 from ...flight.training import counted_once, flight_logs, marks_of
@@ -123,9 +123,13 @@ class Calibration:
         return marks_of(self.flights)
 
 
-def load_calibration(path: Path) -> CalibrationFile:
-    """Read and check a calibration.yaml; UsageError as of any settings file."""
-    settings = load_yaml(path, CalibrationFile)
+def load_calibration(path: Path, further: Sequence[Path] = ()) -> CalibrationFile:
+    """Read and check a calibration.yaml, or a flight file and ``further``; UsageError as of any settings file."""
+    if (flight := flight_of(path)) is None:
+        settings = load_yaml(path, CalibrationFile)
+    else:
+        settings = CalibrationFile(calibration=flight.flight.name, flights=[str(path.resolve())])
+    settings = settings.model_copy(update={"flights": [*settings.flights, *(str(f.resolve()) for f in further)]})
     if len(set(settings.flights)) != len(settings.flights):
         raise UsageError(
             "a flight is named twice", expected="each flight once: its copy would be scored on itself", path=path

@@ -23,6 +23,7 @@ from ...compare.gains.spread import BAND
 from ...compare.learning.correction import OFF, STATED_FIELDS, Base, by_degree, choose, fixed_base
 from ...flight.data import FlightData, site_place, unread
 from ...flight.drafting.remembered import remembered
+from ...flight.gains.memory import flight_of
 from ...flight.settings import FlightFile, LinkSettings, LinksSettings
 from ...flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
 from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
@@ -48,7 +49,7 @@ from .sources import (
     sources_of,
     track_m,
 )
-from .where import TargetOptions, Targets, find_targets, flight_of, is_settings, target_files
+from .where import TargetOptions, Targets, find_targets, is_settings, target_files
 
 # Directions of the nose that count alike where it is not known.
 HEADINGS = 8

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from ...common.errors import InputError, UsageError, parsing
 from ...common.units import BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples, link_directions
 from ...flight.data import FAR_M, FlightData, load_data, nearest_m
-from ...flight.gains.memory import load_with_learned
+from ...flight.gains.memory import flight_of
 from ...flight.pose.heights import raised
 from ...flight.pose.track import interpolated
 from ...flight.replay import attitude_rotation
@@ -148,14 +147,6 @@ def level_samples(
 def is_settings(path: Path) -> bool:
     """Check whether a path names a YAML file."""
     return path.suffix.lower() in (".yaml", ".yml")
-
-
-def flight_of(where: Path) -> FlightFile | None:
-    """The flight file that WHERE is; None where it is a site or a route."""
-    if not is_settings(where) or not where.is_file():
-        return None
-    text = where.read_text(encoding="utf-8", errors="replace")
-    return load_with_learned(where) if re.search(r"^flight\s*:", text, re.MULTILINE) else None
 
 
 def target_files(where: Path, site: str | None, logs_root: Path | None) -> list[Path]:

@@ -148,12 +148,12 @@ def next_step(data: FlightData, result: FlightResult, climbed: FlightLadder | No
             max(high, *(10 * math.ceil(m / 10) + 10 for m in missing)),
         )
         return f"`rss: {{span_db: [{ends[0]:.0f}, {ends[1]:.0f}]}}`"
-    if result.likely_cause is not None:
-        return result.likely_cause.next_step or None
     if any(panel.further.trained_on for panel in result.series):
         return None
+    if result.likely_cause is not None:
+        return result.likely_cause.next_step or None
     if is_one_place(result.rss):
         return "a flight along a route"
     if climbed is not None and climbed.recommended is not None:
-        return "`report --recommend FILE` writes settings significantly better than these"
+        return "`aerpaw-cmp report FLIGHT --recommend FILE` writes settings significantly better than these"
     return result.next_step

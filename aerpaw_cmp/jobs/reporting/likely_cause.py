@@ -61,7 +61,7 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     return None, _CALIBRATE
 
 
-_CALIBRATE = "`aerpaw-cmp calibrate` with two flights of this site"
+_CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site"
 
 
 def is_simulated(telemetry: Stream) -> bool:

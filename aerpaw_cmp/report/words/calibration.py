@@ -16,7 +16,7 @@ ONE_FLIGHT = "Nothing is scored: one flight alone. Next: add a second flight."
 HELPS: dict[str, tuple[str, str]] = {
     "better": (
         "The learned antennas are significantly better ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
-        "`aerpaw-cmp report FLIGHT --with calibrated.yaml`",
+        "`aerpaw-cmp report FLIGHT --with CALIBRATED`",
     ),
     "worse": (
         "The learned antennas are significantly worse ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",

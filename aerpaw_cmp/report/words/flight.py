@@ -106,7 +106,7 @@ class Judged:
 # What may follow the two errors, and when: the first whose condition holds. No other sentence says better or worse.
 SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
     (lambda f: not f.name, "No baseline could be scored."),
-    (lambda f: not f.judged, "The flight is too short for an interval of the difference."),
+    (lambda f: not f.judged, "The flight is too short to tell the two apart."),
     (lambda f: f.better > 0 and f.worse > 0,
      "Ray tracing is significantly better on {better} and worse on {worse} of {channels} {unit} (95 %)."),
     (lambda f: f.worse > 0 and f.channels == 1, "Ray tracing is significantly worse (95 %)."),
@@ -158,9 +158,7 @@ _DECIDED = {
     "not significant": (
         "Ray tracing: RMSE {ray}; {name}: {other}. The difference {ends}{over} is not significant (95 %)."
     ),
-    "no interval": (
-        "Ray tracing: RMSE {ray}; {name}: {other}. The flight is too short for an interval of the difference."
-    ),
+    "no interval": ("Ray tracing: RMSE {ray}; {name}: {other}. The flight is too short to tell the two apart."),
 }
 
 

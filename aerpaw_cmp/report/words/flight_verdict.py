@@ -42,7 +42,7 @@ def paragraph(data: ReportData) -> str:
     advice = "" if data.next_step is None else f"Next: {data.next_step}."
     if learned := _training(data):
         other = error if panels or not data.rss else _baseline_sentence(data.rss)
-        parts = [learned, other, words.expected_sentence(data.rss)]
+        parts = [learned, other, words.expected_sentence(data.rss), advice]
     elif error and data.against is not None and data.against.scores:
         from .prediction import before_flight  # no report without a prediction loads how one is learned
 

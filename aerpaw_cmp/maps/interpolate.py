@@ -181,21 +181,14 @@ class _Near:
     targets_m: FloatArray
 
 
+@dataclass(eq=False, kw_only=True)
 class _Local:
     """Samples, neighbours and field-by-field handling of NaN, shared by the predictors that use near samples."""
 
-    def __init__(
-        self,
-        neighbours: int = 20,
-        radius_m: float = 150.0,
-        *,
-        selection: Literal["nearest", "random"] = "nearest",
-        seed: int = 0,
-    ) -> None:
-        self.neighbours = neighbours
-        self.radius_m = radius_m
-        self.selection = selection
-        self.seed = seed
+    neighbours: int = 20
+    radius_m: float = 150.0
+    selection: Literal["nearest", "random"] = "nearest"
+    seed: int = 0
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
         """Store samples (n, dims) with values (n,) or (n, fields); NaN is out of coverage."""
@@ -245,6 +238,7 @@ class _Local:
         raise NotImplementedError
 
 
+@dataclass(eq=False)
 class IndexInterpolation(_Local):
     """The paper's baselines: spline or makima over the position index of the M samples within the radius.
 
@@ -258,19 +252,8 @@ class IndexInterpolation(_Local):
         As in :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`.
     """
 
-    def __init__(
-        self,
-        kind: Literal["spline", "makima"],
-        grid: Grid,
-        neighbours: int = 20,
-        radius_m: float = 150.0,
-        *,
-        selection: Literal["nearest", "random"] = "nearest",
-        seed: int = 0,
-    ) -> None:
-        super().__init__(neighbours, radius_m, selection=selection, seed=seed)
-        self.kind = kind
-        self.grid = grid
+    kind: Literal["spline", "makima"]
+    grid: Grid
 
     def _combine(self, near: _Near) -> FloatArray:
         curve: Callable[..., FloatArray] = {"spline": spline, "makima": makima}[self.kind]

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import KW_ONLY, dataclass
 from typing import Literal
 
 import numpy as np
@@ -82,6 +82,7 @@ class Weights:
 
 
 @from_python
+@dataclass(eq=False)
 class OrdinaryKriging:
     """Ordinary Kriging of one or many fields sampled at the same points.
 
@@ -122,22 +123,13 @@ class OrdinaryKriging:
     ([2.0, 1.0], True, 0.0)
     """
 
-    def __init__(
-        self,
-        correlation: Correlation,
-        neighbours: int = 20,
-        radius_m: float = 150.0,
-        *,
-        selection: Literal["nearest", "random"] = "nearest",
-        seed: int = 0,
-        outside: Literal["nan", "nearest"] = "nan",
-    ) -> None:
-        self.correlation = correlation
-        self.neighbours = neighbours
-        self.radius_m = radius_m
-        self.selection = selection
-        self.seed = seed
-        self.outside = outside
+    correlation: Correlation
+    neighbours: int = 20
+    radius_m: float = 150.0
+    _: KW_ONLY
+    selection: Literal["nearest", "random"] = "nearest"
+    seed: int = 0
+    outside: Literal["nan", "nearest"] = "nan"
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> OrdinaryKriging:
         """Store the samples.

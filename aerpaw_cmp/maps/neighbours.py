@@ -113,7 +113,7 @@ def by_rule(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntA
     Neighbours
     """
     if rule.selection == "random":
-        return _random_within(samples_m, targets_m, rule.neighbours, rule.radius_m, rule.seed, skip)
+        return _random_within(rule, samples_m, targets_m, skip)
     return nearest(samples_m, targets_m, rule.neighbours, rule.radius_m, skip)
 
 
@@ -181,40 +181,16 @@ def _tie_order(distance: FloatArray, who: IntArray, samples_m: FloatArray, targe
     return np.lexsort((who, *keys, _in_micrometres(distance)), axis=-1)
 
 
-def _random_within(
-    samples_m: FloatArray,
-    targets_m: FloatArray,
-    m: int,
-    radius_m: float,
-    seed: int,
-    skip: IntArray | None = None,
-) -> Neighbours:
-    """M samples drawn without replacement among those within the radius, as the paper's Step 1 may be read.
-
-    Parameters
-    ----------
-    samples_m, targets_m : (n, 2 or 3), (t, 2 or 3)
-        Positions.
-    m : int
-        Samples per target, at most.
-    radius_m : float
-    seed : int
-        Fixes the draw.
-    skip : (t,) int, optional
-        Sample that is not to be taken for a target (leave-one-out).
-
-    Returns
-    -------
-    Neighbours
-        Indices (t, m), -1 where there are fewer, and distances (t, m) [m].
-    """
+def _random_within(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntArray | None) -> Neighbours:
+    """M samples drawn without replacement among those within the radius, as the paper's Step 1 may be read."""
     from scipy.spatial import cKDTree
 
+    m, radius_m = rule.neighbours, rule.radius_m
     index = np.full((len(targets_m), m), -1, dtype=np.int64)
     distance = np.full((len(targets_m), m), np.inf)
     if len(samples_m) == 0:
         return Neighbours(index, distance)
-    generator = np.random.default_rng(seed)
+    generator = np.random.default_rng(rule.seed)
     tree = cKDTree(samples_m)
     for start in range(0, len(targets_m), AT_ONCE):
         part = slice(start, start + AT_ONCE)

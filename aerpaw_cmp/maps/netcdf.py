@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..common.cf import DB, DBM, Dataset, netcdf_bytes, site_crs
+from ..common.cf import DB, DBM, Dataset, site_crs
 from ..common.geodesy import SiteFrame
 from ..common.units import AnyArray, FloatArray
 from .grid import Layer
@@ -24,38 +23,6 @@ from .job import HIGHEST_RANK, RATIO_LIMIT_DB, MapResult
 _PLANE = ("y", "x")
 _LABELS = "foliage_mode latitude longitude"
 _Variable = tuple[tuple[str, ...], AnyArray, dict[str, Any]]
-
-
-def write_netcdf(
-    path: str | Path,
-    maps: Mapping[str, MapResult],
-    frame: SiteFrame,
-    about: Mapping[str, str],
-    further: Sequence[Layer] = (),
-) -> Path:
-    """The file of :func:`maps_dataset`, which has the parameters; replaced where it exists.
-
-    Parameters
-    ----------
-    path : path
-    maps : mapping of str to MapResult
-    frame : SiteFrame
-    about : mapping of str to str
-    further : sequence of Layer
-
-    Returns
-    -------
-    Path
-        The file.
-
-    Raises
-    ------
-    UsageError
-        If netCDF4 is not installed.
-    """
-    target = Path(path)
-    target.write_bytes(netcdf_bytes(maps_dataset(maps, frame, about, further)))
-    return target
 
 
 def maps_dataset(

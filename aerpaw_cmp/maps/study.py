@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -86,13 +86,14 @@ def interpolation_study(
     # bins as wide as the grid's step, as the paper's are: narrower ones would be empty
     correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m)
     fit = _curve(correlation)
+    rule: dict[str, Any] = {"neighbours": neighbours, "radius_m": radius_m, "selection": selection, "seed": seed}
     models: dict[str, evaluate.Predictor] = {
-        "Kriging": OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed),
-        "makima": IndexInterpolation("makima", grid, neighbours, radius_m, selection=selection, seed=seed),
-        "spline": IndexInterpolation("spline", grid, neighbours, radius_m, selection=selection, seed=seed),
+        "Kriging": OrdinaryKriging(fit, **rule),
+        "makima": IndexInterpolation("makima", grid, **rule),
+        "spline": IndexInterpolation("spline", grid, **rule),
         # of one sample the weight is 1 at any distance
-        "nearest": InverseDistance(1, radius_m),
-        "inverse distance": InverseDistance(neighbours, radius_m),
+        "nearest": InverseDistance(neighbours=1, radius_m=radius_m),
+        "inverse distance": InverseDistance(neighbours=neighbours, radius_m=radius_m),
         "serving-tower mean": ServingTowerMean(towers_m),
     }
     scores = {name: evaluate.leave_one_out(model, points, values) for name, model in models.items()}

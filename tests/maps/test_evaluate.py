@@ -60,7 +60,7 @@ def test_leave_one_out_keeps_altitude_and_k():
     values = np.random.default_rng(1).normal(size=(len(GRID), 3, 2))
     table = {
         n: evaluate.leave_one_out(m, GRID.points_m, values)
-        for n, m in (("mean", Spy()), ("nearest", InverseDistance(1)))
+        for n, m in (("mean", Spy()), ("nearest", InverseDistance(neighbours=1)))
     }
     assert table["nearest"].mae.shape == (3, 2)
     n = len(GRID)
@@ -87,7 +87,7 @@ def test_kriging_wins_where_its_model_holds_and_its_variance_is_honest():
     values = simulated_field(GRID.points_m, 2, fields=40, noise=0.1)
     model = OrdinaryKriging(lambda d: 0.9 * exponential(d))
     models = {
-        "kriging": model, "idw": InverseDistance(), "nearest": InverseDistance(1), "spline": IndexInterpolation("spline", GRID),
+        "kriging": model, "idw": InverseDistance(), "nearest": InverseDistance(neighbours=1), "spline": IndexInterpolation("spline", GRID),
         "makima": IndexInterpolation("makima", GRID), "tower": ServingTowerMean([[100.0, 100.0], [500.0, 400.0]]),
     }  # fmt: skip
     table = {name: evaluate.leave_one_out(predictor, GRID.points_m, values) for name, predictor in models.items()}

@@ -95,7 +95,9 @@ def test_leave_one_out_on_a_grid_equals_a_plain_loop(kind):
 
 
 def test_nearest_follows_the_tie_rule():
-    model = InverseDistance(1).fit([[30.0, 0.0], [-30.0, 0.0], [0.0, 30.0], [0.0, -30.0]], [1.0, 2.0, 3.0, 4.0])
+    model = InverseDistance(neighbours=1).fit(
+        [[30.0, 0.0], [-30.0, 0.0], [0.0, 30.0], [0.0, -30.0]], [1.0, 2.0, 3.0, 4.0]
+    )
     assert model.predict([[0.0, 0.0]])[0].tolist() == [4.0]  # the southern one
     assert np.isnan(model.predict([[0.0, 500.0]])[0]).all()
 

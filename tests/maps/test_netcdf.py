@@ -5,7 +5,7 @@ import sys
 import numpy as np
 import pytest
 
-from aerpaw_cmp.common.cf import file_attributes
+from aerpaw_cmp.common.cf import file_attributes, netcdf_bytes
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import netcdf
@@ -57,7 +57,8 @@ def write(path):
     )
     level = Layer("rss_sd_h030m_LW1", np.arange(len(GRID)) / 4.0, "dB", "Standard deviation")
     rank = Layer("rank_learned_h030m_LW1", np.arange(len(GRID)) % 5, "1", "Rank", class_names(4))
-    return netcdf.write_netcdf(path, MAPS, FRAME, about, [level, rank])
+    path.write_bytes(netcdf_bytes(netcdf.maps_dataset(MAPS, FRAME, about, [level, rank])))
+    return path
 
 
 def check(path):

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from ...common.cf import file_attributes
+from ...common.cf import file_attributes, netcdf_bytes
 from ...common.counting import counted
 from ...common.errors import InputError, UsageError, noting_interrupts
 from ...common.jsonable import named
@@ -35,7 +35,7 @@ from ...maps.evaluate import (
 from ...maps.grid import Grid
 from ...maps.interpolate import InverseDistance, ServingTowerMean
 from ...maps.kriging import OrdinaryKriging
-from ...maps.netcdf import write_netcdf
+from ...maps.netcdf import maps_dataset
 from ...maps.store import TileStore
 from ...maps.study import Study, interpolation_study, rank_fields
 from ...maps.tiles import Budget, Reach, Tiling
@@ -548,8 +548,8 @@ def _far_reaching(outcome: MapOutcome) -> dict[str, Predictor]:
     neighbours = outcome.settings.neighbours
     return {
         "Kriging": OrdinaryKriging(outcome.studies["missing"].fit, neighbours, outside="nearest"),
-        "nearest": InverseDistance(1, np.inf),
-        "inverse distance": InverseDistance(neighbours, np.inf),
+        "nearest": InverseDistance(neighbours=1, radius_m=np.inf),
+        "inverse distance": InverseDistance(neighbours=neighbours, radius_m=np.inf),
         "serving-tower mean": ServingTowerMean(outcome.shown.towers_m),
     }
 
@@ -813,8 +813,9 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
         export.write_kmz(folder / "maps.kmz", replace(table, layers=shown), title=site.name),
     ]
     try:
-        maps = dict(outcome.ordered())
-        written.append(write_netcdf(folder / "maps.nc", maps, site.frame, _about_maps(site), flown))
+        maps = maps_dataset(dict(outcome.ordered()), site.frame, _about_maps(site), flown)
+        (folder / "maps.nc").write_bytes(netcdf_bytes(maps))
+        written.append(folder / "maps.nc")
     except UsageError as missing:
         progress(str(missing))
     return written

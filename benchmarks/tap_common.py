@@ -21,7 +21,8 @@ import json, sys
 from pathlib import Path
 from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.live.record.log import LogSettings
-from aerpaw_cmp.live.tap import TapSettings, run_tap
+from aerpaw_cmp.live.tap import TapSettings
+from benchmarks.tap_common import run_tap
 values = json.loads(sys.argv[1])
 log = LogSettings(**values.pop("log", {}))
 show = values.pop("show_status", False)
@@ -60,6 +61,14 @@ print(json.dumps({"answers": summary.answers, "rates_hz": summary.rates_hz, "mis
                   "records": summary.records, "lost_records": summary.lost_records, "reason": summary.reason}))
 sys.exit(summary.exit_code)
 """
+
+
+def run_tap(settings: Any, **options: Any) -> Any:
+    """A tap in this process, until its set time or a signal ends it."""
+    from aerpaw_cmp.live.tap import Stop, Tap
+
+    with Stop() as stop:
+        return Tap(settings, stop, **options).run()
 
 
 def start_tap(port: Path, folder: Path, **settings: Any) -> subprocess.Popen[str]:

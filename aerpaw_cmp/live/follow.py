@@ -161,7 +161,7 @@ class TelemetryFollower:
 
 
 def predict_along(follower: TelemetryFollower, replay_at: Callable[[TelemetrySample], Prediction]) -> Predict:
-    """``predict`` for :func:`~aerpaw_cmp.live.tap.run_tap`: the prediction at the pose of the followed log.
+    """``predict`` for :func:`~aerpaw_cmp.live.tap.Tap`: the prediction at the pose of the followed log.
 
     Parameters
     ----------

@@ -7,19 +7,33 @@ import os
 import select
 import signal
 import threading
-from collections.abc import Iterator
 
 from ..common.interrupts import SIGNALS
 
 
 class Stop:
-    """A request to end, from a signal or another thread; wakes the waiting tap."""
+    """A request to end, from a signal or another thread; wakes the waiting tap.
+
+    As a context it is asked by SIGINT, SIGTERM and SIGHUP, and is closed at the end. Signals reach the main thread
+    alone, and an ignored one (nohup) stays so.
+    """
 
     def __init__(self) -> None:
         # a full pipe must not block a signal handler
         self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
         self.reason = ""
         self.count = 0
+
+    def __enter__(self) -> Stop:
+        alone = threading.current_thread() is threading.main_thread()
+        signals = [number for number in SIGNALS if alone and signal.getsignal(number) is not signal.SIG_IGN]
+        self._before = [(n, signal.signal(n, lambda by, _: self(signal.Signals(by).name))) for n in signals]
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before:
+            signal.signal(number, handler)
+        self.close()
 
     def __call__(self, reason: str = "stop") -> None:
         """Ask for the end; a second time: at once."""
@@ -43,17 +57,3 @@ class Stop:
         """Close the pipe."""
         os.close(self._read)
         os.close(self._write)
-
-    @contextlib.contextmanager
-    def on_signals(self) -> Iterator[None]:
-        """SIGINT, SIGTERM and SIGHUP ask for the end (in the main thread only); an ignored one (nohup) stays so."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        signals = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
-        before = [(number, signal.signal(number, lambda by, _: self(signal.Signals(by).name))) for number in signals]
-        try:
-            yield
-        finally:
-            for number, handler in before:
-                signal.signal(number, handler)

@@ -29,7 +29,7 @@ from .serial.ports import PortGoneError, PortInfo, SerialPort, find_candidates, 
 from .session import StatusNotifier, TapSettings, TapStatus, TapSummary, format_status
 from .stop import Stop
 
-__all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
+__all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status"]
 
 # A jump of the wall clock against the monotonic one beyond this is recorded.
 _CLOCK_STEP_NS = 50_000_000
@@ -64,15 +64,30 @@ def _not_a_modem(path: Path, received: bytes) -> InputError:
 
 
 class Tap:
-    """One session of the tap; see :func:`run_tap`."""
+    """One session of the tap: the modem is polled until ``stop`` or the set time ends it.
+
+    Parameters
+    ----------
+    settings : TapSettings
+    stop : Stop
+        Ends the session when called (from any thread, or by a signal).
+    on_status : callable, optional
+        Called about once per ``settings.status_s`` and at once when there is a message; :func:`format_status`
+        makes a line of it.
+    watch : callable, optional
+        Gets each record once the log has it, and each status; it must neither wait nor raise.
+    predict : callable, optional
+        ``predict(utc_ns) -> Prediction or None`` of the replay at the pose of that moment; runs in its own thread.
+    clock : Clock, optional
+    """
 
     def __init__(
         self,
         settings: TapSettings,
+        stop: Stop,
         *,
         on_status: Callable[[TapStatus], None] | None = None,
         watch: Watch | None = None,
-        stop: Stop,
         predict: Predict | None = None,
         clock: Clock | None = None,
     ) -> None:
@@ -115,7 +130,18 @@ class Tap:
     # the session ------------------------------------------------------------------------------------------
 
     def run(self) -> TapSummary:
-        """Connect, poll until asked to stop, end cleanly."""
+        """Connect, poll until asked to stop, end cleanly.
+
+        Returns
+        -------
+        TapSummary
+            With the exit code.
+
+        Raises
+        ------
+        InputError
+            If the port cannot be used or the folder cannot be written to, at the start.
+        """
         try:
             self._first_connection()
             if not self._stop.count:
@@ -701,48 +727,3 @@ class Tap:
             },
             **self._now(),
         }
-
-
-def run_tap(
-    settings: TapSettings,
-    *,
-    on_status: Callable[[TapStatus], None] | None = None,
-    watch: Watch | None = None,
-    stop: Stop | None = None,
-    predict: Predict | None = None,
-    clock: Clock | None = None,
-) -> TapSummary:
-    """Tap the modem until a signal, ``stop`` or the set time ends it.
-
-    Parameters
-    ----------
-    settings : TapSettings
-    on_status : callable, optional
-        Called about once per ``settings.status_s`` and at once when there is a message; :func:`format_status`
-        makes a line of it.
-    watch : callable, optional
-        Gets each record once the log has it, and each status; it must neither wait nor raise.
-    stop : Stop, optional
-        Ends the session when called (from any thread).
-    predict : callable, optional
-        ``predict(utc_ns) -> Prediction or None`` of the replay at the pose of that moment; runs in its own thread.
-    clock : Clock, optional
-
-    Returns
-    -------
-    TapSummary
-        With the exit code.
-
-    Raises
-    ------
-    InputError
-        If the port cannot be used or the folder cannot be written to, at the start.
-    """
-    own = stop is None
-    stop = stop or Stop()
-    try:
-        with stop.on_signals():
-            return Tap(settings, on_status=on_status, watch=watch, stop=stop, predict=predict, clock=clock).run()
-    finally:
-        if own:
-            stop.close()

@@ -197,7 +197,7 @@ def test_a_hang_up_that_nohup_ignores_stays_ignored():
     try:
         with interrupts.noted(), interrupts.held():
             os.kill(os.getpid(), signal.SIGHUP)
-        with Stop().on_signals():
+        with Stop():
             assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     finally:
         signal.signal(signal.SIGHUP, before)

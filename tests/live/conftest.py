@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.live.feed import Feed
 from aerpaw_cmp.live.serial.modem import QUERIES
-from aerpaw_cmp.live.tap import Stop, TapSettings, run_tap
+from aerpaw_cmp.live.tap import Stop, Tap, TapSettings
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
 from benchmarks.simulated_modem import BadLine, FaultyModem, read_log
 from benchmarks.tap_common import free_port, start_tap
@@ -101,7 +101,7 @@ class Session:
 
     def _run(self):
         try:
-            self.summary = run_tap(self._settings, on_status=self._status, stop=self.stop, **self._options)
+            self.summary = Tap(self._settings, self.stop, on_status=self._status, **self._options).run()
         except Exception as error:
             self.error = error
 

@@ -15,8 +15,8 @@ import pytest
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.live.serial.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
 from aerpaw_cmp.live.session import TapSettings
-from aerpaw_cmp.live.tap import run_tap
 from benchmarks.simulated_modem import Faults, FaultyModem
+from benchmarks.tap_common import run_tap
 from tests.live.terminals import held, until
 
 

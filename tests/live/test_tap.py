@@ -16,10 +16,11 @@ from aerpaw_cmp.live.predict import Prediction
 from aerpaw_cmp.live.record.log import Clock, LogSettings
 from aerpaw_cmp.live.schedule import Schedule
 from aerpaw_cmp.live.serial.modem import OTHER_QUERIES
-from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status, run_tap
+from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER
 from benchmarks.simulated_modem import Faults
+from benchmarks.tap_common import run_tap
 from tests.live.terminals import until
 
 

@@ -6,9 +6,9 @@ import contextlib
 import dataclasses
 import os
 import shlex
-import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,7 +18,7 @@ from ...common.counting import counted
 from ...live.feed import Feed
 from ...live.session import TapSettings, TapStatus, TapSummary
 from ...live.stop import Stop
-from ...live.tap import run_tap
+from ...live.tap import Tap
 
 # Environment variable with the token of a page beyond the loopback: so that it outlives a restart of the tap.
 TOKEN = "AERPAW_CMP_WEB_TOKEN"
@@ -71,29 +71,27 @@ def tap_modems(
     """
     names = _names([port or "modem" for port in ports])
     twin = _twin(shown)
-    stop = Stop()
     with contextlib.ExitStack() as stack:
-        stack.callback(stop.close)
         feed = None
         if shown.web is not None:
             feed = Feed(names)
             _serve(stack, feed, twin, shown, ", ".join(names))
-        stack.enter_context(stop.on_signals())  # nothing is logged before, so nothing has to end in order
-        sessions = []
-        for number, (port, name) in enumerate(zip(ports, names, strict=True)):
-            alone = len(ports) == 1
-            each = dataclasses.replace(settings, port=port, folder=settings.folder if alone else settings.folder / name)
-            sessions.append(
-                partial(
-                    run_tap,
-                    each,
-                    on_status=partial(on_status, "" if alone else name),
-                    watch=None if feed is None else partial(feed.put, number),
-                    stop=stop,
-                    predict=None if twin is None else twin.predictor(),
-                )
-            )
-        summaries = [sessions[0]()] if len(sessions) == 1 else _together(sessions, stop)
+        stop = stack.enter_context(Stop())  # nothing is logged before, so nothing has to end in order
+        alone = len(ports) == 1
+        # one after another: each replays the route that is ahead
+        predictors = [None if twin is None else twin.predictor() for _ in ports]
+
+        def session(number: int) -> TapSummary:
+            folder = settings.folder if alone else settings.folder / names[number]
+            return Tap(
+                dataclasses.replace(settings, port=ports[number], folder=folder),
+                stop,
+                on_status=partial(on_status, "" if alone else names[number]),
+                watch=None if feed is None else partial(feed.put, number),
+                predict=predictors[number],
+            ).run()
+
+        summaries = [session(0)] if alone else _together(session, len(ports), stop)
         if feed is not None:
             feed.end(_ended(settings.folder, summaries, twin))
     return summaries
@@ -120,27 +118,19 @@ def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, tit
     shown.say("the page: " + "  ".join(server.urls) + known)
 
 
-def _together(sessions: Sequence[Callable[[], TapSummary]], stop: Stop) -> list[TapSummary]:
+def _together(session: Callable[[int], TapSummary], count: int, stop: Stop) -> list[TapSummary]:
     """Run sessions at once, each in its thread; the first fault at a start ends all."""
-    results: list[TapSummary | BaseException | None] = [None] * len(sessions)
 
-    def run(number: int) -> None:
+    def run(number: int) -> TapSummary:
         try:
-            results[number] = sessions[number]()
-        # whatever ends one session ends all, and the main thread raises it again
-        except BaseException as error:
-            results[number] = error
+            return session(number)
+        # whatever ends one session ends all
+        except BaseException:
             stop("error")
+            raise
 
-    threads = [threading.Thread(target=run, args=(number,), name=f"tap-{number}") for number in range(len(sessions))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    for result in results:
-        if isinstance(result, BaseException):
-            raise result
-    return [result for result in results if isinstance(result, TapSummary)]
+    with ThreadPoolExecutor(count, "tap") as threads:
+        return list(threads.map(run, range(count)))
 
 
 def _names(paths: Sequence[str]) -> list[str]:

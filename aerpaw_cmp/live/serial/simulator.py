@@ -263,12 +263,8 @@ def run_modem_sim(
     meanwhile : callable, optional
         Called several times a second, e.g. to write the telemetry of the same flight.
     """
-    stop = Stop()
-    try:
-        with stop.on_signals(), simulator:
-            on_ready(simulator.port)
-            while not stop.wait(0.1 if meanwhile else 1.0):
-                if meanwhile is not None:
-                    meanwhile()
-    finally:
-        stop.close()
+    with Stop() as stop, simulator:
+        on_ready(simulator.port)
+        while not stop.wait(0.1 if meanwhile else 1.0):
+            if meanwhile is not None:
+                meanwhile()

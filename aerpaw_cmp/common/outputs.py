@@ -29,7 +29,6 @@ import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import BinaryIO
 
 from .errors import InputError, OutputError, UsageError, add_note, one_line
@@ -187,7 +186,9 @@ class OutputFile:
         for path in self._inputs:
             if _identity(path) == target:
                 raise _replaces_input(self.named, path)
-        own = _ask(self._own, self.target)
+        own = False
+        with contextlib.suppress(OSError, ValueError):
+            own = self._own(self.target)
         for path in () if own else self._inputs:  # an own earlier output may lie among the logs
             if path.is_dir() and any(_identity(file) == target for file in files_below(path)):
                 raise _replaces_input(self.named, path)
@@ -224,9 +225,7 @@ class OutputFile:
                 self._place = None
                 _sync_folder(self.target.parent)
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if self._place is not None:
             with held():
                 self._place.leave()
@@ -247,13 +246,6 @@ def _replaces_input(named: Path, path: Path) -> UsageError:
         expected="another name after -o",
         path=named,
     )
-
-
-def _ask(own: Callable[[Path], bool], path: Path) -> bool:
-    try:
-        return own(path)
-    except (OSError, ValueError):
-        return False
 
 
 # --- a folder -------------------------------------------------------------------------------------
@@ -313,9 +305,7 @@ class OutputFolder:
                 raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         with held():
             if self._place is not None:
                 self._place.leave()
@@ -396,20 +386,22 @@ class OutputFolder:
         (place.part / SUMS).write_text(head + sums, encoding="utf-8")
         _sync_tree(place.part)
         self._refuse_content()  # what came there meanwhile
-        if not self.target.is_dir():
-            place.take_name()
-            return
+        replaced = self.target.is_dir()
         for folder in (place.part, *(entry for entry in place.part.rglob("*") if entry.is_dir())):
             before = self.target / folder.relative_to(place.part)
             if before.is_dir():  # rights that somebody took away stay so
                 folder.chmod(stat.S_IMODE(before.stat().st_mode))
         (place.part / _UNFINISHED).unlink(missing_ok=True)
         _sync_folder(place.part)
-        place.lock_too(self.target)
-        _exchange(place.part, self.target)
+        if replaced:
+            place.lock_too(self.target)
+            _exchange(place.part, self.target)
+        else:
+            place.part.rename(self.target)
         _sync_folder(self.target.parent)
-        with contextlib.suppress(OSError):  # the results stand; the next run tries again
-            _clear(place.part)
+        if replaced:
+            with contextlib.suppress(OSError):  # the results stand; the next run tries again
+                _clear(place.part)
 
 
 def foreign_entries(folder: Path, own: Iterable[str]) -> Iterator[str]:
@@ -479,7 +471,7 @@ class _Place:
     """``.NAME.aerpaw-part``, made and locked; what a killed run left there is cleared."""
 
     def __init__(self, target: Path, named: Path, *, folder: bool) -> None:
-        self.target, self.named = target, named
+        self.named = named
         self.part = hidden_name(target, "part")
         self._further: list[int] = []
         self._left = False
@@ -544,13 +536,6 @@ class _Place:
         return UsageError(
             "another run is writing here", expected="one run at a time, or another name after -o", path=self.named
         )
-
-    def take_name(self) -> None:
-        """Give the folder the name of its target, which nothing has."""
-        (self.part / _UNFINISHED).unlink(missing_ok=True)
-        _sync_folder(self.part)
-        self.part.rename(self.target)
-        _sync_folder(self.target.parent)
 
     def lock_too(self, folder: Path) -> None:
         """Lock what is about to come to this place."""

@@ -287,12 +287,10 @@ class Tap:
             ports = find_candidates(roots) if named is None else []
             return ports or [find_port(named, roots)]
         ports = []
-        try:
+        with contextlib.suppress(PortGoneError):
             now = find_port(last.path, roots)
             if now.interface == last.interface:  # else the number now belongs to another port of the modem
                 ports.append(now)
-        except PortGoneError:
-            pass
         if last.product is not None:
             known = {port.device for port in ports}
             others = [p for p in find_candidates(roots) if p.product == last.product and p.device not in known]

@@ -10,6 +10,7 @@ import platform
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from importlib import import_module, metadata
 from pathlib import Path
@@ -85,14 +86,12 @@ def ready(checks: Sequence[Check]) -> bool:
 def package_checks() -> Iterator[Check]:
     """Sionna RT, Mitsuba and Dr.Jit are installed, in the versions that Sionna RT pins."""
     pins: dict[str, str] = {}
-    try:
+    with suppress(metadata.PackageNotFoundError):
         # read from what is installed: another sionna-rt pins other versions of Mitsuba and Dr.Jit
         for requirement in metadata.requires("sionna-rt") or []:
             # a requirement without an exact version leaves an empty pin, which no version fails
             name, _, exact = requirement.partition("==")
             pins[name.strip()] = exact.strip()
-    except metadata.PackageNotFoundError:
-        pass
     for title, name in (("Sionna RT", "sionna-rt"), ("Mitsuba", "mitsuba"), ("Dr.Jit", "drjit")):
         version, pin = versions.version(name), pins.get(name)
         if version == versions.NOT_INSTALLED:
@@ -153,13 +152,11 @@ def available_memory_bytes(root: Path = Path("/")) -> int | None:
     except (OSError, StopIteration, ValueError, IndexError):
         return None
     group = root / "sys/fs/cgroup"
-    try:
+    with suppress(OSError, ValueError):  # no such group: the machine is the limit
         # names of control groups of version 2; under version 1 the machine's own number stands
         limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
         if limit != "max":
             available = min(available, int(limit) - int(used))
-    except (OSError, ValueError):
-        pass  # no such group: the machine is the limit
     return available
 
 

@@ -224,16 +224,26 @@ def replay(
     # on the scene before terrain changed it: these paths reflect off level ground
     further = further_paths(site, scene, link, poses, search, field)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
-    result = _evaluated(scene, link, poses, (paths, *(some for some, _ in further)), search, field, run, further)
+    fields, has_path = _channels(scene, link, poses, paths, [added for _, added in further], field, run)
+    level_dbm, power_dbm = _levels(fields, has_path, link)
     notes += [*stopped, *(Omission(some.missing) for some, _ in further)]
-    return replace(
-        result,
+    return Replay(
+        rss_dbm=level_dbm,
+        rss_power_dbm=power_dbm,
+        h=fields.h,
+        has_path=has_path,
+        contributions=(paths, *(some for some, _ in further)),
+        faces=scene.faces,
+        ends=Ends(link, poses, scene.sources_m, field),
         seconds=time.perf_counter() - started,
         search_seconds=search_seconds,
+        engine=search.engine,
+        towers=tuple(link.tower_arrays),
         omitted=notes,
         from_cache=from_cache,
         samples=int(search.samples) if search.engine == "sionna" else 0,
         samples_reason=choice.reason if choice else "",
+        surfaces=scene.surfaces,
     )
 
 
@@ -331,18 +341,10 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
     return clear
 
 
-def _evaluated(
-    scene: Scene,
-    link: Link,
-    poses: Poses,
-    contributions: tuple[Any, ...],
-    search: Search,
-    field: Field,
-    run: Run,
-    further: Sequence[tuple[Further, Fields]],
-) -> Replay:
-    """Fields of the paths; times are the caller's."""
-    paths = contributions[0]
+def _channels(
+    scene: Scene, link: Link, poses: Poses, paths: PathSet, further: Sequence[Fields], field: Field, run: Run
+) -> tuple[Fields, BoolArray]:
+    """H and powers of the paths with what further kinds of them add, and which links (poses, towers) have a path."""
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
     work = 0 if run.job is None else run.job.pairs
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, work=work)
@@ -350,25 +352,11 @@ def _evaluated(
     # a blocked path adds zero to H; only the flag tells it from one that fades
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
-    for _, item in further:
+    for item in further:
         # path_power stays that of the reflections: each kind keeps its own
         fields = Fields(fields.h + item.h, fields.path_power, fields.power + item.power)
         has_path |= item.power > 0.0
-    level_dbm, power_dbm = _levels(fields, has_path, link)
-    return Replay(
-        rss_dbm=level_dbm,
-        rss_power_dbm=power_dbm,
-        h=fields.h,
-        has_path=has_path,
-        contributions=contributions,
-        faces=scene.faces,
-        ends=Ends(link, poses, scene.sources_m, field),
-        seconds=0.0,
-        search_seconds=0.0,
-        engine=search.engine,
-        towers=tuple(link.tower_arrays),
-        surfaces=scene.surfaces,
-    )
+    return fields, has_path
 
 
 def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray, FloatArray]:

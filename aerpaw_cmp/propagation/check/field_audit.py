@@ -179,16 +179,9 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
     for row in rows[~beyond[rows]]:
         tower = int(replay.paths.tower[row])
         reference = Reference(site, replay.towers[tower], expected.link, expected.loss)
-        link = _OneLink(
-            reference=reference,
-            replay=replay,
-            poses=poses,
-            row=int(replay.paths.pose[row]),
-            tower=tower,
-            mine=np.array([row]),
-        )
-        sequence = link.sequence(int(row))
-        if sequence is None or reference.verdict(sequence, link.target) is False:
+        sequence = _mirrors_of(reference, replay.faces, replay.paths, row)
+        east, north, up = poses.position_m[replay.paths.pose[row]].tolist()
+        if sequence is None or reference.verdict(sequence, (east, north, up)) is False:
             count += 1
     failures = (f"{counted(count, 'path')} that cannot exist",) if count else ()
     return FieldAudit(phantom_paths=count, failures=failures)

@@ -201,11 +201,8 @@ def turned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
 
 def aircraft(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Matrix:
     """Forward-left-up to east-north-up, by way of the textbook's forward-right-down to north-east-down."""
-    r, p, y = (math.radians(x) for x in (roll_deg, pitch_deg, yaw_deg))
-    heading: Matrix = ((math.cos(y), -math.sin(y), 0.0), (math.sin(y), math.cos(y), 0.0), (0.0, 0.0, 1.0))
-    nose_up: Matrix = ((math.cos(p), 0.0, math.sin(p)), (0.0, 1.0, 0.0), (-math.sin(p), 0.0, math.cos(p)))
-    wing_down: Matrix = ((1.0, 0.0, 0.0), (0.0, math.cos(r), -math.sin(r)), (0.0, math.sin(r), math.cos(r)))
-    to_ned = product(heading, product(nose_up, wing_down))
+    # right turns about down, right and forward: heading, nose up and right wing down
+    to_ned = turned(yaw_deg, pitch_deg, roll_deg)
     enu_of_ned: Matrix = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
     frd_of_flu: Matrix = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
     return product(enu_of_ned, product(to_ned, frd_of_flu))
@@ -551,14 +548,9 @@ class Reference:
     def _reflected(self, mirror: Mirror, wave: _Wave, ray: Vector, onward: Vector) -> _Wave:
         cosine = min(1.0, abs(_dot(mirror.normal, ray)))
         across = _cross(ray, mirror.normal)
-        size = math.sqrt(_dot(across, across))
-        if size < 1e-12:  # straight on: any direction will do
-            across, size = (
-                _cross(mirror.normal, (1.0, 0.0, 0.0) if abs(mirror.normal[0]) < 0.9 else (0.0, 1.0, 0.0)),
-                1.0,
-            )
-            size = math.sqrt(_dot(across, across))
-        s = (across[0] / size, across[1] / size, across[2] / size)
+        if math.sqrt(_dot(across, across)) < 1e-12:  # straight on: any direction will do
+            across = _cross(mirror.normal, (1.0, 0.0, 0.0) if abs(mirror.normal[0]) < 0.9 else (0.0, 1.0, 0.0))
+        s = _unit(across)
         p_in, p_out = _cross(s, ray), _cross(s, onward)
         constants = permittivity(mirror.material, self.link.carrier_hz)
         if constants is None:

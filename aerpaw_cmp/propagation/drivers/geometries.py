@@ -151,13 +151,9 @@ def singular_values_of(
 
 
 def _of_power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
-    covariance = los @ _hermitian(los) + ground @ _hermitian(ground)
+    covariance = sum(field @ field.conj().swapaxes(-1, -2) for field in (los, ground))
     # the eigenvalues of a Hermitian matrix come ascending; rounding leaves the zero ones slightly negative
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., ::-1], 0.0)))
-
-
-def _hermitian(matrix: ComplexArray) -> ComplexArray:
-    return np.asarray(np.conj(np.swapaxes(matrix, -1, -2)))
 
 
 def basis_fields(

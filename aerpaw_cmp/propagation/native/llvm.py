@@ -18,6 +18,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from hashlib import sha256
@@ -336,11 +337,9 @@ def _remembered_trial(library: Library) -> Trial:
         return Trial(library, True)
     trial = try_library(library, program=TRIAL_PROGRAM)
     if trial.ok:
-        try:
+        with suppress(OSError):  # an unwritable cache costs half a second per run, nothing else
             note.parent.mkdir(parents=True, exist_ok=True)
             note.write_text(f"{library.label}\n")
-        except OSError:
-            pass  # an unwritable cache costs half a second per run, nothing else
     return trial
 
 

@@ -439,8 +439,8 @@ def gather(
         () if track is None else doubts(track, telemetry[0][1], _times_on_track(data), _undated(data, telemetry[0][0]))
     )
     # after the overlap was checked: a flight that shares no time stops with its own message
-    data = dataclasses.replace(data, doubts=asked, warnings=(*data.warnings, *(f"{text}." for text in asked)))
-    return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
+    every = (*_idle_attitude(data), *data.warnings, *(f"{text}." for text in asked))
+    return dataclasses.replace(data, doubts=asked, warnings=every)
 
 
 def _undated(data: FlightData, track: str) -> list[str]:

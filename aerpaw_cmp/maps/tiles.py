@@ -159,7 +159,8 @@ class Reach:
 
     def _buildings_in_reach(self, tower: Tower, box_m: FloatArray) -> BoolArray:
         """Buildings (buildings,) that can mirror or shade what one tower sends into a box."""
-        at, tile = tower.position_m[:2], _box(box_m[:, :2])
+        at, (west, south), (east, north) = tower.position_m[:2], *box_m[:, :2]
+        tile = np.array([[west, south], [east, south], [east, north], [west, north]])
         lines = [shapely.linestrings(np.vstack([at, tile])[None])]
         if self._depth:
             # walls alone: seen from above, a path over ground or roof lies on the line between its ends
@@ -193,12 +194,6 @@ class Reach:
         wide = height < 0.05 * length  # a far end of the beam would come near the wall
         lit = np.where(wide, area, shapely.intersection(beam, area))
         return np.asarray(shapely.union(lit, shapely.linestrings(ends)))
-
-
-def _box(points_m: FloatArray, margin_m: float = 0.0) -> FloatArray:
-    """Corners (4, 2) of the box round points (n, 2)."""
-    low, high = points_m.min(axis=0) - margin_m, points_m.max(axis=0) + margin_m
-    return np.array([low, [high[0], low[1]], high, [low[0], high[1]]])
 
 
 def _apart(tower: Tower, box_m: FloatArray) -> FloatArray:

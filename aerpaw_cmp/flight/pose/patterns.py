@@ -94,24 +94,17 @@ def flown(name: str, waypoints: Sequence[Waypoint], speed_mps: float) -> Route:
         A point every second.
     """
     place = np.array([(w.east_m, w.north_m, w.height_m) for w in waypoints])
-    begin, time, at, yaw = 0.0, [0.0], [place[0]], [waypoints[0].yaw_deg]
-    for i, w in enumerate(waypoints):
-        if w.hold_s > 0:
-            begin += w.hold_s
-            time.append(begin)
-            at.append(place[i])
-            yaw.append(w.yaw_deg)
-        if i + 1 < len(waypoints):
-            begin += float(np.linalg.norm(place[i + 1] - place[i])) / speed_mps
-            time.append(begin)
-            at.append(place[i + 1])
-            yaw.append(w.yaw_deg)
+    spans = np.zeros(2 * len(place))  # to each waypoint, and until it is left
+    spans[1::2] = [w.hold_s for w in waypoints]
+    spans[2::2] = [float(np.linalg.norm(step)) / speed_mps for step in np.diff(place, axis=0)]
+    time, yaw = np.cumsum(spans), np.repeat([w.yaw_deg for w in waypoints], 2)
     # a little longer: a flight of whole seconds has its last one
-    seconds = np.arange(0.0, begin + 1e-9, 1.0)
-    leg = np.minimum(np.searchsorted(np.array(time), seconds), len(yaw) - 1)
-    position = interpolated(seconds, np.array(time), np.array(at))
+    seconds = np.arange(0.0, time[-1] + 1e-9, 1.0)
+    # a yaw holds from its waypoint to the next, so that an instant has that of the step before
+    before = np.maximum(np.searchsorted(time, np.minimum(seconds, time[-1])) - 1, 0)
+    position = interpolated(seconds, time, np.repeat(place, 2, axis=0))
     return Route(
-        name=name, waypoints=tuple(waypoints), position_m=position, yaw_deg=np.array(yaw)[leg] % 360.0, time_s=seconds
+        name=name, waypoints=tuple(waypoints), position_m=position, yaw_deg=yaw[before] % 360.0, time_s=seconds
     )
 
 

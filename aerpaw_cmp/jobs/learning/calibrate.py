@@ -242,11 +242,8 @@ def _score_further(
 
 def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None) -> tuple[list[FlightData], list[str]]:
     """Every flight of the calibration, gathered, each log once, and what is to be said of copies."""
-    out = []
-    for name in settings.flights:
-        path = folder / name
-        flight = load_with_learned(path)
-        out.append(load_data(flight, path.parent, logs_root))
+    places = [folder / name for name in settings.flights]
+    out = [load_data(load_with_learned(path), path.parent, logs_root) for path in places]
     names = [data.settings.flight.name for data in out]
     for name in names:
         if names.count(name) > 1:

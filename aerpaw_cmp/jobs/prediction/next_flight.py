@@ -108,12 +108,7 @@ class Candidate:
 
 
 def _plan_flight(
-    target: str,
-    flights: Sequence[NamedFlight],
-    plan: PlanOptions,
-    *,
-    logs_root: Path | None = None,
-    stages: Stages | None = None,
+    target: str, flights: Sequence[NamedFlight], plan: PlanOptions, logs_root: Path | None, stages: Stages
 ) -> PlanPage:
     """Rank candidate flights by the standard deviation that they would leave over a target.
 
@@ -124,8 +119,8 @@ def _plan_flight(
     flights : sequence of NamedFlight
         That were flown; none: antennas are unknown.
     plan : PlanOptions
-    logs_root : Path, optional
-    stages : Stages, optional
+    logs_root : Path or None
+    stages : Stages
 
     Returns
     -------
@@ -137,7 +132,6 @@ def _plan_flight(
     UsageError, InputError
         No candidate fits, a target far outside, a route that cannot be read.
     """
-    stages = stages or Stages()
     with stages("read"):
         datas, remarks = counted_once([flight.load(logs_root) for flight in flights])
         observed = observe(datas)[0] if datas else []
@@ -454,7 +448,7 @@ def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: R
     folder = options.out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
     stages = options.stages("plan", inputs, folder)
     with OutputFolder(folder, job="plan", inputs=inputs, force=options.force) as output:
-        record = _plan_flight(target, known, plan, logs_root=options.logs_root, stages=stages)
+        record = _plan_flight(target, known, plan, options.logs_root, stages)
         with output.filling() as place:
             options.progress("page")
             written = write_plan(record, place)

@@ -46,13 +46,6 @@ def test_order_of_samples_does_not_matter(ours, theirs):
     np.testing.assert_allclose(ours(x[None, ::-1], y[None, ::-1], at)[0], theirs(x, y, 9.0), rtol=1e-12)
 
 
-def test_spline_reproduces_a_cubic_and_extrapolates_it():
-    x = np.array([0.0, 1.0, 3.0, 4.0, 8.0])
-    cubic = np.polynomial.Polynomial([1.0, -2.0, 0.5, 0.25])
-    for at in (-3.0, 2.0, 12.0):
-        assert spline(x[None], cubic(x)[None, :, None], np.array([at]))[0, 0] == pytest.approx(cubic(at), rel=1e-12)
-
-
 def test_makima_does_not_overshoot_a_step_of_ranks():
     """The reason MATLAB gives for the modification: flat data stay flat beside a jump."""
     x = np.arange(8.0)

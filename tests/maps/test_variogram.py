@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import UsageError
@@ -157,16 +157,6 @@ def test_vertical_correlation_closed_form():
 DISTANCE = np.arange(0.0, 501.0, 30.0)
 
 
-def test_paper_coefficients_come_back():
-    fit = fit_biexponential(DISTANCE, PAPER_BIEXPONENTIAL(DISTANCE))
-    for name in ("c1", "c2", "c3", "c4"):
-        assert getattr(fit, name) == pytest.approx(getattr(PAPER_BIEXPONENTIAL, name), abs=1e-6)
-    assert abs(fit.c4 + 0.001) < 1e-6, "1e-3 would be no test of c4"
-    assert fit.rmse < 1e-10
-    assert not fit.degenerate
-    assert fit.message == ""
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_paper_coefficients_with_the_paper_residual(seed):
     """With noise of the paper's RMSE the curve, not each coefficient, is determined."""
@@ -177,11 +167,13 @@ def test_paper_coefficients_with_the_paper_residual(seed):
 
 
 @settings(max_examples=15, deadline=None)
+@example(0.2932, 0.0508, 0.7057, 0.001)  # the paper's
 @given(st.floats(0.1, 0.5), st.floats(0.01, 0.06), st.floats(0.1, 0.5), st.floats(0.0005, 0.002))
 def test_any_well_parted_curve_comes_back(c1, fast, c3, slow):
     truth = variogram.BiExponential(c1, -fast, c3, -slow, 0.0)
     fit = fit_biexponential(DISTANCE, truth(DISTANCE))
     assert fit.rmse < 1e-8
+    assert not fit.message
     np.testing.assert_allclose([fit.c1, fit.c2, fit.c3, fit.c4], [c1, -fast, c3, -slow], rtol=1e-3)
 
 

@@ -34,6 +34,7 @@ from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache, partial
+from importlib import import_module
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -410,6 +411,11 @@ calibration: channel
 """
 
 
+def _loader(module: str, name: str, **options: Any) -> Callable[[Path], Any]:
+    """A reader of the package by its name, loaded by the process that reads."""
+    return lambda path: getattr(import_module(f"aerpaw_cmp.{module}"), name)(path, **options)
+
+
 def _flight(path: Path) -> bool:
     from aerpaw_cmp.flight.gains.memory import load_with_learned
     from aerpaw_cmp.flight.simulate import plan_trajectory
@@ -424,18 +430,6 @@ def _flight(path: Path) -> bool:
     return True
 
 
-def _campaign(path: Path) -> bool:
-    from aerpaw_cmp.jobs.campaigns.campaign import load_campaign
-
-    return load_campaign(path) is not None
-
-
-def _site(path: Path) -> Any:
-    from aerpaw_cmp.site.siteyaml import load_site
-
-    return load_site(path)
-
-
 def _map(path: Path) -> Any:
     from aerpaw_cmp.site.imports.footprints import import_footprints
 
@@ -448,22 +442,10 @@ def _dem(path: Path) -> Any:
     return read_dem(path, FRAME, crs="local" if path.suffix == ".asc" else None)
 
 
-def _pattern(path: Path) -> Any:
-    from aerpaw_cmp.site.antenna.antennas import read_pattern_text
-
-    return read_pattern_text(path)
-
-
 def _mat(data: bytes, _index: int) -> bool:
     from aerpaw_cmp.logs.matfile import read_arrays
 
     return bool(read_arrays(data, None))
-
-
-def _flight_file(path: Path) -> Any:
-    from aerpaw_cmp.logs.flight_file import read_flight
-
-    return read_flight(path)
 
 
 def _gzipped(data: bytes, index: int) -> bool:
@@ -540,14 +522,14 @@ def targets() -> list[Target]:
     mats = [s for seeds in logs.values() for s in seeds if s.startswith((b"MATLAB", b"\x89HDF"))]
     out.append(Target("matfile", tuple(mats), _mat))
     vehicle = next(iter(logs["vehicle_out"]))
-    file = partial(_by_path, "f.h5", _flight_file)
+    file = partial(_by_path, "f.h5", _loader("logs.flight_file", "read_flight"))
     out.append(Target("flight_file", (_flight_bytes(vehicle),), file))
     out.append(Target("path_cache", (_cache_entry(),), _path_cache))
     sample = (ROOT / "sample_logs/flight.yaml").read_bytes()[:MEDIUM_BYTES]
     yamls: list[tuple[str, tuple[bytes, ...], Callable[[Path], Any]]] = [
         ("flight.yaml", (FLIGHT, sample), _flight),
-        ("campaign.yaml", (CAMPAIGN,), _campaign),
-        ("site.yaml", (maps.SITE,), _site),
+        ("campaign.yaml", (CAMPAIGN,), _loader("jobs.campaigns.campaign", "load_campaign")),
+        ("site.yaml", (maps.SITE,), _loader("site.siteyaml", "load_site")),
     ]
     for name, seeds, load in yamls:
         out.append(Target(name, seeds, partial(_by_path, name, load)))
@@ -561,29 +543,11 @@ def targets() -> list[Target]:
     out.append(Target("dem:asc", (maps.DEM,), partial(_by_path, "d.asc", _dem)))
     if (tiff := _geotiff()) is not None:
         out.append(Target("dem:tif", (tiff,), partial(_by_path, "d.tif", _dem)))
-    pattern = partial(_by_path, "p.txt", _pattern)
+    pattern = partial(_by_path, "p.txt", _loader("site.antenna.antennas", "read_pattern_text"))
     out.append(Target("antenna:text", (maps.PATTERN,), pattern))
     for name, (seed, load) in SMALL_FILES.items():
         out.append(Target(name, (seed,), partial(_by_path, name.replace(":", "."), load)))
     return out
-
-
-def _route(path: Path) -> None:
-    from aerpaw_cmp.logs.route import read_route
-
-    read_route(path, height_m=40.0)
-
-
-def _areas(path: Path) -> None:
-    from aerpaw_cmp.logs.route import read_areas
-
-    read_areas(path)
-
-
-def _mesh(path: Path) -> None:
-    from aerpaw_cmp.site.mesh_scenes.meshfiles import read_mesh
-
-    read_mesh(path)
 
 
 def _scene(path: Path) -> None:
@@ -591,18 +555,6 @@ def _scene(path: Path) -> None:
 
     (path.parent / "mesh.ply").write_bytes(PLY)
     read_scene(path)
-
-
-def _sphere(path: Path) -> None:
-    from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv
-
-    read_sphere_csv(path)
-
-
-def _receiver(path: Path) -> None:
-    from aerpaw_cmp.jobs.learning.calibrate_rank import read_receiver
-
-    read_receiver(path)
 
 
 def _report(path: Path) -> None:
@@ -638,16 +590,17 @@ SPHERE = b"azimuth_deg,elevation_deg,gain_dbi\n" + b"".join(
 REPORT = json.dumps({"flight": "f", "rss": {}, "rank": {}, "inputs": [], "rt": {}, "versions": {}}).encode()
 RECEIVER = json.dumps({"format": "aerpaw-cmp receiver 1", "towers": {"LW1": {"weights": [1.0]}}}).encode()
 WAYPOINT = b"%d\t0\t%d\t16\t0\t0\t0\t0\t35.7275\t-78.696\t100\t1\n"
+_ROUTE = _loader("logs.route", "read_route", height_m=40.0)
 # Files of one seed each: what the tool asks a stranger for beside logs and maps.
 SMALL_FILES: dict[str, tuple[bytes, Callable[[Path], Any]]] = {
-    "route:csv": (b"latitude,longitude,altitude\n35.7275,-78.696,40\n35.7285,-78.697,40\n", _route),
-    "route:plan": (PLAN, _route),
-    "route:wpl": (b"QGC WPL 110\n" + WAYPOINT % (0, 0) + WAYPOINT % (1, 3), _route),
-    "fence:kml": (FENCE, _areas),
-    "mesh:ply": (PLY, _mesh),
+    "route:csv": (b"latitude,longitude,altitude\n35.7275,-78.696,40\n35.7285,-78.697,40\n", _ROUTE),
+    "route:plan": (PLAN, _ROUTE),
+    "route:wpl": (b"QGC WPL 110\n" + WAYPOINT % (0, 0) + WAYPOINT % (1, 3), _ROUTE),
+    "fence:kml": (FENCE, _loader("logs.route", "read_areas")),
+    "mesh:ply": (PLY, _loader("site.mesh_scenes.meshfiles", "read_mesh")),
     "scene:xml": (SCENE, _scene),
-    "sphere:csv": (SPHERE, _sphere),
-    "receiver:json": (RECEIVER, _receiver),
+    "sphere:csv": (SPHERE, _loader("site.antenna.sphere_pattern", "read_sphere_csv")),
+    "receiver:json": (RECEIVER, _loader("jobs.learning.calibrate_rank", "read_receiver")),
     "report:json": (REPORT, _report),
 }
 

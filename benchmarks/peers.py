@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from benchmarks.ingest import contest, write_sounder
 
 
-def ingest_vs_pandas(lines: int) -> float:
+def utc_vs_pandas(lines: int) -> float:
     """Reading a power log, against ``pandas.read_csv(engine="c")`` and its times in UTC, by processor time."""
     with tempfile.TemporaryDirectory() as folder:
         place = Path(folder) / "power.txt"
@@ -55,7 +55,7 @@ def main() -> None:
     ratios = {
         "path search, image engine / PathSolver at equal error": search["equal_error"]["ratio"],
         "path search, image engine / PathSolver with 1e5 samples": search["at"].get("1e+05", {}).get("ratio"),
-        "ingest / pandas (C engine, times in UTC), 1 000 000 lines": ingest_vs_pandas(10_000 if quick else 1_000_000),
+        "ingest / pandas (C engine, times in UTC), 1 000 000 lines": utc_vs_pandas(10_000 if quick else 1_000_000),
         "ranks of 100 000 4 x 4 links / numpy.linalg.svd": ranks["ratio"],
     }
     print(json.dumps({"ratios": ratios, "ranks": ranks}))

@@ -70,7 +70,7 @@ def cache_folder(*parts: str) -> Path:
 # Entries of the cache by their place: the name alone would fit a Git object, where the folder is one of the user's.
 _ENTRY = re.compile(
     r"[0-9a-f]{64}\.npz|llvm/[0-9a-f]{24}|(outcomes|audits)/[0-9a-f]{64}\.(npz|json)"
-    r"|compiled/kernels-[0-9a-f]{16}/[^\n]+\.(nb[ci]|compiled)"
+    r"|compiled/kernels-[0-9a-f]{16}/[^\n]+\.(kernel|compiled)"
 )
 
 

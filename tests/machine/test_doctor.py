@@ -110,7 +110,7 @@ def test_cache_folder_that_cannot_be(tmp_path: Path) -> None:
 
 def test_clearing_the_cache_leaves_what_is_not_its_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("AERPAW_CMP_CACHE", str(tmp_path))
-    ours = [f"{64 * 'a'}.npz", f"llvm/{24 * '0'}", f"outcomes/{64 * 'b'}.json", f"compiled/kernels-{16 * 'c'}/m.nbi"]
+    ours = [f"{64 * 'a'}.npz", f"llvm/{24 * '0'}", f"outcomes/{64 * 'b'}.json", f"compiled/kernels-{16 * 'c'}/m.kernel"]
     theirs = ["thesis.tex", "outcomes/notes.txt", "llvm/readme", f"objects/ab/{38 * 'a'}", f"{40 * 'e'}/thesis.tex"]
     theirs += [f"sub/{64 * 'a'}.npz", f"{64 * 'a'}.txt", f"llvm/{64 * 'a'}.npz"]
     for name in ours + theirs:

@@ -75,7 +75,8 @@ def doctor(
     """Check this machine."""
     if clear_cache:
         files, size = cached.clear_cache()
-        say(f"cache: {counted(files, 'file')} removed, {size / 1e6:.1f} MB")
+        # matplotlib's folder is every program's: only its fonts are listed there
+        say(f"cache: {counted(files, 'file')} removed, {size / 1e6:.1f} MB; matplotlib's list of fonts stays")
     from ...machine import doctor as doctor_room
 
     checks = doctor_room.checks()

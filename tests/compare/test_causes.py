@@ -64,6 +64,11 @@ def test_the_clock_has_the_lag_of_its_judgement_and_no_other() -> None:
     assert cause is not None
     assert (cause.name, cause.estimate, cause.ci95) == ("clock", 3.93, (3.83, 4.03))
     assert _clock(3.93, "shifted").in_words in cause.sentence
+    early = np.interp(sound.time_s + 2.0, sound.time_s, sound.predicted_db) + sound.measured_db - sound.predicted_db
+    other = replace(sound, name="LW2 A", measured_db=early, clock=_clock(-2.0, "shifted"))
+    both = flight_cause([replace(sound, measured_db=late, clock=_clock(3.93, "shifted")), other])
+    assert both is not None
+    assert (both.name, both.channels) == ("clock", ("LW1 A",)), "the sentence of one clock is not said of another"
     for clock in (None, _clock(4.0, "cannot tell"), _clock(4.0, "ok"), _clock(4.0, "shifted", APPLIED)):
         assert _named(replace(sound, measured_db=late, clock=clock)) != "clock"
 

@@ -20,6 +20,7 @@ from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting import compare_flight as compared
+from aerpaw_cmp.jobs.reporting import likely_cause
 from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series, compare_rss_series, pairs_of
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.foliage_notes import foliage_notes
@@ -31,6 +32,23 @@ from tests.simulated import write_yaml
 from tests.tables import LW1, ORIGIN, POSITIONS, eastwards, rank_log, rss_log, write_csv
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
+
+
+def test_a_clock_that_is_no_cause_of_the_error_is_still_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sentence, warning and table have one clock; nothing is asked where it was corrected."""
+    level = np.random.default_rng(1).normal(size=50)
+    for shifted in (True, False):
+        clock = SimpleNamespace(shifted=shifted, in_words="0.40 s ahead")
+        evidence = SimpleNamespace(name="LW1 A", clock=clock)
+        monkeypatch.setattr(likely_cause, "_evidence", lambda *_, evidence=evidence: evidence)
+        monkeypatch.setattr(likely_cause, "flight_cause", lambda _: None)
+        monkeypatch.setattr(likely_cause, "gains_by_direction", lambda _: False)
+        data: Any = SimpleNamespace(files=[], rss=[None], settings=SimpleNamespace(antennas={}))
+        replays: Any = SimpleNamespace(rss=[SimpleNamespace(tower_m=None)])
+        result: Any = SimpleNamespace(name="LW1 A", measured_db=level, training=False)
+        cause, _ = likely_cause.cause_of(data, replays, [result])
+        assert (cause is not None and "LW1 A is 0.40 s ahead" in cause.sentence) == shifted
+
 
 FLOOR_DB = -758.6  # what the sounder writes without a signal
 

@@ -21,7 +21,7 @@ from aerpaw_cmp.jobs.reporting.flight_run import next_step, run_flight, unrivall
 from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_changes
 from aerpaw_cmp.site.antenna.learned import Entry, Errors, LearnedSeries, folder_of, remember
 from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv, unit_mean_gain
-from tests.simulated import write_yaml
+from tests.simulated import planned, simulate, write_yaml
 from tests.tables import eastwards, rss_log
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -84,6 +84,19 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     assert again.rss[0].score.rmse_db == pytest.approx(1.0, abs=0.1)
     as_set = {r.model: r for r in again.ladder}["as set in flight.yaml"]
     assert as_set.rmse_heldout_db == pytest.approx(rows["free space"]["rmse_heldout_db"], abs=1e-6)
+
+
+def test_a_reflection_is_seen_where_a_wood_hides_it_from_free_space(tmp_path: Path) -> None:
+    """Woods take 10 dB, the ground 2: without its woods no flight asks for a ground."""
+    route = [(-60, 10, 30), (-250, 60, 30), (-100, 260, 40), (160, 160, 40), (200, -150, 30)]
+    keys = {"rt": {"foliage": "attenuating", "audit_links": 0}, "rss": {"lag": "off", "minimum_height_m": 20}}
+    path = write_yaml(tmp_path / "flight.yaml", planned("woods", route, {"LW4": {"A": 5.0}}, **keys))
+    simulate(path)
+    models = run_flight(load_data(load_flight(path), tmp_path), audit=False, ladder=True).result.ladder
+    assert (
+        min(models[:-1], key=lambda row: row.rmse_heldout_db).model
+        == "coherent ground reflection + woods as media (p833)"
+    )
 
 
 def test_a_hover_recommends_no_model(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -371,9 +371,12 @@ def _rmse_db(models: Sequence[_Model]) -> float:
 
 def _named(name: str, shown: Sequence[_Models], gain: float) -> Cause:
     """The trouble in words, those of the channel that shows it best."""
+    trial = shown[0][frozenset([name])].trials[0]
+    # a channel with other numbers, such as those of another clock, would belie the sentence
+    shown = [table for table in shown if table[frozenset([name])].trials[0].sentence == trial.sentence]
     alone = [table[frozenset([name])] for table in shown]
     rmse, rmse_with = _rmse_db([table[_SOUND] for table in shown]), _rmse_db(alone)
-    trial, channels = alone[0].trials[0], tuple(model.evidence.name for model in alone)
+    channels = tuple(model.evidence.name for model in alone)
     where = channels[0] if len(channels) == 1 else f"{len(channels)} channels"
     value, low, high = trial.estimate
     return Cause(

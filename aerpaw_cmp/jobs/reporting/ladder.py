@@ -1,7 +1,7 @@
 """The ladder of models of a flight: which antennas, attitude, ground, buildings and trees its measurement asks for.
 
-Stages come one after the other (antennas, ground, buildings, woods, relief); each adds variants to the best model
-so far, by the RMSE on held-out segments. Everything but the offset is fixed beforehand.
+Stages come one after the other (antennas, woods, ground, buildings, relief); each adds variants to the best model so
+far, by the RMSE on held-out segments. Everything but the offset is fixed beforehand.
 """
 
 from __future__ import annotations
@@ -202,7 +202,8 @@ class _Climber:
         rungs = self._lines()
         models: list[Model | None] = [None] * len(rungs)
         best = Model()
-        for stage in (self._antennas, self._ground, self._buildings, self._trees, self._edges, self._relief):
+        # a wood takes more than a reflection, which is not seen before it is known
+        for stage in (self._antennas, self._trees, self._ground, self._buildings, self._edges, self._relief):
             for model in stage(best):
                 if model not in models:
                     models.append(model)

@@ -55,6 +55,10 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
         if replayed.tower_m is None and not result.training and result.name in names
     ]
     cause = flight_cause(evidence)
+    clocks = [(e.name, e.clock.in_words) for e in evidence if e.clock is not None and e.clock.shifted]
+    if cause is None and clocks:  # judged by itself: it is mended first, however little of the error it explains
+        said = "The radio clock at {} is {}.".format(*clocks[0])
+        return Cause(name="clock", sentence=said, next_step="`rss: {lag: apply}`"), None
     # learned antennas miss some decibels of any flight
     if cause is not None or data.settings.antennas or not gains_by_direction(evidence):
         return cause, None

@@ -647,7 +647,7 @@ _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
 _LIKE_A_LEVEL = re.compile(
     r"^lw ?[1-5]$|^value$|\b(asu|csq)\b|^(?!.*(batt|volt|throttle|gps|water|fuel|noise|tx)).*"
-    r"(power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss\b|strength|ampl|magnitude)"
+    r"(power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss\b|strength|\bampl|magnitude)"
 )
 _MAPPED = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
 

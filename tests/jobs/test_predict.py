@@ -5,10 +5,13 @@ import json
 import re
 import shutil
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import norm
+from scipy.stats import t as student
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
@@ -17,7 +20,7 @@ from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.learning.calibrate import observe
 from aerpaw_cmp.jobs.learning.calibrate_rank import rank_samples
-from aerpaw_cmp.jobs.prediction import corrected_map
+from aerpaw_cmp.jobs.prediction import corrected_map, sources
 from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.against import score_against
 from aerpaw_cmp.jobs.prediction.sources import named_flights
@@ -102,6 +105,21 @@ def test_columns_are_those_of_the_contract(prediction):
     assert ((levels["q05_db"] < levels["level_db"]) & (levels["level_db"] < levels["q95_db"])).all()
     by_point = levels.groupby(["point", "channel"], observed=True)["p_serving"].sum()
     np.testing.assert_allclose(by_point, 1.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("flights", [1, 2, 9])
+def test_the_offset_of_a_new_flight_is_students_as_in_the_memory(flights, monkeypatch):
+    """A field that knows its spread exactly and nothing else is unsure: the 90 % band is that of n + 1 degrees."""
+    normal_db = 1.5 * np.sqrt(1.0 + 1.0 / flights)
+    samples = [SimpleNamespace(flight=str(k), antenna="LW1.rss", position_m=np.zeros((1, 3))) for k in range(flights)]
+    field = SimpleNamespace(
+        over_headings=lambda *_, **__: (np.zeros(1), np.full(1, normal_db)), channels={"LW1.rss": None},
+        sd_factor=1.0, model=SimpleNamespace(offset_sd_db=1.5),
+    )  # fmt: skip
+    monkeypatch.setattr(sources, "between_blocks_db", lambda _: 0.0)
+    source = SimpleNamespace(samples=[s for s in samples for _ in range(2)])
+    _, slow, _ = sources.Flown(field, {"LW1.rss": source}).levels(samples[:1], 1)
+    assert slow[0] * norm.ppf(0.95) == pytest.approx(student.ppf(0.95, flights + 1) * normal_db)
 
 
 def test_a_notebook_shows_first_words_and_points(prediction):

@@ -19,6 +19,20 @@ SHARES = (0.5, 0.9, 0.95)
 # Of the band that a report draws.
 BAND = 0.9
 
+
+def student_factor(flights: int) -> float:
+    """Standard deviation of the normal distribution with the :data:`BAND` of Student's t with n + 1 degrees of freedom.
+
+    Notes
+    -----
+    So a new flight's offset lies about the mean of n: the spread between flights is itself known from n - 1 differences
+    and a guess that counts as two (Gelman et al., Bayesian Data Analysis, 3.3); two degrees have no variance.
+    """
+    from scipy.special import ndtri, stdtrit
+
+    return float(stdtrit(flights + 1.0, 0.5 + 0.5 * BAND) / ndtri(0.5 + 0.5 * BAND))
+
+
 # Beyond it the expansion of :meth:`Spread.half_width_db` is no longer one of a bell.
 _MOST_KURTOSIS = 2.0
 

@@ -18,7 +18,7 @@ from ...common.jsonable import named
 from ...common.provenance import KEY, MARKS, union
 from ...common.units import spread_out
 from ...compare.gains.direction_gain import Frame, directed
-from ...compare.gains.spread import BAND
+from ...compare.gains.spread import student_factor
 from ...compare.learning.calibration import mean_rmse
 from ...compare.learning.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries, rank_quantity
@@ -358,15 +358,7 @@ _OFFSET_SD_DB = 1.5
 
 
 def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
-    """Mean level of the flights above the antennas as written; its error is that of flights left out.
-
-    Notes
-    -----
-    The offset of a new flight about the mean of n has Student's t with n + 1 degrees of freedom, for the spread between
-    flights is itself known from n - 1 differences and a guess alone (Gelman et al., Bayesian Data Analysis, 3.3).
-    """
-    from scipy.special import ndtri, stdtrit
-
+    """Mean level of the flights above the antennas as written; its error is that of flights left out."""
     mine = [o for o in calibration.observed if (o.samples.tower, o.samples.channel) == (series.tower, series.channel)]
     if mine[0].samples.antenna in calibration.locks:  # without lock a level says nothing of the path
         mine = [o.part(o.locked == 1.0) for o in mine if o.locked is not None]
@@ -380,11 +372,9 @@ def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> Le
     n = max(len(squares), 1)
     # each was predicted by n - 1 others, and misses their mean by n / (n - 1) of what it misses the mean of all
     variance_db2 = (2.0 * _OFFSET_SD_DB**2 + (1.0 - 1.0 / n) ** 2 * sum(squares)) / (n + 1.0)
-    # as the normal distribution with the same interval: two degrees of freedom have no variance
-    as_normal = stdtrit(n + 1.0, 0.5 + 0.5 * BAND) / ndtri(0.5 + 0.5 * BAND)
     return LearnedLevel(
         offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
-        sd_db=round(float(as_normal) * math.sqrt((1.0 + 1.0 / n) * variance_db2), 2),
+        sd_db=round(student_factor(n) * math.sqrt((1.0 + 1.0 / n) * variance_db2), 2),
         transmit_power_dbm=sent,
         unit=series.unit,
     )

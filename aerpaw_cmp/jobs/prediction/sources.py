@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,7 @@ from ...common.geodesy import azimuth_rad
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray
 from ...compare.gains.direction_gain import LinkSamples
-from ...compare.gains.spread import NO_SPREAD, LostLock, Spread, fading_of
+from ...compare.gains.spread import NO_SPREAD, LostLock, Spread, fading_of, student_factor
 from ...compare.learning.calibration import Observed
 from ...compare.learning.correction import BIN_S, Correction, Predictor, between_blocks_db, by_degree
 from ...compare.level.detection import DetectionForecast
@@ -185,6 +186,10 @@ class Flown:
         antenna = each[0].antenna
         level, slow = self.correction.over_headings(each, all_targets=run_targets)
         guess = outside(each[0].position_m, self.sources[antenna].samples)
+        # the field's offset of a new flight is normal; few flights tell little of its spread, as in the memory
+        flights, fitted = len({s.flight for s in self.sources[antenna].samples}), self.correction
+        wider = math.sqrt((1.0 + 1.0 / flights) * (student_factor(flights) ** 2 - 1.0))
+        slow = np.hypot(slow, fitted.sd_factor * wider * fitted.model.offset_sd_db)
         beyond = between_blocks_db(self.correction.channels[antenna])
         return level, np.where(guess, np.hypot(slow, beyond), slow), guess
 

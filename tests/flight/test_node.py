@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.compare.learning.locate import LevelModel, NodeEstimate, Regions, level_track
+from aerpaw_cmp.compare.learning.locate import LevelModel, LevelTrack, NodeEstimate, Regions, level_track
 from aerpaw_cmp.flight.drafting import node
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
 from aerpaw_cmp.flight.drafting.node import listed_places
@@ -158,6 +158,7 @@ def test_a_place_wants_odds_of_two_and_a_listed_one_as_many_as_any_tower(
     )  # fmt: skip
     asked: list[FloatArray] = []
     monkeypatch.setattr(node, "locate", lambda _, places: asked.append(places) or estimate)
+    monkeypatch.setattr(node, "tower_odds", lambda _, towers: np.full(len(towers), -0.6))
     track = level_track(4.0 * np.arange(20), np.zeros((20, 3)), np.zeros(20))
     proposal = placer.propose(track)
     assert proposal is not None
@@ -235,13 +236,8 @@ def _taught() -> node.Taught:
     return node.Taught(SpherePattern("tower", tower, sd), SpherePattern("uav", uav, sd), model)
 
 
-@pytest.mark.parametrize("part", [slice(100, 220), slice(300, 400), slice(0, 500)])
-@pytest.mark.parametrize(("at", "keeps"), [("LW1", True), (ROVER, False), ("LW2", False)])
-def test_a_cut_flight_keeps_a_tower_whose_antennas_flights_taught(
-    at: str | tuple[float, float, float], keeps: bool, part: slice
-) -> None:
-    """Free space and the gains of both ends, 2 dB of noise; of a node elsewhere the tower's antennas explain nothing."""
-    placer, gains = _placer(), _taught()
+def _flown(placer: node.Placer, gains: node.Taught, at: str | tuple[float, float, float], part: slice) -> LevelTrack:
+    """Free space and the gains of both ends, 2 dB of noise, along a part of the flight."""
     place = np.array(SITE.towers[at].position_m if isinstance(at, str) else at)
     time = placer.telemetry.frame["time"].to_numpy()[part]
     pose = placer.track.pose_at(time)
@@ -251,10 +247,36 @@ def test_a_cut_flight_keeps_a_tower_whose_antennas_flights_taught(
     body = np.einsum("nji,nj->ni", pose.rotation, towards)
     level = gains.tower.gain_dbi(*sphere_angles(-towards)) + gains.uav.gain_dbi(*sphere_angles(body))
     level = level - 20.0 * np.log10(away) + np.random.default_rng(8).normal(0.0, 2.0, len(away))
-    track = level_track(time.astype(np.int64) * 1e-9, pose.position_m, level)
-    placement = placer.propose(track, {"LW1": gains})
+    return placer.levels(Stream("rss", "power", pd.DataFrame({"time": time, "line": 1, "flag": "", "rss_db": level})))
+
+
+@pytest.mark.parametrize("part", [slice(100, 220), slice(300, 400), slice(0, 500)])
+@pytest.mark.parametrize(("at", "keeps"), [("LW1", True), (ROVER, False), ("LW2", False)])
+def test_a_cut_flight_keeps_a_tower_whose_antennas_flights_taught(
+    at: str | tuple[float, float, float], keeps: bool, part: slice, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a node elsewhere the tower's antennas explain nothing."""
+    monkeypatch.setattr(node, "tower_odds", lambda _, towers: np.full(len(towers), -9.0))
+    placer, gains = _placer(), _taught()
+    placement = placer.propose(_flown(placer, gains, at, part), {"LW1": gains})
     assert placement is not None
     assert (placement.node == "LW1") == keeps
     if keeps:
         assert "with the antennas that flights taught" in placement.question or "fit LW1 best" in placement.question
         assert placement.tower is None
+
+
+@pytest.mark.parametrize(
+    ("at", "part", "said"),
+    [("LW1", slice(300, 400), "LW1"), ("LW2", slice(100, 220), "LW2"), ("LW2", slice(0, 500), "LW2"),
+     (ROVER, slice(100, 220), "NODE"), (ROVER, slice(0, 500), "NODE")],
+)  # fmt: skip
+def test_a_tower_stands_beside_antennas_of_which_nothing_is_known(
+    at: str | tuple[float, float, float], part: slice, said: str
+) -> None:
+    """Their lobes look like another place to a law of the distance alone; a node within reach is still found."""
+    placer, gains = _placer(), _taught()
+    placement = placer.propose(_flown(placer, gains, at, part))
+    assert placement is not None
+    assert placement.node == said
+    assert ("no place fits the levels better" in placement.question) == (said != "NODE")

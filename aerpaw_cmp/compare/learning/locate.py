@@ -7,7 +7,7 @@ receiver's floor says only that.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -102,6 +102,8 @@ class LevelTrack:
         Level below which the receiver measures nothing; -inf where none shows.
     airframe_db : callable, optional
         Gain (m, n) of the airframe at each of the levels towards unit vectors (m, n, 3) from the UAV, where known.
+    rotation : (n, 3, 3), optional
+        From the aircraft's frame to that of the site.
     """
 
     time_s: FloatArray
@@ -109,6 +111,7 @@ class LevelTrack:
     level_db: FloatArray
     floor_db: float = -np.inf
     airframe_db: Callable[[FloatArray], FloatArray] | None = None
+    rotation: FloatArray | None = None
 
     @property
     def below(self) -> BoolArray:
@@ -445,10 +448,10 @@ def _log_prior(places: FloatArray) -> FloatArray:
     return np.log([_HEIGHTS_M[height] for height in places[:, 2].tolist()])
 
 
-def _grid(track: LevelTrack) -> FloatArray:
+def _grid(track: LevelTrack, spacing_m: float = _SPACING_M) -> FloatArray:
     """Places (m, 2) at equal spacing, as far as :data:`_REACH_M` beyond the track."""
     low, high = track.position_m[:, :2].min(axis=0) - _REACH_M, track.position_m[:, :2].max(axis=0) + _REACH_M
-    axes = [np.arange(a, b + _SPACING_M, _SPACING_M) for a, b in zip(low, high, strict=True)]
+    axes = [np.arange(a, b + spacing_m, spacing_m) for a, b in zip(low, high, strict=True)]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
@@ -476,3 +479,70 @@ def _log_odds(track: LevelTrack, candidates: FloatArray, anywhere: float) -> Flo
     log_weights = np.log(np.outer(weights, weights).ravel())
     near = [logsumexp(fit_places(track, c + moved).evidence + log_weights) for c in candidates]
     return np.array(near) - anywhere
+
+
+# Of a tower against a place: nearly free space, with antennas of which nothing is known; chosen on made flights.
+_RIVAL = LevelModel(slope=2.1, slope_sd=0.3, elevation_sd_db=4.0, scatter_sd_db=1.5)
+# What azimuth adds at the node, and the directions of an airframe at the UAV (spherical harmonics of degrees 1 and 2).
+_AZIMUTH_SD_DB, _AIRFRAME_SD_DB = 0.8, 1.5
+# Shadowing [dB] and its length [m] that are tried: the levels weigh them.
+_SHADOWS = ((2.5, 15.0), (2.5, 45.0), (4.5, 15.0), (4.5, 45.0))
+# A radio stands near the track that was flown for it: a Cauchy distribution in the plane, of this width.
+_NEAR_M = 150.0
+_RIVAL_SPACING_M = 60.0
+
+
+def tower_odds(track: LevelTrack, towers_m: ArrayLike) -> FloatArray:
+    """Log odds (k,) of towers against any place about the track, where no antenna is known.
+
+    Place, gain, slope and antennas are integrated over: a place wins only by more than its freedom gives.
+
+    Parameters
+    ----------
+    track : LevelTrack
+        Levels below the floor count as at it.
+    towers_m : (k, 3)
+    """
+    from scipy.special import logsumexp
+
+    towers, grid = unmasked(towers_m).reshape(-1, 3), _grid(track, _RIVAL_SPACING_M)
+    free = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
+    places = np.concatenate([towers, free])
+    away = np.hypot(*(places[:, None, :2] - track.position_m[:, :2]).transpose(2, 0, 1)).min(axis=1)
+    shadows = [_inverse_root(track, *shadow) for shadow in _SHADOWS]
+    parts = [_rival_evidence(track, places[i : i + _AT_ONCE], shadows) for i in range(0, len(places), _AT_ONCE)]
+    share = np.concatenate(parts) - 1.5 * np.log1p((away / _NEAR_M) ** 2)
+    return np.asarray(share[: len(towers)] + np.log(len(grid)) - logsumexp(share[len(towers) :] + _log_prior(free)))
+
+
+def _inverse_root(track: LevelTrack, sd_db: float, length_m: float) -> FloatArray:
+    """Inverse (n, n) of the lower root of the covariance of shadowing and scatter."""
+    apart = np.linalg.norm(track.position_m[:, None] - track.position_m, axis=-1)
+    covariance = sd_db**2 * np.exp(-apart / length_m) + _RIVAL.scatter_sd_db**2 * np.eye(len(apart))
+    return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)))
+
+
+def _rival_evidence(track: LevelTrack, places: FloatArray, shadows: Sequence[FloatArray]) -> FloatArray:
+    """Log evidence (m,) of the levels at places, over the shadows that are tried."""
+    from scipy.special import logsumexp
+
+    mean, features = _features(track, places, _RIVAL)
+    ray = track.position_m[None] - places[:, None]
+    towards = ray / np.maximum(np.linalg.norm(ray, axis=-1, keepdims=True), 1e-9)
+    east, north, _ = np.moveaxis(towards, -1, 0)
+    more = _AZIMUTH_SD_DB * np.stack([east, north, 0.7 * (east**2 - north**2), 1.4 * east * north], axis=-1)
+    terms = [features, more]
+    if track.rotation is not None:
+        x, y, z = np.moveaxis(np.einsum("nji,mnj->mni", track.rotation, -towards), -1, 0)
+        second = [1.7 * x * y, 1.7 * x * z, 1.7 * y * z, 0.9 * (x**2 - y**2), 0.6 * (3.0 * z**2 - 1.0)]
+        terms.append(_AIRFRAME_SD_DB * np.stack([x, y, z, *second], axis=-1))
+    columns = np.concatenate(terms, axis=-1)
+    evidence = []
+    for root in shadows:
+        left, white = (track.level_db - mean) @ root.T, root @ columns
+        precision = np.eye(white.shape[2]) + white.swapaxes(1, 2) @ white
+        pull = (white.swapaxes(1, 2) @ left[:, :, None])[:, :, 0]
+        gain = (pull * np.linalg.solve(precision, pull[:, :, None])[:, :, 0]).sum(axis=1)
+        size = np.log(np.diag(root)).sum() - 0.5 * np.linalg.slogdet(precision)[1]
+        evidence.append(0.5 * (gain - (left**2).sum(axis=1)) + size)
+    return np.asarray(logsumexp(evidence, axis=0))

@@ -189,7 +189,8 @@ def drawn(troubles: tuple[str, ...], draw: np.random.Generator) -> tuple[LevelEv
     measured = clean + unmodelled(draw, true, at) + fading(draw, time)
     late, clipped = 0.0, np.zeros(len(time), dtype=np.bool_)
     locked = serving = None
-    for trouble in troubles:
+    # what stands in the way dims the link, and not what a receiver writes of it
+    for trouble in sorted(troubles, key="blocked".__ne__):
         before, sign = measured.copy(), draw.choice([-1.0, 1.0])
         if trouble == "clock":
             late = sign * draw.uniform(1.5, 8.0)

@@ -39,7 +39,7 @@ def jumps_of(stream: Stream) -> tuple[BoolArray, str]:
     none = np.zeros(len(stream.frame), dtype=np.bool_)
     if not {"latitude_deg", "longitude_deg"} <= set(stream.frame.columns):
         return none, ""
-    rows, time_s, place_m = _path(stream.frame)
+    rows, time_s, place_m = path_of(stream.frame)
     if len(rows) < 3:
         return none, ""
     speed_mps = _speed_mps(time_s, place_m)
@@ -66,7 +66,7 @@ def jumps_of(stream: Stream) -> tuple[BoolArray, str]:
     )
 
 
-def _path(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
+def path_of(frame: pd.DataFrame) -> tuple[IntArray, FloatArray, FloatArray]:
     """Rows with a time and a position, their times [s], and east, north, up [m] about the first."""
     time = frame["time"].to_numpy("datetime64[ns]")
     latitude, longitude = (frame[name].to_numpy(np.float64) for name in PLACE[:2])

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from scipy.stats import multivariate_normal
 from aerpaw_cmp.compare.judge import causes
 from aerpaw_cmp.compare.judge.causes import LevelEvidence, Trial, flight_cause, gains_by_direction
 from aerpaw_cmp.compare.result import APPLIED, ESTIMATED, ClockResult
-from aerpaw_cmp.jobs.reporting.likely_cause import is_simulated
+from aerpaw_cmp.jobs.reporting.likely_cause import heights_meant, is_simulated
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 from benchmarks.planted_causes import NONE, TROUBLES, situation
 from tests.parsers import autopilots
@@ -82,6 +83,7 @@ def _planted() -> dict[str, LevelEvidence]:
         "heading": replace(sound, measured_db=level + sound.turned_db[90.0]),
         "attitude": replace(sound, measured_db=level + 5.0 * np.sin(time**2), attitude_db={"logged": 5.0 * np.sin(time**2)}),
         "telemetry": replace(sound, measured_db=level + 5.0 * np.cos(time**2), misread_db={"in feet": 5.0 * np.cos(time**2)}),
+        "decibels": replace(sound, measured_db=0.5 * level),
         "height": replace(sound, measured_db=level + 5.0 * np.cos(time / 9.0), raised_db={60.0: 5.0 * np.cos(time / 9.0)}),
         "tower": replace(sound, measured_db=sound.other_towers_db["LW3"] + noise),
         "pattern": replace(sound, measured_db=level + 5.0 * np.sin(np.radians(2 * sound.uav_azimuth_deg))),
@@ -94,7 +96,7 @@ def _planted() -> dict[str, LevelEvidence]:
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", ["telemetry", *(name for name in TROUBLES if name != "clock")])
+@pytest.mark.parametrize("name", ["telemetry", "decibels", *(name for name in TROUBLES if name != "clock")])
 def test_each_trouble_comes_back_with_its_number_and_a_step(name: str) -> None:
     evidence = _planted()[name]
     cause = flight_cause([evidence])
@@ -169,6 +171,23 @@ def test_a_flat_level_is_neither_floor_nor_saturation(spread_db: float) -> None:
     assert "stays at \N{MINUS SIGN}90 dB" in cause.sentence
 
 
+@pytest.mark.parametrize("share", [0.4, 0.5])
+def test_what_is_left_above_a_floor_is_no_ceiling_and_no_other_trouble(share: float) -> None:
+    """A second run, with the floor of the first: of the low links those that fade upwards remain."""
+    sound = _sound()
+    floor = np.quantile(sound.measured_db, share)
+    shown = floor + 10.0 * np.log10(1.0 + 10.0 ** (0.1 * (sound.measured_db - floor)))
+    assert _named(replace(sound, measured_db=np.where(shown > floor + 3.0, shown, np.nan), floored=True)) == NONE
+
+
+def test_an_attitude_that_is_not_used_is_no_turned_antenna() -> None:
+    """Flown with a steady yaw, both explain the level; only one of them is in the settings."""
+    sound, turn = _sound(), _sound().turned_db[90.0]
+    for seed in range(3):
+        logged = {"logged": turn + np.random.default_rng(seed).normal(0.0, 0.05, 300)}
+        assert _named(replace(sound, measured_db=sound.measured_db + turn, attitude_db=logged)) == "attitude"
+
+
 def test_two_channels_are_one_flight_and_a_second_trouble_hides_none() -> None:
     sound, planted = _sound(), _planted()
     both = flight_cause(
@@ -220,6 +239,20 @@ def test_situations_of_the_benchmark_are_named() -> None:
         wrong += [(planted, name)] if name not in (planted or (NONE,)) else []
     assert len(wrong) <= 2, wrong
     assert sum(name != NONE for _, name in wrong) <= 1, wrong
+
+
+@pytest.mark.parametrize(
+    ("height", "speed", "meant"),
+    [(1.0, 1.0, ""), (3.28, 1.0, "are in feet"), (0.305, 1.0, "were divided by 3.28"), (1.0, 3.28, "")],
+)
+def test_heights_of_another_unit_are_told_by_the_vertical_speed(height: float, speed: float, meant: str) -> None:
+    """Speeds in feet are so along the ground, too, and say nothing about heights."""
+    data = next((Path(__file__).parents[2] / "sample_logs" / "UAV").glob("*vehicleOut.txt")).read_bytes()
+    stream = identify(data).read(data, ReadOptions(timezone="America/New_York")).streams[0]
+    scale = {"altitude_m": height} | dict.fromkeys([f"velocity_{way}_mps" for way in ("north", "east", "down")], speed)
+    other = {name: stream.frame[name] * factor for name, factor in scale.items()}
+    told = heights_meant(replace(stream, frame=stream.frame.assign(**other)))
+    assert told == (f"the logged heights {meant}" if meant else "")
 
 
 LOADED = autopilots.VOLTS
@@ -287,7 +320,9 @@ def test_the_fit_is_the_best_normal_with_the_covariance_of_its_memories(
     ridge = np.exp(exact.x) * np.eye(design.shape[1])
     left = residual - design @ np.linalg.solve(design.T @ inverse @ design + ridge, design.T @ inverse @ residual)
     fit = causes._remembering(residual, design, known, climb=False)
-    assert fit.log_likelihood == pytest.approx(-exact.fun + 0.5 * n * np.log(2.0 * np.pi), abs=tolerance)
+    assert fit.log_likelihood == pytest.approx(
+        known.log_prior - exact.fun + 0.5 * n * np.log(2.0 * np.pi), abs=tolerance
+    )
     np.testing.assert_allclose(fit.residual_db, left, atol=max(0.2 * tolerance, 1e-3))
     best = causes._remembering(residual, design, known, climb=True)
     assert best.log_likelihood >= max(causes._remembering(residual, design, near, climb=False).log_likelihood

@@ -205,10 +205,19 @@ class _Memories:
         moved = [tuple(p + step * (k == i) for k, p in enumerate(places)) for i, step in steps]
         return [_Memories(*m) for m in moved if all(0 <= p < size for p, size in zip(m, sizes, strict=True))]
 
+    @property
+    def log_prior(self) -> float:
+        """Log normal in the slow memory, where that is longer than usual: else fading of minutes hides any trouble."""
+        times = -1.0 / math.log(_SLOW[self.slow]) / _FADES_S
+        return -0.5 * (math.log(max(times, 1.0)) / _FADES_FACTOR) ** 2 if _SLOW_SHARE[self.share] else 0.0
+
 
 _SLOW = (0.8, 0.87, 0.92, 0.95, 0.97, 0.985, 0.995)
 _FAST = (0.0, 0.3, 0.5, 0.7, 0.8)
 _SLOW_SHARE = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
+# Shadows of open land are alike over some 37 m (3GPP TR 38.901, table 7.5-6), which 5 m/s fly in 7 s; three times as
+# long is one standard deviation.
+_FADES_S, _FADES_FACTOR = 7.0, math.log(3.0)
 _START = _Memories(4, 2, 3)
 # Where climbs may begin: in the middle, and without any memory.
 _STARTS = (_START, _Memories(0, 0, 0))
@@ -274,7 +283,9 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         fall_db = (1.0 - alone) * _rmse_db([table[_SOUND] for table in shown])
         if name == _CATCH_ALL and not all(_tells_more(table[frozenset([name])]) for table in shown):
             continue
-        if fall_db >= _SHOWN_DB and (share <= 1.0 - least_share or certain):
+        # a floor that the settings leave out explains why the low links that are left look too strong, and is known
+        known = name == "floor" and shown[0][_SOUND].evidence.floored
+        if not known and fall_db >= _SHOWN_DB and (share <= 1.0 - least_share or certain):
             named[name] = shown
     if not named:
         return None
@@ -286,7 +297,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
 def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
     """Check that a gain over directions, which antennas learn, takes off a channel an error that a page shows."""
     for evidence in filter(None, map(_binned, channels)):
-        sound, (antenna,) = _fitted(evidence), _pattern(evidence)
+        sound, (*_, antenna) = _fitted(evidence), _pattern(evidence)
         learned = _fitted(evidence, antenna, at=sound.memories)
         left_db = float(learned.residual_db.std())
         fall_db = min(float(sound.residual_db.std()), float(evidence.measured_db.std())) - left_db
@@ -531,7 +542,7 @@ def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb:
     """Fit under noise of two memories: the given ones, or those climbed to from there or a start.
 
     Coefficients of the design are unit normals: the likelihood is integrated over them, the residual is about their
-    means. The noise has its likeliest size.
+    means. The noise has its likeliest size; its memories have a prior.
     """
     from scipy.linalg.lapack import dtbtrs  # scipy.signal would load for 0.4 s
 
@@ -556,7 +567,7 @@ def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb:
         mean = along / (power + variance)
         square = float(gram[0, 0] - along @ mean) / variance
         size = (n - len(power)) * math.log(variance) + float(np.log(variance + power).sum())
-        return -0.5 * (size + square) + math.log(root), axes @ mean
+        return -0.5 * (size + square) + math.log(root) + memories.log_prior, axes @ mean
 
     tried = {memories: fit(memories) for memories in ({at, *_STARTS} if climb else {at})}
     best, last = max(tried, key=lambda memories: tried[memories][0]), None if climb else at
@@ -634,10 +645,12 @@ def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
 
 def _heading(e: LevelEvidence) -> Iterator[Trial]:
     """An antenna turned about the vertical."""
+    # where the logged attitude is not used, an antenna has no heading that could be wrong
+    cost = _RARE if "logged" in e.attitude_db else 0.0
 
     def turned(angle: float, change: FloatArray) -> Trial:
         return Trial(
-            name="heading", cost=0.0, change_db=change,
+            name="heading", cost=cost, change_db=change,
             next_step="check the antenna's mount and the logged yaw",
             sentence=f"the UAV antenna is turned clockwise by {angle:.0f} degrees",
         )  # fmt: skip
@@ -717,17 +730,20 @@ def _pattern(e: LevelEvidence) -> Iterator[Trial]:
     azimuth, elevation = np.radians(e.uav_azimuth_deg), np.radians(e.uav_elevation_deg)
     axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
-    columns = [_GAIN_DB * np.prod(term, axis=0) for term in terms]
-    if e.turned_db:  # no known pattern any more: the mean over all headings
-        columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
+    columns = np.column_stack([np.prod(term, axis=0) for term in terms])
+    # no known pattern any more: the mean over all headings
+    mean = [np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1)] if e.turned_db else []
     sentence, step = _PATTERN[e.antenna]
-    yield Trial(
-        name=_CATCH_ALL, cost=0.0, sentence=sentence, next_step=step, columns=np.column_stack(columns),
-    )  # fmt: skip
+    for spread_db in _GAINS_DB:
+        yield Trial(
+            name=_CATCH_ALL, cost=math.log(len(_GAINS_DB)), sentence=sentence, next_step=step,
+            columns=np.column_stack([spread_db * columns, *mean]),
+        )  # fmt: skip
 
 
-# Standard deviations before the flight: of the terms of an antenna's gain, and of steps and losses [dB].
-_GAIN_DB, _STEP_DB, _LOSS_DB = 3.0, 8.0, 15.0
+# Standard deviations before the flight: of the terms of an antenna's gain, a smooth one or one with lobes, and of steps
+# and losses [dB].
+_GAINS_DB, _STEP_DB, _LOSS_DB = (1.5, 3.0), 8.0, 15.0
 # Log odds against what a log or its settings seldom have.
 _RARE = 3.0
 
@@ -739,6 +755,25 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
             name="cell", cost=0.0, sentence="the level steps where the phone changes its cell",
             next_step="compare the cells apart", columns=_STEP_DB * e.serving[:, None],
         )  # fmt: skip
+
+
+def _decibels(e: LevelEvidence) -> Iterator[Trial]:
+    """Decibels of an amplitude as if it were a power, or the reverse; none where any other slope is likelier."""
+    any_slope = Trial(name="", cost=0.0, sentence="", next_step="", columns=_SLOPE * e.predicted_db[:, None])
+    # what is left above a floor changes by fewer decibels than the link
+    least = math.inf if e.floored else _fitted(e, any_slope, climb=False).log_likelihood
+    for factor, words in ((0.5, "half"), (2.0, "twice")):
+        trial = Trial(
+            name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
+            sentence=f"the levels change by {words} the link's decibels",
+            next_step="check: 10 lg of power, 20 lg of amplitude",
+        )  # fmt: skip
+        if _fitted(e, trial, climb=False).log_likelihood > least:
+            yield trial
+
+
+# Standard deviation of the slope of levels about their prediction, before the flight.
+_SLOPE = 0.5
 
 
 # --- troubles of the receiver ----------------------------------------------------------------------------------------
@@ -787,7 +822,7 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 def _floor(e: LevelEvidence) -> Iterator[Trial]:
     """A receiver that shows no level below its floor; what it shows there spreads less."""
-    if e.least is None and not e.floored and not _is_flat(e):  # else the log itself says where nothing was detected
+    if e.least is None and not _is_flat(e):  # else the log itself says where nothing was detected
         yield from _clipping(e, 1.0)
 
 
@@ -948,6 +983,6 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
 
 
 CANDIDATES: tuple[Callable[[LevelEvidence], Iterator[Trial]], ...] = (
-    _clock, _heading, _attitude, _misread, _height, _tower, _pattern, _cell,
+    _clock, _heading, _attitude, _misread, _height, _tower, _pattern, _cell, _decibels,
     _lock, _no_detection, _flat, _floor, _saturation, _blocked, _gain_step,
 )  # fmt: skip

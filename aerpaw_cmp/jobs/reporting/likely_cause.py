@@ -18,6 +18,7 @@ from ...flight.data import FlightData, RssSeries, Times
 from ...flight.gains.learned_gain import mean_gain_db
 from ...flight.pose.track import MISREAD
 from ...flight.replay import FlightReplay, Replayed, attitude_rotation, telemetry_time
+from ...logs.jumps import path_of
 from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
 from ...site.antenna.antennas import Isotropic
@@ -46,8 +47,12 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     -------
     Cause or None, str or None
     """
-    if any(is_simulated(stream) for file in data.files for stream in file.result.streams):
+    telemetry = [stream for file in data.files for stream in file.result.streams if stream.kind == "telemetry"]
+    if any(map(is_simulated, telemetry)):
         return SIMULATED, None
+    if meaning := next(filter(None, map(heights_meant, telemetry)), ""):
+        sentence = f"Likely cause: {meaning}, by the logged vertical speed."
+        return Cause(name="telemetry", sentence=sentence, next_step="check the telemetry's columns and units"), None
     names = {result.name for result in without_copies(results)}  # a copy is replayed with antennas of another channel
     evidence = [
         _evidence(data, series, replayed, result)
@@ -74,7 +79,7 @@ def is_simulated(telemetry: Stream) -> bool:
     Of fix 6, 10 satellites and the few voltages of its battery, two are in the log, and what else it has agrees.
     """
     rows = telemetry.frame
-    if telemetry.kind != "telemetry" or len(rows) < _FEWEST_ROWS:
+    if len(rows) < _FEWEST_ROWS:
         return False
     signs = [bool((rows[name] == value).all()) for name, value in _RECEIVER.items() if (rows[name] >= 0).any()]
     if "battery_v" in rows and len(rows) >= _FEWEST_VOLTAGES:
@@ -96,6 +101,31 @@ SIMULATED = Cause(
     sentence="The log is a simulator's: receiver and battery (fix 6, 10 satellites, few voltages) are ArduPilot's.",
     next_step="draw no conclusion on the site from this flight",
 )
+
+
+def heights_meant(telemetry: Stream) -> str:
+    """Unit of heights where logged speeds fit the track along the ground but not upwards, in words; else empty."""
+    rows, time_s, place_m = path_of(telemetry.frame)
+    speed_mps = telemetry.frame[list(_SPEED)].to_numpy(np.float64)[rows] * [1.0, 1.0, -1.0]
+    step_s, flown = np.diff(time_s)[:, None], np.diff(place_m, axis=0)
+    told = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * step_s
+    near = np.isfinite(told).all(axis=1) & (step_s[:, 0] > 0.0) & (step_s[:, 0] < _LONG_STEP_S)
+    flown, told = flown[near], told[near]
+    if min(np.abs(told[:, :2]).sum(), np.abs(told[:, 2]).sum()) < _LEAST_PATH_M:
+        return ""
+    # speeds of another unit are so along the ground, too
+    along, upwards = ((flown[:, axes] * told[:, axes]).sum() / np.square(told[:, axes]).sum() for axes in (slice(2), 2))
+    alike = upwards * (flown[:, 2] @ told[:, 2]) > _ALIKE * (flown[:, 2] @ flown[:, 2])
+    fits = [meaning for meaning, to_m in _HEIGHTS.items() if alike and abs(upwards * to_m - along) < _AS_TOLD * along]
+    return fits[0] if fits else ""
+
+
+# The log of another unit, by what its heights have to be multiplied with.
+_FOOT_M = 0.3048
+_HEIGHTS = {"the logged heights are in feet": _FOOT_M, "the logged heights were divided by 3.28": 1.0 / _FOOT_M}
+# Four field logs climb at .90 to 1.00 of their speeds; rows further apart [s] tell no path between them.
+_AS_TOLD, _ALIKE, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
+_SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
 
 def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: RssResult) -> LevelEvidence:
@@ -193,10 +223,7 @@ class _Direct:
         if data.track is None or track is None:
             return {}
         ground_m, levels = data.track.ground_m, {}
-        for meaning, scale in (
-            ("the logged heights are in feet", _FOOT_M),
-            ("the logged heights were divided by 3.28", 1 / _FOOT_M),
-        ):
+        for meaning, scale in _HEIGHTS.items():
             place = np.column_stack([poses.position_m[:, :2], ground_m + scale * (poses.position_m[:, 2] - ground_m)])
             levels[meaning] = self._level(self.place_m, place, poses.rotation)
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
@@ -230,6 +257,5 @@ class _Direct:
         return np.asarray(free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0] + gain)
 
 
-_FOOT_M = 0.3048
 # A track under another datum may begin so far below the ground [m].
 _BELOW_GROUND_M = 20.0

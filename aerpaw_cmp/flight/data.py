@@ -624,7 +624,7 @@ def _rss_series(
     links: LinksSettings, log: LogSettings, stream: Stream, site: Site, *, number: int, locked: FloatArray | None
 ) -> RssSeries:
     pci = stream.attributes.get("pci")
-    home = log.cells.get(int(pci)) if pci is not None else None
+    home = log.cells.get(stream.name if pci is None else int(pci))
     tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
     channel = _channel_of(log, stream)
     noise_dbm, link = _noise(stream, links.of(channel))

@@ -207,8 +207,8 @@ class LogSettings(StrictModel):
     kind: Kind | None = None
     unit: str | None = None
     floor_db: float = -200.0
-    cells: dict[int, str] = {}
-    """Tower of each cell, by PCI; where it is given, cells that it does not name are left out."""
+    cells: dict[Annotated[int | str, Field(union_mode="left_to_right")], str] = {}
+    """Tower of each cell, by PCI, else by the stream's name; PCIs that it does not name are left out."""
     height_m: float | None = Field(default=None, ge=-1000.0, le=20_000.0)
     """Of a track whose log has no altitude: above take-off, in all of it."""
     skip: list[str] = []

@@ -273,7 +273,9 @@ _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero
 
 def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream | None:
     values, name = sheet.numbers(column), sheet.plain[column]
-    about = {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(name)) else {}
+    meaning, about = sheet.meanings[column], {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(name)) else {}
+    if meaning is not None and meaning.place.startswith("cell"):
+        about |= {"cell": meaning.place, "part": meaning.place}  # no second reading of the first cell
     if tower and name == f"snr {tower[0]}":
         return _rows.snr(rows, about["node"], values)
     where, unit = np.isfinite(values), sheet.unit_read(column)

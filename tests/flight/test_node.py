@@ -280,3 +280,24 @@ def test_a_tower_stands_beside_antennas_of_which_nothing_is_known(
     assert placement is not None
     assert placement.node == said
     assert ("no place fits the levels better" in placement.question) == (said != "NODE")
+
+
+@pytest.mark.parametrize("head", ["cell_id,rsrp", "rsrp cell 1,rsrp cell 2"])
+def test_cells_without_a_pci_have_the_tower_that_their_levels_fit(head: str, tmp_path: Path) -> None:
+    """A number of a cell is told in a column of its own, or in the names of the levels: none is a PCI."""
+    track, random, rows = _track(), np.random.default_rng(3), []
+    latitude, longitude = SITE.frame.to_geographic(track[:, 0], track[:, 1])
+    levels = [
+        -20.0 * np.log10(np.linalg.norm(track - SITE.towers[name].position_m, axis=1)) + random.normal(0.0, 1.0, 500)
+        for name in ("LW1", "LW2")
+    ]
+    for t, (lat, lon, up, first, second) in enumerate(zip(latitude, longitude, track[:, 2], *levels, strict=True)):
+        pose = f"{1748786400 + t},{lat:.7f},{lon:.7f},{up:.1f}"
+        cells = [f"7,{first:.2f}", f"9,{second:.2f}"] if "id" in head else [f"{first:.2f},{second:.2f}"]
+        rows += [f"{pose},{cell}" for cell in cells]
+    (tmp_path / "x.csv").write_text("\n".join([f"time,lat,lon,alt,{head}", *rows, ""]))
+    text, remarks = draft(ingest(tmp_path / "x.csv"), tmp_path)
+    (log,) = parse_yaml(text, FlightFile).logs
+    assert (log.node, list(log.cells.values())) == (None, ["LW1", "LW2"])
+    assert any("which tower has which cell?" in remark for remark in remarks)
+    assert remarks[0].endswith("000 samples can be compared")

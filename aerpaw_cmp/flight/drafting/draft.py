@@ -620,7 +620,7 @@ class _Entries:
         # None: a log without cells is one level
         for pci in entry.get("cells", [None]):
             # the first of its kind: receivers of one node stand at one place
-            level = next((s for s in levels if s.attributes.get("pci") == pci), None)
+            level = next((s for s in levels if pci is None or _cell_of(s) == pci), None)
             if level is not None:
                 series = _key(level, entry)[1], file.result.reader
                 mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
@@ -658,7 +658,7 @@ class _Entries:
     def _offset_db(self, level: Stream, entry: Mapping[str, Any], placer: Placer) -> float | None:
         if level.kind != "rss":
             return None
-        home = entry.get("cells", {}).get(level.attributes.get("pci"))
+        home = entry.get("cells", {}).get(_cell_of(level))
         node = home or entry.get("node") or level.attributes.get("node")
         return placer.offset_db(placer.levels(level, self._floor_db(level)), str(node))
 
@@ -871,12 +871,23 @@ def _apart_m(first: Stream, second: Stream) -> float:
 MOST_CELLS = 6
 
 
-def _cells(streams: Sequence[Stream]) -> list[int]:
-    """PCIs of a log of several cells, those with a twentieth of the samples of the first and more."""
-    counts = {int(s.attributes["pci"]): len(s.frame) for s in streams if "pci" in s.attributes}
+# Attributes that say whose level it is where no PCI does; channels, ports and antennas of one node are no cells.
+_OF_CELL = re.compile(r"(cell|sector|[eg]nb|bs|base_station|e?ci|nci|[en]?cgi)(_.*)?")
+
+
+def _cell_of(stream: Stream) -> int | str | None:
+    """Key of a stream in ``cells:``: the PCI, else the stream's name where another number tells its cell."""
+    if "pci" in stream.attributes:
+        return int(stream.attributes["pci"])
+    return stream.name if any(map(_OF_CELL.fullmatch, stream.attributes)) else None
+
+
+def _cells(streams: Sequence[Stream]) -> list[int | str]:
+    """Cells of a log of several, those with a twentieth of the samples of the first and more."""
+    counts = {cell: len(s.frame) for s in streams if (cell := _cell_of(s)) is not None}
     most = max(counts.values(), default=0)
-    most_sampled = sorted(counts, key=lambda pci: -counts[pci])[:MOST_CELLS]
-    return sorted(pci for pci in most_sampled if 20 * counts[pci] >= most)
+    most_sampled = sorted(counts, key=lambda cell: -counts[cell])[:MOST_CELLS]
+    return sorted((cell for cell in most_sampled if 20 * counts[cell] >= most), key="{:>9}".format)
 
 
 def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[str, Any], str]:
@@ -892,9 +903,9 @@ def _entry(file: IngestedFile, path: str, towers: Sequence[str]) -> tuple[dict[s
     entry["node"] = near or named_tower(path, towers) or alone or next(iter(towers), "LW1")
     if cells := _cells(need):
         entry["cells"] = dict.fromkeys(cells, entry["node"])
-        if all("pci" in stream.attributes for stream in need):
+        if all(_cell_of(stream) is not None for stream in need):
             del entry["node"]
-        return entry, "  # which tower has which PCI?"
+        return entry, "  # which tower has which " + ("PCI?" if isinstance(cells[0], int) else "cell?")
     if (radio := _RADIO.findall(path)) and len(need) == 1 and need[0].kind == "rss":
         entry["channel"] = f"USRP{radio[-1]}"
     return entry, "" if near or alone else "  # which tower?"

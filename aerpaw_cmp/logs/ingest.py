@@ -156,7 +156,11 @@ def ingest(
     return Ingested(files, skipped)
 
 
-def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> tuple[list[IngestedFile], list[Skipped]]:
+# Logs that were read, and files that are none.
+_Found = tuple[list[IngestedFile], list[Skipped]]
+
+
+def _below(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:
     """Logs of a file, a folder, an archive or a flight file, and the files that are none."""
     if (is_folder := _is_folder(place)) or _is_archive(place):
         inside, skipped = (_folder if is_folder else _archive)(place, options, chosen)
@@ -317,9 +321,7 @@ def _is_archive(place: Path) -> bool:
         return False  # reading it says why
 
 
-def _archive(
-    place: Path, options: _OptionsFor | None, chosen: Reader | None
-) -> tuple[list[IngestedFile], list[Skipped]]:
+def _archive(place: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:
     """All logs of an archive; what cannot be read is reported, not fatal."""
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
@@ -503,9 +505,7 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     return result
 
 
-def _folder(
-    folder: Path, options: _OptionsFor | None, chosen: Reader | None
-) -> tuple[list[IngestedFile], list[Skipped]]:
+def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:
     """All logs below a folder; what cannot be read is reported, not fatal."""
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
@@ -655,8 +655,7 @@ def _join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
             # the first of them stands for all, where it stood in the order
             joined |= {file.path: None for file in group[1:]}
             joined[group[0].path] = _joined(folder, group)
-    replaced = [joined.get(file.path, file) for file in files]
-    return [file for file in replaced if file is not None]
+    return [kept for file in files if (kept := joined.get(file.path, file)) is not None]
 
 
 def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:

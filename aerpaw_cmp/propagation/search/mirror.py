@@ -99,15 +99,11 @@ def find_paths(
         budget=budget,
     )
     alive = searched_links(links)
-
-    def sequences(tower: int) -> list[Sequences]:
-        reflecting = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
-        return growth.sequences(sources_m[tower], reflecting, targets_m[alive[tower]]) if alive[tower].any() else []
-
     pieces: list[PathSet] = []
     for tower, source in enumerate(sources_m):
         poses = np.flatnonzero(alive[tower])
-        for level in sequences(tower):
+        reflecting = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
+        for level in growth.sequences(source, reflecting, targets_m[poses]) if len(poses) else []:
             pieces.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
         if progress:
             progress((tower + 1) / len(sources_m))

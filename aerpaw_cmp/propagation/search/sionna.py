@@ -582,9 +582,9 @@ def _refined(
     for finder, towers, some in _each_batch(make, groups, alive):
         raw = finder.searched(targets_m[some], rays.max_depth, rays.samples)
         _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
-        pose, tower, sequence = _sequences(raw, finder.built.face_of, some, towers, rays.max_depth)
+        receiver, tower, _, sequence = _sequences(raw, finder.built.face_of, rays.max_depth)
         del raw  # may be memory of the device, which the next batch needs
-        yield _refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m, surfaces)
+        yield _refine(faces, sources_m, targets_m, some[receiver], towers[tower], sequence, tolerance_m, surfaces)
         traced += len(some)
         if progress:
             progress(traced / count)
@@ -677,18 +677,13 @@ def _raw_paths(
     traced = finder.trace(target, rays.max_depth, rays.samples)
     real, imaginary = (np.asarray(part.numpy()) for part in traced.a)
     raw = _arrays(traced, len(poses))
-    receiver, tower, path = np.nonzero(raw["valid"])
+    receiver, tower, path, sequence = _sequences(raw, finder.built.face_of, rays.max_depth)
+    points = np.full((len(path), rays.max_depth, 3), np.nan)
     steps = min(rays.max_depth, len(raw["kind"]))
-    kinds = raw["kind"][:, receiver, tower, path]
-    # 0 is no interaction, 1 a specular reflection
-    good = np.flatnonzero(((kinds == 0) | (kinds == 1)).all(axis=0))
-    receiver, tower, path = receiver[good], tower[good], path[good]
-    pose, source, sequence = _sequences(raw, finder.built.face_of, poses, towers, rays.max_depth)
-    points = np.full((len(pose), rays.max_depth, 3), np.nan)
     points[:, :steps] = np.moveaxis(traced.vertices.numpy()[:steps, receiver, tower, path], 0, 1)
     points[sequence < 0] = np.nan
     gain = (real + 1j * imaginary)[receiver, :, tower, :, path].astype(np.complex128)
-    return PathSet(pose, source, (sequence >= 0).sum(axis=1), sequence, points), gain
+    return PathSet(poses[receiver], towers[tower], (sequence >= 0).sum(axis=1), sequence, points), gain
 
 
 def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> Iterator[tuple[IntArray, IntArray]]:
@@ -718,9 +713,9 @@ def _check_gain(raw: dict[str, Any], sources_m: FloatArray, targets_m: FloatArra
 
 
 def _sequences(
-    raw: dict[str, Any], face_of: dict[int, IntArray], poses: IntArray, towers: IntArray, max_depth: int
-) -> tuple[IntArray, IntArray, IntArray]:
-    """(pose, tower, faces) of the valid paths made of reflections only."""
+    raw: dict[str, Any], face_of: dict[int, IntArray], max_depth: int
+) -> tuple[IntArray, IntArray, IntArray, IntArray]:
+    """(receiver, tower, path) in Sionna's arrays, and faces, of the valid paths made of reflections only."""
     receiver, tower, path = np.nonzero(raw["valid"])
     sequence = np.full((len(receiver), max_depth), -1, dtype=np.int64)
     good = np.ones(len(receiver), dtype=np.bool_)
@@ -728,12 +723,13 @@ def _sequences(
         kind = raw["kind"][step, receiver, tower, path]
         shape = raw["shape"][step, receiver, tower, path]
         primitive = raw["primitive"][step, receiver, tower, path]
+        # 0 is no interaction, 1 a specular reflection
         good &= (kind == 0) | (kind == 1)
         for number, owner in face_of.items():
             hit = (kind == 1) & (shape == number)
             sequence[hit, step] = owner[primitive[hit]]
         good &= (kind != 1) | (sequence[:, step] >= 0)
-    return poses[receiver[good]], towers[tower[good]], sequence[good]
+    return receiver[good], tower[good], path[good], sequence[good]
 
 
 def _refine(

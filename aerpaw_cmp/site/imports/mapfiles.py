@@ -165,9 +165,7 @@ def _geojson(content: dict[str, Any], path: Path, line_of: Callable[[int], int |
             result.notes.append(left_out(path, line_of(number - 1), f"feature {number}", error))
         else:
             result.take(part)
-    if lines:
-        listed = ", ".join(f"{count} {what}" for what, count in lines.most_common())
-        result.notes.append(f"{path.name}: left out, not areas: {listed}")
+    result.note_no_areas(path.name, lines)
     return result
 
 
@@ -325,8 +323,7 @@ def _kml(root: ElementTree.Element, path: Path, data: bytes) -> MapFile:
             result.outlines.append(outline)
             continue
         lines.update(tag for tag in (plain(part.tag) for part in parts) if tag in _NO_AREAS)
-    if listed := ", ".join(f"{count} {what}" for what, count in lines.most_common() if count):
-        result.notes.append(f"{path.name}: left out, not areas: {listed}")
+    result.note_no_areas(path.name, lines)
     return result
 
 

@@ -66,9 +66,7 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
                 _way_outline(identity, way, data, result, lines)
             except BROKEN_ELEMENT as error:
                 result.notes.append(left_out(path, line_of(way["index"]), f"way {identity}", error))
-    if lines:
-        listed = ", ".join(f"{count} {what}" for what, count in lines.most_common())
-        result.notes.append(f"{path.name}: left out, not areas: {listed}")
+    result.note_no_areas(path.name, lines)
     return result
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -73,6 +74,12 @@ class MapFile:
         self.outlines += other.outlines
         self.trees += other.trees
         self.notes += other.notes
+
+    def note_no_areas(self, name: str, lines: Counter[str]) -> None:
+        """A note on what of a file ``name`` bounds no area, counted by its kind."""
+        if lines:
+            listed = ", ".join(f"{count} {what}" for what, count in lines.most_common())
+            self.notes.append(f"{name}: left out, not areas: {listed}")
 
 
 # A ring that crosses itself more often is no outline that could be repaired: the time to try grows without bound.

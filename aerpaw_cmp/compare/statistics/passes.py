@@ -8,9 +8,10 @@ in closed form.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from itertools import combinations
+from functools import cache
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -148,6 +149,7 @@ class _Places:
 class _Prepared:
     """A pass ready to be paired: places of levels and of residuals (by key), and means by cell."""
 
+    number: int
     flown: Pass
     level: bytes
     residual: bytes
@@ -168,9 +170,11 @@ class PassTable:
 
     def __init__(self, passes: Sequence[Pass], cell_m: float) -> None:
         self._places: dict[bytes, _Places] = {}
-        self._flights: dict[str, list[tuple[int, _Prepared]]] = {}
+        # by flight, then by link
+        self._flights: dict[str, dict[str, list[_Prepared]]] = {}
         for number, flown in enumerate(passes):
-            self._flights.setdefault(flown.flight, []).append((number, _prepare(flown, cell_m, self._places)))
+            links = self._flights.setdefault(flown.flight, {})
+            links.setdefault(flown.link, []).append(_prepare(number, flown, cell_m, self._places))
 
     def pairs(self, *, radius_m: float, heading_within_deg: float | None) -> Iterator[PassPair]:
         """Every pair of two flights' passes on one link, by first flight, second flight and link.
@@ -186,33 +190,24 @@ class PassTable:
         ------
         PassPair
         """
-        rule = radius_m, heading_within_deg
-        # the searches of a pair of flights are shared by its links, and forgotten after it
-        for first, second in combinations(self._flights, 2):
-            known: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
+        for first, second in combinations(self._flights.values(), 2):
+
+            @cache  # the searches of a pair of flights are shared by its links, and forgotten after it
+            def met(mine: bytes, theirs: bytes) -> tuple[IntArray, IntArray]:
+                return self._places[mine].partners(self._places[theirs], radius_m, heading_within_deg)
+
             shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
-            partners: dict[str, list[tuple[int, _Prepared]]] = {}
-            for number, entry in self._flights[second]:
-                partners.setdefault(entry.flown.link, []).append((number, entry))
-            for number, mine in self._flights[first]:
-                for partner, theirs in partners.get(mine.flown.link, ()):
-                    yield _pair(
-                        first=number,
-                        mine=mine,
-                        second=partner,
-                        theirs=theirs,
-                        places=self._places,
-                        known=known,
-                        shared=shared,
-                        rule=rule,
-                    )
+            for link, passes in first.items():
+                for mine, theirs in product(passes, second.get(link, ())):
+                    yield _pair(mine, theirs, met, shared)
 
 
-def _prepare(flown: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:
+def _prepare(number: int, flown: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:
     placed = np.isfinite(flown.position_m).all(axis=1)
     scored = placed & np.isfinite(flown.residual_db)
     cells, means, heights = cell_means(flown.position_m, flown.residual_db, scored, cell_m)
     return _Prepared(
+        number=number,
         flown=flown,
         level=_entered(flown, placed & np.isfinite(flown.level_db), places),
         residual=_entered(flown, scored, places),
@@ -268,23 +263,16 @@ def cell_means(
 
 
 def _pair(
-    first: int,
     mine: _Prepared,
-    second: int,
     theirs: _Prepared,
-    places: dict[bytes, _Places],
-    known: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]],
+    met: Callable[[bytes, bytes], tuple[IntArray, IntArray]],
     shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]],
-    rule: tuple[float, float | None],
 ) -> PassPair:
-    def difference(key: bytes, other_key: bytes, a: FloatArray, b: FloatArray) -> FloatArray:
-        if (key, other_key) not in known:
-            known[key, other_key] = places[key].partners(places[other_key], *rule)
-        i, j = known[key, other_key]
-        return b[j] - a[i]
-
-    level = difference(mine.level, theirs.level, mine.flown.level_db, theirs.flown.level_db)
-    residual = difference(mine.residual, theirs.residual, mine.flown.residual_db, theirs.flown.residual_db)
+    """Two passes of a link; ``met`` gives the partners of their places by key, ``shared`` keeps their common cells."""
+    i, j = met(mine.level, theirs.level)
+    level = theirs.flown.level_db[j] - mine.flown.level_db[i]
+    i, j = met(mine.residual, theirs.residual)
+    residual = theirs.flown.residual_db[j] - mine.flown.residual_db[i]
     cells = mine.residual, theirs.residual  # the same places, so the same cells and heights
     if cells not in shared:
         i, j = _common(mine.cells, theirs.cells)
@@ -293,8 +281,8 @@ def _pair(
     i, j, height = shared[cells]
     change, nan = theirs.means[j] - mine.means[i], float("nan")
     return PassPair(
-        first=first,
-        second=second,
+        first=mine.number,
+        second=theirs.number,
         n=len(level),
         rmse_db=float(level.std()) if len(level) else nan,
         offset_db=float(level.mean()) if len(level) else nan,

@@ -46,7 +46,7 @@ EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
 ROOMS = ("propagation", "compare", "flight", "maps")
 # Modules of the room `jobs` that decide what is scored, and on what.
 RULES = (
-    "learning/calibrate", "reporting/compare_flight", "reporting/levels", "reporting/audit_flight", "reporting/ladder",
+    "learning/calibrate", "reporting/compare_flight", "reporting/audit_flight", "reporting/ladder",
     "reporting/flight_run", "campaigns/campaign",
 )  # fmt: skip
 

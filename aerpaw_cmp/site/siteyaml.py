@@ -448,13 +448,14 @@ def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[s
 
 def extent_m(model: SiteModel, frame: SiteFrame) -> Area:
     """East and north that maps of the site cover: ``area_m``, else 500 m around the towers."""
-    # without a note each time, which build_site makes once
-    positions = []
-    for name, tower in model.towers.items():
-        chosen = _chosen_position(name, tower, model.coordinates, frame, [])
-        positions.append(frame.to_local(chosen.latitude_deg, chosen.longitude_deg))
-    east, north = np.array(positions).T
-    return _checked_area(model.area_m, east.tolist(), north.tolist())
+    return _checked_area(model.area_m, *_tower_places(model, frame).tolist())
+
+
+def _tower_places(model: SiteModel, frame: SiteFrame) -> FloatArray:
+    """East and north (2, towers) of the towers [m]."""
+    # the notes are dropped: build_site makes them once
+    places = [_chosen_position(name, tower, model.coordinates, frame, []) for name, tower in model.towers.items()]
+    return np.transpose([frame.to_local(place.latitude_deg, place.longitude_deg) for place in places])
 
 
 def _outlines(models: list[OutlineT], key: str, frame: SiteFrame) -> Iterator[tuple[OutlineT, Polygon]]:
@@ -491,8 +492,7 @@ def ground_surface(model: SiteModel, frame: SiteFrame) -> Surface:
     points = np.array(model.ground_points, dtype=np.float64).reshape(-1, 4)
     if len(points):
         _check_near([(float(east), float(north)) for east, north in points[:, :2]], "ground_points")
-    places = [_chosen_position(name, tower, model.coordinates, frame, []) for name, tower in model.towers.items()]
-    east, north = np.array([frame.to_local(p.latitude_deg, p.longitude_deg) for p in places]).T
+    east, north = _tower_places(model, frame)
     area = extent_m(model, frame)
     reach = (
         min(area[0], east.min()) - _SURFACE_MARGIN_M, max(area[1], east.max()) + _SURFACE_MARGIN_M,

@@ -22,7 +22,7 @@ from ...common.units import BoolArray, FloatArray, IntArray, spread_out
 from ...compare import offset as offsets
 from ...compare import rank as ranks
 from ...compare.flight_verdict import flight_verdict, with_corrected_verdicts
-from ...compare.gains.spread import LostLock, StatedSpread, inside_shares
+from ...compare.gains.spread import NO_SPREAD, LostLock, Spread, StatedSpread, inside_shares
 from ...compare.judge.ladder import log_distance_level_db
 from ...compare.level import rss
 from ...compare.level.detection import DetectionForecast, DetectionScore, score_detection
@@ -55,7 +55,6 @@ from ...site.antenna.learned import LearnedLock
 from ...site.relief.dem import Dem
 from ...site.site import Site
 from ...site.siteyaml import ground_surface, site_model
-from .levels import Levels, levels_of, stated_spread
 from .likely_cause import cause_of
 
 # Both sides are averaged over these windows to see how much of the error is fading.
@@ -123,6 +122,32 @@ def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> Ser
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Levels:
+    """Measured and simulated levels (n,) [dB].
+
+    ``posed`` are the samples with a known pose above the lowest height; ``measured_db`` is NaN elsewhere.
+    """
+
+    measured_db: FloatArray
+    simulated_db: FloatArray
+    posed: BoolArray
+
+
+def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> Levels:
+    """Levels of a series that are compared, as ``rss`` of the flight file asks."""
+    measured = series.measured_db
+    posed = replayed.valid.copy()
+    if settings.minimum_height_m is not None:
+        posed[posed] = replayed.poses.position_m[:, 2] >= settings.minimum_height_m
+    level_dbm = replayed.level_dbm("power" if settings.field == "power" else "coherent")
+    return Levels(
+        measured_db=np.where(posed, measured, np.nan),
+        simulated_db=replayed.spread(level_dbm),
+        posed=posed,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Case:
     """One tower and channel with what every number of it is computed from.
 
@@ -157,7 +182,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         lag_s = clock.result.radio_minus_telemetry_s
         score = dataclasses.replace(score, lag_s=lag_s, fitted_on_scored=(*score.fitted_on_scored, *also))
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
-    spans = _worst(series.time, score.residual_db, case.position_m, case.geometry, direct)
+    spans = _worst(case, score.residual_db, direct)
     if case.trained:
         score, spans = rss.without_errors(score), []
     stated = _with_lock(case, score, stated_spread(replayed))
@@ -177,14 +202,34 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     )
 
 
+def stated_spread(replayed: Replayed) -> StatedSpread | None:
+    """Error bars of the simulated level that learned antennas state, along the direct line; None where none does.
+
+    Where only one end is learned, or files hold no gain towards both ends at once, the gains of both ends count as
+    independent; they are learned from the same levels, so the true standard deviation is rather smaller. Files of 0.3
+    state that of the gain alone.
+
+    Parameters
+    ----------
+    replayed : Replayed
+
+    Returns
+    -------
+    StatedSpread or None
+    """
+    gain = replayed.learned
+    if gain is None:
+        return None
+    spread = next((s for s in map(Spread.from_text, gain.notes) if s is not None), NO_SPREAD)
+    return StatedSpread(gain_sd_db=replayed.spread(gain.sd_db), spread=spread)
+
+
 def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> StatedSpread | None:
     """Error bars in two parts, where other flights taught when the receiver loses its lock."""
     series, error_db = case.series, score.residual_db
-    if stated is None or series.locked is None:
-        return stated
-    lock = lock_elsewhere(case.data.settings.antennas, series, case.data.folder)
+    lock = None if stated is None else _lock(case)
     locked = (series.locked == 1.0) & np.isfinite(error_db)
-    if lock is None or not locked.any():
+    if stated is None or lock is None or not locked.any():
         return stated
     simulated_db = case.levels.simulated_db
     above_db = simulated_db - series.link.transmit_power_dbm - lock.gain_db
@@ -199,6 +244,13 @@ def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | Non
         lost_sd_db=lock.lost_sd_db,
     )
     return dataclasses.replace(stated, lock=parts)
+
+
+def _lock(case: _Case) -> LearnedLock | None:
+    """Lock that other flights taught; None of a receiver that never loses it."""
+    if case.series.locked is None:
+        return None
+    return lock_elsewhere(case.data.settings.antennas, case.series, case.data.folder)
 
 
 def _forecast(series: RssSeries, lock: LearnedLock) -> DetectionForecast:
@@ -244,7 +296,7 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
     """
     settings, levels, series, replayed = case.data.settings.rss, case.levels, case.series, case.replayed
     wild = rss.outliers(levels.measured_db)
-    detection = None if case.trained else _detection(case.data, series, levels, case.simple["free_space"])
+    detection = None if case.trained else _detection(case)
     further = RssFurther(
         **named(score, "n_measured_out n_simulated_out identifiable_db"),
         block_length=score.intervals.autocorrelation.block_length,
@@ -259,7 +311,7 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
         averaged={},
         simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
         error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
-        elsewhere=_elsewhere(case.data, series, score, detection),
+        elsewhere=_elsewhere(case, score, detection),
         trained_on=case.trained or None,
         rmse_bound=_bound(series, score),
     )
@@ -268,7 +320,7 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
     return dataclasses.replace(
         further,
         compared_with=_paired(levels, case.simple),
-        averaged=_averaged(series, replayed, levels, settings),
+        averaged=_averaged(case),
         detection=detection,
         snr=_snr(series, levels),
     )
@@ -293,12 +345,9 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
     return offsets.grid_offset(inliers_db, levels.simulated_db, span_db=settings.span_db).rmse_db
 
 
-def _elsewhere(
-    data: FlightData, series: RssSeries, score: rss.RssComparison, detection: DetectionScore | None
-) -> dict[str, float] | None:
+def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore | None) -> dict[str, float] | None:
     """Error to expect on another flight, where the antennas of the site say it and this flight does not refute it."""
-    errors = errors_elsewhere(data.settings.antennas, series, data.folder)
-    lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
+    errors, lock = errors_elsewhere(case.data.settings.antennas, case.series, case.data.folder), _lock(case)
     if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:
         return None
     if lock is not None and detection is not None and detection.rmse_ci95_db[0] > lock.floor_rmse_db:
@@ -354,16 +403,15 @@ def _paired(levels: Levels, models: Mapping[str, FloatArray]) -> dict[str, stati
     return {name: statistics.paired_difference(error_db, levels.measured_db - level) for name, level in models.items()}
 
 
-def _averaged(
-    series: RssSeries, replayed: Replayed, levels: Levels, settings: RssSettings
-) -> dict[str, dict[str, Fit]]:
+def _averaged(case: _Case) -> dict[str, dict[str, Fit]]:
     """Both sides averaged alike over windows of time, per simulation."""
+    replayed, span_db = case.replayed, case.data.settings.rss.span_db
     simulations = {
         "coherent": replayed.spread(replayed.level_dbm("coherent")),
         "power_sum": replayed.spread(replayed.level_dbm("power")),
     }
-    averages = {f"{w:g} s": partial(rss.local_mean_db, series.time, window_s=w) for w in _AVERAGING_WINDOWS_S}
-    fits = rss.averaged_fits(levels.measured_db, simulations, averages, span_db=settings.span_db)
+    averages = {f"{w:g} s": partial(rss.local_mean_db, case.series.time, window_s=w) for w in _AVERAGING_WINDOWS_S}
+    fits = rss.averaged_fits(case.levels.measured_db, simulations, averages, span_db=span_db)
     return {
         name: {average: Fit(**named(fit, "offset_db rmse_db")) for average, fit in each.items()}
         for name, each in fits.items()
@@ -386,8 +434,9 @@ def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
     )
 
 
-def _detection(data: FlightData, series: RssSeries, levels: Levels, free_space_db: FloatArray) -> DetectionScore | None:
+def _detection(case: _Case) -> DetectionScore | None:
     """P(lock), or P(above the floor), and all samples with the floor; None for a level without either."""
+    series, levels, lock = case.series, case.levels, _lock(case)
     if series.locked is not None:
         known, detected, floor_db = np.isfinite(series.locked), series.locked == 1.0, LOCK_FLOOR_DB
     else:
@@ -397,16 +446,14 @@ def _detection(data: FlightData, series: RssSeries, levels: Levels, free_space_d
             return None
         floor_db = float(np.nanmin(levels.measured_db))
     at = known & levels.posed
-    lock = lock_elsewhere(data.settings.antennas, series, data.folder) if series.locked is not None else None
-    forecast = None if lock is None else _forecast(series, lock)
     score = score_detection(
         rss.seconds(series.time[at]),
         levels.measured_db[at],
         levels.simulated_db[at],
         detected[at],
         floor_db=floor_db,
-        free_space_db=free_space_db[at],
-        forecast=forecast,
+        free_space_db=case.simple["free_space"][at],
+        forecast=None if lock is None else _forecast(series, lock),
     )
     return None if score is None else dataclasses.replace(score, locks=series.locked is not None)
 
@@ -506,14 +553,9 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
     return out
 
 
-def _worst(
-    time: Any,
-    residual_db: FloatArray,
-    position_m: FloatArray,
-    geometry: Mapping[str, FloatArray],
-    line_of_sight: FloatArray,
-) -> list[rss.ErrorSpan]:
+def _worst(case: _Case, residual_db: FloatArray, line_of_sight: FloatArray) -> list[rss.ErrorSpan]:
     """The spans of largest error, with place and geometry."""
+    geometry = case.geometry
     context = {
         "los": line_of_sight,
         "elevation_deg": geometry["elevation_deg"],
@@ -522,7 +564,9 @@ def _worst(
     for ours, theirs in (("heading_deg", "heading_deg"), ("foliage_depth_m", "foliage_m")):
         if ours in geometry:
             context[theirs] = geometry[ours]
-    spans = rss.error_spans(time, residual_db, position_m=position_m, context=context, largest=len(residual_db))
+    spans = rss.error_spans(
+        case.series.time, residual_db, position_m=case.position_m, context=context, largest=len(residual_db)
+    )
     return [span for span in spans if span.end_s - span.start_s >= _SHORTEST_S][:6]
 
 

@@ -44,7 +44,7 @@ from ...site.antenna.antennas import Isotropic
 from ...site.antenna.sphere_pattern import SpherePattern
 from ...site.site import Site
 from ...site.siteyaml import known_grounds
-from .levels import Levels, levels_of
+from .compare_flight import Levels, levels_of
 
 # Loss of the weakened ground reflection: a smooth half-space reflects more than any field.
 _WEAK_GROUND_DB = 10.0

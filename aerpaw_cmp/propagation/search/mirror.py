@@ -103,7 +103,8 @@ def find_paths(
     for tower, source in enumerate(sources_m):
         poses = np.flatnonzero(alive[tower])
         reflecting = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
-        for level in growth.sequences(source, reflecting, targets_m[poses]) if len(poses) else []:
+        levels = growth.sequences(source, reflecting, targets_m[poses]) if len(poses) else []
+        for level in levels:
             pieces.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
         if progress:
             progress((tower + 1) / len(sources_m))

@@ -44,9 +44,14 @@ def unitary(rng, n, count=None):
 
 def with_profile(profile, seed=0):
     """Channels (n, 4, 4) with given singular values (n, 4) and random directions."""
-    rng = np.random.default_rng(seed)
-    profile = np.atleast_2d(np.asarray(profile, dtype=float))
-    return unitary(rng, 4, len(profile)) * profile[:, None, :] @ unitary(rng, 4, len(profile))
+    return between_frames(np.random.default_rng(seed), np.atleast_2d(np.asarray(profile, dtype=float)), 4, 4)
+
+
+def between_frames(rng, sigma, n_rx, n_tx):
+    """Channels (t, n_rx, n_tx) with the given singular values (t, m) between random unitary frames."""
+    t, m = sigma.shape
+    left, right = unitary(rng, n_rx, t)[:, :, :m], unitary(rng, n_tx, t)[:, :, :m]
+    return (left * sigma[:, None]) @ right.conj().transpose(0, 2, 1)
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1e-150, 1e-9, 1.0, 1e150, 1e300])
@@ -156,9 +161,9 @@ def test_ri_only_ever_two():
 
 
 def test_everything_out_of_coverage():
-    result = compare_rank([2.0, 1.0, 3.0], np.zeros((3, 4, 4)), replicates=50)
+    result = compare_rank([2.0, NAN, 1.0, 3.0], np.zeros((4, 4, 4)), replicates=50)
     fit = result.simulated[10.0]
-    assert fit.out_of_coverage == 3
+    assert (fit.out_of_coverage, result.n, result.n_no_csi) == (4, 3, 1)
     assert np.isnan(fit.histogram).all()
     assert np.isnan(fit.agreement)
     assert np.isnan(result.best_k)
@@ -179,12 +184,15 @@ def test_measured_rank_zero_is_refused():
         compare_rank([1.0, 1.0], np.ones((3, 4, 4)))
 
 
-def slow_ranks(rng, n, memory):
-    """Ranks 1 to 4 that change slowly."""
-    from scipy.ndimage import gaussian_filter1d
-
-    x = gaussian_filter1d(rng.normal(size=n), memory, mode="wrap")
-    return np.searchsorted(np.quantile(x, [0.2, 0.7, 0.95]), x) + 1.0
+def walk(n, seed, low=1, high=4, stay=0.9):
+    """Ranks that remember."""
+    rng = np.random.default_rng(seed)
+    out, now = [], int(rng.integers(low, high + 1))
+    for _ in range(n):
+        if rng.random() > stay:
+            now = int(rng.integers(low, high + 1))
+        out.append(now)
+    return np.array(out)
 
 
 def test_best_k_is_found_within_its_interval():
@@ -199,7 +207,12 @@ def test_best_k_is_found_within_its_interval():
     curve = k_curve(measured, singular_values(h), replicates=200)
     assert curve.best_k_agreement == pytest.approx(truth, rel=0.15)
     assert curve.best_k_interval[0] <= truth <= curve.best_k_interval[1]
+    by_histogram = curve.best_k_total_variation, curve.best_k_total_variation_interval
+    for best, (low, high) in ((curve.best_k_agreement, curve.best_k_interval), by_histogram):
+        assert truth / 10 < low <= best <= high < 10 * truth
     assert not curve.at_edge
+    for alone in (1.0, 4.0):  # the lowest K makes fewest layers
+        assert k_curve(np.full(n, alone), singular_values(h), replicates=2).at_edge
     at = np.flatnonzero(curve.k == 100.0)[0]
     assert curve.agreement[at] == pytest.approx(agreement(measured, channel_rank(h, 100)))
     assert curve.total_variation[at] == pytest.approx(
@@ -297,7 +310,7 @@ def test_a_period_is_taken_when_19_of_20_changes_fall_on_it():
 
 def test_each_interval_is_that_of_its_own_number():
     rng = np.random.default_rng(23)
-    measured = slow_ranks(rng, 3000, 4).astype(float)
+    measured = walk(3000, 23).astype(float)
     simulated = np.where(rng.random(3000) < 0.5, measured, np.clip(measured + 1, 1, 4))
     fit = compare_ranks(measured, simulated, replicates=200)
     values = [fit.agreement, fit.kappa, fit.total_variation, fit.wasserstein]
@@ -306,20 +319,6 @@ def test_each_interval_is_that_of_its_own_number():
         inside = [low <= value <= high for low, high in spans]
         assert inside[k]
         assert sum(inside) == 1, "the four lie far enough apart here"
-
-
-def test_rows_without_a_report_are_counted():
-    h = with_profile(np.sort(np.random.default_rng(2).random((50, 4)))[:, ::-1])
-    measured = channel_rank(h, 5).astype(float)
-    measured[[3, 7, 20]] = NAN
-    assert compare_rank(measured, h, replicates=50).n_no_csi == 3
-
-
-def _with_singular_values(rng, sigma, n_rx, n_tx):
-    """Channels (t, n_rx, n_tx) with the given singular values (t, m) between random unitary frames."""
-    t, m = sigma.shape
-    left, right = unitary(rng, n_rx, t)[:, :, :m], unitary(rng, n_tx, t)[:, :, :m]
-    return (left * sigma[:, None]) @ right.conj().transpose(0, 2, 1)
 
 
 @pytest.mark.parametrize("k", [1.0, 1.25, 10.0, 1000.0, 1e5])
@@ -333,7 +332,7 @@ def test_ranks_by_counting_are_those_of_singular_values(n_rx, n_tx, k):
     graded = 10.0 ** -(np.arange(m) * rng.uniform(0, 6, (n, 1)))
     deficient = rng.choice([0.0, 1.0, 1.0 / k], (n, m))
     equal = 1.0 + 1e-9 * rng.normal(size=(n, m))
-    h = [_with_singular_values(rng, sigma, n_rx, n_tx) for sigma in (near, graded, deficient, equal)]
+    h = [between_frames(rng, sigma, n_rx, n_tx) for sigma in (near, graded, deficient, equal)]
     h.append(rng.normal(size=(3 * n, n_rx, n_tx)) + 1j * rng.normal(size=(3 * n, n_rx, n_tx)))
     h = np.concatenate(h) * 10.0 ** rng.choice([0.0, -5.0, -150.0, 140.0], (7 * n, 1, 1))
     h[::50, 0, 0], h[1::50, -1, -1], h[2::50] = np.nan, np.inf, 0.0
@@ -343,17 +342,6 @@ def test_ranks_by_counting_are_those_of_singular_values(n_rx, n_tx, k):
     if k in (10.0, 1000.0) and m > 1:
         _, certain = certain_rank(h[4 * n :], k)
         assert certain.mean() > 0.4, "counting decides nothing"
-
-
-def walk(n, seed, low=1, high=4, stay=0.9):
-    """Ranks that remember."""
-    rng = np.random.default_rng(seed)
-    out, now = [], int(rng.integers(low, high + 1))
-    for _ in range(n):
-        if rng.random() > stay:
-            now = int(rng.integers(low, high + 1))
-        out.append(now)
-    return np.array(out)
 
 
 @pytest.fixture(scope="module")
@@ -450,19 +438,3 @@ def test_a_curve_without_a_pair_says_nothing():
     ).all()
     assert curve.best_k_interval == curve.best_k_total_variation_interval == NO_INTERVAL
     assert not curve.at_edge
-
-
-def test_a_best_k_lies_within_its_intervals_and_is_told_at_an_end_of_the_grid():
-    rng = np.random.default_rng(8)
-    sigma = -np.sort(-np.exp(rng.normal(0, 1.5, (400, 4))) * np.array([1, 0.3, 0.1, 0.03]), axis=1)
-    measured = np.where(rng.random(400) < 0.7, rank_from_singular_values(sigma, 30.0), walk(400, 1))
-    grid = k_grid(2.0, 500.0, 8)
-    curve = k_curve(measured, sigma, k=grid, replicates=60)
-    for best, (low, high) in (
-        (curve.best_k_agreement, curve.best_k_interval),
-        (curve.best_k_total_variation, curve.best_k_total_variation_interval),
-    ):
-        assert 3.0 < low <= best <= high < 300.0
-    assert not curve.at_edge
-    assert k_curve(np.ones(400), sigma, k=grid, replicates=2).at_edge  # the lowest K makes fewest layers
-    assert k_curve(np.full(400, 4.0), sigma, k=grid, replicates=2).at_edge

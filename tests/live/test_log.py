@@ -2,7 +2,6 @@
 
 import errno
 import os
-import signal
 import subprocess
 import sys
 import threading
@@ -310,37 +309,6 @@ def test_a_folder_of_another_user(tmp_path):
     assert "InputError" in done.stderr
     assert "Permission denied" in done.stderr
     assert "belongs to another user" in done.stderr
-
-
-KILLED = """
-import sys
-from pathlib import Path
-from aerpaw_cmp.live.record.log import SegmentLog
-log = SegmentLog(Path(sys.argv[1]), lambda: {"kind": "header"})
-log.open()
-i = 0
-while True:
-    log.append({"kind": "x", "i": i})
-    print(i, flush=True)
-    i += 1
-"""
-
-
-def test_sigkill_loses_nothing_acknowledged(tmp_path):
-    root = Path(__file__).resolve().parents[2]
-    environment = os.environ | {"PYTHONPATH": str(root)}
-    for round_number in range(5):
-        folder = tmp_path / str(round_number)
-        process = subprocess.Popen([sys.executable, "-c", KILLED, folder], stdout=subprocess.PIPE, env=environment)
-        seen = [process.stdout.readline() for _ in range(37 * (round_number + 1))]
-        process.send_signal(signal.SIGKILL)
-        rest = process.communicate()[0].splitlines()
-        acknowledged = int([*seen, *rest][-1])
-        bad = []
-        written = [r["i"] for r in read_log(folder, bad) if r["kind"] == "x"]
-        assert written[: acknowledged + 1] == list(range(acknowledged + 1))
-        assert len(bad) <= 1
-        assert all(b.torn_tail for b in bad)
 
 
 # the reader --------------------------------------------------------------------------------------------------

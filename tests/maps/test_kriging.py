@@ -236,22 +236,6 @@ def test_correlation_that_turns_negative():
         assert variance[t] == pytest.approx(expected_variance, abs=1e-8)
 
 
-def test_an_invalid_correlation_never_gives_a_negative_variance():
-    """A box is no covariance: the textbook variance comes out negative, the rule does not."""
-    points, targets = scattered(60, 30, 200.0), scattered(50, 31, 200.0)
-
-    def box(d):
-        return np.where(d < 80.0, 0.95, 0.0)
-
-    model = OrdinaryKriging(box, 15, 300.0).fit(points, np.random.default_rng(32).normal(size=60))
-    rule = model.weights(targets)
-    assert (rule.variance >= 0).all()
-    np.testing.assert_allclose(rule.weight.sum(axis=1), 1.0, atol=1e-9)
-    near = np.argsort(np.linalg.norm(points[None] - targets[:, None], axis=-1), axis=1)[:, :15]
-    plain = [textbook(points[near[t]], np.zeros(15), targets[t], box)[1] for t in range(50)]
-    assert min(plain) < 0, "the case is not hard"
-
-
 def test_a_curve_that_is_no_covariance_does_not_blow_up():
     """Found on a real flight log: 1 up to 8 m and then a jump. Textbook weights exceed 1e4, most with a variance > 0."""
 

@@ -14,6 +14,7 @@ from aerpaw_cmp.compare.flight_verdict import (
     without_copies,
 )
 from aerpaw_cmp.compare.judge.causes import MOST_CAUSE_WORDS, Cause
+from aerpaw_cmp.compare.judge.ladder import LadderRow
 from aerpaw_cmp.compare.level.detection import DetectionScore, floored_fit
 from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.compare.ranks.forecast import score_forecast
@@ -22,11 +23,13 @@ from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.report.exports.tables import metrics
 from aerpaw_cmp.report.pages.diff import DIFFERENCE
 from aerpaw_cmp.report.words.flight import (
+    AS_SET,
     OFFSETS,
     ONE_PLACE,
     Judged,
     cautions,
     first_sentence,
+    ladder_verdict,
     offset_sentences,
     pretty,
     ranking_sentence,
@@ -85,6 +88,10 @@ def test_the_first_sentence_follows_from_the_interval_over_all_channels(report_d
     assert "worse" not in same
     won = paragraph(judged_as(report_data, -4.9, -6.0, -3.9, 3.0))
     assert won.startswith(f"Ray tracing (RMSE 3.0 dB) is 4.90 dB better than {best} [3.90, 6.00] over")
+    equal = paragraph(judged_as(report_data, 0.0, -0.001, 0.002))
+    assert equal.startswith(
+        f"Ray tracing (RMSE 8.4 dB) and {best} differ by less than 0.01 dB over {n} channels (95 %)."
+    )
     few = paragraph(judged_as(report_data, 0.5, np.nan, np.nan))
     assert f"{best}: 7.9 dB. The flight is too short to tell the two apart." in few
     none = paragraph(dataclasses.replace(lost, verdict=None))
@@ -254,6 +261,9 @@ def test_an_offset_beyond_the_span_is_no_error_and_its_dead_neighbour_has_no_off
     data = dataclasses.replace(report_data, rss=panels, rank=(), next_step=step)
     assert paragraph(data) == f"No error can be given: the best offset lies beyond the searched span. Next: {step}."
     assert offset_sentences(panels) == []
+    text = paragraph(with_cause(dataclasses.replace(report_data, rss=(panels[0], *report_data.rss[1:]))))
+    assert f" The best offset of {panels[0].name} lies beyond the searched span. Next: " in text
+    assert CAUSE.sentence not in text
 
 
 def test_a_flight_at_one_place_tells_no_models_apart(report_data):
@@ -320,6 +330,16 @@ def test_a_ranking_says_worse_only_where_intervals_do(verdicts):
     named = [name for name in verdicts if f" {name}" in said.partition(":")[2].replace(",", "")]
     assert named == ([n for n, v in verdicts.items() if v != "worse"] if ":" in said else [])
     assert ("Too few flights" in said) == (set(verdicts.values()) == {"no interval"})
+
+
+@pytest.mark.parametrize(("fast", "named"), [("log-distance line", False), ("free space", True)])
+def test_a_line_is_no_model_that_is_as_good_and_faster(fast, named):
+    """By channel it was not told from the replay that beat it over the flight, as the first sentence said."""
+    number = {"tower": "LW1", "channel": "A", "n": 100, "rmse_heldout_db": 11.0}
+    rows = [LadderRow(model=model, seconds=cost, difference_to_best_db=apart, difference_to_best_ci95_db=(-0.5, 3.0),
+                      recommended=apart == 0.0, **number)
+            for model, cost, apart in ((fast, 0.0, 1.6), (AS_SET, 0.1, 0.0))]  # fmt: skip
+    assert ("fastest" in ladder_verdict(rows)) == named
 
 
 @pytest.mark.parametrize("word", ["better", "worse", "not significant", "no interval"])

@@ -14,7 +14,8 @@ from aerpaw_cmp.report.words.maps import first_words, warnings
     ("covered", "change", "said"),
     [
         ({"opaque": 0.99}, {}, "Nothing here was measured. Least coverage: 99.0 % of the positions at 30 m. Next: "),
-        ({"opaque": 0.6, "none": 0.95}, {}, "60.0 % of the positions at 30 m; trees take most of the rest. Next: "),
+        ({"opaque": 0.6, "none": 0.95}, {}, "trees take most of the rest. Next: fly higher, or map with `--foliage"),
+        ({"opaque": 0.6, "attenuating": 0.9, "none": 0.95}, {}, "Next: fly higher, or compare the rows of attenuating"),
         ({"opaque": 0.6, "none": 0.62}, {}, "buildings and terrain take most of the rest"),
         ({"none": 0.0}, {}, "No path arrives at any position at 30 m. Next: check the towers"),
         ({"none": 0.99}, {"outside_flown": 0.7}, "70 % of the positions lie outside the flown places"),

@@ -158,7 +158,8 @@ _DECIDED = {
     "not significant": (
         "Ray tracing: RMSE {ray}; {name}: {other}. The difference {ends}{over} is not significant (95 %)."
     ),
-    "no interval": ("Ray tracing: RMSE {ray}; {name}: {other}. The flight is too short to tell the two apart."),
+    "equal": "Ray tracing (RMSE {ray}) and {name} differ by less than 0.01 dB{over} (95 %).",
+    "no interval": "Ray tracing: RMSE {ray}; {name}: {other}. The flight is too short to tell the two apart.",
 }
 
 
@@ -172,7 +173,8 @@ def flight_sentence(verdict: FlightVerdict, floor_db: float | None = None) -> st
     >>> flight_sentence(pooled)
     'Ray tracing (RMSE 2.0 dB) is 0.23 dB better than two-ray ground [0.14, 0.33] over 10 channels (95 %).'
     """
-    word = paired_verdict(*verdict.ci95_db)
+    near = max(map(abs, verdict.ci95_db)) < 0.005  # both ends would be printed as zero
+    word = "equal" if near else paired_verdict(*verdict.ci95_db)
     ends = sorted(map(abs, verdict.ci95_db)) if word in ("better", "worse") else verdict.ci95_db
     name, over = with_article(verdict.against), f" over {verdict.channels} channels" if verdict.channels > 1 else ""
     floor = "" if floor_db is None else f", floor {Printed(floor_db):.0f}"
@@ -197,6 +199,7 @@ def expected_sentence(panels: Sequence[RssResult]) -> str:
 NO_CAUSE = "No likely cause was identified."
 ONE_PLACE = "No model predicts a change of 1 dB, as at one place: this flight tells no models apart."
 BEYOND_SPAN = "No error can be given: the best offset lies beyond the searched span."
+BEYOND = "The best offset of {name} lies beyond the searched span."
 
 
 def instants(time: AnyArray, span: ErrorSpan) -> tuple[np.datetime64, np.datetime64]:
@@ -270,9 +273,11 @@ def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     compared = [f"{name} {error[name]:.1f} dB" for name in (AS_SET, *BASELINE_TITLE.values()) if name in error]
     least = min(error, key=lambda name: error[name])
     text = f"Cross-validated RMSE: {', '.join(compared)}."
-    if least in (BASELINE_TITLE["log_distance"], BASELINE_TITLE["constant"]):
+    lines = BASELINE_TITLE["log_distance"], BASELINE_TITLE["constant"]
+    if least in lines:
         text += f" The {least}, which replays nothing, has the smallest error of all models."
-    if knee := next((at for at in costs(rows) if at.knee), None):
+    # a line that no single series tells from the best may lose over all of them, as the first sentence says
+    if (knee := next((at for at in costs(rows) if at.knee), None)) and knee.model not in lines:
         text += (
             f" \u201c{knee.model}\u201d ({knee.seconds:.2g} s) is the fastest model that no series tells from the best."
         )
@@ -447,7 +452,7 @@ def _rss_cautions(panel: RssResult) -> list[str]:
         share, floor = 100 - 100 * lock.n_detected / lock.n, f"{Printed(lock.floor_db):.0f}"
         texts.append(
             f"{panel.name} lost its lock in {share:.0f} % of the samples; levels below {floor} {panel.unit} count as "
-            f"{floor} in the first sentence."
+            f"{floor} in the first sentence, and as logged in the tables."
         )
     if 0 < score.n < FEWEST:
         texts.append(f"{panel.name}: only {counted(score.n, 'sample')} scored, too few for a verdict.")

@@ -49,7 +49,9 @@ def paragraph(data: ReportData) -> str:
         parts = [error, before_flight(data.against.scores), advice]
     elif error:
         none = words.ONE_PLACE if is_one_place(panels) else words.NO_CAUSE if panels else ""
-        cause = data.cause or none
+        # the step of such a flight is a wider span, whatever its cause
+        beyond = next((words.BEYOND.format(name=p.name) for p in data.rss if p.score.at_edge), "")
+        cause = beyond or data.cause or none
         parts = [error, words.expected_sentence(panels), cause, advice]
     elif any(panel.score.at_edge for panel in data.rss):
         parts = [words.BEYOND_SPAN, advice]

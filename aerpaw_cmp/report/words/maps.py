@@ -16,7 +16,7 @@ LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
 # Sentence and next step by :func:`~aerpaw_cmp.compare.judge.verdicts.coverage_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
-    "trees": (LEAST + "; trees take most of the rest.", "fly higher, or map `--foliage attenuating` beside it"),
+    "trees": (LEAST + "; trees take most of the rest.", "fly higher, or {thinner}"),
     "blocked": (LEAST + "; buildings and terrain take most of the rest.", "fly higher, or add a tower"),
     "no path": ("No path arrives at any position at {where}.", "check the towers and the area of the site"),
     "extrapolated": (
@@ -37,6 +37,9 @@ def first_words(data: MapsData) -> str:
         CAUSES,
         percent=100.0 * worst.covered,
         outside=100.0 * worst.outside,
+        thinner="compare the rows of attenuating trees"
+        if any(item.foliage == "attenuating" for item in data.rss)
+        else "map with `--foliage attenuating`, too",
     )
     best = max(heights, key=lambda height: height.covered)
     more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""

@@ -76,7 +76,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s| us| ns)?$",
         r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| ns| local| epoch)?$",
         r"^time ?millisecond$", r"^(rel|relative|elapsed) ?time( ms| s| us| ns)?$", r"^elapsed$", r"^time boot ms$",
-        r"^(epoch|unix)( ms| s| us| ns)?$", r"^utc$", r"^t$",
+        r"^(epoch|unix|ts)( ms| s| us| ns| utc)?$", r"^utc$", r"^t$",
         r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
     )),
     Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$", r"^(datum|fecha)$")),
@@ -99,7 +99,10 @@ QUANTITIES: tuple[Quantity, ...] = (
         r" (lon|lng|longitude)( deg)?$",
         r"^(l nge|laenge|l ngengrad|laengengrad|longitud)( deg)?$",
     ), "deg", can_be=(-180.0, 180.0)),
-    Quantity("grid", "grid", (r"\b(easting|northing|utm|ecef)\b",)),
+    Quantity("grid", "grid", (
+        r"\b(easting|northing|utm|ecef)\b",
+        r"^(geom(etry)?|wkt|lat ?(lon|lng)|coordinates?|(gps )?(position|location))$",
+    )),
     # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
     Quantity("home", "other", (
         r"\b(home|take ?off|launch|terrain|ground|geoid|undulation|delta|target|max|min)\b.*" + _UP + r"(?!.*\babove)",

@@ -221,7 +221,8 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
 
 
 def _way_out(head: bytes) -> str:
-    first = head.lstrip(b"\xef\xbb\xbf \r\n").split(b"\n", 1)[0].decode("utf-8", "replace").strip()
+    titled = re.sub(rb"\A(?:\s*#[^\n]*\n)+", b"", head.lstrip(b"\xef\xbb\xbf \r\n"))
+    first = titled.split(b"\n", 1)[0].decode("utf-8", "replace").strip()
     # the commonest: a decimal comma stands less often than what parts the cells
     sign = max(",;\t|", key=first.count)
     names = [name.strip().strip('"') for name in first.split(sign)]
@@ -235,6 +236,9 @@ def _way_out(head: bytes) -> str:
         example = f": {' '.join(pairs)}" if pairs else ""
         missing = f"; no column looks like {' or '.join(lacking)}" if lacking else ""
         return f"a table of another kind: name what its columns hold{example}{missing}"
+    words = re.split(r"[,;\s|]+", first)
+    if len(words) > 1 and (re.fullmatch(r"[-+.\d]+", words[0] + words[-1]) or "time" in words):
+        return "a table without names or commas: write a line such as 'time,rss_db' above it, commas between its cells"
     return "a log of a kind that is not supported: docs/adding_a_reader.md"
 
 

@@ -18,6 +18,7 @@ from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 # RSRP beyond these is a sentinel (2147483647, 0) or a mistake.
+_END_DBM = -140.0
 _RANGE_DBM = (-170.0, -1.0)
 
 
@@ -137,6 +138,11 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str
             f"{_RANGE_DBM[1]:g} dBm (the first: {level[outside][0]:g}; another unit, or an index?): "
             "read as out of coverage"
         )
+    # phones write the end of the scale (3GPP TS 36.133, 9.1.4) where they hear nothing; a weak cell fades down to it
+    ends = (level == _END_DBM) & (about["quantity"] == "RSRP")
+    if ends.sum() > 1 and not ((level > _END_DBM) & (level < _END_DBM + 10.0)).any():
+        outside |= ends
+        rows.warnings.append(f"{cell}: {ends.sum()} levels of {_END_DBM:g} dBm, far below all others: out of coverage")
     if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell}: RSSI lies below RSRP, which cannot be: are the columns exchanged?")
     _lines.add_flag(flag, outside, "out_of_coverage")

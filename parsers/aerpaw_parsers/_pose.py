@@ -39,7 +39,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     latitude, longitude = sheet.find("latitude_deg"), sheet.find("longitude_deg")
     if latitude is None or longitude is None:
         if (grid := sheet.find("grid")) is not None:
-            text = "a position on a grid (UTM, ECEF), which is not read: add columns of latitude and longitude"
+            text = "a position on a grid or in one text, which is not read: add columns of latitude and longitude"
             rows.warnings.append(f"column {sheet.names[grid]!r}: {text}")
         return None
     known = [(i, what.quantity) for i, what in enumerate(sheet.meanings) if what and what.quantity.name == PLACE[0]]

@@ -646,7 +646,7 @@ _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
 
 _LIKE_A_LEVEL = re.compile(
-    r"^lw ?[1-5]$|^value$|\b(asu|csq)\b|^(?!.*(batt|volt|throttle|gps|water|fuel|noise|tx)).*"
+    r"^lw ?[1-5]$|^value$|\b(asu|csq)\b|^(?!.*(batt|volt|throttle|gps|water|fuel|noise|gain|loss|tx)).*"
     r"(power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss\b|strength|\bampl|magnitude)"
 )
 _MAPPED = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
@@ -660,10 +660,10 @@ def way_to_level(sheet: Sheet) -> list[str]:
     time = _time_column(sheet) if sheet.find("time") is not None else sheet.find("gps_seconds")
     if not filled or time is None:
         return []
-    places = [(sheet.find(quantity), quantity) for quantity in _MAPPED]
-    pairs = [(time, "time"), *((i, quantity) for i, quantity in places if i is not None), (filled[0], "rss_db")]
-    options = " ".join(f"--map {sheet.names[i]!r}={quantity}" for i, quantity in pairs)
-    unit = sheet.unit_read(filled[0]) or ("dB" if sheet.meanings[filled[0]] else "dBm")
+    pairs = [(time, "time"), *((sheet.find(quantity), quantity) for quantity in _MAPPED), (filled[0], "rss_db")]
+    options = " ".join(f"--map {sheet.names[i]!r}={quantity}" for i, quantity in pairs if i is not None)
+    relative = sheet.meanings[filled[0]] or "dbfs" in sheet.names[filled[0]].lower()
+    unit = "dBm" if (sheet.unit_read(filled[0]) or "dBm") == "dBm" and not relative else "dB"
     others = f" (so may {', '.join(repr(sheet.names[i]) for i in filled[1:5])})" if filled[1:] else ""
     return [f"{sheet.names[filled[0]]!r} may be a level, and is not read as one{others}: {options} --unit {unit}"]
 

@@ -188,7 +188,8 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
         for network, part, cells in _sheet.parts(of_device, table, "network"):
             suffix = "_".join(word for word in (network, device) if word)
             streams += [_renamed(stream, suffix) for stream in _radio(part, cells)]
-    if not any(stream is not None and stream.kind in ("rss", "rank") for stream in streams):
+    levels = [stream for stream in streams if stream is not None and stream.kind in ("rss", "rank")]
+    if all(stream.attributes.get("quantity") == "SNR" for stream in levels):
         rows.warnings += _sheet.way_to_level(sheet)
     rows.warnings += sheet.unread()
     return rows.result(streams)

@@ -18,7 +18,7 @@ from aerpaw_cmp.logs.text import lines as _lines
 
 _STAMP = rb"(?:\[?\d{4}-\d\d-\d\d[ T][0-9:.]{8,18}\]?[ ,]{1,2})"
 _UHD = re.compile(rb"\[(?:INFO|WARNING|ERROR)\] \[(?:UHD|B200|X300|MULTI_USRP|GPS|USRP|OV|CONFIG|AD936X|CORES)\]")
-_LEVELS = rb"(?i)g-?net ?track|\b(?:rsrp|rssi|rxlev|rscp|level)\b(?:\W|</?\w{1,20}>){0,20}-\d{2,3}\b"
+_LEVELS = rb"(?i)g-?net ?track|\b(?:rsrp|rssi|rxlev|rscp|level)\b(?:\W|</?[\w:]{1,20}>){0,20}-\d{2,3}\b"
 _TIMED = rb"(?i)\btime|<when>|\b\d\d:\d\d:\d\d\b"
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
 

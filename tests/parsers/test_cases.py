@@ -180,6 +180,7 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
         '{"type":"FeatureCollection","features":[{"type":"Feature","properties":{"rsrp":-90}}]}', InputError, "of levels"),
     "JSON of a phone": (
         table("", '{{"time": 174956400{i}, "pci": 11, "rsrp": -9{i}, "lat": 35.728}}')[1:], InputError, "JSON records"),
+    "numbers without names": (table("# fc 3.5e9", "174956400{i}.0 {l}"), InputError, "without names or commas"),
     "a web page": ("<!DOCTYPE html><html><body>Log in</body></html>\n", InputError, "a web page"),
     "a table of nobody": (
         table("index,when_utc,Breite,rx_power_dbm,temperature", "{i},2025-06-10 10:00:0{i},35,{l},20"), InputError,

@@ -15,6 +15,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import noise_floor_dbm
 from aerpaw_cmp.compare.gains.spread import NO_SPREAD, StatedSpread
+from aerpaw_cmp.compare.judge.causes import Cause
 from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
@@ -36,18 +37,22 @@ pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 def test_a_clock_that_is_no_cause_of_the_error_is_still_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """Sentence, warning and table have one clock; nothing is asked where it was corrected."""
-    level = np.random.default_rng(1).normal(size=50)
-    for shifted in (True, False):
+    for name in ("_evidence", "gains_by_direction"):
+        monkeypatch.setattr(likely_cause, name, lambda *_: None)
+    for shifted, other, first in (
+        (True, None, True),
+        (True, "pattern", True),
+        (True, "lock", False),
+        (False, None, False),
+    ):
         clock = SimpleNamespace(shifted=shifted, in_words="0.40 s ahead")
-        evidence = SimpleNamespace(name="LW1 A", clock=clock)
-        monkeypatch.setattr(likely_cause, "_evidence", lambda *_, evidence=evidence: evidence)
-        monkeypatch.setattr(likely_cause, "flight_cause", lambda _: None)
-        monkeypatch.setattr(likely_cause, "gains_by_direction", lambda _: False)
-        data: Any = SimpleNamespace(files=[], rss=[None], settings=SimpleNamespace(antennas={}))
-        replays: Any = SimpleNamespace(rss=[SimpleNamespace(tower_m=None)])
-        result: Any = SimpleNamespace(name="LW1 A", measured_db=level, training=False)
+        named = None if other is None else Cause(name=other, sentence="", next_step="")
+        monkeypatch.setattr(likely_cause, "flight_cause", lambda _, named=named: named)
+        data: Any = SimpleNamespace(files=[], rss=[SimpleNamespace(tower="LW1")], settings=SimpleNamespace(antennas={}))
+        replays: Any = SimpleNamespace(rss=[SimpleNamespace(tower_m=None, clock=SimpleNamespace(result=clock))])
+        result: Any = SimpleNamespace(name="LW1 A", measured_db=np.zeros(9), training=False)
         cause, _ = likely_cause.cause_of(data, replays, [result])
-        assert (cause is not None and "LW1 A is 0.40 s ahead" in cause.sentence) == shifted
+        assert (cause is not None and cause.sentence == "The radio clock at LW1 is 0.40 s ahead.") == first
 
 
 FLOOR_DB = -758.6  # what the sounder writes without a signal

@@ -11,7 +11,7 @@ import numpy as np
 
 from ...common.units import FloatArray
 from ...compare.flight_verdict import without_copies
-from ...compare.judge.causes import Cause, LevelEvidence, flight_cause, gains_by_direction
+from ...compare.judge.causes import OF_DIRECTION, Cause, LevelEvidence, flight_cause, gains_by_direction
 from ...compare.level import rss
 from ...compare.result import RssResult
 from ...flight.data import FlightData, RssSeries, Times
@@ -60,10 +60,11 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
         if replayed.tower_m is None and not result.training and result.name in names
     ]
     cause = flight_cause(evidence)
-    clocks = [(e.name, e.clock.in_words) for e in evidence if e.clock is not None and e.clock.shifted]
-    if cause is None and clocks:  # judged by itself: it is mended first, however little of the error it explains
-        said = "The radio clock at {} is {}.".format(*clocks[0])
-        return Cause(name="clock", sentence=said, next_step="`rss: {lag: apply}`"), None
+    clocks = [(s.tower, r.clock.result) for s, r in zip(data.rss, replays.rss, strict=True) if r.clock is not None]
+    late = next((f"The radio clock at {tower} is {clock.in_words}." for tower, clock in clocks if clock.shifted), None)
+    # judged by itself: it is mended first, however little of the error it explains, and before what directions tell
+    if late is not None and (cause is None or cause.name in OF_DIRECTION):
+        return Cause(name="clock", sentence=late, next_step="`rss: {lag: apply}`"), None
     # learned antennas miss some decibels of any flight
     if cause is not None or data.settings.antennas or not gains_by_direction(evidence):
         return cause, None

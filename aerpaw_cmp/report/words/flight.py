@@ -109,13 +109,9 @@ SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
     (lambda f: not f.judged, "The flight is too short to tell the two apart."),
     (lambda f: f.better > 0 and f.worse > 0,
      "Ray tracing is significantly better on {better} and worse on {worse} of {channels} {unit} (95 %)."),
-    (lambda f: f.worse > 0 and f.channels == 1, "Ray tracing is significantly worse (95 %)."),
-    (lambda f: f.better > 0 and f.channels == 1, "Ray tracing is significantly better (95 %)."),
     (lambda f: f.worse > 0, "Ray tracing is significantly worse on {worse} of {channels} {unit} (95 %)."),
     (lambda f: f.better > 0, "Ray tracing is significantly better on {better} of {channels} {unit} (95 %)."),
-    (lambda f: f.channels == 1, "The difference is not significant (95 %)."),
-    (lambda f: f.channels == 2, "The difference is not significant on either channel (95 %)."),
-    (lambda f: f.channels > 2, "The difference is not significant on any of {channels} {unit} (95 %)."),
+    (bool, "The difference is not significant on any of {channels} {unit} (95 %)."),
 )  # fmt: skip
 
 # Sentence on the ranking of settings, by what the intervals say of those behind the first.
@@ -143,7 +139,7 @@ def first_sentence(facts: Judged) -> str:
     Examples
     --------
     >>> first_sentence(Judged(ray_db=6.72, channels=2, name="free_space", other_db=6.0, judged=2))
-    'Ray tracing: RMSE 6.7 dB; free space: 6.0 dB. The difference is not significant on either channel (95 %).'
+    'Ray tracing: RMSE 6.7 dB; free space: 6.0 dB. The difference is not significant on any of 2 channels (95 %).'
     """
     baseline = f"; {pretty(facts.name)}: {facts.other_db:.1f} dB" if facts.name else ""
     text = next(text for holds, text in SIGNIFICANCE if holds(facts))

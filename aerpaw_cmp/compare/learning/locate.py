@@ -358,8 +358,6 @@ class NodeEstimate:
         Heights that are not shown to be wrong.
     slope, slope_sd : float
         Exponent of the distance and its standard deviation.
-    log_odds : (k,)
-        Of the given candidates against any place within reach, at prior odds of one to one.
     anywhere : float
         Log evidence of any place within reach.
     placed : bool
@@ -374,22 +372,19 @@ class NodeEstimate:
     height_m: tuple[float, float]
     slope: float
     slope_sd: float
-    log_odds: FloatArray
     anywhere: float
     placed: bool
     at_edge: bool
     regions: Regions
 
 
-def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = UNKNOWN) -> NodeEstimate:
-    """Place, height and slope that explain the levels of a flight best, and how well given places do.
+def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
+    """Place, height and slope that explain the levels of a flight best.
 
     Parameters
     ----------
     track : LevelTrack
         At least :data:`FEWEST` bins.
-    candidates_m : (k, 3)
-        Places such as towers: east, north, up.
     model : LevelModel
         Narrower where antennas are known.
 
@@ -413,9 +408,7 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = 
     grid = _grid(track)
     places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
     evidence = fit_places(track, places, model).evidence + _log_prior(places)
-    candidates = unmasked(candidates_m).reshape(-1, 3)
     anywhere = float(logsumexp(evidence)) - np.log(len(grid))
-    log_odds = _log_odds(track, candidates, anywhere)
     afar = fit_places(track, track.position_m[:1] + np.array([_AFAR_M, 0.0, 0.0]), model).evidence[0]
     places = places[evidence > evidence.max() - _POSSIBLE]
     if len(places) <= _MOST_REFINED:
@@ -435,7 +428,6 @@ def locate(track: LevelTrack, candidates_m: ArrayLike = (), model: LevelModel = 
         height_m=(min(heights), max(heights)),
         slope=float(fits.slope[best]),
         slope_sd=float(fits.slope_sd[best]),
-        log_odds=log_odds,
         anywhere=anywhere,
         placed=bool(fits.evidence.max() - afar > _PLACED_ODDS),
         at_edge=bool(share[_on_edge(places, grid)].sum() > _LEAST_SHARE),
@@ -467,21 +459,7 @@ def _refined(places: FloatArray) -> FloatArray:
     return np.asarray((places[:, None] + moved).reshape(-1, 3))
 
 
-def _log_odds(track: LevelTrack, candidates: FloatArray, anywhere: float) -> FloatArray:
-    """Log of the mean evidence about each candidate over that of any place.
-
-    Three-point Gauss-Hermite rule per axis (Abramowitz and Stegun, 25.4.46) over :data:`SYSTEMATIC_M`.
-    """
-    from scipy.special import logsumexp
-
-    steps, weights = np.array([-1.0, 0.0, 1.0]) * np.sqrt(3.0) * SYSTEMATIC_M, np.array([1.0, 4.0, 1.0]) / 6.0
-    moved = np.array([(e, n, 0.0) for e in steps for n in steps])
-    log_weights = np.log(np.outer(weights, weights).ravel())
-    near = [logsumexp(fit_places(track, c + moved).evidence + log_weights) for c in candidates]
-    return np.array(near) - anywhere
-
-
-# Of a tower against a place: nearly free space, with antennas of which nothing is known; chosen on made flights.
+# Of a known place against any: nearly free space, with antennas of which nothing is known; chosen on made flights.
 _RIVAL = LevelModel(slope=2.1, slope_sd=0.3, elevation_sd_db=4.0, scatter_sd_db=1.5)
 # What azimuth adds at the node, and the directions of an airframe at the UAV (spherical harmonics of degrees 1 and 2).
 _AZIMUTH_SD_DB, _AIRFRAME_SD_DB = 0.8, 1.5
@@ -492,8 +470,8 @@ _NEAR_M = 150.0
 _RIVAL_SPACING_M = 60.0
 
 
-def tower_odds(track: LevelTrack, towers_m: ArrayLike) -> FloatArray:
-    """Log odds (k,) of towers against any place about the track, where no antenna is known.
+def place_odds(track: LevelTrack, known_m: ArrayLike) -> FloatArray:
+    """Log odds (k,) of known places, such as towers, against any place about the track, where no antenna is known.
 
     Place, gain, slope and antennas are integrated over: a place wins only by more than its freedom gives.
 
@@ -501,18 +479,18 @@ def tower_odds(track: LevelTrack, towers_m: ArrayLike) -> FloatArray:
     ----------
     track : LevelTrack
         Levels below the floor count as at it.
-    towers_m : (k, 3)
+    known_m : (k, 3)
     """
     from scipy.special import logsumexp
 
-    towers, grid = unmasked(towers_m).reshape(-1, 3), _grid(track, _RIVAL_SPACING_M)
+    known, grid = unmasked(known_m).reshape(-1, 3), _grid(track, _RIVAL_SPACING_M)
     free = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
-    places = np.concatenate([towers, free])
+    places = np.concatenate([known, free])
     away = np.hypot(*(places[:, None, :2] - track.position_m[:, :2]).transpose(2, 0, 1)).min(axis=1)
     shadows = [_inverse_root(track, *shadow) for shadow in _SHADOWS]
     parts = [_rival_evidence(track, places[i : i + _AT_ONCE], shadows) for i in range(0, len(places), _AT_ONCE)]
     share = np.concatenate(parts) - 1.5 * np.log1p((away / _NEAR_M) ** 2)
-    return np.asarray(share[: len(towers)] + np.log(len(grid)) - logsumexp(share[len(towers) :] + _log_prior(free)))
+    return np.asarray(share[: len(known)] + np.log(len(grid)) - logsumexp(share[len(known) :] + _log_prior(free)))
 
 
 def _inverse_root(track: LevelTrack, sd_db: float, length_m: float) -> FloatArray:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from ...common.units import FloatArray, spread_out
-from ...compare.learning.locate import FEWEST, LevelModel, LevelTrack, fit_places, level_track, locate, tower_odds
+from ...compare.learning.locate import FEWEST, LevelModel, LevelTrack, fit_places, level_track, locate, place_odds
 from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
 from ...site.antenna.antennas import MeasuredPattern
@@ -21,16 +21,13 @@ from ..gains.learned_gain import sphere_angles
 from ..pose.track import Track
 from ..rows.scored import unscored
 
-# Log odds from which on a tower of the site is taken; the surveyed flights give 2.8 to 4.7, others at most 1.0.
-_TOWER_ODDS = 2.0
-
-# Log odds from which on a tower stands where no antenna is known: of real flights and thirds at LW1 18 of 20 give more
-# and all more than -3, six rovers -11 and less.
-_RIVAL_ODDS = -0.5
+# Log odds from which on a tower stands: of real flights and thirds at LW1 18 of 20 give more, all more than -3, and six
+# rovers -11 and less; from which on a listed place does, which somebody wrote down: the rovers' give -3 and more.
+_TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
 
 # Log odds that antennas which flights taught must give more: thirds of LW1 flights give 8 to 57 in all where one or two
-# taught; of 165 places elsewhere 158 give less than 5.
-_TAUGHT_MORE = 3.0
+# taught; of 165 places elsewhere 158 give less than the 5 at which a tower stands.
+_TAUGHT_MORE = 5.5
 
 # Log evidence by which another tower must explain the levels better before a named one is doubted.
 CONTRADICTED = 8.0
@@ -168,9 +165,7 @@ class Placer:
         if not len(track.time_s):
             return track
         track = replace(track, rotation=self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation)
-        if airframe is None:
-            return track
-        return replace(track, airframe_db=self._gain_db(track, airframe, node))
+        return track if airframe is None else replace(track, airframe_db=self._gain_db(track, airframe, node))
 
     def propose(self, track: LevelTrack, taught: Mapping[str, Taught] = MappingProxyType({})) -> Placement | None:
         """Tower, listed place or estimated place that the levels fit; None where they are too few.
@@ -186,15 +181,16 @@ class Placer:
         towers = list(self.site.towers.values())
         listed = [place for place in self.listed if self._near(place.latitude_deg, place.longitude_deg)]
         at = [np.asarray(tower.position_m) for tower in towers] + [self._local(place) for place in listed]
-        estimate = locate(track, np.array(at))
-        odds_tower, odds_listed = estimate.log_odds[: len(towers)], estimate.log_odds[len(towers) :]
-        known = np.array([
-            self._taught_odds(track, t.name, taught[t.name]) if t.name in taught else -np.inf for t in towers
-        ])  # fmt: skip
-        # as odds against any place, like those of the search
-        known -= estimate.anywhere + _TAUGHT_MORE
-        odds_tower = np.maximum(odds_tower, known)
-        if len(listed) and odds_listed.max() >= max(_TOWER_ODDS, odds_tower.max()):
+        odds = place_odds(track, np.array(at))
+        odds_tower, odds_listed = odds[: len(towers)].copy(), odds[len(towers) :]
+        # the search takes longer than all else: only where a tower's antennas or a place of its own need it
+        estimate = locate(track) if taught or odds_tower.max() < _TOWER_ODDS else None
+        for i, tower in enumerate(towers):
+            if estimate is not None and tower.name in taught:
+                known = self._taught_odds(track, tower.name, taught[tower.name])
+                # as odds against any place, like those of the search
+                odds_tower[i] = max(odds_tower[i], known - estimate.anywhere - _TAUGHT_MORE)
+        if len(listed) and odds_listed.max() >= max(_LISTED_ODDS, odds_tower.max()):
             # a list of rover places holds neighbours some metres apart: all likely lines are named
             order = np.argsort(-odds_listed)
             place, least = listed[order[0]], odds_listed[order[0]] - _UNDECIDED
@@ -204,12 +200,9 @@ class Placer:
             return self._node(self._local(place), place.latitude_deg, place.longitude_deg, 1.5, about)
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:
-            how = "with the antennas that flights taught" if odds_tower[best] == known[best] else "best"
+            how = "with the antennas that flights taught" if odds_tower[best] > odds[best] else "as well as any place"
             return Placement(towers[best].name, None, f"the levels fit {towers[best].name} {how}: is it this tower?")
-        rival = tower_odds(track, at[: len(towers)])
-        if rival.max(initial=-np.inf) >= _RIVAL_ODDS:
-            name = towers[int(rival.argmax())].name
-            return Placement(name, None, f"no place fits the levels better than {name} does: is it this tower?")
+        assert estimate is not None  # no tower stands
         latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
         apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]
         near = [t.name for t, d in zip(towers, apart, strict=True) if d <= estimate.radius90_m]
@@ -231,12 +224,10 @@ class Placer:
         self, track: LevelTrack, airframe: MeasuredPattern, node: MeasuredPattern | None = None
     ) -> Callable[[FloatArray], FloatArray]:
         """Gain of an airframe, and of a node, at each level of a track towards unit vectors (m, n, 3)."""
-        rotation = track.rotation
-        if rotation is None:
-            rotation = self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation
 
         def gain_db(towards: FloatArray) -> FloatArray:
-            uav_db = airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", rotation, towards)))
+            assert track.rotation is not None
+            uav_db = airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", track.rotation, towards)))
             return uav_db if node is None else uav_db + node.gain_dbi(*sphere_angles(-towards))
 
         return gain_db

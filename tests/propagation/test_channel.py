@@ -216,47 +216,6 @@ def test_slant_follows_tr_38_901_model_2(scenes):
     assert gain(0, 30) == pytest.approx(np.cos(np.pi / 6))
 
 
-def test_attitude_turns_the_array(scenes):
-    """Turning the aircraft equals turning its array's mount and elements."""
-    site = scenes.site()
-    turn = rotation_from_aircraft(12.0, -7.0, 130.0)
-    uav = uav_comparison_array(0.0882, pattern=Crossed())
-    poses = scenes.poses([[80.0, 30.0, 40.0]], turn[None])
-    moved = Array(uav.positions_m, uav.slant_rad, uav.patterns, turn @ uav.mount)
-    turned = replay(site, scenes.link(site, uav_array=uav), poses)
-    remounted = replay(site, scenes.link(site, uav_array=moved), scenes.poses([[80.0, 30.0, 40.0]]))
-    assert turned.h == pytest.approx(remounted.h, rel=1e-9)
-    level = replay(site, scenes.link(site, uav_array=uav), scenes.poses([[80.0, 30.0, 40.0]]))
-    assert np.abs(level.h - turned.h).max() > 0.1 * np.abs(turned.h).max()
-
-
-def test_scene_turned_as_a_whole_gives_the_same_h(scenes):
-    from dataclasses import replace
-
-    from shapely import affinity
-
-    rng = np.random.default_rng(31)
-    site = scenes.site(scenes.buildings(rng, 5, spread_m=60.0))
-    poses = random_poses(scenes, rng, np.full(20, 70.0))
-    angle = 0.7
-    turn = rotation_from_yaw_pitch_roll(angle, 0.0, 0.0)
-    turned_site = replace(
-        site,
-        buildings=tuple(
-            replace(b, footprint=affinity.rotate(b.footprint, angle, origin=(0, 0), use_radians=True))
-            for b in site.buildings
-        ),
-    )
-    tower = tower_comparison_array(pattern=Crossed())
-    turned_tower = Array(tower.positions_m, tower.slant_rad, tower.patterns, turn @ tower.mount)
-    uav = uav_comparison_array(0.0882, pattern=Crossed())
-    original = replay(site, scenes.link(site, tower, uav), poses)
-    turned_poses = scenes.poses(poses.position_m @ turn.T, turn @ poses.rotation)
-    turned = replay(turned_site, scenes.link(turned_site, turned_tower, uav), turned_poses)
-    assert len(original.paths) == len(turned.paths) > 2 * len(poses)
-    assert turned.h == pytest.approx(original.h, rel=1e-8, abs=1e-9 * np.abs(original.h).max())
-
-
 def test_one_pattern_per_element_or_one_for_all(scenes):
     site = scenes.site()
     poses = scenes.poses([[80.0, 30.0, 40.0]])

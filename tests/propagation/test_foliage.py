@@ -52,27 +52,6 @@ def depth(start: object, end: object, stand: Trees, shape: str = "cone") -> floa
     return float(foliage_depth_m(ends[0], NO_VERTEX, ends[1], CrownIndex(stand, shape))[0])  # type: ignore[arg-type]
 
 
-def test_hand_computed_cone_chords() -> None:
-    tree = trees((10, 0, 0, 20, 10, 5))  # cone from 5 m to 20 m, radius 5 m
-    assert depth([-50, 0, 5], [50, 0, 5], tree) == pytest.approx(10)  # along the base
-    assert depth([-50, 0, 12.5], [50, 0, 12.5], tree) == pytest.approx(5)  # half-way up
-    assert depth([-50, 3, 5], [50, 3, 5], tree) == pytest.approx(8)  # 3-4-5 triangle
-    assert depth([10, 0, 0], [10, 0, 30], tree) == pytest.approx(15)  # up the axis
-    assert depth([12.5, 0, 0], [12.5, 0, 30], tree) == pytest.approx(7.5)  # parallel to the axis
-    assert depth([15, 0, 5], [10, 0, 20], tree) == pytest.approx(math.hypot(5, 15), rel=1e-6)  # along the side
-    assert depth([13, 0, 5], [8, 0, 20], tree) == pytest.approx(math.hypot(4, 12), abs=1e-6)  # parallel to the side
-    assert depth([-50, 0, 20.1], [50, 0, 20.1], tree) == 0  # above: the mirrored upper cone is not a crown
-    assert depth([10, 0, 25], [10, 0, 100], tree) == 0
-    assert depth([-50, 0, 4.9], [50, 0, 4.9], tree) == 0
-    assert depth([10, 0, 6], [10, 0, 8], tree) == pytest.approx(2)  # both ends inside
-    assert depth([10, 0, 6], [10, 0, 6], tree) == 0  # no length
-
-
-def test_ground_height_lifts_the_tree() -> None:
-    low, high = trees((0, 0, 0, 20, 10, 5)), trees((0, 0, -7, 20, 10, 5))
-    assert depth([-9, 1, 8], [9, 2, 11], low) == pytest.approx(depth([-9, 1, 1], [9, 2, 4], high), rel=1e-12)
-
-
 @settings(max_examples=60, deadline=None)
 @given(
     st.integers(0, 10_000),

@@ -118,14 +118,19 @@ GRID = tuple(
     [Shadowing(n, (r,) if r else ()) for n in SIZES for r in CORRELATIONS]
     + [Shadowing(n, (float(np.exp(-0.5 / n)),)) for n in SIZES]  # a memory of two flights
     + [Shadowing(n, (r,), noise) for n in (200, 500, 1000, 3000) for r, noise in ((0.9, 0.5), (0.98, 0.5), (0.98, 2.0))]
-    + [Shadowing(n, r) for n in (100, 300, 1000, 3000) for r in ((0.8, 0.8), (0.9, 0.9), (0.97, 0.97), (0.97, 0.5))]
+    + [Shadowing(n, (r,), noise) for n in (60, 100) for r, noise in ((0.8, 1.0), (0.9, 0.5))]
+    + [
+        Shadowing(n, r)
+        for n in (60, 100, 200, 300, 1000, 3000)
+        for r in ((0.8, 0.8), (0.9, 0.9), (0.97, 0.97), (0.97, 0.5))
+    ]
     + [Shadowing(n, r, 0.0, 4) for n in (100, 300, 1000) for r in ((), (0.9,))]
     + [Shadowing(n, (r,), 0.0, None, s) for n in (300, 1000) for r in (0.9, 0.98) for s in ("uneven", "gap")]
 )
 # Between those of the grid, which the weights are fitted to.
 BETWEEN = tuple(
     [Shadowing(n, (r,)) for n in (80, 150, 700, 1500) for r in (0.3, 0.7, 0.93, 0.97, float(np.exp(-1.0 / n)))]
-    + [Shadowing(n, (r,), noise) for n in (150, 700, 1500) for r, noise in ((0.7, 1.0), (0.93, 1.0), (0.97, 0.3))]
+    + [Shadowing(n, (r,), noise) for n in (150, 700, 1500) for r, noise in ((0.7, 1), (0.97, 0.3), (0.98, 2))]
     + [Shadowing(n, r) for n in (150, 700) for r in ((0.85, 0.85), (0.95, 0.95), (0.95, 0.6))]
     + [Shadowing(n, r, 0.0, 5) for n in (150, 700) for r in ((), (0.7,), (0.93,))]
     + [Shadowing(700, (r,), 0.0, None, s) for r in (0.93, 0.97) for s in ("uneven", "gap")]

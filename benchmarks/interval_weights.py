@@ -1,11 +1,12 @@
-"""Weights of the memories in ``memory_weights.json``: those whose 95 % intervals hold in every cell.
+"""Weights of the memories in ``memory_weights.json``, and stretches: those whose 95 % intervals hold in every cell.
 
 Sequences of the kinds of ``benchmarks/coverage_of_intervals.py`` are simulated. The weights minimise the squared
 distance of every cell's coverage from 95 %, plus something for the width of the intervals, where a sequence holds many
 memories, and a little for weights that are not smooth over the rate. They begin at those of the file, and a cell
 outside the asked coverage counts more in the next round. Prints the coverage of each cell and the table, in tenths.
+``--stretch``: instead, what each memory adds to the stretch of the draws, in hundredths, under the weights of the file.
 
-    python benchmarks/interval_weights.py mean|power|ratio [--sequences 700]
+    python benchmarks/interval_weights.py mean|power|ratio [--sequences 700] [--stretch]
 """
 
 import argparse
@@ -15,6 +16,7 @@ import numpy as np
 from coverage_of_intervals import GRID, routed_pair, shadowed_pair
 from scipy.optimize import minimize
 from scipy.special import expit, gammaincc, logit, ndtri, stdtr
+from scipy.stats import norm
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.compare.statistics.intervals import undecided
@@ -26,10 +28,12 @@ from aerpaw_cmp.compare.statistics.memory import (
     heavy_tails,
     likelihoods,
     memories,
+    stretches,
     weights,
 )
 
-TAIL, STEEP, SMOOTH, ROUNDS = 0.025, 5.0, 1.8e-4, 2
+TAIL, STEEP, ROUNDS = 0.025, 5.0, 2
+SMOOTH = np.array([1.8e-4, 2.7e-3, 2.7e-3])[:, None, None]  # of the weights, of both stretches
 # Coverage aimed at; price of the width; price of a coverage that is too large, over that of one too small; distance
 # from the aim at which a cell counts twice what its square says, so that none pays for the others.
 AIM = {
@@ -99,53 +103,70 @@ def scaled(parts: tuple[FloatArray, FloatArray, FloatArray], of_coverage: float,
     return likelihood, below, width / np.median(width.min(axis=1)), of_coverage, of_width
 
 
-def loss(log_weight: FloatArray, made: list[Cell], kind: str) -> tuple[float, FloatArray]:
-    """Sum to be minimised, and its gradient."""
+def loss(tables: FloatArray, made: list[Cell], kind: str) -> tuple[float, FloatArray]:
+    """Sum to be minimised, and its gradient, by logarithms of weights and both stretches (3, memories)."""
     aim, price, idle, far = AIM[kind]
-    prior, total, gradient = np.exp(log_weight - log_weight.max()), 0.0, np.zeros(log_weight.size)
+    log_weight, own, even = tables
+    prior, total, gradient = np.exp(log_weight - log_weight.max()), 0.0, np.zeros(tables.shape)
     for likelihood, below, width, weight, of_width in made:
-        share = likelihood * prior
-        share /= share.sum(axis=1, keepdims=True)
+        share, flat = (np.asarray(p / p.sum(axis=1, keepdims=True)) for p in (likelihood * prior, likelihood))
         chance = np.clip((share * below).sum(axis=1), 1e-7, 1 - 1e-7)
-        over, under = (expit(STEEP * (sign * logit(chance) - logit(TAIL))) for sign in (1.0, -1.0))
+        edge = logit(TAIL) * (share @ own + flat @ even)
+        over, under = (expit(STEEP * (sign * logit(chance) - edge)) for sign in (1.0, -1.0))
         excess = (over * under).mean() - aim
         cost = weight * (1.0 if excess < 0.0 else idle)
-        slope = STEEP * over * under * (under - over) / (chance * (1.0 - chance)) / len(chance)
-        size = (share * width).sum(axis=1)
-        total += cost * (excess**2 + excess**4 / far**2) + of_width * 0.5 * price * np.log(size).mean()
-        pull = 2.0 * excess + 4.0 * excess**3 / far**2
-        gradient += cost * ((pull * slope)[:, None] * share * (below - chance[:, None])).sum(axis=0)
-        gradient += of_width * 0.5 * price * (share * (width - size[:, None]) / size[:, None]).mean(axis=0)
-    table = log_weight.reshape(SHAPE)
-    bend, away = np.diff(table, 2, axis=1), table - table.mean()
-    rough = np.zeros(SHAPE)
+        pull = cost * (2.0 * excess + 4.0 * excess**3 / far**2) * STEEP * over * under / len(chance)
+        by_chance, by_stretch = (
+            pull * (under - over) / (chance * (1.0 - chance)),
+            pull * (over + under - 2.0) * logit(TAIL),
+        )
+        size, tail, dear = (share * width).sum(axis=1), expit(edge), of_width * price / len(chance)
+        reach = -ndtri(tail)  # standard deviations from the middle of a normal distribution
+        total += cost * (excess**2 + excess**4 / far**2) + dear * (0.5 * np.log(size) + np.log(reach)).sum()
+        by_stretch -= dear * tail * (1.0 - tail) / norm.pdf(reach) / reach * logit(TAIL)
+        by_share = by_chance[:, None] * below + by_stretch[:, None] * own
+        by_share += 0.5 * dear * width / size[:, None]
+        gradient[0] += (share * (by_share - (share * by_share).sum(axis=1, keepdims=True))).sum(axis=0)
+        gradient[1:] += by_stretch @ share, by_stretch @ flat
+    table = tables.reshape(3, *SHAPE)
+    bend, away = np.diff(table, 2, axis=2), table - np.array([log_weight.mean(), 1.0, 0.0])[:, None, None]
+    rough = np.zeros(table.shape)
     for place, factor in enumerate((1.0, -2.0, 1.0)):
-        rough[:, place : place + bend.shape[1]] += 2.0 * factor * bend
-    total += SMOOTH * (bend**2).sum() + 0.1 * SMOOTH * (away**2).sum()
-    return float(total), gradient + (SMOOTH * rough + 0.2 * SMOOTH * away).ravel()
+        rough[..., place : place + bend.shape[2]] += 2.0 * factor * bend
+    total += (SMOOTH * bend**2).sum() + 0.1 * (SMOOTH * away**2).sum()
+    return float(total), gradient + (SMOOTH * rough + 0.2 * SMOOTH * away).reshape(tables.shape)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("kind", choices=tuple(AIM))
     parser.add_argument("--sequences", type=int, default=700, help="per cell")
+    parser.add_argument("--stretch", action="store_true", help="fit stretches, not weights")
     arguments = parser.parse_args()
     kind, named = arguments.kind, dict(cells(arguments.kind, arguments.sequences))
-    best, counts, covered = np.log(weights(kind)), dict.fromkeys(named, 1.0), dict.fromkeys(named, 95.0)
+    best, counts = np.array([np.log(weights(kind)), *stretches(kind)]), dict.fromkeys(named, 1.0)
+    fitted = slice(1, 3) if arguments.stretch else slice(0, 1)
+    covered = dict.fromkeys(named, 95.0)
+
+    def scored(parts: FloatArray, made: list[Cell]) -> tuple[float, FloatArray]:
+        best[fitted] = parts.reshape(-1, best.shape[1])
+        total, gradient = loss(best, made, kind)
+        return 1e3 * total, 1e3 * gradient[fitted].ravel()
+
     for _ in range(ROUNDS):
         made = [(*cell[:3], counts[name] * cell[3], cell[4]) for name, cell in named.items()]
-        best = minimize(
-            lambda p, made=made: tuple(1e3 * value for value in loss(p, made, kind)), best, jac=True,
-            method="L-BFGS-B", options={"maxiter": 60},
-        ).x  # fmt: skip
+        parts = minimize(scored, best[fitted].ravel(), (made,), "L-BFGS-B", jac=True, options={"maxiter": 100}).x
+        best[fitted] = parts.reshape(-1, best.shape[1])
         for name, (likelihood, below, *_) in named.items():
-            share = likelihood * np.exp(best - best.max())
-            chance = (share * below).sum(axis=1) / share.sum(axis=1)
-            covered[name] = 100 * ((chance > TAIL) & (chance < 1 - TAIL)).mean()
+            share, flat = likelihood * np.exp(best[0] - best[0].max()), likelihood
+            share, flat = (p / p.sum(axis=1, keepdims=True) for p in (share, flat))
+            chance, tail = (share * below).sum(axis=1), expit(logit(TAIL) * (share @ best[1] + flat @ best[2]))
+            covered[name] = 100 * ((chance > tail) & (chance < 1 - tail)).mean()
             counts[name] *= 1.0 + max(92.8 - covered[name], covered[name] - 96.9, 0.0)
     for name, percent in covered.items():
         print(f"{percent:5.1f}  {name}")
-    for row in np.round(10 * (best - best.mean()).reshape(SHAPE)).astype(int).tolist():
+    shown = 100 * best[1:] if arguments.stretch else 10 * (best[:1] - best[0].mean())
+    for row in np.round(shown).astype(int).reshape(-1, SHAPE[1]).tolist():
         print(row)
 
 

@@ -107,6 +107,26 @@ def test_draws_are_spread_as_their_distributions() -> None:
     assert np.abs(together - np.eye(4)).max() < 0.03
 
 
+@pytest.mark.parametrize("by", [0.7, 1.0, 1.5])
+def test_a_stretch_moves_the_ends_of_an_interval_and_leaves_every_draw_in_its_place(by: float) -> None:
+    drawn = np.random.default_rng(4).normal(size=4096) ** 3
+    stretched = memory._stretched(drawn, by)
+    tail = 1.0 / (1.0 + 39.0**by)  # the odds of 2.5 %, to that power
+    np.testing.assert_allclose(
+        np.quantile(stretched, [0.025, 0.975]), np.quantile(drawn, [tail, 1.0 - tail]), rtol=0.02
+    )
+    assert (np.diff(stretched[np.argsort(drawn)]) >= 0.0).all()
+    np.testing.assert_allclose(memory._stretched(-drawn, by), -stretched, atol=1e-9)
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.5, 0.9, 0.99, 1.0])
+def test_the_ends_of_any_interval_lie_between_the_outer_thousandth_and_tenth_of_its_draws(keep: float) -> None:
+    for n in (20, 60, 300, 3000):
+        values = lfilter([1.0], [1.0, -keep], np.random.default_rng(n).normal(size=n))
+        tails = [1.0 / (1.0 + 39.0 ** memory._picked(cosine_terms(values).slow, kind)[2]) for kind in ("mean", "power")]
+        assert 0.001 < min(tails) <= max(tails) < 0.1
+
+
 def innovations_excess(values: np.ndarray) -> float:
     """Excess kurtosis of the innovations by the correlation of neighbours, the greater of both directions of time."""
     away = values - values.mean()

@@ -4,8 +4,10 @@ Neighbouring errors of a flight repeat each other, and how long they do is itsel
 sequence is described by its slowest cosine terms, after Mueller and Watson (2008),
 doi:10.1111/j.1468-0262.2008.00868.x: given a memory, they are normal with a known covariance. Memories from three times
 the flight's length to none at all, rough (exponential) with and without white noise and smooth (Matern 3/2), are
-weighted by how well they explain the terms, and by weights that make 95 % intervals hold 95 % of the time whatever the
-memory is (``benchmarks/interval_weights.py`` finds them by simulation).
+weighted by how well they explain the terms, and by weights that let no memory's 95 % intervals hold much less. Weights
+alone make others hold more: long memories must be feared though the terms hardly show them. How far out the ends of an
+interval lie among the draws is therefore a matter of the memories that the sequence shows, with the weights and without
+(``benchmarks/interval_weights.py`` finds both by simulation).
 """
 
 from __future__ import annotations
@@ -39,8 +41,9 @@ _SMOOTH_FLOOR = 1e-7
 
 Kind = Literal["mean", "power", "ratio"]
 
-# Logarithms of the weights in tenths, by kind, rough memories of each white share and smooth ones, and rate.
-_TENTHS = Path(__file__).with_name("memory_weights.json")
+# Logarithms of the weights in tenths, by kind, rough memories of each white share and smooth ones, and rate. Stretches
+# of the draws in hundredths: what the weighted shares of the memories add, then what the shares without weights do.
+_TABLES = Path(__file__).with_name("memory_weights.json")
 
 # Of the standard deviation of the logarithm of the power upwards, over that which the fourth moment says; by simulation
 # with Student's t of four degrees of freedom. Most sequences with heavy tails look calmer than the process.
@@ -105,11 +108,23 @@ def _exponential(rate: complex, terms: int) -> ComplexArray:
 
 
 @cache
+def _table(name: str) -> FloatArray:
+    return np.array(json.loads(_TABLES.read_text(encoding="utf-8"))[name], dtype=np.float64)
+
+
+@cache
 def weights(kind: Kind) -> FloatArray:
     """Weight (m,) of each memory before any sample is seen."""
-    tenths = json.loads(_TENTHS.read_text(encoding="utf-8"))[kind]
-    drawn = np.exp(0.1 * np.array(tenths, dtype=np.float64).ravel())
+    drawn = np.exp(0.1 * _table(kind).ravel())
     return np.asarray(drawn / drawn.sum())
+
+
+@cache
+def stretches(kind: Kind) -> FloatArray:
+    """What each memory (2, m) adds to the stretch of draws, times its share by the weights, and without weights."""
+    if kind == "ratio":  # its weights alone hold false verdicts below 5 %
+        return np.repeat([[1.0], [0.0]], len(weights(kind)), axis=1)
+    return 0.01 * _table(f"{kind} stretch").reshape(2, -1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,14 +171,28 @@ def _random(terms: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     return chance[:, 0], 2.0 * gammaincinv(0.5 * terms, chance[:, 1]), ndtri(chance[:, 2]), ndtri(chance[:, 3])
 
 
-def _picked(slow: FloatArray, kind: Kind) -> tuple[IntArray, FloatArray]:
-    """Memory (draws,) and squared scale (draws,) of each draw."""
+def _picked(slow: FloatArray, kind: Kind) -> tuple[IntArray, FloatArray, float]:
+    """Memory (draws,) and squared scale (draws,) of each draw, and what :func:`_stretched` does to them all."""
     likelihood, square = likelihoods(slow)
-    running = np.cumsum(likelihood * weights(kind))
+    weighted = likelihood * weights(kind)
+    running = np.cumsum(weighted)
     uniform, chi_squared, *_ = _random(len(slow))
     # a chance near 1 may round to the whole sum
     index = np.minimum(np.searchsorted(running, uniform * running[-1]), len(running) - 1)
-    return index, square[index] / chi_squared
+    own, even = stretches(kind)
+    stretch = float(weighted @ own / running[-1] + likelihood @ even / likelihood.sum())
+    return index, square[index] / chi_squared, stretch
+
+
+def _stretched(drawn: FloatArray, by: float) -> FloatArray:
+    """Draws moved away from their median: 2.5 % lie where the odds to the power ``by`` did, on either side."""
+    tail = 1.0 / (1.0 + 39.0**by)  # 39 to 1 are the odds of 2.5 %
+    # quantiles, in half the time of NumPy's own
+    asked, ranks = (tail, 0.025, 0.5, 0.975, 1.0 - tail), np.linspace(0.0, 1.0, len(drawn))
+    low, usual_low, middle, usual_high, high = np.interp(asked, ranks, np.sort(drawn))
+    # each stays in its place: a correlation takes draws of mean and power in pairs
+    below, above = (middle - low) / (middle - usual_low), (high - middle) / (usual_high - middle)
+    return np.asarray(middle + (drawn - middle) * np.where(drawn < middle, below, above))
 
 
 def memory_share(values: FloatArray) -> float:
@@ -186,10 +215,11 @@ def mean_draws(values: FloatArray, kind: Kind = "mean") -> FloatArray:
         return np.zeros(2 * _PAIRS)
     slow = cosine_terms(values).slow
     known = memories(len(slow))
-    index, scale = _picked(slow, kind)
-    centre = -(known.slope[index] @ slow)
+    index, scale, stretch = _picked(slow, kind)
+    centre = -(known.slope @ slow)[index]
     reach = np.sqrt(scale * known.variance[index]) * _random(len(slow))[2]
-    return np.asarray(np.concatenate([centre + reach, centre - reach]))
+    drawn = np.concatenate([centre + reach, centre - reach])
+    return drawn if kind == "ratio" else _stretched(drawn, stretch)
 
 
 def heavy_tails(values: FloatArray) -> float:
@@ -203,7 +233,8 @@ def heavy_tails(values: FloatArray) -> float:
     square = max((np.square(e) for e in both), key=lambda e: float(e @ e) / max(float(e.mean()) ** 2, 1e-300))
     # a short normal sequence shows heavy tails by chance: only what is beyond half of its spread counts
     excess = float(square @ square) / n / max(float(square.mean()) ** 2, 1e-300) - 3.0 - np.sqrt(6.0 / n)
-    return float(np.sqrt(max(excess, 0.0) / n))
+    # a long sequence has met the rare large errors that a short one lacks: sharper by its length, found as CALM was
+    return float(np.sqrt(max(excess, 0.0) / n) * (300.0 / n) ** 0.1)
 
 
 def power_draws(values: FloatArray) -> FloatArray:
@@ -219,10 +250,11 @@ def power_draws(values: FloatArray) -> FloatArray:
     if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
     terms = cosine_terms(values)
-    index, scale = _picked(terms.slow, "power")
+    index, scale, stretch = _picked(terms.slow, "power")
     *_, normal, second_normal = _random(len(terms.slow))
     third = 2.0 / (9.0 * terms.fast_freedom)
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
     tails = np.exp(heavy_tails(values) * np.where(normal > 0.0, CALM, 1.0) * normal)
-    return np.tile((scale * memories(len(terms.slow)).power[index] + fast) * tails, 2)
+    drawn = (scale * memories(len(terms.slow)).power[index] + fast) * tails
+    return np.tile(np.exp(_stretched(np.log(drawn), stretch)), 2)

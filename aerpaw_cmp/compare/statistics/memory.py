@@ -121,7 +121,7 @@ def weights(kind: Kind) -> FloatArray:
 
 @cache
 def stretches(kind: Kind) -> FloatArray:
-    """What each memory (2, m) adds to the stretch of draws, times its share by the weights, and without weights."""
+    """Stretch of the draws (2, m) that each memory asks for by its weighted share, and adds by its share without."""
     if kind == "ratio":  # its weights alone hold false verdicts below 5 %
         return np.repeat([[1.0], [0.0]], len(weights(kind)), axis=1)
     return 0.01 * _table(f"{kind} stretch").reshape(2, -1)

@@ -33,6 +33,7 @@ from aerpaw_cmp.compare.statistics.memory import (
 )
 
 TAIL, STEEP, ROUNDS = 0.025, 5.0, 2
+LIMIT = logit(TAIL)
 SMOOTH = np.array([1.8e-4, 2.7e-3, 2.7e-3])[:, None, None]  # of the weights, of both stretches
 # Coverage aimed at; price of the width; price of a coverage that is too large, over that of one too small; distance
 # from the aim at which a cell counts twice what its square says, so that none pays for the others.
@@ -103,27 +104,29 @@ def scaled(parts: tuple[FloatArray, FloatArray, FloatArray], of_coverage: float,
     return likelihood, below, width / np.median(width.min(axis=1)), of_coverage, of_width
 
 
+def shares(likelihood: FloatArray, log_weight: FloatArray) -> list[FloatArray]:
+    """Posterior shares (count, memories) with weights and without."""
+    return [p / p.sum(axis=1, keepdims=True) for p in (likelihood * np.exp(log_weight - log_weight.max()), likelihood)]
+
+
 def loss(tables: FloatArray, made: list[Cell], kind: str) -> tuple[float, FloatArray]:
     """Sum to be minimised, and its gradient, by logarithms of weights and both stretches (3, memories)."""
     aim, price, idle, far = AIM[kind]
     log_weight, own, even = tables
-    prior, total, gradient = np.exp(log_weight - log_weight.max()), 0.0, np.zeros(tables.shape)
+    total, gradient = 0.0, np.zeros(tables.shape)
     for likelihood, below, width, weight, of_width in made:
-        share, flat = (np.asarray(p / p.sum(axis=1, keepdims=True)) for p in (likelihood * prior, likelihood))
+        share, flat = shares(likelihood, log_weight)
         chance = np.clip((share * below).sum(axis=1), 1e-7, 1 - 1e-7)
-        edge = logit(TAIL) * (share @ own + flat @ even)
+        edge = np.minimum(LIMIT * (share @ own + flat @ even), -1.0)  # a search may try ends beyond the middle
         over, under = (expit(STEEP * (sign * logit(chance) - edge)) for sign in (1.0, -1.0))
         excess = (over * under).mean() - aim
         cost = weight * (1.0 if excess < 0.0 else idle)
         pull = cost * (2.0 * excess + 4.0 * excess**3 / far**2) * STEEP * over * under / len(chance)
-        by_chance, by_stretch = (
-            pull * (under - over) / (chance * (1.0 - chance)),
-            pull * (over + under - 2.0) * logit(TAIL),
-        )
+        by_chance, by_stretch = pull * (under - over) / (chance * (1.0 - chance)), pull * (over + under - 2.0) * LIMIT
         size, tail, dear = (share * width).sum(axis=1), expit(edge), of_width * price / len(chance)
         reach = -ndtri(tail)  # standard deviations from the middle of a normal distribution
         total += cost * (excess**2 + excess**4 / far**2) + dear * (0.5 * np.log(size) + np.log(reach)).sum()
-        by_stretch -= dear * tail * (1.0 - tail) / norm.pdf(reach) / reach * logit(TAIL)
+        by_stretch -= dear * tail * (1.0 - tail) / norm.pdf(reach) / reach * LIMIT
         by_share = by_chance[:, None] * below + by_stretch[:, None] * own
         by_share += 0.5 * dear * width / size[:, None]
         gradient[0] += (share * (by_share - (share * by_share).sum(axis=1, keepdims=True))).sum(axis=0)
@@ -145,8 +148,7 @@ def main() -> None:
     arguments = parser.parse_args()
     kind, named = arguments.kind, dict(cells(arguments.kind, arguments.sequences))
     best, counts = np.array([np.log(weights(kind)), *stretches(kind)]), dict.fromkeys(named, 1.0)
-    fitted = slice(1, 3) if arguments.stretch else slice(0, 1)
-    covered = dict.fromkeys(named, 95.0)
+    fitted, covered = slice(1, 3) if arguments.stretch else slice(0, 1), dict.fromkeys(named, 95.0)
 
     def scored(parts: FloatArray, made: list[Cell]) -> tuple[float, FloatArray]:
         best[fitted] = parts.reshape(-1, best.shape[1])
@@ -158,9 +160,8 @@ def main() -> None:
         parts = minimize(scored, best[fitted].ravel(), (made,), "L-BFGS-B", jac=True, options={"maxiter": 100}).x
         best[fitted] = parts.reshape(-1, best.shape[1])
         for name, (likelihood, below, *_) in named.items():
-            share, flat = likelihood * np.exp(best[0] - best[0].max()), likelihood
-            share, flat = (p / p.sum(axis=1, keepdims=True) for p in (share, flat))
-            chance, tail = (share * below).sum(axis=1), expit(logit(TAIL) * (share @ best[1] + flat @ best[2]))
+            share, flat = shares(likelihood, best[0])
+            chance, tail = (share * below).sum(axis=1), expit(LIMIT * (share @ best[1] + flat @ best[2]))
             covered[name] = 100 * ((chance > tail) & (chance < 1 - tail)).mean()
             counts[name] *= 1.0 + max(92.8 - covered[name], covered[name] - 96.9, 0.0)
     for name, percent in covered.items():

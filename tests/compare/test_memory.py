@@ -110,13 +110,11 @@ def test_draws_are_spread_as_their_distributions() -> None:
 @pytest.mark.parametrize("by", [0.7, 1.0, 1.5])
 def test_a_stretch_moves_the_ends_of_an_interval_and_leaves_every_draw_in_its_place(by: float) -> None:
     drawn = np.random.default_rng(4).normal(size=4096) ** 3
-    stretched = memory._stretched(drawn, by)
-    tail = 1.0 / (1.0 + 39.0**by)  # the odds of 2.5 %, to that power
+    stretched, tail = memory._stretched(drawn, by), 1.0 / (1.0 + 39.0**by)  # the odds of 2.5 %, to that power
     np.testing.assert_allclose(
         np.quantile(stretched, [0.025, 0.975]), np.quantile(drawn, [tail, 1.0 - tail]), rtol=0.02
     )
     assert (np.diff(stretched[np.argsort(drawn)]) >= 0.0).all()
-    np.testing.assert_allclose(memory._stretched(-drawn, by), -stretched, atol=1e-9)
 
 
 @pytest.mark.parametrize("keep", [0.0, 0.5, 0.9, 0.99, 1.0])

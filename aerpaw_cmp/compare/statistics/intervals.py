@@ -77,11 +77,6 @@ class Autocorrelation:
     variance_factor: float
 
     @property
-    def blocks(self) -> float:
-        """Blocks that fit into the sequence."""
-        return self.n / self.block_length if self.block_length else 0.0
-
-    @property
     def half_width(self) -> float:
         """Half width of a 95 % interval per bootstrap standard deviation.
 
@@ -89,7 +84,7 @@ class Autocorrelation:
         """
         from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
 
-        blocks = max(self.blocks, 2.0)
+        blocks = max(self.n / max(self.block_length, 1), 2.0)
         unsure = 1.0 + _UNSURE / self.n_effective if self.n_effective > 0 else 1.0
         return float(stdtrit(blocks - 1.0, 0.975) * np.sqrt(unsure * self.variance_factor * blocks / (blocks - 1.0)))
 
@@ -511,7 +506,8 @@ def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_of
     bounds, squares, spread, chance = NO_INTERVAL, NO_INTERVAL, nan, 1.0
     if len(first) >= FEWEST:
         drawn = square - other_square + mean_draws(undecided(first, second), "ratio")
-        squares = _ends(drawn)
+        low, high = np.quantile(drawn, [0.025, 0.975])
+        squares = float(low), float(high)
         scale = max(rmse + other_rmse, 1e-300)
         bounds = squares[0] / scale, squares[1] / scale
         if bounds[0] <= 0.0 <= bounds[1] and (bounds[0] < -other_rmse or bounds[1] > rmse):
@@ -592,11 +588,6 @@ def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | 
             break
         tried.discard(names[i])
     return out
-
-
-def _ends(drawn: FloatArray) -> Interval:
-    low, high = np.quantile(drawn, [0.025, 0.975])
-    return float(low), float(high)
 
 
 def paired_verdict(low: float, high: float) -> Literal["better", "worse", "not significant", "no interval"]:

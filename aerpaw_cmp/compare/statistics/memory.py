@@ -107,7 +107,6 @@ def _exponential(rate: complex, terms: int) -> ComplexArray:
     return np.asarray((np.diag(rate * np.where(order == 0, 2.0, 1.0) / pole) - ends) * np.outer(scale, scale))
 
 
-@cache
 def _table(name: str) -> FloatArray:
     return np.array(json.loads(_TABLES.read_text(encoding="utf-8"))[name], dtype=np.float64)
 

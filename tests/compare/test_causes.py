@@ -72,6 +72,9 @@ def test_the_clock_has_the_lag_of_its_judgement_and_no_other() -> None:
     assert (both.name, both.channels) == ("clock", ("LW1 A",)), "the sentence of one clock is not said of another"
     for clock in (None, _clock(4.0, "cannot tell"), _clock(4.0, "ok"), _clock(4.0, "shifted", APPLIED)):
         assert _named(replace(sound, measured_db=late, clock=clock)) != "clock"
+    for lag_s in (-20.0, 25.0):  # further off than is looked: nor is any other trouble
+        change = np.interp(sound.time_s - lag_s, sound.time_s, sound.predicted_db) - sound.predicted_db
+        assert _named(replace(sound, measured_db=sound.measured_db + change)) == NONE
 
 
 def _planted() -> dict[str, LevelEvidence]:
@@ -171,11 +174,10 @@ def test_a_flat_level_is_neither_floor_nor_saturation(spread_db: float) -> None:
     assert "stays at \N{MINUS SIGN}90 dB" in cause.sentence
 
 
-@pytest.mark.parametrize("share", [0.4, 0.5])
-def test_what_is_left_above_a_floor_is_no_ceiling_and_no_other_trouble(share: float) -> None:
+def test_what_is_left_above_a_floor_is_no_ceiling_and_no_other_trouble() -> None:
     """A second run, with the floor of the first: of the low links those that fade upwards remain."""
     sound = _sound()
-    floor = np.quantile(sound.measured_db, share)
+    floor = np.quantile(sound.measured_db, 0.4)
     shown = floor + 10.0 * np.log10(1.0 + 10.0 ** (0.1 * (sound.measured_db - floor)))
     assert _named(replace(sound, measured_db=np.where(shown > floor + 3.0, shown, np.nan), floored=True)) == NONE
 
@@ -183,9 +185,8 @@ def test_what_is_left_above_a_floor_is_no_ceiling_and_no_other_trouble(share: fl
 def test_an_attitude_that_is_not_used_is_no_turned_antenna() -> None:
     """Flown with a steady yaw, both explain the level; only one of them is in the settings."""
     sound, turn = _sound(), _sound().turned_db[90.0]
-    for seed in range(3):
-        logged = {"logged": turn + np.random.default_rng(seed).normal(0.0, 0.05, 300)}
-        assert _named(replace(sound, measured_db=sound.measured_db + turn, attitude_db=logged)) == "attitude"
+    logged = {"logged": turn + np.random.default_rng(0).normal(0.0, 0.05, 300)}
+    assert _named(replace(sound, measured_db=sound.measured_db + turn, attitude_db=logged)) == "attitude"
 
 
 def test_two_channels_are_one_flight_and_a_second_trouble_hides_none() -> None:
@@ -241,18 +242,19 @@ def test_situations_of_the_benchmark_are_named() -> None:
     assert sum(name != NONE for _, name in wrong) <= 1, wrong
 
 
-@pytest.mark.parametrize(
-    ("height", "speed", "meant"),
-    [(1.0, 1.0, ""), (3.28, 1.0, "are in feet"), (0.305, 1.0, "were divided by 3.28"), (1.0, 3.28, "")],
-)
-def test_heights_of_another_unit_are_told_by_the_vertical_speed(height: float, speed: float, meant: str) -> None:
+def test_heights_of_another_unit_are_told_by_the_vertical_speed() -> None:
     """Speeds in feet are so along the ground, too, and say nothing about heights."""
     data = next((Path(__file__).parents[2] / "sample_logs" / "UAV").glob("*vehicleOut.txt")).read_bytes()
     stream = identify(data).read(data, ReadOptions(timezone="America/New_York")).streams[0]
-    scale = {"altitude_m": height} | dict.fromkeys([f"velocity_{way}_mps" for way in ("north", "east", "down")], speed)
-    other = {name: stream.frame[name] * factor for name, factor in scale.items()}
-    told = heights_meant(replace(stream, frame=stream.frame.assign(**other)))
-    assert told == (f"the logged heights {meant}" if meant else "")
+    for height, speed, meant in (
+        (1.0, 1.0, ""),
+        (3.28, 1.0, "in feet"),
+        (0.305, 1.0, "divided by 3.28"),
+        (1.0, 3.28, ""),
+    ):
+        other = stream.frame.assign(altitude_m=stream.frame["altitude_m"] * height)
+        other[[name for name in other if name.startswith("velocity")]] *= speed
+        assert heights_meant(replace(stream, frame=other)).removeprefix("the logged heights ") == meant
 
 
 LOADED = autopilots.VOLTS

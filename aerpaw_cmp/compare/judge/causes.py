@@ -270,7 +270,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         with_it, without = ([odds[some] for some in odds if (name in some) == side] for side in (True, False))
         lead[name] = float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without))
     least, named = _MARGIN + math.log(max(len(channels), 1)), {}
-    for name in (trouble for trouble in best if lead[trouble] >= least):
+    for name in (trouble for trouble in best - {_UNNAMED} if lead[trouble] >= least):
         shown = [table for table in tables if name in _names(_best(table, best))]
         # the clearest channel gives the words
         shown.sort(key=lambda table: -_best(table, {name}).gain)
@@ -281,7 +281,9 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         if name in _OF_ANTENNA and any(table[_SOUND].evidence.antenna == "learned" for table in shown):
             certain, least_share = False, _LEARNED_SHARE
         fall_db = (1.0 - alone) * _rmse_db([table[_SOUND] for table in shown])
-        if name == _CATCH_ALL and not all(_tells_more(table[frozenset([name])]) for table in shown):
+        alone_models = [table[frozenset([name])] for table in shown]
+        # a log of noise alone likes another antenna better, too: it must leave less than a constant level does
+        if name == _CATCH_ALL and any(m.residual_db.std() >= m.evidence.measured_db.std() for m in alone_models):
             continue
         # a floor that the settings leave out explains why the low links that are left look too strong, and is known
         known = name == "floor" and shown[0][_SOUND].evidence.floored
@@ -304,11 +306,6 @@ def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
         if learned.log_likelihood > sound.log_likelihood + _SELDOM and fall_db >= _SHOWN_DB:
             return True
     return False
-
-
-def _tells_more(model: _Model) -> bool:
-    """Check that a model leaves less than a constant level: a log of noise alone likes another antenna better, too."""
-    return bool(model.residual_db.std() < model.evidence.measured_db.std())
 
 
 def _names(model: _Model) -> frozenset[str]:
@@ -586,7 +583,7 @@ _LEAST_VARIANCE = 1e-12
 
 
 def _clock(e: LevelEvidence) -> Iterator[Trial]:
-    """The lag that the judgement of the radio clock has, and no other."""
+    """The lag that the judgement of the radio clock has; else the likeliest, for which there are no words."""
     if e.clock is not None and e.clock.shifted:
         lag = e.clock.radio_minus_telemetry_s
         late = np.interp(e.time_s - lag, e.time_s, e.predicted_db)
@@ -594,6 +591,17 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
             name="clock", cost=0.0, sentence=f"the radio clock is {e.clock.in_words}", next_step="`rss: {lag: apply}`",
             change_db=late - e.predicted_db, estimate=(lag, *e.clock.ci95_s),
         )  # fmt: skip
+        return
+    # a clock may be further off than was looked, or hidden by another trouble: what else fits is no cause then
+    levels = np.array([np.interp(e.time_s - lag, e.time_s, e.predicted_db) for lag in _LAGS_S])
+    left = (e.measured_db - levels)[:, 1:] - _SEARCHED_PHI[1] * (e.measured_db - levels)[:, :-1]
+    gain = -0.5 * left.shape[1] * np.log(left.var(axis=1) + _LEAST_VARIANCE)
+    cost, change_db = _concentration(gain, np.ones(len(gain))), levels[gain.argmax()] - e.predicted_db
+    yield Trial(name=_UNNAMED, cost=cost, sentence="", next_step="", change_db=change_db)
+
+
+# A rival that is no trouble by itself, and lags of a clock that nobody judged.
+_UNNAMED, _LAGS_S = "", np.arange(-60.0, 61.0, 2.0)
 
 
 def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: _Memories = _START) -> Trial:
@@ -759,7 +767,7 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
 
 def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     """Decibels of an amplitude as if it were a power, or the reverse; none where any other slope is likelier."""
-    any_slope = Trial(name="", cost=0.0, sentence="", next_step="", columns=_SLOPE * e.predicted_db[:, None])
+    any_slope = Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=_SLOPE * e.predicted_db[:, None])
     # what is left above a floor changes by fewer decibels than the link
     least = math.inf if e.floored else _fitted(e, any_slope, climb=False).log_likelihood
     for factor, words in ((0.5, "half"), (2.0, "twice")):

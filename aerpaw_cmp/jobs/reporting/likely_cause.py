@@ -131,6 +131,7 @@ _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
 def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: RssResult) -> LevelEvidence:
     link = _Direct(data.site, series.tower, replayed)
+    known_db = link.level_db
     time_s = rss.seconds(series.time)
     order = np.argsort(time_s, kind="stable")
 
@@ -138,7 +139,7 @@ def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: R
         return replayed.spread(values)[order]
 
     def changed(levels_db: Mapping[_Key, FloatArray]) -> dict[_Key, FloatArray]:
-        return {key: at_samples(level - link.level_db) for key, level in levels_db.items()}
+        return {key: at_samples(level - known_db) for key, level in levels_db.items()}
 
     directions = link.directions(link.place_m, replayed.poses.position_m, replayed.poses.rotation)
     predicted = result.simulated_dbm[order]

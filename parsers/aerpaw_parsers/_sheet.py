@@ -630,7 +630,7 @@ def _zone_beside(sheet: Sheet, column: int, zone: str, texts: list[str], options
         sheet.notes[column] = f"column {sheet.names[column]!r}: {unknown[:30]!r} is no zone that is known: not used"
     elif zone and word and word != zone:
         sheet.notes[column] = f"column {sheet.names[column]!r} says {word}, the name of the times {zone}: read so"
-    elif word and options.timezone not in (None, word) and not all(map(_NUMBER.fullmatch, texts[:3])):
+    elif word and options.timezone not in (None, word) and not all(map(_DATED.fullmatch, texts[:3])):
         text = f"column {sheet.names[column]!r} gives the zone of the times, {word}: --timezone is for times without"
         sheet.notes[column] = text
     if zone or len({*known.values()}) == 1:
@@ -640,6 +640,8 @@ def _zone_beside(sheet: Sheet, column: int, zone: str, texts: list[str], options
     return "", [text if _NUMBER.fullmatch(text) else f"{text} {own}".strip() for text, own in both]
 
 
+# Epochs, and times with an offset of their own.
+_DATED = re.compile(r"\d{9,}[.,]?\d*|.*\d(?:Z|[+-]\d\d:?\d\d)")
 _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
 # The order that a name gives: 'date (dd/mm/yyyy)'.
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")

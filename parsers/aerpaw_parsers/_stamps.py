@@ -346,7 +346,11 @@ def read(
     warnings : list of str
     """
     texts = [text.replace("\u202f", " ").replace("\xa0", " ") for text in texts]  # in front of AM, as browsers write it
-    shown = [text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else text.strip() for text in texts]
+    # Java writes the place behind the offset: 10:00-04:00[America/New_York]
+    place = re.compile(r"\[\w+/[\w/]+\]$")
+    shown = [
+        text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else place.sub("", text.strip()) for text in texts
+    ]
     filled = [text for text in shown if text]
     if 2 * sum((match := _COMPACT.fullmatch(text)) is not None and bool(match[1] or zone) for text in filled) > len(
         filled

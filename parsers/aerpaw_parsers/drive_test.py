@@ -275,8 +275,8 @@ _FROM_ZERO = re.compile(r"\b(zero|0) ?based\b|\bminus ?(1|one)\b|\bfrom ?(0|zero
 def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> Stream | None:
     values, name = sheet.numbers(column), sheet.plain[column]
     meaning, about = sheet.meanings[column], {"node": f"LW{tower[1]}"} if (tower := _TOWER.search(name)) else {}
-    if meaning is not None and meaning.place.startswith("cell"):
-        about |= {"cell": meaning.place, "part": meaning.place}  # no second reading of the first cell
+    if meaning is not None and meaning.place.startswith("cell") and "cell" in name:
+        about |= {"cell": meaning.place, "part": meaning.place}  # no second reading of the first, as 'rsrp 2' may be
     if tower and name == f"snr {tower[0]}":
         return _rows.snr(rows, about["node"], values)
     where, unit = np.isfinite(values), sheet.unit_read(column)

@@ -567,9 +567,8 @@ def _report(path: Path) -> None:
 _VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
 PLY = (
     b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n"
-    b"element face 1\nproperty list uint int vertex_indices\nend_header\n"
-    + _VERTICES + struct.pack("<I3i", 3, 0, 1, 2)
-)  # fmt: skip
+    b"element face 1\nproperty list uint int vertex_indices\nend_header\n" + _VERTICES + struct.pack("<I3i", 3, 0, 1, 2)
+)
 PLAN = json.dumps({
     "fileType": "Plan", "mission": {"firmwareType": 3, "plannedHomePosition": [35.7275, -78.696, 100], "items": [
         {"command": 16, "frame": 3, "params": [0, 0, 0, None, 35.7275, -78.696, 40], "type": "SimpleItem"},

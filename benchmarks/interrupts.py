@@ -58,7 +58,7 @@ CASES = {
     "site export": "site export lake_wheeler -o out",
     "modem-sim": "modem-sim --link modem --flight {0}/sample/flight.yaml --telemetry track.txt",
     "tap": "tap {0}/modem -o taplog --web 127.0.0.1:0",
-}  # fmt: skip
+}
 
 
 def fence(corners: int, spread: float) -> str:

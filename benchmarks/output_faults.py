@@ -123,9 +123,7 @@ def make_inputs(folder: Path, wanted: list[str] | None = None) -> dict[str, Job]
 
 def _buildings(count: int) -> dict[str, Any]:
     square = ((0, 0), (0, 1), (1, 1), (1, 0), (0, 0))
-    corners = [
-        [[-78.7 + (2 * i + a) * 1e-4, 35.727 + b * 1e-4] for a, b in square] for i in range(count)
-    ]  # fmt: skip
+    corners = [[[-78.7 + (2 * i + a) * 1e-4, 35.727 + b * 1e-4] for a, b in square] for i in range(count)]
     return {
         "type": "FeatureCollection",
         "features": [
@@ -299,9 +297,7 @@ class Runs:
         digests = self.content()
         if not os.path.lexists(self.target) or not digests:
             return "the output that was there is gone" if before else None
-        variants = [
-            v for v in VARIANTS if all(digests[n] == d for n, d in self.stable[v].items() if n in digests)
-        ]  # fmt: skip
+        variants = [v for v in VARIANTS if all(digests[n] == d for n, d in self.stable[v].items() if n in digests)]
         if not variants:
             return "files of two runs"
         return self._wrong_file() if self.job.kind == "file" else self._wrong_folder(digests)

@@ -538,9 +538,7 @@ def _fitted(rows: list[tuple[int, list[str]]], names: list[str]) -> list[tuple[i
     return rows
 
 
-def rows(
-    sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None
-) -> _rows.Rows | None:  # fmt: skip
+def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None = None) -> _rows.Rows | None:
     """Rows of a table with their times; None where no column is one of times.
 
     Parameters
@@ -712,10 +710,10 @@ def _refuse_shifted(columns: Sequence[tuple[str, dictionary.Quantity, FloatArray
     # three rows or a twentieth: fewer are damaged, not shifted
     few = max(3, len(count) // 20)
     alone = [
-        mask for name, values, mask in wrong
-        if "pci" in name.lower()
-        and ((mask & (values < 0)).sum() >= few or 2 * mask.sum() > np.isfinite(values).sum())
-    ]  # fmt: skip
+        mask
+        for name, values, mask in wrong
+        if "pci" in name.lower() and ((mask & (values < 0)).sum() >= few or 2 * mask.sum() > np.isfinite(values).sum())
+    ]
     if not alone and (count > 1).sum() < few:
         return
     row = int(np.argmax(alone[0] if alone else count > 1))

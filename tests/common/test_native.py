@@ -88,9 +88,9 @@ def hostile(folder: Path) -> dict[str, bytes]:
     made["one_large.h5"] = hdf5(lambda book: flight(book).create_dataset("C00000", (1 << 40,), "f8", chunks=(1 << 20,)))
     made["circle.h5"] = hdf5(lambda book: flight(book).__setitem__("again", book["files"]))
     body = zlib.compress(struct.pack("<II", 14, 1 << 30) + bytes(1 << 24), 1)
-    made["level_5_bomb.mat"] = b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + (
-        struct.pack("<II", 15, len(body)) + body
-    ) * 40  # fmt: skip
+    made["level_5_bomb.mat"] = (
+        b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + (struct.pack("<II", 15, len(body)) + body) * 40
+    )
     made["wide.tif"] = b"II*\0" + struct.pack("<IH", 8, 3) + b"".join(
         struct.pack("<HHII", tag, 4, 1, 2**31 - 1) for tag in (256, 257, 258)
     ) + bytes(4)  # fmt: skip

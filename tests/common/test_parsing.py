@@ -84,7 +84,7 @@ HOSTILE = {
     "receiver:json": nested('{"a":'),
     "mesh:ply": PLY[:-16] + b"\xff" * 16,
     "scene:xml": b"<scene>" + b"<shape>" * 20_000,
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("name", HOSTILE)

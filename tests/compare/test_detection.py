@@ -109,9 +109,7 @@ def test_every_score_is_that_by_hand(learned: bool) -> None:
     time, free = time + 5.0, simulated + np.cos(time)
     simulated[7], time[9], measured[11] = np.nan, np.nan, np.nan
     forecast = DetectionForecast(level_db=-56.0, per_db=0.25, share=0.4) if learned else None
-    score = score_detection(
-        time, measured, simulated, detected, floor_db=FLOOR, free_space_db=free, forecast=forecast
-    )  # fmt: skip
+    score = score_detection(time, measured, simulated, detected, floor_db=FLOOR, free_space_db=free, forecast=forecast)
     assert score is not None
     ok = np.isfinite(simulated) & np.isfinite(time)
     seen, level = detected[ok], simulated[ok]

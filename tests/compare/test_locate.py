@@ -36,10 +36,7 @@ def _prior(track: LevelTrack, place: FloatArray) -> tuple[FloatArray, FloatArray
         away = float(np.sqrt(((here - place) ** 2).sum()))
         up = np.arcsin((here[2] - place[2]) / away)
         mean.append(middle - 30.0 * np.log10(away / 100))
-        rows.append(
-            [100.0, -10.0 * np.log10(away / 100), 5.0 * np.sin(up) ** 2,
-             2.5 * np.cos(4 * up)]
-        )  # fmt: skip
+        rows.append([100.0, -10.0 * np.log10(away / 100), 5.0 * np.sin(up) ** 2, 2.5 * np.cos(4 * up)])
     return np.array(mean), cover + np.array(rows) @ np.array(rows).T
 
 

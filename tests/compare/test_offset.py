@@ -98,7 +98,7 @@ def test_nothing_known_is_no_number_and_no_edge():
     for fit in (
         grid_offset([NAN], [1.0]),
         *pooled_offsets({("f", "t", "c"): ([NAN], [1.0])}).values(),
-    ):  # fmt: skip
+    ):
         assert np.isnan([fit.offset_db, fit.rmse_db]).all()
         assert (fit.n, fit.at_edge) == (0, False)
 

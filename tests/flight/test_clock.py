@@ -31,9 +31,7 @@ STEP_S = 0.1
 GRID = np.arange(0.0, 500.0, STEP_S)
 
 
-CORNERS = np.array([
-    [(-1) ** i * 180.0 + 12.0 * (i % 3), -190.0 + 32.0 * i, 42.0 + 6.0 * (i % 4)] for i in range(12)
-])  # fmt: skip
+CORNERS = np.array([[(-1) ** i * 180.0 + 12.0 * (i % 3), -190.0 + 32.0 * i, 42.0 + 6.0 * (i % 4)] for i in range(12)])
 REACHED_S = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(CORNERS, axis=0), axis=1) / 8.2)])
 
 

@@ -179,9 +179,7 @@ def test_files_hold_the_route_that_was_planned(tmp_path: Path):
         Waypoint(east_m=120.0, north_m=-40.0, height_m=35.0, yaw_deg=270.0, hold_s=8.0),
         Waypoint(east_m=130.0, north_m=200.0, height_m=45.0, yaw_deg=10.0),
     ]
-    for name, text in (
-        ("a.plan", plan_text(ways, frame, 8.0)), ("a.csv", waypoints_csv(ways, frame))
-    ):  # fmt: skip
+    for name, text in (("a.plan", plan_text(ways, frame, 8.0)), ("a.csv", waypoints_csv(ways, frame))):
         (tmp_path / name).write_text(text)
         table = read_route(tmp_path / name)
         east, north = frame.to_local(table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy())

@@ -170,7 +170,7 @@ REPAIRED = {
     "a chunk of an axis": (rewrite("x/c/0", b"cut"), []),
     "metadata are gone": (lambda store: (store / "rank/zarr.json").unlink(), []),
     "attributes": (change_metadata("rank/zarr.json", attributes={"units": "furlong"}), []),
-}  # fmt: skip
+}
 PICKLE = [{"name": "numcodecs.pickle", "configuration": {"protocol": 5}}]
 # Metadata that this job does not write.
 REFUSED = {
@@ -184,7 +184,7 @@ REFUSED = {
     "another type": (change_metadata("rank/zarr.json", data_type="float64"), "data_type in rank/zarr.json"),
     "another shape": (change_metadata("rank/zarr.json", shape=[1 << 40] * 6), "shape in rank/zarr.json"),
     "other chunks": (change_metadata(f"{LEDGER}/zarr.json", chunk_grid={}), f"chunk_grid in {LEDGER}/zarr.json"),
-}  # fmt: skip
+}
 
 
 @pytest.fixture(scope="module")

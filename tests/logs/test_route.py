@@ -128,9 +128,9 @@ def test_landings_returns_and_heights_above_ground(tmp_path: Path) -> None:
     route = read_route(file)
     assert route["altitude_m"].tolist() == [40.0, 40.0, 0.0]
     assert route[["latitude_deg", "longitude_deg"]].iloc[2].tolist() == [*POINTS[1][:2]]
-    assert [word for word in ("return", "above the ground") if any(word in text for text in route.attrs["remarks"])] == [
-        "return", "above the ground"
-    ]  # fmt: skip
+    assert [
+        word for word in ("return", "above the ground") if any(word in text for text in route.attrs["remarks"])
+    ] == ["return", "above the ground"]
 
 
 def test_a_table_with_its_own_yaw(tmp_path: Path) -> None:

@@ -23,7 +23,7 @@ OPTIONS = ReadOptions(
     timezone="America/New_York", time_origin="2025-03-02T15:00:00Z", kind="rss",
     columns={"time": "Time", "rss_db": "Level"}, unit="dBm",
     file_name="results_3320000000.0_2000000.0_2025_03_02_10_00_00_250.mat",
-)  # fmt: skip  # fmt: skip
+)  # fmt: skip
 
 
 def sounder_log(count: int) -> bytes:
@@ -150,4 +150,4 @@ WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
     "ardupilot_bin", "mavlink_tlog", "px4_ulog",
     ("vehicle_out", "utc_offset"), ("flight_mat", "lte"), ("flight_mat", "processed"), ("gpx", "track"),
     ("drive_test", "srsue_metrics"), ("pose_csv", "airdata"), ("srsran_gnb", "log"), ("oai_log", "frames"), ("oai_log", "ue"),
-)  # fmt: skip  # fmt: skip
+)  # fmt: skip

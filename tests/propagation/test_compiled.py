@@ -527,7 +527,7 @@ DAMAGED = {
     "a program": lambda place, _: place.write_bytes(pickle.dumps(_Ends())),
     "gone": lambda place, _: place.unlink(),
     "a folder": lambda place, _: (place.unlink(), place.mkdir()),
-}  # fmt: skip
+}
 
 
 class _Ends:

@@ -148,7 +148,7 @@ def test_the_picture_lies_where_the_values_do(driver, data, scheme, begun):
         "const p = mapExplorer.project(), c = document.getElementById('map'), pen = c.getContext('2d'), k = c.width / c.clientWidth; "
         "return arguments[0].map(([e, n]) => Array.from(pen.getImageData(Math.round(p.x(e) * k), Math.round(p.y(n) * k), 1, 1).data).slice(0, 3))",
         [[-405.0, -630.0], [405.0, -630.0], [-405.0, 630.0], [405.0, 930.0]],
-    )  # fmt: skip
+    )
     set_scheme(driver)
     ends = driver.execute_script("return mapExplorer.limits()")
     layer = of(data, "LW4", "SISO", "none", 30.0)

@@ -144,7 +144,7 @@ CAUSE = Cause(
     name="made",
     sentence=f"Likely cause at LW1 USRP1:{' long' * 9}; RMSE 2.5 dB with it.",
     next_step="a step that has no more words than nine",
-)  # fmt: skip
+)
 
 
 def with_cause(data):

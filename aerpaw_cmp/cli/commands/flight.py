@@ -207,7 +207,7 @@ def calibrate(
         table(heads, rows, "Scores on what was left out, means")
     forecasts = [
         {**forecast, "split": split.replace("_", " ")} for split, scores in m["rank"].items() for forecast in scores
-    ]  # fmt: skip
+    ]
     columns = {
         "left out": "split", "flight": "flight", "tower": "tower", "kappa": "kappa:.3f", "agree": "agreement:.3f",
         "commonest": "majority_agreement:.3f", "log score": "log_score:.3f", "constant": "constant_log_score:.3f",

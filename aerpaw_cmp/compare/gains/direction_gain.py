@@ -150,9 +150,7 @@ class Term:
     sd_db: float
 
 
-ANTENNA_TERMS = (
-    Term("body", "all", 1.0, 3.2), Term("mast", "antenna", 0.5, 3.4), Term("pair", "antenna", 0.35, 1.5)
-)  # fmt: skip
+ANTENNA_TERMS = (Term("body", "all", 1.0, 3.2), Term("mast", "antenna", 0.5, 3.4), Term("pair", "antenna", 0.35, 1.5))
 
 
 @dataclass(frozen=True, slots=True)

@@ -206,11 +206,9 @@ def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], li
             span_db=span,
         )
         pooled = [
-            dataclasses.replace(
-                row, pooled_offset_db=fits[row.key].offset_db, pooled_rmse_db=fits[row.key].rmse_db
-            )
+            dataclasses.replace(row, pooled_offset_db=fits[row.key].offset_db, pooled_rmse_db=fits[row.key].rmse_db)
             for row in members
-        ]  # fmt: skip
+        ]
         pooled_rows += pooled
         by_group: dict[str, list[RssRow]] = {}
         for row in pooled:

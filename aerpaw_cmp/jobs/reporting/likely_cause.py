@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Mapping, Sequence
 from typing import TypeVar
 
@@ -11,6 +10,7 @@ import numpy as np
 
 from ...common.units import FloatArray
 from ...compare.flight_verdict import without_copies
+from ...compare.gains.mount import turned
 from ...compare.judge.causes import OF_DIRECTION, Cause, LevelEvidence, flight_cause, gains_by_direction
 from ...compare.level import rss
 from ...compare.result import RssResult
@@ -190,14 +190,10 @@ class _Direct:
         """Levels where the heading is greater; none for isotropic antennas."""
         if not self._has_pattern:
             return {}
-        levels, poses = {}, self.replayed.poses
-        for angle in _ANGLES_DEG:
-            turn = math.radians(-angle)  # a heading grows clockwise
-            rotation = np.array(
-                [[math.cos(turn), -math.sin(turn), 0.0], [math.sin(turn), math.cos(turn), 0.0], [0.0, 0.0, 1.0]]
-            )
-            levels[angle] = self._level(self.place_m, poses.position_m, rotation @ poses.rotation)
-        return levels
+        place_m, poses = self.place_m, self.replayed.poses
+        # a heading grows clockwise, the angle of a mount the other way
+        turns = {angle: turned(-angle) @ poses.rotation for angle in _ANGLES_DEG}
+        return {angle: self._level(place_m, poses.position_m, rotation) for angle, rotation in turns.items()}
 
     def raised_db(self) -> dict[float, FloatArray]:
         """Levels where the UAV is higher, no lower than the ground."""
@@ -230,8 +226,8 @@ class _Direct:
             levels[meaning] = self._level(self.place_m, place, poses.rotation)
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
             for meaning in MISREAD:
-                turned = dataclasses.replace(track, rotation=data.track.rotations_if(meaning, time))
-                levels[meaning] = self._level(self.place_m, poses.position_m, attitude_rotation(turned, used))
+                other = dataclasses.replace(track, rotation=data.track.rotations_if(meaning, time))
+                levels[meaning] = self._level(self.place_m, poses.position_m, attitude_rotation(other, used))
         return levels
 
     def other_towers_db(self) -> dict[str, FloatArray]:

@@ -198,7 +198,7 @@ def _rss_columns(series: RssResult) -> dict[str, FloatArray]:
     return {
         **({} if series.stated is None else series.stated.columns(series.simulated_dbm)),
         **({} if series.tower_m is None else _places(series.tower_m, "tower_")),
-    }  # fmt: skip
+    }
 
 
 def _places(position_m: FloatArray, whose: str = "") -> dict[str, FloatArray]:

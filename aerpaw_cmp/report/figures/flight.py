@@ -201,9 +201,7 @@ def rss_over_time(data: ReportData, panel: RssResult) -> Figure:
     below.set_ylabel("Residual [dB]")
     time_axis(below, start)
     shown = legend_of(below, lambda label: label.startswith(("measured", "RMSE")))
-    below.legend(
-        *shown, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1
-    )  # fmt: skip
+    below.legend(*shown, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1)
     return fig
 
 

@@ -142,7 +142,7 @@ def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer],
         "quantities": quantities,
         "plots": [packed(chart.content, arrays) for chart in charts],
         "packed": arrays.content(),
-    }  # fmt: skip
+    }
 
 
 def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, stride: int) -> dict[str, Any]:

@@ -219,7 +219,7 @@ def _error(panels: Sequence[RssResult], pooled: FlightVerdict | None) -> Headlin
         value=f"{total:.1f} dB",
         interval="" if floor else _ends(panels),
         reference=best,
-    )  # fmt: skip
+    )
 
 
 def _interval(ends: Interval, form: str, unit: str = "") -> str:

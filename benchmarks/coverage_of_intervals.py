@@ -33,16 +33,17 @@ from aerpaw_cmp.compare.rank import compare_ranks
 from aerpaw_cmp.compare.statistics.intervals import (
     PairedDifference,
     corrected,
-    error_intervals,
+    mean_interval,
     paired_difference,
     pooled_difference,
+    spread_interval,
 )
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import correlated_noise
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 
-SHADOW_DB, OFFSET_DB, CHANNELS, APART_DB = 4.0, 7.3, 10, 0.3
+SHADOW_DB, CHANNELS, APART_DB = 4.0, 10, 0.3
 CUTS = np.array([-0.8, 0.5, 1.6])
 ASKED, NEAR = (0.92, 0.97), 8
 
@@ -194,8 +195,7 @@ def level_cell(shadowing: Shadowing, flights: int) -> dict[str, object]:
     ends = np.empty((0, 2, 2))
     for more in (flights, (NEAR - 1) * flights):
         errors = SHADOW_DB * shadowing.sequences(rng, more)
-        fits = (error_intervals(e - OFFSET_DB, np.zeros_like(e)) for e in errors)
-        ends = np.concatenate([ends, [[np.sort(np.subtract(fit.offset_db, OFFSET_DB)), fit.rmse_db] for fit in fits]])
+        ends = np.concatenate([ends, [[mean_interval(e), spread_interval(e)] for e in errors]])
         held = ((ends[..., 0] <= (0.0, truth)) & ((0.0, truth) <= ends[..., 1])).mean(axis=0)
         if not any(low < bound < high for low, high in (wilson(share, more) for share in held) for bound in ASKED):
             break

@@ -77,6 +77,12 @@ def test_the_clock_has_the_lag_of_its_judgement_and_no_other() -> None:
         assert _named(replace(sound, measured_db=sound.measured_db + change)) == NONE
 
 
+def test_a_prediction_that_ripples_has_no_lag_that_rivals_a_trouble() -> None:
+    """Shifted between its samples a ripple is smoother, and fits better from second to second; no level is nearer."""
+    sound = _sound()
+    assert not list(causes._clock(replace(sound, predicted_db=sound.predicted_db + 6.0 * np.sin(sound.time_s**2))))
+
+
 def _planted() -> dict[str, LevelEvidence]:
     sound, time = _sound(), np.arange(300.0)
     noise, level = sound.measured_db - sound.predicted_db, sound.measured_db

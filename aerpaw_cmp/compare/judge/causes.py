@@ -594,10 +594,19 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
         return
     # a clock may be further off than was looked, or hidden by another trouble: what else fits is no cause then
     levels = np.array([np.interp(e.time_s - lag, e.time_s, e.predicted_db) for lag in _LAGS_S])
+    nearer = _nearer(e, levels)
+    if not nearer.any():
+        return
     left = (e.measured_db - levels)[:, 1:] - _SEARCHED_PHI[1] * (e.measured_db - levels)[:, :-1]
-    gain = -0.5 * left.shape[1] * np.log(left.var(axis=1) + _LEAST_VARIANCE)
+    gain = np.where(nearer, -0.5 * left.shape[1] * np.log(left.var(axis=1) + _LEAST_VARIANCE), -np.inf)
     cost, change_db = _concentration(gain, np.ones(len(gain))), levels[gain.argmax()] - e.predicted_db
     yield Trial(name=_UNNAMED, cost=cost, sentence="", next_step="", change_db=change_db)
+
+
+def _nearer(e: LevelEvidence, level_db: FloatArray) -> BoolArray:
+    """Check which levels (..., n) take a share off the error: smoother ones may fade like the log, and be no nearer."""
+    error_db = (e.measured_db - e.predicted_db).std()
+    return np.asarray((e.measured_db - level_db).std(axis=-1) <= (1.0 - _LEAST_SHARE) * error_db)
 
 
 # A rival that is no trouble by itself, and lags of a clock that nobody judged.
@@ -776,7 +785,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
             sentence=f"the levels change by {words} the link's decibels",
             next_step="check: 10 lg of power, 20 lg of amplitude",
         )  # fmt: skip
-        if _fitted(e, trial, climb=False).log_likelihood > least:
+        if _nearer(e, factor * e.predicted_db) and _fitted(e, trial, climb=False).log_likelihood > least:
             yield trial
 
 

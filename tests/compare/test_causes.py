@@ -127,6 +127,12 @@ def test_each_trouble_comes_back_with_its_number_and_a_step(name: str) -> None:
         assert _named(replace(evidence, floored=True)) != "floor"
 
 
+def test_a_signal_below_the_noise_overloads_no_receiver() -> None:
+    evidence = _planted()["saturation"]
+    assert _named(replace(evidence, unit="dB", measured_db=evidence.measured_db + 100.0)) == "saturation"
+    assert _named(replace(evidence, unit="dB")) != "saturation"
+
+
 @pytest.mark.parametrize("step_db", [0.05, 6.0])
 def test_an_error_that_no_page_shows_has_no_cause(step_db: float) -> None:
     """Exact levels but for a step of 0.05 dB: as sure as one of 6 dB, and nobody need do anything about it."""

@@ -119,7 +119,7 @@ class LevelEvidence:
     uav_elevation_deg: FloatArray
     tower_azimuth_deg: FloatArray
     name: str = ""
-    unit: str = "dB"
+    unit: str = "dBm"
     start: np.datetime64 = _EPOCH
     antenna: str = "measured"
     turned_db: Mapping[float, FloatArray] = field(default_factory=dict)
@@ -845,7 +845,8 @@ def _floor(e: LevelEvidence) -> Iterator[Trial]:
 
 def _saturation(e: LevelEvidence) -> Iterator[Trial]:
     """A receiver that shows no level above its ceiling."""
-    if not _is_flat(e):
+    drowned = e.unit == "dB" and bool(np.median(e.measured_db) < 0.0)  # a signal below the noise overloads nothing
+    if not drowned and not _is_flat(e):
         yield from _clipping(e, -1.0)
 
 

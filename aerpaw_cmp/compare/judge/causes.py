@@ -299,7 +299,7 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
 def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
     """Check that a gain over directions, which antennas learn, takes off a channel an error that a page shows."""
     for evidence in filter(None, map(_binned, channels)):
-        sound, (*_, antenna) = _fitted(evidence), _pattern(evidence)
+        sound, (antenna,) = _fitted(evidence), _pattern(evidence)
         learned = _fitted(evidence, antenna, at=sound.memories)
         left_db = float(learned.residual_db.std())
         fall_db = min(float(sound.residual_db.std()), float(evidence.measured_db.std())) - left_db
@@ -747,20 +747,17 @@ def _pattern(e: LevelEvidence) -> Iterator[Trial]:
     azimuth, elevation = np.radians(e.uav_azimuth_deg), np.radians(e.uav_elevation_deg)
     axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
     terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
-    columns = np.column_stack([np.prod(term, axis=0) for term in terms])
-    # no known pattern any more: the mean over all headings
-    mean = [np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1)] if e.turned_db else []
+    columns = [_GAIN_DB * np.prod(term, axis=0) for term in terms]
+    if e.turned_db:  # no known pattern any more: the mean over all headings
+        columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
     sentence, step = _PATTERN[e.antenna]
-    for spread_db in _GAINS_DB:
-        yield Trial(
-            name=_CATCH_ALL, cost=math.log(len(_GAINS_DB)), sentence=sentence, next_step=step,
-            columns=np.column_stack([spread_db * columns, *mean]),
-        )  # fmt: skip
+    yield Trial(
+        name=_CATCH_ALL, cost=0.0, sentence=sentence, next_step=step, columns=np.column_stack(columns),
+    )  # fmt: skip
 
 
-# Standard deviations before the flight: of the terms of an antenna's gain, a smooth one or one with lobes, and of steps
-# and losses [dB].
-_GAINS_DB, _STEP_DB, _LOSS_DB = (1.5, 3.0), 8.0, 15.0
+# Standard deviations before the flight: of the terms of an antenna's gain, and of steps and losses [dB].
+_GAIN_DB, _STEP_DB, _LOSS_DB = 3.0, 8.0, 15.0
 # Log odds against what a log or its settings seldom have.
 _RARE = 3.0
 

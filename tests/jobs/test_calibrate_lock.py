@@ -10,7 +10,7 @@ from scipy.special import expit
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term
-from aerpaw_cmp.compare.learning.calibration import Learned, Observed, Recipe, learn
+from aerpaw_cmp.compare.learning.calibration import Learned, Observed, Recipe, flight_left_out, learn
 from aerpaw_cmp.compare.level.detection import DetectionForecast, learn_detection
 from aerpaw_cmp.flight.data import RssSeries
 from aerpaw_cmp.flight.drafting.remembered import lock_elsewhere
@@ -45,8 +45,14 @@ def flight(name: str, seed: int, losing: bool = True) -> Observed:
     return Observed(samples, path_db + SENT_DBM, np.zeros(len(time)), locked=lock, sent_dbm=SENT_DBM)
 
 
+def locks_of(observed: list[Observed]) -> dict[str, LearnedLock]:
+    fits: dict[str, Learned] = {}
+    flight_left_out(observed, RECIPE, fits)
+    return learned_locks(observed, RECIPE, fits)
+
+
 def test_the_planted_lock_is_recovered_and_beats_the_share_on_flights_left_out() -> None:
-    locks = learned_locks([flight(name, seed) for seed, name in enumerate("abc")], RECIPE, {})
+    locks = locks_of([flight(name, seed) for seed, name in enumerate("abc")])
     lock = locks["ROVER.power"]
     assert lock.gain_db == pytest.approx(HALF_DB, abs=1.5)  # of the path gain: not of 40 dBm
     assert lock.per_db == pytest.approx(PER_DB, rel=0.35)
@@ -82,7 +88,7 @@ def test_a_forecast_that_is_scored_knows_nothing_of_the_flight(monkeypatch: pyte
         assert set(learned.mounts) == set("abc") - set(pair)
         taught.append(set(pair))
     assert len(taught) == 6
-    learned_locks(observed, RECIPE, {})
+    locks_of(observed)
     assert [len(each) for each in calls] == [3, 2, 2, 2]
     assert not set(calls[0]) & {level for each in calls[1:] for level in each}  # of gains that knew one flight less
 
@@ -90,7 +96,7 @@ def test_a_forecast_that_is_scored_knows_nothing_of_the_flight(monkeypatch: pyte
 def test_one_flight_or_a_receiver_that_keeps_its_lock_teaches_nothing() -> None:
     assert learned_locks([flight("a", 1)], RECIPE, {}) == {}
     assert learned_locks([flight("a", 1), flight("b", 2)], RECIPE, {}) == {}  # nothing is left for a score
-    assert learned_locks([flight(name, 1, losing=False) for name in "abc"], RECIPE, {}) == {}
+    assert locks_of([flight(name, 1, losing=False) for name in "abc"]) == {}
 
 
 def test_what_a_site_remembers_of_the_lock_is_used_with_its_airframe_alone(tmp_path: Path) -> None:

@@ -11,7 +11,6 @@ from ...compare.learning.calibration import (
     Learned,
     Observed,
     Recipe,
-    flight_left_out,
     flights_of,
     groups_of,
     learn,
@@ -30,7 +29,7 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[st
         Of all flights.
     recipe : Recipe
     fits : mapping of str to Learned
-        What was learned without each flight; learned here where it is empty.
+        What was learned without each flight.
 
     Returns
     -------
@@ -40,9 +39,6 @@ def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[st
     able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
     if len(flights_of(able)) < 3:
         return {}
-    if not fits:
-        fits = {}
-        flight_left_out(observed, recipe, fits)
     pairs = _without_pairs(observed, recipe)
     out = {}
     for antenna in dict.fromkeys(o.samples.antenna for o in able):

@@ -142,7 +142,7 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str
     ends = (level == _END_DBM) & (about["quantity"] == "RSRP")
     if ends.sum() > 1 and not ((level > _END_DBM) & (level < _END_DBM + 10.0)).any():
         outside |= ends
-        rows.warnings.append(f"{cell}: {ends.sum()} levels of {_END_DBM:g} dBm, far below all others: out of coverage")
+        rows.warnings.append(f"{cell}: {ends.sum()} levels of {_END_DBM:g} dBm, and none near above: out of coverage")
     if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell}: RSSI lies below RSRP, which cannot be: are the columns exchanged?")
     _lines.add_flag(flag, outside, "out_of_coverage")

@@ -301,14 +301,14 @@ def beside(text: str) -> str:
 
     Examples
     --------
-    >>> beside("edt"), beside("-240"), beside("-14400"), beside("-0400"), beside("5.5"), beside("at home")
+    >>> beside("edt"), beside("-240"), beside("-14400"), beside("-0400"), beside("5.5"), beside("here")
     ('EDT', '-04:00', '-04:00', '-0400', '+05:30', '')
     >>> beside("Asia/Tokyo"), beside("Asia/Nowhere")
     ('Asia/Tokyo', '')
     """
     number = re.fullmatch(r"[+-]?\d{1,5}(?:\.\d{1,2})?", text)
     if number is None or re.fullmatch(r"[+-]\d{4}", text):
-        word = text if "/" in text else text.upper()
+        word = text.upper() if text.upper() in {*_HOURS, *_time.WINTER, *_WITH_SUMMER} else text  # 'home' is none
         return word if re.fullmatch(_NAMED_ZONE, word) and ("/" not in word or _at(word, datetime.min)) else ""
     hours = float(text)
     # no zone is further than 14 h from UTC: larger numbers are minutes (840) or seconds
@@ -346,10 +346,11 @@ def read(
     warnings : list of str
     """
     texts = [text.replace("\u202f", " ").replace("\xa0", " ") for text in texts]  # in front of AM, as browsers write it
-    # Java writes the place behind the offset: 10:00-04:00[America/New_York]
-    place = re.compile(r"\[\w+/[\w/]+\]$")
+    # Java writes the place behind the offset: 10:00-04:00[America/New_York], 14:00Z[UTC]
+    place = re.compile(r"(Z|[+-]\d\d:\d\d)\[[\w/+-]+\]$")
     shown = [
-        text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else place.sub("", text.strip()) for text in texts
+        text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else place.sub(r"\1", text.strip())
+        for text in texts
     ]
     filled = [text for text in shown if text]
     if 2 * sum((match := _COMPACT.fullmatch(text)) is not None and bool(match[1] or zone) for text in filled) > len(

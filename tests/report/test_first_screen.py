@@ -137,6 +137,7 @@ def test_no_sentence_contradicts_its_numbers(better, worse, channels):
     assert ("worse" in said) == (worse > 0)
     assert ("not significant" in said) == (better + worse == 0)
     assert said.count("(95 %)") == 1
+    assert (f" of {channels} channels" in said) == (channels > 1)
 
 
 # As long as any: tests of the causes hold each to these words.

@@ -108,10 +108,10 @@ SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
     (lambda f: not f.name, "No baseline could be scored."),
     (lambda f: not f.judged, "The flight is too short to tell the two apart."),
     (lambda f: f.better > 0 and f.worse > 0,
-     "Ray tracing is significantly better on {better} and worse on {worse} of {channels} {unit} (95 %)."),
-    (lambda f: f.worse > 0, "Ray tracing is significantly worse on {worse} of {channels} {unit} (95 %)."),
-    (lambda f: f.better > 0, "Ray tracing is significantly better on {better} of {channels} {unit} (95 %)."),
-    (bool, "The difference is not significant on any of {channels} {unit} (95 %)."),
+     "Ray tracing is significantly better on {better} and worse{of} (95 %)."),
+    (lambda f: f.worse > 0, "Ray tracing is significantly worse{of} (95 %)."),
+    (lambda f: f.better > 0, "Ray tracing is significantly better{of} (95 %)."),
+    (bool, "The difference is not significant{of} (95 %)."),
 )  # fmt: skip
 
 # Sentence on the ranking of settings, by what the intervals say of those behind the first.
@@ -143,7 +143,8 @@ def first_sentence(facts: Judged) -> str:
     """
     baseline = f"; {pretty(facts.name)}: {facts.other_db:.1f} dB" if facts.name else ""
     text = next(text for holds, text in SIGNIFICANCE if holds(facts))
-    significance = text.format(better=facts.better, worse=facts.worse, channels=facts.channels, unit=facts.unit)
+    of = f" on {facts.worse or facts.better or 'any'} of {facts.channels} {facts.unit}"
+    significance = text.format(better=facts.better, of="" if facts.channels == 1 else of)
     return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{baseline}. {significance}"
 
 

@@ -111,7 +111,7 @@ def _antennas(
     mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
     place, series = site_place(settings.site.file, flight.parent), (level.channel, file.result.reader)
     every = taught(place, series, (file.sha256, mark)).items()
-    both = next(((ends.tower, ends.uav) for name, ends in every if name not in site.towers), None)
+    both = next(((ends.tower, ends.uav) for name, ends in every if ends and name not in site.towers), None)
     return both or (None, searching_airframe(place, site.towers, series, (file.sha256, mark)))
 
 

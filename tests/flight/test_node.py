@@ -113,6 +113,19 @@ def test_the_span_of_offsets_holds_the_expected_one(tmp_path: Path, level_100_m:
     assert ((low, high) != (-50.0, 50.0)) is moved
 
 
+def test_relative_levels_are_placed_where_the_track_that_dates_them_was(tmp_path: Path) -> None:
+    """Their tower and their span of offsets come from the levels, as those of a log with a clock do."""
+    pose, _ = _logs(tmp_path, tuple(SITE.towers["LW1"].position_m), -105.0, slope=2.0)
+    rows = zip(*((tmp_path / name).read_text().splitlines()[1:] for name in ("pose.csv", "levels.csv")), strict=True)
+    cells = [(*place.split(","), level.split(",")[1]) for place, level in rows]
+    lines = [f"{t},{(int(t) - 99) * 1000},{a},{o},{up},3,{p},," for t, a, o, up, p in cells]
+    head = "index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi"
+    (tmp_path / "nemo.csv").write_text("\n".join([head, *lines, ""]))
+    text, _ = draft([pose, *ingest(tmp_path / "nemo.csv")], tmp_path, DraftOptions())
+    assert "the levels fit LW1" in text
+    assert parse_yaml(text, FlightFile).rss.span_db == (40.0, 90.0)  # Friis: 62.2 dB at 100 m
+
+
 def _placer(listed: list[node.ListedPlace] | None = None) -> node.Placer:
     track = _track()
     latitude, longitude = SITE.frame.to_geographic(track[:, 0], track[:, 1])
@@ -257,6 +270,19 @@ def test_a_cut_flight_keeps_a_tower_whose_antennas_flights_taught(
     if keeps:
         assert "with the antennas that flights taught" in placement.question
         assert placement.tower is None
+
+
+@pytest.mark.parametrize(("usual", "said"), [({"LW1"}, "LW1"), ({"LW3"}, "LW2"), (set(), "LW2")])
+def test_of_towers_that_fit_alike_the_receivers_own_is_proposed(
+    usual: set[str], said: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Log odds of the second quarter of a flight about LW1."""
+    monkeypatch.setattr(node, "place_odds", lambda _, towers: np.array([1.6, 1.9, -1.2, -1.4, -3.8])[: len(towers)])
+    placer, gains = _placer(), _taught()
+    placement = placer.propose(_flown(placer, gains, "LW1", slice(0, 500)), dict.fromkeys(usual))
+    assert placement is not None
+    assert placement.node == said
+    assert f"the levels fit LW2 or LW1 as well as any place: is it {said}?" in placement.question
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import ceil, floor
 from pathlib import Path
 from typing import Any
@@ -507,7 +507,7 @@ class _Entries:
         entry, comment = _entry(file, path, self.towers_known)
         origin = None if self.options.time_origin else self._origin(streams)
         if self.placer is not None:
-            levels = [s for s in streams if s.kind == "rss" and not is_ratio(s)]
+            levels = [self._dated(s, origin) for s in streams if s.kind == "rss" and not is_ratio(s)]
             if comment:
                 comment = self._place(file, entry, comment, levels, self.placer)
             else:
@@ -550,7 +550,8 @@ class _Entries:
             comment = _also(comment, question)
         self.lines[file.path] = f"  - {_flow(entry)}{comment}\n"
         if self.placer is not None:
-            self.offsets_db += [o for s in compared if (o := self._offset_db(s, entry, self.placer)) is not None]
+            offsets = (self._offset_db(self._dated(s, origin), entry, self.placer) for s in compared)
+            self.offsets_db += [offset for offset in offsets if offset is not None]
         self.kinds |= {s.kind for s in compared}
         self.tops_m += [_top_m(s) for s in compared if _has_positions(s)]
         reader = file.result.reader
@@ -668,6 +669,13 @@ class _Entries:
             return None
         relative = [s for s in streams if s.attributes.get("clock") == "relative"]
         return next((origin for s in relative if (origin := origin_of(s, self.flown[0])) is not None), None)
+
+    def _dated(self, stream: Stream, origin: Origin | None) -> Stream:
+        """A stream at the times that the draft gives it: its levels belong where the track was then."""
+        time = stream.frame["time"] + np.timedelta64(round(60 * self._hours(stream)), "m")
+        if origin is not None and stream.attributes.get("clock") == "relative":
+            time += origin.time - np.datetime64(0, "ns")
+        return replace(stream, frame=stream.frame.assign(time=time))
 
     def _refused(
         self, streams: Sequence[Stream], entry: Mapping[str, Any], shown: str, *, dated: bool

@@ -36,7 +36,7 @@ CONTRADICTED = 8.0
 _FEWEST_OF_VEHICLE = 8
 _NEAR_FREE_SPACE = LevelModel(slope=2.0, slope_sd=0.3, elevation_sd_db=2.0, shadow_sd_db=2.0, scatter_sd_db=1.5)
 
-# Places of a list whose log odds differ by less are both named.
+# Places of a list, and towers, whose log odds differ by less are all named.
 _UNDECIDED = 3.0
 
 # Of the link that a draft proposes.
@@ -167,14 +167,16 @@ class Placer:
         track = replace(track, rotation=self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation)
         return track if airframe is None else replace(track, airframe_db=self._gain_db(track, airframe, node))
 
-    def propose(self, track: LevelTrack, taught: Mapping[str, Taught] = MappingProxyType({})) -> Placement | None:
+    def propose(
+        self, track: LevelTrack, taught: Mapping[str, Taught | None] = MappingProxyType({})
+    ) -> Placement | None:
         """Tower, listed place or estimated place that the levels fit; None where they are too few.
 
         Parameters
         ----------
         track : LevelTrack
-        taught : mapping of str to Taught
-            Gains of towers and airframe that other flights taught, by tower.
+        taught : mapping of str to Taught or None
+            Gains of towers and airframe that other flights with such a receiver taught, by tower; None of its own.
         """
         if len(track.level_db) < FEWEST:
             return None
@@ -184,10 +186,10 @@ class Placer:
         odds = place_odds(track, np.array(at))
         odds_tower, odds_listed = odds[: len(towers)].copy(), odds[len(towers) :]
         # the search takes longer than all else: only where a tower's antennas or a place of its own need it
-        estimate = locate(track) if taught or odds_tower.max() < _TOWER_ODDS else None
+        estimate = locate(track) if any(taught.values()) or odds_tower.max() < _TOWER_ODDS else None
         for i, tower in enumerate(towers):
-            if estimate is not None and tower.name in taught:
-                known = self._taught_odds(track, tower.name, taught[tower.name])
+            if estimate is not None and (gains := taught.get(tower.name)) is not None:
+                known = self._taught_odds(track, tower.name, gains)
                 # as odds against any place, like those of the search
                 odds_tower[i] = max(odds_tower[i], known - estimate.anywhere - _TAUGHT_MORE)
         if len(listed) and odds_listed.max() >= max(_LISTED_ODDS, odds_tower.max()):
@@ -201,7 +203,11 @@ class Placer:
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:
             how = "with the antennas that flights taught" if odds_tower[best] > odds[best] else "as well as any place"
-            return Placement(towers[best].name, None, f"the levels fit {towers[best].name} {how}: is it this tower?")
+            alike = [towers[i].name for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
+            # a part of a flight that circles no tower fits several: the receiver's own tower is the likeliest
+            name = next((tower for tower in alike if tower in taught), alike[0])
+            asked = "is it this tower?" if len(alike) == 1 else f"is it {name}?"
+            return Placement(name, None, f"the levels fit {' or '.join(alike)} {how}: {asked}")
         assert estimate is not None  # no tower stands
         latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
         apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]

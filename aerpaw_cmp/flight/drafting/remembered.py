@@ -184,7 +184,7 @@ def searching_airframe(
     return None
 
 
-def taught(site: str | Path, series: tuple[str, str], log: tuple[str, str]) -> dict[str, Taught]:
+def taught(site: str | Path, series: tuple[str, str], log: tuple[str, str]) -> dict[str, Taught | None]:
     """Antennas at both ends that flights taught for a channel and reader, by tower; a damaged memory has none.
 
     Parameters
@@ -192,33 +192,27 @@ def taught(site: str | Path, series: tuple[str, str], log: tuple[str, str]) -> d
     site : str or Path
     series : (channel, reader)
     log : (SHA-256, mark)
-        Of the log, which must not have been learned from.
+        Of the log: None of a tower whose antennas were learned from it.
     """
     from ...compare.learning.locate import LevelModel  # a draft's alone, and a report loads this module
     from .node import Taught
 
+    def unseen(known: Remembered) -> Taught | None:
+        if log[0] in known.entry.trained_on or among(log[1], known.uav.marks):
+            return None
+        model = LevelModel(
+            slope=2.0,
+            slope_sd=_TAUGHT_SLOPE_SD,
+            elevation_sd_db=known.spread.own_sd_db,
+            shadow_sd_db=float(np.hypot(known.spread.own_sd_db, known.series.sd_db)),
+            scatter_sd_db=known.spread.noise_sd_db,
+        )
+        return Taught(tower=known.tower, uav=known.uav, model=model)
+
     with suppress(InputError, UsageError):
-        fit = [
-            known
-            for known in remembered(site).values()
-            if (known.series.channel, known.series.reader) == (series[0], learned.receiver_of(series[1]))
-            and log[0] not in known.entry.trained_on
-            and not among(log[1], known.uav.marks)
-        ]
-        return {
-            known.series.tower: Taught(
-                tower=known.tower,
-                uav=known.uav,
-                model=LevelModel(
-                    slope=2.0,
-                    slope_sd=_TAUGHT_SLOPE_SD,
-                    elevation_sd_db=known.spread.own_sd_db,
-                    shadow_sd_db=float(np.hypot(known.spread.own_sd_db, known.series.sd_db)),
-                    scatter_sd_db=known.spread.noise_sd_db,
-                ),
-            )
-            for known in fit
-        }
+        same = (series[0], learned.receiver_of(series[1]))
+        every = remembered(site).values()
+        return {k.series.tower: unseen(k) for k in every if (k.series.channel, k.series.reader) == same}
     return {}
 
 

@@ -402,10 +402,9 @@ def gather(
         if unnamed := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
             warnings.append(f"{log.path}: {counted(len(unnamed), 'cell')} left out that 'cells' does not name")
         names = [s.name for s in file.result.streams]
-        if unknown := [name for name in log.skip if name not in names]:
-            warnings.append(
-                f"{log.path}: nothing is skipped by {', '.join(unknown)}: its streams are {', '.join(names)}"
-            )
+        keys = [*log.skip, *(key for key in log.cells if isinstance(key, str))]
+        if unknown := [name for name in keys if name not in names]:
+            warnings.append(f"{log.path}: no stream is named {', '.join(unknown)}: its streams are {', '.join(names)}")
         warnings += _of_ratios(settings.link, log, file.result.streams)
         warnings += _of_carriers(settings.link, log, streams)
     if rank and settings.link.rank.bandwidth_hz is None:
@@ -616,16 +615,18 @@ def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
 
 def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
     """Check whether a stream is that of a cell that the flight file, which names others, does not name."""
-    pci = stream.attributes.get("pci")
-    return bool(log.cells) and pci is not None and int(pci) not in log.cells
+    return bool(log.cells) and "pci" in stream.attributes and _home(log, stream) is None
+
+
+def _home(log: LogSettings, stream: Stream) -> str | None:
+    """Tower that ``cells`` gives a stream, by its PCI or by its name."""
+    return log.cells.get(int(stream.attributes.get("pci", -1)), log.cells.get(stream.name))
 
 
 def _rss_series(
     links: LinksSettings, log: LogSettings, stream: Stream, site: Site, *, number: int, locked: FloatArray | None
 ) -> RssSeries:
-    pci = stream.attributes.get("pci")
-    home = log.cells.get(stream.name if pci is None else int(pci))
-    tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
+    tower = _known_tower(_home(log, stream) or log.node or _text(stream, "node"), log, site)
     channel = _channel_of(log, stream)
     noise_dbm, link = _noise(stream, links.of(channel))
     frame, left_out = scored_rows(stream, log.path)
@@ -735,7 +736,7 @@ def _check_overlap(data: FlightData) -> None:
         raise UsageError(
             "none of the logs holds RSS or rank",
             expected="at least one radio log under 'logs'",
-            cause="'skip', or a log left out",
+            cause="'skip', 'cells', or a log left out",
         )
     for kind, series in data.series:
         what, placed = f"{kind} of {series.tower}", isinstance(series, RankSeries) and series.position_m is not None

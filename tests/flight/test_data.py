@@ -120,7 +120,7 @@ def test_the_site_lies_by_the_flight_file_and_the_logs_elsewhere(tmp_path: Path)
 def test_names_in_the_flight_file_that_fit_nothing_are_told(tmp_path: Path) -> None:
     log = f"path: {SAMPLE / 'LW1/USRP1_power_log.txt'}, node: LW1"
     (warning,) = _flight(tmp_path, f"{log}, skip: [qualty]").warnings
-    assert "nothing is skipped by qualty: its streams are power" in warning
+    assert "no stream is named qualty: its streams are power" in warning
     text = (tmp_path / "flight.yaml").read_text().replace(", skip: [qualty]", "")
     (tmp_path / "flight.yaml").write_text(text + "link: {channels: {USRP1: {carrier_hz: 3.3e9}}}\n")
     (warning,) = load_data(load_flight(tmp_path / "flight.yaml"), tmp_path).warnings

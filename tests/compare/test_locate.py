@@ -50,6 +50,26 @@ def test_the_evidence_is_that_of_a_normal_vector() -> None:
     assert fit_places(track, PLACES).evidence == pytest.approx(expected, abs=1e-6)
 
 
+def test_the_evidence_of_a_known_place_is_that_of_normal_vectors_over_the_shadows() -> None:
+    """Covariances of all that is unknown, level by level; the share of each shadowing is the same."""
+    rng = np.random.default_rng(3)
+    (time, position), turn = _lawnmower(12), np.linalg.qr(rng.normal(size=(12, 3, 3)))[0]
+    track = LevelTrack(time, position, rng.normal(-60.0, 8.0, 12), rotation=turn)
+    tried, apart = ((2.5, 15.0), (4.5, 45.0)), np.linalg.norm(position[:, None] - position, axis=2)
+    shadows = [sd**2 * np.exp(-apart / length) + 1.5**2 * np.eye(12) for sd, length in tried]
+    roots = [locating._inverse_root(track, *shadow) for shadow in tried]
+    for place in PLACES:
+        mean, features = (part[0] for part in locating._features(track, place[None], locating._RIVAL))
+        e, n, _ = unit = ((position - place) / np.linalg.norm(position - place, axis=1)[:, None]).T
+        x, y, z = np.einsum("nji,jn->in", turn, -unit)
+        node = 0.8 * np.array([e, n, 0.7 * (e**2 - n**2), 1.4 * e * n])
+        frame = [x, y, z, 1.7 * x * y, 1.7 * x * z, 1.7 * y * z, 0.9 * (x**2 - y**2), 0.6 * (3 * z**2 - 1)]
+        terms = np.vstack([features.T, node, 1.5 * np.array(frame)])
+        logs = [multivariate_normal.logpdf(track.level_db, mean, shadow + terms.T @ terms) for shadow in shadows]
+        evidence = locating._rival_evidence(track, place[None], roots)[0] - 6.0 * np.log(2.0 * np.pi)
+        assert evidence == pytest.approx(np.logaddexp(*logs), abs=1e-6)
+
+
 def test_a_level_below_the_floor_counts_as_the_probability_to_be_below() -> None:
     time, position = _lawnmower(12)
     level = np.maximum(np.random.default_rng(2).normal(-60.0, 8.0, 12), -69.0)

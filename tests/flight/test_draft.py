@@ -214,7 +214,9 @@ def test_sparse_telemetry_is_named_as_the_reason_why_nothing_is_compared(
     rows = telemetry.read_text().splitlines(keepends=True)
     step_s = 14
     per_s = round((len(rows) - 1) / float(np.ptp([_seconds(row) for row in (rows[1], rows[-2])])))
-    sparse = [row.replace(".000000,", ".313000,") for row in rows[:: step_s * per_s]]  # and no sample is at a fix
+    # no sample is at a fix, and a longitude that jumps leaves no straight leg
+    sparse = [row.replace(".000000,", ".313000,") for row in rows[:: step_s * per_s]]
+    sparse[2::2] = [row.replace(",-78.", ",-77.") for row in sparse[2::2]]
     telemetry.write_text("".join(sparse))
     target = logs.parent / "flight.yaml"
     call = ["ingest", str(telemetry), str(logs / "LW1"), "--timezone", ZONE, "--draft", str(target)]

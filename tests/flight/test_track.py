@@ -306,16 +306,25 @@ def test_a_position_is_on_earth_and_not_where_a_receiver_without_a_fix_says(plac
     assert good_positions(*(np.array([value]) for value in place)).tolist() == [bool(good)]
 
 
-@pytest.mark.parametrize(("speed_mps", "joined"), [(2.0, True), (15.0, False)])
-def test_sparse_fixes_of_a_slow_flight_are_joined_by_lines(speed_mps: float, joined: bool) -> None:
-    """Speed between fixes decides: 14 s are 28 m of a search, and 210 m of a survey."""
+@pytest.mark.parametrize(("speed_mps", "lost"), [(2.0, []), (10.0, [19])])
+def test_sparse_fixes_are_joined_by_lines_where_they_are_slow_or_fly_straight(
+    speed_mps: float, lost: list[int]
+) -> None:
+    """There and back: the turn amid two fixes cuts 14 m of a search at 2 m/s, and 70 m of a flight at 10."""
     seconds = 14.0 * np.arange(40)
-    track = Track(telemetry(seconds, speed_mps * seconds, 0, 40), FRAME)
+    east = speed_mps * np.minimum(seconds, 546.0 - seconds)
+    track = Track(telemetry(seconds, east, 0, 40), FRAME)
     pose = track.pose_at(at(seconds[:-1] + 7.0))
-    assert pose.valid.all() == joined
-    assert any("a fix every 14 s: positions between are a straight line" in t for t in track.account.warnings) == joined
-    if joined:
-        np.testing.assert_allclose(pose.position_m[:, 0], speed_mps * (seconds[:-1] + 7.0), atol=1e-3)
+    assert np.flatnonzero(~pose.valid).tolist() == lost
+    assert any("a fix every 14 s: positions between are a straight line" in t for t in track.account.warnings)
+    np.testing.assert_allclose(pose.position_m[:19, 0], speed_mps * (seconds[:19] + 7.0), atol=1e-3)
+    assert ("turns between fixes" in track.why_not(pose.where(pose.valid))) == bool(lost)
+
+
+def test_a_fast_flight_without_a_straight_leg_is_not_joined() -> None:
+    seconds = 14.0 * np.arange(40)
+    track = Track(telemetry(seconds, 140.0 * (np.arange(40) % 2), 0, 40), FRAME)
+    assert not track.pose_at(at(seconds[:-1] + 7.0)).valid.any()
 
 
 def test_the_error_of_lines_between_sparse_fixes_is_that_of_a_circle() -> None:

@@ -18,6 +18,7 @@ from aerpaw_cmp.report.figures import flight as figures
 from aerpaw_cmp.report.figures import maps as map_figures
 from aerpaw_cmp.report.kit import canvas
 from aerpaw_cmp.report.pages import flight as html
+from aerpaw_cmp.site.siteyaml import load_site
 from benchmarks.fabricated import rank_result, rss_result, with_numbers
 
 
@@ -316,3 +317,14 @@ def test_both_channels_of_a_tower_stand_in_one_panel_of_report_and_map(report_da
     assert ax.get_ylabel() == f"RSS [{first.unit}]"
     with_flight = map_figures.figure_specs(dataclasses.replace(maps_data, flights=(report_data,)))
     assert [spec.name for spec in with_flight if spec.name.startswith("rss_channels")] == [f"{spec.name}_sample"]
+
+
+def test_names_of_towers_stay_inside_the_plan() -> None:
+    site = load_site("lake_wheeler")
+    fig, ax = canvas.subplots((4.0, 4.0), 1, 1)
+    canvas.draw_site(ax, site)
+    canvas.frame_around(ax, *np.array([tower.position_m[:2] for tower in site.towers.values()]).T, margin=0.01)
+    fig.canvas.draw()
+    names = [text for text in ax.texts if text.get_text() in site.towers]
+    assert len(names) == 5
+    assert all(np.all(ax.bbox.padded(2).contains(*name.get_window_extent().max)) for name in names)

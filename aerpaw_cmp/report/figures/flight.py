@@ -283,7 +283,8 @@ def rank_maps(data: ReportData, panel: RankResult) -> Figure:
     rows = -(-len(maps) // columns)
     east, north, _ = panel.position_m.T
     shape = plan_shape(east, north)
-    fig, axes = subplots((9.2, rows * (3.9 / shape + 1.1)), rows, columns, squeeze=False)
+    # title, axis label and a legend of two lines take 1.6 inches
+    fig, axes = subplots((9.2, rows * (3.9 / shape + 1.6)), rows, columns, squeeze=False)
     for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
         _rank_map(ax, data.site, east, north, rank, title)
         frame_around(ax, east, north, shape=shape)

@@ -615,6 +615,8 @@ def frame_around(
     shape : float
         Width over height of the plan.
     """
+    from matplotlib.text import Annotation
+
     good = np.isfinite(east) & np.isfinite(north)
     if not good.any():
         return
@@ -626,6 +628,12 @@ def frame_around(
     middle_east, middle_north = (east.min() + east.max()) / 2, (north.min() + north.max()) / 2
     ax.set_xlim(middle_east - width / 2, middle_east + width / 2)
     ax.set_ylim(middle_north - height / 2, middle_north + height / 2)
+    for name in (text for text in ax.texts if isinstance(text, Annotation)):
+        # names stand right of and above their towers, and would hang over these two edges
+        if name.xy[0] > middle_east + width / 4:
+            name.set(x=-6, ha="right")
+        if name.xy[1] > middle_north + 0.4 * height:
+            name.set(y=-4, va="top")
 
 
 def plan_shape(east: FloatArray, north: FloatArray) -> float:

@@ -103,6 +103,11 @@ def raising(error: BaseException):
             "aerpaw-cmp: f.yaml, line 3: unknown key 'sight'. Next: 'aerpaw-cmp report --help' lists the options\n",
         ),
         (InputError("the file is empty", path="a.txt"), 3, "aerpaw-cmp: a.txt: the file is empty. Next: 'ls "),
+        (
+            UsageError("RSS of LW1 has no positions and there is no telemetry log"),
+            2,
+            "'aerpaw-cmp ingest LOG TELEMETRY",
+        ),
         (KeyboardInterrupt(), 130, "aerpaw-cmp: interrupted\n"),
         (ModuleNotFoundError("x", name="distributed"), 1, "the Python package 'distributed' is not installed"),
     ],

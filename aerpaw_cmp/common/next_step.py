@@ -32,6 +32,9 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if place is not None and not _exists(place):  # as the flight file names it
         candidates = (Path(word).parent / place for word in arguments if word.endswith(_SETTINGS))
         place = next(filter(_exists, candidates), place)
+    if "there is no telemetry log" in error.found:
+        named = "--map COLUMN=latitude_deg --map COLUMN=longitude_deg names positions in the log"
+        return f"'aerpaw-cmp ingest LOG TELEMETRY --draft flight.yaml' drafts it with telemetry; {named}"
     if isinstance(error, CheckError):
         return "read the page, or run without the check"
     if isinstance(error, OutputError) or re.search(r"after -o\b|a new name", error.expected or ""):

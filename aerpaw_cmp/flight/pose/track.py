@@ -467,6 +467,8 @@ class Track:
             turns, away_m = nearer_m > _SPARSE_ERROR_M, nearer_m[nearer_m <= _SPARSE_ERROR_M]
             if not len(away_m):
                 return 0.0, ~turns, (0.0, 0.0)
+            # chosen by the nearer of two ends, they look straighter than they are: the limit, not their own 90 %
+            return usual_s, turns, (float(np.median(away_m)), _SPARSE_ERROR_M)
         return usual_s, turns, (float(np.median(away_m)), float(np.quantile(away_m, 0.9)))
 
     def _raised(self, position: FloatArray) -> tuple[FloatArray, BoolArray]:

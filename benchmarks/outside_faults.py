@@ -57,7 +57,7 @@ FAULTS = (
     Fault("yaw of a mount clockwise", "aerpaw_cmp/propagation/geometry/arrays.py", "ca, sa = np.cos(yaw), np.sin(yaw)", "ca, sa = np.cos(yaw), -np.sin(yaw)", "tests/jobs/test_audit_flight.py"),
     Fault("antenna table read clockwise", "aerpaw_cmp/site/antenna/antennas.py", "(phi % full).ravel()", "(-phi % full).ravel()", "tests/jobs/test_audit_raw.py"),
     Fault("antenna table upside down", "aerpaw_cmp/site/antenna/antennas.py", "at = np.stack([(theta % full)", "at = np.stack([((np.pi - theta) % full)", "tests/jobs/test_audit_raw.py"),
-    Fault("two towers exchanged", "aerpaw_cmp/flight/data.py", "home = log.cells.get(stream.name if pci is None else int(pci))\n    tower =", "home = {\"T1\": \"T2\", \"T2\": \"T1\", \"LW1\": \"LW2\", \"LW2\": \"LW1\"}.get(log.node or \"\")\n    tower =", RAW),
+    Fault("two towers exchanged", "aerpaw_cmp/flight/data.py", "_known_tower(_home(log, stream) or", "_known_tower({\"T1\": \"T2\", \"T2\": \"T1\", \"LW1\": \"LW2\", \"LW2\": \"LW1\"}.get(log.node or \"\") or", RAW),
     Fault("antenna 0.3 m higher", "aerpaw_cmp/site/site.py", "self.ground_m + self.antenna_height_m])", "self.ground_m + self.antenna_height_m + 0.3])", "tests/site/test_siteyaml.py"),
     Fault("lowest height 5 m", "aerpaw_cmp/common/units.py", "MINIMUM_HEIGHT_M = 0.5", "MINIMUM_HEIGHT_M = 5.0", "tests/flight/test_track.py", "no sample of this flight is below 5 m"),
     Fault("readings one line late", "aerpaw_cmp/flight/data.py", "measured_db=frame[\"rss_db\"].to_numpy(np.float64)", "measured_db=np.roll(frame[\"rss_db\"].to_numpy(np.float64), 1)", RAW),

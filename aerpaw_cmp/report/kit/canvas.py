@@ -634,6 +634,10 @@ def frame_around(
             name.set(x=-6, ha="right")
         if name.xy[1] > middle_north + 0.4 * height:
             name.set(y=-4, va="top")
+        if name.xy[0] > middle_east and name.xy[1] < middle_north - 0.4 * height:
+            # the map's credit stands in that corner
+            for credit in (text for text in ax.texts if text.get_gid() == "credit"):
+                credit.set(x=0.005, ha="left")
 
 
 def plan_shape(east: FloatArray, north: FloatArray) -> float:

@@ -22,6 +22,8 @@ from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 
 _NAMED_ZONE = r"Z|[A-Z][A-Za-z]+/[A-Z][\w/]+|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
+# Java writes the place behind the offset: 10:00-04:00[America/New_York], 14:00Z[UTC].
+_PLACE = re.compile(r"(Z|[+-]\d\d:\d\d)\[[\w/+-]+\]$")
 # A zone is not the AM or PM that stands in the same place.
 _ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
 _CLOCK = (
@@ -346,10 +348,8 @@ def read(
     warnings : list of str
     """
     texts = [text.replace("\u202f", " ").replace("\xa0", " ") for text in texts]  # in front of AM, as browsers write it
-    # Java writes the place behind the offset: 10:00-04:00[America/New_York], 14:00Z[UTC]
-    place = re.compile(r"(Z|[+-]\d\d:\d\d)\[[\w/+-]+\]$")
     shown = [
-        text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else place.sub(r"\1", text.strip())
+        text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else _PLACE.sub(r"\1", text.strip())
         for text in texts
     ]
     filled = [text for text in shown if text]

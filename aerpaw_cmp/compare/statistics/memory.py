@@ -49,6 +49,7 @@ _TABLES = Path(__file__).with_name("memory_weights.json")
 # with Student's t of four degrees of freedom. Most sequences with heavy tails look calmer than the process.
 CALM = 1.8
 
+# A sum over shares that no simulated flight showed may fall to nothing: eight of ten draws stay within the ends.
 _LEAST_STRETCH = 0.6
 
 # Draws come in pairs of opposite sign, so that exchanging two models turns an interval about exactly.
@@ -182,7 +183,6 @@ def _picked(slow: FloatArray, kind: Kind) -> tuple[IntArray, FloatArray, float]:
     index = np.minimum(np.searchsorted(running, uniform * running[-1]), len(running) - 1)
     own, even = stretches(kind)
     stretch = float(weighted @ own / running[-1] + likelihood @ even / likelihood.sum())
-    # a sum over shares that no simulated flight showed may fall to nothing: eight of ten draws stay within the ends
     return index, square[index] / chi_squared, max(stretch, _LEAST_STRETCH)
 
 

@@ -672,10 +672,10 @@ class _Entries:
 
     def _dated(self, stream: Stream, origin: Origin | None) -> Stream:
         """A stream at the times that the draft gives it: its levels belong where the track was then."""
-        time = stream.frame["time"] + np.timedelta64(round(60 * self._hours(stream)), "m")
+        shift = self._shift(stream)
         if origin is not None and stream.attributes.get("clock") == "relative":
-            time += origin.time - np.datetime64(0, "ns")
-        return replace(stream, frame=stream.frame.assign(time=time))
+            shift += origin.time - np.datetime64(0, "ns")
+        return replace(stream, frame=stream.frame.assign(time=stream.frame["time"] + shift)) if shift else stream
 
     def _refused(
         self, streams: Sequence[Stream], entry: Mapping[str, Any], shown: str, *, dated: bool
@@ -690,8 +690,8 @@ class _Entries:
             span = stream_span(stream)
             if span is None:
                 return "no samples"
-            hours = np.timedelta64(round(60 * self._hours(stream)), "m")
-            span = span[0] + hours, span[1] + hours
+            shift = self._shift(stream)
+            span = span[0] + shift, span[1] + shift
             if stream.name in leading:
                 return f"of the same receiver and cell as {leading[stream.name]}, which is compared"
             why = self._reason(stream, span, dated=dated)
@@ -712,17 +712,18 @@ class _Entries:
 
     def is_utc(self, file: IngestedFile) -> bool:
         """Check whether a log whose clock has no zone meets the telemetry as UTC, and not as local time."""
-        return any(self._hours(stream) for stream in file.result.streams)
+        return any(self._shift(stream) for stream in file.result.streams)
 
-    def _hours(self, stream: Stream) -> float:
-        """Hours to be added to a clock in UTC that was read as local time; 0 of any other."""
+    def _shift(self, stream: Stream) -> np.timedelta64:
+        """Time to be added to a clock in UTC that was read as local time; 0 of any other."""
         span = stream_span(stream)
         if self.flown is None or span is None or stream.kind == "telemetry":
-            return 0.0
+            return np.timedelta64(0, "m")
         # an offset that the log itself writes is no guess of ours to mend
         trap = clock_trap(span, self.flown[1], self.options.timezone)
         written = stream.attributes.get("clock_from") == "written"
-        return trap.hours if trap is not None and trap.is_utc and not written else 0.0
+        hours = trap.hours if trap is not None and trap.is_utc and not written else 0.0
+        return np.timedelta64(round(60 * hours), "m")
 
     def _reason(self, stream: Stream, span: Span, *, dated: bool) -> str | None:
         relative = not has_wall_clock(span[0])
@@ -895,6 +896,7 @@ def _cells(streams: Sequence[Stream]) -> list[int | str]:
     counts = {cell: len(s.frame) for s in streams if (cell := _cell_of(s)) is not None}
     most = max(counts.values(), default=0)
     most_sampled = sorted(counts, key=lambda cell: -counts[cell])[:MOST_CELLS]
+    # numbers flush right are in their own order, and compare with names
     return sorted((cell for cell in most_sampled if 20 * counts[cell] >= most), key="{:>9}".format)
 
 

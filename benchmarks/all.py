@@ -55,7 +55,7 @@ SMALLEST: dict[str, list[str]] = {
     "drafts": ["sample_logs"],
     "exports": ["--samples", "20000"],
     "fabricated": [],
-    "freeze": ["record", "{folder}/record.npz"],
+    "freeze": ["record", "{folder}/record.npz", "--quick"],
     "fuzz_commands": ["--calls", "20"],
     "fuzz_inputs": ["--inputs", "20"],
     "interrupts": ["--only", "formats", "--moments", "2"],

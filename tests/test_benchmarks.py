@@ -7,9 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from benchmarks import kriging
+from benchmarks import freeze, kriging
 
 ROOT = Path(__file__).parents[1]
 BENCHMARKS = ROOT / "benchmarks"
@@ -91,3 +92,24 @@ def test_the_tests_named_for_a_fault_from_outside_are_there() -> None:
         for named in fault.tests.split():
             file, _, test = named.partition("::")
             assert f"def {test}" in (ROOT / file).read_text(encoding="utf-8"), named
+
+
+@pytest.mark.parametrize(
+    ("after", "status"),
+    [
+        ({}, 0),
+        ({"report, rss.csv|lines": np.array(["level", "-48"])}, 1),
+        ({"channel, h|table": np.array([1.0, 3.0])}, 1),
+    ],
+)
+def test_records_of_tables_differ_by_a_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], after: dict, status: int
+) -> None:
+    before = {"report, rss.csv|lines": np.array(["level", "-47"]), "channel, h|table": np.array([np.nan, 2.0])}
+    np.savez(tmp_path / "before.npz", **before)
+    np.savez(tmp_path / "after.npz", **before | after)
+    monkeypatch.setattr(
+        sys, "argv", ["freeze.py", "compare", *map(str, (tmp_path / "before.npz", tmp_path / "after.npz"))]
+    )
+    assert freeze.main() == status
+    assert all(name in capsys.readouterr().out for name in after)

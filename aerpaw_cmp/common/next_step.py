@@ -58,6 +58,8 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return f"'ls {one_line(str(place))}' shows what the folder holds"
     if words[:1] == ["ingest"]:
         return "'aerpaw-cmp formats' lists what can be read"
+    if "--tower NAME=" in (error.expected or ""):
+        return "the same command with --tower NAME=LATITUDE,LONGITUDE,HEIGHT"
     if words[:1] in _OF_LOGS:
         return f"'aerpaw-cmp ingest {one_line(str(place))}' shows what the file holds"
     return f"the same command with another file than {one_line(place.name)}"

@@ -335,12 +335,13 @@ def run_site_import(
     files: list[Path],
     out: Path,
     *,
-    base: str = "lake_wheeler",
+    base: str | None = None,
+    towers: Sequence[str] = (),
     untagged: str | None = None,
     trees: bool = False,
     force: bool = False,
 ) -> list[str]:
-    """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them.
+    """Write a site.yaml from map files and return what was done to them.
 
     Parameters
     ----------
@@ -348,8 +349,10 @@ def run_site_import(
         GeoJSON, OSM XML, Overpass JSON, KML or KMZ.
     out : Path
         The site.yaml to write.
-    base : str
-        Site whose towers and settings are kept.
+    base : str, optional
+        Site whose towers and settings are kept. Default: Lake Wheeler if no tower is named.
+    towers : sequence of str
+        ``NAME=LATITUDE,LONGITUDE,HEIGHT`` of antennas; the first is the origin if there is no base.
     untagged : str, optional
         What areas without a tag are: building, forest or geofence.
     trees : bool
@@ -365,11 +368,13 @@ def run_site_import(
     from ..site.antenna.learned import carry_memory
     from ..site.imports.footprints import import_site, site_yaml
 
-    with OutputFile(out, own=is_sealed, inputs=[*files, Path(base)], force=force) as output:
-        model, actions = import_site(files, base=base, untagged=untagged, trees=trees)
+    inputs = [*files, *([] if base is None else [Path(base)])]
+    with OutputFile(out, own=is_sealed, inputs=inputs, force=force) as output:
+        model, actions = import_site(files, base=base, towers=towers, untagged=untagged, trees=trees)
         text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
         output.write(sealed(text))
-    return [*actions, *carry_memory(base, out)]
+    # antennas learned for a site belong to its towers, which named towers replace
+    return [*actions, *([] if towers else carry_memory(base or "lake_wheeler", out))]
 
 
 def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:

@@ -284,7 +284,7 @@ def _rss_layers(result: MapResult, tower: str | None) -> list[Layer]:
     kinds: tuple[Antennas, ...] = ("siso", "mimo")
     for antennas in kinds:
         for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
-            name = f"rss_{antennas}_h{_in_name(height)}m_{who}"
+            name = f"rss_{antennas}_h{in_name(height)}m_{who}"
             layers.append(Layer(name, values, "dBm", f"RSS {antennas.upper()}, {height:g} m{of}"))
     return layers
 
@@ -297,11 +297,11 @@ def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
     )
     ranks, layers = result.ranks(tower), []
     for row, height in enumerate(result.rank_altitudes_m):
-        at = f"h{_in_name(height)}m_{who}"
+        at = f"h{in_name(height)}m_{who}"
         for column, k in enumerate(result.ks):
             title = f"Rank, K = {k:g}, {height:g} m{of}"
             layers.append(
-                Layer(f"rank_k{_in_name(k, 0)}_{at}", ranks[row, column], "1", title, class_names(HIGHEST_RANK))
+                Layer(f"rank_k{in_name(k, 0)}_{at}", ranks[row, column], "1", title, class_names(HIGHEST_RANK))
             )
         for name, title, values in ratios:
             layers.append(Layer(f"{name}_{at}", values[row], "dB", f"{title}, {height:g} m{of}"))
@@ -314,7 +314,7 @@ def _label(tower: str | None) -> tuple[str, str]:
     return (re.sub(r"\W", "_", tower), f", {tower}") if tower else ("joint", ", nearest tower")
 
 
-def _in_name(number: float, digits: int = 3) -> str:
-    """030 for 30, 12p5 for 12.5."""
+def in_name(number: float, digits: int = 3) -> str:
+    """Return a height or K as part of a layer's name: 030 for 30, 12p5 for 12.5."""
     # padded with zeros, so that layers sorted by name are sorted by height
     return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")

@@ -231,6 +231,16 @@ class SceneModel(StrictModel):
     ground_plane: bool = False
 
 
+class CoverageModel(StrictModel):
+    """The link budget of the site's coverage maps; ``aerpaw-cmp map`` has an option for each key."""
+
+    tx_power_dbm: float | None = None
+    bandwidth_mhz: Positive | None = None
+    noise_figure_db: _NotNegative | None = None
+    threshold_dbm: float | None = None
+    threshold_snr_db: float | None = None
+
+
 class SiteModel(StrictModel):
     """The whole of site.yaml."""
 
@@ -248,6 +258,7 @@ class SiteModel(StrictModel):
     forests: list[ForestModel] = Field(default_factory=list)
     trees: TreesModel = Field(default_factory=TreesModel)
     geofences: list[PolygonModel] = Field(default_factory=list)
+    coverage: CoverageModel = Field(default_factory=CoverageModel)
     credit: str = ""
     assumed: str = ""
     notes: list[str] = Field(default_factory=list)

@@ -19,6 +19,7 @@ from aerpaw_cmp.jobs.mapping import coverage_map as mapping
 from aerpaw_cmp.jobs.mapping.paper_table import paper_rows
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import RATIO_LIMIT_DB, rank_of_singular_values
+from aerpaw_cmp.maps.link_budget import PAPER_BUDGET, LinkBudget
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL
 from aerpaw_cmp.propagation.field.foliage import CrownIndex, Opaque, foliage_loss_db
 from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, linear_array, single_element
@@ -26,6 +27,7 @@ from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.relief.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
+from aerpaw_cmp.site.trees import join_trees
 from tests.jobs.sent_by_pickle import SentByPickle
 from tests.json_page import unlisted
 
@@ -333,3 +335,37 @@ def test_paths_of_infinite_loss_are_no_paths(site):
     assert np.isnan(result.rss_power_dbm[0, 0])
     assert (result.h[0] == 0).all()
     assert np.isfinite(result.rss_dbm[1, 0])
+
+
+def test_coverage_is_the_share_of_levels_at_the_threshold(site, tmp_path):
+    """With free space alone the covered positions lie in a disc around the tower, whose radius Friis states."""
+    open_site = replace(site, buildings=(), trees=join_trees([]))
+    budget = LinkBudget(tx_power_dbm=20.0, bandwidth_mhz=10.0, noise_figure_db=5.0, threshold_snr_db=18.0)
+    chosen = settings(foliage=("none",), budget=budget, max_depth=0, study=False)
+    outcome = mapping.make_maps(open_site, chosen, Stages(lambda *_: None))
+    level = outcome.shown.rss("siso", "A")[0]
+    grid = outcome.shown.grid.positions_m(30.0)
+    away = np.linalg.norm(grid - open_site.towers["A"].position_m, axis=1)
+    reach_m = wavelength_m(CARRIER_HZ) / (4 * np.pi) * 10 ** ((20.0 - budget.level_dbm) / 20)
+    np.testing.assert_array_equal(budget.covered(level) > 0, away <= reach_m)
+    record = mapping.maps_record(outcome, name="open", stages_s={}, paper=paper_rows(outcome))
+    shares = {(m.tower, m.antennas): m.coverage for m in record.rss}
+    assert 0.2 < shares["A", "SISO"] < 0.8
+    assert shares["A", "SISO"] == pytest.approx(np.mean(away <= reach_m))
+    layers = {layer.name: layer for layer in mapping._budget_layers(outcome)}
+    assert set(layers) == {"margin_mimo_h030m_joint_none", "snr_mimo_h030m_joint_none"}
+    apart = layers["snr_mimo_h030m_joint_none"].values - layers["margin_mimo_h030m_joint_none"].values
+    np.testing.assert_allclose(apart, 18.0, atol=0.011)
+
+
+def test_options_replace_the_link_budget_of_the_site(tmp_path):
+    file = tmp_path / "site.yaml"
+    file.write_text(
+        "name: a\norigin: {latitude_deg: 35.7, longitude_deg: -78.7}\n"
+        "towers: {A: {latitude_deg: 35.7, longitude_deg: -78.7}}\n"
+        "coverage: {tx_power_dbm: 23, bandwidth_mhz: 10, noise_figure_db: 6, threshold_snr_db: 3}\n"
+    )
+    assert mapping.link_budget(str(file), {}).sentence().startswith("Transmit power 23 dBm; noise floor -98.0 dBm")
+    changed = mapping.link_budget(str(file), {"threshold_dbm": -90.0, "tx_power_dbm": None})
+    assert (changed.tx_power_dbm, changed.threshold_snr_db, changed.level_dbm) == (23, None, -90.0)
+    assert mapping.link_budget("lake_wheeler", {}) == PAPER_BUDGET

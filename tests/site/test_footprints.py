@@ -243,7 +243,7 @@ def test_swapped_far_and_antimeridian(tmp_path: Path) -> None:
         import_footprints([raw(tmp_path / "p.json", (2.0, 48.0), (2.1, 48.0), (2.1, 48.1))], FRAME)
     with pytest.raises(InputError, match=r"antimeridian"):
         import_footprints([raw(tmp_path / "d.json", (179.9, 35.0), (-179.9, 35.0), (179.9, 35.1))], FRAME)
-    with pytest.raises(InputError, match="metres or feet in place of degrees"):
+    with pytest.raises(InputError, match="metres or feet instead of degrees"):
         import_footprints([raw(tmp_path / "f.json", (2020.5, 1971.5), (2050, 1971), (2050, 1990))], FRAME)
 
 

@@ -18,7 +18,7 @@ from ..shown import answered, print_files, say, show, table
     of=site_app,
     text="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) or a Mitsuba scene to a site.yaml.",
     examples=[
-        "aerpaw-cmp site import farm.osm -o site.yaml",
+        "aerpaw-cmp site import campus.osm --tower roof=40.0090,-105.2670,25 -o site.yaml",
         "aerpaw-cmp site import munich.xml --origin 48.1372,11.5755 --tower BS=8.5,21,27 -o munich.yaml",
         "aerpaw-cmp site import fields.kml barns.geojson --base my_towers.yaml --untagged building -o site.yaml",
     ],
@@ -30,13 +30,18 @@ def site_import(
         Argument(help="Map files, or one Mitsuba XML"),
     ],
     base: Annotated[
-        str | None, Option(help="Site that gives towers and settings  [default: lake_wheeler; none for a scene]")
+        str | None,
+        Option(help="Site whose towers and settings are kept  [default: lake_wheeler for a map without --tower]"),
     ] = None,
     origin: Annotated[
         str | None, Option(help="Scene: latitude,longitude[,ground height] of its (0, 0, 0), or 'local'.")
     ] = None,
     tower: Annotated[
-        list[str] | None, Option(help="Scene: name=east,north,height [m] of an antenna; repeatable.")
+        list[str] | None,
+        Option(
+            help="Antenna; repeatable. Map: NAME=LATITUDE,LONGITUDE,HEIGHT above ground [deg, m], the first is the "
+            "origin. Scene: NAME=EAST,NORTH,HEIGHT [m]."
+        ),
     ] = None,
     material: Annotated[
         list[str] | None, Option(help="Scene: id=concrete, for a material without radio properties; repeatable.")
@@ -53,7 +58,7 @@ def site_import(
     from ...jobs.mapping import site_scene
 
     scene = len(files) == 1 and site_scene.is_scene(files[0])
-    of_scenes = {"--origin": origin, "--tower": tower, "--material": material, "--turn": turn}
+    of_scenes = {"--origin": origin, "--material": material, "--turn": turn}
     of_maps = {"--untagged": untagged, "--trees": trees}
     for option in (name for name, value in (of_maps if scene else of_scenes).items() if value):
         kinds = ("a Mitsuba scene", "map files") if scene else ("map files", "one Mitsuba XML")
@@ -64,8 +69,9 @@ def site_import(
         )
         actions = site_scene.run_scene_import(files[0], out, facts, force=force)
     else:
-        base = base or "lake_wheeler"
-        actions = run.run_site_import(files, out, base=base, untagged=untagged, trees=trees, force=force)
+        actions = run.run_site_import(
+            files, out, base=base, towers=tower or (), untagged=untagged, trees=trees, force=force
+        )
     if answered({"file": str(out), "base": base, "actions": actions}):
         return
     for line in actions:
@@ -153,6 +159,7 @@ def antenna_export(
         "aerpaw-cmp map site.yaml --spacing 15 --dry-run",
         "aerpaw-cmp map site.yaml -o reports/map --spacing 20 --rank-altitude 30 --rank-altitude 70",
         "aerpaw-cmp map lake_wheeler --foliage none --no-study --json",
+        "aerpaw-cmp map site.yaml --tx-power-dbm 30 --bandwidth-mhz 20 --noise-figure-db 7 --threshold-dbm -90",
         "aerpaw-cmp map lake_wheeler --with flight1.yaml --with flight2.yaml",
     ],
 )
@@ -176,6 +183,15 @@ def map_(
     ] = None,
     carrier_ghz: Annotated[float | None, Option(help="Carrier frequency [GHz]  [default: 3.4]")] = None,
     max_depth: Annotated[int | None, Option(min=0, max=3, help="Largest number of reflections  [default: 2]")] = None,
+    tx_power_dbm: Annotated[float | None, Option(help="Transmit power of a tower [dBm]  [default: 40]")] = None,
+    bandwidth_mhz: Annotated[
+        float | None, Option(help="Receiver bandwidth [MHz], from which the noise floor follows.")
+    ] = None,
+    noise_figure_db: Annotated[float | None, Option(help="Noise figure of the receiver [dB]  [default: 0]")] = None,
+    threshold_dbm: Annotated[
+        float | None, Option(help="Lowest level that counts as coverage [dBm]  [default: any path]")
+    ] = None,
+    threshold_snr_db: Annotated[float | None, Option(help="Lowest SNR that counts as coverage [dB].")] = None,
     flights: Flights = None,
     logs_root: LogsRoot = None,
     study: Annotated[bool, Option("--study/--no-study", help="Also spatial correlation and interpolation.")] = True,
@@ -194,7 +210,7 @@ def map_(
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
     from ...jobs import run
-    from ...jobs.mapping.coverage_map import map_settings
+    from ...jobs.mapping.coverage_map import link_budget, map_settings
 
     modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
     fields: dict[str, Any] = {
@@ -207,14 +223,28 @@ def map_(
         "max_depth": max_depth,
         "study": study,
         "tile_m": tile_m,
+        "budget": link_budget(
+            site,
+            {
+                "tx_power_dbm": tx_power_dbm,
+                "bandwidth_mhz": bandwidth_mhz,
+                "noise_figure_db": noise_figure_db,
+                "threshold_dbm": threshold_dbm,
+                "threshold_snr_db": threshold_snr_db,
+            },
+        ),
     }
     settings = map_settings(fields, quick=quick)
     options = RunOptions(
         out=out, logs_root=logs_root, force=force, workers=workers, scheduler=scheduler, progress=say, dry=dry_run
     )
+    if not say.as_json:
+        show(settings.budget.sentence())
     outcome = run.run_map(site, settings, options, flights=flights or (), figures=figures)
     if answered(outcome.metrics):
         return
+    if settings.budget.level_dbm is not None:
+        _print_coverage(outcome.metrics["coverage"], settings)
     rows = [[p["where"], p["what"], p["paper"], p["ours"]] for p in outcome.metrics["paper"]]
     if rows:
         table(["where", "what", "paper", "here"], rows, "What the paper states, and what this run gives")
@@ -223,3 +253,15 @@ def map_(
             show(path)
     if outcome.metrics["tiles"]:
         show(outcome.metrics["tiles"]["store"])
+
+
+def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
+    """Print the share of covered positions per tower and height, with the foliage of the paper."""
+    shown = [row for row in rows if row["antennas"] == "MIMO" and row["foliage"] == settings.shown]
+    heights = sorted({row["altitude_m"] for row in shown})
+    share = {(row["tower"], row["altitude_m"]): f"{100.0 * row['coverage']:.1f} %" for row in shown}
+    names = list(dict.fromkeys(row["tower"] for row in shown))
+    lines = [
+        ["nearest tower" if name == "joint" else name, *(share[name, height] for height in heights)] for name in names
+    ]
+    table(["tower", *(f"{height:g} m" for height in heights)], lines, f"Covered positions, foliage {settings.shown}")

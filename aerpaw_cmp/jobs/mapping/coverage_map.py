@@ -35,6 +35,7 @@ from ...maps.evaluate import (
 from ...maps.grid import Grid
 from ...maps.interpolate import InverseDistance, ServingTowerMean
 from ...maps.kriging import OrdinaryKriging
+from ...maps.link_budget import PAPER_BUDGET, LinkBudget
 from ...maps.netcdf import maps_dataset
 from ...maps.store import TileStore
 from ...maps.study import Study, interpolation_study, rank_fields
@@ -52,7 +53,7 @@ from ...report.content.flight import ReportData
 from ...report.pages.prediction import outside_share
 from ...site.inputs import inputs_of_site
 from ...site.site import Site
-from ...site.siteyaml import load_site
+from ...site.siteyaml import load_site, site_model
 from ..prediction.corrected_map import CorrectedMaps
 from ..reporting.foliage_notes import p833_note
 from ..tasks.outcomes import code_digest
@@ -85,8 +86,10 @@ class MapSettings:
         Heights above ground.
     ks : tuple of float
         Singular-value ratios.
-    carrier_hz, transmit_power_dbm : float
-        40 dBm are the paper's 10 W.
+    carrier_hz : float
+        Carrier frequency.
+    budget : LinkBudget
+        Transmit power, receiver noise and the threshold of coverage.
     elements, element_spacing : int, float
         Of the linear arrays at both ends, along north; spacing in wavelengths.
     max_depth : int
@@ -110,7 +113,7 @@ class MapSettings:
     rank_altitudes_m: tuple[float, ...] = job.PAPER_RANK_ALTITUDES_M
     ks: tuple[float, ...] = job.PAPER_KS
     carrier_hz: float = 3.4e9
-    transmit_power_dbm: float = 40.0
+    budget: LinkBudget = PAPER_BUDGET
     elements: int = 4
     element_spacing: float = 0.5
     max_depth: int = 2
@@ -158,9 +161,21 @@ QUICK: dict[str, Any] = {"spacing_m": 120.0, "rss_altitudes_m": (30.0, 110.0), "
 
 
 def map_settings(fields: Mapping[str, Any], *, quick: bool = False) -> MapSettings:
-    """Settings of a map from fields that were given; None leaves the default."""
+    """Return the settings of a map from the fields that were given; None leaves the default."""
     stated = {name: value for name, value in fields.items() if value is not None}
     return MapSettings(**({**QUICK, **stated} if quick else stated))
+
+
+def link_budget(site: str, options: Mapping[str, float | None]) -> LinkBudget:
+    """Return the link budget of the key ``coverage`` of a site, with command-line options in its place.
+
+    A threshold among the options replaces either threshold of the site.
+    """
+    stated = {name: value for name, value in options.items() if value is not None}
+    kept = site_model(site).coverage.model_dump(exclude_none=True)
+    if "threshold_dbm" in stated or "threshold_snr_db" in stated:
+        kept = {name: value for name, value in kept.items() if not name.startswith("threshold")}
+    return LinkBudget(**(kept | stated))
 
 
 # --- the engine ----------------------------------------------------------------------------------------------------
@@ -177,7 +192,7 @@ class SiteChannels:
         self.crowns = {mode: crown_index(site.under(mode).trees) for mode in settings.foliage}
         budget = Budget(
             carrier_hz=settings.carrier_hz,
-            transmit_power_dbm=settings.transmit_power_dbm,
+            transmit_power_dbm=settings.budget.tx_power_dbm,
             gain_db=float(db_from_power(settings.elements)),
             floor_dbm=THERMAL_NOISE_DBM_HZ,
         )
@@ -196,7 +211,7 @@ class SiteChannels:
 
     def _link(self, array: Any) -> Link:
         towers = dict.fromkeys(self.site.towers, array)
-        return Link(self.settings.carrier_hz, towers, array, self.settings.transmit_power_dbm, uav_transmits=False)
+        return Link(self.settings.carrier_hz, towers, array, self.settings.budget.tx_power_dbm, uav_transmits=False)
 
     def of(self, mode: str) -> job.Evaluate:
         """The evaluation of one foliage mode."""
@@ -278,7 +293,7 @@ class SiteChannels:
         return job.Evaluation(siso, mimo, spread, placed(some.singular_values))
 
     def _rss_dbm(self, h: ComplexArray) -> FloatArray:
-        return rss_dbm(_beam_power(h), self.settings.transmit_power_dbm)
+        return rss_dbm(_beam_power(h), self.settings.budget.tx_power_dbm)
 
     def _above_ground(self, position_m: FloatArray) -> FloatArray:
         if self.site.dem is None:
@@ -581,7 +596,7 @@ def maps_record(
     MapsData
     """
     s, result, flown = outcome.settings, outcome.shown, outcome.corrected
-    rss = tuple(item for mode, maps in outcome.ordered() for item in _rss_maps(maps, mode))
+    rss = tuple(item for mode, maps in outcome.ordered() for item in _rss_maps(maps, mode, s.budget))
     rank = tuple(item for mode, maps in outcome.ordered() for item in _rank_maps(maps, mode))
     towers = result.tower_names if len(result.tower_names) > 1 else ()
     by_tower = (item for mode, maps in outcome.ordered() for tower in towers for item in _rank_maps(maps, mode, tower))
@@ -598,6 +613,7 @@ def maps_record(
         flights=outcome.flights,
         flown_m=() if flown is None else tuple(line.T for line in flown.prediction.flown.values()),
         outside_flown=0.0 if flown is None else outside_share(flown.prediction.table),
+        budget="" if s.budget == PAPER_BUDGET else f"{s.budget.sentence()} ",
         corrected_words="" if flown is None else flown.prediction.verdict,
         rank=rank,
         rank_by_tower=tuple(by_tower),
@@ -617,7 +633,7 @@ def maps_record(
     )
 
 
-def _rss_maps(result: job.MapResult, mode: str) -> Iterator[page.RssMap]:
+def _rss_maps(result: job.MapResult, mode: str, budget: LinkBudget) -> Iterator[page.RssMap]:
     kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
     for antennas in kinds:
         for row, height in enumerate(result.rss_altitudes_m):
@@ -628,7 +644,7 @@ def _rss_maps(result: job.MapResult, mode: str) -> Iterator[page.RssMap]:
                     antennas=antennas.upper(),
                     altitude_m=height,
                     rss_dbm=result.grid.raster(values),
-                    coverage=float(np.isfinite(values).mean()),
+                    coverage=float(budget.covered(values).mean()),
                     foliage=mode,
                 )
 
@@ -658,18 +674,19 @@ def _rank_versions(outcome: MapOutcome) -> Iterator[page.RankMap]:
 def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     """Layers of the linked map alone: how many towers cover a position, at what share of heights, which one serves."""
     kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
+    budget = outcome.settings.budget
     for mode, result in outcome.ordered():
         raster = result.grid.raster
         for antennas in kinds:
             axes = {"Antennas": antennas.upper(), "Foliage": mode}
-            each = np.isfinite(result.rss_mimo_dbm if antennas == "mimo" else result.rss_siso_dbm)
+            each = budget.covered(result.rss_mimo_dbm if antennas == "mimo" else result.rss_siso_dbm)
             for row, height in enumerate(result.rss_altitudes_m):
                 yield page.MapLayer(
                     quantity="Towers in coverage", unit="towers", axes={**axes, **page.at_height(height)},
-                    values=raster(each[row].sum(axis=0).astype(np.float64)),
+                    values=raster(each[row].sum(axis=0)),
                 )  # fmt: skip
             for tower in (None, *result.tower_names) if len(result.rss_altitudes_m) > 1 else ():
-                covered = np.isfinite(result.rss(antennas, tower)).mean(axis=0)
+                covered = budget.covered(result.rss(antennas, tower)).mean(axis=0)
                 yield page.MapLayer(
                     quantity="Probability of coverage over heights", unit="%",
                     axes={"Tower": tower or page.JOINT, **axes}, values=raster(100.0 * covered),
@@ -682,10 +699,32 @@ def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
         )  # fmt: skip
 
 
+def _budget_layers(outcome: MapOutcome) -> Iterator[cells.Layer]:
+    """Yield the margin above the threshold and the SNR of the nearest tower, per foliage mode and height."""
+    budget = outcome.settings.budget
+    for mode, result in outcome.ordered():
+        for row, height in enumerate(result.rss_altitudes_m):
+            level, at = result.rss()[row], f"{job.in_name(height)}m_joint_{mode}"
+            where = f"{height:g} m, nearest tower, foliage {mode}"
+            if budget.level_dbm is not None:
+                margin = np.round(level - budget.level_dbm, 2)
+                yield cells.Layer(
+                    f"margin_mimo_h{at}", margin, "dB", f"Margin above {budget.level_dbm:.1f} dBm, {where}"
+                )
+            if budget.noise_dbm is not None:
+                yield cells.Layer(f"snr_mimo_h{at}", np.round(level - budget.noise_dbm, 2), "dB", f"SNR, {where}")
+
+
 def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     """Singular-value spread and condition number, then what foliage changes."""
     result, s = outcome.shown, outcome.settings
     raster = result.grid.raster
+    for layer in _budget_layers(outcome):
+        quantity, _, height = layer.title.partition(", ")
+        height, _, foliage = height.partition(", nearest tower, foliage ")
+        yield page.MapLayer(
+            quantity=quantity, unit="dB", axes={"Foliage": foliage, "Height": height}, values=raster(layer.values)
+        )
     for name, values in (("Singular-value spread", result.spread_db), ("Condition number", result.condition_db)):
         joint = values[..., result.serving, np.arange(len(result.grid))]
         for row, height in enumerate(result.rank_altitudes_m):
@@ -758,7 +797,7 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
 def _notes(outcome: MapOutcome) -> tuple[str, ...]:
     """Notes on the loss in crowns where it is continued beyond its table, and on tiles."""
     note = p833_note(outcome.settings.carrier_hz) if "attenuating" in outcome.settings.foliage else None
-    notes = [] if note is None else [note]
+    notes = [outcome.settings.budget.sentence(), *([] if note is None else [note])]
     if outcome.tiles:
         each, all_ = outcome.tiles["shown_every"], outcome.tiles["positions"]
         notes.append(
@@ -799,7 +838,7 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
     ``progress`` is told where it is left out, and why.
     """
     site, grid = outcome.site, outcome.shown.grid
-    flown = [] if outcome.corrected is None else outcome.corrected.layers()
+    flown = [*_budget_layers(outcome), *([] if outcome.corrected is None else outcome.corrected.layers())]
     joint, every = (_all_layers(outcome, towers_too=too) + flown for too in (False, True))
     names = {layer.name for layer in joint}
     every = [layer for layer in every if layer.name in names or not layer.name.startswith(RATIOS)]

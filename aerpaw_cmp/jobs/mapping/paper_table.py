@@ -15,6 +15,7 @@ import yaml
 from ...common.counting import counted
 from ...common.units import finite_mean, power_from_db
 from ...maps.job import Antennas
+from ...maps.link_budget import PAPER_BUDGET
 from ...maps.study import rank_fields
 from ...report.content.maps import PaperRow
 from ...report.names import k_key
@@ -27,8 +28,11 @@ WORDS = {"zero": "Z as rank 0", "missing": "Z left out"}
 
 
 def paper_rows(outcome: MapOutcome) -> Iterator[PaperRow]:
-    """All rows, in the order of the paper, whose towers the site has; those of the study only when it was made."""
-    if not {f"LW{number}" for number in range(1, 6)} <= set(outcome.site.towers):
+    """Return all rows in the order of the paper, if the site has its towers and the map is of its kind.
+
+    A map with a link budget of its own is not the paper's. Rows of the study are there only if the study was made.
+    """
+    if not {f"LW{n}" for n in range(1, 6)} <= set(outcome.site.towers) or outcome.settings.budget != PAPER_BUDGET:
         return
     result = outcome.shown
     heights = result.rss_altitudes_m or (0.0,)
@@ -61,7 +65,7 @@ def _setup(outcome: MapOutcome) -> dict[str, str]:
         "depth": str(s.max_depth),
         "elements": f"{s.elements} (TX and RX)",
         "element_spacing": f"{s.element_spacing:g} wavelengths",
-        "power": f"{float(power_from_db(s.transmit_power_dbm - 30.0)):g} W",
+        "power": f"{float(power_from_db(s.budget.tx_power_dbm - 30.0)):g} W",
         "interval": f"{s.spacing_m:g} m",
         "locations": f"{columns} x {rows} = {columns * rows}",
         "materials": f"{', '.join(buildings)}, {site.ground_material} (ITU-R P.2040)",

@@ -152,6 +152,8 @@ class MapsData(Made):
         Share of positions further from those flights than a correction reaches.
     corrected_words : str
         First words of the prediction that corrected the levels.
+    budget : str
+        Power, noise floor and threshold in one sentence, if they are not the paper's.
     flights : tuple of ReportData
         Those that ``--with`` names, replayed and compared.
     layers : tuple of MapLayer
@@ -172,6 +174,7 @@ class MapsData(Made):
     flown_m: tuple[FloatArray, ...] = ()
     outside_flown: float = 0.0
     corrected_words: str = ""
+    budget: str = ""
     flights: tuple[ReportData, ...] = ()
     rank: tuple[RankMap, ...] = ()
     rank_by_tower: tuple[RankMap, ...] = ()

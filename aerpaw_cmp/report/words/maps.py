@@ -44,7 +44,7 @@ def first_words(data: MapsData) -> str:
     best = max(heights, key=lambda height: height.covered)
     more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
     measured = "" if data.corrected else "Nothing here was measured. "
-    return f"{measured}{more}{sentence}"
+    return f"{data.budget}{measured}{more}{sentence}"
 
 
 def coverage(data: MapsData) -> list[Coverage]:
@@ -97,8 +97,4 @@ def _made(data: MapsData) -> Iterator[str]:
         "takes ITU-R P.833 over the path's length in crowns; none leaves the trees out."
     )
     yield "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element."
-    yield (
-        "No receiver bandwidth is assumed: a link is in coverage where a path arrives above the thermal noise of 1 Hz "
-        "(-174 dBm)."
-    )
     yield f"Spread, condition number, correlation and interpolation are those of foliage {data.rss[0].foliage}."

@@ -19,7 +19,7 @@ import numpy as np
 import shapely
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
-from shapely.geometry import LineString, MultiPolygon, Polygon, box
+from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from ...common.counting import counted
@@ -52,6 +52,9 @@ _DEFAULT_HEIGHT_M = 6.0
 TALLEST_M = 300.0
 # Outlines farther from the origin are not of this site.
 FAR_M = 20_000.0
+
+# The area of a site without a base: the map within this square around the first tower, and this far around each tower.
+_AROUND_M, _NEAR_TOWER_M = 2000.0, 500.0
 
 # Coordinates are rounded to this.
 _GRID_M = 0.001
@@ -325,10 +328,11 @@ def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
         f"the nearest position is {away / 1000:.0f} km from the site ({first})"
         if math.isfinite(away)
         else f"the positions are no latitudes and longitudes ({first})",
-        expected=f"WGS84 degrees near the site's origin {centre}",
+        expected=f"WGS84 degrees near the site's origin {centre}, or a site where the map is: --base SITE, or "
+        "--tower NAME=LATITUDE,LONGITUDE,HEIGHT of its antenna",
         cause="the area crosses the antimeridian (180 deg)"
         if max(spans, default=0) > 180
-        else ("metres or feet in place of degrees" if not math.isfinite(away) else "a map of another place"),
+        else ("metres or feet instead of degrees" if not math.isfinite(away) else "a map of another place"),
         path=path,
     )
 
@@ -626,17 +630,22 @@ def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, 
 def import_site(
     files: Sequence[str | Path],
     *,
-    base: str | Path = "lake_wheeler",
+    base: str | Path | None = None,
+    towers: Sequence[str] = (),
     **options: Any,
 ) -> tuple[SiteModel, list[str]]:
-    """A site with the towers and settings of ``base`` and everything else from map files.
+    """Return a site whose buildings, woods and geofences come from map files.
 
     Parameters
     ----------
     files : sequence of paths
         Map files.
-    base : str or path
-        Packaged site or site.yaml.
+    base : str or path, optional
+        Packaged site or site.yaml from which towers and settings are kept. Without ``towers`` the default is Lake
+        Wheeler, if the map is there.
+    towers : sequence of str
+        ``NAME=LATITUDE,LONGITUDE,HEIGHT``: antennas [deg, deg, m above the ground]. They replace those of ``base``.
+        Without a base the first one is the origin and the ground is flat.
     **options
         For :func:`import_footprints`.
 
@@ -644,17 +653,82 @@ def import_site(
     -------
     SiteModel, list of str
         The settings (see :func:`site_yaml`), and what was done.
+
+    Raises
+    ------
+    UsageError
+        If no file or no tower is known, or a tower is not ``NAME=LATITUDE,LONGITUDE,HEIGHT``.
+    InputError
+        If the map cannot be read, or does not lie at the site.
     """
     if not files:
         raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
+    named_towers = _named_towers(towers)
+    if towers and base is None:
+        return _site_around(files, named_towers, options)
+    base = base or "lake_wheeler"
     model = site_model(base)
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
     content = model.model_dump()
+    if towers:
+        content["towers"] = named_towers
     if model.dem is not None:  # the new file may lie in another folder
         content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
     actions = _from_maps(content, import_footprints(files, frame, area_m=extent_m(model, frame), **options))
     imported = SiteModel.model_validate(content)
     return imported, [_kept_of_base(imported, base), *actions]
+
+
+def _site_around(
+    files: Sequence[str | Path], towers: dict[str, dict[str, float]], options: dict[str, Any]
+) -> tuple[SiteModel, list[str]]:
+    """Return a site with flat ground whose origin is the first tower, and whose area is that of the map around it."""
+    first = next(iter(towers.values()))
+    origin = {key: first[key] for key in ("latitude_deg", "longitude_deg")}
+    frame = SiteFrame(**origin)
+    positions = [frame.to_local(tower["latitude_deg"], tower["longitude_deg"]) for tower in towers.values()]
+    reach = box(-_AROUND_M, -_AROUND_M, _AROUND_M, _AROUND_M)
+    imports = import_footprints(files, frame, area_m=(-_AROUND_M, _AROUND_M, -_AROUND_M, _AROUND_M), **options)
+    shapes = [item.footprint for item in imports.buildings] + [item.area for item in imports.forests]
+    mapped = shapely.union_all([shape.intersection(reach) for shape in shapes])
+    around = [Point(*position).buffer(_NEAR_TOWER_M) for position in positions]
+    west, south, east, north = shapely.union_all([mapped, *around]).bounds
+    content: dict[str, Any] = {
+        "name": Path(files[0]).stem,
+        "origin": origin,
+        "towers": towers,
+        "area_m": [math.floor(west), math.ceil(east), math.floor(south), math.ceil(north)],
+        "trees": {},
+    }
+    actions = _from_maps(content, imports)
+    west, east, south, north = content["area_m"]
+    ground = SiteModel.model_fields["ground_material"].default
+    about = (
+        f"the origin is tower {next(iter(towers))}; the ground is flat ({ground}); the area is {east - west} m x "
+        f"{north - south} m: the map within {_AROUND_M / 1000:g} km of the origin. Change them in the file"
+    )
+    return SiteModel.model_validate(content), [about, *actions]
+
+
+def _named_towers(towers: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return towers by name from ``NAME=LATITUDE,LONGITUDE,HEIGHT``."""
+    form = "--tower NAME=LATITUDE,LONGITUDE,HEIGHT, such as --tower roof=40.009,-105.267,25 [deg, deg, m above ground]"
+    by_name: dict[str, dict[str, float]] = {}
+    for text in towers:
+        name, _, place = text.partition("=")
+        try:
+            latitude, longitude, height = (float(word) for word in place.split(","))
+        except ValueError:
+            raise UsageError(f"--tower '{text}'", expected=form) from None
+        if not (name and math.isfinite(height) and 0 < height <= TALLEST_M):
+            raise UsageError(f"--tower '{text}'", expected=form, cause=f"a height outside 0 to {TALLEST_M:g} m")
+        if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+            swapped = abs(longitude) <= 90 and abs(latitude) <= 180
+            raise UsageError(f"--tower '{text}'", expected=form, cause="the two are swapped" if swapped else None)
+        if name in by_name:
+            raise UsageError(f"two towers named '{name}'", expected="one --tower per name")
+        by_name[name] = {"latitude_deg": latitude, "longitude_deg": longitude, "antenna_height_m": height}
+    return by_name
 
 
 def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:

@@ -434,9 +434,9 @@ def gather(
     for path, stream in (*telemetry[:1], *placed):
         check_place(site, path, stream)
     _check_overlap(data)
-    asked = (
-        () if track is None else doubts(track, telemetry[0][1], _times_on_track(data), _undated(data, telemetry[0][0]))
-    )
+    asked = tuple(site.cautions(series.tower for series in (*data.rss, *data.rank)))
+    if track is not None:
+        asked += doubts(track, telemetry[0][1], _times_on_track(data), _undated(data, telemetry[0][0]))
     # after the overlap was checked: a flight that shares no time stops with its own message
     every = (*_idle_attitude(data), *data.warnings, *(f"{text}." for text in asked))
     return dataclasses.replace(data, doubts=asked, warnings=every)

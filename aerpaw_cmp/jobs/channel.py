@@ -311,6 +311,7 @@ def run_channel(flight: Path, chosen: ChannelOptions, options: RunOptions = DEFA
             written, metrics = write_channel(parts, place, formats, stages)
         files = output.placed(written)
         # of a route: its towers stand, and what is said of nodes that move along a track is not of it
-        warnings = [*(data.warnings if route is None else ()), *metrics.pop("warnings")]
+        read = data.warnings if route is None else [f"{text}." for text in data.site.cautions()]
+        warnings = [*read, *metrics.pop("warnings")]
         metrics |= {"files": [*map(str, files)], "warnings": warnings, "stages": stages.seconds}
         return JobOutcome(folder=folder, metrics=metrics, files=files)

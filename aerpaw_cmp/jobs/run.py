@@ -167,7 +167,8 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
     folder = options.out or Path("simulated") / settings.flight.name
     stages = options.stages("simulate", inputs, folder)
     files = simulator.run(folder, inputs=inputs, force=options.force, stages=stages)
-    return JobOutcome(folder=folder, files=tuple(files))
+    cautions = tuple(f"{text}." for text in site.cautions())
+    return JobOutcome(folder=folder, files=tuple(files), warnings=cautions)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -400,7 +401,8 @@ def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:
         place = load_site(site)
         with output.filling() as folder:
             written = write_site_view(place, folder)
-        return JobOutcome(folder=out, files=output.placed(written))
+        cautions = tuple(f"{text}." for text in place.cautions())
+        return JobOutcome(folder=out, files=output.placed(written), warnings=cautions)
 
 
 def run_map(

@@ -6,11 +6,11 @@ tower's own ground height says otherwise (one reflecting plane per tower).
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, fields, replace
 
 import numpy as np
-from shapely.geometry import Polygon
+from shapely.geometry import Point, Polygon
 
 from ..common.counting import counted
 from ..common.geodesy import SiteFrame
@@ -166,6 +166,8 @@ class Site:
         Sizes on the map that nobody measured.
     notes : tuple of str
         For the report.
+    disagreements : tuple of str
+        Clauses on ground heights that the site file states and its elevation model contradicts.
     takeoff_ground_m : float
         Up of the take-off point, from which ``altitude_m`` of logs counts.
     dem : Dem or None
@@ -187,6 +189,7 @@ class Site:
     credit: str = ""
     assumed: str = ""
     notes: tuple[str, ...] = ()
+    disagreements: tuple[str, ...] = ()
     takeoff_ground_m: float = 0.0
     dem: Dem | None = None
     scene: TriangleScene | None = None
@@ -215,6 +218,32 @@ class Site:
             return ground
         terrain = self.dem.ground_m(east_m, north_m)
         return np.where(np.isnan(terrain), ground, terrain)
+
+    def cautions(self, towers: Iterable[str] | None = None) -> list[str]:
+        """Return clauses on errors of the site that spoil every number at some towers; all towers by default."""
+        names = self.towers if towers is None else towers
+        chosen = [self.towers[name] for name in dict.fromkeys(names) if name in self.towers]
+        clauses = list(self.disagreements)
+        for tower in chosen:
+            up = float(tower.position_m[2])
+            clauses += [
+                f"the antenna of tower {tower.name} ({up:.1f} m up) is inside building '{building.name}' (roof at "
+                f"{building.base_m + building.height_m:.1f} m), so no path reaches it: correct the tower's position, "
+                "set antenna_height_m above the roof if it is on the roof, or delete the building from the site file"
+                for building in self.buildings
+                if building.base_m < up < building.base_m + building.height_m
+                and building.footprint.contains(Point(tower.east_m, tower.north_m))
+            ]
+        if self.dem is not None:
+            places = {f"tower {tower.name}": (tower.east_m, tower.north_m) for tower in chosen}
+            for name, (east, north) in {"the site's origin": (0.0, 0.0), **places}.items():
+                if (patch := self.dem.filled_patch(east, north)) is not None:
+                    clauses.append(
+                        f"the elevation model is {patch.height_m:g} m at {name}, in {counted(patch.cells, 'cell')} of "
+                        f"one height at whose edge the ground jumps by {patch.jump_m:.0f} m, probably a gap filled "
+                        "with a number: fill it from its neighbours (gdal_fillnodata.py) or use another elevation model"
+                    )
+        return clauses
 
     def under(self, foliage: str) -> Site:
         """The site as a kind of foliage sees it: to ``opaque`` a stand that carries trees is those trees."""

@@ -31,7 +31,16 @@ from .relief.dem import Dem, read_dem
 from .relief.surface import Surface, surface_through
 from .scenes import placed_scene, without_traps
 from .site import Building, Forest, Geofence, Site, Tower, Trees
-from .trees import TreeSizes, join_trees, place_trees, trees_at, wanted_trees
+from .trees import (
+    CrownDiameter,
+    TreeHeight,
+    TreeSizes,
+    TrunkDiameter,
+    join_trees,
+    place_trees,
+    trees_at,
+    wanted_trees,
+)
 
 # Sites that come with the package, by name.
 PACKAGED = ("lake_wheeler",)
@@ -50,8 +59,6 @@ _MAPPED_M = 500.0
 
 # No tree is placed at random closer to a tower: masts stand clear.
 MAST_CLEARANCE_M = 8.0
-
-_TALLEST_TREE_M = 120.0
 
 # A higher building or mast is in feet or centimetres; no structure on Earth reaches it.
 TALLEST_M = 1000.0
@@ -188,7 +195,7 @@ class ForestModel(PolygonModel):
     trees_per_hectare: _NotNegative = 100.0
     minimum_spacing_m: _NotNegative = 4.0
     source: str = ""
-    height_m: Annotated[Positive, Field(le=_TALLEST_TREE_M)] | None = None
+    height_m: TreeHeight | None = None
     trees: bool = False
     evergreen_share: Annotated[float, Field(ge=0, le=1)] = 0.0
 
@@ -200,9 +207,9 @@ class SingleTreeModel(StrictModel):
     """A tree with sizes of its own; what is absent is as of all trees."""
 
     at_m: tuple[float, float]
-    height_m: Positive | None = None
-    crown_diameter_m: Positive | None = None
-    trunk_diameter_m: Positive | None = None
+    height_m: TreeHeight | None = None
+    crown_diameter_m: CrownDiameter | None = None
+    trunk_diameter_m: TrunkDiameter | None = None
 
 
 class TreesModel(TreeSizes):
@@ -381,7 +388,6 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         with _at("towers", name):
             towers[name] = _tower(name=name, model=tower, site=model, frame=frame, dem=dem, notes=notes)
             _check_tower(towers[name], model.area_m, frame)
-    notes += _disagreements(model, towers, dem)
     with _at("area_m"):
         places = towers.values()
         area = _checked_area(model.area_m, [t.east_m for t in places], [t.north_m for t in places])
@@ -390,7 +396,7 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         scene, woods, scene_notes = without_traps(scene, {name: tower.position_m for name, tower in towers.items()})
         notes += scene_notes
     buildings = tuple(_building(item, outline, dem) for item, outline in _outlines(model.buildings, "buildings", frame))
-    notes += _buried(towers, buildings) + _overlaps(buildings)
+    notes += _overlaps(buildings)
     forests = tuple(
         Forest(
             **named(item, "name trees_per_hectare minimum_spacing_m source height_m trees evergreen_share"),
@@ -414,6 +420,7 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         geofences=tuple(Geofence(item.name, area) for item, area in _outlines(model.geofences, "geofences", frame)),
         area_m=area,
         notes=tuple(notes),
+        disagreements=_disagreements(model, towers, dem),
         takeoff_ground_m=model.origin.takeoff_ground_m,
         dem=dem,
         scene=scene,
@@ -424,22 +431,23 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
 _HEIGHTS_AGREE_M = 5.0
 
 
-def _disagreements(model: SiteModel, towers: Mapping[str, Tower], dem: Dem | None) -> list[str]:
-    """Sentences on grounds that the file states and its elevation model contradicts."""
+def _disagreements(model: SiteModel, towers: Mapping[str, Tower], dem: Dem | None) -> tuple[str, ...]:
+    """Return clauses on ground heights that the file states and its elevation model contradicts."""
     # a surface through points contradicts none of its own points
     if dem is None or model.dem is None:
-        return []
+        return ()
     pairs = []
     if (ground := model.origin.ground) is not None and ground.reference == model.dem.reference:
         pairs.append(("origin.ground", ground.height_m, float(dem.absolute_m(0.0, 0.0))))
     for name, tower in model.towers.items():
         if tower.ground_offset_m is not None:
             pairs.append((f"the ground of tower {name}", tower.ground_offset_m, float(towers[name].ground_m)))
-    return [
-        f"{what} is stated as {stated:.1f} m, the elevation model has {modelled:.1f} m: is one of another datum?"
+    return tuple(
+        f"{what} is stated as {stated:.1f} m, the elevation model has {modelled:.1f} m: probably one of the two is "
+        "of another datum"
         for what, stated, modelled in pairs
         if abs(stated - modelled) > _HEIGHTS_AGREE_M
-    ]
+    )
 
 
 def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[str]]:
@@ -579,17 +587,6 @@ def _unmapped(towers: Mapping[str, Tower], shapes: list[Polygon]) -> list[str]:
     if not shapes or not bare:
         return []
     return [f"no map here: no building and no wood is known within {_MAPPED_M:g} m of {', '.join(bare)}"]
-
-
-def _buried(towers: Mapping[str, Tower], buildings: tuple[Building, ...]) -> list[str]:
-    """Warnings of antennas inside buildings, which no path reaches."""
-    return [
-        f"warning: the antenna of tower '{tower.name}' lies inside building '{building.name}'; no path will reach it"
-        for tower in towers.values()
-        for building in buildings
-        if tower.position_m[2] < building.base_m + building.height_m
-        and building.footprint.contains(Point(tower.east_m, tower.north_m))
-    ]
 
 
 def _outside(value: float, low: float, high: float) -> float:

@@ -29,12 +29,22 @@ _MAXIMUM_TREES = 2_000_000
 _STALLED_ROUNDS = 12  # batches of darts in a row that add less than a thousandth: the forest is full
 
 
+# Beyond the tallest, widest and thickest trees on Earth [m]: larger sizes are feet or centimetres.
+TALLEST_TREE_M = 120.0
+WIDEST_CROWN_M = 90.0
+THICKEST_TRUNK_M = 15.0
+
+TreeHeight = Annotated[float, Field(gt=0, le=TALLEST_TREE_M)]
+CrownDiameter = Annotated[float, Field(gt=0, le=WIDEST_CROWN_M)]
+TrunkDiameter = Annotated[float, Field(gt=0, le=THICKEST_TRUNK_M)]
+
+
 class TreeSizes(StrictModel):
     """Sizes of trees; the crown's base lies at a share of the height."""
 
-    height_m: Annotated[float, Field(gt=0)] = 20.0
-    crown_diameter_m: Annotated[float, Field(gt=0)] = 10.0
-    trunk_diameter_m: Annotated[float, Field(gt=0)] = 0.4
+    height_m: TreeHeight = 20.0
+    crown_diameter_m: CrownDiameter = 10.0
+    trunk_diameter_m: TrunkDiameter = 0.4
     crown_base_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.25
 
 

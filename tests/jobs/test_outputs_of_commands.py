@@ -177,6 +177,36 @@ def tiny_flight(folder: Path) -> Path:
     return folder / "flight.yaml"
 
 
+def test_a_tower_inside_a_building_is_named_by_each_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A tower of the site and a node of the flight's own, both inside one hall; no path reaches either."""
+    flight, site = tiny_flight(tmp_path), tmp_path / "site.yaml"
+    content = yaml.safe_load(flight.read_text())
+    hall = {"name": "hall", "polygon_m": [[-20, -20], [20, -20], [20, 20], [-20, 20]], "height_m": 30}
+    at = {"latitude_deg": 35.72750947, "longitude_deg": -78.69595819}
+    site.write_text(yaml.safe_dump({"name": "s", "origin": at, "towers": {"LW1": at}, "buildings": [hall]}))
+    flight.write_text(yaml.safe_dump(content | {"site": "site.yaml"}))
+    for command in (
+        ["report", flight, "--audit", "none"],
+        ["channel", flight],
+        ["map", site, "--quick"],
+        ["site", "show", site],
+    ):
+        capsys.readouterr()
+        main([str(word) for word in (*command, "-o", tmp_path / command[0])])
+        said = " ".join(capsys.readouterr().err.split())
+        assert "antenna of tower LW1 (10.0 m up) is inside building 'hall' (roof at 30.0 m)" in said, command
+    own = yaml.safe_load(flight.read_text().replace("LW1\n", "MINE\n"))
+    site.write_text(
+        yaml.safe_dump(
+            {"name": "s", "origin": at, "towers": {"LW5": {**at, "latitude_deg": 35.73}}, "buildings": [hall]}
+        )
+    )
+    flight.write_text(yaml.safe_dump(own | {"towers": {"MINE": {**at, "antenna_height_m": 5}}}))
+    capsys.readouterr()
+    main(["report", str(flight), "--audit", "none", "-o", str(tmp_path / "own")])
+    assert "antenna of tower MINE (5.0 m up) is inside building 'hall'" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_report_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An error inside the writing leaves the old set whole."""
     from aerpaw_cmp.report.pages import flight as html

@@ -154,9 +154,11 @@ def retyped(source: Path, target: Path, decimals: int = 2) -> None:
 @pytest.mark.parametrize("how", ["as written", "without comments", "one decimal", "a table without comments"])
 def test_an_export_of_learned_antennas_is_not_scored_on_its_training_log(folder: Path, how: str) -> None:
     """MSI files of a calibration, and copies of its files that name no log, known by their numbers."""
-    place, sphere = folder / "calibrated", how.startswith("a table")
+    place = folder / "calibrated"
     ends = {}
     for end in ("tower", "uav"):
+        # no sphere results from cuts beside the lobe of the tower's antenna: such a copy is refused
+        sphere = how.startswith("a table") or (how != "as written" and end == "tower")
         source = place / f"LW1.USRP1.{end}{'.csv' if sphere else '.msi'}"
         target = source if how == "as written" else folder / f"mine_{how.replace(' ', '_')}_{end}{source.suffix}"
         if target != source:

@@ -238,6 +238,17 @@ def test_page_terminal_and_metrics_have_the_same_words(report_data):
     assert len(set(numbers["warnings"])) == len(numbers["warnings"])
 
 
+def test_samples_in_the_near_field_are_a_caution(report_data):
+    panel = report_data.rss[0]
+    distance = np.linspace(0.5, 100.0, len(panel.time))
+    panel = dataclasses.replace(panel, geometry={**panel.geometry, "distance_m": distance})
+    compared = panel.posed & np.isfinite(panel.measured_db)
+    near = f"{panel.name}: {int((compared & (distance < 10.0)).sum())} of "
+    (said,) = (text for text in cautions(dataclasses.replace(report_data, rss=(panel,))) if "near field" in text)
+    assert said.startswith(near)
+    assert not any("near field" in text for text in cautions(report_data))
+
+
 def test_one_wild_sample_that_moves_the_error_is_said(report_data):
     panel = with_numbers(report_data.rss[0], rmse_db=12.5, n_outliers=1, rmse_without_outliers_db=1.8)
     said = cautions(dataclasses.replace(report_data, rss=(panel,)))

@@ -49,6 +49,8 @@ def test_angles_from_the_zenith_are_the_same_antenna(tmp_path):
     assert first == pytest.approx(second)
     middle = np.degrees(theta[:, 0])
     assert first[:, 6] == pytest.approx(gain_dbi(middle, 0.0), abs=0.3)
+    # half a vertical circle does not know the back, which the horizontal cut has 30 dB down
+    assert read_cut_files(azimuth, up).gain_dbi(np.pi / 2, np.pi) == pytest.approx(-22.0, abs=0.1)
 
 
 def test_what_is_no_pair_of_cuts_is_refused(cuts, tmp_path):
@@ -115,6 +117,24 @@ def test_what_a_pattern_is_not_is_refused(cuts, tmp_path, capsys):
     ):
         assert main(["antenna", "export", *words, "-o", str(tmp_path / "new.msi")]) == 2
         assert said in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("text", "cause"),
+    [
+        ("REVNUM:,NSMA WG16.99.050\nREVDAT:,19990520\nPATCUT:,H\n0,0\n", "NSMA"),
+        ("Angle(deg),Frequency(GHz),Amplitude(dB)\n0.000,3.300,15.0\n", "'elevation'"),
+        ("Theta [deg.]  Phi   [deg.]  Abs(Gain)[dBi   ]\n-----\n0.000 0.000 7.1\n", "CST"),
+        ("##File Type: Far Field\n##File Format: 3\n#Frequency: 3.3E9\n", "FEKO"),
+    ],
+)
+def test_a_file_of_another_planning_tool_names_the_formats_that_are_read(text, cause, tmp_path, capsys):
+    file = tmp_path / "other.txt"
+    file.write_text(text)
+    assert main(["antenna", "export", str(file), "-o", str(tmp_path / "o.csv")]) == 3
+    said = capsys.readouterr().err
+    for words in ("MSI Planet", "azimuth_deg,elevation_deg,gain_dbi", "AERPAW", cause):
+        assert words in said
 
 
 def test_no_file_of_others_and_no_input_is_replaced(cuts, tmp_path, capsys):

@@ -165,7 +165,7 @@ def test_foreign_files(tmp_path: Path) -> None:
     path = write(tmp_path / "cut.txt", rows_of())
     text = path.read_text()
     path.write_text("hello\n1 2 3\n")
-    with pytest.raises(InputError, match="no pattern found"):
+    with pytest.raises(InputError, match="no antenna pattern of a known format"):
         read_pattern_text(path)
     path.write_text("azimuth_deg,gain_dbi\n0,3\n")
     with pytest.raises(InputError, match="one cut of two"):
@@ -261,7 +261,7 @@ def test_damaged_patterns_name_the_line(tmp_path: Path, rows: list[str], line: i
         read_pattern_text(path)
     assert error.value.line == line
     path.write_text((HEADER + "\n".join(SMALL)).replace("\t", ";"))
-    with pytest.raises(InputError, match=r"not separated by tabs|no pattern found"):
+    with pytest.raises(InputError, match=r"not separated by tabs|no antenna pattern of a known format"):
         read_pattern_text(path)
 
 

@@ -8,6 +8,7 @@ import pytest
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.relief.dem import EARTH_RADIUS_M, Dem, read_dem
+from aerpaw_cmp.site.site import Site, Tower
 from aerpaw_cmp.site.siteyaml import load_site
 
 FRAME = SiteFrame(35.7275, -78.696)
@@ -126,8 +127,26 @@ def test_grounds_that_the_elevation_model_contradicts_are_told(
     text = SITE.replace("longitude_deg: -78.696}\ntowers", f"longitude_deg: -78.696{origin}towers")
     offset = f", ground_offset_m: {tower_m - origin_m}}}\n"
     (tmp_path / "site.yaml").write_text(text.replace("-78.696}\ndem", f"-78.696{offset}dem"))
-    notes = [note for note in load_site(tmp_path / "site.yaml").notes if "the elevation model has" in note]
-    assert [note.split(" is stated")[0] for note in notes] == contradicted
+    cautions = load_site(tmp_path / "site.yaml").cautions()
+    assert [text.split(" is stated")[0] for text in cautions] == contradicted
+
+
+@pytest.mark.parametrize(("value", "size"), [(0.0, 1), (0.0, 6), (5.0, 6)])
+def test_gaps_filled_with_a_number_are_a_caution_of_the_tower_on_them(tmp_path: Path, value: float, size: int) -> None:
+    """A tower on a hole of one height stands 100 m below the origin; a lake or a level field is no such hole."""
+    ground = 110.0 + plane(-500, -500, 10, (101, 101)) / 100.0
+    ground[20 : 20 + size, 70 : 70 + size] = value
+    ground[40:60, 10:30] = ground[40, 9] - 1.0
+    grid = Dem(height_m=ground, west=-500.0, south=-500.0, step_x=10.0, step_y=10.0, crs="local", frame=FRAME)
+    places = {"hole": (202.0, -298.0), "lake": (-300.0, 0.0), "field": (0.0, 300.0)}
+    towers = {
+        name: Tower(name=name, latitude_deg=0.0, longitude_deg=0.0, east_m=east, north_m=north)
+        for name, (east, north) in places.items()
+    }
+    site = Site("s", grid.frame, towers, dem=grid)
+    (text,) = site.cautions()
+    assert f"the elevation model is {value:g} m at tower hole" in text
+    assert site.cautions(["lake", "field"]) == []
 
 
 def test_bad_grids(tmp_path: Path) -> None:

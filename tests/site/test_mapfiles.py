@@ -77,6 +77,10 @@ def test_trees_have_their_tagged_sizes(tmp_path: Path) -> None:
             {},
             {"height": "tall"},
             {"height": "400"},
+            {"circumference": "250"},
+            {"circumference": "250 m", "diameter_crown": "800"},
+            {"circumference": "80"},
+            {"circumference": "120 cm"},
         ]
     ):
         osm.node(*square(40.0 * place + 30, 50)[0], natural="tree", **tags)
@@ -84,12 +88,15 @@ def test_trees_have_their_tagged_sizes(tmp_path: Path) -> None:
     model, actions = import_site([tmp_path / "t.osm"])
     (tmp_path / "site.yaml").write_text(site_yaml(model, header=actions), encoding="utf-8")
     trees = load_site(tmp_path / "site.yaml").trees
-    np.testing.assert_allclose(trees.height_m, [12, 12.19, 20, 20, 20])
-    np.testing.assert_allclose(trees.crown_diameter_m, [6, 10, 10, 10, 10])
+    np.testing.assert_allclose(trees.height_m, [12, 12.19] + 7 * [20])
+    np.testing.assert_allclose(trees.crown_diameter_m, [6] + 8 * [10])
     np.testing.assert_allclose(trees.crown_base_m, trees.height_m / 4)
-    np.testing.assert_allclose(trees.trunk_diameter_m, [0.5, 0.4, 0.4, 0.4, 0.4])
+    np.testing.assert_allclose(trees.trunk_diameter_m, [0.5, 0.4, 0.4, 0.4, 0.4, 0.8, 0.4, 0.4, 0.38])
     assert "t.osm: node 4: the height 'tall' is not a length" in actions
-    assert any("node 5: a tree 400 m high" in action for action in actions)
+    said = ("node 5: a tree 400 m high", "node 6: the circumference '250' is taken as centimetres", "node 7: a trunk 250 m",
+            "node 7: a crown 800 m", "node 8: a trunk 80 m around; feet or centimetres?")  # fmt: skip
+    for words in said:
+        assert any(words in action for action in actions), words
 
 
 def test_tree_rows_become_trees_along_the_line(tmp_path: Path) -> None:

@@ -115,10 +115,11 @@ def test_trees_stand_in_forests_and_clear_of_masts() -> None:
     np.testing.assert_array_equal(again.opaque_trees.east_m, trees.east_m)
 
 
-def test_antenna_inside_a_building_is_noted(tmp_path: Path) -> None:
+def test_an_antenna_inside_a_building_is_a_caution(tmp_path: Path) -> None:
     hall = "buildings:\n- {name: hall, height_m: %g, polygon_m: [[-9, -9], [9, -9], [9, 9], [-9, 9]]}"
-    assert any("inside building 'hall'" in n for n in load_site(site_file(tmp_path, MINIMAL + hall % 12)).notes)
-    assert not load_site(site_file(tmp_path, MINIMAL + hall % 9)).notes  # on the roof
+    (text,) = load_site(site_file(tmp_path, MINIMAL + hall % 12)).cautions()
+    assert "inside building 'hall' (roof at 12.0 m)" in text
+    assert not load_site(site_file(tmp_path, MINIMAL + hall % 9)).cautions(), "on the roof"
 
 
 def test_no_such_site(tmp_path: Path) -> None:

@@ -173,6 +173,25 @@ def test_a_pattern_that_no_antenna_can_have_is_refused(tmp_path, gain_dbi, cut, 
         read_pattern_file(file)
 
 
+def test_a_gain_without_unit_that_cannot_be_dbd_is_refused_with_the_line_that_fixes_it(tmp_path):
+    """MSI Planet's default is dBd; with beams of 65 and 15 deg, 17.15 dBi is more power out than in."""
+    file, text = tmp_path / "a.msi", msi(15.0, sector(65, 25.0), sector(15, 25.0))
+    file.write_text(text.replace("15.00 dBi", "15.0"))
+    with pytest.raises(InputError, match=r"mean gain over the sphere is 1\.9 dB.*'GAIN 15\.0 dBi'"):
+        read_pattern_file(file)
+    file.write_text(text)
+    assert read_pattern_file(file).peak_gain_dbi == pytest.approx(15.0, abs=0.1)
+
+
+@pytest.mark.parametrize("gain_dbi", [15.0, 12.0])
+def test_cuts_that_do_not_meet_in_front_are_refused(tmp_path, gain_dbi):
+    """A beam 30 deg to the side, each cut relative to its own peak: their sum lies above the stated gain."""
+    file = tmp_path / "a.msi"
+    file.write_text(msi(gain_dbi, np.roll(sector(65, 25.0), 30), sector(15, 25.0)))
+    with pytest.raises(InputError, match=r"2\.1 dB above the stated gain; .*2\.6 dB \(HORIZONTAL\)"):
+        read_pattern_file(file)
+
+
 @pytest.mark.parametrize("values", ["power", "normalised", "dBd", "peak 10 dB too high"])
 def test_a_table_of_impossible_gains_is_refused(tmp_path, values):
     _, _, v = sphere_grid()

@@ -238,7 +238,9 @@ def simulate(
     from ...jobs import run
 
     options = RunOptions(out=out, force=force, progress=say, dry=dry_run)
-    print_files(run.run_simulate(flight, options).files)
+    outcome = run.run_simulate(flight, options)
+    warn_all(outcome.warnings)
+    print_files(outcome.files)
 
 
 @command(

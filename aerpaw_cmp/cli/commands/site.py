@@ -10,7 +10,7 @@ from typer import Argument, Option
 from ...common.errors import UsageError
 from ...jobs.tasks.options import RunOptions
 from ..app import DryRun, Flights, Force, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
-from ..shown import answered, print_files, say, show, table
+from ..shown import answered, print_files, say, show, table, warn_all
 
 
 @command(
@@ -120,6 +120,7 @@ def site_show(
 
         for line in memory_lines(site):
             say(line)
+    warn_all(shown.warnings)
     print_files(shown.files)
 
 
@@ -241,6 +242,7 @@ def map_(
     if not say.as_json:
         show(settings.budget.sentence())
     outcome = run.run_map(site, settings, options, flights=flights or (), figures=figures)
+    warn_all(outcome.metrics["warnings"])
     if answered(outcome.metrics):
         return
     if settings.budget.level_dbm is not None:

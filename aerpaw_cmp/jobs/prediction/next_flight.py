@@ -193,7 +193,7 @@ def _plan_flight(
             "route.plan": plan_text(ways, site.frame, speed),
             "route.csv": waypoints_csv(ways, site.frame),
         },
-        warnings=remarks,
+        warnings=[*(f"{text}." for text in site.cautions(tower for tower, _ in ends.values())), *remarks],
         stages_s=stages.seconds,
     )
 

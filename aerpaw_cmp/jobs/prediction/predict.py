@@ -149,6 +149,7 @@ def predict(
         receivers = _receivers(known, place, site)
         table = _table(targets, site, (sources, model, receivers), stages.progress)
     about = _model_fields(model, known, [receiver for receiver, _, _ in receivers.values()], table)
+    cautioned = [f"{text}." for text in site.cautions(source.tower for source in sources.values())]
     page = PredictionPage(
         **named(targets, "name kind heights_m"),
         site=site,
@@ -157,7 +158,7 @@ def predict(
         shape=None if targets.grid is None else targets.grid.shape,
         flown={f"{s.flight} {s.antenna}": track_m(s).T for source in sources.values() for s in source.samples},
         stages_s=stages.seconds,
-        **about | {"warnings": (*about["warnings"], *remarks, *targets.remarks)},
+        **about | {"warnings": (*cautioned, *about["warnings"], *remarks, *targets.remarks)},
     )
     return Prediction(page=page, targets=targets, model=model, sources=sources)
 

@@ -62,9 +62,12 @@ class JobOutcome:
         What was written, the page first.
     failed_checks : tuple of str
         Stated checks that did not hold.
+    warnings : tuple of str
+        Sentences for the terminal, of a job whose metrics have none.
     """
 
     folder: Path
     metrics: dict[str, Any] = field(default_factory=dict)
     files: tuple[Path, ...] = ()
     failed_checks: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()

@@ -443,8 +443,20 @@ def cautions(data: ReportData) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
+# Closer to the tower's antenna than this a level cannot be compared [m]: the far field of an array of 0.7 m begins at
+# 11 m (2 D^2 / lambda at 3.3 GHz), and a GPS error of 3 m changes the level of free space by more than 2 dB.
+_NEAR_M = 10.0
+
+
 def _rss_cautions(panel: RssResult) -> list[str]:
     texts, score, lock, further = [], panel.score, lock_lost(panel), panel.further
+    compared = panel.geometry["distance_m"][panel.posed & np.isfinite(panel.measured_db)]
+    if (near := int((compared < _NEAR_M).sum())) > 0:
+        texts.append(
+            f"{panel.name}: {near} of {counted(len(compared), 'sample')} lie within {_NEAR_M:g} m of the tower's "
+            f"antenna, the nearest at {np.nanmin(compared):.1f} m: too near. In the near field free space does not "
+            "hold, and position errors change the level by several dB. Check the tower's position and antenna_height_m."
+        )
     if lock is not None:
         share, floor = 100 - 100 * lock.n_detected / lock.n, f"{Printed(lock.floor_db):.0f}"
         texts.append(

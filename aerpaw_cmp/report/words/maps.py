@@ -69,7 +69,7 @@ def coverage(data: MapsData) -> list[Coverage]:
 
 def warnings(data: MapsData) -> list[str]:
     """Warnings that must be known before the maps are believed."""
-    out = []
+    out = [f"{text}." for text in data.site.cautions()]
     if data.corrected_words:
         out.append(f"Corrected: {data.corrected_words}")
     for key, fit in data.metrics.get("correlation", {}).items():

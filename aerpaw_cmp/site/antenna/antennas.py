@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ...common.counting import counted
-from ...common.errors import InputError, UsageError, about_file, parsed
+from ...common.errors import InputError, UsageError, about_file, one_line, parsed
 from ...common.files import LARGEST_TABLE, read_input
 from ...common.units import (
     AnyArray,
@@ -281,6 +281,31 @@ def read_pattern_text(path: str | Path) -> MeasuredPattern:
     return pattern
 
 
+# What the reader of antenna files accepts: the expectation of its refusals.
+READABLE = (
+    "one of: AERPAW's text ('Phi Theta E Total. dB ...', radians and dBi), MSI Planet (.msi, .pln), a sphere as CSV "
+    "(azimuth_deg,elevation_deg,gain_dbi), or an azimuth and an elevation cut as two CSV files "
+    "(azimuth_deg,gain_dbi and elevation_deg,gain_dbi)"
+)
+
+# Signs of formats that are not read, each with the program or standard that writes it.
+_FOREIGN = (
+    (r"\s*(REVNUM|REVDAT)\s*:,", "an NSMA antenna file (.adf, WG16.99.050): save it as MSI Planet"),
+    (r"(?s).{0,400}?(//CST Farfield|Theta \[deg\.?\]\s+Phi)", "a far field of CST: save gain in dBi as a sphere CSV"),
+    (r"(?s)\s*##File Type: Far Field", "a far field of FEKO (.ffe): save gain in dBi as a sphere CSV"),
+    (r"(?s).{0,200}?Freq\w*\s*\d+\s*\n.{0,200}?rETheta", "a far field of HFSS: save gain in dBi as a sphere CSV"),
+    (r"(?s)\s*(<\?xml|<antenna)", "an antenna in XML: save it as MSI Planet"),
+    (r"\s*(azimuth|elevation|theta)_deg", "one cut of two: 'elevation' names the other"),
+    (r"[^\n]*(?i:angle|azimuth|elevation|theta|phi)[^\n]*,", "one cut of two ('elevation' names "
+     "the other), or a table with other names of columns"),
+)  # fmt: skip
+
+
+def _foreign_format(text: str) -> str | None:
+    """Return the format that a file without a known pattern probably has, with the remedy."""
+    return next((cause for sign, cause in _FOREIGN if re.match(sign, text)), None)
+
+
 _FREQUENCY = re.compile(
     r"\s*frequency\s*=\s*([-+]?\d{1,20}(?:\.\d{0,20})?(?:e[-+]?\d{1,2})?)\s*\(\s*([kMG]?)Hz\s*\)",
     re.IGNORECASE | re.ASCII,
@@ -306,11 +331,11 @@ def _read_rows(path: Path) -> _Rows:
             rows.lines.append(number)
     _check_last_line(text, rows, path)
     if not values:
-        cut = re.match(r"\s*(azimuth|elevation|theta)_deg", text)
+        first = next((line.strip() for line in text.splitlines() if line.strip()), "")
         raise InputError(
-            "no pattern found",
-            expected="a header line 'Phi  Theta  E Total. dB ...' and rows",
-            cause="one cut of two: 'elevation' names the other" if cut else None,
+            f"no antenna pattern of a known format; the file begins with '{one_line(first)[:60]}'",
+            expected=READABLE,
+            cause=_foreign_format(text),
             path=path,
         )
     rows.values = np.array(values)
@@ -487,7 +512,9 @@ def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
     return scores[0] > 1.05 * scores[1] + 1e-6
 
 
-def check_power(pattern: MeasuredPattern, path: Path, *, most_db: float = 0.5) -> None:
+def check_power(
+    pattern: MeasuredPattern, path: Path, *, most_db: float = 0.5, cause: str = "the values are not gain over isotropic"
+) -> None:
     """Refuse a pattern of any format that radiates more than it is fed, almost nothing, or linear numbers.
 
     Parameters
@@ -497,6 +524,8 @@ def check_power(pattern: MeasuredPattern, path: Path, *, most_db: float = 0.5) -
         For the message.
     most_db : float
         Greatest mean gain over the sphere; an antenna without loss has 0 dB, the rest is error of the measurement.
+    cause : str
+        Likely cause of a mean gain out of range, unless the values are linear.
     """
     # without a gain below that of an isotropic antenna none can lie above it
     # linear gains read as dBi lie between 0 and a few: no antenna is above isotropic everywhere
@@ -506,7 +535,7 @@ def check_power(pattern: MeasuredPattern, path: Path, *, most_db: float = 0.5) -
             f"the mean gain over the sphere is {float(db_from_power(pattern.efficiency)):.1f} dB "
             f"(peak {pattern.peak_gain_dbi:.1f} dBi)",
             expected=f"a mean of {float(db_from_power(_MINIMUM_EFFICIENCY)):g} to 0 dB",
-            cause="linear values in place of dBi" if linear else "the values are not gain over isotropic",
+            cause="linear values in place of dBi" if linear else cause,
             path=path,
         )
 

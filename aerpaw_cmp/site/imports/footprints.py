@@ -30,6 +30,7 @@ from ...common.units import FloatArray
 from ...common.yamlfile import dump_yaml
 from ..site import Building, Forest, Geofence
 from ..siteyaml import SiteModel, extent_m, site_model
+from ..trees import TALLEST_TREE_M, WIDEST_CROWN_M
 from .mapfiles import read_map_file
 from .outlines import MAX_CROSSINGS, MapFile, Outline, Position, TreeLine, is_tangled
 from .tags import (
@@ -73,7 +74,8 @@ _EVERGREEN = {"evergreen": 1.0, "needleleaved": 1.0, "mixed": 0.5}
 # Forests are cut off this far outside the area of the site: trees there shadow nothing.
 _FOREST_MARGIN_M = 1000.0
 
-_TALLEST_TREE_M = 120.0
+# The thickest trunk known is 42 m around.
+_WIDEST_GIRTH_M = 45.0
 # Distance of the trees of a row without a tagged crown diameter: the default crowns touch.
 _ROW_SPACING_M = 10.0
 
@@ -226,11 +228,25 @@ def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[
     """A tree with its tagged sizes, or those of a row, a crown's diameter apart."""
     notes: list[str] = []
     height = positive_metres(tree.tags, ("height", "est_height"), notes)
-    if height is not None and height > _TALLEST_TREE_M:
+    if height is not None and height > TALLEST_TREE_M:
         notes.append(f"a tree {height:g} m high; feet or centimetres? The site's default holds")
         height = None
     crown = positive_metres(tree.tags, ("diameter_crown", "crown_diameter"), notes)
+    if crown is not None and crown > WIDEST_CROWN_M:
+        notes.append(f"a crown {crown:g} m wide; feet or centimetres? The site's default is used")
+        crown = None
     girth = positive_metres(tree.tags, ("circumference",), notes)
+    if girth is not None and girth > _WIDEST_GIRTH_M:
+        # a number without unit that no tree reaches in metres or in feet is in centimetres
+        bare = metres(f"{tree.tags['circumference'].strip()} m") is not None
+        if bare and 3.3 * _WIDEST_GIRTH_M < girth <= 100.0 * _WIDEST_GIRTH_M:
+            notes.append(
+                f"the circumference '{girth:g}' is taken as centimetres: a trunk {girth / 100 / math.pi:.2g} m thick"
+            )
+            girth /= 100.0
+        else:
+            notes.append(f"a trunk {girth:g} m around; feet or centimetres? The site's default is used")
+            girth = None
     points = np.stack(frame.to_local(*np.array(tree.positions, dtype=np.float64).reshape(-1, 2).T), axis=1)
     # a torn number of degrees projects to infinity
     points = points[np.isfinite(points).all(axis=1)]
@@ -479,7 +495,7 @@ def _assumed_heights(shapes: list[_Shape]) -> str:
 def _describe_wood(shape: _Shape, tags: Mapping[str, str], actions: list[str]) -> None:
     notes: list[str] = []
     height = positive_metres(tags, ("height", "est_height"), notes) or 0.0
-    if height > _TALLEST_TREE_M:
+    if height > TALLEST_TREE_M:
         notes.append(f"a wood {height:g} m high; feet or centimetres? The default holds")
         height = 0.0
     shape.height_m = height

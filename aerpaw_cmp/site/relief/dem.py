@@ -27,6 +27,31 @@ MAX_BYTES = 512 * 1024 * 1024
 _SAMPLES_AT_ONCE = 1_000_000
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FilledPatch:
+    """Neighbouring cells of one height with a cliff all around: probably a gap that was filled with a number.
+
+    Parameters
+    ----------
+    height_m : float
+        Height of the cells [m].
+    cells : int
+        Number of cells.
+    jump_m : float
+        Median difference to the cells around the patch [m].
+    """
+
+    height_m: float
+    cells: int
+    jump_m: float
+
+
+# A patch of one height is suspicious from this number of cells on (at exactly 0 m: from one on) ...
+_FILLED_CELLS = 4
+# ... if the ground around it is further away than this [m]: four cells of a slope in whole metres are not.
+_FILLED_JUMP_M = 20.0
+
+
 @dataclass(frozen=True, slots=True)
 class Dem:
     """Heights on a regular grid, asked for in the site frame.
@@ -119,6 +144,29 @@ class Dem:
     def ground_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
         """Up of the ground [m]: 0 at the origin of the site; NaN outside the grid."""
         return self.absolute_m(east_m, north_m) - self._origin_m
+
+    def filled_patch(self, east_m: float, north_m: float) -> FilledPatch | None:
+        """Return the patch of cells around a position if its gap was probably filled with a number, else None."""
+        from scipy.ndimage import binary_dilation, label
+
+        column, row = (int(np.rint(value)) for value in self._cell(east_m, north_m))
+        rows, columns = self.height_m.shape
+        if not (0 <= row < rows and 0 <= column < columns):
+            return None
+        height = float(self.height_m[row, column])
+        beside = self.height_m[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
+        # on real ground hardly any neighbour has the same height: only then is all of a large grid searched
+        if height != 0.0 and int((beside == height).sum()) < 2:
+            return None
+        labels, _ = label(self.height_m == height)
+        patch = labels == labels[row, column]
+        cells = int(patch.sum())
+        if cells < _FILLED_CELLS and height != 0.0:
+            return None
+        around = self.height_m[binary_dilation(patch) & ~patch]
+        around = around[np.isfinite(around)]
+        jump = float(np.median(np.abs(around - height))) if len(around) else 0.0
+        return FilledPatch(height_m=height, cells=cells, jump_m=jump) if jump > _FILLED_JUMP_M else None
 
     def slope(self, east_m: FloatArray, north_m: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Rise of the ground per metre to the east and to the north, from points 1/64 of a cell apart."""

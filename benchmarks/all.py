@@ -55,6 +55,7 @@ SMALLEST: dict[str, list[str]] = {
     "drafts": ["sample_logs"],
     "exports": ["--samples", "20000"],
     "fabricated": [],
+    "first_flight_prediction": [],
     "freeze": ["record", "{folder}/record.npz", "--quick"],
     "fuzz_commands": ["--calls", "20"],
     "fuzz_inputs": ["--inputs", "20"],

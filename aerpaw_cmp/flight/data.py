@@ -300,6 +300,8 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     InputError
         A missing file, a log of another kind than the flight file says, a log without any record.
     """
+    if not settings.logs:
+        raise UsageError("the flight file lists no log", expected="one or more lines under 'logs:'")
     # a flight file of several logs is read once
     root, cache = logs_root or folder, Held()
     return tuple(

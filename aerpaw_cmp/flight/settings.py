@@ -415,7 +415,8 @@ class FlightFile(StrictModel):
     """SHA-256 of the logs that settings of this file were learned from: nothing is scored on them."""
     marks: list[str] = []
     """Marks of the same logs, by which their copies are known."""
-    logs: Annotated[list[LogSettings], Field(min_length=1)]
+    logs: list[LogSettings]
+    """Logs of the flight; an empty list is enough for a plan or a route."""
     antennas: dict[str, str] = {}
     """Learned antennas of a site by name, of the ``uav`` and of ``TOWER.CHANNEL``, in place of those of link."""
     link: LinksSettings = LinksSettings()

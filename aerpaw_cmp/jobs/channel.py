@@ -247,9 +247,8 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
 def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> Callable[[Poses], dict[str, Any]]:
     """Calibrated levels of poses by remembered antennas, as :class:`Channel` has them; nothing without memory."""
     towers, sources = tuple(link.tower_arrays), dict[str, Source]()
-    try:
-        memory = memory_of(data.site_place, data.site)
-    except UsageError:
+    memory = memory_of(data.site_place, data.site)
+    if memory is None:
         remarks.append("No calibrated level: no flight taught the site its antennas (aerpaw-cmp calibrate).")
         return lambda _: {}
     # antennas of the link's own channel come first (False before True): another near the carrier fills in

@@ -239,8 +239,9 @@ class SceneModel(StrictModel):
 
 
 class CoverageModel(StrictModel):
-    """The link budget of the site's coverage maps; ``aerpaw-cmp map`` has an option for each key."""
+    """Carrier and link budget of maps and of predictions before any flight; the commands have an option for each."""
 
+    carrier_ghz: Annotated[float, Field(ge=0.1, le=100)] | None = None
     tx_power_dbm: float | None = None
     bandwidth_mhz: Positive | None = None
     noise_figure_db: _NotNegative | None = None

@@ -340,7 +340,7 @@ def test_paths_of_infinite_loss_are_no_paths(site):
 def test_coverage_is_the_share_of_levels_at_the_threshold(site, tmp_path):
     """With free space alone the covered positions lie in a disc around the tower, whose radius Friis states."""
     open_site = replace(site, buildings=(), trees=join_trees([]))
-    budget = LinkBudget(tx_power_dbm=20.0, bandwidth_mhz=10.0, noise_figure_db=5.0, threshold_snr_db=18.0)
+    budget = LinkBudget(tx_power_dbm=20.0, bandwidth_mhz=10.0, noise_figure_db=5.0, threshold_snr_db=30.0)
     chosen = settings(foliage=("none",), budget=budget, max_depth=0, study=False)
     outcome = mapping.make_maps(open_site, chosen, Stages(lambda *_: None))
     level = outcome.shown.rss("siso", "A")[0]
@@ -355,7 +355,7 @@ def test_coverage_is_the_share_of_levels_at_the_threshold(site, tmp_path):
     layers = {layer.name: layer for layer in mapping._budget_layers(outcome)}
     assert set(layers) == {"margin_mimo_h030m_joint_none", "snr_mimo_h030m_joint_none"}
     apart = layers["snr_mimo_h030m_joint_none"].values - layers["margin_mimo_h030m_joint_none"].values
-    np.testing.assert_allclose(apart, 18.0, atol=0.011)
+    np.testing.assert_allclose(apart, 30.0, atol=0.011)
 
 
 def test_options_replace_the_link_budget_of_the_site(tmp_path):

@@ -8,7 +8,6 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.compare.gains.spread import Spread
 from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.corrected_map import corrected_maps
@@ -152,14 +151,13 @@ def test_maps_are_corrected_by_the_memory_alone(site: Path) -> None:
     np.testing.assert_allclose(maps.levels[0].corrected_dbm, said.table["level_db"] + 7.0, atol=1e-3)
 
 
-def test_a_site_that_remembers_no_level_is_one_message(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_site_without_learned_levels_is_predicted_by_the_prior_and_says_so(tmp_path: Path) -> None:
     place = copied(tmp_path)
-    with pytest.raises(UsageError, match="the site remembers no level"):
-        job.predict(place, [])
+    assert job.predict(place, []).page.chosen["base"] == "prior"
     remember(place, "old", entry(None), {"t.csv.gz": table(4.0, (1, 1)), "u.csv.gz": table(2.0, (1, 1))})
-    assert main(["predict", str(place), "-o", str(tmp_path / "out")]) == 2
-    assert "an earlier version" in " ".join(capsys.readouterr().err.split())
-    assert not (tmp_path / "out").exists()
+    page = job.predict(place, []).page
+    assert page.chosen["base"] == "prior"
+    assert any("have no level" in text for text in page.warnings)
 
 
 @pytest.fixture(scope="module")

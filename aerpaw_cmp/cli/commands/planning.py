@@ -19,6 +19,7 @@ from ..shown import answered, print_files, records, say, show, warn_all
     examples=[
         "aerpaw-cmp predict plan.kml --with flight1.yaml --with flight2.yaml -o prediction",
         "aerpaw-cmp predict plan.kml --site lake_wheeler -o prediction",
+        "aerpaw-cmp predict route.kml --site my_site.yaml --carrier-ghz 3.4 --tx-power-dbm 30",
         "aerpaw-cmp predict next_flight.yaml --with flight1.yaml",
         "aerpaw-cmp predict lake_wheeler --with flight1.yaml --height 40 --height 80 --spacing 30",
     ],
@@ -44,6 +45,10 @@ def predict(
         float | None,
         Option(help="Heading at all points [deg]  [default: that of the route; where it says none, all count alike]"),
     ] = None,
+    carrier_ghz: Annotated[
+        float | None, Option(min=0.1, max=100.0, help="Carrier of a prediction before any flight [GHz].")
+    ] = None,
+    tx_power_dbm: Annotated[float | None, Option(help="Transmit power of the same [dBm].")] = None,
     logs_root: LogsRoot = None,
     dry_run: DryRun = False,
     force: Force = False,
@@ -55,7 +60,14 @@ def predict(
     outcome = run_predict(
         where,
         flights or (),
-        TargetOptions(heights_m=tuple(height or (40.0,)), spacing_m=spacing, heading_deg=heading, site=site),
+        TargetOptions(
+            heights_m=tuple(height or (40.0,)),
+            spacing_m=spacing,
+            heading_deg=heading,
+            site=site,
+            carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
+            tx_power_dbm=tx_power_dbm,
+        ),
         RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run),
     )
     if not answered(outcome.metrics):

@@ -211,7 +211,7 @@ def map_(
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
     from ...jobs import run
-    from ...jobs.mapping.coverage_map import link_budget, map_settings
+    from ...jobs.mapping.coverage_map import link_budget, map_settings, site_carrier_hz
 
     modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
     fields: dict[str, Any] = {
@@ -220,7 +220,7 @@ def map_(
         "rss_altitudes_m": tuple(sorted(set(rss_altitude))) if rss_altitude else None,
         "rank_altitudes_m": tuple(sorted(set(rank_altitude))) if rank_altitude else None,
         "ks": tuple(sorted(set(k))) if k else None,
-        "carrier_hz": None if carrier_ghz is None else carrier_ghz * 1e9,
+        "carrier_hz": site_carrier_hz(site) if carrier_ghz is None else carrier_ghz * 1e9,
         "max_depth": max_depth,
         "study": study,
         "tile_m": tile_m,

@@ -166,13 +166,19 @@ def map_settings(fields: Mapping[str, Any], *, quick: bool = False) -> MapSettin
     return MapSettings(**({**QUICK, **stated} if quick else stated))
 
 
+def site_carrier_hz(site: str) -> float | None:
+    """Return the carrier of the key ``coverage`` of a site [Hz]; None if it names none."""
+    carrier_ghz = site_model(site).coverage.carrier_ghz
+    return None if carrier_ghz is None else carrier_ghz * 1e9
+
+
 def link_budget(site: str, options: Mapping[str, float | None]) -> LinkBudget:
     """Return the link budget of the key ``coverage`` of a site, with command-line options in its place.
 
     A threshold among the options replaces either threshold of the site.
     """
     stated = {name: value for name, value in options.items() if value is not None}
-    kept = site_model(site).coverage.model_dump(exclude_none=True)
+    kept = site_model(site).coverage.model_dump(exclude_none=True, exclude={"carrier_ghz"})
     if "threshold_dbm" in stated or "threshold_snr_db" in stated:
         kept = {name: value for name, value in kept.items() if not name.startswith("threshold")}
     return LinkBudget(**(kept | stated))

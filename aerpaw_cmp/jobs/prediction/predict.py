@@ -28,19 +28,33 @@ from ...flight.settings import FlightFile, LinkSettings, LinksSettings
 from ...flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
 from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
 from ...report.pages.prediction import PredictionPage, outside_share, prediction_metrics, write_prediction
-from ...report.words.prediction import FLAGS, TITLES, cautions, first_words, heading_words, memory_cautions
+from ...report.words.prediction import (
+    FLAGS,
+    TITLES,
+    cautions,
+    first_words,
+    heading_words,
+    memory_cautions,
+    prior_caution,
+    prior_words,
+)
 from ...site.antenna.antennas import MeasuredPattern
 from ...site.antenna.learned import BAND as CARRIER_BAND
 from ...site.antenna.learned import folder_of, read_learned
 from ...site.site import Site
-from ...site.siteyaml import load_site
+from ...site.siteyaml import load_site, site_model
 from ..learning.calibrate import learned_antennas, observe
 from ..learning.calibrate_rank import FittedReceiver, RankSamples, read_receiver
 from ..tasks.options import DEFAULT, JobOutcome, RunOptions
 from .sources import (
+    PRIOR_ANTENNA_DB,
+    PRIOR_FADING_DB,
+    PRIOR_OFFSET_DB,
+    PRIOR_SHADOWING_DB,
     Flown,
     Memory,
     NamedFlight,
+    Prior,
     Source,
     files_of,
     memory_of,
@@ -82,7 +96,7 @@ class Prediction:
 
     page: PredictionPage
     targets: Targets
-    model: Flown | Memory
+    model: Flown | Memory | Prior
     sources: Mapping[str, Source]
 
     @property
@@ -111,7 +125,8 @@ def predict(
     where : Path
         See :func:`.where.find_targets`.
     flights : sequence of NamedFlight
-        To learn from; without any the memory of the site is the source.
+        Flights to learn from. Without any, the levels learned for the site are used; if there are none, ray tracing
+        with a wide prior.
     options : TargetOptions, optional
     logs_root : Path, optional
         Where logs resolve.
@@ -130,10 +145,12 @@ def predict(
     with stages("read"):
         known, remarks = counted_once([flight.load(logs_root) for flight in flights])
         site, place = site_of(where, flights, known, options.site)
-        memory = None if known else memory_of(place, site)
-        if memory is not None:
+        unflown = None if known else _unflown(where, place, site, options)
+        if unflown is not None:
             asked = _nodes_of(where)
-            every = memory.sources()
+            every = unflown.sources()
+            if isinstance(unflown, Prior) and options.carrier_hz is None and (learned := remembered(place)):
+                remarks.append(f"Not used: the antennas learned for {', '.join(learned)} have no level.")
             sources = {name: s for name, s in every.items() if s.tower in asked} or every
         else:
             observed, warnings = observe(known)
@@ -144,7 +161,7 @@ def predict(
     work = f"{counted(len(targets.position_m), 'point')}: {', '.join(sources)}"
     stages.checked(lambda: [PlannedStage("choose, predict", work)])
     with stages("choose"):
-        model = memory or _best_model(targets, sources, known, place, remarks)
+        model = unflown or _best_model(targets, sources, known, place, remarks)
     with stages("predict"):
         receivers = _receivers(known, place, site)
         table = _table(targets, site, (sources, model, receivers), stages.progress)
@@ -164,7 +181,7 @@ def predict(
 
 
 def _model_fields(
-    model: Flown | Memory, known: Sequence[FlightData], receivers: Sequence[FittedReceiver], table: pd.DataFrame
+    model: Flown | Memory | Prior, known: Sequence[FlightData], receivers: Sequence[FittedReceiver], table: pd.DataFrame
 ) -> dict[str, Any]:
     """Fields of the page that tell of the model and what it learned from."""
     guess = outside_share(table)
@@ -174,6 +191,19 @@ def _model_fields(
         heading_words(table["yaw_deg"].to_numpy(np.float64)),
         float(table[P_LOCK].mean()) if P_LOCK in table else None,
     )
+    if isinstance(model, Prior):
+        return {
+            "verdict": first_words(
+                None, 0.0, *expected, origin=prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
+            ),
+            "warnings": [prior_caution(PRIOR_OFFSET_DB, PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, PRIOR_FADING_DB)],
+            "flights": [],
+            KEY: (),
+            MARKS: (),
+            "candidates": [],
+            "model": {},
+            "chosen": {"title": TITLES["prior"], "base": "prior", "corrected": False, "field": OFF},
+        }
     logs, marks = ([getattr(receiver, key) for receiver in receivers] for key in (KEY, MARKS))
     if isinstance(model, Memory):
         entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
@@ -264,6 +294,22 @@ def site_of(
                 expected="flights of one site",
             )
     return site, place
+
+
+def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions) -> Memory | Prior:
+    """Return the model of a site without named flights: what was learned for it, else ray tracing with a prior.
+
+    A carrier or a power that the user names asks for the prior: learned levels belong to their own.
+    """
+    memory = memory_of(place, site) if options.carrier_hz is None and options.tx_power_dbm is None else None
+    if memory is not None:
+        return memory
+    stated, flight = site_model(place).coverage, flight_of(where)
+    link = LinksSettings().rank if flight is None else flight.link.rss
+    carrier_hz = options.carrier_hz or (stated.carrier_ghz or 0.0) * 1e9 or link.carrier_hz
+    powers = (options.tx_power_dbm, stated.tx_power_dbm, link.transmit_power_dbm)
+    link = LinkSettings(carrier_hz=carrier_hz, transmit_power_dbm=next(p for p in powers if p is not None))
+    return Prior(site, link, tuple(site.towers))
 
 
 def _nodes_of(where: Path) -> set[str]:
@@ -361,7 +407,7 @@ def _bases(
 def _table(
     targets: Targets,
     site: Site,
-    learned: tuple[Mapping[str, Source], Flown | Memory, Receivers],
+    learned: tuple[Mapping[str, Source], Flown | Memory | Prior, Receivers],
     progress: Progress,
 ) -> pd.DataFrame:
     """Rows of every tower and channel, then of every receiver; float32, or a million points take gigabytes.
@@ -418,7 +464,7 @@ def _table(
     return table
 
 
-def _stated(model: Flown | Memory, antenna: str, level_db: AnyArray, slow_db: AnyArray) -> dict[str, AnyArray]:
+def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slow_db: AnyArray) -> dict[str, AnyArray]:
     """Columns (n,) of a level: median, standard deviation, interval, and P(lock) of a receiver that loses its lock."""
     lock = model.lost_lock(antenna, level_db)
     if lock is None:
@@ -435,7 +481,7 @@ def _stated(model: Flown | Memory, antenna: str, level_db: AnyArray, slow_db: An
 
 
 def _levels(
-    targets: Targets, sources: Mapping[str, Source], model: Flown | Memory, progress: Progress
+    targets: Targets, sources: Mapping[str, Source], model: Flown | Memory | Prior, progress: Progress
 ) -> tuple[AnyArray, AnyArray, BoolArray]:
     """Level, standard deviation of 4 s means (series, n) [dB], and where the model is a guess.
 
@@ -582,6 +628,10 @@ def run_predict(
     JobOutcome
     """
     known = named_flights(flights)
+    if known and (target.carrier_hz is not None or target.tx_power_dbm is not None):
+        raise UsageError(
+            "--with and --carrier-ghz or --tx-power-dbm", expected="one of them: flights state carrier and power"
+        )
     inputs = [*target_files(where, target.site, options.logs_root), *files_of(known, options.logs_root)]
     folder = options.out or Path("reports") / f"prediction-{where.stem}"
     stages = options.stages("predict", inputs, folder)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ...common.errors import InputError, UsageError
+from ...common.errors import InputError
 from ...common.geodesy import azimuth_rad
 from ...common.jsonable import named
 from ...common.units import BoolArray, FloatArray
@@ -275,23 +275,72 @@ class Memory:
         return out
 
 
-def memory_of(place: str | Path, site: Site) -> Memory:
-    """Model of what a site remembers of its towers.
+def memory_of(place: str | Path, site: Site) -> Memory | None:
+    """Return the model of the antennas and levels learned for a site; None if no level of its towers was learned."""
+    known = {
+        name: entry
+        for name, entry in remembered(place).items()
+        if entry.series.level and entry.series.tower in site.towers
+    }
+    return Memory(known, site) if known else None
 
-    Raises
-    ------
-    UsageError
-        Nothing that a level can be predicted from.
+
+# Standard deviations of a prediction before any flight [dB]. Offset: transmit power, cables and receiver gain that
+# nobody measured. Antennas: the gain of two unknown antennas over directions (a dipole's nulls, mast, airframe).
+# Shadowing: 3GPP TR 36.777, table B-3, gives 4.2 dB (LoS) and 6 dB (NLoS) for rural aerial links. Fading: Rayleigh's
+# 5.6 dB is the worst case. `benchmarks/first_flight_prediction.py` checks the sum on flights.
+PRIOR_OFFSET_DB, PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, PRIOR_FADING_DB = 10.0, 8.0, 6.0, 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """The model before any flight: ray tracing with isotropic antennas, and a wide error that is stated.
+
+    Parameters
+    ----------
+    site : Site
+    link : LinkSettings
+        Carrier and transmit power.
+    towers : tuple of str
+        The towers that are predicted.
     """
-    every = remembered(place)
-    known = {name: entry for name, entry in every.items() if entry.series.level and entry.series.tower in site.towers}
-    if known:
-        return Memory(known, site)
-    raise UsageError(
-        "no flight to learn from, and the site remembers no level of its towers",
-        expected="--with flight.yaml (repeatable), a flight of this site",
-        cause="a memory of an earlier version: 'aerpaw-cmp calibrate --into-site' makes it anew" if every else "",
-    )
+
+    site: Site
+    link: LinkSettings
+    towers: tuple[str, ...]
+
+    def sources(self) -> dict[str, Source]:
+        """Return one link per tower, with isotropic ends and woods that attenuate."""
+        rt = RtSettings(foliage="attenuating")
+        return {
+            f"{tower}.level": Source(
+                tower=tower, channel="level", unit="dBm", link=self.link, site=self.site, rt=rt,
+                rss=RssSettings(field="power"),
+            )
+            for tower in self.towers
+        }  # fmt: skip
+
+    def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:  # noqa: ARG002
+        """Return level above free space and standard deviation (n,) [dB]; no heading matters to isotropic antennas."""
+        level = self.sources()[each[0].antenna].replayed_db(each[0])
+        return level, np.where(np.isfinite(level), self.slow_sd_db, np.nan), np.ones(len(level), dtype=np.bool_)
+
+    @property
+    def slow_sd_db(self) -> float:
+        """Standard deviation of a mean over 4 s on a first flight [dB]."""
+        return math.sqrt(PRIOR_OFFSET_DB**2 + PRIOR_ANTENNA_DB**2 + PRIOR_SHADOWING_DB**2)
+
+    def fading(self, antenna: str) -> Spread:  # noqa: ARG002
+        """Return the spread of samples about their means over 4 s."""
+        return dataclasses.replace(NO_SPREAD, fading_sd_db=PRIOR_FADING_DB)
+
+    def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:  # noqa: ARG002
+        """Return None: no receiver is known."""
+        return None
+
+    def offset_db(self, antenna: str) -> float:  # noqa: ARG002
+        """Return 0: no level was measured [dB]."""
+        return 0.0
 
 
 def outside(position_m: FloatArray, flown: Sequence[LinkSamples]) -> BoolArray:

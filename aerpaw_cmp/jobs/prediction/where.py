@@ -96,12 +96,16 @@ class TargetOptions:
         At all points; without it that of the route, and where none is said all headings count alike.
     site : str, optional
         Where neither flights nor the place name it.
+    carrier_hz, tx_power_dbm : float, optional
+        Of a prediction before any flight.
     """
 
     heights_m: tuple[float, ...] = (40.0,)
     spacing_m: float = 30.0
     heading_deg: float | None = None
     site: str | None = None
+    carrier_hz: float | None = None
+    tx_power_dbm: float | None = None
 
 
 def level_samples(

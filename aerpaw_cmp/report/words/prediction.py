@@ -21,6 +21,7 @@ TITLES = {
     "free space": "free space",
     "none": "a constant level",
     "memory": "antennas that the site remembers",
+    "prior": "ray tracing with isotropic antennas, before any flight",
 }
 
 FLAGS = {
@@ -129,6 +130,7 @@ def first_words(
     band_db: float,
     heading: str = "heading open",
     lock: float | None = None,
+    origin: str = REMEMBERED,
 ) -> str:
     """First paragraph of terminal, page and metrics.json: one error with its band, best baseline, one next step.
 
@@ -147,6 +149,8 @@ def first_words(
         As :func:`heading_words` has it.
     lock : float, optional
         Mean probability of lock, of a receiver that loses it.
+    origin : str
+        Sentence on what predicts, if there is no correction.
 
     Returns
     -------
@@ -157,7 +161,7 @@ def first_words(
     texts += [] if lock is None else filled([LOCK], percent=100.0 * lock)
     step = ""
     if correction is None:
-        texts.append(REMEMBERED)
+        texts.append(origin)
     else:
         if ("free space", OFF) in correction.rmse_db and (correction.base, correction.title) != ("free space", OFF):
             verdict = _against_free_space(correction)
@@ -183,6 +187,22 @@ def memory_cautions(known: Sequence[tuple[Entry, LearnedSeries]], outside: float
         each.setdefault(entry.about(), []).append(f"{series.tower} {series.channel}")
     texts = filled([OUTSIDE["remembered"]], percent=100.0 * outside) if outside > MANY else []
     return [*texts, *(f"{', '.join(names)}: {about}." for about, names in each.items())]
+
+
+def prior_words(carrier_hz: float, power_dbm: float) -> str:
+    """Return the sentence on a prediction before any flight."""
+    return (
+        f"No flight is known: ray tracing with isotropic antennas, {carrier_hz / 1e9:g} GHz, {power_dbm:g} dBm "
+        "transmitted. Next: fly once, then `aerpaw-cmp predict --with flight.yaml`."
+    )
+
+
+def prior_caution(offset_db: float, antennas_db: float, shadowing_db: float, fading_db: float) -> str:
+    """Return the sentence on the parts of the standard deviation before any flight [dB]."""
+    return (
+        f"The standard deviation is a prior: offset {offset_db:g} dB, antennas {antennas_db:g} dB, shadowing "
+        f"{shadowing_db:g} dB, fading {fading_db:g} dB. One flight determines the offset and most of the rest."
+    )
 
 
 def _stated(correction: Correction) -> str:

@@ -1,0 +1,79 @@
+"""Predictions at a site where nobody has flown: ray tracing with a prior that is stated."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.units import wavelength_m
+
+SITE = """name: meadow
+origin: {latitude_deg: 48.0, longitude_deg: 11.0}
+towers: {T1: {latitude_deg: 48.0, longitude_deg: 11.0, antenna_height_m: 20}}
+coverage: {carrier_ghz: 2.5, tx_power_dbm: 30}
+"""
+# far from the towers of any packaged site; 30 degrees north of the ground's reflections
+POINTS = "east_m,north_m,height_m\n300,0,60\n0,400,60\n-250,250,60\n"
+
+
+@pytest.fixture
+def place(tmp_path: Path) -> Path:
+    (tmp_path / "site.yaml").write_text(SITE)
+    (tmp_path / "points.csv").write_text(POINTS)
+    return tmp_path
+
+
+def predicted(place: Path, *words: str) -> tuple[pd.DataFrame, dict[str, object]]:
+    out = place / "out"
+    command = ["predict", str(place / "points.csv"), "--site", str(place / "site.yaml"), "-o", str(out), "--force"]
+    assert main([*command, *words]) == 0
+    return pd.read_csv(out / "prediction.csv"), json.loads((out / "metrics.json").read_text())
+
+
+def test_level_is_that_of_two_paths_and_the_standard_deviation_is_stated(place: Path) -> None:
+    table, metrics = predicted(place)
+    points = np.array([[300, 0, 60], [0, 400, 60], [-250, 250, 60]], dtype=float)
+    away = np.linalg.norm(points - [0, 0, 20], axis=1)
+    free = 30.0 + 20 * np.log10(wavelength_m(2.5e9) / (4 * np.pi * away))
+    # the power sum adds between nothing and the whole of one ground reflection (3 dB) to the direct path
+    above = table["level_db"].to_numpy() - free
+    assert ((above > 0.0) & (above < 3.02)).all()
+    assert table["sd_db"].to_numpy() == pytest.approx(np.sqrt(10**2 + 8**2 + 6**2 + 5**2), abs=0.01)
+    half = (table["q95_db"] - table["q05_db"]).to_numpy() / 2
+    assert half == pytest.approx(1.6449 * table["sd_db"].to_numpy(), rel=1e-3)
+    assert "No flight is known" in str(metrics["sentence"])
+    assert "2.5 GHz, 30 dBm" in str(metrics["sentence"])
+
+
+def test_options_replace_carrier_and_power_of_the_site(place: Path) -> None:
+    level = predicted(place)[0]["level_db"].to_numpy()
+    changed = predicted(place, "--tx-power-dbm", "20", "--carrier-ghz", "2.5")[0]["level_db"].to_numpy()
+    np.testing.assert_allclose(level - changed, 10.0, atol=1e-3)
+
+
+def test_carrier_beside_flights_is_refused(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sample = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
+    words = [
+        "predict",
+        str(place / "points.csv"),
+        "--with",
+        str(sample),
+        "--carrier-ghz",
+        "2.4",
+        "-o",
+        str(place / "p"),
+    ]
+    assert main(words) == 2
+    assert "--with and --carrier-ghz" in capsys.readouterr().err
+
+
+def test_channel_of_a_route_needs_no_logs_and_a_report_does(place: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (place / "flight.yaml").write_text("flight: plan\nsite: site.yaml\nlogs: []\n")
+    command = ["channel", str(place / "flight.yaml"), "--route", str(place / "points.csv"), "-o", str(place / "c")]
+    assert main([*command, "--format", "npz"]) == 0
+    capsys.readouterr()
+    assert main(["report", str(place / "flight.yaml"), "-o", str(place / "r")]) == 2
+    assert "lists no log" in capsys.readouterr().err

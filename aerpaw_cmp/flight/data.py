@@ -8,7 +8,7 @@ from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ..common.counting import counted
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
+from ..common.yamlfile import nearest
 from ..logs.ingest import Held, IngestedFile, ingest, read_log
 from ..logs.records import COLUMNS, Stream
 from ..propagation.geometry.arrays import Link
@@ -28,7 +29,7 @@ from .pose.hour_shift import clock_trap
 from .pose.track import Track, TrackPoses, good_positions
 from .rows.lock import lock_of
 from .rows.scored import scored_rows, unscored
-from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, SiteChoice
+from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, RankSettings, SiteChoice
 
 Times = NDArray[np.datetime64]
 
@@ -97,6 +98,8 @@ class FlightData:
     """Tracks of the towers that move; ``site`` has them in the middle of their positions."""
     doubts: tuple[str, ...] = ()
     """Clauses on clocks and heights that the first words of a report repeat."""
+    cautions: tuple[str, ...] = ()
+    """Sentences on settings that the user wrote and that do not fit: they come before all other cautions."""
     _links: dict[str, Link] = field(init=False, default_factory=dict, repr=False, compare=False)
 
     @property
@@ -413,8 +416,7 @@ def gather(
         warnings.append(
             "link.rank: no bandwidth_hz: ranks count as in coverage down to the thermal noise of 1 Hz (-174 dBm)"
         )
-    if idle := set(settings.link.channels) - {series.channel for _, series in rss}:
-        warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")
+    cautions = check_names(settings, site, [(series.tower, series.channel) for _, series in rss])
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
     track = (
@@ -440,8 +442,75 @@ def gather(
     if track is not None:
         asked += doubts(track, telemetry[0][1], _times_on_track(data), _undated(data, telemetry[0][0]))
     # after the overlap was checked: a flight that shares no time stops with its own message
-    every = (*_idle_attitude(data), *data.warnings, *(f"{text}." for text in asked))
-    return dataclasses.replace(data, doubts=asked, warnings=every)
+    every = (*cautions, *_idle_attitude(data), *data.warnings, *(f"{text}." for text in asked))
+    return dataclasses.replace(data, doubts=asked, warnings=every, cautions=cautions)
+
+
+def check_names(settings: FlightFile, site: Site, series: Sequence[tuple[str, str]]) -> tuple[str, ...]:
+    """Check the towers and channels that settings name; return the cautions on learned antennas that do not fit.
+
+    Parameters
+    ----------
+    settings : FlightFile
+    site : Site
+        With the towers of the flight.
+    series : sequence of (tower, channel)
+        Every level of the logs.
+
+    Raises
+    ------
+    UsageError
+        A tower that neither site nor flight has, a channel or a pair of both that no log has.
+    """
+    channels = list(dict.fromkeys(channel for _, channel in series))
+    pairs = [f"{tower}.{channel}" for tower, channel in dict.fromkeys(series)]
+    named = {**settings.antennas, **{c.key.removeprefix("antennas."): c for c in settings.cautions}}
+    for key in sorted(named.keys() - {"uav", "rank.receiver", *pairs}):
+        tower = key.partition(".")[0]
+        unknown = ("channel", key) if tower in site.towers else ("tower", tower)
+        _unknown(f"antennas.{key}", *unknown, ["uav", *pairs])
+    for name in sorted(settings.link.channels.keys() - settings.lent - {*channels}):
+        _unknown(f"link.channels.{name}", "channel", name, channels)
+    links = {"rss": settings.link.rss, "rank": settings.link.rank}
+    links |= {f"channels.{name}": settings.link.of(name) for name in settings.link.channels.keys() - settings.lent}
+    for where, link in links.items():
+        for name in sorted(link.towers.keys() - site.towers.keys()):
+            _unknown(f"link.{where}.towers.{name}", "tower", name, list(site.towers))
+    if settings.rank.tower not in site.towers and settings.rank.tower != RankSettings().tower:
+        _unknown("rank.tower", "tower", settings.rank.tower, list(site.towers))
+    return (*_learned_cautions(settings, channels), *_idle_channels(settings, channels))
+
+
+def _unknown(key: str, kind: str, name: str, valid: Sequence[str]) -> NoReturn:
+    near = nearest(name, valid)
+    raise UsageError(
+        f"{key}: this flight has no {kind} {name!r}",
+        expected="one of " + ", ".join(valid) if valid else "no such key: the flight has no levels",
+        cause=f"did you mean {near!r}?" if near else "a typing error, or a line of another flight",
+    )
+
+
+def _learned_cautions(settings: FlightFile, channels: Sequence[str]) -> tuple[str, ...]:
+    """Return a sentence per caution on learned antennas and receivers; it names channels if only some are concerned."""
+    touched: dict[str, list[str]] = {}
+    for caution in settings.cautions:
+        # None: the link of all channels without an entry
+        links = settings.link.channels if caution.channel is None else {*channels} - {caution.channel}
+        concerned = [channel for channel in channels if channel not in links]
+        if concerned or caution.key == "rank.receiver":
+            touched.setdefault(f"{caution.key}: {caution.text}", []).extend(concerned)
+    if settings.antennas and not channels:
+        touched["antennas: the logs have no levels, so no antenna is used"] = []
+    part = {text for text, on in touched.items() if text.startswith("antennas.uav") and {*on} != {*channels}}
+    where = {text: f" (channel {', '.join(touched[text])})" for text in part}
+    return tuple(f"{text}{where.get(text, '')}." for text in touched)
+
+
+def _idle_channels(settings: FlightFile, channels: Sequence[str]) -> tuple[str, ...]:
+    """Return a sentence if calibrations or overrides add channels that no log has."""
+    idle = sorted((settings.link.channels.keys() & settings.lent) - {*channels})
+    text = f"link.channels names {', '.join(idle)}, which no log of this flight has: these settings are not used."
+    return (text,) if idle else ()
 
 
 def _undated(data: FlightData, track: str) -> list[str]:

@@ -33,7 +33,7 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
     for key in sorted(overrides, key=lambda key: (key.startswith("link.channels."), ".towers." in key)):
         _set(plain, key, overrides[key])
     try:
-        return FlightFile.model_validate(plain)
+        other = FlightFile.model_validate(plain)
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -41,6 +41,8 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
         key = next((k for k in overrides if k.startswith(where) or where.startswith(k)), where)
         message = str(first["msg"]).removeprefix("Value error, ")
         raise UsageError(f"the override {key!r}: found {first['input']!r} at {where}", expected=message) from None
+    # a campaign changes a channel that some of its flights do not have
+    return other.changed({}, lent={*settings.lent, *(other.link.channels.keys() - settings.link.channels.keys())})
 
 
 def _set(plain: dict[str, Any], key: str, value: Any) -> None:

@@ -6,7 +6,8 @@ are errors that name the nearest valid key. Relative paths resolve against the f
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -14,6 +15,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import (
     Field,
+    PrivateAttr,
     field_validator,
     model_validator,
 )
@@ -403,6 +405,19 @@ class ReportSettings(StrictModel):
     waypoints: list[Waypoint] = []
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Caution:
+    """A caution about a learned antenna or receiver that the flight file names."""
+
+    key: str
+    """Key of the flight file, such as ``antennas.uav``."""
+    channel: str | None
+    """Channel to which it does not apply; None for all channels that ``link.channels`` does not name."""
+    text: str
+    """Which one is not used, why and what is used instead; or which setting it replaces."""
+    used: bool = False
+
+
 class FlightFile(StrictModel):
     """The whole flight.yaml."""
 
@@ -424,6 +439,27 @@ class FlightFile(StrictModel):
     rss: RssSettings = RssSettings()
     rank: RankSettings = RankSettings()
     report: ReportSettings = ReportSettings()
+    _cautions: tuple[Caution, ...] = PrivateAttr(())
+    _lent: frozenset[str] = PrivateAttr(frozenset())
+
+    @property
+    def cautions(self) -> tuple[Caution, ...]:
+        """Cautions about learned antennas and receivers that the file names: one that does not fit is not used."""
+        return self._cautions
+
+    @property
+    def lent(self) -> frozenset[str]:
+        """Channels of ``link.channels`` that a calibration or an override added: they may be of another flight."""
+        return self._lent
+
+    def changed(
+        self, content: Mapping[str, Any], *, cautions: Iterable[Caution] | None = None, lent: Iterable[str] = ()
+    ) -> FlightFile:
+        """Return the settings with other values for some top-level keys, which are not checked again."""
+        other = self.model_copy(update=dict(content))
+        other._cautions = self._cautions if cautions is None else tuple(cautions)
+        other._lent = self._lent | frozenset(lent)
+        return other
 
     @model_validator(mode="before")
     @classmethod
@@ -450,39 +486,41 @@ class FlightFile(StrictModel):
         return value
 
 
+class LearnedLink(StrictModel):
+    """The links of calibrated.yaml: channels only."""
+
+    channels: dict[str, dict[str, Any]] = {}
+
+
 class LearnedSettings(StrictModel):
     """calibrated.yaml: the part of a flight.yaml that a calibration knows."""
 
     trained_on: list[str] = []
     marks: list[str] = []
-    link: dict[str, Any] = {}
+    link: LearnedLink = LearnedLink()
     rt: dict[str, Any] = {}
     rank: dict[str, Any] = {}
 
 
-def load_flight(path: str | Path, learned: Path | None = None) -> FlightFile:
+def load_flight(path: str | Path) -> FlightFile:
     """Read and check a flight.yaml.
 
     Parameters
     ----------
     path : str or Path
-    learned : Path, optional
-        calibrated.yaml whose settings take the place of those of the flight file; its files lie beside it.
 
     Returns
     -------
     FlightFile
+        The settings as they are written; :func:`aerpaw_cmp.flight.gains.memory.load_with_learned` adds the learned
+        antennas that they name.
 
     Raises
     ------
     UsageError
         Unknown or duplicate keys, wrong types, wrong ranges: with the line and the nearest valid key.
     """
-    settings = load_yaml(Path(path), FlightFile)
-    if learned is None:
-        return settings
-    knowledge = load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True)
-    return _joined(settings, files_of(knowledge, learned.parent, learned), learned)
+    return load_yaml(Path(path), FlightFile)
 
 
 def files_of(content: Mapping[str, Any], folder: Path, learned: Path | None = None) -> dict[str, Any]:
@@ -503,26 +541,56 @@ def files_of(content: Mapping[str, Any], folder: Path, learned: Path | None = No
     return dict(place(dict(content)))
 
 
-def _joined(settings: FlightFile, learned: Mapping[str, Any], path: Path) -> FlightFile:
-    """The settings of a flight with what was learned in place of its own."""
+def joined(settings: FlightFile, learned: Path) -> FlightFile:
+    """Return the settings of a flight with those of a calibrated.yaml instead of its own.
+
+    Parameters
+    ----------
+    settings : FlightFile
+        With the learned antennas that it names: those of the same end, tower and channel are replaced.
+    learned : Path
+        calibrated.yaml; its files are in its folder.
+
+    Raises
+    ------
+    UsageError
+        A file that is not a calibrated.yaml, or whose settings do not fit this flight.
+    """
+    known = files_of(load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True), learned.parent, learned)
+    taught: dict[str, Any] = known.get("link", {}).get("channels", {})
     # what the file says, no defaults: a stated default would keep a learned value out
     stated: dict[str, Any] = settings.model_dump(mode="json", exclude_unset=True)
-    link = dict(stated.get("link", {}))
     # a channel begins as the RSS link, as with overrides; what was learned comes last
     rss_link = settings.link.rss.model_dump(mode="json", exclude_unset=True)
-    channels = dict(link.get("channels", {}))
-    for name, channel in learned.get("link", {}).get("channels", {}).items():
-        channels[name] = {**rss_link, **channels.get(name, {}), **channel}
-    stated["link"] = {**link, **({"channels": channels} if channels else {})}
+    channels = dict(stated.get("link", {}).get("channels", {}))
+    for name, channel in taught.items():
+        before = {**rss_link, **channels.get(name, {})}
+        # a learned 'tower' is that of every tower: one by name would come before it
+        towers = {} if "tower" in channel else before.get("towers", {})
+        channels[name] = {**before, **channel, "towers": {**towers, **channel.get("towers", {})}}
+    stated["link"] = {**stated.get("link", {}), **({"channels": channels} if channels else {})}
+    stated["antennas"] = {key: name for key, name in settings.antennas.items() if not _replaced(key, taught)}
     for key in ("rt", "rank"):
-        stated[key] = {**stated.get(key, {}), **learned.get(key, {})}
+        stated[key] = {**stated.get(key, {}), **known.get(key, {})}
     for key in ("trained_on", "marks"):
-        stated[key] = [*stated.get(key, []), *learned.get(key, [])]
+        stated[key] = [*stated.get(key, []), *known.get(key, [])]
     try:
-        return FlightFile.model_validate(stated)
+        whole = FlightFile.model_validate(stated)
     except ValueError as error:
         raise UsageError(
             f"its settings do not fit this flight: {str(error).splitlines()[-1]}",
             expected="a calibrated.yaml of 'aerpaw-cmp calibrate'",
-            path=path,
+            path=learned,
         ) from None
+    here = {"rank.receiver"} if "receiver" in known.get("rank", {}) else set[str]()
+    cautions = [u for u in settings.cautions if u.key not in here and not _replaced(u.key, taught, u.channel)]
+    return whole.changed({}, cautions=cautions, lent={*settings.lent, *(taught.keys() - settings.link.channels.keys())})
+
+
+def _replaced(key: str, taught: Mapping[str, Any], channel: str | None = None) -> bool:
+    """Check whether learned channels have an antenna for the end that a key of ``antennas`` names."""
+    tower, _, name = key.removeprefix("antennas.").partition(".")
+    if tower == "uav" and channel is None:
+        return any("uav" in link for link in taught.values())
+    link = taught.get(channel or name, {})
+    return "uav" in link if tower == "uav" else "tower" in link or tower in link.get("towers", {})

@@ -63,6 +63,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
             vehicle, file, level = _streams(settings, flight, options.logs_root, channel)
             check_place(site, str(flight), vehicle)
             node, uav = _antennas(settings, flight, options.logs_root, site, (file, level))
+            cautions = _cautions(settings, level.channel, uav)
         with stages("locate"):
             floor = LOCK_FLOOR_DB if is_sounder_power(level) else receiver_floor_db([level])
             track = Placer(site, vehicle).levels(level, -np.inf if floor is None else floor, uav, node)
@@ -77,6 +78,7 @@ def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None 
         assumed = "unknown, one gain over the elevation" if node is None else f"{node.name}, learned on other flights"
         ends = f"Antenna of the UAV: {'unknown' if uav is None else uav.name}. Antenna of the node: {assumed}."
         numbers = {"flight": settings.flight.name, "channel": level.channel, **_numbers(site, track, estimate, ends)}
+        numbers["warnings"] = (*cautions, *numbers["warnings"])
         metrics = json_object(**numbers, **about(Made()))
         with output.filling() as part:
             written = write_locate(metrics, estimate.regions, track.position_m, site, part)
@@ -113,6 +115,20 @@ def _antennas(
     every = taught(place, series, (file.sha256, mark)).items()
     both = next(((ends.tower, ends.uav) for name, ends in every if ends and name not in site.towers), None)
     return both or (None, searching_airframe(place, site.towers, series, (file.sha256, mark)))
+
+
+def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -> list[str]:
+    """Return sentences on antennas that the flight file names and that the search does not use."""
+    own = [c for c in settings.cautions if c.key != "rank.receiver" and c.channel in (None, channel)]
+    texts = [f"{caution.key}: {caution.text}." for caution in own]
+    texts += [
+        f"antennas.{key} is not used: the node is unknown here; link.rss.tower describes its antenna."
+        for key in settings.antennas if key.endswith(f".{channel}")
+    ]  # fmt: skip
+    used = settings.link.of(channel).uav.antenna.file
+    if "uav" in settings.antennas and (uav is None or used is None or uav.name not in used):
+        texts.append("antennas.uav is not used: it was learned from this very log.")
+    return list(dict.fromkeys(texts))
 
 
 def _model_of(node: Any) -> LevelModel:

@@ -21,10 +21,10 @@ from ..common.yamlfile import parse_yaml
 from ..compare.result import FlightResult
 from ..flight.data import FlightData, gather, load_data, rank_positions
 from ..flight.drafting.draft import draft, flights_by_name
-from ..flight.gains.memory import load_with_learned, with_learned
+from ..flight.gains.memory import with_learned
 from ..flight.overrides import overridden
 from ..flight.replay import FlightReplay, Replayed, replay_flight
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, load_flight
 from ..logs.flight_file import is_flight_file
 from ..logs.ingest import ingest
 from ..propagation.geometry.paths import PathSet
@@ -79,12 +79,12 @@ def open_flight(
     drafted = file.is_file() and is_flight_file(file)
     if flight is not None and not drafted:
         raise UsageError("flight=NAME beside a flight.yaml", expected="a flight file of several flights", path=file)
-    settings = _drafted(file, flight) if drafted else load_with_learned(file)
-    data = load_data(overridden(settings, overrides or {}), file.parent, root)
+    written = overridden(_drafted(file, flight) if drafted else load_flight(file), overrides or {})
+    data = load_data(with_learned(written, file.parent), file.parent, root)
     for warning in data.warnings:
         logging.getLogger("aerpaw_cmp.flight").warning(warning)
     changed = ("the draft of its flight file",) if drafted else ()
-    return Flight(file, data, root, changed=(*changed, *(overrides or ())))
+    return Flight(file, data, root, written=written, changed=(*changed, *(overrides or ())))
 
 
 def _drafted(file: Path, flight: str | None) -> FlightFile:
@@ -96,7 +96,7 @@ def _drafted(file: Path, flight: str | None) -> FlightFile:
         raise UsageError(f"no flight {flight!r}", expected=f"one of {', '.join(known)}", path=file)
     name = flight or next(iter(known))
     text, _ = draft(known[name].files, file.parent, flight=known[name])
-    return with_learned(parse_yaml(text, FlightFile), file.parent)
+    return parse_yaml(text, FlightFile)
 
 
 @from_python
@@ -111,16 +111,25 @@ class Flight:
         Settings, site, logs, track and series.
     logs_root : Path, optional
         As given.
+    written : FlightFile, optional
+        Settings as the flight file has them, before learned antennas are added; by default those of ``data``.
     changed : tuple of str
         Keys in which its settings are not those of the file.
     """
 
     def __init__(
-        self, path: Path, data: FlightData, logs_root: Path | None = None, *, changed: tuple[str, ...] = ()
+        self,
+        path: Path,
+        data: FlightData,
+        logs_root: Path | None = None,
+        *,
+        written: FlightFile | None = None,
+        changed: tuple[str, ...] = (),
     ) -> None:
         self.path = path
         self.data = data
         self.logs_root = logs_root
+        self._written = data.settings if written is None else written
         self.changed = changed
 
     @property
@@ -194,7 +203,8 @@ class Flight:
         keys = {key if "." in key else f"rt.{key}": value for key, value in overrides.items()}
         if engine is not None:
             keys["rt.engine"] = engine
-        settings = overridden(self.settings, keys)
+        # before the antennas: they must fit the carrier of the overrides
+        settings = with_learned(overridden(self._written, keys), self.path.parent)
         data = gather(settings, self.path.parent, self.data.files, self.logs_root) if keys else self.data
         return ReplayedFlight(data, replay_flight(data))
 

@@ -123,8 +123,8 @@ def test_names_in_the_flight_file_that_fit_nothing_are_told(tmp_path: Path) -> N
     assert "no stream is named qualty: its streams are power" in warning
     text = (tmp_path / "flight.yaml").read_text().replace(", skip: [qualty]", "")
     (tmp_path / "flight.yaml").write_text(text + "link: {channels: {USRP1: {carrier_hz: 3.3e9}}}\n")
-    (warning,) = load_data(load_flight(tmp_path / "flight.yaml"), tmp_path).warnings
-    assert "link.channels names USRP1: no log is of such a channel" in warning
+    with pytest.raises(UsageError, match="no channel 'USRP1'; expected one of power"):
+        load_data(load_flight(tmp_path / "flight.yaml"), tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,8 @@ import pytest
 from pydantic import ValidationError
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.flight.settings import ArraySettings, FlightFile, load_flight
+from aerpaw_cmp.flight.gains.memory import load_with_learned
+from aerpaw_cmp.flight.settings import ArraySettings, FlightFile
 
 POINT = {"east_m": 0, "north_m": 0, "height_m": 5}
 PLAN = {"start": "2025-06-01T10:00:00", "waypoints": [POINT, POINT]}
@@ -104,4 +105,4 @@ def test_learned_settings_name_no_file_outside_their_folder(tmp_path: Path, name
     text = f"link: {{channels: {{A: {{carrier_hz: 3.3e9, tower: {antenna}}}}}}}\n"
     (folder / "calibrated.yaml").write_text(text)
     with pytest.raises(InputError, match=r"leaves its folder|no file of its folder"):
-        load_flight(flight, folder / "calibrated.yaml")
+        load_with_learned(flight, folder / "calibrated.yaml")

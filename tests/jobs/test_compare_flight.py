@@ -48,7 +48,9 @@ def test_a_clock_that_is_no_cause_of_the_error_is_still_the_first_step(monkeypat
         clock = SimpleNamespace(shifted=shifted, in_words="0.40 s ahead")
         named = None if other is None else Cause(name=other, sentence="", next_step="")
         monkeypatch.setattr(likely_cause, "flight_cause", lambda _, named=named: named)
-        data: Any = SimpleNamespace(files=[], rss=[SimpleNamespace(tower="LW1")], settings=SimpleNamespace(antennas={}))
+        data: Any = SimpleNamespace(
+            files=[], rss=[SimpleNamespace(tower="LW1")], settings=SimpleNamespace(antennas={}, cautions=())
+        )
         replays: Any = SimpleNamespace(rss=[SimpleNamespace(tower_m=None, clock=SimpleNamespace(result=clock))])
         result: Any = SimpleNamespace(name="LW1 A", measured_db=np.zeros(9), training=False)
         cause, _ = likely_cause.cause_of(data, replays, [result])

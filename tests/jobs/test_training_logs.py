@@ -18,6 +18,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common import provenance
 from aerpaw_cmp.common.provenance import trained_on
 from aerpaw_cmp.flight.data import FlightData, load_data
+from aerpaw_cmp.flight.gains.memory import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import counted_once, flight_logs, marks_of
 from aerpaw_cmp.jobs.diff_reports import run_diff
@@ -312,7 +313,7 @@ def test_what_was_learned_from_ranks_alone_names_its_logs_too(tmp_path: Path) ->
     (tmp_path / "calibrated.yaml").write_text(text)
     assert set(trained_on(text)) == set(flight_logs(flights[0]))
     assert set(provenance.marks(text)) == set(marks_of(flights))
-    joined = load_flight(sample / "flight.yaml", learned=tmp_path / "calibrated.yaml")
+    joined = load_with_learned(sample / "flight.yaml", tmp_path / "calibrated.yaml")
     assert set(joined.trained_on) == set(flight_logs(flights[0]))
     assert joined.rank.receiver == str(tmp_path / "calibrated" / "receiver.json")
 

@@ -100,30 +100,77 @@ def test_antennas_by_name_are_those_of_the_memory(folder: Path) -> None:
         [-3.0, 0.0], abs=1e-3
     )  # type: ignore[attr-defined]
     assert not isinstance(link.tower_arrays["LW2"].patterns[0], SpherePattern)
-    assert settings.flight.notes == []
+    assert settings.cautions == ()
 
 
 @pytest.mark.parametrize(
-    ("name", "carrier_hz", "said"),
+    ("antennas", "said"),
     [
-        ("mine/d13_uav", CARRIER_HZ, "nothing learned is called 'mine/d13_uav'"),
-        ("other/d12_uav", CARRIER_HZ, "nothing learned is called 'other/d12_uav'"),
-        ("mine/d12_uav", 3.51e9, "learned at 3.3 GHz, used at 3.51 GHz"),
+        ({"uav": "mine/d13_uav"}, "nothing learned is called 'mine/d13_uav' for the UAV; expected one of mine/d12_uav"),
+        ({"uav": "mine/d12_LW1.A"}, "expected one of mine/d12_uav"),
+        ({"LW1.A": "mine/d12_uav"}, "expected one of mine/d12_LW1.A"),
+        ({"uav": "other/d12_uav"}, "there is no such learned model in .*other.learned"),
+        ({"uav1": "mine/d12_uav"}, "unknown key 'antennas.uav1'; expected 'uav' or 'TOWER.CHANNEL'"),
     ],
 )
-def test_what_does_not_fit_is_left_out_and_said(folder: Path, name: str, carrier_hz: float, said: str) -> None:
-    settings = load_with_learned(flight(folder, {"uav": name}, carrier_hz))
-    (note,) = settings.flight.notes
-    assert said in note
-    assert settings.link.channels == {}
+def test_a_name_that_can_never_apply_is_refused_with_the_valid_ones(folder: Path, antennas: dict, said: str) -> None:
+    with pytest.raises(UsageError, match=said):
+        load_with_learned(flight(folder, antennas))
+
+
+def test_an_antenna_of_another_band_is_a_caution(folder: Path) -> None:
+    settings = load_with_learned(flight(folder, {"uav": "mine/d12_uav"}, 3.51e9))
+    (caution,) = settings.cautions
+    assert "learned at 3.3 GHz, used at 3.51 GHz" in caution.text
+    assert settings.link == load_flight(folder / "flight.yaml").link
+    assert settings.antennas == {}
+
+
+def test_the_airframe_is_the_end_of_every_channel(folder: Path) -> None:
+    """Whether the file lists a channel or not; a channel of another band keeps its own antenna."""
+    path = flight(folder, {"uav": "mine/d12_uav"})
+    overrides = {"link.channels.B.carrier_hz": 3.31e9, "link.channels.C.carrier_hz": 3.6e9}
+    settings = load_with_learned(path, overrides=overrides)
+    models = {name: settings.link.of(name).uav.antenna.model for name in ("any", "B", "C")}
+    assert models == {"any": "sphere", "B": "sphere", "C": "iso"}
+    assert [caution.channel for caution in settings.cautions] == ["C"]
+
+
+def test_an_override_of_the_carrier_leaves_no_antenna_of_another_band(folder: Path) -> None:
+    path = flight(folder, {"uav": "mine/d12_uav"})
+    settings = load_with_learned(path, overrides={"link.rss.carrier_hz": 2.4e9})
+    assert settings.link.rss.uav.antenna.model == "iso"
+    assert len(settings.cautions) == 1
+    assert load_with_learned(path, overrides={"link.rss.carrier_hz": 3.31e9}).link.rss.uav.antenna.model == "sphere"
+
+
+@pytest.mark.parametrize("end", ["tower", "towers", "uav"])
+def test_a_calibrated_file_comes_before_the_antennas_of_the_flight(folder: Path, end: str) -> None:
+    path = flight(folder, {"LW1.A": "mine/d12_LW1.A", "LW1.B": "mine/d12_LW1.A", "uav": "mine/d12_uav"})
+    dipole = {"antenna": {"model": "dipole"}}
+    channel = {"A": {end: {"LW1": dipole} if end == "towers" else dipole}}
+    (folder / "calibrated.yaml").write_text(yaml.safe_dump({"link": {"channels": channel}}))
+    settings = load_with_learned(path, folder / "calibrated.yaml")
+    links = {name: settings.link.channels[name] for name in ("A", "B")}
+    models = {name: (link.towers.get("LW1", link.tower).antenna.model, link.uav.antenna.model)
+              for name, link in links.items()}  # fmt: skip
+    assert models["B"] == ("sphere", "sphere")
+    assert models["A"] == (("sphere", "dipole") if end == "uav" else ("dipole", "sphere"))
+    assert ("LW1.A" in settings.antennas) == (end == "uav")
+    assert ("uav" in settings.antennas) == (end != "uav")
+
+
+def test_a_calibrated_file_with_another_link_is_refused(folder: Path) -> None:
+    path = flight(folder, {})
+    (folder / "calibrated.yaml").write_text("link: {rss: {carrier_hz: 3.3e9}}\n")
+    with pytest.raises(UsageError, match=r"unknown key 'link.rss'"):
+        load_with_learned(path, folder / "calibrated.yaml")
 
 
 def test_reading_a_flight_opens_no_table(folder: Path) -> None:
     """A name that leads nowhere is noticed by the stage that looks for it, not by the settings."""
     path = flight(folder, {"uav": "nowhere/d12_uav"})
-    assert load_flight(path).flight.notes == []
     assert load_flight(path).antennas == {"uav": "nowhere/d12_uav"}
-    assert len(load_with_learned(path).flight.notes) == 1
 
 
 OTHER_LOGS = sphere_csv(np.zeros((7, 8)), np.ones((7, 8)), (f"trained_on: {'b' * 64}",)).encode()
@@ -149,11 +196,10 @@ def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: b
     else:
         table.write_bytes(content)
     settings = load_with_learned(flight(folder, {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"}))
-    (note,) = settings.flight.notes
-    assert note.startswith(f"antennas.{end}: ")
-    assert said in note
-    assert note.endswith("isotropic in its place")
-    link = settings.link.channels["A"].build(["LW1"], Path("/nowhere"))
+    assert {caution.key for caution in settings.cautions} == {f"antennas.{end}"}
+    assert all(said in caution.text for caution in settings.cautions)
+    assert all(caution.text.endswith("an isotropic antenna is used instead") for caution in settings.cautions)
+    link = settings.link.of("A").build(["LW1"], Path("/nowhere"))
     learned = {"LW1.A": link.tower_arrays["LW1"].patterns[0], "uav": link.uav_array.patterns[0]}
     assert {name for name, pattern in learned.items() if isinstance(pattern, SpherePattern)} == {"LW1.A", "uav"} - {end}
 
@@ -164,7 +210,7 @@ def test_a_damaged_table_is_left_out_and_said(folder: Path, end: str, content: b
         (b"{", "cannot be read"),
         (b"\x1f\x8bgarbage", "cannot be read"),
         (json.dumps({"trained_on": ["b" * 64]}).encode(), "that its entry does not name"),
-        (None, "nothing learned is called"),
+        (None, "learned at 3.3 GHz, used at 3.6 GHz"),
     ],
 )
 def test_a_damaged_receiver_is_left_out_and_said(folder: Path, content: bytes | None, said: str) -> None:
@@ -176,15 +222,18 @@ def test_a_damaged_receiver_is_left_out_and_said(folder: Path, content: bytes | 
         {"r.json.gz": b"{}"},
     )
     path = flight(folder, {})
-    name = "mine/nr" if content is not None else "mine/other"
     if content is not None:
         (folder_of(folder / "mine.yaml") / "r.json.gz").write_bytes(content)
-    path.write_text(path.read_text() + f"rank: {{receiver: {name}}}\n", encoding="utf-8")
-    settings = load_with_learned(path)
-    (note,) = settings.flight.notes
-    assert note.startswith("rank.receiver: ")
-    assert said in note
+    path.write_text(path.read_text() + "rank: {receiver: mine/nr}\n", encoding="utf-8")
+    carrier_hz = CARRIER_HZ if content is not None else 3.6e9
+    settings = load_with_learned(path, overrides={"link.rank.carrier_hz": carrier_hz})
+    (caution,) = settings.cautions
+    assert caution.key == "rank.receiver"
+    assert said in caution.text
     assert settings.rank.receiver is None
+    path.write_text(path.read_text().replace("mine/nr", "mine/d12"), encoding="utf-8")
+    with pytest.raises(UsageError, match="for the rank receiver; expected one of mine/nr"):
+        load_with_learned(path)
 
 
 @pytest.mark.parametrize(
@@ -194,7 +243,7 @@ def test_a_damaged_memory_is_one_message(folder: Path, text: str) -> None:
     (folder_of(folder / "mine.yaml") / "learned.yaml").write_text(text)
     with pytest.raises(UsageError):
         read_learned(folder / "mine.yaml")
-    assert load_with_learned(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
+    assert load_with_learned(flight(folder, {"uav": "mine/d12_uav"})).cautions
 
 
 def test_a_second_entry_joins_the_first_and_one_of_the_same_name_replaces_it(folder: Path) -> None:
@@ -240,7 +289,7 @@ def test_a_memory_that_names_a_file_of_others_touches_and_shows_none(
     said = capsys.readouterr()
     assert "years of work" not in said.out + said.err
     assert thesis.read_text() == "years of work"
-    assert load_with_learned(flight(folder, {"uav": "mine/d12_uav"})).flight.notes
+    assert load_with_learned(flight(folder, {"uav": "mine/d12_uav"})).cautions
 
 
 def test_an_index_that_leads_elsewhere_is_not_read(folder: Path) -> None:
@@ -321,7 +370,7 @@ def test_learned_antennas_are_found_from_any_working_folder(
     """The flight file is named relative to the working folder, and its site's memory lies beside it."""
     (folder / "rl" / "deep").mkdir(parents=True)
     folder_of(folder / "mine.yaml").rename(folder / "rl" / "mine.learned")
-    receiver = LearnedReceiver(tower="LW1", quantity="scheduled PDSCH rank", carrier_hz=CARRIER_HZ, file="r.json.gz")
+    receiver = LearnedReceiver(tower="LW1", quantity="scheduled PDSCH rank", carrier_hz=3.4e9, file="r.json.gz")
     ranked = entry("A").model_copy(update={"series": [], "receivers": [receiver]})
     remember(folder / "rl" / "mine.yaml", "nr", ranked, {"r.json.gz": b"{}"})
     path = flight(folder / "rl", {"LW1.A": "mine/d12_LW1.A", "uav": "mine/d12_uav"})
@@ -329,7 +378,7 @@ def test_learned_antennas_are_found_from_any_working_folder(
     monkeypatch.chdir(folder / where)
     relative = Path(os.path.relpath(path))
     settings = load_with_learned(relative)
-    assert settings.flight.notes == []
+    assert settings.cautions == ()
     link = settings.link.channels["A"].build(["LW1"], relative.parent)
     assert isinstance(link.uav_array.patterns[0], SpherePattern)
     assert isinstance(link.tower_arrays["LW1"].patterns[0], SpherePattern)

@@ -153,6 +153,8 @@ def _print_report_summary(outcome: Any) -> None:
     show(" ".join([outcome.metrics["sentence"], *outcome.metrics["offsets"]]))
     if "against" in outcome.metrics:
         show(outcome.metrics["against"]["sentence"])
+    for text in outcome.metrics["antennas"]:
+        show(text)
     warn_all(outcome.metrics["warnings"])
     show(f"report: {outcome.folder / 'report.html'}")
     if audited := (outcome.metrics.get("rt") or {}).get("audit"):

@@ -21,9 +21,9 @@ from ...common.units import finite_mean
 from ...common.yamlfile import StrictModel, load_yaml
 from ...compare.offset import Pooling, pooled_moments
 from ...compare.statistics.passes import Pass, PassPair, PassTable
-from ...flight.gains.memory import load_with_learned
+from ...flight.gains.memory import with_learned
 from ...flight.overrides import Overrides, overridden
-from ...flight.settings import FlightFile
+from ...flight.settings import FlightFile, load_flight
 from ...report.content.campaign import CampaignData, Failure, PooledOffset, RankRow, RankTransfer, Repeat, RssRow
 from ..tasks.options import DEFAULT, RunOptions
 from ..tasks.outcomes import OutcomeStore
@@ -172,7 +172,8 @@ def _flight_files(
     for entry in campaign.flights:
         path = folder / entry
         try:
-            flight = load_with_learned(path)
+            flight = load_flight(path)
+            with_learned(flight, path.parent)
         except (InputError, UsageError) as error:
             failures.append(Failure(flight=Path(entry).stem, setting="every setting", message=str(error)))
             continue

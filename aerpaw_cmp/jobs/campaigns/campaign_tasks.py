@@ -23,10 +23,10 @@ from ...common.versions import versions
 from ...compare import offset
 from ...compare.result import FlightResult, RankResult, RssResult
 from ...flight.data import FlightData, RankSeries, RssSeries, gather, read_logs
-from ...flight.gains.memory import load_with_learned
+from ...flight.gains.memory import with_learned
 from ...flight.marks import among
 from ...flight.overrides import Overrides, overridden
-from ...flight.settings import FlightFile, RssSettings
+from ...flight.settings import FlightFile, RssSettings, load_flight
 from ...flight.training import logs_of, series_mark
 from ...report.content.campaign import Failure, RankRow, RssRow
 from ..reporting.flight_run import run_flight
@@ -84,7 +84,13 @@ def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Out
 
 @lru_cache(maxsize=512)
 def _flight_file(path: Path, _size: int, _mtime_ns: int) -> FlightFile:
-    return load_with_learned(path)
+    return load_flight(path)
+
+
+def _settings(task: Task) -> FlightFile:
+    """Return the settings of a task; the learned antennas that they name must fit its overrides."""
+    written = overridden(_flight_file(task.path, *stamp(task.path)), task.overrides)
+    return with_learned(written, task.path.parent)
 
 
 @lru_cache(maxsize=2)
@@ -106,7 +112,7 @@ class _Logs:
 
 def flight_data(task: Task) -> FlightData:
     """Read and gather the flight of a task; errors as in :mod:`aerpaw_cmp.flight.data`."""
-    settings = overridden(_flight_file(task.path, *stamp(task.path)), task.overrides)
+    settings = _settings(task)
     folder, root = task.path.parent, task.logs_root
     text = "\n".join([str(settings.timezone), *(log.model_dump_json() for log in settings.logs)])
     stamps = tuple(stamp((root or folder) / log.path) for log in settings.logs)
@@ -190,7 +196,7 @@ def digest_of(task: Task) -> str:
     AerpawCmpError, OSError
         If an input cannot be read.
     """
-    settings = overridden(_flight_file(task.path, *stamp(task.path)), task.overrides)
+    settings = _settings(task)
     return task_key(settings, task_inputs(settings, task.path, task.logs_root))
 
 

@@ -65,6 +65,9 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     # judged by itself: it is mended first, however little of the error it explains, and before what directions tell
     if late is not None and (cause is None or cause.name in OF_DIRECTION):
         return Cause(name="clock", sentence=late, next_step="`rss: {lag: apply}`"), None
+    # an antenna that the file names is missing: errors by direction are expected, and the first caution has the reason
+    if any(not c.used for c in data.settings.cautions) and (cause is None or cause.name in OF_DIRECTION):
+        return None, "see the first caution: a learned antenna that the flight file names is not used"
     # learned antennas miss some decibels of any flight
     if cause is not None or data.settings.antennas or not gains_by_direction(evidence):
         return cause, None

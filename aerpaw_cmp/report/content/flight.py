@@ -134,6 +134,10 @@ class ReportData(FlightResult):
         What the reader must know before believing a number, one sentence each.
     doubts : tuple of str
         Clauses on clocks and heights for the first words.
+    cautions : tuple of str
+        Sentences on settings that do not fit; they come before all other cautions.
+    antennas : tuple of str
+        Sentences that name the antennas of the replay.
     notes : tuple of str
         Remarks for the end of the report.
     settings : mapping
@@ -156,6 +160,8 @@ class ReportData(FlightResult):
     synthetic: bool = False
     warnings: tuple[str, ...] = ()
     doubts: tuple[str, ...] = ()
+    cautions: tuple[str, ...] = ()
+    antennas: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
     settings: Mapping[str, Any] = field(default_factory=dict)
     stages_s: Mapping[str, float] = field(default_factory=dict)

@@ -13,6 +13,7 @@ from ...common.units import FloatArray
 from ...common.versions import utc_now, versions
 from ...compare.result import APPLIED, NOT_APPLIED, ClockResult, FlightResult, RankResult, RssResult
 from ...flight.data import FlightData
+from ...flight.gains.memory import antennas_used
 from ...flight.replay import FlightReplay, Replayed
 from ...flight.settings import LogSettings
 from ...logs.ingest import IngestedFile
@@ -79,6 +80,8 @@ def report_data(
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
         doubts=data.doubts,
+        cautions=data.cautions,
+        antennas=antennas_used([(s.tower, s.channel, s.link) for s in data.rss]),
         notes=(*settings.flight.notes, *notes),  # the page adds those of the site
         settings=settings.model_dump(mode="json"),
     )

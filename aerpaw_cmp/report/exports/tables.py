@@ -40,6 +40,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         **named(data, "flight title synthetic settings"),
         "sentence": paragraph(data),
         "warnings": cautions(data),
+        "antennas": data.antennas,
         "site": named(data.site, "name credit assumed"),
         "inputs": [
             named(f, "path sha256 reader lines accepted rejected blank role warnings")

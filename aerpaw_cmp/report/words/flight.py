@@ -405,7 +405,7 @@ def _kappa_references(panel: RankResult) -> str:
 
 def cautions(data: ReportData) -> list[str]:
     """Sentences to be known before a number is believed: the list under the first paragraph, gravest first."""
-    texts = []
+    texts = [*data.cautions]
     audit = None if data.engine is None else data.engine.audit
     if audit is not None and audit.fields is not None and audit.fields.failed:
         texts.append(

@@ -344,19 +344,27 @@ class Named(StrictModel):
         return next(iter([*exact, *self.entry.series]), None)
 
 
-def find_named(name: str, folder: Path) -> Named:
-    """The entry of a name ``SITE/ENTRY``, ``SITE/ENTRY_uav`` or ``SITE/ENTRY_TOWER.CHANNEL``.
+class UnknownName(UsageError):  # noqa: N818  # a case of its base, which is the error
+    """A name of the learned models of a site that can never apply."""
+
+
+def find_named(name: str, folder: Path, end: str = "") -> Named:
+    """Return the entry of a name ``SITE/ENTRY``, ``SITE/ENTRY_uav`` or ``SITE/ENTRY_TOWER.CHANNEL``.
 
     Parameters
     ----------
     name : str
     folder : Path
         Where sites that are not packaged lie: SITE.learned in it.
+    end : {"uav", "tower", "receiver", ""}
+        Part that is wanted: the airframe, the antenna of a tower, a rank receiver, or any.
 
     Raises
     ------
+    UnknownName
+        No such site, entry or part, or a part for another end.
     UsageError
-        No such site, entry or part; a memory that cannot be read.
+        A memory that cannot be read.
     """
     site, _, entry_part = name.rpartition("/")
     # a site beside the flight file comes before a packaged one of its name
@@ -364,16 +372,27 @@ def find_named(name: str, folder: Path) -> Named:
     packaged = folder_of(site)
     if not folder_of(place).is_dir() and packaged.is_absolute() and packaged.is_dir():
         place = site
-    memory = read_learned(place)
-    for entry_name, entry in memory.entries.items():
-        parts = {"": entry_name, "uav": f"{entry_name}_uav"}
-        parts |= {f"{s.tower}.{s.channel}": f"{entry_name}_{s.tower}.{s.channel}" for s in entry.series}
-        for part, full in parts.items():
+    fitting = []
+    for entry_name, entry in read_learned(place).entries.items():
+        for part, full in _parts(entry_name, entry, end).items():
             if full == entry_part:
                 return Named(entry=entry, part=part, folder=folder_of(place))
-    raise UsageError(
-        f"nothing learned is called {name!r}",
-        expected="SITE/ENTRY_uav, SITE/ENTRY_TOWER.CHANNEL or SITE/ENTRY, with one of the entries "
-        + (", ".join(memory.entries) or "(there are none)"),
-        path=folder_of(place) / _INDEX,
+            fitting.append(f"{site}/{full}")
+    raise UnknownName(
+        f"nothing learned is called {name!r}" + (f" for {_WANTED[end]}" if end else ""),
+        expected="one of " + ", ".join(fitting) if fitting else "SITE/ENTRY of a site with learned models",
+        cause=None if fitting else f"there is no such learned model in {folder_of(place)}",
     )
+
+
+_WANTED = {"uav": "the UAV", "tower": "a tower", "receiver": "the rank receiver"}
+
+
+def _parts(name: str, entry: Entry, end: str) -> dict[str, str]:
+    """Return the full names of the parts of an entry that fit an end, by part."""
+    parts = {"": name} if end in ("", "receiver") and (not end or entry.receivers) else {}
+    if end in ("", "uav") and entry.series:
+        parts["uav"] = f"{name}_uav"
+    if end in ("", "tower"):
+        parts |= {f"{s.tower}.{s.channel}": f"{name}_{s.tower}.{s.channel}" for s in entry.series}
+    return parts

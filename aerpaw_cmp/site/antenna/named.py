@@ -38,20 +38,35 @@ def antenna_file(named: Named, key: str, channel: str, carrier_hz: float) -> Pat
     series = named.antenna(key.partition(".")[0], channel, end)
     if series is None:
         raise UsageError(f"no learned antenna of {key}", expected="one that the entry has")
-    if abs(carrier_hz / series.carrier_hz - 1.0) > BAND:
-        raise UsageError(
-            f"learned at {series.carrier_hz / 1e9:g} GHz, used at {carrier_hz / 1e9:g} GHz",
-            expected="an antenna of the same band",
-        )
+    _check_band(series.carrier_hz, carrier_hz, "an antenna of the same band")
     path = named.folder / (series.uav_file if end == "uav" else series.tower_file)
     check_logs(read_sphere_csv(path).trained_on, named, path)
     return path
 
 
-def receiver_file(named: Named) -> Path:
-    """File of a learned rank receiver that can be read and was made from the logs that its entry names."""
-    if not named.entry.receivers:
-        raise UsageError("the entry has no rank receiver", expected="one learned from ranks")
+def _check_band(learned_hz: float, used_hz: float, expected: str) -> None:
+    if abs(used_hz / learned_hz - 1.0) > BAND:
+        raise UsageError(f"learned at {learned_hz / 1e9:g} GHz, used at {used_hz / 1e9:g} GHz", expected=expected)
+
+
+def receiver_file(named: Named, carrier_hz: float) -> Path:
+    """Return the file of a learned rank receiver of the same band, which was made from the logs that its entry names.
+
+    Parameters
+    ----------
+    named : Named
+        An entry with a receiver.
+    carrier_hz : float
+        Carrier of the rank link [Hz].
+
+    Raises
+    ------
+    UsageError
+        A receiver of another band.
+    InputError
+        A table that is damaged, or learned from other logs than its entry says.
+    """
+    _check_band(named.entry.receivers[0].carrier_hz, carrier_hz, "a receiver of the same band")
     path = named.folder / named.entry.receivers[0].file
     with parsing(path, "a rank receiver"):
         content = json.loads(read_table(path, "a rank receiver"))

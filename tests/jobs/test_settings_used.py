@@ -1,0 +1,103 @@
+"""Settings that a user writes are used, refused or reported."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pandas as pd
+import pytest
+import yaml
+
+from aerpaw_cmp.__main__ import main
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs"
+
+
+def write_flight(folder: Path, **changes: object) -> Path:
+    """Write a flight over LW1 and LW2 in free space, with further keys."""
+    content = {
+        "flight": "used", "site": "lake_wheeler", "timezone": "America/New_York",
+        "logs": [
+            {"path": str(SAMPLE / "UAV/2025-06-01_10_00_00_vehicleOut.txt")},
+            {"path": str(SAMPLE / "LW1/USRP1_power_log.txt"), "node": "LW1", "channel": "A"},
+            {"path": str(SAMPLE / "LW2/USRP2_power_log.txt"), "node": "LW2", "channel": "B"},
+        ],
+        "link": {"rss": {"carrier_hz": 3.3e9}},
+        "rt": {"max_depth": 0, "audit_links": 0},
+        "rss": {"lag": "off"},
+    }  # fmt: skip
+    path = folder / "flight.yaml"
+    path.write_text(yaml.safe_dump(content | changes), encoding="utf-8")
+    return path
+
+
+def report(path: Path, name: str, *options: str) -> tuple[pd.DataFrame, dict]:
+    """Report a flight; return rss.csv and metrics.json."""
+    out = path.parent / name
+    assert main(["report", str(path), "-o", str(out), "-q", *options]) == 0
+    return pd.read_csv(out / "rss.csv"), json.loads((out / "metrics.json").read_text())
+
+
+def changed_channels(before: pd.DataFrame, after: pd.DataFrame) -> set[str]:
+    differ = (before["simulated_dbm"] - after["simulated_dbm"]).abs() > 0.1
+    return set(before.loc[differ, "channel"])
+
+
+def test_the_airframe_changes_the_levels_of_every_channel(tmp_path: Path) -> None:
+    plain, _ = report(write_flight(tmp_path), "plain")
+    path = write_flight(tmp_path, antennas={"uav": "lake_wheeler/dataset12_uav"})
+    with_airframe, metrics = report(path, "airframe")
+    assert changed_channels(plain, with_airframe) == {"A", "B"}
+    assert metrics["antennas"] == [
+        "Antennas of LW1 A, LW2 B: isotropic at the tower, dataset12.LW1.USRP1.uav at the UAV."
+    ]
+
+
+def test_calibrated_antennas_come_before_those_of_the_flight(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    antennas = {"LW1.A": "lake_wheeler/dataset12_LW1.USRP1", "uav": "lake_wheeler/dataset12_uav"}
+    path = write_flight(tmp_path, antennas=antennas)
+    dipole = {"antenna": {"model": "dipole"}}
+    learned = tmp_path / "learned.yaml"
+    learned.write_text(yaml.safe_dump({"link": {"channels": {"A": {"tower": dipole, "uav": dipole}}}}))
+    own, _ = report(path, "own")
+    taken, _ = report(path, "with", "--with", str(learned))
+    assert changed_channels(own, taken) == {"A"}
+    assert "Antennas of LW1 A: dipole at the tower, dipole at the UAV." in capsys.readouterr().out
+    learned.write_text(yaml.safe_dump({"link": {"channels": {"C": {"uav": dipole}}}}))
+    same, metrics = report(path, "idle", "--with", str(learned))
+    assert changed_channels(own, same) == set()
+    assert "link.channels names C, which no log of this flight has" in metrics["warnings"][0]
+
+
+def test_an_antenna_of_another_band_is_the_first_caution(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    link = {"rss": {"carrier_hz": 2.4e9}}
+    path = write_flight(tmp_path, antennas={"uav": "lake_wheeler/dataset12_uav"}, link=link)
+    _, metrics = report(path, "band")
+    assert "learned at 3.3 GHz, used at 2.4 GHz" in metrics["warnings"][0]
+    assert "learned at 3.3 GHz, used at 2.4 GHz" in capsys.readouterr().err.splitlines()[0]
+    assert metrics["likely_cause"] is None
+    assert "first caution" in metrics["next_step"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "found", "expected"),
+    [
+        ({"antennas": {"LW9.A": "lake_wheeler/dataset12_LW1.USRP1"}}, "no tower 'LW9'", "uav, LW1.A, LW2.B"),
+        ({"antennas": {"LW1.B": "lake_wheeler/dataset12_LW1.USRP1"}}, "no channel 'LW1.B'", "uav, LW1.A, LW2.B"),
+        ({"antennas": {"uav": "lake_wheeler/dataset13_uav"}}, "nothing learned is called", "lake_wheeler/dataset12_uav"),
+        ({"link": {"channels": {"USRP1": {"carrier_hz": 3.3e9}}}}, "no channel 'USRP1'", "one of A, B"),
+        ({"link": {"rss": {"carrier_hz": 3.3e9, "towers": {"LW9": {}}}}}, "no tower 'LW9'", "LW1, LW2, LW3"),
+        ({"rank": {"tower": "LW9"}}, "no tower 'LW9'", "LW1, LW2, LW3"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("dry", [(), ("--dry-run",)])
+def test_a_name_that_can_never_apply_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture, changes: dict, found: str, expected: str, dry: tuple[str, ...]
+) -> None:
+    path = write_flight(tmp_path, **changes)
+    assert main(["report", str(path), "-o", str(tmp_path / "out"), *dry]) == 2
+    message = capsys.readouterr().err
+    assert found in message
+    assert expected in message
+    assert not (tmp_path / "out").exists()

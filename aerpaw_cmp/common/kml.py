@@ -28,7 +28,8 @@ _DPI = 110
 # A named value, and the first place of a shape, on a line of a log.
 # repeats have ends: a line of a stranger may be megabytes long, and each start would search all of it
 DATA = re.compile(rb'<Data name="([A-Za-z][A-Za-z0-9 _-]{0,39})">\s{0,40}<value>([^<]{0,200})</value>')
-POINT = re.compile(rb"<coordinates>\s{0,40}(-?[\d.]{1,20}),(-?[\d.]{1,20})(?:,(-?[\d.]{1,20}))?")
+_DECIMAL = rb"([-+]?[\d.]{1,20})"
+POINT = re.compile(rb"<coordinates>\s{0,40}%b,\s?%b(?:,\s?%b)?" % (_DECIMAL, _DECIMAL, _DECIMAL))
 
 
 def is_kml(head: bytes) -> bool:
@@ -53,30 +54,44 @@ def modes_of(shape: ElementTree.Element) -> set[str]:
     return {str(mode.text or "").strip() for mode in named(shape, "altitudeMode")}
 
 
-def cells_of(shape: ElementTree.Element) -> list[list[str]]:
-    """Texts of longitude, latitude and, where it is said, height of each place below an element."""
-    if plain(shape.tag) == "Track":
-        return [str(place.text or "").split() for place in named(shape, "coord")]
-    texts = " ".join(str(places.text or "") for places in named(shape, "coordinates"))
-    # 'longitude, latitude' with a blank is common and can mean nothing else
-    return [place.split(",") for place in re.sub(r"\s*,\s*", ",", texts).split()]
-
-
 def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
-    """Longitude, latitude [deg] and, where it is said, height [m] of each place below an element.
+    """Longitude, latitude [deg] and, where it is written, height [m] of each place below an element.
+
+    Numbers that commas alone join are taken in threes, as Google Earth does.
 
     Raises
     ------
     InputError
-        A coordinate that is no number, or alone.
+        A coordinate that is no number, or alone; joined numbers that are not the threes of one area.
     """
+    if plain(shape.tag) == "Track":
+        cells = [str(place.text or "").split() for place in named(shape, "coord")]
+    else:
+        texts = " ".join(str(places.text or "") for places in named(shape, "coordinates"))
+        # 'longitude, latitude' with a blank is common and can mean nothing else
+        cells = [place.split(",") for place in re.sub(r"\s*,\s*", ",", texts).split()]
     try:
-        places = [tuple(float(cell) for cell in cells) for cells in cells_of(shape)]
+        places = [tuple(float(cell) for cell in place) for place in cells]
     except ValueError as error:
         raise InputError(f"a coordinate that is no number ({error})", expected="longitude,latitude,altitude") from error
     if any(len(place) < 2 for place in places):
         raise InputError("a coordinate without latitude", expected="longitude,latitude,altitude")
-    return places
+    return [part for place in places for part in ([place] if len(place) <= 3 else _in_threes(place))]
+
+
+# Longitudes and latitudes of one area differ by less [deg]; a longitude and a latitude in the same place do not.
+_AREA_DEG = 5.0
+
+
+def _in_threes(numbers: tuple[float, ...]) -> list[tuple[float, ...]]:
+    """Places of numbers that no blank divides."""
+    threes = [numbers[i : i + 3] for i in range(0, len(numbers), 3)]
+    if len(numbers) % 3 or any(max(column) - min(column) > _AREA_DEG for column in list(zip(*threes, strict=True))[:2]):
+        raise InputError(
+            f"{len(numbers)} numbers joined by commas alone, which are not longitude,latitude,altitude in turns",
+            expected="a blank between places",
+        )
+    return threes
 
 
 # --- writing -------------------------------------------------------------------------------------------------------

@@ -27,6 +27,7 @@ from .pose.cross_checks import doubts
 from .pose.heights import at_height, lacks_height, raised
 from .pose.hour_shift import clock_trap
 from .pose.track import Track, TrackPoses, good_positions
+from .rows.frozen import FLAG, frozen
 from .rows.lock import lock_of
 from .rows.scored import scored_rows, unscored
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, RankSettings, SiteChoice
@@ -422,6 +423,8 @@ def gather(
     track = (
         _track(site, *telemetry[0], warnings, maximum_gap_s=settings.rt.advanced.maximum_gap_s) if telemetry else None
     )
+    if track is not None:
+        rss = [(path, _moving(path, series, track, warnings)) for path, series in rss]
     # without any position at all the message of the overlap says it better
     if track is None and rss and any(series.position_m is not None for _, series in rank):
         levels = ", ".join(dict.fromkeys(f"{series.tower} {series.channel}" for _, series in rss))
@@ -716,6 +719,22 @@ def _rss_series(
         locked=None if locked is None else locked[~unscored(stream.frame)],
         serving=frame["serving"].to_numpy(np.float64) if "serving" in frame else None,
     )
+
+
+def _moving(path: str, series: RssSeries, track: Track, warnings: list[str]) -> RssSeries:
+    """Return a series without the samples at which the level is frozen in flight, counted among the flagged."""
+    order = np.argsort(series.time, kind="stable")
+    bad = np.zeros(len(order), dtype=np.bool_)
+    bad[order] = frozen(series.time[order], series.measured_db[order], track.pose_at(series.time[order]).position_m)
+    if not bad.any():
+        return series
+    warnings.append(
+        f"{path}: {counted(int(bad.sum()), 'sample')} of {series.tower} {series.channel} repeat one level to all "
+        f"digits while the UAV flies on; the first: line {int(series.line[bad][0])}; flagged {FLAG}, not scored"
+    )
+    per_sample = ("time", "measured_db", "log", "line", "serving", "locked")
+    kept = {name: column[~bad] for name in per_sample if (column := getattr(series, name)) is not None}
+    return dataclasses.replace(series, **kept, flagged={**series.flagged, FLAG: int(bad.sum())})
 
 
 def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | None, number: int) -> RankSeries:

@@ -18,7 +18,7 @@ import pandas as pd
 
 from ..common.counting import counted
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-from .jumps import FLAG, PLACE, jumps_of
+from .jumps import FLAG, PLACE, STALE, jumps_of, stale_of
 from .records import COLUMNS, ReadResult, Stream
 
 
@@ -69,8 +69,8 @@ _CLOCK_SET_NS = int(np.datetime64("2010-01-01", "ns").astype(np.int64))
 _FEW_ROWS = 3
 
 # Flags of rows that no comparison scores (`flight/scored.py`). The other flags void the doubtful value itself.
-UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports", "no_number", "unterminated_line",
-            "marked_invalid")  # fmt: skip
+UNSCORED = ("level_out_of_range", "level_lost", "time_out_of_range", "rank_above_ports", "no_number",
+            "unterminated_line", "marked_invalid")  # fmt: skip
 
 
 def check(result: ReadResult) -> ReadResult:
@@ -100,6 +100,9 @@ SITES_DEG, NEAR_DEG = ((35.727, -78.696), (35.773, -78.677)), 0.3
 # No receiver in flight meets such levels: reports of RSRP end at -31 dBm (3GPP TS 38.133, 10.1.6), those of RSRQ and
 # SINR do not.
 _MOST_DBM = {"RSRP": -20.0}
+# A lost reading is this near 0 dB and this far above all others, and at most this share of the readings is lost: no
+# path gains 20 dB from one reading to the next and loses it again.
+_LOST_DB, _FAR_DB, _LOST_SHARE = 1.0, 20.0, 0.2
 # Levels that alternate from record to record: further apart than fading, and back with the next.
 _APART_DB, _BACK_SHARE, _FEW_ALTERNATE = 10.0, 0.2, 6
 
@@ -125,12 +128,15 @@ class _Check:
             self._within_ports()
         self._near_in_time()
         if kind == "rss":
+            self._lost_readings()
             self._two_levels()
         self._at_a_site_if_otherwise()
-        bad, sentence = jumps_of(replace(self.stream, frame=self.frame))
-        if bad.any():
-            self.frame = _marked(self.frame, bad, FLAG, [name for name in PLACE if name in self.frame.columns])
-        return [*self._said, *([sentence] if sentence else [])]
+        for flag, check_of in ((STALE, stale_of), (FLAG, jumps_of)):
+            bad, sentence = check_of(replace(self.stream, frame=self.frame))
+            if bad.any():
+                self.frame = _marked(self.frame, bad, flag, [name for name in PLACE if name in self.frame.columns])
+            self._said += [sentence] if sentence else []
+        return self._said
 
     def _values(self, name: str) -> FloatArray:
         return self.frame[name].to_numpy(dtype=np.float64)
@@ -201,6 +207,17 @@ class _Check:
         known = "another unit, an RSRQ, or an index?" if quantity in _MOST_DBM else "another unit, or an index?"
         first = f"{level[int(np.argmax(bad))]:g} dBm"
         self._flag(bad, "level_out_of_range", first, f"which is received nowhere ({known})", ["rss_db"])
+
+    def _lost_readings(self) -> None:
+        """Flag a few levels near 0 dB far above all others: what a program writes for a reading that it lost."""
+        level = self._values("rss_db")
+        near = np.abs(level) < _LOST_DB
+        if not near.any() or near.sum() > _LOST_SHARE * np.isfinite(level).sum():
+            return
+        if (highest := float(np.nanmax(level[~near]))) < -_LOST_DB - _FAR_DB:
+            first = f"{level[int(np.argmax(near))]:g} dB"
+            why = f"far above all others, which end at {highest:.1f} dB (a reading that was lost?)"
+            self._flag(near, "level_lost", first, why, ["rss_db"])
 
     def _two_levels(self) -> None:
         """Say where the levels of a series alternate between two: of two devices, SIMs or networks."""

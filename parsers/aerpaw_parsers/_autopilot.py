@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from aerpaw_cmp.common.counting import counted
+from aerpaw_cmp.common.geodesy import rough_m
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
@@ -149,6 +151,7 @@ def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     rows.mark(lost, "no_fix")
     for name in _pose.PLACE:
         values[name] = np.where(lost, np.nan, values[name])
+    rows.warnings += _apart(flight, time_s, values)
     values["altitude_m"] = _height(rows, flight, time_s, values)
     heading = values.pop("yaw_deg", np.full(len(rows), np.nan))
     values |= {name: flight.attitude.near(name, time_s) for name in _pose.ANGLES}
@@ -161,6 +164,28 @@ def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:
     return rows.stream("telemetry", flight.name, values, source=flight.source, system=flight.system)
 
 
+# The filter's position and the receiver's differ by less than this [m]; a filter follows within seconds.
+_APART_M, _APART_SHARE, _FIX_3D = 15.0, 0.05, 3
+
+
+def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> list[str]:
+    """Return the sentence about positions of the autopilot that are far from those of its receiver; else nothing."""
+    fixed = flight.fix.near("fix", time_s) >= _FIX_3D
+    receiver = [np.where(fixed, flight.fix.near(name, time_s), np.nan) for name in _pose.PLACE[:2]]
+    place = [values[name] for name in _pose.PLACE[:2]]
+    if not np.isfinite(receiver[0] + place[0]).any():
+        return []
+    origin = float(np.nanmedian(place[0])), float(np.nanmedian(place[1]))
+    apart_m = np.hypot(*(rough_m(*place, origin) - rough_m(*receiver, origin)).T)
+    far, both = apart_m > _APART_M, np.isfinite(apart_m).sum()
+    if far.sum() <= _APART_SHARE * both:
+        return []
+    return [
+        f"{int(far.sum())} of {counted(int(both), 'position')} are {np.median(apart_m[far]):.0f} m (median) from those "
+        "of the receiver in the same log: one of the two is wrong; the autopilot's own were read"
+    ]
+
+
 def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> FloatArray:
     """Height above home as it was at take-off; without a home above the ground at rest, else the first position."""
     altitude: FloatArray = values["altitude_m"]
@@ -170,6 +195,7 @@ def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[s
     home = np.isfinite(flight.home.columns.get("altitude_m", flight.home.time_s))
     if not home.any():
         rest = _pose.at_rest(rows.time[known], *(values[name][known] for name in _pose.PLACE))
+        rows.warnings.append(f"no home is known: heights count from {'the first position' if rest is None else 'rest'}")
         return altitude - float(altitude[known[0]] if rest is None else rest)
     home_m = flight.home.columns["altitude_m"][home]
     return _pose.above_home(rows, time_s, altitude, flight.home.time_s[home], home_m)
@@ -178,9 +204,12 @@ def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[s
 def of_both(position: Series, above_home: str) -> Series:
     """Home of positions that carry their altitude above sea level and their height above home.
 
-    Where home never moves the height above home is the log's own: it becomes the altitude, above a home at 0.
+    If home never moves, the height above home is used as logged: it becomes the altitude, above a home at 0. If both
+    are the same number throughout, home was never set and there is none.
     """
     altitude, height = position.columns["altitude_m"], position.columns.pop(above_home)
+    if not _pose.home_was_set(altitude, height):
+        return NONE
     home_m = altitude - height
     finite = home_m[np.isfinite(home_m)]
     if not len(finite) or np.ptp(finite) <= _pose.MOVED_M:

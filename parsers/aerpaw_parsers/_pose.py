@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
+from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.records import Attribute, Stream
 from aerpaw_cmp.logs.text import rows as _rows
@@ -52,7 +53,8 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     if fix is not None and (sheet.numbers(fix) > 0).any():  # some leave the column at 0 throughout
         values[PLACE[0]] = np.where(sheet.numbers(fix) == 0, np.nan, values[PLACE[0]])
     lost = clean(rows, values)
-    refuse_whole_degrees([sheet.names[latitude], sheet.names[longitude]], values)
+    if coarse := whole_degrees([sheet.names[latitude], sheet.names[longitude]], values):
+        raise _sheet.shifted(coarse, "positions")
     datum, height = _height(rows, sheet)
     values["altitude_m"] = height
     about: Height = {"height_from": rows.height_from}
@@ -72,13 +74,12 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
 
 
-def refuse_whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> None:
-    """Refuse positions of which one angle has whole degrees alone: the values stand beside their names."""
+def whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> str:
+    """Return the clause about the one of two angles that has whole degrees only; empty if there is none."""
     known = [angle[np.isfinite(angle)] for angle in (values[key] for key in PLACE[:2])]
     # a receiver writes decimals even at rest; an index or a count does not
     coarse = [len(angle) > 2 and bool((angle == np.round(angle)).all()) for angle in known]
-    if coarse[0] != coarse[1]:
-        raise _sheet.shifted(f"{names[coarse.index(True)]!r} has whole degrees alone", "positions")
+    return f"{names[coarse.index(True)]!r} has whole degrees alone" if coarse[0] != coarse[1] else ""
 
 
 def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
@@ -112,19 +113,33 @@ def _height(rows: _rows.Rows, sheet: _sheet.Sheet) -> tuple[str, FloatArray]:
             if len(said) == 1 and (one := said.pop()) is not None and one.quantity.datum not in ("", "unknown"):
                 rows.height_from, datum = "written", one.quantity.datum
     height = sheet.numbers(column)
-    return datum, _with_moved_home(rows, sheet, height) if datum == "take-off" else height
+    if datum != "take-off":
+        return datum, height
+    height, home_is_set = _with_moved_home(rows, sheet, height)
+    return datum if home_is_set else "sea level", height
 
 
 # Columns that name the datum of the heights.
 _OF_DATUM = re.compile(r"(vertical )?(alt|altitude|height)? ?(ref|reference|type|datum|mode|frame)( frame)?")
 # Home moved where it is further than this from where it was [m]; an aircraft that is so much higher has taken off [m].
 MOVED_M, _OFF_M = 0.5, 2.0
+# A home this near sea level [m] is not set: the two heights of a record are the same number, but for rounding.
+UNSET_M = 0.01
 
 
 def above_home(
     rows: _rows.Rows, time_s: FloatArray, altitude: FloatArray, home_s: FloatArray, home_m: FloatArray
 ) -> FloatArray:
     """Heights above the home at take-off, of altitudes above sea level and the altitudes of home at their times."""
+    if (known_home := np.abs(home_m) > UNSET_M).any() and not known_home.all():
+        # until the autopilot knows its home, it reports the altitude of its filter as the height above home
+        home_s, home_m = home_s[known_home], home_m[known_home]
+        begin = int(np.searchsorted(time_s, home_s[0]))
+        step_m = altitude[begin - 1] - altitude[begin] if 0 < begin < len(altitude) else 0.0
+        leaps = abs(step_m) > _REST_M + _CLIMB_MPS * (time_s[begin] - time_s[begin - 1]) if step_m else False
+        altitude = np.where(np.arange(len(altitude)) < begin, np.nan, altitude) if leaps else altitude
+        how = "have no height, since the altitude leaps as home is set" if leaps else "count from the home set later"
+        rows.warnings.append(f"home was not set in {counted(int((~known_home).sum()), 'record')}: those before {how}")
     known = np.flatnonzero(np.isfinite(altitude))
     climbs = altitude[known] - np.minimum.accumulate(altitude[known]) > _OFF_M
     takeoff_s = time_s[known[int(np.argmax(climbs))]] if climbs.any() else home_s[-1]
@@ -137,21 +152,32 @@ def above_home(
     return np.asarray(altitude - home_m[at])
 
 
-def _with_moved_home(rows: _rows.Rows, sheet: _sheet.Sheet, height: FloatArray) -> FloatArray:
-    """Heights above take-off, where a column above sea level beside them tells that home moved in one step."""
+def home_was_set(altitude: FloatArray, height: FloatArray) -> bool:
+    """Check whether heights above home differ anywhere from the altitudes above sea level, or begin near zero."""
+    apart = np.abs(altitude - height)
+    return not np.isfinite(apart).any() or np.nanmax(apart) > UNSET_M or np.nanmin(np.abs(height)) < _NEAR_ZERO_M
+
+
+def _with_moved_home(rows: _rows.Rows, sheet: _sheet.Sheet, height: FloatArray) -> tuple[FloatArray, bool]:
+    """Return heights above the home at take-off, by a column above sea level if there is one, and whether home is set.
+
+    Such a column shows that home moved in one step, or that the autopilot never knew it.
+    """
     for i, meaning in enumerate(sheet.meanings):
         datum = "" if meaning is None else meaning.quantity.datum
         if datum == "sea level" or (
             datum == "unknown" and sheet.program is not None and sheet.program.datum == "sea level"
         ):
             altitude = sheet.numbers(i)
+            if not home_was_set(altitude, height):
+                return height, False
             known = np.flatnonzero(np.isfinite(altitude) & np.isfinite(height))
             home_m = (altitude - height)[known]
             steady = np.abs(np.diff(home_m)) < _JITTER_M
             if len(known) > 1 and np.ptp(home_m) > MOVED_M and steady.mean() > _STEADY:
                 time_s = (rows.time - rows.time[0]) / np.timedelta64(1, "s")
-                return above_home(rows, time_s, altitude, time_s[known], home_m)
-    return height
+                return above_home(rows, time_s, altitude, time_s[known], home_m), True
+    return height, True
 
 
 # Two columns of one estimate go together to this [m], in all rows but those in which home moves.

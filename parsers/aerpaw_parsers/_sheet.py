@@ -33,7 +33,7 @@ from . import _stamps
 SEPARATORS = (",", ";", "\t", "|")
 # Lines in front of a header, at most.
 TITLES = 60
-_NUMBER = re.compile(r"([-+]?\d{0,20}(?:[.,]\d{0,20})?(?:[eE][-+]?\d{1,3})?) ?([^\d\s,.][^\d\s]{0,9})?")
+_NUMBER = re.compile(r"([-+]?\d{0,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?) ?([^\d\s,.][^\d\s]{0,9})?")
 
 _IsHeader = Callable[[list[str]], bool]
 
@@ -340,9 +340,9 @@ class Sheet:
         return [self.notes[column] for column in sorted(self.notes)]
 
 
-_DECIMAL_POINT = re.compile(r"-?\d{1,9}\.\d{1,15}")
-_DECIMAL_COMMA = re.compile(r"-?\d{1,4},\d{1,9}")
-_THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,12})?")
+_DECIMAL_POINT = re.compile(r"[-+]?\d{1,20}\.\d{1,40}")
+_DECIMAL_COMMA = re.compile(r"[-+]?\d{1,20},\d{1,40}")
+_THOUSANDS = re.compile(r"[-+]?\d{1,3}(?:,\d{3})+(?:\.\d{0,40})?")
 # Cells that say that there is no value.
 NO_VALUE = {"", "-", "--", "nan", "na", "n/a", "#n/a", "none", "null", "inf", "-inf", "-infinity", "unavailable",
             "unknown", "invalid"}  # fmt: skip
@@ -547,10 +547,11 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         Of the times; by default the one that the dictionary finds.
     """
     known = {i: m.quantity for i, m in enumerate(sheet.meanings) if m is not None and not m.indirect}
-    _refuse_positions_beside(sheet)
-    bounded = {i: q for i, q in known.items() if q.role in ("position", "cell", "rss") and q.can_be[1] < np.inf}
-    _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
     mapped = column is not None
+    if not mapped:  # the user has named the columns: no guess by values overrules that
+        _refuse_positions_beside(sheet)
+        bounded = {i: q for i, q in known.items() if q.role in ("position", "cell", "rss") and q.can_be[1] < np.inf}
+        _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
     column = _time_column(sheet) if column is None else column
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
     if column is None and weeks is None:
@@ -725,7 +726,7 @@ def _refuse_positions_beside(sheet: Sheet) -> None:
     """Refuse a table with columns that look like positions and are none, where one that is called so does not."""
     names = {i: what.quantity.name for i, what in enumerate(sheet.meanings) if what is not None and not what.indirect}
     place = [i for i, name in names.items() if name in ("latitude_deg", "longitude_deg")]
-    astray = [i for i in place if np.isfinite(sheet.numbers(i)).sum() > 2 and not _is_angle(sheet.numbers(i))]
+    astray = [i for i in place if np.isfinite(sheet.numbers(i)).sum() > 2 and not _is_place(sheet.numbers(i))]
     if not astray or len(place) < 2:
         return
     texts = {i: sheet.texts(i) for i in range(len(sheet.names)) if i not in place}
@@ -735,12 +736,21 @@ def _refuse_positions_beside(sheet: Sheet) -> None:
         raise shifted(f"{beside!r} holds values as positions have, {empty!r} does not", "values beside their names")
 
 
-def _is_angle(values: FloatArray) -> bool:
-    """Check whether numbers are written as positions of one flight: of four decimals and more, and near each other."""
+def _is_place(values: FloatArray) -> bool:
+    """Check whether numbers can be an angle of the positions of one flight: near each other, and not whole degrees.
+
+    A leg due north keeps one longitude, which may have few decimals.
+    """
     known = values[np.isfinite(values)]
     near = len(known) and np.ptp(known) < NEAR_DEG and 1 < np.abs(known).max() <= 180
+    return bool(near and (known != np.round(known)).any())
+
+
+def _is_angle(values: FloatArray) -> bool:
+    """Check whether numbers are written as positions of one flight: with four or more decimals, near each other."""
+    known = values[np.isfinite(values)]
     # more than three decimals: a thousandth of a degree is 100 m, too coarse for any receiver
-    return bool(near and (np.abs(known * 1e3 % 1 - 0.5) < 0.499999).mean() > 0.5)
+    return _is_place(values) and bool((np.abs(known * 1e3 % 1 - 0.5) < 0.499999).mean() > 0.5)
 
 
 def shifted(found: str, expected: str) -> InputError:

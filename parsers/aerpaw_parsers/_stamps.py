@@ -27,7 +27,7 @@ _PLACE = re.compile(r"(Z|[+-]\d\d:\d\d)\[[\w/+-]+\]$")
 # A zone is not the AM or PM that stands in the same place.
 _ZONE = rf"(?: ?[(\[]?(?P<zone>(?:UTC|GMT) ?[+-]\d{{1,2}}(?::?\d\d)?|(?![AaPp][Mm]\b)(?:{_NAMED_ZONE}))[)\]]?)?"
 _CLOCK = (
-    r"(?P<hour>\d{1,2})[:.h-](?P<minute>\d\d)(?:[:.m-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,9}))?)?"
+    r"(?P<hour>\d{1,2})[:.h-](?P<minute>\d\d)(?:[:.m-](?P<second>\d\d)(?:[.,:](?P<fraction>\d{1,40}))?)?"
     r" ?(?P<half>[AaPp]\.?[Mm]\.?)?"
 )
 _GAP = r"[T _,:;-]{1,3}(?:at )?"
@@ -43,7 +43,7 @@ _DATES = (
 )
 _DIGITS = re.compile(
     r"(?P<year>20\d\d)(?P<month>\d\d)(?P<day>\d\d)[T_ -]?(?P<hour>\d\d):?(?P<minute>\d\d):?(?P<second>\d\d)"
-    r"(?:\.?(?P<fraction>\d{1,9}))?" + _ZONE
+    r"(?:\.?(?P<fraction>\d{1,40}))?" + _ZONE
 )
 
 
@@ -57,7 +57,8 @@ def _forms() -> tuple[re.Pattern[str], ...]:
 
 
 _OF_DAY = re.compile(r"T?" + _CLOCK.replace("[:.h-]", ":", 1).replace("[:.m-](?P<second>", ":(?P<second>") + _ZONE)
-_NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")
+# Python, pandas and C print up to 17 digits, decimals of arbitrary precision more: 0.30000000000000004.
+_NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?")
 # An epoch that a spreadsheet shortened, ``1.74093E+12``: fewer than nine digits behind the first leave out seconds.
 _ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
 # What a spreadsheet shows of a time: minutes, seconds, tenths; the hour is lost.
@@ -200,7 +201,7 @@ def _written(text: str, order: _Order, zones: _Zones) -> bytes:
     groups = match.groupdict()
     hour = _hour(groups)
     date = f"{year}-{month:02d}-{day:02d} {hour:02d}:{groups.get('minute') or '00'}:{groups.get('second') or '00'}"
-    fraction = f".{groups['fraction']}" if groups.get("fraction") else ""
+    fraction = f".{groups['fraction'][:9]}" if groups.get("fraction") else ""
     return (date + fraction + zones.offset(groups.get("zone"), date)).encode()
 
 
@@ -380,7 +381,7 @@ def read(
 
 
 # The date and the time of day of a GPS receiver, six digits each: ddmmyy or yymmdd, hhmmss.
-_COMPACT = re.compile(r"((\d\d)(\d\d)(\d\d)[ T])?([01]\d|2[0-3])([0-5]\d)([0-5]\d(?:\.\d{1,9})?)")
+_COMPACT = re.compile(r"((\d\d)(\d\d)(\d\d)[ T])?([01]\d|2[0-3])([0-5]\d)([0-5]\d(?:\.\d{1,40})?)")
 
 
 def _with_marks(match: re.Match[str]) -> str:

@@ -181,7 +181,8 @@ def _stream(
     options, flag = rows.options, rows.flag.copy()
     values: dict[str, AnyArray] = {key: _values(sheet, column, key, options) for key, column in where.items()}
     if {*_pose.PLACE[:2]} <= set(values):
-        _pose.refuse_whole_degrees([sheet.names[where[key]] for key in _pose.PLACE[:2]], values)
+        coarse = _pose.whole_degrees([sheet.names[where[key]] for key in _pose.PLACE[:2]], values)
+        rows.warnings += [f"{coarse}: is it the right column?"] if coarse else []
     about = _lifted(rows, sheet, values, where)
     odd = np.any([_odd(sheet, where[key]) for key in _VALUE[kind]], axis=0)
     _lines.add_flag(flag, odd, "no_number")

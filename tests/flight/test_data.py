@@ -64,6 +64,23 @@ def test_parts_of_which_one_says_no_serving_cell_are_one_record(tmp_path: Path) 
         assert np.isnan(joined.serving).sum() > 100
 
 
+@pytest.mark.parametrize(("digits", "frozen"), [(6, 139), (0, 0)])
+def test_a_level_frozen_to_all_digits_in_flight_is_not_scored(digits: int, frozen: int, tmp_path: Path) -> None:
+    """For 70 s; a level that is rounded to 1 dB keeps its value often."""
+    written = (SAMPLE / "LW1/USRP1_power_log.txt").read_text().splitlines()
+    lines = [line for line in written if len(line.split()) == 4]
+    assert len(lines) > 600
+    noisy = [f"{float(line.split()[-1]):.{digits}f}" for line in lines]
+    noisy[300:440] = noisy[300:301] * 140
+    text = "".join(f"{line[:37]} {level}\n" for line, level in zip(lines, noisy, strict=True))
+    (tmp_path / "a.txt").write_text(text)
+    flight = _flight(tmp_path, "path: a.txt, node: LW1, channel: USRP1")
+    (series,) = flight.rss
+    assert series.flagged.get("level_frozen", 0) == frozen
+    assert len(series.time) == len(lines) - frozen
+    assert any("repeat one level" in text for text in flight.warnings) is bool(frozen)
+
+
 def test_a_rank_log_in_two_parts_is_one_record(tmp_path: Path) -> None:
     log = "UAV/modem_ri.csv"
     (uncut,) = _flight(tmp_path, f"path: {SAMPLE / log}").rank

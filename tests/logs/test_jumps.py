@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.logs import limits
-from aerpaw_cmp.logs.jumps import jumps_of
+from aerpaw_cmp.logs.jumps import jumps_of, stale_of
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
 
 DEGREE_M = 111_200.0
@@ -96,3 +96,36 @@ def test_rows_before_the_clock_was_set_are_flagged_however_many(unset: str, coun
     assert (flags[:count] == "time_out_of_range").all()
     assert not flags[count:].astype(bool).any()
     assert "before the clock was set" in checked.warnings[0]
+
+
+@pytest.mark.parametrize("end", ["begin", "end"])
+def test_a_log_that_rests_where_it_cannot_have_flown_is_flagged_there(end: str) -> None:
+    """An autopilot's filter falls back to its origin at disarm: 80 m in a second, slower than the fastest aircraft."""
+    frame, rows = straight(speed_mps=2.0), slice(160, 199) if end == "end" else slice(0, 39)
+    frame.loc[rows, "latitude_deg"] = frame["latitude_deg"][159 if end == "end" else 40] - 80.0 / DEGREE_M
+    jumps, sentence = jumps_of(stream(frame))
+    assert np.flatnonzero(jumps).tolist() == list(range(200))[rows.start : rows.stop + 1]
+    assert "flagged position_jump" in sentence
+
+
+@pytest.mark.parametrize(("step_s", "held"), [(0.1, 10), (0.2, 5), (1.0, 1)])
+def test_a_receiver_that_reports_more_rarely_than_the_logger_writes_does_not_jump(step_s: float, held: int) -> None:
+    frame = straight(count=600, step_s=step_s, speed_mps=20.0)
+    frame["latitude_deg"] = frame["latitude_deg"][np.arange(600) // held * held].to_numpy()
+    frame["velocity_north_mps"], frame["velocity_east_mps"] = 20.0, 0.0
+    assert not jumps_of(stream(frame))[0].any()
+    assert not stale_of(stream(frame))[0].any()
+
+
+@pytest.mark.parametrize(("speed_mps", "flagged"), [(5.0, 99), (0.0, 0), (0.1, 0)])
+def test_positions_that_stand_still_at_speed_are_stale(speed_mps: float, flagged: int) -> None:
+    """The first of them is where the aircraft was; a hover, and the noise of its speed, are none."""
+    frame = straight(step_s=1.0)
+    frame.loc[50:149, "latitude_deg"] = frame["latitude_deg"][50]
+    frame["velocity_north_mps"], frame["velocity_east_mps"] = 5.0, 0.0
+    frame.loc[50:149, "velocity_north_mps"] = speed_mps
+    after = limits.check(ReadResult("r", (stream(frame),), lines=200, accepted=200, blank=0))
+    shown = after.streams[0].frame
+    assert (shown["flag"] == "position_stale").sum() == flagged
+    assert shown["latitude_deg"].isna().sum() == flagged
+    assert not flagged or "still for 99 s from line 51 on, at a logged speed of 5.0 m/s" in after.warnings[0]

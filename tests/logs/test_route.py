@@ -53,6 +53,10 @@ FILES = {
     "mission.waypoints": f"QGC WPL 110\r\n0\t1\t0\t16\t0\t0\t0\t0\t35.7275\t-78.6962\t90\t1\r\n{WPL}\r\n".encode(),
     "line.kml": kml("<LineString><altitudeMode>relativeToGround</altitudeMode><coordinates>\n" + LINE
                     + "\n</coordinates></LineString>"),
+    "commas.kml": kml("<LineString><altitudeMode>relativeToGround</altitudeMode><coordinates>" + LINE.replace(" ", ",")
+                      + "</coordinates></LineString>"),
+    "signs.kml": kml("<LineString><altitudeMode>relativeToGround</altitudeMode><coordinates>"
+                     + " ".join(f"{lon:+},{lat:+},{height:+}" for lat, lon, height in POINTS) + "</coordinates></LineString>"),
     "track.kml": kml(f"<gx:Track><altitudeMode>relativeToGround</altitudeMode>{TRACK}</gx:Track>"),
     "header.csv": b"Longitude,Latitude,Altitude (m)\r\n" + "".join(f"{b},{a},{c}\r\n" for a, b, c in POINTS).encode(),
     "feet.csv": b"lat;lng;alt [ft]\n" + "".join(f"{a};{b};{c / 0.3048}\n" for a, b, c in POINTS).encode(),
@@ -159,6 +163,16 @@ def test_points_without_height_ask_for_one(tmp_path: Path) -> None:
     ("name", "content", "message"),
     [
         ("fence.kml", kml("<Polygon><coordinates>-78.7,35.7,0</coordinates></Polygon>"), "geofence"),
+        (
+            "a.kml",
+            kml("<LineString><coordinates>-78.7,35.7,-78.7,35.8</coordinates></LineString>"),
+            "4 numbers joined by commas",
+        ),
+        (
+            "a.kml",
+            kml("<LineString><coordinates>-78.7,35.7,-78.7,35.8,-78.6,35.8</coordinates></LineString>"),
+            "6 numbers joined",
+        ),
         ("a.plan", b'{"fileType": "Plan", "mission": 3}', "damaged QGroundControl plan"),
         ("a.plan", b'{"fileType": "Plan", "mission": {"items": [', "damaged QGroundControl plan"),
         ("a.plan", plan(), "no point"),

@@ -80,3 +80,16 @@ def test_a_message_of_an_unknown_kind_of_value_is_left_unread() -> None:
     after = by_name("ardupilot_bin").read(LOGS["ardupilot_bin"] + b"\xa3\x95\x80" + described + row, ReadOptions())
     pd.testing.assert_frame_equal(after.streams[0].frame, before.streams[0].frame)
     assert (after.lines, after.rejected) == (before.lines + 2, before.rejected)
+
+
+@pytest.mark.parametrize(("north_deg", "apart"), [(4e-4, True), (4e-5, False)])
+def test_a_filter_far_from_the_receiver_of_its_log_is_reported(north_deg: float, apart: bool) -> None:
+    """In POS 40 m (4 m) north of GPS, which the same log holds."""
+    moved = struct.pack("<i", round(357_300_000 + north_deg * 1e7))
+    data = LOGS["ardupilot_bin"]
+    for i in range(COUNT):
+        place = struct.pack("<ii", 357_300_000 + i, -787_000_000 - i)
+        first = data.index(place)  # POS stands in front of GPS
+        data = data[:first] + moved + data[first + 4 :]
+    warnings = by_name("ardupilot_bin").read(data, ReadOptions()).warnings
+    assert any("5 of 5 positions are 44 m (median) from those of the receiver" in text for text in warnings) is apart

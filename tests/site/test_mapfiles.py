@@ -333,6 +333,13 @@ def test_kmz_and_kml_of_many_hands(tmp_path: Path) -> None:
     assert said(footprints, "b.kml, line 3: placemark 'odd' was left out: ")
 
 
+def test_a_building_drawn_above_the_ground_has_its_signed_height(tmp_path: Path) -> None:
+    drawn = placemark(square(0, 0, 100)).replace(",30", ",+30").replace("absolute", "relativeToGround")
+    tags = "<ExtendedData><Data name='building'><value>yes</value></Data></ExtendedData>"
+    (building,) = read(tmp_path, kml(drawn.replace("<MultiGeometry>", f"{tags}<MultiGeometry>")), "a.kml").buildings
+    assert building.height_m == 30.0
+
+
 @pytest.mark.parametrize(
     ("content", "words"),
     [

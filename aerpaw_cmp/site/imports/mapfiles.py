@@ -10,6 +10,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import cache
+from math import isfinite
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -334,15 +335,12 @@ _PLACEMARK_PARTS = {*_NO_AREAS, "Polygon", "Data", "SimpleData"}
 def _kml_height(polygons: list[ElementTree.Element], outline: Outline) -> None:
     """Height tag of polygons drawn above the ground, extruded or not, where the placemark's data name none."""
     modes = {mode for polygon in polygons for mode in kml.modes_of(polygon)}
-    cells = [place[2] for polygon in polygons for place in kml.cells_of(polygon) if len(place) == 3]
-    highest = max((float(height) for height in cells if _HEIGHT.fullmatch(height)), default=0.0)
+    heights = (place[2] for polygon in polygons for place in kml.places_of(polygon) if place[2:])
+    highest = max(filter(isfinite, heights), default=0.0)
     # heights above sea level say nothing of a building
     if modes == {"relativeToGround"} and highest > 0.0:
         outline.tags = {"height": f"{highest:g}", **outline.tags}
 
 
-_HEIGHT = re.compile(r"-?\d+(?:\.\d*)?")
-
-
 def _kml_ring(boundary: ElementTree.Element, outline: Outline, path: Path) -> list[Position]:
-    return [lonlat(cells, outline.source, path) for cells in kml.cells_of(boundary)]
+    return [lonlat(place, outline.source, path) for place in kml.places_of(boundary)]

@@ -20,7 +20,7 @@ import numpy as np
 
 def flight(samples: int):
     """An export of one link."""
-    from aerpaw_cmp.report.exports.points import Export, points_table
+    from aerpaw_cmp.report.exports import Export, points_table
     from aerpaw_cmp.site.siteyaml import load_site
 
     rng = np.random.default_rng(1)
@@ -40,7 +40,7 @@ def flight(samples: int):
 
 def write_one(name: str, samples: int) -> None:
     """Write one format and print its numbers."""
-    from aerpaw_cmp.report.exports.formats import write_exports
+    from aerpaw_cmp.report.exports import write_exports
 
     export = flight(samples)
     with tempfile.TemporaryDirectory() as folder:
@@ -52,7 +52,7 @@ def write_one(name: str, samples: int) -> None:
 
 
 def main() -> None:
-    from aerpaw_cmp.report.exports.formats import FORMATS
+    from aerpaw_cmp.report.exports import FORMATS
 
     parser = argparse.ArgumentParser()
     parser.add_argument("--samples", type=int, default=100_000)

@@ -16,8 +16,8 @@ from aerpaw_cmp.compare.level.rss import compare_rss, error_spans
 from aerpaw_cmp.compare.rank import channel_rank, commonest_rank, compare_rank, singular_values
 from aerpaw_cmp.compare.result import ModelLevel, RankFurther, RankResult, RssFurther, RssResult
 from aerpaw_cmp.jobs.campaigns.season import with_season
-from aerpaw_cmp.report.content.campaign import CampaignData, Failure, RssRow
-from aerpaw_cmp.report.content.flight import ReportData, Track
+from aerpaw_cmp.report.campaign import CampaignData, Failure, RssRow
+from aerpaw_cmp.report.flight_data import ReportData, Track
 from aerpaw_cmp.site.siteyaml import load_site
 
 DRIFT_DB_PER_30_DAYS = 0.4

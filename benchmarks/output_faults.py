@@ -150,10 +150,10 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
     from aerpaw_cmp.jobs.mapping import coverage_map
     from aerpaw_cmp.jobs.reporting import flight_run
     from aerpaw_cmp.maps import export
-    from aerpaw_cmp.report.figures import campaign as campaign_figures
-    from aerpaw_cmp.report.figures import flight as figures
-    from aerpaw_cmp.report.figures import maps as maps_figures
-    from aerpaw_cmp.report.kit import canvas
+    from aerpaw_cmp.report import campaign as campaign_figures
+    from aerpaw_cmp.report import canvas
+    from aerpaw_cmp.report import flight_figures as figures
+    from aerpaw_cmp.report import maps as maps_figures
 
     for room in (figures, campaign_figures, maps_figures):
         specs: Callable[..., Any] = room.figure_specs

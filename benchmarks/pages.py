@@ -64,7 +64,7 @@ def report_page(folder: Path) -> Path:
 
 def long_page(folder: Path, samples: int = 50_000) -> Path:
     """A made-up flight of ten channels with so many samples together, from the records alone."""
-    from aerpaw_cmp.report.pages import flight as write
+    from aerpaw_cmp.report import flight as write
     from benchmarks.fabricated import long_flight
 
     return write.write_report(long_flight(samples), folder / "long").files[0]
@@ -78,7 +78,7 @@ def map_page(folder: Path) -> Path:
 
 def campaign_page(folder: Path, flights: int, settings: int) -> tuple[Path, dict[str, Any]]:
     """A season that was never flown."""
-    from aerpaw_cmp.report.pages.campaign import write_campaign
+    from aerpaw_cmp.report.campaign import write_campaign
     from benchmarks.fabricated import season
 
     data = season(flights, settings)

@@ -45,7 +45,7 @@ watch = None
 if web := values.pop("web", None):  # a page at this port; no limit on new connections, which a fuzz run would meet
     from aerpaw_cmp.live.feed import Feed
     from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
-    from aerpaw_cmp.report.pages.live import live_page
+    from aerpaw_cmp.report.live import live_page
     feed = Feed(["modem"])
     WebServer(feed, Page(*live_page(None, "benchmark")), Address("127.0.0.1", web), token="benchmark",
               limits=Limits(per_second=1e6, burst=1e6)).__enter__()

@@ -22,7 +22,7 @@ sys.path.insert(0, str(Path(__file__).parent))
 from simulated_modem import BadLine, Faults, FaultyModem, read_log
 from tap_common import CSI, conditions, cpu_s, damaged, free_port, resident_kib, show, start_browser, start_tap
 
-from aerpaw_cmp.report.pages.live import live_page
+from aerpaw_cmp.report.live import live_page
 
 
 def log_against_modem(log: Path, modem: FaultyModem) -> dict[str, int]:

@@ -201,7 +201,7 @@ def blank_pictures() -> Iterator[None]:
     """
     from matplotlib.figure import Figure
 
-    from aerpaw_cmp.report.kit import canvas
+    from aerpaw_cmp.report import canvas
 
     def save_as(fig: Any, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
         return dict(blank(tuple(fig.get_size_inches()), tuple(formats), kind))  # the caller may take from it
@@ -221,7 +221,7 @@ def few_pictures(blank_pictures: None) -> Iterator[None]:
     """Also, a figure is made from its data once per module: for usual flights that many tests of a module report."""
     from matplotlib.figure import Figure
 
-    from aerpaw_cmp.report.kit import canvas
+    from aerpaw_cmp.report import canvas
 
     def render(spec: Any, *how: Any) -> Any:
         if spec.name in made:

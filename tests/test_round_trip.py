@@ -12,8 +12,8 @@ from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import gather, load_data, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
-from aerpaw_cmp.report.content.flight_parts import report_data
-from aerpaw_cmp.report.exports.tables import metrics
+from aerpaw_cmp.report.columns import metrics
+from aerpaw_cmp.report.flight_data import report_data
 from tests.simulated import simulate
 
 SAMPLE = Path(__file__).parents[1] / "sample_logs" / "flight.yaml"

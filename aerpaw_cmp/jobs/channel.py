@@ -27,8 +27,8 @@ from ..flight.training import flight_logs
 from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.options import Job
 from ..propagation.path_table import check_band, subcarriers_hz
-from ..report.exports.channel import FORMATS, STREAMED, Along, Channel, write_channel
-from ..report.exports.formats import chosen_formats
+from ..report.channel import FORMATS, STREAMED, Along, Channel, write_channel
+from ..report.exports import chosen_formats
 from ..site.antenna.learned import BAND
 from .prediction.sources import Source, memory_of
 from .prediction.where import TargetOptions, find_targets, target_files
@@ -57,7 +57,7 @@ class ChannelOptions:
     step_s : float
         Between poses.
     formats : sequence of str
-        Of :data:`aerpaw_cmp.report.exports.channel.FORMATS`.
+        Of :data:`aerpaw_cmp.report.channel.FORMATS`.
     bandwidth_hz : float, optional
         Also H at the subcarriers of a band.
     subcarriers : int

@@ -19,8 +19,8 @@ from ..common.provenance import KEY
 from ..common.units import FloatArray
 from ..compare.judge import report_difference
 from ..compare.statistics.intervals import pooled_difference
-from ..report.content.diff import Entry, InputEntry, ReportDiff, ReportSide
-from ..report.names import RANK_COLUMNS, RSS_COLUMNS, links_of
+from ..report.diff import Entry, InputEntry, ReportDiff, ReportSide
+from ..report.page import RANK_COLUMNS, RSS_COLUMNS, links_of
 
 _NEEDED: dict[str, type] = {
     "flight": str, "versions": dict, "inputs": list, "settings": dict, "rss": dict, "rank": dict,
@@ -68,7 +68,7 @@ def run_diff(first: Path, second: Path, *, out: Path | None = None, force: bool 
     _same_flight(first_report, second_report)
     if out is None:
         return _compare_reports(first_report, second_report)
-    from ..report.pages.diff import write_diff
+    from ..report.diff import write_diff
 
     with OutputFolder(out, job="diff", inputs=[*first_report.files, *second_report.files], force=force) as output:
         diff = _compare_reports(first_report, second_report)

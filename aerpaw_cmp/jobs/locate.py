@@ -24,8 +24,8 @@ from ..flight.rows.lock import LOCK_FLOOR_DB, is_sounder_power
 from ..flight.settings import FlightFile
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream
-from ..report.content.made import Made, about
-from ..report.pages.locate import write_locate
+from ..report.locate import write_locate
+from ..report.page import Made, about
 from ..site.antenna.antennas import MeasuredPattern
 from ..site.antenna.sphere_pattern import SpherePattern
 from ..site.site import Site

@@ -252,7 +252,7 @@ class Flight:
         -------
         xarray.Dataset
         """
-        from ..report.exports.channel import channel_dataset
+        from ..report.channel import channel_dataset
         from .channel import ChannelOptions, channel_parts
 
         (channel,) = channel_parts(self.data, ChannelOptions(**options))

@@ -218,9 +218,9 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     from ..flight.data import load_data
     from ..flight.replay import replay_flight
     from ..flight.settings import load_flight
-    from ..report.content.flight_parts import pose_paths, report_data
-    from ..report.exports.tables import metrics as metrics_of
-    from ..report.pages.flight import write_report
+    from ..report.columns import metrics as metrics_of
+    from ..report.flight import write_report
+    from ..report.flight_data import pose_paths, report_data
     from .reporting.flight_run import report_stages, run_flight
     from .reporting.foliage_notes import foliage_notes
     from .reporting.ladder import recommended_text
@@ -269,9 +269,9 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
 
 def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[str, ...]:
     """Refuse options that no report can follow; returns the formats of its exports."""
-    from ..report.exports.formats import chosen_formats
-    from ..report.kit.canvas import STYLES
-    from ..report.pages.flight import FIGURES
+    from ..report.canvas import STYLES
+    from ..report.exports import chosen_formats
+    from ..report.flight import FIGURES
 
     for word, words in ((chosen.figures, FIGURES), (chosen.style, STYLES)):
         if word not in words:
@@ -312,7 +312,7 @@ def _with_audit(settings: Any, audit: str | None) -> Any:
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
     """Checks that the report states and that did not hold."""
-    from ..report.names import links_of
+    from ..report.page import links_of
 
     failed = []
     for (tower, channel), m in links_of(metrics["rss"]).items():
@@ -392,7 +392,7 @@ def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:
     -------
     JobOutcome
     """
-    from ..report.pages.site import write_site_view
+    from ..report.site import write_site_view
     from ..site.inputs import inputs_of_site
     from ..site.siteyaml import load_site
 
@@ -431,7 +431,7 @@ def run_map(
     JobOutcome
     """
     from ..maps.grid import Grid
-    from ..report.pages.maps import maps_metrics, write_maps
+    from ..report.maps import maps_metrics, write_maps
     from ..site.inputs import inputs_of_site
     from ..site.siteyaml import load_site
     from .mapping import coverage_map as mapping
@@ -480,7 +480,7 @@ def run_map(
 
 def _compared(flight: Any, options: RunOptions, stages: Stages) -> Any:
     """A flight replayed and compared, for the figures of a map."""
-    from ..report.content.flight_parts import report_data
+    from ..report.flight_data import report_data
     from .reporting.flight_run import run_flight
 
     data = flight.load(options.logs_root)
@@ -516,8 +516,7 @@ def run_campaign(
     UsageError
         A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
     """
-    from ..report.pages.campaign import campaign_metrics, write_campaign
-    from ..report.words.campaign import warnings
+    from ..report.campaign import campaign_metrics, warnings, write_campaign
     from .campaigns.campaign import load_campaign
     from .campaigns.campaign import run as run_all
     from .campaigns.season import find_reports, soundings, with_season
@@ -553,7 +552,7 @@ def run_campaign(
 
 def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
     """A file per failed task in ``failures/``: its message, and where in the program it came from."""
-    from ..report.names import safe_name
+    from ..report.page import safe_name
 
     for failure in failures:
         if failure.traceback:

@@ -16,10 +16,10 @@ from aerpaw_cmp.jobs.reporting.compare_flight import serving_of
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.report.content.flight_parts import report_data
-from aerpaw_cmp.report.exports.tables import metrics
-from aerpaw_cmp.report.figures.charts import shown_confusion
-from aerpaw_cmp.report.pages import flight as html
+from aerpaw_cmp.report import flight as html
+from aerpaw_cmp.report.charts import shown_confusion
+from aerpaw_cmp.report.columns import metrics
+from aerpaw_cmp.report.flight_data import report_data
 from aerpaw_cmp.site.siteyaml import load_site
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"

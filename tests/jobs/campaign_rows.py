@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.report.content.campaign import RssRow
+from aerpaw_cmp.report.campaign import RssRow
 
 
 def rss_row(flight: str, channel: str, measured: Any, simulated: Any, **keys: Any) -> RssRow:

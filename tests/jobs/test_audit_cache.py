@@ -14,7 +14,7 @@ from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.replay import replay_flight
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting import audit_flight
-from aerpaw_cmp.report.words.flight import audit_summary
+from aerpaw_cmp.report.flight_words import audit_summary
 from aerpaw_cmp.site.site import Building
 from tests.simulated import write_yaml
 from tests.tables import eastwards, rss_log

@@ -15,7 +15,7 @@ from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, pool_offsets, repe
 from aerpaw_cmp.jobs.campaigns.campaign_tasks import Outcome, Task, digest_of, fitted_to
 from aerpaw_cmp.jobs.tasks.options import RunOptions
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore
-from aerpaw_cmp.report.content.campaign import RankRow
+from aerpaw_cmp.report.campaign import RankRow
 from tests.jobs.campaign_rows import rss_row
 from tests.json_page import unlisted
 from tests.simulated import planned, simulate, write_yaml

@@ -9,8 +9,8 @@ import pytest
 from aerpaw_cmp.compare.result import ESTIMATED, FlightResult
 from aerpaw_cmp.flight.pose.clock import ClockEstimate
 from aerpaw_cmp.flight.replay import _clock_of, telemetry_time
-from aerpaw_cmp.report.content.flight_parts import clock_warnings
-from aerpaw_cmp.report.exports.tables import clock_metrics
+from aerpaw_cmp.report.columns import clock_metrics
+from aerpaw_cmp.report.flight_data import clock_warnings
 
 TIME = np.datetime64("2024-07-15T15:48:16", "ns") + (np.arange(100) * 1e9).astype("timedelta64[ns]")
 SERIES: Any = SimpleNamespace(tower="LW1", time=TIME)

@@ -26,8 +26,8 @@ from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series, compar
 from aerpaw_cmp.jobs.reporting.flight_run import run_flight
 from aerpaw_cmp.jobs.reporting.foliage_notes import foliage_notes
 from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
-from aerpaw_cmp.report.content.flight_parts import rank_warnings, rss_warnings, track_of
-from aerpaw_cmp.report.words.flight import instants
+from aerpaw_cmp.report.flight_data import rank_warnings, rss_warnings, track_of
+from aerpaw_cmp.report.flight_words import instants
 from aerpaw_cmp.site.antenna.learned import Errors
 from tests.simulated import write_yaml
 from tests.tables import LW1, ORIGIN, POSITIONS, eastwards, rank_log, rss_log, write_csv

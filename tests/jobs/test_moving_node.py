@@ -18,8 +18,8 @@ from aerpaw_cmp.jobs.reporting.ladder import flight_ladder
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.report.exports.tables import rank_csv, rss_csv
-from aerpaw_cmp.report.pages import explorer
+from aerpaw_cmp.report import explorer
+from aerpaw_cmp.report.columns import rank_csv, rss_csv
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.simulated import write_yaml
 from tests.tables import ORIGIN, POSITIONS, rank_log, rss_log, table_log, write_csv

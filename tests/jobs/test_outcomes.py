@@ -32,7 +32,7 @@ from aerpaw_cmp.jobs.campaigns.campaign_tasks import (
 )
 from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
 from aerpaw_cmp.jobs.tasks.workers import InProcess, Lost, Workers
-from aerpaw_cmp.report.content.campaign import Failure
+from aerpaw_cmp.report.campaign import Failure
 from tests.jobs.campaign_rows import rss_row
 
 pytestmark = pytest.mark.usefixtures("few_pictures")

@@ -209,7 +209,7 @@ def test_a_tower_inside_a_building_is_named_by_each_command(tmp_path: Path, caps
 
 def test_a_report_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """An error inside the writing leaves the old set whole."""
-    from aerpaw_cmp.report.pages import flight as html
+    from aerpaw_cmp.report import flight as html
 
     out = tmp_path / "reports" / "r"
     command = ["report", str(tiny_flight(tmp_path)), "-o", str(out)]

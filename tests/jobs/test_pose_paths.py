@@ -11,8 +11,7 @@ from aerpaw_cmp.propagation.edges import over_edges
 from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.report.content.flight import FURTHER
-from aerpaw_cmp.report.content.flight_parts import SHORTEST, pose_paths
+from aerpaw_cmp.report.flight_data import FURTHER, SHORTEST, pose_paths
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 

@@ -9,7 +9,7 @@ import pytest
 import xarray
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.report.exports.formats import FORMATS
+from aerpaw_cmp.report.exports import FORMATS
 from tests.simulated import planned, simulate, write_yaml
 
 SETTINGS = planned(

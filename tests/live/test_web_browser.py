@@ -15,7 +15,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.live.feed import Feed
 from aerpaw_cmp.live.session import TapStatus
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
-from aerpaw_cmp.report.pages.live import LiveMap, live_page
+from aerpaw_cmp.report.live import LiveMap, live_page
 from tests.report.browsing import (
     complaints,
     extents,

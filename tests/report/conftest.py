@@ -12,17 +12,8 @@ from aerpaw_cmp.compare.flight_verdict import flight_verdict
 from aerpaw_cmp.compare.level.rss import ChannelDifference
 from aerpaw_cmp.compare.result import AuditResult, EngineResult, PairResult, RankResult, RssResult
 from aerpaw_cmp.logs.records import RejectedLine
-from aerpaw_cmp.report.content.flight import InputFile, ReportData, Track, Waypoint
-from aerpaw_cmp.report.content.maps import (
-    Correlation,
-    MapError,
-    MapLayer,
-    MapsData,
-    PaperRow,
-    RankMap,
-    RssMap,
-    at_height,
-)
+from aerpaw_cmp.report.flight_data import InputFile, ReportData, Track, Waypoint
+from aerpaw_cmp.report.maps import Correlation, MapError, MapLayer, MapsData, PaperRow, RankMap, RssMap, at_height
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Tower, Trees
 from benchmarks.fabricated import rank_result, rss_result
 

@@ -13,16 +13,15 @@ from aerpaw_cmp.compare.judge.ladder import LadderRow
 from aerpaw_cmp.compare.judge.report_difference import Overlap, level_difference
 from aerpaw_cmp.compare.learning.calibration import Score
 from aerpaw_cmp.compare.statistics.intervals import pooled_difference
-from aerpaw_cmp.report.content.calibration import CalibrationData
-from aerpaw_cmp.report.content.diff import Entry, ReportDiff, ReportSide
-from aerpaw_cmp.report.pages import calibration as calibration_html
-from aerpaw_cmp.report.pages import campaign as campaign_html
-from aerpaw_cmp.report.pages import diff as diff_html
-from aerpaw_cmp.report.pages import flight as html
-from aerpaw_cmp.report.pages import maps as maps_html
-from aerpaw_cmp.report.pages import prediction as prediction_html
-from aerpaw_cmp.report.words.calibration import sentences
-from aerpaw_cmp.report.words.prediction import cautions, first_words
+from aerpaw_cmp.report import calibration as calibration_html
+from aerpaw_cmp.report import campaign as campaign_html
+from aerpaw_cmp.report import diff as diff_html
+from aerpaw_cmp.report import flight as html
+from aerpaw_cmp.report import maps as maps_html
+from aerpaw_cmp.report import prediction as prediction_html
+from aerpaw_cmp.report.calibration import CalibrationData, sentences
+from aerpaw_cmp.report.diff import Entry, ReportDiff, ReportSide
+from aerpaw_cmp.report.prediction import cautions, first_words
 from benchmarks import fabricated
 
 Fixture = Callable[[str], Any]

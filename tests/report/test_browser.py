@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.offset import grid_offset
-from aerpaw_cmp.report.pages import flight as write
+from aerpaw_cmp.report import flight as write
 from benchmarks.fabricated import with_numbers
 from tests.report.browsing import (
     PageLaws,

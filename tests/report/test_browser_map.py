@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from matplotlib import colormaps
 
-from aerpaw_cmp.report.content.maps import JOINT
-from aerpaw_cmp.report.pages import maps as maps_html
+from aerpaw_cmp.report import maps as maps_html
+from aerpaw_cmp.report.maps import JOINT
 from tests.report.browsing import PageLaws, choose, frame, needs_browser, open_page, papers, set_scheme, start
 
 pytest.importorskip("selenium", reason="selenium is not installed")

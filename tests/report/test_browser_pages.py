@@ -9,7 +9,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report.pages.site import viewer
+from aerpaw_cmp.report.site import viewer
 from tests.report.browsing import complaints, needs_browser, open_page, saves_every_chart, set_scheme, set_width, start
 from tests.report.shown import PAGES
 

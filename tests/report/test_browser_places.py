@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.kml import CLASS_COLOURS
-from aerpaw_cmp.report.kit.page import embedded
-from aerpaw_cmp.report.pages.places import BAND, COMPASS, LIKELIEST, Places, payload
+from aerpaw_cmp.report.page import embedded
+from aerpaw_cmp.report.places import BAND, COMPASS, LIKELIEST, Places, payload
 from tests.report.browsing import PageLaws, choose, frame, needs_browser, open_page, papers, saved, start
 from tests.report.shown import PAGES
 

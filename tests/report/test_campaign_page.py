@@ -8,11 +8,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.report.content.campaign import Repeat
-from aerpaw_cmp.report.figures import campaign as campaign_figures
-from aerpaw_cmp.report.kit import canvas
-from aerpaw_cmp.report.pages import campaign as campaign_html
-from aerpaw_cmp.report.words import campaign as campaign_words
+from aerpaw_cmp.report import campaign as campaign_figures
+from aerpaw_cmp.report import campaign as campaign_html
+from aerpaw_cmp.report import campaign as campaign_words
+from aerpaw_cmp.report import canvas
+from aerpaw_cmp.report.campaign import Repeat
 from benchmarks import fabricated
 
 

@@ -9,9 +9,9 @@ import pytest
 from aerpaw_cmp.compare.judge.ladder import LadderRow
 from aerpaw_cmp.compare.level.detection import DetectionScore
 from aerpaw_cmp.compare.level.serving import compare_serving
-from aerpaw_cmp.report.content.against import Against, AgainstSeries
-from aerpaw_cmp.report.figures.charts import charts_of, shown_confusion
-from aerpaw_cmp.report.pages import flight as html
+from aerpaw_cmp.report import flight as html
+from aerpaw_cmp.report.against import Against, AgainstSeries
+from aerpaw_cmp.report.charts import charts_of, shown_confusion
 from benchmarks.fabricated import with_numbers
 
 

@@ -12,8 +12,8 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.outputs import OutputFolder
 from aerpaw_cmp.compare.statistics.intervals import pooled_difference
 from aerpaw_cmp.jobs.diff_reports import run_diff
-from aerpaw_cmp.report.pages.diff import diff_page, verdict
-from aerpaw_cmp.report.pages.flight import write_report
+from aerpaw_cmp.report.diff import diff_page, verdict
+from aerpaw_cmp.report.flight import write_report
 from tests.json_page import unlisted
 
 LINK = ("LW1", "USRP1")

@@ -10,9 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.report.content.flight import Source
-from aerpaw_cmp.report.kit import canvas, page
-from aerpaw_cmp.report.pages import explorer
+from aerpaw_cmp.report import canvas, explorer, packed, page
+from aerpaw_cmp.report.flight_data import Source
 from aerpaw_cmp.site.site import Trees
 
 
@@ -102,5 +101,5 @@ def test_a_plan_of_a_place_without_a_map_says_so(report_data):
         site, buildings=(), forests=(), trees=Trees.none(), opaque_trees=Trees.none(), scene=None
     )
     assert (site.mapped, bare.mapped) == (True, False)
-    assert explorer.scene(site)["credit"] == site.credit
-    assert explorer.scene(bare)["credit"] == "no map here"
+    assert packed.scene(site)["credit"] == site.credit
+    assert packed.scene(bare)["credit"] == "no map here"

@@ -6,8 +6,8 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.compare.result import EngineResult
-from aerpaw_cmp.report import names
-from aerpaw_cmp.report.exports import tables as export
+from aerpaw_cmp.report import columns as export
+from aerpaw_cmp.report import page as names
 from benchmarks.fabricated import with_numbers
 
 

@@ -11,8 +11,10 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.compare.gains.spread import NO_SPREAD, StatedSpread
-from aerpaw_cmp.report.exports import formats, kmz, points
-from aerpaw_cmp.report.exports import tables as export
+from aerpaw_cmp.report import columns as export
+from aerpaw_cmp.report import exports as formats
+from aerpaw_cmp.report import exports as kmz
+from aerpaw_cmp.report import exports as points
 
 ODD = 'LW<4> & "ö"'
 DBM = "0.1 lg(re 1 mW)"

@@ -13,11 +13,11 @@ from PIL import Image
 
 from aerpaw_cmp.common.kml import CLASS_COLOURS
 from aerpaw_cmp.compare.result import RankResult, RssResult
-from aerpaw_cmp.report.content.flight import ReportData, Track, start_of, used_towers
-from aerpaw_cmp.report.figures import flight as figures
-from aerpaw_cmp.report.figures import maps as map_figures
-from aerpaw_cmp.report.kit import canvas
-from aerpaw_cmp.report.pages import flight as html
+from aerpaw_cmp.report import canvas
+from aerpaw_cmp.report import flight as html
+from aerpaw_cmp.report import flight_figures as figures
+from aerpaw_cmp.report import maps as map_figures
+from aerpaw_cmp.report.flight_data import ReportData, Track, start_of, used_towers
 from aerpaw_cmp.site.siteyaml import load_site
 from benchmarks.fabricated import rank_result, rss_result, with_numbers
 

@@ -20,22 +20,24 @@ from aerpaw_cmp.compare.level.field_difference import FieldAudit
 from aerpaw_cmp.compare.ranks.forecast import score_forecast
 from aerpaw_cmp.compare.result import FlightVerdict
 from aerpaw_cmp.compare.statistics.intervals import paired_difference
-from aerpaw_cmp.report.exports.tables import metrics
-from aerpaw_cmp.report.pages.diff import DIFFERENCE
-from aerpaw_cmp.report.words.flight import (
+from aerpaw_cmp.report.columns import metrics
+from aerpaw_cmp.report.diff import DIFFERENCE
+from aerpaw_cmp.report.flight_words import (
     AS_SET,
+    MOST_WORDS,
     OFFSETS,
     ONE_PLACE,
     Judged,
     cautions,
     first_sentence,
+    headlines,
     ladder_verdict,
     offset_sentences,
+    paragraph,
     pretty,
     ranking_sentence,
     rss_verdict,
 )
-from aerpaw_cmp.report.words.flight_verdict import MOST_WORDS, headlines, paragraph
 from benchmarks.fabricated import with_numbers
 
 

@@ -15,10 +15,10 @@ from aerpaw_cmp.compare.rank import CommonestRank, RankRepeat
 from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
 from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.logs.records import RejectedLine
-from aerpaw_cmp.report.content import flight_parts as build
-from aerpaw_cmp.report.content.flight import InputFile, ReportData
-from aerpaw_cmp.report.pages import flight as html
-from aerpaw_cmp.report.words import flight as words
+from aerpaw_cmp.report import flight as html
+from aerpaw_cmp.report import flight_data as build
+from aerpaw_cmp.report import flight_words as words
+from aerpaw_cmp.report.flight_data import InputFile, ReportData
 from benchmarks.fabricated import with_numbers
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}

@@ -10,13 +10,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aerpaw_cmp import report
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.report import kit
-from aerpaw_cmp.report.content.maps import JOINT, MapLayer
-from aerpaw_cmp.report.kit.packed import NONE
-from aerpaw_cmp.report.kit.page import as_json
-from aerpaw_cmp.report.pages import maps as maps_html
-from aerpaw_cmp.report.pages import maps_explorer as map_explorer
+from aerpaw_cmp.report import maps as map_explorer
+from aerpaw_cmp.report import maps as maps_html
+from aerpaw_cmp.report.maps import JOINT, MapLayer
+from aerpaw_cmp.report.packed import NONE
+from aerpaw_cmp.report.page import as_json
 
 
 def arrays_of(packed):
@@ -131,7 +131,7 @@ def test_one_cell_and_absurd_values(maps_data):
 def test_level_colours_rise_evenly_in_lightness():
     """CIE L* of the level scale grows by nearly equal steps; the difference scale is lightest at zero."""
     lightness = {}
-    script = (Path(kit.__file__).parents[1] / "templates/common.js").read_text(encoding="utf-8")
+    script = (Path(report.__file__).parent / "templates/common.js").read_text(encoding="utf-8")
     for name in ("viridis", "RdBu_r"):
         text = re.search(rf'{name}: "([0-9a-f]+)"', script)[1]
         rgb = np.array([[int(text[i + k : i + k + 2], 16) for k in (0, 2, 4)] for i in range(0, len(text), 6)]) / 255

@@ -6,8 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report.content.maps import MapsData, RssMap
-from aerpaw_cmp.report.words.maps import first_words, warnings
+from aerpaw_cmp.report.maps import MapsData, RssMap, first_words, warnings
 
 
 @pytest.mark.parametrize(

@@ -5,11 +5,11 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report.content.maps import MapsData
-from aerpaw_cmp.report.figures import maps as maps_figures
-from aerpaw_cmp.report.figures.charts import flown
-from aerpaw_cmp.report.kit import canvas
-from aerpaw_cmp.report.pages import maps as maps_html
+from aerpaw_cmp.report import canvas
+from aerpaw_cmp.report import maps as maps_figures
+from aerpaw_cmp.report import maps as maps_html
+from aerpaw_cmp.report.charts import flown
+from aerpaw_cmp.report.maps import MapsData
 
 
 @pytest.fixture

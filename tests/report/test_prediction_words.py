@@ -9,8 +9,8 @@ import pytest
 from aerpaw_cmp.compare.judge.verdicts import Verdict
 from aerpaw_cmp.compare.learning.correction import OFF, Correction
 from aerpaw_cmp.compare.learning.field_gp import FieldModel
-from aerpaw_cmp.report.words.flight_verdict import MOST_WORDS
-from aerpaw_cmp.report.words.prediction import FIELD, FLOWN, after_flight, cautions, first_words
+from aerpaw_cmp.report.flight_words import MOST_WORDS
+from aerpaw_cmp.report.prediction import FIELD, FLOWN, after_flight, cautions, first_words
 
 FREE, LEARNED, WITH_FIELD = ("free space", OFF), ("learned", OFF), ("learned", "field of 2 dB, 30 m")
 

@@ -6,8 +6,8 @@ import sys
 import pytest
 
 from aerpaw_cmp.common.stages import Stages
-from aerpaw_cmp.report.figures.flight import figure_specs
-from aerpaw_cmp.report.pages import flight as write
+from aerpaw_cmp.report import flight as write
+from aerpaw_cmp.report.flight_figures import figure_specs
 
 
 def test_whole_report(small_report, tmp_path):
@@ -43,8 +43,8 @@ def test_the_seconds_of_the_writing_are_told(small_report, tmp_path):
 
 def test_importing_the_room_draws_nothing():
     code = (
-        "import sys, aerpaw_cmp.report.exports.tables, aerpaw_cmp.report.figures.flight, aerpaw_cmp.report.pages.flight,"
-        " aerpaw_cmp.report.pages.maps, aerpaw_cmp.report.pages.site;"
+        "import sys, aerpaw_cmp.report.columns, aerpaw_cmp.report.flight_figures, aerpaw_cmp.report.flight,"
+        " aerpaw_cmp.report.maps, aerpaw_cmp.report.site;"
         "print([m for m in ('matplotlib', 'pandas', 'jinja2', 'sionna') if m in sys.modules])"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

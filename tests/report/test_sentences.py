@@ -21,17 +21,15 @@ ROOT = Path(__file__).parents[2] / "aerpaw_cmp" / "report"
 TABLE = Path(__file__).with_name("sentences.md")
 GAP = "…"
 SOURCES = {
-    "report": ("words/flight.py", "words/flight_verdict.py", "figures/flight.py", "figures/charts.py",
-               "templates/report.html.jinja", "templates/explorer.html.jinja",
-               "templates/method.html.jinja", "templates/plates.html.jinja", "templates/spans.html.jinja",
-               "templates/site_view.html.jinja"),
-    "map": ("words/maps.py", "figures/maps.py", "figures/charts.py", "templates/map.html.jinja",
-            "templates/plates.html.jinja", "templates/map_explorer.html.jinja"),
-    "campaign": ("words/campaign.py", "figures/campaign.py", "templates/campaign.html.jinja"),
-    "calibration": ("words/calibration.py", "pages/calibration.py", "templates/calibration.html.jinja"),
-    "diff": ("pages/diff.py", "content/diff.py", "templates/diff.html.jinja"),
-    "prediction": ("words/prediction.py", "pages/prediction.py", "templates/prediction.html.jinja",
-                   "templates/places.html.jinja"),
+    "report": ("flight_words.py", "flight_figures.py", "charts.py", "templates/report.html.jinja",
+               "templates/explorer.html.jinja", "templates/method.html.jinja", "templates/plates.html.jinja",
+               "templates/spans.html.jinja", "templates/site_view.html.jinja"),
+    "map": ("maps.py", "charts.py", "templates/map.html.jinja", "templates/plates.html.jinja",
+            "templates/map_explorer.html.jinja"),
+    "campaign": ("campaign.py", "templates/campaign.html.jinja"),
+    "calibration": ("calibration.py", "templates/calibration.html.jinja"),
+    "diff": ("diff.py", "templates/diff.html.jinja"),
+    "prediction": ("prediction.py", "templates/prediction.html.jinja", "templates/places.html.jinja"),
 }  # fmt: skip
 WORD = re.compile(r"[A-Za-z][A-Za-z'-]*")
 INLINE = {"b", "i", "em", "strong", "code", "a", "br", "sup", "sub", "abbr"}

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.report.kit import canvas, shapes
-from aerpaw_cmp.report.pages import site as site_view
+from aerpaw_cmp.report import canvas
+from aerpaw_cmp.report import packed as shapes
+from aerpaw_cmp.report import site as site_view
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Trees
 
 

@@ -97,7 +97,7 @@ def diff(
 ) -> int:
     """Differences between two reports of a flight: settings, inputs, versions, numbers on common samples."""
     from ...jobs.diff_reports import run_diff
-    from ...report.pages.diff import diff_metrics
+    from ...report.diff import diff_metrics
 
     comparison = run_diff(first, second, out=out, force=force)
     if not answered(diff_metrics(comparison)):
@@ -112,7 +112,7 @@ _SHOWN = 20
 
 
 def _print_diff(comparison: Any) -> None:
-    from ...report.pages.diff import verdict
+    from ...report.diff import verdict
 
     show(verdict(comparison))
     for text in comparison.remarks:

@@ -24,7 +24,7 @@ from ...compare.statistics.passes import Pass, PassPair, PassTable
 from ...flight.gains.memory import with_learned
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, load_flight
-from ...report.content.campaign import CampaignData, Failure, PooledOffset, RankRow, RankTransfer, Repeat, RssRow
+from ...report.campaign import CampaignData, Failure, PooledOffset, RankRow, RankTransfer, Repeat, RssRow
 from ..tasks.options import DEFAULT, RunOptions
 from ..tasks.outcomes import OutcomeStore
 from ..tasks.workers import open_workers

@@ -28,7 +28,7 @@ from ...flight.marks import among
 from ...flight.overrides import Overrides, overridden
 from ...flight.settings import FlightFile, RssSettings, load_flight
 from ...flight.training import logs_of, series_mark
-from ...report.content.campaign import Failure, RankRow, RssRow
+from ...report.campaign import Failure, RankRow, RssRow
 from ..reporting.flight_run import run_flight
 from ..tasks.manifest import stamp
 from ..tasks.outcomes import OutcomeStore, task_inputs, task_key

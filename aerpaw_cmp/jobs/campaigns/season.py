@@ -22,7 +22,7 @@ from ...compare.statistics.passes import cell_means
 from ...logs.ingest import ingest
 from ...logs.readers import ReadOptions
 from ...logs.records import has_wall_clock
-from ...report.content.campaign import CampaignData, PlaceMap, RssRow, Season, SettingRank
+from ...report.campaign import CampaignData, PlaceMap, RssRow, Season, SettingRank
 
 _QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
 

@@ -31,7 +31,7 @@ from ...flight.rows.lock import LOCK_FLOOR_DB
 from ...flight.settings import AntennaSettings, load_pattern
 from ...flight.training import counted_once, flight_logs, marks_of
 from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
-from ...report.words.calibration import sentences
+from ...report.calibration import sentences
 from ...site.antenna.learned import LearnedLock, Source
 from .calibrate_lock import learned_locks, lock_words
 

@@ -24,10 +24,8 @@ from ...compare.learning.learning_curve import with_one_more
 from ...flight.data import FlightData, RankSeries, RssSeries, rank_quantity
 from ...flight.training import flight_logs, marks_of
 from ...logs.records import has_wall_clock
-from ...report.content.calibration import AntennaMap, CalibrationData
-from ...report.kit.files import write_file
-from ...report.names import safe_name
-from ...report.pages.calibration import calibration_metrics, write_calibration
+from ...report.calibration import AntennaMap, CalibrationData, calibration_metrics, write_calibration
+from ...report.page import safe_name, write_file
 from ...site.antenna.learned import (
     Entry,
     Errors,
@@ -190,7 +188,7 @@ def _record_of(
     Returns
     -------
     CalibrationData
-        As :func:`aerpaw_cmp.report.pages.calibration.write_calibration` takes it.
+        As :func:`aerpaw_cmp.report.calibration.write_calibration` takes it.
     """
     mounts = {
         name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}

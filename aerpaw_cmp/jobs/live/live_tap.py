@@ -108,7 +108,7 @@ def _twin(shown: Shown) -> Any:
 def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, title: str) -> None:
     """Build the page, serve it as long as the stack lasts, and say where."""
     from ...live.web import Address, Page, WebServer
-    from ...report.pages.live import live_page
+    from ...report.live import live_page
 
     address = Address.parse(shown.web or "")
     background = None if twin is None else twin.map()

@@ -28,7 +28,7 @@ from ...logs.writers import format_vehicle_out
 from ...maps.grid import Grid
 from ...propagation.field.baselines import free_space_dbm
 from ...propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
-from ...report.pages.live import LiveMap
+from ...report.live import LiveMap
 from ...site.site import Site
 
 _MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)

@@ -48,9 +48,9 @@ from ...propagation.geometry.arrays import Link, Poses, linear_array, single_ele
 from ...propagation.geometry.paths import PathSet
 from ...propagation.options import Job, Run, Search
 from ...propagation.replay import Replay, replay
-from ...report.content import maps as page
-from ...report.content.flight import ReportData
-from ...report.pages.prediction import outside_share
+from ...report import maps as page
+from ...report.flight_data import ReportData
+from ...report.prediction import outside_share
 from ...site.inputs import inputs_of_site
 from ...site.site import Site
 from ...site.siteyaml import load_site, site_model
@@ -585,7 +585,7 @@ def maps_record(
     stages_s: Mapping[str, float],
     paper: Iterable[page.PaperRow] = (),
 ) -> page.MapsData:
-    """The record that :func:`aerpaw_cmp.report.pages.maps.write_maps` turns into files.
+    """The record that :func:`aerpaw_cmp.report.maps.write_maps` turns into files.
 
     Parameters
     ----------

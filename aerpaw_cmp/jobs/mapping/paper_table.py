@@ -17,8 +17,8 @@ from ...common.units import finite_mean, power_from_db
 from ...maps.job import Antennas
 from ...maps.link_budget import PAPER_BUDGET
 from ...maps.study import rank_fields
-from ...report.content.maps import PaperRow
-from ...report.names import k_key
+from ...report.maps import PaperRow
+from ...report.page import k_key
 from .coverage_map import INTERPOLATORS, MapOutcome
 
 # Horizontal distance of "near the tower" in the rows about rank 2.

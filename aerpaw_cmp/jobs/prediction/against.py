@@ -20,8 +20,8 @@ from ...compare.ranks.forecast import ForecastScore, score_forecast
 from ...flight.data import FlightData
 from ...flight.marks import among
 from ...flight.training import common, flight_logs, marks_of
-from ...report.content.against import Against, AgainstSeries
-from ...report.words.prediction import against_words
+from ...report.against import Against, AgainstSeries
+from ...report.prediction import against_words
 from ..learning.calibrate import observe
 from ..learning.calibrate_rank import RankSamples, rank_samples
 from .predict import P_LOCK, RANKS

@@ -15,8 +15,8 @@ import numpy as np
 from ...common.stages import Stages
 from ...common.units import FloatArray
 from ...maps.grid import Grid, Layer, class_names
-from ...report.content import maps as page
-from ...report.pages.prediction import PredictionPage
+from ...report import maps as page
+from ...report.prediction import PredictionPage
 from .predict import RANKS, Prediction, predict
 from .sources import NamedFlight, Source
 from .where import TargetOptions

@@ -27,16 +27,19 @@ from ...flight.gains.memory import flight_of
 from ...flight.settings import FlightFile, LinkSettings, LinksSettings
 from ...flight.training import counted_once, flight_logs, knows, learned_patterns, marks_of
 from ...propagation.geometry.arrays import Poses, rotation_from_aircraft
-from ...report.pages.prediction import PredictionPage, outside_share, prediction_metrics, write_prediction
-from ...report.words.prediction import (
+from ...report.prediction import (
     FLAGS,
     TITLES,
+    PredictionPage,
     cautions,
     first_words,
     heading_words,
     memory_cautions,
+    outside_share,
+    prediction_metrics,
     prior_caution,
     prior_words,
+    write_prediction,
 )
 from ...site.antenna.antennas import MeasuredPattern
 from ...site.antenna.learned import BAND as CARRIER_BAND

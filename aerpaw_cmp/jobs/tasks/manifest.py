@@ -18,7 +18,7 @@ from ...common.outputs import file_digest
 from ...common.provenance import trained_on
 from ...flight.gains.memory import load_with_learned
 from ...flight.settings import FlightFile
-from ...report.content.flight import InputFile
+from ...report.flight_data import InputFile
 from ...site.antenna.learned import read_table
 from ...site.inputs import inputs_of_site, site_files
 

@@ -1,0 +1,272 @@
+"""calibration.html with metrics.json: antennas over the sphere, where flights looked, held-out scores."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.jsonable import json_object, named
+from ..common.units import FloatArray
+from ..compare.judge.verdicts import Verdict, antenna_or_place, by_flight
+from ..compare.learning.calibration import BASELINES, Score, mean_rmse
+from ..compare.learning.learning_curve import CurvePoint, with_one_more
+from .flight_words import said_of
+from .page import Made, about, write_page
+from .places import BODY, COMPASS, Places, payload
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AntennaMap:
+    """One antenna over the sphere.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``LW1.USRP1 tower``.
+    theta_deg, azimuth_deg : (t,), (p,)
+    gain_dbi, sd_db : (t, p)
+    level_db : float
+        What was taken from the learned gain for a mean of 0 dBi.
+    flown : (m, 3)
+        Unit vectors of the directions that flights looked in.
+    """
+
+    name: str
+    theta_deg: FloatArray
+    azimuth_deg: FloatArray
+    gain_dbi: FloatArray
+    sd_db: FloatArray
+    level_db: float
+    flown: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationData(Made):
+    """The record of a calibration; ``scores`` and ``controls`` hold rows with flight, tower, channel, RMSE."""
+
+    name: str
+    flights: Sequence[str]
+    trained_on: Sequence[str]
+    marks: Sequence[str]
+    words: Sequence[str]
+    warnings: Sequence[str]
+    scores: Mapping[str, Sequence[Mapping[str, Any]]]
+    controls: Mapping[str, Sequence[Mapping[str, Any]]]
+    mounts: Mapping[str, Mapping[str, Any]]
+    strengths: Mapping[str, Any]
+    ground: Mapping[str, Any] | None
+    curve: Sequence[Mapping[str, Any]]
+    """Error by number of flights that were learned from, fewest first; none with fewer than three flights."""
+    one_more_rmse_db: float
+    """To expect with one flight more, extrapolated [dB]; NaN without a curve."""
+    antennas: Sequence[AntennaMap]
+    rank: Mapping[str, Any] | None = None
+    settings_text: str = ""
+
+
+ONE_FLIGHT = "Nothing is scored: one flight alone. Next: add a second flight."
+
+# Learned antennas against the best baseline, by :func:`~aerpaw_cmp.compare.judge.verdicts.by_flight`.
+HELPS: dict[str, tuple[str, str]] = {
+    "better": (
+        "The learned antennas are significantly better ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
+        "`aerpaw-cmp report FLIGHT --with CALIBRATED`",
+    ),
+    "worse": (
+        "The learned antennas are significantly worse ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
+        "leave them out of flight.yaml; check node, channel and gain of the logs",
+    ),
+    "not significant": (
+        "The difference of {effect:+.1f} dB is not significant (95 %: {low:+.1f} to {high:+.1f} dB).",
+        "add flights with other headings",
+    ),
+    "no interval": (
+        "The difference is {effect:+.1f} dB; two flights give no interval.",
+        "add a third flight",
+    ),
+}
+
+# Body frame against frames that do not turn, by :func:`~aerpaw_cmp.compare.judge.verdicts.antenna_or_place`.
+FRAMES: dict[str, tuple[str, str]] = {
+    "antenna": (
+        "What was learned turns with the UAV, as an antenna does: {where} the error is {size:.1f} dB larger "
+        "(95 %: {near:.1f} to {far:.1f} dB).",
+        "",
+    ),
+    "place": (
+        "What was learned belongs to places: {where} the error is {size:.1f} dB smaller "
+        "(95 %: {near:.1f} to {far:.1f} dB).",
+        "fly the same places with other headings",
+    ),
+    "not separable": (
+        "Antenna and place are not separable: {where} the error differs by {size:.1f} dB, not significantly.",
+        "",
+    ),
+    "no interval": ("Antenna and place are not separable with two flights.", ""),
+}
+
+WRONG_FRAMES = {
+    "world frame at the UAV": "in a frame fixed to the ground",
+    "heading turned the wrong way": "with the heading turned the wrong way",
+}
+
+
+def helps(scores: Sequence[Score]) -> Verdict:
+    """The learned antennas against the best baseline on the flights left out."""
+    name = min(BASELINES, key=lambda key: mean_rmse(scores, key))
+    return by_flight(_errors(scores), _errors(scores, name), name)
+
+
+def frame(controls: Mapping[str, Sequence[Score]]) -> Verdict:
+    """Antenna or memory of the place, without patterns."""
+    body = _errors(controls.get("body frame, no patterns", ()))
+    return antenna_or_place(
+        [by_flight(body, _errors(controls.get(name, ())), where) for name, where in WRONG_FRAMES.items()]
+    )
+
+
+def _errors(scores: Sequence[Score], name: str = "rmse_db") -> list[tuple[str, float]]:
+    return [(score.flight, getattr(score, name)) for score in scores]
+
+
+def sentences(
+    scores: Mapping[str, Sequence[Score]],
+    controls: Mapping[str, Sequence[Score]],
+    ground_m: tuple[float, float] | None,
+    curve: Sequence[CurvePoint],
+) -> tuple[str, ...]:
+    """The first words of page and terminal, then further sentences.
+
+    Parameters
+    ----------
+    scores, controls : mapping of str to sequence of Score
+        By what was left out, and by wrong or simpler model.
+    ground_m : (float, float), optional
+        Heights of roughness that the data allow; None where no ground was fitted.
+    curve : sequence of CurvePoint
+
+    Returns
+    -------
+    tuple of str
+    """
+    left_out = scores["flight_left_out"]
+    if not left_out:
+        return (ONE_FLIGHT,)
+    verdict, turned = helps(left_out), frame(controls)
+    worst = max(left_out, key=lambda score: score.rmse_db)
+    ends = sorted(map(abs, turned.interval))
+    helped, _, step = said_of(verdict, HELPS).partition(" Next: ")
+    first = (
+        f"Flights left out: RMSE {mean_rmse(left_out):.1f} dB with learned antennas; "
+        f"{BASELINES[verdict.where]}: {mean_rmse(left_out, verdict.where):.1f} dB.",
+        helped,
+        f"Largest error: {worst.flight}, {worst.tower} {worst.channel}, {worst.rmse_db:.1f} dB.",
+        said_of(turned, FRAMES, near=ends[0], far=ends[1]),
+        f"Next: {step}" if turned.cause != "place" else "",
+    )
+    return (" ".join(text for text in first if text), *_further(scores, ground_m), *_of_curve(curve))
+
+
+def _further(scores: Mapping[str, Sequence[Score]], ground_m: tuple[float, float] | None) -> Iterator[str]:
+    left_out, sectors = scores["flight_left_out"], scores["sector_left_out"]
+    if sectors:
+        base, error = mean_rmse(sectors, "free_space_rmse_db"), mean_rmse(sectors)
+        yield f"Directions that no training flight has seen: RMSE {error:.1f} dB; free space: {base:.1f} dB."
+        gain = mean_rmse(left_out, "free_space_rmse_db") - mean_rmse(left_out)
+        if gain > 0:
+            share = min(max((base - error) / gain, 0.0), 1.0)
+            yield f"{100 * share:.0f} % of the gain over free space carries over to these directions."
+    if not scores["heading_left_out"]:
+        yield "No heading could be left out: the flights share one."
+    if ground_m is not None and math.isinf(ground_m[0]):
+        yield "A coherent ground ray is not in the data."
+    elif ground_m is not None:
+        low, high = (100.0 * end for end in ground_m)
+        yield f"Roughness of the ground that the data allow: {low:.1f} cm " + (
+            "or more." if math.isinf(high) else f"to {high:.1f} cm."
+        )
+
+
+def _of_curve(points: Sequence[CurvePoint]) -> Iterator[str]:
+    if len(points) > 1:
+        counts, errors = (", ".join(texts) for texts in ([str(p.flights) for p in points],
+                                                         [f"{p.rmse_db:.2f}" for p in points]))  # fmt: skip
+        more = with_one_more(points)
+        yield f"Learned from {counts} other flights, the error on a flight left out is {errors} dB."
+        yield (f"One flight more would bring about {points[-1].rmse_db - more:.2f} dB ({more:.2f} dB, extrapolated).")
+
+
+SPLIT_TITLE = {
+    "flight_left_out": "each flight left out",
+    "altitude_left_out": "and its cruising height",
+    "heading_left_out": "and an eighth of the compass of headings",
+    "sector_left_out": "and a sector of 60 degrees at the tower",
+    "route_left_out": "a segment of the flight's own route",
+    "other_flights": "flights that had no part (--score)",
+}
+
+
+def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
+    """The numbers of the page under stable names."""
+    return json_object(
+        calibration=data.name,
+        **named(data, "flights trained_on marks scores controls mounts strengths ground words warnings"),
+        learning_curve={"points": data.curve, "one_more_rmse_db": data.one_more_rmse_db},
+        antennas=[
+            {"name": a.name, "share_of_sphere_seen": _share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
+        ],
+        rank=data.rank or {},
+        **about(data),
+    )
+
+
+def _directions(antenna: AntennaMap) -> FloatArray:
+    """Unit vectors (t, p, 3) of the grid."""
+    t, p = np.radians(antenna.theta_deg)[:, None], np.radians(antenna.azimuth_deg)[None, :]
+    return np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
+
+
+def _share_seen(antenna: AntennaMap, within_deg: float = 10.0) -> float:
+    """Share of the sphere within some degrees of a direction that a flight looked in."""
+    grid = _directions(antenna)
+    near = np.zeros(grid.shape[:2], bool)
+    for part in np.array_split(antenna.flown, max(1, len(antenna.flown) // 500)):
+        near |= (grid @ part.T > np.cos(np.radians(within_deg))).any(axis=-1)
+    weight = np.sin(np.radians(antenna.theta_deg))[:, None] * np.ones_like(near)
+    return float((near * weight).sum() / weight.sum())
+
+
+def _mean(rows: Sequence[Mapping[str, Any]], key: str = "rmse_db") -> float:
+    return float(np.mean([r[key] for r in rows])) if rows else float("nan")
+
+
+def _groups(data: CalibrationData) -> Iterator[Places]:
+    """Each antenna over the sphere."""
+    for a in data.antennas:
+        yield Places(
+            name=a.name,
+            at=_directions(a).reshape(-1, 3),
+            values={"gain [dBi]": a.gain_dbi.ravel(), "standard deviation [dB]": a.sd_db.ravel()},
+            around=BODY if a.name.endswith(" uav") else COMPASS,
+            dots=a.flown,
+        )
+
+
+def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:
+    """Write ``calibration.html`` and ``metrics.json``."""
+    numbers = calibration_metrics(data)
+    rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
+    columns = ("rmse_db", "rmse_4s_db", *BASELINES)
+    return write_page(
+        folder, "calibration", numbers, payload(list(_groups(data))) if data.antennas else {},
+        data=data,
+        metrics=numbers,
+        split_title=SPLIT_TITLE,
+        baselines=BASELINES,
+        means={name: ([_mean(scores, key) for key in columns], len(scores)) for name, scores in rows.items()},
+    )  # fmt: skip

@@ -1,0 +1,666 @@
+"""Figures of a report: finished arrays in, matplotlib figures out.
+
+No pyplot and no global state: every figure is a :class:`matplotlib.figure.Figure` of its own, drawn inside
+:func:`style`. Colours are told apart in grey as well, by lightness, line style, marker or hatch. Clouds of points
+are rasterised and long lines thinned (extremes kept), so that an SVG stays small however long the flight.
+"""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, spread_out
+from ..logs.records import has_wall_clock
+from ..site.scenes import drawn_buildings
+from ..site.site import Site, Tower, Trees
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+# Okabe & Ito's palette (jfly.uni-koeln.de/color), chosen here for distinct lightness too
+MEASURED = "#56B4E9"
+SECOND = "#7A3FA0"
+SIMULATED = "#111111"
+BASELINE = {
+    "free_space": ("#D55E00", (0, (5, 2))),
+    "two_ray": ("#009E73", (0, (1, 1.5))),
+    "log_distance": ("#CC79A7", (0, (6, 2, 1, 2))),
+    "constant": ("#0072B2", (0, (8, 3))),
+}
+TOWER = "#C1121F"
+_BUILDING = "#8A8A8A"
+_FOREST = "#B9D8B0"
+WAYPOINT = "#555555"
+
+RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
+
+POINTS_PER_LINE = 3000
+POINTS_PER_CLOUD = 30_000
+_RASTER_DPI = 130
+
+
+@dataclass(frozen=True, slots=True)
+class FigureSpec:
+    """A figure that can be drawn: file name, the function that draws it, and its words where a page shows it."""
+
+    name: str
+    draw: Callable[[], Figure]
+    title: str = ""
+    caption: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A drawn figure: the picture by format ("png", "svg", "pdf"), and the smaller PNG that a page holds."""
+
+    spec: FigureSpec
+    formats: Mapping[str, bytes]
+    inline: bytes = b""
+
+
+STYLES = ("screen", "paper")
+FORMATS = ("png", "svg", "pdf")
+INLINE = "png of few colours"
+
+# Width of two columns of an IEEE page.
+_IEEE_WIDTH_IN = 7.16
+
+
+@contextmanager
+def style(kind: str = "screen") -> Iterator[None]:
+    """The look of every figure, without touching the user's settings.
+
+    ``paper``: Times-like letters of the size of an IEEE page once a figure is scaled to its width, fonts embedded.
+    """
+    import matplotlib
+
+    settings = {
+        "font.family": "sans-serif",
+        "font.sans-serif": ["DejaVu Sans"],
+        "font.size": 9.0,
+        "text.usetex": False,  # a matplotlibrc of the working folder, a stranger's perhaps, would run LaTeX
+        "text.parse_math": False,  # names are drawn as they are: a waypoint may be called A_$
+        "axes.titlesize": 10.0,
+        "axes.titleweight": "bold",
+        "axes.titlelocation": "left",
+        "axes.titley": 1.0,  # else every axis is measured for the place of its title
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.axisbelow": True,
+        "axes.grid": True,
+        "grid.color": "#E2E2E2",
+        "grid.linewidth": 0.6,
+        "legend.frameon": True,
+        "legend.framealpha": 0.9,
+        "legend.edgecolor": "#DDDDDD",
+        "legend.fontsize": 8.0,
+        "hatch.linewidth": 0.5,
+        "figure.dpi": 100.0,
+        "savefig.dpi": _RASTER_DPI,
+        "svg.fonttype": "path",  # the page must look the same where the font is missing
+        "svg.hashsalt": "aerpaw-cmp",  # same numbers, same bytes
+        "path.simplify": True,
+        "figure.autolayout": False,  # the layout is set here, and is switched off again when it is done
+        "figure.constrained_layout.use": False,
+    }
+    if kind == "paper":
+        settings |= {
+            "font.family": "serif",
+            "font.serif": ["Liberation Serif", "Times New Roman", "Nimbus Roman", "DejaVu Serif"],
+            "font.size": 10.3,  # 8 pt once scaled to the width of the page
+            "axes.titleweight": "normal",
+            "pdf.fonttype": 42,
+            "savefig.dpi": 300.0,
+        }
+    with matplotlib.rc_context(settings):
+        yield
+
+
+def subplots(size: tuple[float, float], *shape: int, **options: Any) -> tuple[Figure, Any]:
+    """A figure [inch] whose parts do not overlap, and its axes, as :meth:`matplotlib.figure.Figure.subplots` makes."""
+    from matplotlib.figure import Figure
+
+    fig = Figure(figsize=size, layout="constrained")
+    return fig, fig.subplots(*shape, **options)
+
+
+def placed(
+    size: tuple[float, float], rows: int, columns: int, *, gap_in: tuple[float, float] = (0.15, 0.4),
+    right_in: float = 0.15, bottom_in: float = 0.9, **options: Any,
+) -> tuple[Figure, Any]:  # fmt: skip
+    """A figure and its axes (rows, columns), all places in inches: to measure a grid takes as long as to draw it.
+
+    Parameters
+    ----------
+    size : (width, height)
+    rows, columns : int
+    gap_in : (across, up)
+        Between axes.
+    right_in, bottom_in : float
+        Margins, for a colour bar and for a legend.
+    options
+        Of :meth:`matplotlib.figure.Figure.subplots`.
+
+    Returns
+    -------
+    tuple of Figure and array of Axes (rows, columns)
+    """
+    from matplotlib.figure import Figure
+
+    (width, height), left, top = size, 0.7, 0.3
+    wide = (width - left - right_in - (columns - 1) * gap_in[0]) / columns
+    high = (height - top - bottom_in - (rows - 1) * gap_in[1]) / rows
+    fig = Figure(figsize=size)
+    grid = {
+        "left": left / width, "right": 1.0 - right_in / width, "bottom": bottom_in / height,
+        "top": 1.0 - top / height, "wspace": gap_in[0] / wide, "hspace": gap_in[1] / high,
+    }  # fmt: skip
+    return fig, fig.subplots(rows, columns, squeeze=False, gridspec_kw=grid, **options)
+
+
+def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
+    """The figure in some of :data:`FORMATS`; on paper as wide as two columns of an IEEE page.
+
+    Beside them :data:`INLINE`, the same picture of 256 colours at most: a third of the bytes, and the same to the eye.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.ticker import AutoLocator
+    from PIL import Image
+
+    if kind == "paper":
+        width, height = fig.get_size_inches()
+        fig.set_size_inches(_IEEE_WIDTH_IN, height * _IEEE_WIDTH_IN / width)
+    dots_per_inch = 300.0 if kind == "paper" else _RASTER_DPI
+    fig.set_dpi(dots_per_inch)
+    for axis in (axis for ax in fig.axes for axis in (ax.xaxis, ax.yaxis)):
+        locator = axis.get_major_locator()
+        if isinstance(locator, AutoLocator):
+            locator.set_params(min_n_ticks=3)
+    images = {name: io.BytesIO() for name in formats}
+    # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
+    agg = FigureCanvasAgg(fig)
+    agg.draw()  # the layout is made here
+    picture = Image.fromarray(np.asarray(agg.buffer_rgba())).convert("RGB")
+    if "png" in images:
+        picture.save(images["png"], "PNG", compress_level=2, dpi=(dots_per_inch, dots_per_inch))
+    if INLINE in images:
+        # an octree takes a tenth of the time of a median cut, and fewer pixels are far off; level 9 gains 5 %
+        few = picture.quantize(256, method=Image.Quantize.FASTOCTREE)
+        few.save(images[INLINE], "PNG", compress_level=6)
+    fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
+    if "svg" in images:
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+        FigureCanvasSVG(fig).print_svg(images["svg"], metadata={"Date": None})
+    if "pdf" in images:
+        from matplotlib.backends.backend_pdf import FigureCanvasPdf  # loads fontTools: as much as a figure
+
+        FigureCanvasPdf(fig).print_pdf(images["pdf"], metadata={"CreationDate": None})
+    return {name: file.getvalue() for name, file in images.items()}
+
+
+def render(spec: FigureSpec, formats: Sequence[str] = ("png",), kind: str = "screen") -> Picture:
+    """Draw a figure and forget it; its pictures stay."""
+    with style(kind):
+        files = save_as(spec.draw(), (*formats, INLINE) if "png" in formats else formats, kind)
+    return Picture(spec, {name: files[name] for name in formats}, files.get(INLINE, b""))
+
+
+# --- parts --------------------------------------------------------------------------------------
+
+
+def seconds_since(time: AnyArray, start: np.datetime64) -> FloatArray:
+    """Instants as seconds after ``start``."""
+    return np.asarray((np.asarray(time) - start) / np.timedelta64(1, "s"), dtype=np.float64)
+
+
+_CLOCK_STEPS_S = (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800, 3600, 7200, 10800, 21600, 43200, 86400)
+
+
+def _clock_ticks(low_s: float, high_s: float, start: np.datetime64, most: int = 9) -> tuple[FloatArray, list[str]]:
+    """Ticks at round times of day.
+
+    Parameters
+    ----------
+    low_s, high_s : float
+        Ends of the axis, seconds after ``start``.
+    start : datetime64
+        UTC.
+    most : int
+        Ticks at most, about.
+
+    Returns
+    -------
+    tuple of (n,) and list of str
+        Seconds after ``start``, and the times.
+
+    Examples
+    --------
+    >>> _clock_ticks(0.0, 200.0, np.datetime64("2025-06-01T14:00:13.5"))[1]
+    ['14:00:30', '14:01:00', '14:01:30', '14:02:00', '14:02:30', '14:03:00', '14:03:30']
+    """
+    step = next((s for s in _CLOCK_STEPS_S if (high_s - low_s) / s <= most), _CLOCK_STEPS_S[-1])
+    begun = float((start - start.astype("datetime64[D]")) / np.timedelta64(1, "s"))
+    ticks = np.arange(np.ceil((low_s + begun) / step), np.floor((high_s + begun) / step) + 1) * step
+    pattern = slice(11, 19 if step < 60 else 16)
+    day = start.astype("datetime64[D]").astype("datetime64[s]")
+    return ticks - begun, [str(day + np.timedelta64(int(tick), "s"))[pattern] for tick in ticks]
+
+
+def time_axis(ax: Axes, start: np.datetime64) -> None:
+    """Label and ticks of a time axis whose curves are drawn, seconds after ``start``: UTC, where the logs have it."""
+    if not has_wall_clock(start):
+        ax.set_xlabel("Time after the first sample [s]")
+        return
+    ax.set_xlabel(f"Time of day, {str(start)[:10]} (UTC)")
+    low, high = ax.get_xlim()
+    ax.set_xticks(*_clock_ticks(low, high, start))
+    ax.set_xlim(low, high)
+
+
+def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
+    """Indices of at most about ``limit`` samples, with the smallest and largest of each array in each stretch.
+
+    Parameters
+    ----------
+    values : sequence of (n,)
+        Arrays whose extremes must stay; NaN counts as no extreme.
+    limit : int
+        Samples wanted.
+
+    Returns
+    -------
+    (m,) int
+        Rising; all of them when n <= limit.
+
+    Examples
+    --------
+    >>> keep_extremes([np.array([0.0, 5.0, 1.0, 0.0, -7.0, 0.0])], 3).tolist()
+    [0, 1, 4, 5]
+    """
+    n = len(values[0])
+    if n <= limit:
+        return np.arange(n)
+    # each stretch gives two samples per array, its smallest and its largest
+    per = -(-n // max(1, limit // (2 * len(values))))
+    starts = np.arange(0, n, per)
+    # a thinned line must end where the flight ends
+    rows = [np.array([0, n - 1])]
+    for array in values:
+        table = np.pad(np.asarray(array, dtype=np.float64), (0, -n % per), constant_values=np.nan).reshape(-1, per)
+        missing = np.isnan(table)
+        rows += [starts + np.where(missing, np.inf, table).argmin(axis=1)]
+        rows += [starts + np.where(missing, -np.inf, table).argmax(axis=1)]
+    return np.unique(np.minimum(np.concatenate(rows), n - 1))
+
+
+def thinned(at: FloatArray, values: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
+    """A line (n,) with at most about ``limit`` points that looks the same: both extremes of each stretch are kept.
+
+    NaN in the values breaks the line and is kept as a break.
+
+    Examples
+    --------
+    >>> a, b = thinned(np.arange(100000.0), np.sin(np.arange(100000.0)))
+    >>> len(a) <= 3002, bool(b.max() > 0.999999)
+    (True, True)
+    """
+    rows = keep_extremes([values], limit)
+    return at[rows], values[rows]
+
+
+def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
+    """Rows of a cloud of points that are drawn: all up to ``limit``; of more, evenly spread ones and every extreme.
+
+    Parameters
+    ----------
+    values : (n,)
+        The ordinate, in the order of the abscissa; NaN is no extreme.
+    limit : int
+        Points wanted.
+
+    Examples
+    --------
+    >>> values = np.sin(np.arange(1e5) / 9e3)
+    >>> values[31_415] = 7.0
+    >>> rows = cloud(values, 2000)
+    >>> 2000 <= len(rows) <= 3200, bool(values[rows].max() == 7.0), len(cloud(values[:50]))
+    (True, True, 50)
+    """
+    if len(values) <= limit:
+        return np.arange(len(values))
+    return np.union1d(spread_out(len(values), limit), keep_extremes([values], 1200))  # an extreme in every two pixels
+
+
+def dots(ax: Axes, at: FloatArray, values: FloatArray, size: float = 2.0, **options: Any) -> None:
+    """A cloud of points, thinned and rasterised.
+
+    Parameters
+    ----------
+    ax : Axes
+    at, values : (n,)
+    size : float
+        Of a dot.
+    options
+        Of :meth:`matplotlib.axes.Axes.plot`.
+    """
+    rows = cloud(values)
+    options = {"marker": ".", **options}
+    ax.plot(at[rows], values[rows], linestyle="none", markersize=size, rasterized=True, **options)
+
+
+def runs(mask: BoolArray) -> list[tuple[int, int]]:
+    """Stretches of True as (first, last) indices, both inside.
+
+    Examples
+    --------
+    >>> runs(np.array([True, False, True, True]))
+    [(0, 0), (2, 3)]
+    """
+    # zeros at both ends: a stretch that begins or ends with the flight has its edges, too
+    edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
+    return list(zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True))
+
+
+def lonely(level: FloatArray) -> BoolArray:
+    """Finite samples whose neighbours are both missing.
+
+    Examples
+    --------
+    >>> lonely(np.array([1.0, np.nan, 2.0, 3.0, np.nan])).tolist()
+    [True, False, False, False, False]
+    """
+    good = np.isfinite(level)
+    neighboured = np.zeros(len(good), dtype=bool)
+    neighboured[1:] |= good[:-1]
+    neighboured[:-1] |= good[1:]
+    return np.asarray(good & ~neighboured)
+
+
+def draw_out_of_coverage(
+    ax: Axes, seconds: FloatArray, mask: BoolArray, label: str, *, height: float = 1.0, hatch: str = "////"
+) -> None:
+    """Hatched spans, marked Z where there is room, over a share of the height of the axes.
+
+    Parameters
+    ----------
+    ax : Axes
+    seconds : (n,)
+        Times of the samples.
+    mask : (n,) bool
+        Samples out of coverage.
+    label : str
+        For the legend.
+    height : float
+        Share of the height of the axes, from below.
+    hatch : str
+        Of matplotlib.
+    """
+    if not mask.any():
+        return
+    # a sample stands for half a step to each side: one lost sample alone would have no width
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    spans = [(seconds[a] - step / 2, seconds[b] - seconds[a] + step) for a, b in _apart(runs(mask), seconds)]
+    bars = ax.broken_barh(
+        spans, (0.0, height), transform=ax.get_xaxis_transform(), facecolor="#EEEEEE", edgecolor="#888888",
+        hatch=hatch, linewidth=0.0, label=label, zorder=0.5 if height == 1.0 else 4.0,
+    )  # fmt: skip
+    bars.set_rasterized(len(spans) > 300)
+    duration = max(float(seconds[-1] - seconds[0]), step)
+    for begin, width in spans:
+        if width > 0.015 * duration and height == 1.0:
+            ax.text(
+                begin + width / 2, 0.93, "Z", transform=ax.get_xaxis_transform(), ha="center", va="center", zorder=6,
+                fontweight="bold", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+            )  # fmt: skip
+
+
+# More spans than this are joined where no eye could part them.
+_SPANS = 2000
+
+
+def _apart(spans: list[tuple[int, int]], seconds: FloatArray) -> list[tuple[int, int]]:
+    """Spans with those joined that are nearer than a pixel, where there are very many."""
+    if len(spans) <= _SPANS:
+        return spans
+    least = float(seconds[-1] - seconds[0]) / _SPANS
+    joined = [spans[0]]
+    for first, last in spans[1:]:
+        if seconds[first] - seconds[joined[-1][1]] < least:
+            joined[-1] = (joined[-1][0], last)
+        else:
+            joined.append((first, last))
+    return joined
+
+
+def draw_waypoints(
+    ax: Axes, waypoints: Iterable[tuple[str, np.datetime64]], start: np.datetime64, *, names: bool = True
+) -> None:
+    """Vertical lines at the named moments of the flight.
+
+    Parameters
+    ----------
+    ax : Axes
+        Its x axis is seconds.
+    waypoints : iterable of (str, datetime64)
+        Label and instant of each.
+    start : datetime64
+        Where its seconds begin.
+    names : bool
+        Write the labels, too.
+    """
+    for number, (label, time) in enumerate(waypoints):
+        at = float((time - start) / np.timedelta64(1, "s"))
+        ax.axvline(at, color=WAYPOINT, linewidth=0.8, linestyle=(0, (2, 2)), label="waypoint" if number == 0 else None)
+        if names:
+            ax.annotate(
+                label, (at, 1.0), xycoords=ax.get_xaxis_transform(), xytext=(0, 2),
+                textcoords="offset points", ha="center", va="bottom", fontsize=8, color=WAYPOINT,
+            )  # fmt: skip
+
+
+def legend_below(ax: Axes, columns: int = 4) -> None:
+    """A legend under the axes, where it hides no data."""
+    handles, labels = ax.get_legend_handles_labels()
+    if handles:
+        ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
+
+
+# --- site ---------------------------------------------------------------------------------------
+
+
+def draw_credit(ax: Axes, site: Site) -> None:
+    """Name whose map is drawn, in small type in a corner: in lines, as panels beside each other may be narrow."""
+    if site.credit:
+        ax.text(
+            0.995, 0.005, textwrap.fill(site.credit, 20), transform=ax.transAxes, ha="right", va="bottom", fontsize=5,
+            color="#444444", zorder=7, gid="credit",
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.6, "pad": 0.6},
+        )  # fmt: skip
+
+
+def draw_site(ax: Axes, site: Site) -> None:
+    """Forests, trees, buildings, geofences and towers on a plan (east, north) [m].
+
+    Parameters
+    ----------
+    ax : Axes
+    site : Site
+    """
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    draw_credit(ax, site)
+    if not site.mapped:
+        ax.text(0.5, 0.02, "no map here", transform=ax.transAxes, ha="center", color="#777777", fontsize=8, zorder=7)
+    areas: dict[str, tuple[list[Any], dict[str, Any]]] = {
+        "forest": ([forest.area for forest in site.forests],
+                   {"facecolor": _FOREST, "edgecolor": "#7FA873", "hatch": "..", "linewidth": 0.6, "alpha": 0.7,
+                    "zorder": 0.3}),
+        "building": ([building.footprint for building in drawn_buildings(site)],
+                     {"facecolor": _BUILDING, "edgecolor": "black", "linewidth": 0.7, "zorder": 0.6}),
+        "geofence": ([fence.area for fence in site.geofences],
+                     {"facecolor": "none", "edgecolor": "#333333", "linestyle": (0, (4, 3)), "linewidth": 0.9,
+                      "zorder": 0.6}),
+    }  # fmt: skip
+    for label, (polygons, look) in areas.items():
+        for number, polygon in enumerate(polygons):
+            # one path of all rings, so that holes stay empty
+            rings = [np.asarray(ring.coords)[:, :2] for ring in (polygon.exterior, *polygon.interiors)]
+            outline = Outline.make_compound_path(*(Outline(ring, closed=True) for ring in rings))
+            ax.add_patch(PathPatch(outline, **look, label=label if number == 0 else None))
+    if len(site.trees):
+        _draw_crowns(ax, site.trees)
+    for number, tower in enumerate(site.towers.values()):
+        draw_tower(ax, tower, markeredgecolor="black", label="tower" if number == 0 else None)
+        ax.annotate(
+            tower.name, (tower.east_m, tower.north_m), xytext=(6, 4), textcoords="offset points", zorder=6,
+            fontsize=8, fontweight="bold", annotation_clip=True,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
+        )  # fmt: skip
+    plan_axes(ax)
+
+
+def draw_tower(ax: Axes, tower: Tower, **look: Any) -> None:
+    """The mark of a tower on a plan."""
+    look = {"marker": "^", "markersize": 9, "color": TOWER, "markeredgecolor": "white", "zorder": 5, **look}
+    ax.plot(tower.east_m, tower.north_m, linestyle="none", **look)
+
+
+def _draw_crowns(ax: Axes, trees: Trees) -> None:
+    """Crowns to scale, each with a dot where the trunk stands."""
+    from matplotlib.collections import EllipseCollection
+
+    wide, places = trees.crown_diameter_m, np.column_stack([trees.east_m, trees.north_m])
+    crowns = EllipseCollection(
+        wide, wide, np.zeros(len(trees)), units="xy", offsets=places, offset_transform=ax.transData,
+        facecolor="#5E8C4F", alpha=0.45, linewidth=0, zorder=0.4,
+    )  # fmt: skip
+    crowns.set_rasterized(True)
+    ax.add_collection(crowns, autolim=False)
+    ax.scatter(trees.east_m, trees.north_m, s=1.5, color="#2F5A25", linewidths=0, rasterized=True, zorder=0.45)
+    ax.plot([], [], marker="o", markersize=6, color="#5E8C4F", alpha=0.6, linestyle="none", label="tree")
+
+
+def plan_axes(ax: Axes) -> None:
+    """Labels and equal scale of a plan."""
+    ax.set_aspect("equal", adjustable="box")
+    ax.set(xlabel="East of the site origin [m]", ylabel="North of the site origin [m]")
+
+
+def frame_around(
+    ax: Axes, east: FloatArray, north: FloatArray, *, margin: float = 0.08, least_m: float = 60.0, shape: float = 1.0
+) -> None:
+    """Limits of a plan around points, with a margin and a least extent [m]; ``shape`` is width over height.
+
+    Parameters
+    ----------
+    ax : Axes
+    east, north : (n,)
+        Points [m]; NaN does not count.
+    margin : float
+        Share of the extent on each side.
+    least_m : float
+        Least width and height.
+    shape : float
+        Width over height of the plan.
+    """
+    from matplotlib.text import Annotation
+
+    good = np.isfinite(east) & np.isfinite(north)
+    if not good.any():
+        return
+    east, north = east[good], north[good]
+    width = max(float(np.ptp(east)) * (1 + 2 * margin), least_m)
+    height = max(float(np.ptp(north)) * (1 + 2 * margin), least_m)
+    # equal scales: what one axis needs, the other gets in proportion
+    width, height = max(width, height * shape), max(height, width / shape)
+    middle_east, middle_north = (east.min() + east.max()) / 2, (north.min() + north.max()) / 2
+    ax.set_xlim(middle_east - width / 2, middle_east + width / 2)
+    ax.set_ylim(middle_north - height / 2, middle_north + height / 2)
+    for name in (text for text in ax.texts if isinstance(text, Annotation)):
+        # names stand right of and above their towers, and would hang over these two edges
+        if name.xy[0] > middle_east + width / 4:
+            name.set(x=-6, ha="right")
+        if name.xy[1] > middle_north + 0.4 * height:
+            name.set(y=-4, va="top")
+        if name.xy[0] > middle_east and name.xy[1] < middle_north - 0.4 * height:
+            # the map's credit stands in that corner
+            for credit in (text for text in ax.texts if text.get_gid() == "credit"):
+                credit.set(x=0.005, ha="left")
+
+
+def plan_shape(east: FloatArray, north: FloatArray) -> float:
+    """Width over height of the area that points cover, kept between 0.8 and 2."""
+    good = np.isfinite(east) & np.isfinite(north)
+    if not good.any():
+        return 1.0
+    return float(np.clip((np.ptp(east[good]) + 60.0) / (np.ptp(north[good]) + 60.0), 0.8, 2.0))
+
+
+def beyond(values: FloatArray, low: float, high: float) -> str:
+    """Ends of a colour scale from ``low`` to ``high`` that values pass: its colours mean "or more" there.
+
+    Examples
+    --------
+    >>> beyond(np.array([1.0, 9.0]), 0.0, 5.0), beyond(np.array([1.0, np.nan]), 0.0, 5.0)
+    ('max', 'neither')
+    """
+    under, over = bool(np.nanmin(values, initial=np.inf) < low), bool(np.nanmax(values, initial=-np.inf) > high)
+    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((under, over), "neither")
+
+
+def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither", cax: Any = None) -> Any:
+    """A colour bar that an SVG holds as one picture, without seams; with arrows where values lie beyond.
+
+    Parameters
+    ----------
+    fig : Figure
+    mappable : ScalarMappable
+        What the colours stand for.
+    ax : Axes or sequence of Axes
+        Beside which it stands.
+    label : str
+    extend : {"neither", "min", "max", "both"}
+        Ends beyond which values lie.
+    cax : Axes, optional
+        The bar's own, of a figure that is :func:`placed`.
+
+    Returns
+    -------
+    matplotlib.colorbar.Colorbar
+    """
+    bar = fig.colorbar(mappable, cax=cax, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
+    if bar.solids is not None:
+        bar.solids.set_rasterized(True)
+        bar.solids.set_edgecolor("face")
+    return bar
+
+
+def legend_of(ax: Axes, shown: Callable[[str], bool]) -> tuple[list[Any], list[str]]:
+    """Handles and labels of the legend entries that a rule wants."""
+    pairs = [(handle, label) for handle, label in zip(*ax.get_legend_handles_labels(), strict=True) if shown(label)]
+    return [handle for handle, _ in pairs], [label for _, label in pairs]
+
+
+def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None = None) -> None:
+    """Ordinate limits that a few two-ray nulls cannot stretch: the 0.2 to 99.8 % range and a margin."""
+    values = np.concatenate([level[np.isfinite(level)] for level in levels])
+    if not len(values):
+        ax.set_ylim(-1.0, 1.0)
+        return
+    low, high = np.percentile(values, [0.2, 99.8])
+    if around is not None:
+        reach = max(abs(low - around), abs(high - around), 1.0)
+        low, high = around - reach, around + reach
+    margin = max(0.08 * (high - low), 0.5)
+    ax.set_ylim(low - margin, high + margin)

@@ -1,0 +1,355 @@
+"""Channel along a route as files: NetCDF, arrays for Sionna, a DeepMIMO scenario, MATLAB, a table for an emulator."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pandas as pd
+
+from ..common.cf import Dataset, GrowingNetcdf, file_attributes
+from ..common.jsonable import named
+from ..common.provenance import KEY
+from ..common.stages import Stages
+from ..common.units import AnyArray, FloatArray
+from ..common.versions import tool_version
+from ..propagation.drivers.parts import added_up
+from ..propagation.geometry.arrays import Poses
+from ..propagation.path_table import PathTable, frequency_responses, impulse_responses
+from ..propagation.replay import Replay
+
+_LINK, _PORTS = ("pose", "tower"), ("rx", "tx")
+_PATH = ("path", *_LINK)
+_SITE, _ARRAY = "site frame, azimuth from east, counter-clockwise", "array frame, from the boresight, counter-clockwise"
+# Dimensions along which the file grows, pose by pose or with the link that has most paths.
+_GROWS = ("pose", "path", "faces_of_a_path", "face_names_length")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Along:
+    """Poses of the UAV at equal steps of a flight or a route.
+
+    Parameters
+    ----------
+    name : str
+    poses : Poses
+    time_s : (poses,)
+        Since ``start``.
+    start : datetime64, optional
+        UTC; None of a route that was not flown.
+    towers_m : (poses, 3), optional
+        Places of a tower that moves.
+    velocity_mps, tower_mps : (poses, 3), optional
+        Of the UAV where the times say it, and of a tower that moves.
+    remarks : tuple of str
+    """
+
+    name: str
+    poses: Poses
+    time_s: FloatArray
+    start: Any = None
+    towers_m: FloatArray | None = None
+    velocity_mps: FloatArray | None = None
+    tower_mps: FloatArray | None = None
+    remarks: tuple[str, ...] = ()
+
+    def part(self, rows: slice) -> Along:
+        """Some of the poses."""
+        arrays = named(self, "time_s towers_m velocity_mps tower_mps")
+        some: Any = {name: None if values is None else values[rows] for name, values in arrays.items()}
+        return replace(self, poses=self.poses[rows], **some)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Channel:
+    """Channel of towers along a route.
+
+    Parameters
+    ----------
+    along : Along
+    link : str
+        Which link of the flight file.
+    replay : Replay
+    table : PathTable
+    summed : {"coherent", "power"}
+        How the level of a link adds up its paths.
+    level_db, level_sd_db : (poses, towers), optional
+        Calibrated level and its standard deviation, in the unit of the log.
+    level_unit : str
+    trained_on : tuple of str
+        SHA-256 of the logs that taught the level.
+    offsets_hz : (subcarriers,), optional
+        Of the frequency response.
+    """
+
+    along: Along
+    link: str
+    replay: Replay
+    table: PathTable
+    summed: Literal["coherent", "power"] = "power"
+    level_db: FloatArray | None = None
+    level_sd_db: FloatArray | None = None
+    level_unit: str = ""
+    trained_on: tuple[str, ...] = ()
+    offsets_hz: FloatArray | None = None
+
+    @property
+    def carrier_hz(self) -> float:
+        """Carrier of the link."""
+        return self.replay.ends.link.carrier_hz
+
+    @property
+    def doppler_hz(self) -> FloatArray | None:
+        """Doppler shift (paths,); None without a velocity."""
+        own, other = self.along.velocity_mps, self.along.tower_mps
+        return None if own is None else self.table.doppler_hz(self.carrier_hz, own, 0.0 if other is None else other)
+
+    @property
+    def warnings(self) -> list[str]:
+        """Sentences on what the numbers lack."""
+        return [*self.along.remarks, *self.replay.left_out]
+
+    def by_link(self, values: AnyArray | None, fill: Any = np.nan) -> Any:
+        """Values per path (paths, ...) as (most paths of a link, poses, towers, ...); None of None."""
+        return None if values is None else self.table.by_link(values, self.replay.ends, fill)
+
+
+def channel_dataset(channel: Channel) -> Dataset:
+    """The channel as variables: paths by (path, pose, tower), H and levels by (pose, tower)."""
+    variables: dict[str, Any] = {}
+    for name, values, dimensions, *about in _quantities(channel):
+        if values is not None:
+            variables |= _variables(name, values, dimensions, *about)
+    link, kinds = channel.replay.ends.link, channel.table.kinds
+    written = file_attributes(
+        title=f"Channel along {channel.along.name}, link {channel.link}",
+        source="ray tracing along a flight",
+        comment=" ".join(channel.warnings),
+    )
+    ends = {"transmitter": "UAV" if link.uav_transmits else "tower", "trained_on": " ".join(channel.trained_on)}
+    data = Dataset(variables, {**written, **named(link, "carrier_hz transmit_power_dbm"), **ends})
+    described = {name: variable.attrs for name, variable in data.variables.items()}
+    described["kind"] |= {"flag_values": np.arange(len(kinds), dtype=np.int8), "flag_meanings": " ".join(kinds)}
+    if channel.along.start is not None:
+        start = str(channel.along.start).replace("T", " ")
+        described["time"] |= {"long_name": f"since {start} UTC", "units": f"seconds since {start[:19]} UTC"}
+    if channel.level_db is not None:
+        described["level_db"]["comment"] = f"unit: {channel.level_unit}"
+    return data
+
+
+def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[str, ...], str, str]]:
+    """Name, values, dimensions, unit and meaning of each quantity of a file; values are None where it has none."""
+    table, replay, of, sd = channel.table, channel.replay, channel.by_link, channel.level_sd_db
+    ends, ports, offsets, speed = replay.ends, (*_LINK, *_PORTS), channel.offsets_hz, channel.along.velocity_mps
+    cfr = None if offsets is None else frequency_responses(table, ends, offsets)
+    yield "gain", of(table.gain, 0.0), (*_PATH, *_PORTS), "1", _GAIN
+    yield "kind", of(table.kind.astype(np.int8), -1), _PATH, "", "kind of the path"
+    yield "faces", of(table.via.astype(np.int32), -1), _PATH, "", "row of face_names"
+    faces = np.array(table.names, dtype=object)
+    yield "face_names", faces, ("faces_of_a_path",), "", "faces that a path touches, from tower to UAV"
+    yield "h", replay.h, ports, "1", "channel matrix: sum of the gains over the paths"
+    yield "tower_name", np.array(replay.towers, dtype=object), ("tower",), "", "name of the tower"
+    yield "delay_s", of(table.delay_s), _PATH, "s", "delay between the array centres"
+    doppler = "Doppler shift, positive while the path gets shorter"
+    yield "doppler_hz", of(channel.doppler_hz), _PATH, "Hz", doppler
+    for name, values in table.angles_deg(ends).items():
+        angle, end, *array, _ = name.split("_")
+        meaning = f"{angle} towards the path at its {end}: {_ARRAY if array else _SITE}"
+        yield name, of(values), _PATH, "degree", meaning
+    yield "level_db", channel.level_db, _LINK, "1", "level that the receiver would log, of antennas that flights taught"
+    yield "level_sd_db", sd, _LINK, "1", "standard deviation of level_db [dB], larger where no flight taught"
+    yield "cfr", cfr, (*ports, "subcarrier"), "1", "channel matrix at the subcarriers"
+    yield "subcarrier_hz", offsets, ("subcarrier",), "Hz", "offset of a subcarrier from the carrier"
+    yield "time", channel.along.time_s, ("pose",), "s", "since the start of the route"
+    sources, along = (ends.sources_m[:, 0], "pose") if ends.moving else (ends.sources_m, "tower")
+    for i, name in enumerate(("east", "north", "up")):
+        yield f"{name}_m", ends.poses.position_m[:, i], ("pose",), "m", f"{name} of the site origin, UAV"
+        yield f"tower_{name}_m", sources[:, i], (along,), "m", f"{name} of the site origin, tower"
+        velocity = None if speed is None else speed[:, i]
+        yield f"velocity_{name}_mps", velocity, ("pose",), "m s-1", f"velocity {name}, UAV"
+
+
+_GAIN = "gain of a path at the carrier, its phase included; 0 without a path"
+
+
+def _variables(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: str, meaning: str) -> dict[str, Any]:
+    """A variable as ``xarray`` takes it, by name; two of complex numbers."""
+    about = {"long_name": meaning, **({"units": unit} if unit else {})}
+    if np.iscomplexobj(values):
+        # digits of a phase do not deflate: level 1 takes out the zeros alone
+        encoding = {"complevel": 1, **({"_FillValue": 0.0} if name == "gain" else {})}
+        halves = (("real", values.real), ("imag", values.imag))
+        return {
+            f"{name}_{part}": (dimensions, half, about | {"long_name": f"{meaning} ({part})"}, encoding)
+            for part, half in halves
+        }
+    missing: Any = {"i": values.dtype.type(-1), "f": np.nan}.get(values.dtype.kind)
+    of_links = dimensions[: len(_PATH)] == _PATH or dimensions == _LINK
+    return {name: (dimensions, values, about, {"_FillValue": missing} if of_links else {})}
+
+
+# --- files ---------------------------------------------------------------------------------------------------------
+
+
+def write_channel(
+    parts: Iterable[Channel], folder: Path, formats: Sequence[str], stages: Stages
+) -> tuple[list[Path], dict[str, Any]]:
+    """Write parts of a channel that follow each other, each as it comes.
+
+    Parameters
+    ----------
+    parts : iterable of Channel
+        One alone where a format is not of :data:`STREAMED`.
+    folder : Path
+    formats : sequence of str
+        Of :data:`FORMATS`.
+    stages : Stages
+        Times "write".
+
+    Returns
+    -------
+    list of Path
+        The file to open of each format.
+    dict
+        What was written, for ``--json``.
+    """
+    poses, paths, omitted = 0, 0, list[Any]()
+    with ExitStack() as stack:
+        writers = [_WRITERS.get(name) or stack.enter_context(_netcdf(folder)) for name in formats]
+        for channel in parts:
+            poses, paths = poses + len(channel.along.time_s), paths + len(channel.table.pose)
+            omitted = added_up([*omitted, *channel.replay.omitted])
+            latest = replace(channel, replay=replace(channel.replay, omitted=omitted))
+            with stages("write"):
+                files = [write(latest, folder) for write in writers]
+    return files, {
+        "flight": latest.along.name,
+        **named(latest, "link carrier_hz"),
+        "towers": list(latest.replay.towers),
+        "poses": poses,
+        "paths": paths,
+        "has_doppler": latest.along.velocity_mps is not None,
+        "has_level": latest.level_db is not None,
+        KEY: list(latest.trained_on),
+        "warnings": latest.warnings,
+    }
+
+
+@contextmanager
+def _netcdf(folder: Path) -> Any:
+    with GrowingNetcdf(folder / "channel.nc", _GROWS) as book:
+
+        def write(channel: Channel, folder: Path) -> Path:
+            data = channel_dataset(channel)
+            book.append(data)
+            book.describe(comment=data.attrs["comment"])  # of all parts so far
+            return folder / "channel.nc"
+
+        yield write
+
+
+def _arrays(channel: Channel) -> dict[str, Any]:
+    """Gains and delays in Sionna's axis order, and what they belong to."""
+    a, tau = impulse_responses(channel.table, channel.replay.ends)
+    arrays = {
+        "a": a,
+        "tau": tau,
+        "h": channel.replay.h,
+        "time_s": channel.along.time_s,
+        "position_m": channel.replay.ends.poses.position_m,
+        "towers": np.array(channel.replay.towers),
+        "carrier_hz": channel.carrier_hz,
+        "doppler_hz": channel.by_link(channel.doppler_hz),
+        **named(channel, "level_db level_sd_db"),
+    }
+    return {name: values for name, values in arrays.items() if values is not None}
+
+
+def _write_npz(channel: Channel, folder: Path) -> Path:
+    np.savez(folder / "channel.npz", **_arrays(channel))
+    return folder / "channel.npz"
+
+
+def _write_mat(channel: Channel, folder: Path) -> Path:
+    from scipy.io import savemat
+
+    savemat(folder / "channel.mat", _arrays(channel), do_compression=True, oned_as="column")
+    return folder / "channel.mat"
+
+
+def _write_csv(channel: Channel, folder: Path) -> Path:
+    """A row per instant and tower: the level of the link, delay and Doppler shift of its strongest path."""
+    path, table, (poses, towers) = folder / "channel.csv", channel.table, channel.replay.has_path.shape
+    # the strongest path of a link comes last, the first of equals
+    order = np.argsort(-(np.abs(table.gain) ** 2).mean(axis=(1, 2)), kind="stable")[::-1]
+    strongest = np.full((poses, towers), -1)
+    strongest[table.pose[order], table.tower[order]] = order
+    time: AnyArray = channel.along.time_s
+    if channel.along.start is not None:
+        instants = channel.along.start + np.round(channel.along.time_s * 1e9).astype("timedelta64[ns]")
+        time = np.char.add(np.datetime_as_string(instants, unit="ms"), "Z")
+    gain_db = channel.replay.level_dbm(channel.summed) - channel.replay.ends.link.transmit_power_dbm
+    shown: dict[str, Any] = {"time": np.repeat(time, towers), "tower": np.tile(channel.replay.towers, poses)}
+    shown["gain_db"] = gain_db.ravel().round(3)
+    for name, values in (("delay_s", table.delay_s), ("doppler_hz", channel.doppler_hz)):
+        # row -1, of no path, is the appended one
+        shown[name] = np.nan if values is None else np.append(values, np.nan)[strongest].ravel()
+    # parts follow each other in one file, which the first one begins
+    pd.DataFrame(shown).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
+    return path
+
+
+def _write_deepmimo(channel: Channel, folder: Path) -> Path:
+    """A scenario of DeepMIMO 4: towers transmit to the poses, first port to first port, elevations from the zenith."""
+    table, ends, link = channel.table, channel.replay.ends, channel.replay.ends.link
+    scenario = folder / "deepmimo" / (re.sub(r"[^a-z0-9]+", "_", channel.along.name.lower()).strip("_") or "flight")
+    scenario.mkdir(parents=True)
+    gain = table.gain[:, 0, 0]
+    angles = table.angles_deg(ends)
+    leave, arrive = ("arrival", "departure") if link.uav_transmits else ("departure", "arrival")
+    with np.errstate(divide="ignore"):
+        columns = {"power": 20.0 * np.log10(np.abs(gain)), "phase": np.degrees(np.angle(gain)), "delay": table.delay_s}
+    for name, end in (("aod", leave), ("aoa", arrive)):
+        columns[f"{name}_az"] = angles[f"azimuth_{end}_deg"]
+        columns[f"{name}_el"] = 90.0 - angles[f"elevation_{end}_deg"]
+    columns |= {"inter": table.turns.astype(np.float64), "inter_pos": table.vertices_m}
+    by_link = {name: channel.by_link(values).swapaxes(0, 1) for name, values in columns.items()}
+    sources = np.nanmedian(ends.sources_m, axis=0) if ends.moving else ends.sources_m
+    for number in range(len(channel.replay.towers)):
+        arrays = {name: values[:, :, number] for name, values in by_link.items()}
+        arrays |= {"rx_pos": ends.poses.position_m, "tx_pos": sources[number : number + 1]}
+        for name, values in arrays.items():
+            np.savez_compressed(scenario / f"{name}_t000_tx{number:03}_r001.npz", **{name: values})
+    covered = int(channel.replay.has_path.any(axis=1).sum())
+    about = _deepmimo_parameters(channel, {"tx": (len(sources), len(sources)), "rx": (len(ends.poses), covered)})
+    for name, content in (("params", about), ("objects", [])):
+        (scenario / f"{name}.json").write_text(json.dumps(content, indent=1), encoding="utf-8")
+    np.savez_compressed(scenario / "vertices.npz", vertices=np.zeros((0, 3)))
+    return scenario / "params.json"
+
+
+def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]) -> dict[str, Any]:
+    """Content of params.json that the loader asks for; all else of its device sets has its defaults."""
+    sets = {
+        f"txrx_set_{number}": {"name": name, "id": number, f"is_{name}": True, "num_points": every,
+                               "num_active_points": active, f"is_{'rx' if name == 'tx' else 'tx'}": False}
+        for number, (name, (every, active)) in enumerate(points.items())
+    }  # fmt: skip
+    rays = {"raytracer_name": "aerpaw-cmp", "raytracer_version": tool_version(), "frequency": channel.carrier_hz}
+    rays |= {"max_reflections": channel.table.vertices_m.shape[1], "max_diffractions": 1}
+    return {"version": "4.0", "rt_params": rays, "scene": {"num_scenes": 1}, "materials": {}, "txrx_sets": sets}
+
+
+# Writers of a part by the name of their format; each gives the file to open. A NetCDF file grows.
+_WRITERS = {"npz": _write_npz, "deepmimo": _write_deepmimo, "mat": _write_mat, "csv": _write_csv}
+FORMATS = ("netcdf", *_WRITERS)
+
+# Those that take a channel part by part; the others are held in memory.
+STREAMED = {"netcdf", "csv"}

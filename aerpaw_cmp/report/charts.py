@@ -1,0 +1,250 @@
+"""Charts that the script of a page draws: marks over two axes, arrays beside plain values; a table of cells.
+
+A mark is a ``band`` (x, low, high), a ``line`` (x, y) or ``dots`` (x, y, and whiskers low to high). ``rows`` are names
+in place of an ordinate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.kml import CLASS_COLOURS
+from ..common.units import AnyArray
+from ..compare.judge.ladder import LadderRow, ModelCost, costs
+from ..compare.level.detection import DetectionScore
+from ..compare.level.serving import ServingComparison
+from ..compare.result import RankResult
+from ..logs.records import has_wall_clock
+from .canvas import placed, seconds_since
+from .flight_data import RANKS, ReportData, start_of
+from .flight_words import learned_on
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from .against import AgainstSeries
+
+
+# Means of a forecast along the flight: as many as a page can show.
+_FORECAST_COLUMNS = 600
+
+# Curves of a figure are told apart in grey, too.
+_LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
+COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chart:
+    """A chart of a page: its section, its words, and what the script draws."""
+
+    section: str
+    title: str
+    caption: str
+    content: Mapping[str, Any]
+
+
+def drawn(panels: Mapping[str, Mapping[str, Any]]) -> Figure:
+    """Charts of one kind by their titles as a figure, at most three in a row."""
+    columns = min(len(panels), 3)
+    rows = -(-len(panels) // columns)
+    fig, axes = placed((9.2, 0.6 + 3.2 * rows), rows, columns, gap_in=(0.7, 0.8))
+    for ax in axes.flat[len(panels) :]:
+        ax.set_visible(False)
+    for ax, (title, content) in zip(axes.flat, panels.items(), strict=False):
+        for number, mark in enumerate(content["marks"]):
+            look = {"color": mark.get("colour", COLOURS[number % len(COLOURS)]), "label": mark["name"]}
+            if mark["kind"] == "band":
+                ax.fill_between(mark["x"], mark["low"], mark["high"], linewidth=0, **look)
+            elif mark["kind"] == "line":
+                ax.plot(mark["x"], mark["y"], linestyle=_LINES[number % len(_LINES)], linewidth=1.3, **look)
+            else:
+                ax.plot(mark["x"], mark["y"], linestyle="none", marker="o", markersize=4, **look)
+        ax.set(title=title, xlabel=content["x"]["label"], ylabel=content["y"]["label"])
+        ax.set_ylim(*content["y"].get("ends", ax.get_ylim()))
+    curves = [ax.get_legend_handles_labels() for ax in axes.flat[: len(panels)]]
+    if all(names == curves[0][1] for _, names in curves):
+        fig.legend(*curves[0], loc="lower center", ncols=6)
+    else:
+        for ax in axes.flat[: len(panels)]:
+            ax.legend(loc="best", fontsize=7.5)
+    return fig
+
+
+def charts_of(data: ReportData) -> list[Chart]:
+    """Every chart that the data allow, in reading order."""
+    charts = []
+    for panel in data.rss:
+        score = panel.further.detection
+        if score is not None and score.reliability:
+            charts.append(Chart(
+                section=f"rss/{panel.tower}/{panel.channel}",
+                title=f"{panel.name}: is the probability of detection calibrated?",
+                caption="Fifths of the predicted probability against the share that the receiver detected; on the line "
+                f"the forecast is calibrated. Brier score {score.brier:.3f}, this flight's own share "
+                f"{score.constant_brier:.3f}; log score {score.log_score:.3f}, own share "
+                f"{score.constant_log_score:.3f} ({learned_on(score)}).",
+                content=_detection(score),
+            ))  # fmt: skip
+    if any(np.isfinite(row.rmse_heldout_db) for row in data.ladder):
+        charts.append(Chart(
+            section="ladder", title="Models from the simplest to the richest",
+            caption="RMSE on held-out segments. Whiskers: 95 % interval of the difference to the best model on the "
+            "same samples.",
+            content=_ladder(data.ladder),
+        ))  # fmt: skip
+        charts.append(Chart(
+            section="ladder", title="What does accuracy cost?",
+            caption="RMSE over all series against the seconds of the whole flight. Knee: the fastest model that no "
+            "series tells from the best.",
+            content=_costs(costs(data.ladder)),
+        ))  # fmt: skip
+    charts += [
+        Chart(
+            section="forecast", title=f"{rank.tower}: rank forecast along the flight",
+            caption="Probability of each rank by the fitted receiver (means).", content=_forecast(data, rank),
+        )
+        for rank in data.rank if rank.probability is not None
+    ]  # fmt: skip
+    charts += [
+        Chart(
+            section="against", title=f"{series.name}: predicted before this flight",
+            caption="Band: 90 % interval of one sample as it was predicted. Nothing of this flight was used.",
+            content=_predicted(series),
+        )
+        for series in (data.against.series if data.against is not None else ())
+    ]  # fmt: skip
+    return charts
+
+
+def _ladder(rows: Sequence[LadderRow]) -> dict[str, Any]:
+    """RMSE of each model on held-out segments, dots of one colour per tower and channel."""
+    models = list(dict.fromkeys(row.model for row in rows))
+    channels: dict[str, list[LadderRow]] = {}
+    for row in rows:
+        if np.isfinite(row.rmse_heldout_db):
+            channels.setdefault(f"{row.tower} {row.channel}".strip(), []).append(row)
+    marks = [
+        {
+            "kind": "dots",
+            "name": name,
+            "x": np.array([row.rmse_heldout_db for row in of]),
+            "y": np.array([models.index(row.model) for row in of]) + 0.5 * ((number + 0.5) / len(channels) - 0.5),
+            "low": np.array([row.rmse_heldout_db - row.difference_to_best_db + row.difference_to_best_ci95_db[0]
+                             for row in of]),
+            "high": np.array([row.rmse_heldout_db - row.difference_to_best_db + row.difference_to_best_ci95_db[1]
+                              for row in of]),
+        }
+        for number, (name, of) in enumerate(channels.items())
+    ]  # fmt: skip
+    chosen = next((models.index(row.model) for row in rows if row.recommended), -1)
+    return {"rows": models, "chosen": chosen, "x": {"label": "RMSE on held-out segments [dB]"}, "marks": marks}
+
+
+def _costs(models: Sequence[ModelCost]) -> dict[str, Any]:
+    """A dot for each model."""
+    marks = [
+        {"kind": "dots", "name": f"{at.model} (knee)" if at.knee else at.model, "x": np.array([at.seconds]),
+         "y": np.array([at.rmse_heldout_db])}
+        for at in models
+    ]  # fmt: skip
+    return {"x": {"label": "Seconds"}, "y": {"label": "RMSE on held-out segments [dB]"}, "marks": marks}
+
+
+def _predicted(series: AgainstSeries) -> dict[str, Any]:
+    """Levels over time with the band that was predicted."""
+    return {
+        "x": _time_axis(series.start),
+        "y": {"label": "Level [dB]"},
+        "marks": [
+            {"kind": "band", "name": "90 %", "x": series.time_s, "low": series.low_db, "high": series.high_db},
+            {"kind": "dots", "name": "measured", "x": series.time_s, "y": series.measured_db},
+            {"kind": "line", "name": "predicted", "x": series.time_s, "y": series.level_db},
+        ],
+    }
+
+
+def _time_axis(start: np.datetime64 | None) -> dict[str, str]:
+    """Abscissa in seconds after an instant, None where it is not known."""
+    begun = "" if start is None else str(start.astype("datetime64[ms]"))
+    return {"label": "" if begun else "Time after the first sample [s]", "start": begun}
+
+
+def flown(data: ReportData) -> list[Chart]:
+    """Measured and simulated levels of every channel of a flight over time, for the page of a map."""
+    start, caption = start_of(data), "Ray tracing is drawn less the offset of the channel."
+    known = start if has_wall_clock(start) else None
+    return [
+        Chart(section="flights", title=f"{data.flight}, {panel.name}", caption=caption, content={
+            "x": _time_axis(known), "y": {"label": f"RSS [{panel.unit}]"},
+            "marks": [
+                {"kind": kind, "name": name, "x": seconds_since(panel.time, start), "y": level}
+                for kind, name, level in (("dots", "measured", panel.measured_db),
+                                          ("line", "ray tracing", panel.simulated_dbm - panel.score.offset_db))
+            ],
+        })
+        for panel in data.rss if panel.score.n
+    ]  # fmt: skip
+
+
+def _detection(score: DetectionScore) -> dict[str, Any]:
+    """Share of detected samples over the probability that the predicted level gave them."""
+    said, seen, _ = 100.0 * np.array(score.reliability, dtype=np.float64).T
+    ends = np.array([0.0, 100.0])
+    return {
+        "x": {"label": "Predicted probability of detection [%]", "ends": [0, 100]},
+        "y": {"label": "Detected samples [%]", "ends": [0, 100]},
+        "marks": [
+            {"kind": "dots", "name": "fifths of the samples", "x": said, "y": seen},
+            {"kind": "line", "name": "calibrated", "x": ends, "y": ends},
+        ],
+    }
+
+
+def _forecast(data: ReportData, panel: RankResult) -> dict[str, Any]:
+    """Probability of each rank along the flight, one band upon the other."""
+    assert panel.probability is not None
+    start = start_of(data)
+    seconds = seconds_since(panel.time, start)
+    known = np.isfinite(panel.probability).all(axis=1)
+    order = np.flatnonzero(known)[np.argsort(seconds[known], kind="stable")]
+    parts = [part for part in np.array_split(order, min(_FORECAST_COLUMNS, max(len(order), 1))) if len(part)]
+    at = np.array([seconds[part].mean() for part in parts])
+    means = np.array([panel.probability[part].mean(axis=0) for part in parts]).reshape(-1, len(RANKS))
+    edges = 100.0 * np.column_stack([np.zeros(len(at)), means.cumsum(axis=1)])
+    return {
+        "x": {"label": "", "start": str(start.astype("datetime64[ms]"))},
+        "y": {"label": "Probability [%]", "ends": [0, 100]},
+        "marks": [
+            {"kind": "band", "name": f"rank {rank}", "x": at, "low": edges[:, i], "high": edges[:, i + 1],
+             "colour": CLASS_COLOURS[rank]}
+            for i, rank in enumerate(RANKS)
+        ],
+    }  # fmt: skip
+
+
+# Cells with a row of their own; the others stand together.
+MOST_CELLS = 16
+OTHER = "others"
+
+
+def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple[list[str], AnyArray]:
+    """Names and counts (cells, cells + 1) of a matrix that can be read; the last column: no cell predicted.
+
+    Cells that neither served nor were predicted are left out. Of more than ``most``, those of fewest samples are added
+    up as "others"; that row and column meet in hits and misses alike, so their cell has no frame.
+    """
+    counts = np.asarray(serving.confusion)
+    weight = counts.sum(axis=1) + counts[:, :-1].sum(axis=0)
+    order = [int(i) for i in np.argsort(-weight, kind="stable") if weight[i] > 0]
+    first, few = sorted(order[:most]), sorted(order[most:])
+    names = [serving.cells[i] for i in first]
+    columns = np.column_stack([counts[:, first], counts[:, few].sum(axis=1)] if few else [counts[:, first]])
+    columns = np.column_stack([columns, counts[:, -1]])
+    table = columns[first]
+    if few:
+        table, names = np.vstack([table, columns[few].sum(axis=0)]), [*names, OTHER]
+    return names, table

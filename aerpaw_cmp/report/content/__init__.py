@@ -1,1 +1,0 @@
-"""Contents of pages as records; a file is named by its page."""

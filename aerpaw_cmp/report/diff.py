@@ -1,0 +1,191 @@
+"""diff.html and diff.json: changes between two reports of one flight, and the sentences that say what they mean."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..common.counting import counted
+from ..common.jsonable import fields_of, json_object
+from ..common.units import Printed
+from ..compare.judge.report_difference import LevelDifference, Overlap, RankDifference
+from ..compare.statistics.intervals import PairedDifference
+from .flight_words import count
+from .page import json_text, rendered, write_file
+
+# Differences up to this count as none: the tables hold four decimals, offsets one.
+TOLERANCE_DB = 0.01
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entry:
+    """A named value of either report; None where a report has no such entry."""
+
+    key: str
+    first: Any
+    second: Any
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputEntry:
+    """A file that either report was made from; ``what`` is added, removed or changed."""
+
+    role: str
+    path: str
+    what: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportSide:
+    """One of the two reports: where it was found, when made, by which version."""
+
+    folder: str
+    flight: str
+    generated: str
+    version: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportDiff:
+    """Two reports, ``first`` and ``second``; every difference is second minus first.
+
+    Parameters
+    ----------
+    settings, versions : tuple of Entry
+        Those that differ.
+    inputs : tuple of InputEntry
+        Those that differ.
+    levels, ranks : tuple
+        On common samples.
+    pooled : PairedDifference, optional
+        RMSE over all links.
+    links_first_only, links_second_only : tuple of str
+        Links that one report alone has.
+    remarks : tuple of str
+        What the comparison could not do, and what looks wrong.
+    """
+
+    first: ReportSide
+    second: ReportSide
+    settings: tuple[Entry, ...]
+    inputs: tuple[InputEntry, ...]
+    versions: tuple[Entry, ...]
+    levels: tuple[LevelDifference, ...]
+    ranks: tuple[RankDifference, ...]
+    pooled: PairedDifference | None
+    links_first_only: tuple[str, ...]
+    links_second_only: tuple[str, ...]
+    remarks: tuple[str, ...]
+
+    @property
+    def differences(self) -> tuple[str, ...]:
+        """Every way in which numbers differ beyond the tolerance, one clause each; empty: they do not."""
+        return tuple(_differences(self))
+
+
+def _differences(diff: ReportDiff) -> Iterator[str]:
+    for name, links in (("first", diff.links_first_only), ("second", diff.links_second_only)):
+        if links:
+            yield f"only the {name} report has {', '.join(links)}"
+    for level in diff.levels:
+        yield from (f"{level.tower} {level.channel}: {text}" for text in _level_clauses(level))
+    for rank in diff.ranks:
+        yield from (f"{rank.tower} K = {rank.k}: {text}" for text in _rank_clauses(rank))
+
+
+def _level_clauses(level: LevelDifference) -> Iterator[str]:
+    for what, value in (("measured", level.measured_max_db), ("replayed", level.simulated_max_db)):
+        if value > TOLERANCE_DB:
+            yield f"{what} level by up to {value:.3g} dB"
+    if abs(level.offset_db.difference) > TOLERANCE_DB:
+        yield f"offset by {Printed(level.offset_db.difference):+.3g} dB"
+    if abs(level.rmse.difference_db) > TOLERANCE_DB:
+        yield f"RMSE by {Printed(level.rmse.difference_db):+.3g} dB"
+    if level.samples.only_first or level.samples.only_second:
+        yield _alone(level.samples)
+    elif level.scored.first != level.scored.second or level.scored.common != level.scored.first:
+        yield f"{counted(level.scored.first, 'scored sample')} against {level.scored.second}"
+
+
+def _alone(samples: Overlap) -> str:
+    """Number of samples that are in one report alone, in words."""
+    sides = ((samples.only_first, "first"), (samples.only_second, "second"))
+    return ", ".join(f"{counted(n, 'sample')} only in the {name}" for n, name in sides if n)
+
+
+def _rank_clauses(rank: RankDifference) -> Iterator[str]:
+    if rank.n_changed:
+        yield f"{rank.n_changed} of {counted(rank.samples.common, 'simulated rank')}"
+    if rank.n_reported_changed:
+        yield f"{rank.n_reported_changed} of {counted(rank.samples.common, 'reported rank')}"
+    if rank.samples.only_first or rank.samples.only_second:
+        yield _alone(rank.samples)
+
+
+def diff_metrics(diff: ReportDiff) -> dict[str, Any]:
+    """Everything as plain JSON: verdict, differences, and the fields of the record."""
+    return json_object(
+        verdict=verdict(diff), differs=bool(diff.differences), differences=diff.differences, **fields_of(diff)
+    )
+
+
+def diff_page(diff: ReportDiff) -> str:
+    """The whole page."""
+    return rendered("diff", diff=diff, tolerance_db=TOLERANCE_DB, verdict=verdict(diff))
+
+
+def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:
+    """Write ``diff.html`` and ``diff.json``; gives the files, page first."""
+    numbers = json_text(diff_metrics(diff))
+    return [write_file(folder / "diff.html", diff_page(diff)), write_file(folder / "diff.json", numbers)]
+
+
+# Sentence on two reports, by the verdict of the paired interval. No other sentence of a diff says better or worse.
+DIFFERENCE = {
+    "better": "The second is significantly better: {difference:+.2f} dB {interval} (95 %).",
+    "worse": "The second is significantly worse: {difference:+.2f} dB {interval} (95 %).",
+    "not significant": "The difference of {difference:+.2f} dB {interval} is not significant (95 %).",
+    "no interval": "The difference is {difference:+.2f} dB; too few independent samples for an interval.",
+}
+
+# Differences that stand in the first sentence where RMSE agree.
+_NAMED = 2
+
+
+def verdict(diff: ReportDiff) -> str:
+    """The result in one or two sentences."""
+    changed = {"setting": len(diff.settings), "input": len(diff.inputs), "version": len(diff.versions)}
+    listed = ", ".join(counted(n, name) for name, n in changed.items() if n)
+    also = f" Changed: {listed}." if listed else " Settings, inputs and versions are the same."
+    if _site_alone(diff):
+        also = " The site differs, and nothing else."
+    if not diff.differences:
+        return f"No difference: the numbers agree within {TOLERANCE_DB:g} dB.{also}"
+    return _numbers(diff) + also
+
+
+def _site_alone(diff: ReportDiff) -> bool:
+    """Check whether all that changed is the site: its key of the flight file, that file, and its own."""
+    settings = [entry.key.split(".")[0] == "site" for entry in diff.settings]
+    inputs = [entry.role.startswith("site file") for entry in diff.inputs]
+    others = [entry for entry in diff.inputs if not entry.role.startswith(("site file", "flight file"))]
+    return any(settings + inputs) and all(settings) and not others and not diff.versions
+
+
+def _numbers(diff: ReportDiff) -> str:
+    """Sentence on the RMSE over all links; where those agree, the first differences."""
+    scored, pooled = [level for level in diff.levels if level.rmse.n], diff.pooled
+    if pooled is None or all(abs(item.rmse.difference_db) <= TOLERANCE_DB for item in scored):
+        more = len(diff.differences) - _NAMED
+        return "; ".join(diff.differences[:_NAMED]) + (f"; and {more} more." if more > 0 else ".")
+    common, most = (count(sum(getattr(item.samples, name) for item in scored)) for name in ("common", "first"))
+    low, high = pooled.difference_ci95_db
+    interval = f"[{Printed(low):+.2f}, {Printed(high):+.2f}]" if math.isfinite(low) else ""
+    return (
+        f"RSS over {common} common samples of {most}: RMSE {pooled.other_rmse_db:.2f} dB in the first, "
+        f"{pooled.rmse_db:.2f} dB in the second. "
+        + DIFFERENCE[pooled.verdict].format(difference=Printed(pooled.difference_db), interval=interval)
+    )

@@ -1,0 +1,173 @@
+"""The data of the linked views: what the page's script draws, as one block of packed arrays.
+
+Every number of the page's script comes from here; it computes only what a span or a switch changes (offset, RMSE,
+correlation and histograms of the chosen samples), by the same formulas as :mod:`aerpaw_cmp.compare`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from ..common.jsonable import named
+from ..common.units import BoolArray, IntArray, spread_out
+from ..compare.level.rss import PART_DB, RssComparison
+from ..compare.offset import STEP_DB
+from ..compare.result import ModelLevel, RankResult, RssResult
+from ..logs.records import has_wall_clock
+from .canvas import keep_extremes, seconds_since
+from .charts import Chart
+from .flight_data import GEOMETRY, PosePaths, ReportData, Source, start_of
+from .flight_words import instants, nearest_k, pretty
+from .packed import PackedArrays, packed, scene
+from .page import k_key
+
+# Samples of all series together that the page holds; beyond them each series is thinned, extremes kept.
+POINTS = 50_000
+
+TRACK_POINTS = 4000
+
+
+def payload(data: ReportData, charts: Sequence[Chart] = (), limit: int = POINTS) -> dict[str, Any]:
+    """Everything the script needs, as plain values.
+
+    Parameters
+    ----------
+    data : ReportData
+    charts : sequence of Chart
+    limit : int
+        Samples of all series together.
+    """
+    start, arrays = start_of(data), PackedArrays()
+    total = sum(len(p.time) for p in data.rss) + sum(len(p.time) for p in data.rank)
+
+    def share(n: int) -> int:
+        # 200: a short series beside a very long one keeps its course
+        return n if total <= limit else max(200, limit * n // total)
+
+    rss_settings = data.settings.get("rss") or {}
+    return {
+        "start": str(start.astype("datetime64[ms]")) if has_wall_clock(start) else "",
+        "step_db": STEP_DB,
+        "span_db": list(rss_settings.get("span_db", (-50.0, 50.0))),
+        "rss": [
+            _rss(p, data.sources.get(p.name), start, arrays, share(len(p.time))) | _beside(data, p, start)
+            for p in data.rss
+        ],
+        "rank": [_rank(p, start, arrays, share(len(p.time))) for p in data.rank],
+        "track": _track(data, start, arrays),
+        "site": scene(data.site),
+        "paths": [_paths(p, start) for p in data.paths],
+        "plots": [packed(chart.content, arrays) for chart in charts],
+        "packed": arrays.content(),
+    }
+
+
+def _place(panel: RssResult | RankResult, pick: IntArray, arrays: PackedArrays) -> dict[str, int]:
+    """Places of the UAV, and those of a tower that moves."""
+    ends = [("", panel.position_m), *([] if panel.tower_m is None else [("tower_", panel.tower_m)])]
+    return {
+        f"{whose}{axis}": arrays.add(places[pick])
+        for whose, position_m in ends
+        for axis, places in zip(AXES, position_m.T, strict=True)
+    }
+
+
+AXES = ("east", "north", "up")
+
+
+def _rss(
+    panel: RssResult, source: Source | None, start: np.datetime64, arrays: PackedArrays, limit: int
+) -> dict[str, Any]:
+    # of the residual too: its largest errors are what a reader looks for
+    pick = keep_extremes([panel.measured_db, panel.residual_db], limit) if len(panel.time) else np.arange(0)
+    models = [{"name": "ray tracing", **_fit(panel.score), "level": arrays.add(panel.simulated_dbm[pick]),
+               "learned_here": panel.training}]  # fmt: skip
+    for name, baseline in panel.baselines.items():
+        models.append({"name": pretty(name), **_fit(baseline), "level": arrays.add(baseline.level_dbm[pick])})
+    geometry = [
+        {"name": GEOMETRY[key].replace("\n", " "), "values": arrays.add(values[pick])}
+        for key, values in panel.geometry.items()
+        if key in GEOMETRY
+    ]
+    channel = {
+        **named(panel, "name tower unit"),
+        "of": len(panel.time),
+        "time": arrays.add(seconds_since(panel.time, start)[pick], "f8"),
+        **_place(panel, pick, arrays),
+        "measured": arrays.add(panel.measured_db[pick]),
+        "models": models,
+        "geometry": geometry,
+    }
+    if panel.stated is not None:
+        band = panel.stated.columns(panel.simulated_dbm)
+        channel["band"] = [arrays.add(band[f"simulated_{end}_dbm"][pick]) for end in ("low", "high")]
+    if source is not None:
+        channel |= {
+            "files": list(source.files),
+            "file": arrays.add(source.file[pick]),
+            # a 32-bit float holds no line number beyond 16 million
+            "line": arrays.add(source.line[pick], "f8"),
+        }
+    return channel
+
+
+def _beside(data: ReportData, panel: RssResult, start: np.datetime64) -> dict[str, Any]:
+    """The second channel of a tower and the spans in which the two part, as in the paper's Fig. 15."""
+    for pair in data.pairs:
+        if pair.tower == panel.tower and panel.channel in (pair.first, pair.second):
+            ends = [seconds_since(np.array(instants(pair.time, span)), start).tolist() for span in pair.score.spans]
+            beside = pair.second if panel.channel == pair.first else pair.first
+            return {"beside": f"{pair.tower} {beside}", "parted": ends, "parted_db": PART_DB}
+    return {}
+
+
+def _fit(model: RssComparison | ModelLevel) -> dict[str, float | None]:
+    return {"offset": _number(model.offset_db), "rmse": _number(model.rmse_db)}
+
+
+def _rank(panel: RankResult, start: np.datetime64, arrays: PackedArrays, limit: int) -> dict[str, Any]:
+    pick = keep_extremes([panel.measured], limit) if len(panel.time) else np.arange(0)
+    shares = [] if panel.probability is None else panel.probability.T
+    best = nearest_k(panel)
+    return {
+        "tower": panel.tower,
+        "of": len(panel.time),
+        "time": arrays.add(seconds_since(panel.time, start)[pick], "f8"),
+        **_place(panel, pick, arrays),
+        "measured": arrays.add(panel.measured[pick]),
+        "best": 0 if best is None else list(panel.rank).index(best),
+        "models": [{"name": f"K = {k_key(k)}", "rank": arrays.add(rank[pick])} for k, rank in panel.rank.items()],
+        "probability": [
+            {"name": f"probability_rank{rank}", "values": arrays.add(share[pick])}
+            for rank, share in enumerate(shares, start=1)
+        ],
+    }
+
+
+def _track(data: ReportData, start: np.datetime64, arrays: PackedArrays) -> dict[str, int] | None:
+    track = data.track
+    if track is None or not len(track.time):
+        return None
+    known: BoolArray = np.isfinite(track.east_m) & np.isfinite(track.north_m) & np.isfinite(track.up_m)
+    pick = np.flatnonzero(known)[spread_out(int(known.sum()), TRACK_POINTS)]
+    return {
+        "time": arrays.add(seconds_since(track.time, start)[pick], "f8"),
+        "east": arrays.add(track.east_m[pick]),
+        "north": arrays.add(track.north_m[pick]),
+        "up": arrays.add(track.up_m[pick]),
+    }
+
+
+def _paths(paths: PosePaths, start: np.datetime64) -> dict[str, Any]:
+    return {
+        "tower": paths.tower,
+        "time": np.round(seconds_since(paths.time, start), 3).tolist(),
+        "lines": [[[np.round(line, 1).tolist(), kind] for line, kind in lines] for lines in paths.lines],
+    }
+
+
+def _number(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

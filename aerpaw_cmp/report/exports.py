@@ -1,0 +1,612 @@
+"""Samples along a flight as files that other programs open: ``write_exports(export, folder, formats)``.
+
+An :class:`Export` holds one table of points per kind (``rss``, ``rank``): one row per sample with its link, instant,
+place and values, and per value column its unit and meaning. The values are those of ``rss.csv`` and ``rank.csv``,
+rounded as there, with latitude and longitude beside them. A missing number is NaN; a rank of 0 is a code, "no path".
+Each format is one function ``write_X(export, folder)``: NetCDF after CF-1.11, and tracks for Google Earth coloured by
+level, residual and rank (one folder per link and quantity; only the first is switched on; out of coverage is grey).
+Maps over a grid are written by :mod:`aerpaw_cmp.maps.export`.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import itertools
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common import kml
+from ..common.cf import DB, DBM, WGS84, Dataset, file_attributes, netcdf_bytes
+from ..common.errors import UsageError
+from ..common.geodesy import SiteFrame
+from ..common.jsonable import named
+from ..common.kml import CLASS_COLOURS, xml_text
+from ..common.stages import Progress, logged
+from ..common.units import AnyArray, FloatArray, IntArray
+from ..logs.records import has_wall_clock
+from ..site.site import Site
+from .canvas import keep_extremes
+from .columns import DECIMALS, rank_tables, rss_tables
+from .flight_data import ReportData, Track
+from .page import RANK_COLUMNS, RSS_COLUMNS, iso_time
+
+# 1 mm.
+_DEGREE_DECIMALS = 8
+
+# Meanings of 0 to 4 in a simulated rank.
+_RANK_FLAGS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
+_YES_NO = ("no", "yes")
+
+_UNITS = (
+    (r"_dbm$|^calibrated_db$", DBM, "dBm"),
+    (r"_db$", DB, "dB"),
+    (r"_deg$", "degree", "deg"),
+    (r"_m$", "m", "m"),
+    (r"_s$", "s", "s"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """One quantity of the samples.
+
+    Parameters
+    ----------
+    name : str
+        As in the CSV.
+    unit : str
+        As UDUNITS reads it.
+    shown_unit : str
+        As people write it: dBm.
+    meaning : str
+    flags : tuple of str
+        Meanings of 0, 1, ...; empty for a number.
+    """
+
+    name: str
+    unit: str = "1"
+    shown_unit: str = ""
+    meaning: str
+    flags: tuple[str, ...] = ()
+
+
+# What names a link.
+LINK = ("flight", "tower", "channel")
+PLACES = {
+    "latitude_deg": ("degrees_north", "WGS84 latitude"),
+    "longitude_deg": ("degrees_east", "WGS84 longitude"),
+    "east_m": ("m", "east of the site origin"),
+    "north_m": ("m", "north of the site origin"),
+    "up_m": ("m", "height above the ground at the site origin"),
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Points:
+    """Samples of one kind.
+
+    Parameters
+    ----------
+    kind : str
+        Name of files and layers: ``"rss"``, ``"rank"``.
+    table : pandas.DataFrame
+        ``time`` (UTC), :data:`LINK`, unit, :data:`PLACES`, ``columns``; links one below the other, each in time order.
+    columns : tuple of Column
+    """
+
+    kind: str
+    table: Any
+    columns: tuple[Column, ...]
+
+    def __len__(self) -> int:
+        return len(self.table)
+
+    def links(self) -> Iterator[tuple[str, str, str, Any]]:
+        """Flight, tower, channel and table of each link, in their order."""
+        for key, rows in self.table.groupby(list(LINK), sort=False, observed=True):
+            yield *map(str, key), rows
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Export:
+    """Everything that is exported of a flight.
+
+    Parameters
+    ----------
+    flight, title : str
+    site : Site
+        Frame, towers, height of the origin.
+    sets : tuple of Points
+    track : Track, optional
+    clock : bool
+        Instants are UTC; else they count from 1970-01-01, because the logs have relative times and no origin.
+    synthetic : bool
+    """
+
+    flight: str
+    title: str
+    site: Site
+    sets: tuple[Points, ...]
+    track: Track | None
+    clock: bool
+    synthetic: bool
+
+    @property
+    def remarks(self) -> tuple[str, ...]:
+        """Remarks that whoever opens a file must know."""
+        texts = [
+            "Heights (up_m) are metres above the ground at the site origin.",
+            "A missing number is out of coverage or unknown; a simulated rank of 0 means that there is no path.",
+        ]
+        if not self.clock:
+            texts.append(
+                "The logs have relative times and no origin: instants count from 1970-01-01, the date is none."
+            )
+        if self.synthetic:
+            texts.append("The logs are synthetic: made by simulation, they measure nothing.")
+        return tuple(texts)
+
+    def towers(self) -> Iterator[tuple[str, float, float, float]]:
+        """Name, latitude, longitude [deg] and height above the ground at the origin [m]."""
+        for tower in self.site.towers.values():
+            latitude, longitude = latitude_longitude(self.site.frame, tower.east_m, tower.north_m)
+            yield tower.name, float(latitude), float(longitude), float(tower.position_m[2])
+
+
+# --- columns --------------------------------------------------------------------------------------------------------
+
+
+def column(name: str, unit: str | None = None) -> Column:
+    """The column of a name: its unit from the name's end, its meaning as rss.csv and rank.csv have it."""
+    meaning = (RANK_COLUMNS | RSS_COLUMNS).get(name, name.replace("_", " "))
+    if name.endswith("out_of_coverage"):
+        return Column(name=name, meaning=meaning, flags=_YES_NO)
+    if name == "measured_rank" or name.startswith("simulated_rank_k"):
+        k = name.removeprefix("simulated_rank_k")
+        return Column(name=name, meaning=meaning if k == name else f"rank by ray tracing, K = {k}", flags=_RANK_FLAGS)
+    if name == "measured_db":
+        return Column(name=name, unit=DBM if unit == "dBm" else DB, shown_unit=unit or "dB", meaning=meaning)
+    _, udunits, shown = next((known for known in _UNITS if re.search(known[0], name)), ("", "1", ""))
+    return Column(name=name, unit=udunits, shown_unit=shown, meaning=meaning)
+
+
+def points_table(
+    kind: str, flight: str, links: Iterable[tuple[Any, dict[str, Any]]], frame: SiteFrame
+) -> Iterator[Points]:
+    """The points of the links of a flight one below the other; nothing without links.
+
+    Parameters
+    ----------
+    kind : str
+        Name of files and layers.
+    flight : str
+    links : iterable of (times, dict)
+        Instants (n,) of a link and its further columns: arrays (n,), or one value for all rows.
+    frame : SiteFrame
+
+    Yields
+    ------
+    Points
+    """
+    import pandas as pd
+
+    link = {"channel": "", "unit": "1", "flight": flight}
+    parts = [pd.DataFrame({**link, "time": time, **columns}, index=range(len(time))) for time, columns in links]
+    if not parts:
+        return
+    table = pd.concat(parts, ignore_index=True)
+    table["time"] = table["time"].to_numpy("datetime64[ns]")
+    units = table["unit"].unique()
+    names = [name for name in table.columns if name not in {"time", *LINK, "unit", *PLACES}]
+    for name in ("east_m", "north_m", "up_m", *names):
+        values = np.round(table[name].to_numpy(np.float64, na_value=np.nan), DECIMALS)
+        table[name] = np.where(np.isfinite(values), values, np.nan)
+    table["latitude_deg"], table["longitude_deg"] = latitude_longitude(
+        frame, table["east_m"].to_numpy(), table["north_m"].to_numpy()
+    )
+    table = table.astype(dict.fromkeys((*LINK, "unit"), "category"))[["time", *LINK, "unit", *PLACES, *names]]
+    shared = str(units[0]) if len(units) == 1 else "dB, reference by link"
+    yield Points(kind=kind, table=table, columns=tuple(column(name, shared) for name in names))
+
+
+def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[FloatArray, FloatArray]:
+    """WGS84 latitude and longitude [deg] of positions (n,), NaN where a position is unknown."""
+    known = np.isfinite(east_m) & np.isfinite(north_m)
+    latitude, longitude = frame.to_geographic(np.where(known, east_m, 0.0), np.where(known, north_m, 0.0))
+    return (
+        np.where(known, np.round(latitude, _DEGREE_DECIMALS), np.nan),
+        np.where(known, np.round(longitude, _DEGREE_DECIMALS), np.nan),
+    )
+
+
+# --- from a report --------------------------------------------------------------------------------------------------
+
+
+def of_report(data: ReportData) -> Export:
+    """The samples of a flight."""
+    tables = {"rss": rss_tables(data.rss), "rank": rank_tables(data.rank)}
+    sets = tuple(p for kind, links in tables.items() for p in points_table(kind, data.flight, links, data.site.frame))
+    times = [points.table["time"].to_numpy() for points in sets] + ([] if data.track is None else [data.track.time])
+    known = [time.min() for time in (time[~np.isnat(time)] for time in times) if len(time)]
+    return Export(
+        **named(data, "flight title site track synthetic"),
+        sets=sets,
+        clock=bool(known) and has_wall_clock(min(known)),
+    )
+
+
+# Stands for a missing code in NetCDF; attribute ``_FillValue``.
+_NO_CODE = -1
+
+
+_TITLES = {"rss": "Received level, measured and replayed", "rank": "Channel rank, reported and replayed"}
+
+
+def write_netcdf(export: Export, folder: Path) -> list[Path]:
+    """``<kind>.nc``: trajectories as a contiguous ragged array, one per link."""
+    paths = []
+    for points in export.sets:
+        path = folder / f"{points.kind}.nc"
+        path.write_bytes(netcdf_bytes(_points_dataset(export, points)))
+        paths.append(path)
+    return paths
+
+
+def _points_dataset(export: Export, points: Points) -> Dataset:
+    """The samples of one kind as variables with dimensions trajectory (links) and obs."""
+    links = list(points.links())
+    texts = {
+        "link": ("flight, tower and channel", [f"{f} {f'{t} {c}'.strip()}" for f, t, c, _ in links]),
+        **{name: (f"name of the {name}", [link[i] for link in links]) for i, name in enumerate(LINK)},
+        "unit_of_measured": ("unit of the level as logged", [str(rows["unit"].iloc[0]) for *_, rows in links]),
+    }
+    variables: dict[str, Any] = {
+        name: ("trajectory", np.array(values, dtype=object), {"long_name": meaning})
+        for name, (meaning, values) in texts.items()
+    }
+    variables["link"][2]["cf_role"] = "trajectory_id"
+    size = {"long_name": "number of samples of this link", "sample_dimension": "obs"}
+    variables["row_size"] = ("trajectory", np.array([len(rows) for *_, rows in links], dtype=np.int32), size)
+    variables["time"] = ("obs", *_seconds(export, points.table["time"].to_numpy()))
+    axes = {"latitude_deg": "Y", "longitude_deg": "X", "up_m": "Z"}
+    for name, (unit, meaning) in PLACES.items():
+        short = name.rpartition("_")[0]
+        attributes = {"long_name": meaning, "units": unit}
+        if name in axes:
+            attributes |= {"standard_name": "height" if short == "up" else short, "axis": axes[name]}
+        if short == "up":
+            attributes["positive"] = "up"
+        variables[short] = ("obs", points.table[name].to_numpy(), attributes)
+    variables["crs"] = ((), np.int32(0), WGS84)
+    for item in points.columns:
+        variables[item.name.replace(".", "p")] = ("obs", *_values(item, points.table[item.name].to_numpy()))
+    about = file_attributes(
+        title=f"{_TITLES.get(points.kind, points.kind)}: {export.title}",
+        source="field logs, replayed by ray tracing",
+        comment=" ".join(export.remarks),
+    )
+    return Dataset(variables, {**about, "featureType": "trajectory"})
+
+
+def _seconds(export: Export, times: Any) -> tuple[Any, dict[str, str]]:
+    """Seconds after the first whole second, and their attributes."""
+    known = times[~np.isnat(times)]
+    start = known.min().astype("datetime64[s]") if len(known) and export.clock else np.datetime64("1970-01-01", "s")
+    attributes = {
+        "standard_name": "time",
+        "long_name": "instant of the sample",
+        "units": f"seconds since {str(start).replace('T', ' ')} UTC",
+        "calendar": "standard",
+        "units_metadata": "leap_seconds: none",
+        "axis": "T",
+    }
+    if not export.clock:
+        attributes["comment"] = "the logs have relative times and no origin: the date is none"
+    return np.where(np.isnat(times), np.nan, (times - start) / np.timedelta64(1, "s")), attributes
+
+
+def _values(column: Column, values: Any) -> tuple[Any, ...]:
+    """Values, attributes and encoding of a quantity or of codes."""
+    shared = {"long_name": column.meaning, "coordinates": "time latitude longitude up", "grid_mapping": "crs"}
+    if column.flags:
+        codes = np.where(np.isfinite(values), values, _NO_CODE).astype(np.int8)
+        flags = {"flag_values": np.arange(len(column.flags), dtype=np.int8), "flag_meanings": " ".join(column.flags)}
+        return codes, shared | flags, {"_FillValue": np.int8(_NO_CODE)}
+    comment = {} if column.shown_unit in ("", column.unit) else {"comment": f"unit: {column.shown_unit}"}
+    return values, {**shared, "units": column.unit, **comment}, {"_FillValue": np.nan}
+
+
+# Points of all coloured lines together: more, and Google Earth gets slow.
+POINTS = 24_000
+TRACK_POINTS = 5_000
+
+_LEVELS = {"calibrated_db": "Level measured", "simulated_dbm": "Level replayed", "residual_db": "Residual"}
+_AIR = "<altitudeMode>relativeToGround</altitudeMode>"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Shown:
+    """A link coloured by one quantity."""
+
+    name: str
+    column: Column
+    scale: Scale
+    rows: Any
+
+
+def write_kmz(export: Export, folder: Path) -> list[Path]:
+    """``samples.kmz``."""
+    shown = list(_shown(export))
+    scales = {item.scale.key: item.scale for item in shown}
+    budget = POINTS // max(1, len(shown))
+    body = [_towers(export), _flown(export)]
+    for number, link in enumerate(shown):
+        lines = "".join(_lines(link, budget, clock=export.clock, visible=number == 0))
+        body.append(kml.folder(link.name, _legend_name(link.scale), lines, visible=number == 0))
+    words = [*export.remarks, "Lines stand at their height above the ground below."]
+    if max((len(item.rows) for item in shown), default=0) > budget:
+        words.append(
+            f"Thinned to about {budget} points per line, with minimum and maximum of every segment; all samples are in "
+            "rss.csv and rank.csv."
+        )
+    path, text = folder / "samples.kmz", "".join([*map(_styles, scales.values()), *body])
+    legends = {_legend_name(scale): _legend(scale) for scale in scales.values()}
+    return [kml.write_archive(path, export.title, " ".join(words), text, legends)]
+
+
+def _shown(export: Export) -> Iterator[_Shown]:
+    for kind, scales in _scales_of(export).items():
+        points = next(item for item in export.sets if item.kind == kind)
+        columns = {c.name: c for c in points.columns}
+        for (_, tower, channel, rows), (name, scale) in itertools.product(points.links(), scales.items()):
+            if name.startswith("simulated_rank") and rows[name].isna().all():  # a K of other links
+                continue
+            shown = f"{tower} {channel}".strip() + f", {_LEVELS.get(name, columns[name].meaning)}"
+            yield _Shown(name=shown, column=columns[name], scale=scale, rows=rows)
+
+
+def _styles(scale: Scale) -> str:
+    """One line style per colour; KML writes alpha, blue, green, red."""
+    return "".join(
+        f'<Style id="{scale.key}{i}"><LineStyle><color>ff{c[5:7]}{c[3:5]}{c[1:3]}</color><width>4</width></LineStyle>'
+        "</Style>"
+        for i, c in enumerate(scale.colours)
+    )
+
+
+def _towers(export: Export) -> str:
+    marks = [
+        kml.mark(name, kml.coordinates(np.array([longitude]), np.array([latitude]), np.array([up]))[0], in_the_air=True)
+        for name, latitude, longitude, up in export.towers()
+    ]
+    return f"<Folder><name>Towers</name>{''.join(marks)}</Folder>"
+
+
+def _flown(export: Export) -> str:
+    """The flown line: with a clock as a track that the time slider moves along; nothing of less than two places."""
+    if (line := export.track) is None:
+        return ""
+    known = np.flatnonzero(np.isfinite(line.east_m) & np.isfinite(line.north_m) & ~np.isnat(line.time))
+    if len(known) < 2:
+        return ""
+    pick = known[keep_extremes([line.up_m[known]], TRACK_POINTS)]
+    latitude, longitude = latitude_longitude(export.site.frame, line.east_m[pick], line.north_m[pick])
+    at = kml.coordinates(longitude, latitude, line.up_m[pick])
+    if export.clock:
+        times = "".join(f"<when>{time}</when>" for time in iso_time(line.time[pick]))
+        places = "".join(f"<gx:coord>{item.replace(',', ' ')}</gx:coord>" for item in at)
+        shape = f"<gx:Track>{_AIR}{times}{places}</gx:Track>"
+    else:
+        shape = f"<LineString>{_AIR}<coordinates>{' '.join(at)}</coordinates></LineString>"
+    name, style = xml_text(export.flight), kml.line_style("99ffffff", 2)
+    return f"<Placemark><name>Flown: {name}</name>{style}{shape}</Placemark>"
+
+
+def _lines(shown: _Shown, budget: int, *, clock: bool, visible: bool) -> Iterator[str]:
+    """A link's lines, one a stretch of one colour."""
+    rows = shown.rows[shown.rows["latitude_deg"].notna() & shown.rows["time"].notna()]
+    if len(rows) < 2:
+        return
+    rows = rows.iloc[keep_extremes([rows[shown.column.name].to_numpy()], budget)]
+    values = rows[shown.column.name].to_numpy()
+    at = kml.coordinates(*(rows[name].to_numpy() for name in ("longitude_deg", "latitude_deg", "up_m")))
+    times, bins = iso_time(rows["time"].to_numpy()), shown.scale.bin_of(values)
+    starts = np.flatnonzero(np.concatenate([[True], bins[1:] != bins[:-1]]))
+    for first, after in zip(starts, [*starts[1:], len(rows) - 1], strict=True):
+        last = int(after)  # a line ends where the next begins, so that no gap shows
+        if last <= first:
+            continue
+        number = int(bins[first])
+        span = f"<TimeSpan><begin>{times[first]}</begin><end>{times[last]}</end></TimeSpan>" if clock else ""
+        head = f"<visibility>{int(visible)}</visibility>{span}"
+        style = f"<styleUrl>#{shown.scale.key}{number}</styleUrl>"
+        name = _label(shown, values[first:last], number)
+        yield kml.line(name, at[first : last + 1], _AIR, head=head, style=style)
+
+
+def _label(shown: _Shown, values: AnyArray, number: int) -> str:
+    """Text of a line's balloon: its values, or the name of its class."""
+    known = values[np.isfinite(values)]
+    if shown.scale.edges is None or not len(known):
+        return shown.scale.labels[number]
+    low, high = known.min(), known.max()
+    return (f"{low:.1f}" if high - low < 0.05 else f"{low:.1f} to {high:.1f}") + f" {shown.column.shown_unit}"
+
+
+def _legend_name(scale: Scale) -> str:
+    return f"legends/{scale.key}.png"
+
+
+def _legend(scale: Scale) -> bytes:
+    return kml.list_legend(scale.title, dict(zip(scale.labels, scale.colours, strict=True)))
+
+
+# --- colours ---------------------------------------------------------------------------------------------------------
+
+# Colours of a scale of numbers.
+LEVELS = 10
+# Grey: no value.
+OUT = CLASS_COLOURS[0]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scale:
+    """Colours of one quantity: ``edges`` (m + 1,) between them, or none where its values are classes."""
+
+    key: str
+    title: str
+    colours: tuple[str, ...]
+    labels: tuple[str, ...]
+    edges: FloatArray | None = None
+
+    def bin_of(self, values: FloatArray) -> IntArray:
+        """Number of each value's colour (n,); the last is out of coverage."""
+        known = np.isfinite(values)
+        if self.edges is None:
+            number = np.clip(np.nan_to_num(values).astype(np.int64), 0, len(self.colours) - 2) - 1
+            return np.where(known & (number >= 0), number, len(self.colours) - 1)
+        number = np.searchsorted(self.edges[1:-1], np.nan_to_num(values), side="right")
+        return np.where(known, number, len(self.colours) - 1)
+
+
+RANKS = Scale(
+    key="rank",
+    title="Rank",
+    colours=(*CLASS_COLOURS[1:5], OUT),
+    labels=("rank 1", "rank 2", "rank 3", "rank 4", "no path or no report"),
+)
+
+
+def _scales_of(export: Export) -> dict[str, dict[str, Scale]]:
+    """By kind and column: levels share one scale, residuals another, ranks their classes."""
+    scales: dict[str, dict[str, Scale]] = {}
+    for points in export.sets:
+        names = {c.name for c in points.columns}
+        by_column = {c: RANKS for c in names if c == "measured_rank" or c.startswith("simulated_rank_k")}
+        levels = sorted(names & {"calibrated_db", "simulated_dbm"})
+        if levels:
+            values = points.table[levels].to_numpy().ravel()
+            by_column |= dict.fromkeys(levels, _level_scale(values[np.isfinite(values)]))
+        if "residual_db" in names:
+            apart = np.abs(points.table["residual_db"].to_numpy())
+            by_column["residual_db"] = _residual_scale(apart[np.isfinite(apart)])
+        scales[points.kind] = {c.name: by_column[c.name] for c in points.columns if c.name in by_column}
+    return scales
+
+
+def _level_scale(levels: FloatArray) -> Scale:
+    """Steps of whole numbers between the 2nd and 98th percentile."""
+    low, high = np.percentile(levels, [2, 98]) if len(levels) else (-100.0, -60.0)
+    step = _round_step((high - low) / LEVELS)
+    edges = (np.floor(low / step) + np.arange(LEVELS + 1)) * step
+    return _numbers("level", "Level [dBm]", edges, "viridis")
+
+
+def _residual_scale(apart: FloatArray) -> Scale:
+    """Symmetric about zero, to the 98th percentile of the size."""
+    most = float(np.percentile(apart, 98)) if len(apart) else 5.0
+    step = _round_step(2 * most / (LEVELS - 1))
+    edges = (np.arange(LEVELS) - (LEVELS - 1) / 2) * step
+    return _numbers("residual", "Measured minus replayed [dB]", edges, "RdBu_r")
+
+
+def _round_step(step: float) -> float:
+    """The next step up of 1, 2, 5 times a power of ten."""
+    if not step > 0:
+        return 1.0
+    power = 10.0 ** np.floor(np.log10(step))
+    # a step that is 2 but for rounding must not become 5
+    return float(next(m for m in (1, 2, 5, 10) if m * power >= step * (1 - 1e-9)) * power)
+
+
+def _numbers(key: str, title: str, edges: AnyArray, palette: str) -> Scale:
+    from matplotlib import colormaps
+    from matplotlib.colors import to_hex
+
+    count = len(edges) - 1
+    colours = [to_hex(colormaps[palette]((i + 0.5) / count)) for i in range(count)]
+    labels = [f"{low:g} to {high:g}" for low, high in itertools.pairwise(edges)]
+    labels[0], labels[-1] = f"below {edges[1]:g}", f"above {edges[-2]:g}"
+    return Scale(
+        key=key, title=title, colours=(*colours, OUT), labels=(*labels, "out of coverage"), edges=np.asarray(edges)
+    )
+
+
+FORMATS = ("kmz", "netcdf")
+# By format: the modules that it needs besides the default installation.
+_NEEDS = {"netcdf": ("netCDF4", "xarray")}
+
+ALL = "all"
+FOLDER = "exports"
+
+
+def chosen_formats(names: Iterable[str], known: Iterable[str] = FORMATS) -> tuple[str, ...]:
+    """The formats that a user writes: names of known ones, also joined by commas; ``all`` for every one.
+
+    Raises
+    ------
+    UsageError
+        An unknown name; a format that is named and whose library is not installed.
+
+    Examples
+    --------
+    >>> chosen_formats(["netcdf,kmz", "kmz"])
+    ('kmz', 'netcdf')
+    """
+    chosen = [part.strip().lower() for name in names for part in name.split(",") if part.strip()]
+    if unknown := [name for name in chosen if name not in (*known, ALL)]:
+        raise UsageError(f"format {unknown[0]!r}", expected=", ".join((*known, ALL)))
+    for name in chosen:
+        if name != ALL and (missing := _missing_module(name)):
+            raise UsageError(
+                f"format {name} needs {missing}, which is not installed",
+                expected="pip install 'aerpaw-cmp[geo]', or another format",
+            )
+    return tuple(name for name in known if name in chosen or ALL in chosen)
+
+
+def _missing_module(name: str) -> str:
+    """The module that a format needs and that is not there."""
+    return next((module for module in _NEEDS.get(name, ()) if importlib.util.find_spec(module) is None), "")
+
+
+def write_exports(export: Export, folder: Path, formats: Iterable[str], progress: Progress = logged) -> list[Path]:
+    """Write the files of some formats into ``folder / "exports"``.
+
+    Parameters
+    ----------
+    export : Export
+    folder : Path
+        Of the results; the folder of the exports is made when missing.
+    formats : iterable of str
+        Of :data:`FORMATS`.
+    progress : Progress
+        Told of a format whose library is missing (asked for as ``all``).
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    OSError
+        If the disk does not take a file.
+    """
+    pass
+    pass
+
+    writers = {"kmz": write_kmz, "netcdf": write_netcdf}
+    place = folder / FOLDER
+    written: list[Path] = []
+    for name in formats:
+        if missing := _missing_module(name):
+            progress(f"export {name} left out: {missing} is not installed (pip install 'aerpaw-cmp[geo]')")
+            continue
+        place.mkdir(exist_ok=True)
+        written += writers[name](export, place)
+    return written

@@ -1,1 +1,0 @@
-"""Figures, named by their page."""

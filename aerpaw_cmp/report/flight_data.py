@@ -1,0 +1,412 @@
+"""The record that a flight's report shows: its parts around the numbers (:mod:`aerpaw_cmp.compare.result`).
+
+Each part that a flight may lack is optional: a flight with rank only has ``rss=()``, one without a path anywhere has
+NaN numbers, never invented ones. Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN (in
+``metrics.json``: ``null``).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.counting import counted
+from ..common.jsonable import named
+from ..common.units import AnyArray, FloatArray, IntArray
+from ..common.versions import utc_now, versions
+from ..compare.result import APPLIED, NOT_APPLIED, ClockResult, FlightResult, RankResult, RssResult
+from ..flight.gains.memory import antennas_used
+from ..logs.records import RejectedLine
+from ..site.site import Site
+
+if TYPE_CHECKING:  # the logs and the replay load pandas; a prediction loads how it is scored
+    from ..flight.data import FlightData
+    from ..flight.replay import FlightReplay, Replayed
+    from ..flight.settings import LogSettings
+    from ..logs.ingest import IngestedFile
+    from .against import Against
+
+
+# Ranks of a 4 x 4 channel, the bars of every histogram.
+RANKS = (1, 2, 3, 4)
+
+# Quantities that residuals are drawn against, and their axis labels.
+GEOMETRY = {
+    "distance_m": "Distance tower to UAV [m]",
+    "elevation_deg": "Elevation of the UAV seen from the tower [deg]",
+    "azimuth_deg": "Azimuth of the UAV in the frame of the tower antenna [deg]",
+    "heading_deg": "UAV heading [deg clockwise from north]",
+    "altitude_m": "Height of the UAV above ground [m]",
+    "uav_azimuth_deg": "Azimuth of the tower,\nUAV antenna frame [deg]",
+    "uav_elevation_deg": "Elevation of the tower,\nUAV antenna frame [deg]",
+    "foliage_depth_m": "Path length inside tree crowns [m]",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputFile:
+    """An input; the account of a log has ``lines == accepted + rejected + blank``.
+
+    ``rejected_lines`` may hold all of them or a sample; ``rejected`` is the count.
+    """
+
+    path: str
+    sha256: str
+    reader: str = ""
+    lines: int = 0
+    accepted: int = 0
+    rejected: int = 0
+    blank: int = 0
+    role: str = ""
+    warnings: tuple[str, ...] = ()
+    rejected_lines: tuple[RejectedLine, ...] = ()
+    learned_on: tuple[str, ...] = ()
+    """SHA-256 of the logs that this file was learned from; none of other files."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """The flown line: ``time`` (n,), positions (n,) in the site frame [m]."""
+
+    time: AnyArray
+    east_m: FloatArray
+    north_m: FloatArray
+    up_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Waypoint:
+    """A named moment of the flight, e.g. ``A`` to ``F`` of the paper."""
+
+    label: str
+    time: np.datetime64
+    east_m: float
+    north_m: float
+    up_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Origin of samples in the logs: names of the files, and per sample its file's number and its line, (n,)."""
+
+    files: tuple[str, ...]
+    file: IntArray
+    line: IntArray
+
+
+# Kind of drawn paths beside a number of reflections: any further one, as over an edge.
+FURTHER = -1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PosePaths:
+    """Propagation paths of some poses of a tower, to be drawn.
+
+    Parameters
+    ----------
+    tower : str
+    time : (poses,) datetime64[ns]
+        Samples of the tower's first channel.
+    lines : tuple of tuples
+        Per pose its paths: points (corners, 3) [m] from tower to UAV, and the number of reflections or another kind.
+    """
+
+    tower: str
+    time: AnyArray
+    lines: tuple[tuple[tuple[FloatArray, int], ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportData(FlightResult):
+    """Everything a report shows: the numbers of the flight, and what stands around them.
+
+    Parameters
+    ----------
+    title, flight : str
+        Headline, and the short name that is the folder's name too.
+    site : Site
+    generated : str
+        UTC, ISO 8601.
+    versions : mapping of str to str
+    inputs : tuple of InputFile
+    track, waypoints
+        The flown line, and its named moments.
+    sources : mapping of str to Source
+        Where the samples stand in the logs, by tower and channel.
+    synthetic : bool
+        The logs were made by ``aerpaw-cmp simulate``; said on the first screen.
+    warnings : tuple of str
+        What the reader must know before believing a number, one sentence each.
+    doubts : tuple of str
+        Clauses on clocks and heights for the first words.
+    cautions : tuple of str
+        Sentences on settings that do not fit; they come before all other cautions.
+    antennas : tuple of str
+        Sentences that name the antennas of the replay.
+    notes : tuple of str
+        Remarks for the end of the report.
+    settings : mapping
+        The checked flight.yaml, nested mappings of plain values.
+    stages_s : mapping of str to float
+        Seconds per named stage.
+    extra_metrics : mapping
+        Merged into ``metrics.json`` last, key by key.
+    """
+
+    title: str
+    flight: str
+    site: Site
+    generated: str
+    versions: Mapping[str, str] = field(default_factory=dict)
+    inputs: tuple[InputFile, ...] = ()
+    track: Track | None = None
+    waypoints: tuple[Waypoint, ...] = ()
+    sources: Mapping[str, Source] = field(default_factory=dict)
+    synthetic: bool = False
+    warnings: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
+    cautions: tuple[str, ...] = ()
+    antennas: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    stages_s: Mapping[str, float] = field(default_factory=dict)
+    extra_metrics: Mapping[str, Any] = field(default_factory=dict)
+    paths: tuple[PosePaths, ...] = ()
+    against: Against | None = None
+    """What was predicted before the flight, where a prediction is named."""
+
+    @property
+    def moments(self) -> list[tuple[str, np.datetime64]]:
+        """Label and instant of each waypoint."""
+        return [(waypoint.label, waypoint.time) for waypoint in self.waypoints]
+
+
+def start_of(data: ReportData) -> np.datetime64:
+    """The instant that is zero on every time axis: the first of the track, or of any panel."""
+    times = [] if data.track is None or not len(data.track.time) else [data.track.time[0]]
+    times += [item.time[0] for item in data.series if len(item.time)]
+    if not times:
+        return np.datetime64(0, "ns")
+    return times[0] if data.track is not None and len(data.track.time) else min(times)
+
+
+def used_towers(data: ReportData) -> list[str]:
+    """Towers that a panel of the report names, or all."""
+    used = dict.fromkeys(item.tower for item in data.series)
+    return [name for name in used if name in data.site.towers] or list(data.site.towers)
+
+
+# Poses per tower whose paths are drawn.
+POSES = 300
+
+# Paths of each further kind that are drawn of a pose.
+SHORTEST = 8
+
+
+def report_data(
+    data: FlightData,
+    result: FlightResult,
+    *,
+    notes: Sequence[str] = (),
+    other_inputs: Sequence[InputFile] = (),
+    paths: Sequence[PosePaths] = (),
+) -> ReportData:
+    """Everything a report shows.
+
+    Parameters
+    ----------
+    data : FlightData
+        Settings, site, logs and track.
+    result : FlightResult
+        The numbers.
+    notes : sequence of str
+        Remarks beside those of the flight file.
+    other_inputs : sequence of InputFile
+        Files besides the logs: settings, site, antennas.
+    paths : sequence of PosePaths
+        Paths at the samples, for the page that shows them.
+
+    Returns
+    -------
+    ReportData
+    """
+    settings = data.settings
+    warnings = [
+        *clock_warnings(result.clocks),
+        *data.warnings,
+        *(text for item in result.rss for text in rss_warnings(item)),
+        *(text for item in result.rank for text in rank_warnings(item)),
+    ]
+    sources = {
+        panel.name: Source(files=tuple(log.path for log in settings.logs), file=series.log, line=series.line)
+        for panel, series in zip(result.rss, data.rss, strict=True)
+        if len(series.line) == len(series.time)
+    }
+    return ReportData(
+        **{field.name: getattr(result, field.name) for field in dataclasses.fields(result)},
+        title=settings.flight.title or settings.flight.name,
+        flight=settings.flight.name,
+        site=data.site,
+        generated=utc_now(),
+        versions=versions(),
+        inputs=(*_inputs_of(settings.logs, data.files), *other_inputs),
+        track=track_of(data),
+        waypoints=waypoints_of(data),
+        paths=tuple(paths),
+        sources=sources,
+        synthetic=settings.flight.synthetic,
+        warnings=tuple(dict.fromkeys(warnings)),
+        doubts=data.doubts,
+        cautions=data.cautions,
+        antennas=antennas_used([(s.tower, s.channel, s.link) for s in data.rss]),
+        notes=(*settings.flight.notes, *notes),  # the page adds those of the site
+        settings=settings.model_dump(mode="json"),
+    )
+
+
+# --- what must be known before a number is believed ------------------------------------------------------------------
+
+
+def clock_warnings(clocks: Mapping[str, ClockResult]) -> tuple[str, ...]:
+    """Clocks that were corrected, should be, or cannot be judged; a correction that was not made comes first.
+
+    Receivers of one computer have one clock, and one sentence.
+    """
+    receivers: dict[str, list[str]] = {}
+    for receiver in sorted(clocks, key=lambda receiver: clocks[receiver].applied != NOT_APPLIED):
+        receivers.setdefault(_clock_warning(clocks[receiver]), []).append(receiver)
+    return tuple(f"{', '.join(names)}: {text}" for text, names in receivers.items() if text)
+
+
+def _clock_warning(clock: ClockResult) -> str:
+    """Sentence on what one receiver's clock does to its numbers; "" when there is nothing to know."""
+    if clock.applied == NOT_APPLIED:
+        return f"rss.lag: apply was asked for, but the radio clock was not corrected: {clock.reason}."
+    if clock.applied == APPLIED:
+        return f"the radio clock is {clock.in_words}; it was corrected."
+    if clock.shifted:
+        return f"the radio clock is {clock.in_words}; it was not corrected (rss.lag: apply would)."
+    if clock.verdict == "cannot tell":
+        return f"the radio clock could not be checked: {clock.reason}."
+    return ""
+
+
+def rss_warnings(result: RssResult) -> tuple[str, ...]:
+    """A channel that could not be compared, or whose offset is no result."""
+    if result.score.n == 0:
+        return (f"{result.name}: no sample could be compared; its numbers are missing, not zero.",)
+    if result.score.at_edge:
+        return (
+            f"{result.name}: the best offset lies at the edge of the searched span, so it and its RMSE are no result. "
+            "Widen rss.span_db, and check the transmit power and the unit of the log.",
+        )
+    return ()
+
+
+def rank_warnings(result: RankResult) -> tuple[str, ...]:
+    """Warnings that the reader must know of the rank of one tower before believing its numbers."""
+    out = []
+    if left_out := result.n_samples - len(result.time):
+        of = counted(result.n_samples, "sample")
+        out.append(f"Rank {result.tower}: {left_out} of {of} left out: too low, or without a pose.")
+    if result.score.n == 0:
+        out.append(f"Rank {result.tower}: the modem reported no rank at any compared pose.")
+    if result.score.staleness.verdict == "held":
+        out.append(
+            f"Rank {result.tower}: the modem holds each report for about {result.score.staleness.hold_s:.1f} s; "
+            f"{counted(result.score.n, 'sample')} hold {counted(result.score.staleness.n_reports, 'report')}."
+        )
+    return tuple(out)
+
+
+# --- the flight ----------------------------------------------------------------------------------------------------
+
+
+def _inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tuple[InputFile, ...]:
+    """The account of every log."""
+    return tuple(
+        InputFile(
+            path=log.path,
+            sha256=file.sha256,
+            **named(file.result, "reader lines accepted blank warnings"),
+            rejected=file.result.rejected_count,
+            role=", ".join(sorted({s.kind for s in file.result.streams})),
+            rejected_lines=file.result.rejected,
+        )
+        for log, file in zip(logs, files, strict=True)
+    )
+
+
+def track_of(data: FlightData) -> Track | None:
+    """The flown line: telemetry's, or the rank log's own positions."""
+    if data.track is not None and len(data.track):
+        step_ns = max((data.track.end_ns - data.track.start_ns) // 2000, 500_000_000)
+        time = np.arange(data.track.start_ns, data.track.end_ns + 1, step_ns).astype("datetime64[ns]")
+        position = data.track.pose_at(time).position_m
+    else:
+        placed = next((s for s in data.rank if s.position_m is not None), None)
+        if placed is None or placed.position_m is None:
+            return None
+        time, position = placed.time, placed.position_m
+    return Track(time=time, east_m=position[:, 0], north_m=position[:, 1], up_m=position[:, 2])
+
+
+def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
+    """Waypoints of the plan or the report settings, each at the moment the track comes nearest."""
+    plan = data.settings.flight.plan
+    points = data.settings.report.waypoints or (plan.waypoints if plan else [])
+    track = track_of(data)
+    if track is None:
+        return ()
+    out, start, line_m = [], 0, np.column_stack([track.east_m, track.north_m, track.up_m])
+    for point in points:
+        if not point.label:
+            continue
+        distance = np.linalg.norm(line_m[start:] - (point.east_m, point.north_m, point.height_m), axis=1)
+        # the first moment it comes as near as it ever will (within 2 m): later visits belong to later waypoints
+        near = np.flatnonzero(distance <= np.nanmin(distance) + 2.0)
+        index = start + int(near[0])
+        out.append(
+            Waypoint(
+                **named(point, "label east_m north_m"),
+                time=track.time[index],
+                up_m=point.height_m,
+            )
+        )
+        start = index
+    return tuple(out)
+
+
+def pose_paths(data: FlightData, replays: FlightReplay) -> tuple[PosePaths, ...]:
+    """Paths of each tower's first series at about :data:`POSES` of its poses, spread over the flight."""
+    by_tower: dict[str, PosePaths] = {}
+    for (_, series), replayed in zip(data.series, replays.all, strict=True):
+        if series.tower not in by_tower and replayed.valid.any():
+            poses = np.unique(np.linspace(0, len(replayed.poses) - 1, POSES).astype(np.int64))
+            time = series.time[replayed.valid][poses]
+            tower_m = np.broadcast_to(replayed.source_m(data.site), replayed.poses.position_m.shape)
+            lines = tuple(tuple(_lines(replayed, pose, tower_m[pose])) for pose in poses)
+            by_tower[series.tower] = PosePaths(tower=series.tower, time=time, lines=lines)
+    return tuple(by_tower.values())
+
+
+def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple[FloatArray, int]]:
+    """Polylines of a pose with their kind: number of reflections, or FURTHER."""
+    replay, target_m = replayed.replay, replayed.poses.position_m[pose]
+    for number, some in enumerate(replay.contributions):
+        paths, kind = some.lines(), FURTHER if number else None
+        start, stop = np.searchsorted(paths.pose, [pose, pose + 1])
+        lines = [
+            np.concatenate([tower_m[None], paths.vertices_m[row, : paths.depth[row]], target_m[None]])
+            for row in range(start, stop)
+        ]
+        if kind is not None:
+            lines = sorted(lines, key=lambda line: float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()))[
+                :SHORTEST
+            ]
+        for line in lines:
+            yield line, len(line) - 2 if kind is None else kind

@@ -1,0 +1,96 @@
+"""The page of ``tap --web``: one file that asks only the tap for more; the map behind the flight stands inside."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+
+from ..common.units import AnyArray, FloatArray
+from ..site.site import Site
+from .packed import PackedArrays, plan_of
+from .page import as_json, digest, environment, k_key, script
+
+_POLICY = (
+    "default-src 'none'; script-src {script}; style-src {style}; connect-src 'self'; img-src data:; base-uri 'none'; "
+    "form-action 'none'; frame-ancestors 'none'"
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveMap:
+    """Predicted rank and level (heights, north, east) over the site, for one tower.
+
+    Parameters
+    ----------
+    title : str
+        Of the flight.
+    site : Site
+    tower : str
+    k : float
+        Singular-value ratio of the ranks.
+    heights_m, east_m, north_m : sequence of float
+        Axes of the grid, evenly spaced east and north [m].
+    rank : (heights, north, east) int
+        0: no path.
+    level_dbm : (heights, north, east) float
+        [dBm]; NaN: no path.
+    """
+
+    title: str
+    site: Site
+    tower: str
+    k: float
+    heights_m: Sequence[float]
+    east_m: FloatArray
+    north_m: FloatArray
+    rank: AnyArray
+    level_dbm: FloatArray
+
+    def content(self) -> dict[str, Any]:
+        """Plain values for the script."""
+        arrays = PackedArrays()
+        rank, level = arrays.add(np.clip(self.rank, 0, 4), "u1"), arrays.add_steps(self.level_dbm, 0.1)
+        step = float(self.east_m[1] - self.east_m[0]) if len(self.east_m) > 1 else 20.0
+        return {
+            "site": plan_of(self.site),
+            "tower": self.tower,
+            "k": k_key(self.k),
+            "heights": [float(height) for height in self.heights_m],
+            "east": float(self.east_m[0]),
+            "north": float(self.north_m[0]),
+            "step": step,
+            "columns": len(self.east_m),
+            "rows": len(self.north_m),
+            "rank": rank,
+            "level": level,
+            **arrays.content(),
+        }
+
+
+def live_page(background: LiveMap | None, title: str) -> tuple[bytes, str]:
+    """The page and its Content-Security-Policy.
+
+    Parameters
+    ----------
+    background : LiveMap, optional
+        None: no prediction, so the page shows what was measured, without a map.
+    title : str
+        Words beside the heading.
+    """
+    style, code = script("live.css"), script("common.js", "live.js")
+    text = (
+        environment()
+        .get_template("live.html.jinja")
+        .render(
+            title=title,
+            mapped=background is not None,
+            style=Markup(style),
+            script=Markup(code),
+            scene=Markup(as_json(background.content() if background else {})),
+        )
+    )
+    return text.encode(), _POLICY.format(script=digest(code), style=digest(style))

@@ -1,0 +1,49 @@
+"""locate.html with metrics.json: the regions of a ground node's place on the site."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..compare.learning.locate import Regions
+from ..site.site import Site
+from .page import write_page
+from .places import Places, payload
+
+
+def write_locate(
+    numbers: Mapping[str, Any], regions: Regions, track_m: FloatArray, site: Site, folder: Path
+) -> list[Path]:
+    """Write the page and all files beside it; the page first.
+
+    Parameters
+    ----------
+    numbers : mapping
+        Content of metrics.json; ``modes`` are places, the likeliest first.
+    regions : Regions
+    track_m : (n, 2 or more)
+        [m]
+    site : Site
+    folder : Path
+
+    Returns
+    -------
+    list of Path
+    """
+    held, (east, north) = regions.likelier(), np.meshgrid(regions.east_m, regions.north_m, indexing="ij")
+    inside = held < 0.9
+    places = Places(
+        name="region of the node",
+        at=np.column_stack([east[inside], north[inside], np.zeros(inside.sum())]),
+        values={"in the region of [%]": 100.0 * held[inside]},
+        cell_m=float(regions.east_m[1] - regions.east_m[0]),
+    )
+    crosses = [np.array([[m["east_m"], m["north_m"]]]) + 8.0 * arm for m in numbers["modes"] for arm in _CROSS]
+    return write_page(folder, "locate", numbers, payload([places], site, lines=[track_m, *crosses]), data=numbers)
+
+
+_CROSS = np.array([[[-1.0, 0.0], [1.0, 0.0]], [[0.0, -1.0], [0.0, 1.0]]])

@@ -1,0 +1,908 @@
+"""map.html of the `map` job with metrics.json: finished maps and tables, sentences, figures, data of the page's script.
+
+All maps of a page lie on one grid. Row 0 is the south, column 0 the west. A position without any path ("Z") is NaN
+in a map of levels and 0 in a map of ranks. What the script shows of a layer (share covered, median, shares of ranks) it
+computes from integers with a step; :func:`layer_numbers` returns the same numbers for metrics.json from the maps.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from ..common.geodesy import SiteFrame
+from ..common.jsonable import json_object, json_safe, named
+from ..common.kml import CLASS_COLOURS
+from ..common.units import FloatArray, IntArray, spread_out
+from ..compare.judge.verdicts import Coverage, coverage_verdict
+from ..compare.statistics.intervals import Interval
+from ..maps.grid import PAPER_SPACING_M
+from ..site.scenes import drawn_buildings
+from ..site.site import Site
+from . import canvas
+from .canvas import TOWER, FigureSpec, beyond, colour_bar, draw_credit, draw_tower, placed
+from .charts import Chart, drawn, flown
+from .flight_data import RANKS, ReportData
+from .flight_figures import channel_specs
+from .flight_words import said_of
+from .packed import NONE, PackedArrays, ends_of_scale, listed, packed, plan_of, step_for
+from .page import Made, about, embedded, json_text, k_key, merge, rendered, safe_name, write_figures, write_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+# Name of the map in which the nearest tower serves.
+JOINT = "joint"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RssMap:
+    """RSS [dBm] of one tower, or of the nearest tower (``tower="joint"``), at one height.
+
+    ``rss_dbm`` (rows, columns) with NaN for Z; ``coverage`` is the share of positions with a path.
+    """
+
+    tower: str
+    antennas: str
+    altitude_m: float
+    rss_dbm: FloatArray
+    coverage: float
+    foliage: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankMap:
+    """Rank (rows, columns) for one K at one height, 0 for Z; ``share`` (5,) of Z and rank 1 to 4.
+
+    Without K the rank is the most probable one of a learned receiver, and ``share`` its mean probabilities.
+    """
+
+    k: float | None
+    altitude_m: float
+    rank: IntArray
+    share: FloatArray
+    foliage: str = ""
+    tower: str = JOINT
+
+    @property
+    def source(self) -> str:
+        """K, or the learned receiver."""
+        return "learned receiver" if self.k is None else f"K = {k_key(self.k)}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapLayer:
+    """One layer that the page can show.
+
+    Parameters
+    ----------
+    quantity, unit : str
+        Layers of one quantity share a colour scale and can be subtracted.
+    axes : mapping of str to str
+        What tells it from the others of its quantity: "Tower", "Antennas", "Foliage", "K", "Height", with their value.
+    values : (rows, columns)
+        From the south-west; NaN out of coverage.
+    classes : tuple of str
+        Names of the values 0, 1, ... where the layer holds classes.
+    difference : bool
+        Its zero means something: a scale around it.
+    """
+
+    quantity: str
+    unit: str
+    axes: Mapping[str, str]
+    values: FloatArray = field(repr=False, compare=False)
+    classes: tuple[str, ...] = ()
+    difference: bool = False
+
+
+def at_height(altitude_m: float) -> dict[str, str]:
+    """The axis of a height, for :class:`MapLayer`."""
+    return {"Height": f"{altitude_m:g} m"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Correlation:
+    """Correlation against distance, each (bins,), and a fitted model on its own distances."""
+
+    title: str
+    distance_m: FloatArray
+    correlation: FloatArray
+    fit_distance_m: FloatArray | None = None
+    fit: FloatArray | None = None
+    fit_label: str = ""
+    excluded: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapError:
+    """Mean absolute error of one method for one K and height, under one way of evaluation.
+
+    ``evaluation`` is e.g. ``"leave one out"``, ``"blocks"``, ``"altitude held out"``, ``"along a flight"``.
+    """
+
+    evaluation: str
+    method: str
+    k: float
+    altitude_m: float
+    mae: float
+    n: int
+    mae_ci95: Interval | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperRow:
+    """A number that the paper states, beside ours, and where to see it."""
+
+    where: str
+    what: str
+    paper: str
+    ours: str
+    figure: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapsData(Made):
+    """Everything the page of a `map` job shows.
+
+    Parameters
+    ----------
+    title, name : str
+        Headline and short name.
+    site : Site
+    east_m, north_m : (columns,), (rows,)
+        Centres of the cells [m].
+    borders_m : tuple of (2, 2) arrays
+        Lines between the areas of two towers (Voronoi), east and north [m].
+    rank : tuple of RankMap
+        The nearest tower serving; ``rank_by_tower`` each alone, for the linked map.
+    corrected : tuple of RssMap
+        Of each link, raw and corrected by flights (``antennas``): for figures; the linked map has them in ``layers``.
+    corrected_rank : tuple of RankMap
+        Of each tower with a learned receiver: the traced ranks of every K and those of the receiver.
+    flown_m : tuple of (n, 2)
+        Tracks of those flights, east and north [m].
+    outside_flown : float
+        Share of positions further from those flights than a correction reaches.
+    corrected_words : str
+        First words of the prediction that corrected the levels.
+    budget : str
+        Power, noise floor and threshold in one sentence, if they are not the paper's.
+    flights : tuple of ReportData
+        Those that ``--with`` names, replayed and compared.
+    layers : tuple of MapLayer
+        Besides RSS and rank.
+    metrics : mapping
+        Written to ``metrics.json`` after the tables of this page.
+    """
+
+    title: str
+    name: str
+    site: Site
+    east_m: FloatArray
+    north_m: FloatArray
+    borders_m: tuple[FloatArray, ...] = ()
+    rss: tuple[RssMap, ...] = ()
+    corrected: tuple[RssMap, ...] = ()
+    corrected_rank: tuple[RankMap, ...] = ()
+    flown_m: tuple[FloatArray, ...] = ()
+    outside_flown: float = 0.0
+    corrected_words: str = ""
+    budget: str = ""
+    flights: tuple[ReportData, ...] = ()
+    rank: tuple[RankMap, ...] = ()
+    rank_by_tower: tuple[RankMap, ...] = ()
+    layers: tuple[MapLayer, ...] = ()
+    correlation: tuple[Correlation, ...] = ()
+    errors: tuple[MapError, ...] = ()
+    paper: tuple[PaperRow, ...] = ()
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    metrics: Mapping[str, Any] = field(default_factory=dict)
+
+
+LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
+
+# Sentence and next step by :func:`~aerpaw_cmp.compare.judge.verdicts.coverage_verdict`.
+CAUSES: dict[str, tuple[str, str]] = {
+    "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
+    "trees": (LEAST + "; trees take most of the rest.", "fly higher, or {thinner}"),
+    "blocked": (LEAST + "; buildings and terrain take most of the rest.", "fly higher, or add a tower"),
+    "no path": ("No path arrives at any position at {where}.", "check the towers and the area of the site"),
+    "extrapolated": (
+        LEAST + ". {outside:.0f} % of the positions lie outside the flown places: there the correction is a guess.",
+        "`aerpaw-cmp plan` names the flight that helps most",
+    ),
+}
+
+
+def first_words(data: MapsData) -> str:
+    """Coverage at the best and at the worst height, what takes the rest, and what to do next."""
+    heights = coverage(data)
+    if not heights:
+        return ""
+    worst = min(heights, key=lambda height: height.covered)
+    sentence = said_of(
+        coverage_verdict(heights),
+        CAUSES,
+        percent=100.0 * worst.covered,
+        outside=100.0 * worst.outside,
+        thinner="compare the rows of attenuating trees"
+        if any(item.foliage == "attenuating" for item in data.rss)
+        else "map with `--foliage attenuating`, too",
+    )
+    best = max(heights, key=lambda height: height.covered)
+    more = f"Best height: {best.height_m:g} m, {100 * best.covered:.1f} %. " if best.covered > worst.covered else ""
+    measured = "" if data.corrected else "Nothing here was measured. "
+    return f"{data.budget}{measured}{more}{sentence}"
+
+
+def coverage(data: MapsData) -> list[Coverage]:
+    """Each height of the map of the nearest tower, with the most trees that were mapped."""
+    shown = [item for item in data.rss if item.tower == JOINT] or list(data.rss)
+    if not shown:
+        return []
+    first = shown[0]
+    same_link = [item for item in shown if (item.tower, item.antennas) == (first.tower, first.antennas)]
+    clear = {item.altitude_m: item.coverage for item in same_link if item.foliage == "none" != first.foliage}
+    return [
+        Coverage(
+            height_m=item.altitude_m,
+            covered=item.coverage,
+            clear=clear.get(item.altitude_m, np.nan),
+            outside=data.outside_flown,
+        )
+        for item in same_link
+        if item.foliage == first.foliage
+    ]
+
+
+def warnings(data: MapsData) -> list[str]:
+    """Warnings that must be known before the maps are believed."""
+    out = [f"{text}." for text in data.site.cautions()]
+    if data.corrected_words:
+        out.append(f"Corrected: {data.corrected_words}")
+    for key, fit in data.metrics.get("correlation", {}).items():
+        if fit["degenerate"]:
+            out.append(f"Correlation fit ({key.replace('z_', 'Z ')}): {fit['message']}")
+    spacing = data.settings.get("spacing_m", 0.0)
+    if spacing > PAPER_SPACING_M:
+        out.append(
+            f"A spacing of {spacing:g} m is coarser than the paper's {PAPER_SPACING_M:g} m: errors of interpolation "
+            "and correlation are not comparable with it."
+        )
+    return [*out, *data.warnings]
+
+
+def notes(data: MapsData) -> list[str]:
+    """Notes on how the maps were made."""
+    how = list(_made(data)) if "foliage" in data.settings else []
+    return [*data.site.notes, *how, *data.notes]
+
+
+def _made(data: MapsData) -> Iterator[str]:
+    s = data.settings
+    yield (
+        f"Foliage {', '.join(s['foliage'])}: opaque stops whatever touches a crown or a trunk (the paper); attenuating "
+        "takes ITU-R P.833 over the path's length in crowns; none leaves the trees out."
+    )
+    yield "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element."
+    yield f"Spread, condition number, correlation and interpolation are those of foliage {data.rss[0].foliage}."
+
+
+T = TypeVar("T")
+MISSING: dict[str, Any] = {"facecolor": "#F2F2F2", "edgecolor": "#888888", "hatch": "//////", "linewidth": 0.0}
+# Maps side by side, at most.
+COLUMNS = 6
+
+
+def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
+    """Items under their keys, in the order of first appearance."""
+    result: dict[Any, list[T]] = {}
+    for item in items:
+        result.setdefault(key(item), []).append(item)
+    return result
+
+
+# --- one map ------------------------------------------------------------------------------------
+
+
+def half_width(at_m: FloatArray) -> float:
+    """Half of the spacing of cell centres [m]; 15 where there is one cell only."""
+    return float(at_m[1] - at_m[0]) / 2 if len(at_m) > 1 else 15.0
+
+
+def extent_m(data: MapsData) -> tuple[float, float, float, float]:
+    """Outer edges of the grid: west, east, south, north [m]."""
+    (west, east), (south, north) = (
+        (float(at[0]) - half_width(at), float(at[-1]) + half_width(at)) for at in (data.east_m, data.north_m)
+    )
+    return west, east, south, north
+
+
+def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | None = None, **options: Any) -> Any:
+    """One map: cells as an image, hatched where NaN, with what stands there and the borders of the towers.
+
+    Parameters
+    ----------
+    ax : Axes
+    data : MapsData
+        Site, axes of the grid and borders.
+    values : (rows, columns)
+        Of the cells, from south to north; NaN out of coverage.
+    highlight : str, optional
+        The only tower that counts: no borders are drawn then.
+    options
+        Of :meth:`matplotlib.axes.Axes.imshow`.
+
+    Returns
+    -------
+    matplotlib.image.AxesImage
+        For a colour bar.
+    """
+    ax.patch.set(**MISSING)  # cells without a value are transparent, so the hatched ground shows
+    image = ax.imshow(values, origin="lower", extent=extent_m(data), interpolation="none", zorder=1, **options)
+    _draw_overlay(ax, data.site, highlight)
+    for line in data.borders_m if highlight is None else ():
+        ax.plot(line[:, 0], line[:, 1], color="white", linewidth=1.8, zorder=3)
+        ax.plot(line[:, 0], line[:, 1], color="black", linewidth=0.9, linestyle=(0, (4, 2)), zorder=3.1)
+    west, east, south, north = extent_m(data)
+    ax.set(xlim=(west, east), ylim=(south, north))
+    ax.set_aspect("equal", adjustable="box")
+    ax.grid(visible=False)
+    ax.tick_params(labelsize=7)
+    ax.locator_params(axis="x", nbins=4)
+    return image
+
+
+def _draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
+    """Outlines of buildings and forests, and the towers; only the named tower when one is named."""
+    from matplotlib.collections import PolyCollection
+
+    draw_credit(ax, site)
+    for forest in site.forests:
+        outline = np.asarray(forest.area.exterior.coords)
+        ax.plot(outline[:, 0], outline[:, 1], color="white", linewidth=1.4, zorder=2)
+        ax.plot(outline[:, 0], outline[:, 1], color="#2F5D28", linewidth=0.8, linestyle=(0, (2, 1)), zorder=2.1)
+    outlines = [np.asarray(building.footprint.exterior.coords)[:, :2] for building in drawn_buildings(site)]
+    ax.add_collection(PolyCollection(outlines, facecolor="white", edgecolor="black", linewidth=0.7, zorder=2.2))
+    for name, tower in site.towers.items():
+        if highlight is None or name == highlight:
+            draw_tower(ax, tower, markersize=7)
+
+
+def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
+    """Legend entries of what :func:`draw_map` draws."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    entries: list[Any] = [Patch(**MISSING, label="Z: out of coverage")]
+    entries.append(Line2D([], [], marker="^", color=TOWER, markeredgecolor="white", linestyle="none", label="tower"))
+    if drawn_buildings(data.site):
+        entries.append(Patch(facecolor="white", edgecolor="black", label="building"))
+    if data.site.forests:
+        entries.append(Line2D([], [], color="#2F5D28", linestyle=(0, (2, 1)), label="forest"))
+    if borders and data.borders_m:
+        entries.append(Line2D([], [], color="black", linestyle=(0, (4, 2)), label="border of the towers' areas"))
+    return entries
+
+
+def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure, list[Axes]]:
+    """A figure with room for ``count`` maps, a legend and a margin on the right [inch], outer axes labelled."""
+    west, east, south, north = extent_m(data)
+    columns = min(count, COLUMNS)
+    rows = -(-count // columns)
+    columns = -(-count // rows)
+    width = min((7.4 - 0.15 * columns) / columns, 3.2)  # what a colour bar and the labels leave
+    height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
+    fig, grid = placed(
+        (9.2, rows * (height + 0.35) + 1.0),
+        rows,
+        columns,
+        gap_in=(0.3, 0.4),
+        right_in=right_in,
+        sharex=True,
+        sharey=True,
+    )
+    axes: list[Axes] = list(grid.ravel())
+    for ax in axes[count:]:
+        ax.set_visible(False)
+    for row in grid:
+        row[0].set_ylabel("North [m]")
+    for number in range(count):
+        if number + columns >= count:
+            axes[number].set_xlabel("East [m]")
+            axes[number].tick_params(labelbottom=True)
+    return fig, axes[:count]
+
+
+# --- figures ------------------------------------------------------------------------------------
+
+
+def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]) -> Figure:
+    """Each tower alone and all jointly, for one antenna choice and height, on one colour scale [dBm]."""
+    fig, axes = map_axes(data, len(maps), 1.0)
+    image = None
+    for ax, shown in zip(axes, maps, strict=True):
+        alone = None if shown.tower == JOINT else shown.tower
+        image = draw_map(ax, data, shown.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
+        ax.set_title(f"{shown.tower}: {100 * shown.coverage:.0f} %", fontsize=9)
+    levels = np.concatenate([entry.rss_dbm.ravel() for entry in maps])
+    low, high = axes[-1].get_position().y0, axes[0].get_position().y1
+    bar = fig.add_axes((0.91, low + 0.1 * (high - low), 0.016, 0.8 * (high - low)))
+    colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits), bar)
+    entries = overlay_legend(data, borders=any(entry.tower == JOINT for entry in maps))
+    fig.legend(handles=entries, loc="lower center", ncols=3)
+    return fig
+
+
+def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
+    """Rank at every height for one K."""
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    fig, axes = map_axes(data, len(maps))
+    colours = ListedColormap([CLASS_COLOURS[r] for r in RANKS])
+    norm = BoundaryNorm([0.5, 1.5, 2.5, 3.5, 4.5], 4)
+    for ax, shown in zip(axes, maps, strict=True):
+        draw_map(ax, data, np.where(shown.rank > 0, shown.rank, np.nan), cmap=colours, norm=norm)
+        ax.set_title(f"{shown.altitude_m:g} m", fontsize=9)
+    entries = [Patch(facecolor=CLASS_COLOURS[r], edgecolor="black", label=f"rank {r}") for r in RANKS]
+    fig.legend(handles=[*entries, *overlay_legend(data, borders=True)], loc="lower center", ncols=5)
+    return fig
+
+
+def distribution(members: Sequence[RssMap]) -> dict[str, Any]:
+    """Distribution of RSS of each tower and jointly at one height, positions out of coverage counted as below."""
+    marks = []
+    for shown in members:
+        level = np.sort(shown.rss_dbm[np.isfinite(shown.rss_dbm)])
+        share = (shown.rss_dbm.size - len(level) + np.arange(1, len(level) + 1)) / shown.rss_dbm.size
+        some = spread_out(len(level), 400)  # steps of a four-hundredth cannot be seen
+        marks.append({"kind": "line", "name": shown.tower, "x": level[some], "y": 100.0 * share[some]})
+    return {"x": {"label": "RSS [dBm]"}, "y": {"label": "Positions below [%]", "ends": [0, 100]}, "marks": marks}
+
+
+def rank_shares(members: Sequence[RankMap]) -> dict[str, Any]:
+    """Shares of Z and rank 1 to 4 about each height, one upon the other."""
+    members = sorted(members, key=lambda member: member.altitude_m)
+    at = np.array([member.altitude_m for member in members])
+    half = np.diff(at) / 2.0 if len(at) > 1 else np.array([5.0])
+    sides = np.repeat([max(at[0] - half[0], 0.0), *(at[:-1] + half[: len(at) - 1]), at[-1] + half[-1]], 2)[1:-1]
+    share = 100.0 * np.array([member.share for member in members])
+    edges = np.repeat(np.column_stack([np.zeros(len(at)), share.cumsum(axis=1)]), 2, axis=0)
+    marks = [
+        {"kind": "band", "name": f"rank {rank}" if rank else "Z: out of coverage", "x": sides, "low": edges[:, rank],
+         "high": edges[:, rank + 1], "colour": CLASS_COLOURS[rank]}
+        for rank in (0, *RANKS)
+    ]  # fmt: skip
+    return {"x": {"label": "Height [m]"}, "y": {"label": "Positions [%]", "ends": [0, 100]}, "marks": marks}
+
+
+def correlation(curve: Correlation) -> dict[str, Any]:
+    """Correlation against distance and its model."""
+    marks: list[Any] = [{"kind": "dots", "name": "data", "x": curve.distance_m, "y": curve.correlation}]
+    if curve.fit is not None:
+        name = curve.fit_label or "model"
+        marks.append({"kind": "line", "name": name, "x": curve.fit_distance_m, "y": curve.fit})
+    return {"x": {"label": "Distance [m]"}, "y": {"label": "Correlation"}, "marks": marks}
+
+
+def error_curves(members: Sequence[MapError], worst: float) -> dict[str, Any]:
+    """MAE against height for every method; ``worst`` of all panels sets the scale."""
+    marks = []
+    for method, rows in grouped(sorted(members, key=lambda e: e.altitude_m), lambda e: e.method).items():
+        at, mae = np.array([[row.altitude_m, row.mae] for row in rows]).T
+        marks.append({"kind": "line", "name": method, "x": at, "y": mae})
+    y = {"label": "MAE of the rank", "ends": [0.0, 1.08 * worst if worst > 0 else 1.0]}
+    return {"x": {"label": "Height [m]"}, "y": y, "marks": marks}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plate:
+    """Panels of one kind: a figure as a file, and a chart of the page each; ``panels`` by their titles."""
+
+    name: str
+    section: str
+    title: str
+    caption: str
+    panels: Mapping[str, Mapping[str, Any]]
+
+    @property
+    def spec(self) -> FigureSpec:
+        """The figure."""
+        return FigureSpec(self.name, partial(drawn, self.panels))
+
+    @property
+    def charts(self) -> list[Chart]:
+        """Charts of the page."""
+        return [
+            Chart(
+                section=self.section, title=f"{self.title}: {name}", caption="" if i else self.caption, content=content
+            )
+            for i, (name, content) in enumerate(self.panels.items())
+        ]
+
+
+def plates(data: MapsData) -> Iterator[Plate]:
+    """Distributions, shares, correlation and errors: all that is no map."""
+    for words, maps in grouped((*data.rss, *data.corrected), lambda m: f"{m.antennas}{_under(m.foliage)}").items():
+        yield Plate(
+            name=f"rss_cdf_{safe_name(words)}", section="rss", title=f"Distribution of RSS, {words}",
+            caption="Share of positions with an RSS below the value; a curve starts at its share of Z.",
+            panels={f"{at:g} m": distribution(some) for at, some in grouped(maps, lambda m: m.altitude_m).items()},
+        )  # fmt: skip
+    for words, ranks in grouped(data.rank, lambda m: _under(m.foliage)).items():
+        yield Plate(
+            name="_".join(["rank_share", *([safe_name(words)] if words else [])]), section="rank",
+            title=f"Rank against height{words}", caption="Share of positions with each rank; Z is out of coverage.",
+            panels={source: rank_shares(some) for source, some in grouped(ranks, lambda m: m.source).items()},
+        )  # fmt: skip
+    for tower, ranks in grouped(data.corrected_rank, lambda m: m.tower).items():
+        yield Plate(
+            name=f"rank_share_learned_{safe_name(tower)}", section="rank",
+            title=f"Rank of {tower} against height, raw and corrected",
+            caption="Raw: share of positions with each rank of the traced channel, by K; Z is out of coverage. Learned "
+            "receiver: mean probability of each rank.",
+            panels={source: rank_shares(some) for source, some in grouped(ranks, lambda m: m.source).items()},
+        )  # fmt: skip
+    if data.correlation:
+        yield Plate(
+            name="correlation", section="kriging", title="Spatial correlation",
+            caption="Pearson correlation between positions against their distance, and the fitted model. "
+            + " ".join(f"{c.title}: {c.excluded} constant positions left out." for c in data.correlation),
+            panels={curve.title: correlation(curve) for curve in data.correlation},
+        )  # fmt: skip
+    for evaluation, errors in grouped(data.errors, lambda error: error.evaluation).items():
+        worst = max((error.mae for error in errors if np.isfinite(error.mae)), default=1.0)
+        yield Plate(
+            name=f"mae_{safe_name(evaluation)}", section="kriging", title=f"Error of interpolated rank, {evaluation}",
+            caption="Mean absolute error against height; lower is better.",
+            panels={f"K = {k_key(k)}": error_curves(some, worst) for k, some in grouped(errors, lambda e: e.k).items()},
+        )  # fmt: skip
+
+
+# --- all figures ---------------------------------------------------------------------------------
+
+
+def _level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
+    """One colour scale for all maps [dBm]: the 1 to 99.5 % range, to whole 5 dB."""
+    parts = [entry.rss_dbm[np.isfinite(entry.rss_dbm)] for entry in maps]
+    finite = np.concatenate(parts) if parts else np.zeros(0)
+    if not len(finite):
+        return -100.0, -50.0
+    # a few cells beside a tower are far above all others and would take most colours
+    low, high = np.percentile(finite, [1.0, 99.5])
+    return float(5 * np.floor(low / 5)), float(max(5 * np.ceil(high / 5), 5 * np.floor(low / 5) + 5))
+
+
+def figure_specs(data: MapsData) -> list[FigureSpec]:
+    """Every figure that the data allow, in reading order."""
+    flown = [
+        replace(spec, name=f"{spec.name}_{safe_name(flight.flight)}")
+        for flight in data.flights for spec in channel_specs(flight)
+    ]  # fmt: skip
+    return [*_rss_specs(data), *flown, *_rank_specs(data), *(plate.spec for plate in plates(data))]
+
+
+def _under(foliage: str) -> str:
+    return f", foliage {foliage}" if foliage else ""
+
+
+def _rss_specs(data: MapsData) -> Iterator[FigureSpec]:
+    levels = (*data.rss, *data.corrected)
+    limits = _level_limits(levels)
+    by_height = grouped(levels, lambda m: (f"{m.antennas}{_under(m.foliage)}", m.altitude_m))
+    for (antennas, height), maps in by_height.items():
+        name = f"rss_map_{safe_name(f'{antennas}, {height:g} m')}"
+        yield FigureSpec(name, partial(rss_maps, data, maps, limits))
+
+
+def _rank_specs(data: MapsData) -> Iterator[FigureSpec]:
+    for words, maps in grouped(data.rank, lambda m: f"{m.source}{_under(m.foliage)}").items():
+        yield FigureSpec(f"rank_map_{safe_name(words)}", partial(rank_grid, data, maps))
+    for tower, maps in grouped(data.corrected_rank, lambda m: m.tower).items():
+        learned = [m for m in maps if m.k is None]
+        yield FigureSpec(f"rank_map_learned_{safe_name(tower)}", partial(rank_grid, data, learned))
+
+
+# Base64 that the layers may take; beyond it layers of single towers are left out, then cells.
+MOST_BYTES = 4_000_000
+
+_LATTICE = 9
+_DEGREE = 4
+_FINEST_DB = 0.01
+
+LEVEL, _CLASSES, DIFFERENCE = "level", "classes", "difference"
+_RANK_CLASSES = ("Z", *map(str, RANKS))
+
+
+# --- layers ---------------------------------------------------------------------------------------------------------
+
+
+def page_layers(data: MapsData) -> list[MapLayer]:
+    """Every layer that the page can show, quantities in their order."""
+    rss = [
+        MapLayer(
+            quantity="RSS", unit="dBm", axes={"Tower": m.tower, "Antennas": m.antennas, **_foliage_height(m)},
+            values=m.rss_dbm,
+        )
+        for m in data.rss
+    ]  # fmt: skip
+    traced = [
+        _rank_layer(m, "Rank", {"Tower": m.tower, "K": k_key(m.k or 0.0), **_foliage_height(m)})
+        for m in (*data.rank, *data.rank_by_tower)
+    ]
+    corrected = [
+        _rank_layer(
+            m, "Rank, raw and corrected",
+            {"Version": f"{'corrected' if m.k is None else 'raw'}, {m.source}", "Tower": m.tower,
+             **at_height(m.altitude_m)},
+        )
+        for m in data.corrected_rank
+    ]  # fmt: skip
+    return [*rss, *traced, *corrected, *data.layers]
+
+
+def _rank_layer(m: RankMap, quantity: str, axes: dict[str, str]) -> MapLayer:
+    values = np.where(m.rank > 0, m.rank, np.nan)
+    return MapLayer(quantity=quantity, unit="", axes=axes, values=values, classes=_RANK_CLASSES)
+
+
+def _foliage_height(m: RssMap | RankMap) -> dict[str, str]:
+    return {**({"Foliage": m.foliage} if m.foliage else {}), **at_height(m.altitude_m)}
+
+
+def layer_numbers(layer: MapLayer) -> dict[str, Any]:
+    """Numbers of a layer on the page: share covered, percentiles, shares of classes (None where there is none)."""
+    finite = layer.values[np.isfinite(layer.values)]
+    result: dict[str, Any] = {
+        "quantity": layer.quantity,
+        "unit": layer.unit,
+        **{name.lower(): value for name, value in layer.axes.items()},
+        "covered": len(finite) / layer.values.size,
+    }
+    if layer.classes:
+        counts = np.bincount(finite.astype(np.int64), minlength=len(layer.classes)).astype(np.float64)
+        if layer.classes[0] == _RANK_CLASSES[0]:  # no path is a class of its own
+            counts[0] = layer.values.size - len(finite)
+        return result | {"share": dict(zip(layer.classes, counts / layer.values.size, strict=True))}
+    names = ("min", "p10", "median", "p90", "max")
+    levels = np.quantile(finite, [0.0, 0.1, 0.5, 0.9, 1.0]) if len(finite) else np.full(5, np.nan)
+    return result | {"mean": finite.mean() if len(finite) else np.nan, **dict(zip(names, levels, strict=True))}
+
+
+# --- what the script gets ---------------------------------------------------------------------------------------------
+
+
+def payload(data: MapsData, charts: Sequence[Chart] = (), most_bytes: int = MOST_BYTES) -> dict[str, Any]:
+    """Everything the script needs, as plain values, in at most about ``most_bytes`` of base64.
+
+    Parameters
+    ----------
+    data : MapsData
+    charts : sequence of Chart
+    most_bytes : int
+        Where all layers need more, those of single towers but RSS are left out, then all of single towers, then
+        every second (third, ...) cell of each row and column is kept; ``left_out`` says which.
+    """
+    layers = page_layers(data)
+    tries: list[tuple[str, Sequence[MapLayer], int]] = [("", layers, 1)]
+    joint = [item for item in layers if _is_joint(item)]
+    levels = [item for item in layers if _is_joint(item) or item.quantity == "RSS"]
+    tries.append(("layers of single towers but RSS", levels, 1))
+    tries.append(("layers of single towers", joint, 1))
+    stride = 1
+    while True:
+        for words, chosen, every in tries:
+            content = _packed(data, charts, chosen, every)
+            # measured after packing: how far the block deflates depends on the maps
+            if len(content["packed"]["data"]) <= most_bytes:
+                return content | {"left_out": words, "stride": every}
+        stride += 1
+        words = f"layers of single towers, and all but every {stride}. cell of each row and column"
+        tries = [(words, joint, stride)]
+
+
+def _is_joint(layer: MapLayer) -> bool:
+    return layer.axes.get("Tower", JOINT) == JOINT
+
+
+def _packed(data: MapsData, charts: Sequence[Chart], layers: Sequence[MapLayer], stride: int) -> dict[str, Any]:
+    arrays = PackedArrays()
+    east, north = data.east_m[::stride], data.north_m[::stride]
+    by_quantity = grouped(layers, lambda layer: layer.quantity)
+    quantities = [_quantity(name, members, arrays, stride) for name, members in by_quantity.items()]
+    return {
+        "east": arrays.add(east, "f8"),
+        "north": arrays.add(north, "f8"),
+        "half": [stride * half_width(axis) for axis in (data.east_m, data.north_m)],
+        "degrees": geographic(data.site.frame, data.east_m, data.north_m),
+        "site": plan_of(data.site),
+        "borders": [listed(line) for line in data.borders_m],
+        "flown": [listed(np.round(line, 1)) for line in data.flown_m],
+        "joint": JOINT,
+        "quantities": quantities,
+        "plots": [packed(chart.content, arrays) for chart in charts],
+        "packed": arrays.content(),
+    }
+
+
+def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, stride: int) -> dict[str, Any]:
+    """One quantity: its axes, and per combination of their values the number of its array."""
+    axes: dict[str, list[str]] = {}
+    for layer in layers:
+        for axis, value in layer.axes.items():
+            if value not in axes.setdefault(axis, []):
+                axes[axis].append(value)
+    for axis, values in axes.items():
+        values.sort(key=lambda value: _place(axis, value))
+    kind = _CLASSES if layers[0].classes else DIFFERENCE if layers[0].difference else LEVEL
+    every = np.concatenate([layer.values[np.isfinite(layer.values)] for layer in layers])
+    step = 1.0 if kind == _CLASSES else step_for(every, _FINEST_DB)
+    stored = {}
+    for layer in layers:
+        cells = layer.values[::stride, ::stride].ravel()
+        key = ",".join(str(axes[axis].index(layer.axes[axis])) if axis in layer.axes else "0" for axis in axes)
+        classes = np.nan_to_num(cells, nan=NONE["u1"])
+        stored[key] = arrays.add(classes, "u1") if kind == _CLASSES else arrays.add_steps(cells, step)
+    return {
+        "name": name,
+        "unit": layers[0].unit,
+        "kind": kind,
+        "step": step,
+        "range": _range(every, kind),
+        "classes": list(layers[0].classes),
+        "colours": _class_colours(layers[0].classes),
+        "axes": [{"name": axis, "values": values} for axis, values in axes.items()],
+        "layers": stored,
+    }
+
+
+def _place(axis: str, value: str) -> float:
+    """Order of the values of an axis: all towers together first, heights and K rising, others as they came."""
+    if axis == "Tower":
+        return 0.0 if value == JOINT else 1.0
+    return float(value.removesuffix(" m")) if axis in ("Height", "K") else 0.0
+
+
+def _range(values: FloatArray, kind: str) -> list[float]:
+    """Ends of the colour scale that all layers of a quantity share: 1 and 99.5 %, even about zero for differences."""
+    if kind == DIFFERENCE and len(values):
+        reach = float(np.percentile(np.abs(values), 99)) or float(np.abs(values).max()) or 1.0
+        return [-reach, reach]
+    return ends_of_scale(values, 99.5)
+
+
+def _class_colours(classes: Sequence[str]) -> list[str]:
+    """A colour per class: those of ranks, else well apart in hue and lightness."""
+    if tuple(classes) == _RANK_CLASSES:
+        return ["", *(CLASS_COLOURS[rank] for rank in RANKS)]
+    if not classes:
+        return []
+    hues = ("#0072B2", "#E69F00", "#009E73", "#CC79A7", "#D55E00", "#56B4E9", "#F0E442", "#555555")
+    return [hues[number % len(hues)] for number in range(len(classes))]
+
+
+def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dict[str, Any]:
+    """Latitude and longitude [deg] over the area as polynomials of east and north, for the script.
+
+    Returns
+    -------
+    dict
+        ``middle`` and ``reach`` (2,) [m]; ``powers`` (m, 2); ``lat``, ``lon`` (m,) [deg]: the sum over m of
+        coefficient times u^p v^q with u, v = (position - middle) / reach. ``worst_m``: the largest error on the
+        lattice of the fit.
+
+    Notes
+    -----
+    Least squares on a lattice of 9 x 9 points. Over 10 km the error is below a millimetre; the projection's inverse
+    itself is :meth:`aerpaw_cmp.common.geodesy.SiteFrame.to_geographic`.
+    """
+    ends = np.array([[east_m[0], east_m[-1]], [north_m[0], north_m[-1]]], dtype=np.float64)
+    middle = ends.mean(axis=1)
+    # of one row of cells the reach is 0, by which the script would divide
+    reach = np.maximum(np.ptp(ends, axis=1) / 2, 100.0)
+    u, v = (grid.ravel() for grid in np.meshgrid(np.linspace(-1, 1, _LATTICE), np.linspace(-1, 1, _LATTICE)))
+    east, north = middle[0] + u * reach[0], middle[1] + v * reach[1]
+    lat, lon = frame.to_geographic(east, north)
+    powers = [(p, q) for p in range(_DEGREE + 1) for q in range(_DEGREE + 1 - p)]
+    matrix = np.column_stack([u**p * v**q for p, q in powers])
+    (by_lat, by_lon), *_ = (np.linalg.lstsq(matrix, np.column_stack([lat, lon]), rcond=None)[0].T,)
+    back = frame.to_local(matrix @ by_lat, matrix @ by_lon)
+    worst = float(np.hypot(back[0] - east, back[1] - north).max())
+    return {
+        "middle": middle.tolist(), "reach": reach.tolist(), "powers": [list(pair) for pair in powers],
+        "lat": by_lat.tolist(), "lon": by_lon.tolist(), "worst_m": worst,
+    }  # fmt: skip
+
+
+def maps_metrics(data: MapsData) -> dict[str, Any]:
+    """The numbers of the page under stable names; ``data.metrics`` is merged in last."""
+    columns, rows = len(data.east_m), len(data.north_m)
+    numbers = json_object(
+        name=data.name,
+        title=data.title,
+        site=named(data.site, "name credit assumed"),
+        grid={"columns": columns, "rows": rows, "positions": columns * rows},
+        coverage=[named(m, "tower antennas foliage altitude_m coverage") for m in data.rss],
+        rank=[
+            {
+                **named(m, "k foliage altitude_m"),
+                "share": dict(zip(("Z", *map(str, RANKS)), m.share, strict=True)),
+            }
+            for m in data.rank
+        ],
+        layers=[layer_numbers(layer) for layer in page_layers(data)],
+        mae=[named(e, "evaluation method k altitude_m mae mae_ci95 n") for e in data.errors],
+        paper=[named(p, "where what paper ours") for p in data.paper],
+        warnings=warnings(data),
+        **about(data),
+    )
+    merge(numbers, json_safe(data.metrics))
+    return numbers
+
+
+def coverage_table(data: MapsData) -> tuple[list[str], list[tuple[list[str], list[float | None]]]]:
+    """Column heads (heights) and rows (antennas, foliage, tower; share per height)."""
+    heights = sorted({m.altitude_m for m in data.rss})
+    rows = []
+    for key, maps in grouped(data.rss, lambda m: (m.antennas, m.foliage, m.tower)).items():
+        share = {m.altitude_m: m.coverage for m in maps}
+        rows.append(([str(part) for part in key], [share.get(h) for h in heights]))
+    return [f"{h:g} m" for h in heights], rows
+
+
+def error_tables(
+    errors: Sequence[MapError],
+) -> list[tuple[str, list[str], list[tuple[str, str, list[float | None], float]]]]:
+    """Per evaluation: title, heights, and rows of (method, K, MAE per height, mean over heights)."""
+    result = []
+    for evaluation, members in grouped(errors, lambda e: e.evaluation).items():
+        heights = sorted({e.altitude_m for e in members})
+        rows = []
+        for (method, k), group in grouped(members, lambda e: (e.method, e.k)).items():
+            mae = {e.altitude_m: e.mae for e in group}
+            mean = sum(mae.values()) / len(mae)
+            rows.append((method, k_key(k), [mae.get(h) for h in heights], mean))
+        result.append((evaluation, [f"{h:g} m" for h in heights], rows))
+    return result
+
+
+def maps_page(data: MapsData, files: Sequence[str]) -> str:
+    """The whole page."""
+    charts = [chart for plate in plates(data) for chart in plate.charts]
+    charts += [chart for flight in data.flights for chart in flown(flight)]
+    linked = payload(data, charts) if data.rss or data.rank or data.layers else None
+    return rendered(
+        "map",
+        ("common.js", "map_explorer.js") if linked else (),
+        data=data,
+        verdict=first_words(data),
+        warnings=warnings(data),
+        notes=notes(data),
+        charts=charts,
+        coverage=coverage_table(data),
+        errors=error_tables(data.errors),
+        files=files,
+        explorer=embedded(linked),
+    )
+
+
+def write_maps(data: MapsData, folder: str | Path, drawn: str = "none") -> list[Path]:
+    """Write ``map.html``, ``metrics.json`` and figures in one format, all or none; gives the files, the page first."""
+    folder = Path(folder)
+    written = [write_file(folder / "metrics.json", json_text(maps_metrics(data)))]
+    specs = [] if drawn == "none" else figure_specs(data)
+    formats = canvas.FORMATS if drawn == "all" else (drawn,)
+    _, files = write_figures(specs, folder / "figures", formats)
+    page = write_file(folder / "map.html", maps_page(data, ["metrics.json"]))
+    return [page, *written, *files]

@@ -1,0 +1,166 @@
+"""Data for the scripts of pages: packed arrays, and outlines and walls of a site as points."""
+
+from __future__ import annotations
+
+import base64
+import zlib
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import shapely
+from shapely import Polygon
+
+from ..common.units import AnyArray, FloatArray, spread_out
+from ..site.scenes import drawn_buildings
+from ..site.site import Building, Site
+
+# What stands for NaN in an array of each integer kind.
+NONE = {"u1": 255, "u2": 65_535, "i2": -32_768}
+
+# the most negative number stands for NaN, so the range is even about zero
+LARGEST = 32_767
+
+
+# Trees that a page draws.
+_TREES = 1500
+
+
+class PackedArrays:
+    """Arrays of a page, each stored once, one after the other at multiples of eight bytes.
+
+    Examples
+    --------
+    >>> arrays = PackedArrays()
+    >>> arrays.add(np.array([1.5, 2.5]), "f4"), arrays.add(np.array([7]), "u1"), arrays.add(np.array([1.5, 2.5]), "f4")
+    (0, 1, 0)
+    >>> arrays.content()["arrays"]
+    [['f4', 0, 2], ['u1', 8, 1]]
+    """
+
+    def __init__(self) -> None:
+        self._parts: list[bytes] = []
+        self._table: list[tuple[str, int, int]] = []
+        self._known: dict[tuple[str, bytes], int] = {}
+        self._size = 0
+
+    def add(self, values: AnyArray, kind: str = "f4") -> int:
+        """Number under which the values stand, little endian; equal arrays share one."""
+        raw = np.ascontiguousarray(values, dtype=f"<{kind}").tobytes()
+        key = (kind, raw)
+        if key not in self._known:
+            self._known[key] = len(self._table)
+            self._table.append((kind, self._size, np.size(values)))
+            # a typed array of JavaScript must begin at a multiple of its own size
+            padded = raw + bytes(-len(raw) % 8)
+            self._parts.append(padded)
+            self._size += len(padded)
+        return self._known[key]
+
+    def add_steps(self, values: FloatArray, step: float) -> int:
+        """Values as 16-bit multiples of ``step``; what is not finite is none."""
+        return self.add(_steps_of(values, step), "i2")
+
+    def content(self) -> dict[str, Any]:
+        """``{"data": base64 of the deflated block, "arrays": [[kind, offset, length], ...]}``."""
+        block = zlib.compress(b"".join(self._parts), 9)
+        return {"data": base64.b64encode(block).decode("ascii"), "arrays": [list(entry) for entry in self._table]}
+
+
+def _steps_of(values: FloatArray, step: float) -> AnyArray:
+    """Values as multiples of ``step``, those beyond 16 bits at the end of the range; NaN and infinities are none.
+
+    Examples
+    --------
+    >>> _steps_of(np.array([0.014, -1.0, np.nan]), 0.01).tolist()
+    [1, -100, -32768]
+    """
+    array = np.asarray(values, dtype=np.float64)
+    finite = np.isfinite(array)
+    with np.errstate(over="ignore"):
+        scaled = np.rint(np.where(finite, array, 0.0) / step)
+    return np.where(finite, np.clip(scaled, -LARGEST, LARGEST), NONE["i2"]).astype(np.int16)
+
+
+def step_for(values: FloatArray, finest: float = 0.01) -> float:
+    """Least step that holds all values in 16 bits: ``finest``, or that times a power of ten.
+
+    Examples
+    --------
+    >>> step_for(np.array([-140.0, 30.0])), step_for(np.array([0.0, 5000.0]))
+    (0.01, 1.0)
+    """
+    array = np.asarray(values, dtype=np.float64)
+    reach = float(np.abs(array[np.isfinite(array)]).max(initial=0.0))
+    # less a rounding of the logarithm: what fits exactly must not get a step ten times as coarse
+    tens = int(np.ceil(np.log10(max(reach / (LARGEST * finest), 1.0)) - 1e-12))
+    return float(finest * 10.0**tens)
+
+
+def outline(area: Polygon) -> FloatArray:
+    """Corners (n, 2) of an area as one line that also runs round its holes, so that filling it leaves them empty."""
+    area = shapely.orient_polygons(area)
+    outer = np.asarray(area.exterior.coords)[:, :2]
+    holes = [part for ring in area.interiors for part in (np.asarray(ring.coords)[:, :2], outer[:1])]
+    return np.concatenate([outer, *holes])
+
+
+def walls(building: Building) -> list[FloatArray]:
+    """Wall rectangles and roof of a prism as polygons (n, 3)."""
+    base, top = building.base_m, building.base_m + building.height_m
+    result = []
+    for ring in (building.footprint.exterior, *building.footprint.interiors):
+        corners = np.asarray(ring.coords)[:, :2]
+        for (e0, n0), (e1, n1) in pairwise(corners):
+            result.append(np.array([[e0, n0, base], [e1, n1, base], [e1, n1, top], [e0, n0, top]]))
+    result.append(at_height(outline(building.footprint), top))
+    return result
+
+
+def listed(points: Any) -> Any:
+    """Points as nested lists, rounded to 0.1 m."""
+    return np.round(np.asarray(points, dtype=np.float64), 1).tolist()
+
+
+def at_height(line_m: FloatArray, up_m: float) -> FloatArray:
+    """A line (n, 2) in the plane at a height, (n, 3)."""
+    return np.column_stack([line_m, np.full(len(line_m), up_m)])
+
+
+def ends_of_scale(values: FloatArray, most: float) -> list[float]:
+    """Ends of a colour scale: 1 % and ``most`` % of finite values, half a unit about a constant, 0 and 1 of none."""
+    low, high = (float(v) for v in np.percentile(values, [1.0, most])) if len(values) else (0.0, 1.0)
+    return [low, high] if high > low else [low - 0.5, low + 0.5]
+
+
+def packed(value: Any, arrays: PackedArrays) -> Any:
+    """A chart with its arrays in the page's block."""
+    if isinstance(value, np.ndarray):
+        # 32-bit floats have seven digits: beyond 1e5 a time would lose hundredths of a second
+        return arrays.add(value, "f8" if value.max(initial=0.0) > 1e5 else "f4")
+    if isinstance(value, dict):
+        return {key: packed(each, arrays) for key, each in value.items()}
+    return [packed(each, arrays) for each in value] if isinstance(value, list) else value
+
+
+def scene(site: Site, most_trees: int = _TREES) -> dict[str, Any]:
+    """Towers, buildings, trees and forests as plain lists, rounded to 0.1 m."""
+    trees, pick = site.trees, spread_out(len(site.trees), most_trees)
+    columns = ("east_m", "north_m", "ground_m", "height_m", "crown_diameter_m", "crown_base_m")
+    return {
+        "name": site.name,
+        "credit": site.credit if site.mapped else "no map here",
+        "towers": [
+            {"name": t.name, "at": listed([t.east_m, t.north_m, t.ground_m]), "top": round(float(t.position_m[2]), 2)}
+            for t in site.towers.values()
+        ],
+        "buildings": [[listed(face) for face in walls(b)] for b in drawn_buildings(site)],
+        "forests": [listed(outline(f.area)) for f in site.forests],
+        "trees": listed(np.column_stack([getattr(trees, c)[pick] for c in columns])) if len(pick) else [],
+    }
+
+
+def plan_of(site: Site) -> dict[str, Any]:
+    """:func:`scene` for a plan: no trees (foliage is in the levels), roofs alone of buildings."""
+    solid = scene(site)
+    return {**solid, "trees": [], "buildings": [faces[-1:] for faces in solid["buildings"]]}

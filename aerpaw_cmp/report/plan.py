@@ -1,0 +1,83 @@
+"""plan.html with metrics.json, the chosen route as files, and the map of expected standard deviations."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ..common.cells import guarded
+from ..common.jsonable import json_object, named
+from ..common.units import FloatArray
+from ..site.site import Site
+from .page import Made, about, write_file, write_page
+from .places import COMPASS, Places, payload
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanPage(Made):
+    """Content of the page of ``plan``.
+
+    ``candidates`` and ``curve`` hold rows of metrics.json; ``outline_m`` (k, 2) and ``holes_m`` bound where a route may
+    run; ``track_m`` (n, 3); ``place_m`` (m, 3) with ``before_db`` and ``after_db`` (m,), seen from ``seen_from_m`` (3,)
+    where the target is all directions.
+    """
+
+    target: str
+    sentence: str
+    antennas: Sequence[str]
+    flights: Sequence[str]
+    candidates: Sequence[Mapping[str, Any]]
+    curve: Sequence[Mapping[str, float]]
+    outline_m: FloatArray
+    holes_m: Sequence[FloatArray]
+    track_m: FloatArray
+    place_m: FloatArray
+    before_db: FloatArray
+    after_db: FloatArray
+    seen_from_m: FloatArray | None
+    site: Site
+    files: Mapping[str, str]
+    warnings: Sequence[str]
+
+
+def plan_metrics(data: PlanPage) -> dict[str, Any]:
+    """The numbers of the page under stable names."""
+    return json_object(
+        **named(data, "target sentence antennas flights candidates warnings"),
+        sd_now_db=float(np.sqrt(np.mean(data.before_db**2))),
+        length=data.curve,
+        **about(data),
+    )
+
+
+def write_plan(data: PlanPage, folder: Path) -> list[Path]:
+    """Write the page and all files beside it; the page first."""
+    numbers = plan_metrics(data)
+    shown = payload(list(_groups(data)), data.site, lines=[data.track_m], rings=[data.outline_m, *data.holes_m])
+    written = write_page(folder, "plan", numbers, shown, data=data, metrics=numbers)
+    written += [write_file(folder / name, text) for name, text in data.files.items()]
+    columns = dict(zip(("east_m", "north_m", "height_m"), data.place_m.T, strict=True))
+    table: pd.DataFrame = pd.DataFrame({**columns, "sd_before_db": data.before_db, "sd_after_db": data.after_db})
+    guarded(table.round(3)).to_csv(folder / "sd_map.csv", index=False, lineterminator="\n")
+    return [*written, folder / "sd_map.csv"]
+
+
+def _groups(data: PlanPage) -> Iterator[Places]:
+    """The target, each point once over its headings: on the map, or the directions from a tower; and the route."""
+    _, first, member = np.unique(data.place_m.round(1), axis=0, return_index=True, return_inverse=True)
+    count = np.bincount(member.ravel())
+    now, after = (np.sqrt(np.bincount(member.ravel(), v**2) / count) for v in (data.before_db, data.after_db))
+    values = {"standard deviation now [dB]": now, "standard deviation after the flight [dB]": after}
+    place = data.place_m[first]
+    if data.seen_from_m is None:
+        yield Places(name="target", at=place, values=values)
+    else:
+        away = place - data.seen_from_m
+        unit = away / np.linalg.norm(away, axis=1, keepdims=True)
+        yield Places(name="directions from the tower", at=unit, values=values, around=COMPASS)
+    yield Places(name="proposed route", at=data.track_m, values={"height [m]": data.track_m[:, 2]})

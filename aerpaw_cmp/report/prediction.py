@@ -1,0 +1,434 @@
+"""prediction.html with metrics.json, prediction.csv and prediction.nc; sentences before and after the flight."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from numpy.typing import ArrayLike
+
+from ..common.cells import guarded
+from ..common.cf import Dataset, file_attributes, netcdf_bytes
+from ..common.errors import UsageError
+from ..common.jsonable import json_object, named
+from ..common.units import FloatArray
+from ..compare.judge.verdicts import Verdict, stated_errors
+from ..compare.learning.correction import OFF, Correction, crps_difference
+from ..compare.ranks.forecast import ForecastScore
+from ..compare.statistics.intervals import mean_interval, paired_difference
+from ..site.antenna.learned import Entry, LearnedSeries
+from ..site.site import Site
+from .against import AgainstSeries
+from .flight_data import RANKS
+from .flight_words import before_flight, filled, said_of
+from .page import Made, about, write_file, write_page
+from .places import BAND, LIKELIEST, Places, payload
+
+TITLES = {
+    "learned": "antennas learned from the named flights",
+    "replay": "ray tracing with the flights' own settings",
+    "free space": "free space",
+    "none": "a constant level",
+    "memory": "antennas that the site remembers",
+    "prior": "ray tracing with isotropic antennas, before any flight",
+}
+
+FLAGS = {
+    "outside_flown": "outside the flown places: the standard deviation is that of the model alone",
+    "out_of_coverage": "no path",
+    "no_position": "no position",
+}
+
+# Share of points outside the flown places that the first words name.
+MANY = 0.2
+
+# The chosen model on what was left out, by the paired interval.
+AGAINST_FREE_SPACE = {
+    "better": ("On {over} left out it is {size:.1f} dB better than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
+    "worse": ("On {over} left out it is {size:.1f} dB worse than free space [{near:.1f}, {far:.1f}] (95 %).", ""),
+    "not significant": (
+        "On {over} left out the difference from free space [{low:+.1f}, {high:+.1f}] is not significant (95 %).",
+        "",
+    ),
+    "no interval": ("The flight is too short for an interval of the difference from free space.", ""),
+}
+
+# The residual field, by the interval of the difference of the CRPS; ``off`` where it holds zero.
+FIELD = {
+    "better": (
+        "The residual field is on: it lowers the CRPS by {size:.2f} dB (95 %: {high:+.2f} to {low:+.2f} dB).",
+        "",
+    ),
+    "worse": ("The residual field is off: it raises the CRPS by {size:.2f} dB on held-out samples.", ""),
+    "off": ("The residual field is off: the CRPS differs by {size:.2f} dB, not significantly.", ""),
+}
+
+HELD_OUT = "90 % intervals hold {inside:.0f} % of the held-out samples."
+# Stated standard deviations on what was left out, by :func:`~aerpaw_cmp.compare.judge.verdicts.stated_errors`.
+STATED: dict[str, tuple[str, str]] = {
+    "none": (HELD_OUT, ""),
+    "no interval": ("", ""),
+    "narrow": (
+        HELD_OUT
+        + " They are too narrow: errors are {effect:.1f} times as large as stated (95 %: {low:.1f} to {high:.1f}).",
+        "add a flight of this area",
+    ),
+    "wide": (
+        HELD_OUT
+        + " They are too wide: errors are {effect:.1f} times as large as stated (95 %: {low:.1f} to {high:.1f}).",
+        "",
+    ),
+    "biased": (
+        HELD_OUT + " Measured lies {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) above predicted.",
+        "check the gain of the flights that were learned from",
+    ),
+}
+
+# The same on the flight that followed.
+FLOWN: dict[str, tuple[str, str]] = {
+    "none": ("", "`aerpaw-cmp predict` with this flight for the next route"),
+    "no interval": ("Too few samples to judge the intervals.", ""),
+    "narrow": (
+        "Intervals of {where} are too narrow: errors are {effect:.1f} times as large as stated "
+        "(95 %: {low:.1f} to {high:.1f}).",
+        "add this flight to those that are learned from",
+    ),
+    "wide": (
+        "Intervals of {where} are too wide: errors are {effect:.1f} times as large as stated "
+        "(95 %: {low:.1f} to {high:.1f}).",
+        "add this flight to those that are learned from",
+    ),
+    "biased": (
+        "Likely cause at {where}: another offset, measured {effect:+.1f} dB (95 %: {low:+.1f} to {high:+.1f} dB) "
+        "above predicted.",
+        "check transmit power and receiver gain of this flight",
+    ),
+}
+
+
+EXPECTED = (
+    "Expect an RMSE of {error:.1f} dB{over} at these points on a new flight ({heading}); 90 % of the samples "
+    "lie within \u00b1{band:.1f} dB."
+)
+LOCK = "The receiver is in lock for {percent:.0f} % of them (P(lock) of each point: `p_lock` in prediction.csv)."
+REMEMBERED = "No flight is named: antennas and levels are those that the site remembers."
+OUTSIDE = {
+    "flown": "{percent:.0f} % of the points lie outside the flown places.",
+    "remembered": "{percent:.0f} % of the points lie in directions that the remembered flights hardly saw.",
+}
+PLAN = "Next: `aerpaw-cmp plan` names the flight that helps most."
+
+
+def heading_words(yaw_deg: FloatArray) -> str:
+    """Heading for which a prediction holds.
+
+    Examples
+    --------
+    >>> heading_words(np.array([90.0, 90.0])), heading_words(np.array([0.0, 90.0])), heading_words(np.array([np.nan]))
+    ('heading 90 degrees', 'headings of the route', 'heading open')
+    """
+    if not np.isfinite(yaw_deg).all():
+        return "heading open"
+    return "headings of the route" if np.ptp(yaw_deg) else f"heading {yaw_deg[0]:.0f} degrees"
+
+
+def first_words(
+    correction: Correction | None,
+    outside: float,
+    expected_db: float,
+    band_db: float,
+    heading: str = "heading open",
+    lock: float | None = None,
+    origin: str = REMEMBERED,
+) -> str:
+    """First paragraph of terminal, page and metrics.json: one error with its band, best baseline, one next step.
+
+    Parameters
+    ----------
+    correction : Correction, optional
+        None: the memory of the site is the source.
+    outside : float
+        Share of points outside the flown places, or in directions that flights hardly saw.
+    expected_db : float
+        Stated standard deviation of a mean over 4 s (of a sample, where a receiver loses its lock) on a new flight,
+        root mean square over the points [dB].
+    band_db : float
+        Half of the 90 % interval of a sample, mean over the points [dB].
+    heading : str
+        As :func:`heading_words` has it.
+    lock : float, optional
+        Mean probability of lock, of a receiver that loses it.
+    origin : str
+        Sentence on what predicts, if there is no correction.
+
+    Returns
+    -------
+    str
+    """
+    over = " over 4 s means" if lock is None else ""
+    texts = filled([EXPECTED], error=expected_db, band=band_db, heading=heading, over=over)
+    texts += [] if lock is None else filled([LOCK], percent=100.0 * lock)
+    step = ""
+    if correction is None:
+        texts.append(origin)
+    else:
+        if ("free space", OFF) in correction.rmse_db and (correction.base, correction.title) != ("free space", OFF):
+            verdict = _against_free_space(correction)
+            near, far = sorted(map(abs, verdict.interval))
+            over = "flights" if len(correction.flights) > 1 else "300 m blocks"
+            texts.append(said_of(verdict, AGAINST_FREE_SPACE, over=over, near=near, far=far))
+        step = _stated(correction).partition("Next: ")[2]
+    texts.append(PLAN if outside > MANY else f"Next: {step}" if step else "")
+    return " ".join(text for text in texts if text)
+
+
+def cautions(correction: Correction, outside: float) -> list[str]:
+    """Sentences under the first paragraph: places never flown, intervals on what was left out, model and field."""
+    texts = filled([OUTSIDE["flown"]], percent=100.0 * outside) if outside > MANY else []
+    texts += [_stated(correction).partition(" Next: ")[0], f"Model: {TITLES[correction.base]}."]
+    return [text for text in (*texts, said_of(field(correction), FIELD)) if text]
+
+
+def memory_cautions(known: Sequence[tuple[Entry, LearnedSeries]], outside: float) -> list[str]:
+    """The same of a prediction without flights: what the site remembers, by entry."""
+    each: dict[str, list[str]] = {}
+    for entry, series in known:
+        each.setdefault(entry.about(), []).append(f"{series.tower} {series.channel}")
+    texts = filled([OUTSIDE["remembered"]], percent=100.0 * outside) if outside > MANY else []
+    return [*texts, *(f"{', '.join(names)}: {about}." for about, names in each.items())]
+
+
+def prior_words(carrier_hz: float, power_dbm: float) -> str:
+    """Return the sentence on a prediction before any flight."""
+    return (
+        f"No flight is known: ray tracing with isotropic antennas, {carrier_hz / 1e9:g} GHz, {power_dbm:g} dBm "
+        "transmitted. Next: fly once, then `aerpaw-cmp predict --with flight.yaml`."
+    )
+
+
+def prior_caution(offset_db: float, antennas_db: float, shadowing_db: float, fading_db: float) -> str:
+    """Return the sentence on the parts of the standard deviation before any flight [dB]."""
+    return (
+        f"The standard deviation is a prior: offset {offset_db:g} dB, antennas {antennas_db:g} dB, shadowing "
+        f"{shadowing_db:g} dB, fading {fading_db:g} dB. One flight determines the offset and most of the rest."
+    )
+
+
+def _stated(correction: Correction) -> str:
+    """Sentence and step on the stated standard deviations on what was left out."""
+    error, sd = correction.held_out[correction.base, correction.title]
+    return said_of(stated_errors(error, sd), STATED, inside=100.0 * _inside_share(error, sd))
+
+
+def _inside_share(error: FloatArray, sd: FloatArray) -> float:
+    """Share of errors inside their 90 % interval."""
+    good = np.isfinite(error)
+    return float(np.mean(np.abs(error[good]) <= 1.6449 * sd[good])) if good.any() else float("nan")
+
+
+def _against_free_space(correction: Correction) -> Verdict:
+    """The chosen model and free space on the same samples that were left out."""
+    error, free_space = (
+        correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF))
+    )
+    pair = paired_difference(error, free_space, free_offset=False)
+    return Verdict(cause=pair.verdict, effect=pair.difference_db, interval=pair.difference_ci95_db)
+
+
+def field(correction: Correction) -> Verdict:
+    """CRPS with the best residual field minus that without one."""
+    base = correction.base
+    title = min((t for b, t in correction.crps_db if b == base and t != OFF), key=lambda t: correction.crps_db[base, t])
+    difference = crps_difference(correction.held_out, (base, title))
+    ends = mean_interval(difference)
+    cause = "better" if correction.on else "worse" if ends[0] > 0.0 else "off"
+    return Verdict(cause=cause, effect=float(difference.mean()), interval=ends, where=title)
+
+
+def against_words(series: Sequence[AgainstSeries], ranks: Mapping[str, ForecastScore]) -> str:
+    """Sentences on what a flight says of the prediction made before it: levels, then ranks by tower."""
+    levels = [after_flight({s.name: s.scores for s in series}, [s.stated for s in series])] if series else []
+    return " ".join([*levels, *(rank_after_flight(tower, score) for tower, score in ranks.items())])
+
+
+def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Verdict]) -> str:
+    """Sentences on what a flight says of the prediction made before it.
+
+    Parameters
+    ----------
+    scores : mapping of str to mapping
+        By tower and channel.
+    stated : sequence of Verdict
+        Of each, by :func:`~aerpaw_cmp.compare.judge.verdicts.stated_errors`.
+
+    Returns
+    -------
+    str
+    """
+    rows = list(scores.values())
+    mean = {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+    worst = max(stated, key=lambda verdict: list(FLOWN).index(verdict.cause))
+    return (
+        f"{before_flight(scores)} Over 4 s {mean['rmse_4s_db']:.1f} dB, after the flight's own offset "
+        f"{mean['own_offset_rmse_db']:.1f} dB. {said_of(worst, FLOWN).strip()}"
+    )
+
+
+def rank_after_flight(tower: str, score: ForecastScore) -> str:
+    """Sentence on what a flight says of the ranks that were predicted before it."""
+    return (
+        f"Rank at {tower}, predicted before this flight: kappa {score.kappa:.2f} (0 is chance), log score "
+        f"{score.log_score:.2f}; the mean of the prediction, without positions: {score.constant_log_score:.2f}."
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictionPage(Made):
+    """Content of a page of ``predict``; ``table`` as prediction.csv has it, ``rows`` of candidates and their errors."""
+
+    name: str
+    kind: str
+    site: Site
+    table: pd.DataFrame
+    units: Mapping[str, str]
+    shape: tuple[int, int] | None
+    heights_m: tuple[float, ...]
+    verdict: str
+    candidates: Sequence[Mapping[str, Any]]
+    model: Mapping[str, float]
+    chosen: Mapping[str, Any]
+    flown: Mapping[str, Any]
+    flights: Sequence[str]
+    trained_on: Sequence[str]
+    marks: Sequence[str]
+    warnings: Sequence[str]
+
+    @property
+    def series(self) -> list[tuple[str, pd.DataFrame]]:
+        """Rows of each tower and channel that has levels."""
+        levels = self.table[self.table["channel"] != "rank"]
+        each = levels.groupby(["tower", "channel"], sort=False, observed=True)
+        return [(f"{t} {c}", part) for (t, c), part in each]
+
+
+def outside_share(table: pd.DataFrame) -> float:
+    """Share of the levels with a position that are flagged as outside the flown places."""
+    flag = table["flag"][(table["channel"] != "rank") & (table["flag"] != "no_position")]
+    return float((flag == "outside_flown").mean())
+
+
+def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
+    """The numbers of the page under stable names."""
+    series = {
+        name: {
+            "unit": data.units.get(name, ""),
+            "points": len(part),
+            "mean_level_db": part["level_db"].mean(),
+            "mean_sd_db": part["sd_db"].mean(),
+            "mean_p_lock": part["p_lock"].mean() if "p_lock" in part else None,
+            "share_outside_flown": outside_share(part),
+            **{f"share_{flag}": float((part["flag"] == flag).mean()) for flag in FLAGS if flag != "outside_flown"},
+        }
+        for name, part in data.series
+    }
+    ranks = data.table[data.table["channel"] == "rank"]
+    return json_object(
+        prediction=data.name,
+        **named(data, "kind flights trained_on marks chosen candidates warnings"),
+        sentence=data.verdict,
+        field=data.model,
+        series=series,
+        ranks={
+            tower: {k: part[f"p_rank{k}"].mean() for k in "1234"}
+            for tower, part in ranks.groupby("tower", observed=True)
+        },
+        **about(data),
+    )
+
+
+# Rows of prediction.csv that are rounded and written together: bounds the memory.
+_ROWS_AT_ONCE = 100_000
+
+
+def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], list[str]]:
+    """Write the page and all files beside it; also what could not be written, and why.
+
+    Parameters
+    ----------
+    data : PredictionPage
+    folder : Path
+
+    Returns
+    -------
+    files : list of Path
+        The page first.
+    said : list of str
+    """
+    numbers = prediction_metrics(data)
+    shown = payload(list(_groups(data)), data.site, lines=[np.asarray(line).T for line in data.flown.values()])
+    written = write_page(folder, "prediction", numbers, shown, data=data, metrics=numbers, flags=FLAGS)
+    digits = {c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))}
+    digits |= {c: 4 for c in data.table.columns if c.startswith("p_")}
+    with (folder / "prediction.csv").open("w", encoding="utf-8", newline="") as book:
+        for start in range(0, len(data.table), _ROWS_AT_ONCE):
+            part = guarded(data.table.iloc[start : start + _ROWS_AT_ONCE].round(digits))
+            part.to_csv(book, index=False, header=not start, lineterminator="\n")
+    written.append(folder / "prediction.csv")
+    try:
+        written.append(write_file(folder / "prediction.nc", bytes(netcdf_bytes(_dataset(data)))))
+    except UsageError as missing:
+        return written, [str(missing)]
+    return written, []
+
+
+def _dataset(data: PredictionPage) -> Dataset:
+    """Points along one dimension, towers and channels along another."""
+    series = data.series
+    names, first = [name for name, _ in series], series[0][1]
+    variables: dict[str, Any] = {"series": ("series", np.array(names), {"long_name": "tower and channel"})}
+    for name, unit in (("time_s", "s"), ("east_m", "m"), ("north_m", "m"), ("height_m", "m"), ("yaw_deg", "degree")):
+        variables[name] = ("point", first[name].to_numpy(np.float64), {"units": unit})
+    ends = ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db")
+    for name in (*ends, "p_serving", "p_lock", "locked_db", "locked_sd_db", "lost_db", "lost_sd_db"):
+        if name in first:
+            values = np.stack([part[name].to_numpy(np.float32) for _, part in series])
+            variables[name] = (("series", "point"), values, {"units": "dB" if name.endswith("_db") else "1"})
+    variables["level_db"][2]["comment"] = ", ".join(f"{name}: {unit}" for name, unit in data.units.items())
+    about = file_attributes(
+        f"Predicted levels, {data.name}",
+        f"{data.chosen['title']}, learned from {', '.join(data.flights)}",
+        data.verdict,
+    )
+    return Dataset(variables, about)
+
+
+def _groups(data: PredictionPage) -> Iterator[Places]:
+    """Each tower and channel, each receiver of ranks: at each height of a grid, or at all points."""
+    groups: list[tuple[str, dict[str, ArrayLike], pd.DataFrame]] = []
+    for name, part in data.series:
+        level = {f"level [{data.units.get(name, 'dB')}]": part["level_db"], "standard deviation [dB]": part["sd_db"]}
+        if "p_lock" in part and part["p_lock"].notna().any():
+            level["probability of lock"] = part["p_lock"]
+        groups.append((name, {**level, BAND[0]: part["q05_db"], BAND[1]: part["q95_db"]}, part))
+    ranks = data.table[data.table["channel"] == "rank"]
+    for tower, part in ranks.groupby("tower", sort=False, observed=True):
+        chance = part[[f"p_rank{k}" for k in RANKS]].to_numpy(np.float64)
+        likeliest = np.where(np.isfinite(chance).all(axis=1), 1 + chance.argmax(axis=1), np.nan)
+        each = {f"probability of rank {k}": chance[:, i] for i, k in enumerate(RANKS)}
+        groups.append((f"{tower} rank", {LIKELIEST: likeliest, **each}, part))
+    for name, values, part in groups:
+        at = part[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
+        size = len(part) if data.shape is None else data.shape[0] * data.shape[1]
+        for k, start in enumerate(range(0, len(part), max(size, 1))):
+            some = slice(start, start + size)
+            yield Places(
+                name=name if data.shape is None else f"{name}, {data.heights_m[k]:g} m",
+                at=at[some],
+                values={key: np.asarray(column)[some] for key, column in values.items()},
+                cell_m=0.0 if data.shape is None else float(np.ptp(at[:size, 0])) / max(data.shape[1] - 1, 1),
+                time_s=part["time_s"].to_numpy(np.float64) if data.kind == "route" else None,
+            )

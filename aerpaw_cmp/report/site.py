@@ -1,0 +1,106 @@
+"""A site as a plan, and as a page that turns it in 3-D under the mouse.
+
+The page is one file with its script inside; it draws on a canvas and loads nothing.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..site.scenes import drawn_buildings
+from ..site.site import Site
+from . import canvas
+from .packed import at_height, listed, scene
+from .page import embedded, rendered, safe_name, write_file
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+
+TREES_IN_PAGE = 5000
+
+
+def view_limits(site: Site) -> FloatArray:
+    """(3, 2) lowest and highest east, north, up of everything that stands there, with a margin [m]."""
+    points = [tower.position_m for tower in site.towers.values()]
+    areas = [(b.footprint, b.base_m + b.height_m) for b in drawn_buildings(site)]
+    areas += [(forest.area, 0.0) for forest in site.forests] + [(fence.area, 0.0) for fence in site.geofences]
+    for area, top_m in areas:
+        points += list(at_height(np.asarray(area.exterior.coords)[:, :2], top_m))
+    if len(trees := site.trees):
+        points += list(np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m]))
+    if not points:
+        return np.array([[-100.0, 100.0], [-100.0, 100.0], [0.0, 50.0]])
+    cloud = np.array(points)
+    cloud = cloud[np.isfinite(cloud).all(axis=1)]
+    low, high = cloud.min(axis=0), cloud.max(axis=0)
+    margin = 0.05 * max(high[0] - low[0], high[1] - low[1], 100.0)
+    # a site may lie below its origin
+    ground = min(0.0, float(low[2]))
+    return np.array(
+        [[low[0] - margin, high[0] + margin], [low[1] - margin, high[1] + margin], [ground, max(high[2] * 1.1, 30.0)]]
+    )
+
+
+def plan(site: Site) -> Figure:
+    """Plan view with everything on it, to scale."""
+    limits = view_limits(site)
+    width, height = np.ptp(limits[:2], axis=1)
+    shape = float(np.clip(width / height, 0.45, 2.2))
+    fig, ax = canvas.subplots((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
+    canvas.draw_site(ax, site)
+    ax.set_xlim(*limits[0])
+    ax.set_ylim(*limits[1])
+    ax.set_title(site.name, wrap=True)
+    if ax.get_legend_handles_labels()[0]:
+        ax.legend(loc="center left", bbox_to_anchor=(1.01, 0.5))
+    return fig
+
+
+def _view_of(site: Site) -> dict[str, Any]:
+    """The site as plain lists for the page, rounded to 0.1 m."""
+    shown = scene(site, TREES_IN_PAGE)
+    walled = zip(drawn_buildings(site), shown["buildings"], strict=True)
+    return {
+        **shown,
+        "buildings": [{"name": b.name, "height": b.height_m, "faces": faces} for b, faces in walled],
+        "limits": listed(view_limits(site)),
+        "fences": [listed(g.area.exterior.coords) for g in site.geofences],
+    }
+
+
+def viewer(site: Site) -> str:
+    """The page that shows the site in 3-D."""
+    content = _view_of(site)
+    return rendered(
+        "site_view",
+        ("common.js", "site_view.js"),
+        site=site,
+        scene=embedded(content),
+        trees_shown=len(content["trees"]),
+    )
+
+
+def write_site_view(site: Site, folder: str | Path) -> list[Path]:
+    """Write ``<site>.html`` and ``<site>_plan.svg|png``.
+
+    Parameters
+    ----------
+    site : Site
+    folder : path
+        Made when missing.
+
+    Returns
+    -------
+    list of Path
+        The page first.
+    """
+    folder, stem = Path(folder), safe_name(site.name)
+    written = [write_file(folder / f"{stem}.html", viewer(site))]
+    with canvas.style():
+        drawn = canvas.save_as(plan(site), ("svg", "png"))
+    return [*written, *(write_file(folder / f"{stem}_plan.{form}", picture) for form, picture in drawn.items())]

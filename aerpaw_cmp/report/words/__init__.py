@@ -1,1 +1,0 @@
-"""Sentences, named by their page."""

@@ -31,6 +31,9 @@ MINIMUM_HEIGHT_M = 0.5
 
 
 # Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact).
+# Radio carriers [Hz] that a setting can mean: a smaller number is in megahertz or gigahertz, a larger one twice so.
+LOWEST_CARRIER_HZ, HIGHEST_CARRIER_HZ = 1e6, 1e12
+
 THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
 
 
@@ -134,3 +137,21 @@ def spread_out(count: int, most: int) -> IntArray:
     ([0, 4, 8], [0, 1], [])
     """
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64) if count else np.zeros(0, np.int64)
+
+
+def carrier_fault(carrier_hz: float) -> str:
+    """Return what is wrong with a carrier frequency; empty if a radio can have it.
+
+    Examples
+    --------
+    >>> carrier_fault(3.3)
+    '3.3 Hz is not the frequency of a radio link; expected hertz, 1e+06 to 1e+12, such as 3.3e9 for 3.3 GHz'
+    >>> carrier_fault(3.3e9)
+    ''
+    """
+    if LOWEST_CARRIER_HZ <= carrier_hz <= HIGHEST_CARRIER_HZ:
+        return ""
+    return (
+        f"{carrier_hz:g} Hz is not the frequency of a radio link; expected hertz, {LOWEST_CARRIER_HZ:g} to "
+        f"{HIGHEST_CARRIER_HZ:g}, such as 3.3e9 for 3.3 GHz"
+    )

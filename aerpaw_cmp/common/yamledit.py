@@ -93,10 +93,11 @@ def _with_key(text: str, node: Any, pair: str, *, top: bool) -> str:
     if node.flow_style:
         end = node.end_mark.index - 1
         return f"{text[:end].rstrip()}{', ' if node.value else ''}{pair}{text[end:]}"
+    line_end = "\r\n" if "\r\n" in text else "\n"
     if top:
-        return text + ("" if text.endswith("\n") else "\n") + pair + "\n"
+        return text + ("" if text.endswith("\n") else line_end) + pair + line_end
     at = node.start_mark.index
-    return f"{text[:at]}{pair}\n{' ' * node.start_mark.column}{text[at:]}"
+    return f"{text[:at]}{pair}{line_end}{' ' * node.start_mark.column}{text[at:]}"
 
 
 def _without(text: str, node: Any, at: int) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -112,6 +112,22 @@ def replay_flight(data: FlightData, stages: Stages | None = None) -> FlightRepla
         return FlightReplay(
             rss=tuple(replay_rss(data, stages.progress, known)), rank=tuple(replay_rank(data, stages.progress))
         )
+
+
+SeriesT = TypeVar("SeriesT", RssSeries, RankSeries)
+
+
+def try_replay(data: FlightData) -> None:
+    """Replay the first known pose of every series, for the errors that a replay of the flight would raise."""
+
+    def first(series: SeriesT, known: BoolArray) -> SeriesT:
+        at = np.flatnonzero(known & data.tower_at(series.tower, series.time)[1])[:1]
+        every = ((field.name, getattr(series, field.name)) for field in dataclasses.fields(series))
+        return dataclasses.replace(series, **{name: a[at] for name, a in every if isinstance(a, np.ndarray)})
+
+    replay_rss(dataclasses.replace(data, rss=tuple(first(s, data.poses_at(s.time).valid) for s in data.rss)))
+    ranked = tuple(first(s, rank_positions(s, data.track)[1]) for s in data.rank)
+    replay_rank(dataclasses.replace(data, rank=ranked))
 
 
 def replay_rss(

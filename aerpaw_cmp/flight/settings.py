@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import (
+    AfterValidator,
     Field,
     PrivateAttr,
     field_validator,
@@ -23,7 +24,7 @@ from pydantic import (
 from ..common.errors import UsageError
 from ..common.files import inside
 from ..common.jsonable import named
-from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wavelength_m
+from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, carrier_fault, noise_floor_dbm, wavelength_m
 from ..common.yamlfile import StrictModel, load_yaml, nearest_zone
 from ..logs.readers import ReadOptions
 from ..logs.records import Kind
@@ -41,6 +42,15 @@ from ..site.antenna.antennas import Isotropic
 from ..site.antenna.sphere_pattern import read_sphere_csv
 
 Positive = Annotated[float, Field(gt=0)]
+
+
+def _in_hertz(value: float) -> float:
+    if fault := carrier_fault(value):
+        raise ValueError(fault)
+    return value
+
+
+CarrierHz = Annotated[float, AfterValidator(_in_hertz)]
 
 
 class AntennaSettings(StrictModel):
@@ -141,7 +151,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
 class LinkSettings(StrictModel):
     """One radio link: carrier, power, and the arrays at both ends."""
 
-    carrier_hz: Positive
+    carrier_hz: CarrierHz
     transmit_power_dbm: float = 40.0
     uav_transmits: bool = True
     bandwidth_hz: Positive | None = None
@@ -200,7 +210,7 @@ class LogSettings(StrictModel):
     reader: str | None = None
     node: str | None = None
     channel: str | None = None
-    frequency_hz: Positive | None = None
+    frequency_hz: CarrierHz | None = None
     timezone: str | None = None
     clock: Literal["local", "utc", "local_as_utc"] | None = None
     time_origin: str | None = None

@@ -351,9 +351,14 @@ class FlightSimulator:
         if tower not in self.site.towers:
             raise UsageError(f"the site has no tower {tower!r}", expected="one of " + ", ".join(self.site.towers))
         if log.reader == "quectel_ri":
-            return partial(self._rank_log, log, tower, links.rank.build([tower], self.folder))
-        link = links.of(str(log.channel)).build([tower], self.folder)
+            return partial(self._rank_log, log, tower, self._tried(links.rank.build([tower], self.folder)))
+        link = self._tried(links.of(str(log.channel)).build([tower], self.folder))
         return partial(self._rss_log, log, tower, link)
+
+    def _tried(self, link: Link) -> Link:
+        """Return a link after one replay with it: a dry run refuses what the simulation would refuse."""
+        replay_poses(self.site, self.settings.rt, link, self._poses(np.zeros(1)))
+        return link
 
     def _telemetry_log(self, log: LogSettings) -> bytes:
         frame = telemetry_frame(self.trajectory, self.start_utc, self.plan.telemetry_interval_s, self.site.frame)

@@ -223,7 +223,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     from ..report.flight_data import pose_paths, report_data
     from .reporting.flight_run import report_stages, run_flight
     from .reporting.foliage_notes import foliage_notes
-    from .reporting.ladder import recommended_text
+    from .reporting.ladder import check_recommended, recommended_text
     from .tasks.manifest import other_inputs
 
     formats = _checked(flight, chosen, options)
@@ -243,6 +243,8 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
                 from .prediction.against import score_against  # loads what calibration and prediction need
 
                 before = score_against(data, Path(chosen.against))
+        if chosen.recommend is not None:
+            check_recommended(data)
         stages.checked(lambda: report_stages(data, chosen.figures))
         replays = replay_flight(data, stages)
         flight_run = run_flight(data, stages, replays=replays, anew=chosen.audit is not None, ladder=True)
@@ -258,7 +260,9 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             extra = {**record.extra_metrics, "against": before.metrics()}
             record = replace(record, against=before, extra_metrics=extra)
         if target is not None:
-            target.write(sealed(recommended_text(load_flight(flight), flight_run.ladder, flight)))
+            text, sentence = recommended_text(load_flight(flight), flight_run.ladder, flight)
+            target.write(sealed(text))
+            record = replace(record, extra_metrics={**record.extra_metrics, "recommended": sentence})
         with output.filling() as place:
             written = write_report(
                 record, place, drawn=chosen.figures, style=chosen.style, exports=formats, stages=stages
@@ -448,6 +452,7 @@ def run_map(
     folder = options.out or Path("reports") / f"map-{Path(site).stem}"
     stages = options.stages("map", inputs, folder)
     with OutputFolder(folder, job="map", inputs=inputs, force=options.force) as output:
+        mapping.check_study(place, settings)
         stages.checked(lambda: mapping.map_stages(place, settings, [f.load(options.logs_root) for f in known]))
         file = [Path(site).absolute()] if Path(site).is_file() else []
         with open_workers(options.workers, options.scheduler, paths=file, progress=progress) as crew:

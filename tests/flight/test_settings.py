@@ -17,7 +17,6 @@ TINY = 1e-9
 # Numbers above 0, by the part of a flight file that they stand in.
 POSITIVE = {
     "link.rss": "bandwidth_hz",
-    "logs": "frequency_hz",
     "flight.plan": "speed_mps climb_mps telemetry_interval_s rss_interval_s rank_interval_s fading_correlation_s rank_k",
     "towers.N": "antenna_height_m",
     "rt.advanced": "gamma_db_per_m maximum_loss_db maximum_gap_s",
@@ -26,6 +25,7 @@ LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
     **{f"{part}.{key}": ([TINY], [0.0]) for part, keys in POSITIVE.items() for key in keys.split()},
     **dict.fromkeys(("flight.plan.fading_db", "rt.reflection_loss_db"), ([0.0], [-TINY])),
     "link.rss.uav.elements": ([1, 64], [0, 65]),
+    **dict.fromkeys(("logs.frequency_hz", "link.rss.carrier_hz"), ([1e6, 1e12], [3.3, 3300.0, 3.3e12])),
     "logs.height_m": ([-1000, 20_000], [-1000.1, 20_000.1]),
     "flight.plan.waypoints": ([[POINT, POINT]], [[POINT]]),
     "flight.plan.bad_lines": ([0, 5], [-1]),

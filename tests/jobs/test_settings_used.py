@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import pandas as pd
@@ -49,9 +50,7 @@ def test_the_airframe_changes_the_levels_of_every_channel(tmp_path: Path) -> Non
     path = write_flight(tmp_path, antennas={"uav": "lake_wheeler/dataset12_uav"})
     with_airframe, metrics = report(path, "airframe")
     assert changed_channels(plain, with_airframe) == {"A", "B"}
-    assert metrics["antennas"] == [
-        "Antennas of LW1 A, LW2 B: isotropic at the tower, dataset12.LW1.USRP1.uav at the UAV."
-    ]
+    assert metrics["antennas"] == ["Antennas: isotropic at the tower, dataset12.LW1.USRP1.uav at the UAV."]
 
 
 def test_calibrated_antennas_come_before_those_of_the_flight(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
@@ -101,3 +100,86 @@ def test_a_name_that_can_never_apply_is_refused(
     assert found in message
     assert expected in message
     assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("changes", "code", "found"),
+    [
+        ({"link": {"rss": {"carrier_hz": 3.3}}}, 2, "line 2: link.rss.carrier_hz: 3.3 Hz is not the frequency"),
+        ({"link": {"rss": {"carrier_hz": 15e9}}}, 2, "no values for 'medium_dry_ground' at 15 GHz"),
+        ({"link": {"rss": {"carrier_hz": 3.3e9, "uav": {"antenna": {"model": "file", "file": "no.txt"}}}}}, 3, "no.txt"),
+        ({"link": {"rss": {"carrier_hz": 3.3e9, "uav": {"slant_deg": [1.0, 2.0]}}}}, 2, "2 slants for 1 elements"),
+    ],
+)  # fmt: skip
+def test_a_dry_run_refuses_what_the_report_refuses(
+    tmp_path: Path, capsys: pytest.CaptureFixture, changes: dict, code: int, found: str
+) -> None:
+    path = write_flight(tmp_path, **changes)
+    messages = []
+    for dry in ((), ("--dry-run",)):
+        assert main(["report", str(path), "-o", str(tmp_path / "out"), "-q", *dry]) == code
+        messages.append(capsys.readouterr().err)
+    assert messages[0] == messages[1]
+    assert found.replace("line 2: ", "") in messages[0]
+
+
+def test_a_dry_run_reads_the_receiver_and_the_recommendation(tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    logs = [{"path": str(SAMPLE / "UAV/modem_ri.csv"), "node": "LW1"}]
+    path = write_flight(tmp_path, logs=logs, rank={"receiver": "none.json"})
+    assert main(["report", str(path), "--dry-run"]) == 3
+    assert "none.json" in capsys.readouterr().err
+    path = write_flight(tmp_path, logs=logs)
+    assert main(["report", str(path), "--dry-run", "--recommend", str(tmp_path / "rec.yaml")]) == 2
+    assert "no model can be recommended" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "found"),
+    [
+        (("--carrier-ghz", "3400"), "3.4e+12 Hz is not the frequency"),
+        (("--carrier-ghz", "34"), "no values for 'medium_dry_ground' at 34 GHz"),
+        (("--rank-altitude", "40"), "1 rank height at or above 30 m"),
+    ],
+)
+def test_a_dry_run_refuses_what_the_map_refuses(
+    tmp_path: Path, capsys: pytest.CaptureFixture, options: tuple[str, ...], found: str
+) -> None:
+    arguments = ["map", "lake_wheeler", "-o", str(tmp_path / "out"), "--spacing", "300", *options]
+    for dry in ((), ("--dry-run",)):
+        assert main([*arguments, *dry]) == 2
+        assert found in capsys.readouterr().err
+
+
+def test_a_recommended_file_keeps_line_ends_and_says_that_it_is_a_copy(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    path = write_flight(tmp_path)
+    path.write_bytes(path.read_bytes().replace(b"\n", b"\r\n"))
+    # free space is worse than the ground reflection of these logs, so lines change
+    assert (
+        main(["report", str(path), "-o", str(tmp_path / "out"), "-q", "--recommend", str(tmp_path / "rec.yaml")]) == 0
+    )
+    assert "The recommended file has the settings of the model '" in capsys.readouterr().out
+    _, *lines = (tmp_path / "rec.yaml").read_bytes().splitlines(keepends=True)
+    assert all(line.endswith(b"\r\n") for line in lines)
+    unchanged = set(path.read_bytes().splitlines(keepends=True)) & set(lines)
+    assert len(unchanged) > 10
+    (tmp_path / "rec.yaml").write_bytes(b"".join(lines))
+    again = ["report", str(tmp_path / "rec.yaml"), "-o", str(tmp_path / "again"), "-q"]
+    assert main([*again, "--recommend", str(tmp_path / "copy.yaml")]) == 0
+    assert "No model is significantly better than rec.yaml: the recommended file is a copy" in capsys.readouterr().out
+    assert (tmp_path / "copy.yaml").read_bytes().partition(b"\n")[2] == b"".join(lines)
+
+
+def test_a_quiet_draft_shows_the_lines_to_check_and_takes_the_bandwidth_from_names(
+    tmp_path: Path, capsys: pytest.CaptureFixture
+) -> None:
+    logs = tmp_path / "40m_fs5MHz"
+    shutil.copytree(SAMPLE / "LW1", logs / "LW1")
+    shutil.copytree(SAMPLE / "UAV", logs / "UAV")
+    command = ["ingest", str(logs), "--timezone", "America/New_York", "--draft", str(tmp_path / "f.yaml"), "-q"]
+    assert main(command) == 0
+    message = capsys.readouterr().err
+    assert "check: rss: {carrier_hz: 3.3e9" in message
+    assert "can be compared" not in message
+    assert yaml.safe_load((tmp_path / "f.yaml").read_text())["link"]["rss"]["bandwidth_hz"] == "5e6"

@@ -156,6 +156,8 @@ def _print_report_summary(outcome: Any) -> None:
     for text in outcome.metrics["antennas"]:
         show(text)
     warn_all(outcome.metrics["warnings"])
+    if "recommended" in outcome.metrics:
+        show(outcome.metrics["recommended"])
     show(f"report: {outcome.folder / 'report.html'}")
     if audited := (outcome.metrics.get("rt") or {}).get("audit"):
         show(audited["summary"])

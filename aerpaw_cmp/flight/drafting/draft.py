@@ -154,6 +154,7 @@ def draft(
     parts += [f"  # left out: {remark}\n" for remark in entries.out]
     known = _remembered(entries, site, folder)
     link = _DOWNLINK if entries.downlink and all(entries.downlink) else LINK
+    link = link.replace("20e6", f"{_bandwidth_mhz([file.path for file in own]):g}e6")
     parts += _learned_lines(known, link) if "rss" in entries.kinds else []
     parts += [RANK] if "rank" in entries.kinds else []
     parts += _settings(entries, known)
@@ -299,6 +300,26 @@ def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
     towers = () if entries.placer is None else tuple(entries.placer.site.towers)
     nodes = Nodes(placed=frozenset(entries.sure), fixed=towers)
     return propose(known, str(Path(site).with_suffix("")), entries.series, nodes)
+
+
+# Sampling rate in the names of sounder files and folders, such as 70m_fs20MHz.
+_SAMPLING_RATE = re.compile(r"(?:^|[^a-z0-9])fs_?([0-9]+(?:\.[0-9]+)?) ?MHz", re.IGNORECASE)
+
+
+def _bandwidth_mhz(paths: Sequence[str]) -> float:
+    """Return the bandwidth of the receiver [MHz]: the sampling rate in file names, else that of the sounder.
+
+    Examples
+    --------
+    >>> _bandwidth_mhz(["a/40m_fs5MHz.mat"]), _bandwidth_mhz(["a/log.txt"]), _bandwidth_mhz(["fs5MHz/a", "fs10MHz/a"])
+    (5.0, 20.0, 20.0)
+    """
+    # the last name counts: a folder of several rates contains folders of one
+    rates = {float(found[-1]) for path in paths if (found := _SAMPLING_RATE.findall(str(path)))}
+    return rates.pop() if len(rates) == 1 else _SOUNDER_MHZ
+
+
+_SOUNDER_MHZ = 20.0
 
 
 def _learned_lines(known: Proposal, link: str) -> list[str]:

@@ -122,17 +122,19 @@ def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
 
 
 def antennas_used(series: Sequence[tuple[str, str, LinkSettings]]) -> tuple[str, ...]:
-    """Return a sentence per pair of antennas: the channels that are replayed with it, by tower, and its names.
+    """Return a sentence per pair of antennas: its names, and the channels that are replayed with it if others are not.
 
     Examples
     --------
     >>> antennas_used([("LW1", "A", LinkSettings(carrier_hz=3.3e9)), ("LW1", "B", LinkSettings(carrier_hz=3.3e9))])
-    ('Antennas of LW1 A, LW1 B: isotropic at the tower, isotropic at the UAV.',)
+    ('Antennas: isotropic at the tower, isotropic at the UAV.',)
     """
     pairs: dict[str, list[str]] = {}
     for tower, channel, link in series:
         ends = (_antenna_name(array.antenna) for array in (link.towers.get(tower, link.tower), link.uav))
         pairs.setdefault("{} at the tower, {} at the UAV".format(*ends), []).append(f"{tower} {channel}")
+    if len(pairs) == 1:
+        return (f"Antennas: {next(iter(pairs))}.",)
     return tuple(f"Antennas of {', '.join(names)}: {what}." for what, names in pairs.items())
 
 

@@ -23,7 +23,15 @@ from ...common.errors import InputError, UsageError, noting_interrupts
 from ...common.jsonable import named
 from ...common.outputs import file_digest
 from ...common.stages import PlannedStage, Progress, Stages, share_of
-from ...common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray, db_from_power, finite_mean, wavelength_m
+from ...common.units import (
+    THERMAL_NOISE_DBM_HZ,
+    ComplexArray,
+    FloatArray,
+    carrier_fault,
+    db_from_power,
+    finite_mean,
+    wavelength_m,
+)
 from ...compare.rank import singular_values
 from ...maps import export, job
 from ...maps import grid as cells
@@ -38,7 +46,7 @@ from ...maps.kriging import OrdinaryKriging
 from ...maps.link_budget import PAPER_BUDGET, LinkBudget
 from ...maps.netcdf import maps_dataset
 from ...maps.store import TileStore
-from ...maps.study import Study, interpolation_study, rank_fields
+from ...maps.study import LOWEST_M, Study, interpolation_study, rank_fields
 from ...maps.tiles import Budget, Reach, Tiling
 from ...maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ...propagation.field.foliage import crown_index, foliage_loss_db, foliage_model
@@ -133,8 +141,8 @@ class MapSettings:
             raise UsageError(f"heights {heights}", expected="heights above ground [m], above 0")
         if not self.ks or any(not k > 1 for k in self.ks):
             raise UsageError(f"K {self.ks}", expected="ratios of singular values, above 1")
-        if not self.carrier_hz > 0:
-            raise UsageError(f"a carrier of {self.carrier_hz} Hz", expected="a positive frequency [Hz]")
+        if fault := carrier_fault(self.carrier_hz):
+            raise UsageError(fault, cause="--carrier-ghz in megahertz or hertz")
         if self.tile_m is not None and not self.tile_m >= self.spacing_m > 0:
             raise UsageError(f"tiles of {self.tile_m:g} m", expected=f"at least the spacing, {self.spacing_m:g} m")
 
@@ -231,6 +239,10 @@ class SiteChannels:
             return self._ready.pop((mode, chunk))
 
         return evaluate
+
+    def try_at(self, position_m: FloatArray) -> None:
+        """Evaluate one position (3,) [m] in every mode, for the errors that it raises."""
+        self._all_modes(position_m[None])
 
     def tile(self, order: TileOrder, progress: Callable[[float], None] | None = None) -> TileDone:
         """Maps of one tile, with the towers and buildings that can reach it."""
@@ -524,8 +536,9 @@ def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
 
 
 def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[PlannedStage]:
-    """Stages of a map, for its dry run."""
+    """Return the stages of a map, for its dry run; one position is mapped, so that it refuses what the map would."""
     grid = Grid.over_area(place.area_m, settings.spacing_m)
+    SiteChannels(place, settings).try_at(np.append(grid.points_m[0, :2], min(settings.rss_altitudes_m, default=30.0)))
     heights, tile = {*settings.rss_altitudes_m, *settings.rank_altitudes_m}, settings.tile_cells(grid)
     sides = {"position": len(grid), "height": len(heights), "tower": len(place.towers)}
     work = f"{counted(math.prod(sides.values()), 'link')}: {', '.join(counted(n, name) for name, n in sides.items())}"
@@ -538,14 +551,21 @@ def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[
     return [PlannedStage(name, what) for name, what in stages.items() if what]
 
 
+def check_study(place: Site, settings: MapSettings) -> None:
+    """Refuse a study of fewer than two rank heights before any map is computed."""
+    studied = settings.study and not settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m))
+    heights = [height for height in settings.rank_altitudes_m if height >= LOWEST_M]
+    if studied and len(heights) < 2:
+        raise UsageError(
+            f"{counted(len(heights), 'rank height')} at or above {LOWEST_M:g} m",
+            expected="two or more for the study, or --no-study",
+        )
+
+
 def study_maps(outcome: MapOutcome, stages: Stages) -> None:
     """Correlation, interpolation and its errors, on the maps of the paper's foliage mode."""
     s, result = outcome.settings, outcome.shown
     heights, rank = rank_fields(result)
-    if len(heights) < 2:
-        raise UsageError(
-            f"{len(heights)} rank height at or above 30 m", expected="two or more for the study, or --no-study"
-        )
     local: dict[str, Any] = {"neighbours": s.neighbours, "radius_m": s.reach_m, "seed": s.seed}
     with stages("leave one out"):
         zeros, towers = rank_fields(result, "zero")[1], result.towers_m

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -56,6 +56,9 @@ from ...site.relief.dem import Dem
 from ...site.site import Site
 from ...site.siteyaml import ground_surface, site_model
 from .likely_cause import cause_of
+
+if TYPE_CHECKING:
+    from ..learning.calibrate_rank import FittedReceiver
 
 # Both sides are averaged over these windows to see how much of the error is fading.
 _AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
@@ -619,23 +622,39 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
     )
 
 
+def fitted_receiver(data: FlightData, tower: str) -> FittedReceiver | None:
+    """Return the receiver of a tower that the flight file names; None if it names no file.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, or that has no receiver of this tower.
+    """
+    named = data.settings.rank.receiver
+    if named is None:
+        return None
+    from ..learning.calibrate_rank import read_receiver  # few flights name one
+
+    receivers = read_receiver(data.folder / named)
+    if tower not in receivers:
+        raise InputError(
+            f"no receiver at {tower}",
+            expected="a receiver fitted at one of the flight's towers; it has " + ", ".join(receivers),
+            path=data.folder / named,
+        )
+    return receivers[tower]
+
+
 def _receiver_forecast(
     data: FlightData, series: RankSeries
 ) -> tuple[FloatArray | None, ForecastScore | None, tuple[str, ...]]:
     """Probability (n, 4) of each rank by the receiver of the flight file, its score, and logs that it was fitted on."""
-    named = data.settings.rank.receiver
-    if named is None:
+    receiver = fitted_receiver(data, series.tower)
+    if receiver is None:
         return None, None, ()
-    from ..learning.calibrate_rank import rank_samples, read_receiver  # few flights name one
+    from ..learning.calibrate_rank import rank_samples  # few flights name a receiver
 
-    receivers = read_receiver(data.folder / named)
-    if series.tower not in receivers:
-        raise InputError(
-            f"no receiver at {series.tower}",
-            expected="a receiver fitted at one of the flight's towers; it has " + ", ".join(receivers),
-            path=data.folder / named,
-        )
-    samples, receiver = rank_samples(data, series), receivers[series.tower]
+    samples = rank_samples(data, series)
     probability, decided = receiver.forecast(samples)
     if receiver.knows(samples):  # nothing is scored where it was fitted
         return probability, None, samples.logs

@@ -19,9 +19,9 @@ from ...compare.judge.causes import OF_DIRECTION, Cause
 from ...compare.judge.ladder import series_rows
 from ...compare.result import FlightResult
 from ...flight.data import FlightData
-from ...flight.replay import FlightReplay, replay_flight
+from ...flight.replay import FlightReplay, replay_flight, try_replay
 from .audit_flight import audit_replays
-from .compare_flight import compare_flight
+from .compare_flight import compare_flight, fitted_receiver
 from .ladder import FlightLadder, flight_ladder
 
 
@@ -98,7 +98,13 @@ def run_flight(
 
 
 def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
-    """Stages of a report of a flight that was read, for its dry run; ``figures`` as for the report."""
+    """Return the stages of a report of a flight that was read, for its dry run; ``figures`` as for the report.
+
+    One pose of every series is replayed and the receiver is read, so that a dry run refuses what the run would refuse.
+    """
+    try_replay(data)
+    for series in data.rank:
+        fitted_receiver(data, series.tower)
     n_rss, n_rank = (sum(len(item.time) for item in series) for series in (data.rss, data.rank))
     samples, rt = f"{counted(n_rss, 'RSS sample')}, {counted(n_rank, 'rank sample')}", data.settings.rt
     audited = min(rt.audit_links, n_rss + n_rank)

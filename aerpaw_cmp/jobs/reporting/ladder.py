@@ -521,22 +521,32 @@ def _isotropic(content: Mapping[str, Any], path: KeyPath) -> dict[KeyPath, Any]:
     return changes
 
 
-def recommended_text(settings: FlightFile, ladder: FlightLadder | None, flight: Path) -> str:
-    """The flight file with the lines changed that the recommended model needs, all others as they are.
+def check_recommended(data: FlightData) -> None:
+    """Refuse to recommend a model for a flight without RSS, or with rays of another engine than the image method."""
+    if not data.rss or data.settings.rt.engine != "image":
+        raise _NOT_RECOMMENDED
+
+
+_NOT_RECOMMENDED = UsageError(
+    "no model can be recommended for this flight",
+    expected="RSS with known poses, replayed by the image engine (rt.engine: image)",
+)
+
+
+def recommended_text(settings: FlightFile, ladder: FlightLadder | None, flight: Path) -> tuple[str, str]:
+    """Return the flight file with the lines changed that the recommended model needs, and a sentence on them.
 
     Raises
     ------
     UsageError
-        If no ladder was climbed: no RSS, or rays of another engine than the image method.
+        If no models were compared: no RSS, or rays of another engine than the image method.
     """
     if ladder is None or ladder.ladder.recommended is None:
-        raise UsageError(
-            "no model can be recommended for this flight",
-            expected="RSS with known poses, replayed by the image engine (rt.engine: image)",
-        )
-    text = unsealed(flight.read_text(encoding="utf-8"))
-    if ladder.recommended is None:  # no model is better than the flight as set
-        return text
+        raise _NOT_RECOMMENDED
+    # bytes: line ends stay as they are
+    text = unsealed(flight.read_bytes().decode("utf-8"))
+    if ladder.recommended is None:
+        return text, f"No model is significantly better than {flight.name}: the recommended file is a copy of it."
     text = edited(text, recommended_changes(settings, yaml.safe_load(text), ladder.recommended, ladder.offered))
     parse_yaml(text, FlightFile)  # a flight file that its own reader refuses is a fault of ours
-    return text
+    return text, f"The recommended file has the settings of the model '{ladder.recommended.name}'."

@@ -6,6 +6,7 @@ at take-off: a home that moves later, or stood elsewhere before, is no ground.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -103,9 +104,10 @@ class Flight:
 
 
 def result(
-    reader: str, options: ReadOptions, flights: list[Flight], messages: int, damaged: list[RejectedLine]
-) -> ReadResult:
-    """A telemetry stream per vehicle; the lines of the account are messages, all but positions count as comments.
+    reader: str, options: ReadOptions, flights: list[Flight], messages: int, damaged: list[RejectedLine],
+    radio: Series = NONE,
+) -> ReadResult:  # fmt: skip
+    """Return a telemetry stream per vehicle and the levels of its radio; all other messages count as comments.
 
     Parameters
     ----------
@@ -116,13 +118,16 @@ def result(
     messages : int
         Sound messages; each of ``damaged`` comes on top.
     damaged : list of RejectedLine
+    radio : Series
+        Status of the telemetry radio: MAVLink's ``rssi``, ``remrssi``, ``noise``, ``remnoise`` in steps of the radio.
     """
     zero_ns, offset = _time.origin_ns(options, needed_by=reader), flights[0].utc_minus_clock_s
     if offset is not None:
         zero_ns = round(offset * 1e6) * 1000  # autopilots count microseconds
-    time_s = np.concatenate([flight.position.time_s for flight in flights])
-    number = np.concatenate([flight.position.number for flight in flights])
-    owner = np.repeat(np.arange(len(flights)), [len(flight.position.time_s) for flight in flights])
+    series = [*(flight.position for flight in flights), radio]
+    time_s = np.concatenate([item.time_s for item in series])
+    number = np.concatenate([item.number for item in series])
+    owner = np.repeat(np.arange(len(series)), [len(item.time_s) for item in series])
     timed = np.abs(time_s) < _MOST_S
     rejected = [*damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in np.sort(number[~timed]))]
     lines = messages + len(damaged)
@@ -139,7 +144,31 @@ def result(
         systems = ", ".join(str(flight.system) for flight in flights)
         rows.warnings.append(f"{len(flights)} vehicles (systems {systems}): a track of its own for each")
     of = owner[timed]
-    return rows.result([_track(rows.part(of == i), flight, timed[owner == i]) for i, flight in enumerate(flights)])
+    tracks = [_track(rows.part(of == i), flight, timed[owner == i]) for i, flight in enumerate(flights)]
+    at = owner == len(flights)
+    return rows.result([*tracks, *_radio(rows.part(of == len(flights)), radio, timed[at])])
+
+
+# Channels of the radio: its own receiver and that of the other end, each with its noise.
+_ENDS = {"rssi": "radio", "remrssi": "radio_remote", "noise": "radio_noise", "remnoise": "radio_remote_noise"}
+
+
+def _radio(rows: _rows.Rows, radio: Series, timed: BoolArray) -> Iterator[Stream | None]:
+    """Yield the levels and the noise at both ends of a telemetry link [dBm].
+
+    Notes
+    -----
+    SiK radios report steps of 1/1.9 dB from -127 dBm (ArduPilot wiki, "SiK Telemetry Radio"); 0 and 255 are unknown.
+    """
+    for name, channel in _ENDS.items():
+        steps = radio.columns.get(name, np.zeros(len(timed)))[timed]
+        known = (steps > 0) & (steps < 255)
+        level_dbm = steps / 1.9 - 127.0
+        if "noise" in name:
+            yield rows.stream("kpi", channel, {"value": level_dbm}, where=known, unit="dBm", quantity="noise")
+        else:
+            yield rows.stream("rss", channel, {"rss_db": level_dbm}, where=known, channel=channel, unit="dBm",
+                              quantity="RSSI", source="telemetry radio, by SiK's scale")  # fmt: skip
 
 
 def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:

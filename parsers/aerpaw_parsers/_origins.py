@@ -9,6 +9,7 @@ _CLOCKS = {
         "vehicle_log sounder_log controller_log srsenb_log srsue_log srsran_gnb oai_log",
     "program: aerpawlib datetime.now(), local wall time": "vehicle_out",
     "program: QuectelLogger datetime.now(), local wall time": "quectel_csv quectel_ri quectel_console",
+    "program: DJI, the camera's local time": "dji_srt",
     "program: AADM controller datetime.now(), local wall time": "aadm_snr",
     "program: AERPAW's post-processing, local wall time": "flight_mat",
     "program: get_IQ.py names files in America/New_York": "iq_burst",
@@ -19,7 +20,7 @@ _CLOCKS = {
     "written: UTC of the ground station": "mavlink_tlog",
     "written: offset or epoch in the meta file": "sigmf",
     "written: epoch of the companion computer": "pawprints",
-    "written: UTC": "tap_jsonl",
+    "written: UTC": "tap_jsonl nmea rtklib_pos",
     "written": "generic_csv",
 }  # fmt: skip
 _HEIGHTS = {

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
 from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
-from aerpaw_cmp.logs.records import Attribute, Stream
+from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
-from aerpaw_cmp.readers import dictionary
+from aerpaw_cmp.readers import ReadOptions, dictionary
 
 from . import _sheet
 
@@ -72,6 +73,20 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
     where = None if lost.all() else ~lost
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
+
+
+def of_readings(
+    lines: _lines.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine],
+    options: ReadOptions, *, reader: str,
+) -> ReadResult:  # fmt: skip
+    """Return the telemetry ``vehicle`` of readings with a time and a position; see :func:`._sheet.of_readings`."""
+    sheet = _sheet.of_readings(lines, readings, rejected)
+    rows = _sheet.rows(sheet, options, reader=reader) if readings else None
+    if rows is None:
+        return _sheet.nothing(lines.data, reader, "no reading with a time and a position")
+    track = from_sheet(rows, sheet, name="vehicle", source=reader)
+    rows.warnings += sheet.unread()
+    return rows.result([track])
 
 
 def whole_degrees(names: Sequence[str], values: dict[str, AnyArray]) -> str:

@@ -362,6 +362,27 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
     return cut(_lines.split(data), *header)
 
 
+def of_readings(
+    lines: _lines.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine]
+) -> Sheet:
+    """Return the table of readings that no separator divides; lines that are neither read nor rejected are comments.
+
+    Parameters
+    ----------
+    lines : Lines
+    readings : sequence of (int, mapping)
+        0-based line of each reading, and its cells by the names of their columns.
+    rejected : list of RejectedLine
+    """
+    names = list(dict.fromkeys(name for _, cells in readings for name in cells))
+    row = np.array([i for i, _ in readings], dtype=np.int64)
+    known = [*row, *(line.number - 1 for line in rejected)]
+    return Sheet(
+        lines=lines, names=names, row=row, cells=[[cells.get(name, "") for name in names] for _, cells in readings],
+        blank_rows=np.setdiff1d(np.flatnonzero(~lines.blank), known), rejected=rejected, closed=True,
+    )  # fmt: skip
+
+
 def cut(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     """The table below a header; lines above it, headers again and words at the end are comments, torn rows rejected.
 

@@ -2,7 +2,8 @@
 
 The format describes itself: every message begins with A3 95 and its number, ``FMT`` messages give the length and
 columns of each; in text each message is a line, ``NAME, value, value``.
-Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity), ``GPS`` (UTC, fix) and ``BAT``.
+Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity), ``GPS`` (UTC, fix), ``BAT``
+and ``RAD`` (levels at both ends of the telemetry radio).
 Heights are above home at take-off (``RelHomeAlt``), else above the ground at rest or the first position.
 Source: ArduPilot ``libraries/AP_Logger/LogStructure.h``.
 """
@@ -30,7 +31,7 @@ _TYPES = {
     "n": ("4s", 0.0), "N": ("16s", 0.0), "Z": ("64s", 0.0), "a": ("64s", 0.0),
 }  # fmt: skip
 _FIX_3D = 3
-_WANTED = ("POS", "GPS", "ATT", "XKF1", "NKF1", "EKF1", "BAT")
+_WANTED = ("POS", "GPS", "ATT", "XKF1", "NKF1", "EKF1", "BAT", "RAD")
 
 
 _TEXT = re.compile(rb"FMT, ?128, ?89, ?FMT,")
@@ -162,7 +163,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         position=position, attitude=_named(series["ATT"]), velocity=_named(filters), fix=_named(gps),
         utc_minus_clock_s=_offset(gps), home=home, source="ArduPilot dataflash log", battery=_named(series["BAT"]),
     )  # fmt: skip
-    return _autopilot.result("ardupilot_bin", options, [flight], count, damaged)
+    status = _autopilot.Series(
+        series["RAD"].time_s, series["RAD"].number, {name.lower(): v for name, v in series["RAD"].columns.items()}
+    )
+    return _autopilot.result("ardupilot_bin", options, [flight], count, damaged, status)
 
 
 def _named(series: _autopilot.Series, *names: str) -> _autopilot.Series:
@@ -181,6 +185,6 @@ def _offset(gps: _autopilot.Series) -> float | None:
 
 
 READER = Reader(
-    name="ardupilot_bin", title="ArduPilot dataflash log (.bin, or .log in text)", kinds=("telemetry",),
+    name="ardupilot_bin", title="ArduPilot dataflash log (.bin, or .log in text)", kinds=("telemetry", "rss", "kpi"),
     sample="binary: POS, GPS, ATT, XKF1", sniff=sniff, read=read,
 )  # fmt: skip

@@ -37,13 +37,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     cut = [i for i, text in enumerate(texts) if b"</Placemark>" not in text]
     readings = [_reading(text) for text in texts]
     timed = [i for i, reading in enumerate(readings) if reading.get("TIME") and i not in cut]
-    names = list(dict.fromkeys(name for i in timed for name in readings[i]))
-    sheet = _sheet.Sheet(
-        lines=lines, names=names, row=row[timed], cells=[[readings[i].get(name, "") for name in names] for i in timed],
-        blank_rows=np.setdiff1d(np.flatnonzero(~lines.blank), row[[*timed, *cut]]),
-        rejected=lines.reject_all(np.setdiff1d(row[cut], row[timed]), "a placemark without its end (a cut file?)"),
-        closed=True,
-    )  # fmt: skip
+    torn = lines.reject_all(np.setdiff1d(row[cut], row[timed]), "a placemark without its end (a cut file?)")
+    sheet = _sheet.of_readings(lines, [(int(row[i]), readings[i]) for i in timed], torn)
     rows = _sheet.rows(sheet, options, reader="gnettrack_kml") if timed else None
     if rows is None:
         return _sheet.nothing(data, "gnettrack_kml", "no placemark with a time")

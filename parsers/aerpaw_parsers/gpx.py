@@ -12,6 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import IntArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
@@ -48,9 +49,17 @@ def _points(data: bytes) -> list[tuple[int, dict[bytes, bytes]]]:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Telemetry ``track``; UsageError if the times have no zone and none is given."""
-    lines = _lines.split(data)
-    points = [(at, values) for at, values in _points(data) if {b"lat", b"lon", b"time"} <= set(values)]
+    """Return the telemetry ``track``; UsageError if the times have no zone and none is given.
+
+    Raises
+    ------
+    InputError
+        If no point has a time.
+    """
+    lines, known = _lines.split(data), _points(data)
+    points = [(at, values) for at, values in known if {b"lat", b"lon", b"time"} <= set(values)]
+    if known and not points:
+        raise InputError("a GPX track without times", expected="<time> in its points", cause="a route or a drawn track")
     row = lines.number_at(at for at, _ in points)
     placed = [values for _, values in points]
     clock, time, warnings = _stamps.read([values[b"time"].decode("ascii", "replace") for values in placed], options)

@@ -11,14 +11,15 @@ COUNT = 5
 VOLTS = (12.587, 12.193, 12.242)  # of ArduPilot's simulated battery on the ground and in the air
 
 
-def dataflash(count: int = COUNT, fix: int = 4, satellites: int = 14) -> bytes:
-    """ArduPilot .bin: POS, ATT, GPS, XKF1 and BAT at 1 Hz; the clock counts from switching on."""
+def dataflash(count: int = COUNT, fix: int = 4, satellites: int = 14, *, radio: bool = False) -> bytes:
+    """ArduPilot .bin: POS, ATT, GPS, XKF1, BAT and RAD at 1 Hz; the clock counts from switching on."""
     forms = {
         129: ("POS", "QLLfff", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt"),
         130: ("ATT", "QccccCC", "TimeUS,DesRoll,Roll,DesPitch,Pitch,DesYaw,Yaw"),
         131: ("GPS", "QBBIHBcLLeffffB", "TimeUS,I,Status,GMS,GWk,NSats,HDop,Lat,Lng,Alt,Spd,GCrs,VZ,Yaw,U"),
         132: ("XKF1", "QBccCfff", "TimeUS,C,Roll,Pitch,Yaw,VN,VE,VD"),
         133: ("BAT", "QBff", "TimeUS,Inst,Volt,VoltR"),
+        134: ("RAD", "QBBBBBHH", "TimeUS,RSSI,RemRSSI,TxBuf,Noise,RemNoise,RxErrors,Fixed"),
     }
     codes = {"Q": "Q", "L": "i", "f": "f", "c": "h", "C": "H", "B": "B", "I": "I", "H": "H", "e": "i"}
     out = b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", 128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
@@ -38,6 +39,7 @@ def dataflash(count: int = COUNT, fix: int = 4, satellites: int = 14) -> bytes:
             (132, (now, 1, 150, -250, 9000, 9.5, 9.5, 9.5)),
             (133, (now, 0, VOLTS[i % 3], 0.0)),
             (133, (now, 1, 5.0, 0.0)),
+            *([(134, (now + 200_000, 133 - i, 255 if i == 2 else 152, 100, 38, 57, 0, 0))] if radio else []),
         ):
             out += b"\xa3\x95" + bytes([kind]) + struct.pack("<" + "".join(codes[c] for c in forms[kind][1]), *values)
     return out

@@ -146,7 +146,7 @@ CASES = [(reader, name) for reader, samples in SAMPLES.items() for name in sampl
 
 # Readers and samples whose clock is UTC or relative.
 WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
-    "nemo_csv", "nemo_kml", "tap_jsonl", "pawprints", "srsran_json",
+    "nemo_csv", "nemo_kml", "tap_jsonl", "pawprints", "srsran_json", "nmea", "rtklib_pos",
     "ardupilot_bin", "mavlink_tlog", "px4_ulog",
     ("vehicle_out", "utc_offset"), ("flight_mat", "lte"), ("flight_mat", "processed"), ("gpx", "track"),
     ("drive_test", "srsue_metrics"), ("pose_csv", "airdata"), ("srsran_gnb", "log"), ("oai_log", "frames"), ("oai_log", "ue"),

@@ -71,7 +71,6 @@ def cases(name: str) -> dict[str, Right]:
 RIGHT, AUTOPILOTS, COUSINS = (cases(f"{name}.yaml") for name in ("logs", "autopilots", "cousins"))
 REFUSED = {
     "35_levels_no_time.kml": "levels and positions without times",
-    "39_nmea.txt": "NMEA",
     "49_wifi_scan.txt": "a Wi-Fi scan of PawPrints",
 }
 
@@ -163,14 +162,12 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "a scan of access points": ("WigleWifi-1.4,appRelease=2.53\nMAC,SSID,FirstSeen,RSSI\n", InputError, "a Wi-Fi scan"),
     "answers of another modem": (
         table("", '[2025-06-10 10:00:0{i}] #RFSTS: "310 26",1795,-101,-67,-15,2242'), InputError, "AT answers of a modem"),
-    "NMEA through ts": (table("", "[2025-06-10 10:00:0{i}] $GNGGA,140000.00,3543.68,N,07841.76,W,1"), InputError, "NMEA"),
     "an index in front of AERPAW's positions": (
         table("time,lat,lon,alt,rsrp", EPOCH + f",1.{{i}},{PLACE},{{l}}"), InputError, "holds values as positions have"),
     "an index in front of positions elsewhere": (
         table("time,lat,lon,alt,rsrp", EPOCH + ",1.{i},48.13712{i},11.57541{i},{l}"), InputError, "'alt' holds values as"),
     "a level without its PCI, elsewhere": (
         table("time,pci,rsrp,lat,lon,alt", EPOCH + ",{l},48.13712{i},11.57541{i},520.3,3"), InputError, SHIFTED),
-    "NMEA of another sentence": (table("", "$GNGNS,14000{i}.00,3543.68,N,07841.76,W,AA,10,0.9,110.1,-33,,*5C"), InputError, "NMEA"),
     "GnssLogger": (
         "# Header\n# Fix,Provider,LatitudeDegrees,LongitudeDegrees\n" + "Fix,GPS,35.728,-78.696\n" * 4, InputError, "GnssLogger"),
     "KML points with levels": (

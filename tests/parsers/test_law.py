@@ -19,7 +19,8 @@ from tests.parsers.samples import BINARY, CASES, NO_LOGS, OPTIONS, SAMPLES
 
 SNIFFED = [case for case in CASES if case[0] != "generic_csv"]
 _CONSOLES = ("quectel_console", "cell_search", "srsran_gnb", "oai_log")
-TALK = ("controller_log", "srsenb_log", "srsue_log", "nemo_kml", "gnettrack_kml", "gpx", "vehicle_log", *_CONSOLES)
+_MARKUP = ("nemo_kml", "gnettrack_kml", "gpx", "dji_srt")
+TALK = ("controller_log", "srsenb_log", "srsue_log", "vehicle_log", *_MARKUP, *_CONSOLES)
 TEXT_CASES = [case for case in CASES if case[0] not in BINARY]
 
 
@@ -158,11 +159,14 @@ def test_a_last_record_without_line_end_is_flagged(reader: str, sample: str) -> 
     last = max(int(stream.frame["line"].max()) for stream in result.streams)
     cut = check_law(reader, b"\n".join(lines[:last]).rstrip(b"\r"))
     if cut is None or cut.accepted != result.accepted:
-        assert reader == "sounder_log" or sample == "pretty"  # the layout tells a cut line, or an object ends below
+        assert (
+            reader in ("sounder_log", "dji_srt") or sample == "pretty"
+        )  # the layout tells a cut line, or an object ends below
         return
     flagged = [flag for stream in cut.streams for flag in stream.frame.loc[stream.frame["line"] == last, "flag"]]
     assert flagged
-    closed = reader in ("gpx", "gnettrack_kml")  # a record ends with its own tag
+    # a record ends with its own tag, a checksum, or fields behind the position
+    closed = reader in ("gpx", "gnettrack_kml", "dji_srt", "nmea", "rtklib_pos")
     assert all(("unterminated_line" in flag) is not closed for flag in flagged)
 
 

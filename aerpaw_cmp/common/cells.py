@@ -9,6 +9,8 @@ from typing import Any
 # and an apostrophe of the log itself: unguarded() would take it for one of ours
 _BEGINNING = re.compile(r"(^|;)(?=[=+\-@\t\r'])")
 _GUARDED = re.compile(r"(^|;)'")
+# within a comment a separator begins a cell, too; numbers stay as they are, since some comments hold tables of them
+_IN_COMMENT = re.compile(r"([,;\t]\s*)(?=[=@]|[+\-](?![\d.]|inf|nan))")
 
 
 def guarded(table: Any) -> Any:
@@ -37,6 +39,17 @@ def guarded_text(word: str) -> str:
     ("'=1+1", "LW1;'=1+1", 'LW1')
     """
     return _BEGINNING.sub(r"\1'", word)
+
+
+def guarded_comment(line: str) -> str:
+    """Return a comment line of a table whose parts between separators are not formulas.
+
+    Examples
+    --------
+    >>> guarded_comment("# learned: f1, =1+1"), guarded_comment("# pair: 1.5,-0.3")
+    ("# learned: f1, '=1+1", '# pair: 1.5,-0.3')
+    """
+    return _IN_COMMENT.sub(r"\1'", line)
 
 
 def unguarded(word: str) -> str:

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
+from ..common.cells import guarded
 from ..common.cf import Dataset, GrowingNetcdf, file_attributes
 from ..common.jsonable import named
 from ..common.provenance import KEY
@@ -302,7 +303,7 @@ def _write_csv(channel: Channel, folder: Path) -> Path:
         # row -1, of no path, is the appended one
         shown[name] = np.nan if values is None else np.append(values, np.nan)[strongest].ravel()
     # parts follow each other in one file, which the first one begins
-    pd.DataFrame(shown).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
+    guarded(pd.DataFrame(shown)).to_csv(path, mode="a", header=not path.exists(), index=False, float_format="%.9g")
     return path
 
 

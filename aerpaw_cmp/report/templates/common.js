@@ -239,7 +239,10 @@ const common = (() => {
   // buttons that save a chart: drawn anew by ``draw`` as SVG, as a picture, and the rows of its numbers
   function downloads(canvas, name, rows, draw) {
     const save = (kind, blob) => { const a = document.createElement("a"); a.href = URL.createObjectURL(blob); a.download = `${name}.${kind}`; a.click(); URL.revokeObjectURL(a.href); };
-    const cell = v => v === null || Number.isNaN(v) ? "" : /[",\n]/.test(v) ? `"${String(v).replaceAll('"', '""')}"` : v;
+    // texts as aerpaw_cmp.common.cells guards them: a spreadsheet must not take a name for a formula
+    const guarded = v => typeof v === "string" ? v.replace(/(^|;)(?=[=+\-@\t\r'])/g, "$1'") : v;
+    const quoted = v => /[",\n]/.test(v) ? `"${String(v).replaceAll('"', '""')}"` : v;
+    const cell = v => v === null || Number.isNaN(v) ? "" : quoted(guarded(v));
     const kinds = { svg: () => save("svg", new Blob([drawnAsSvg(canvas, draw)])), png: () => canvas.toBlob(blob => save("png", blob)), csv: () => save("csv", new Blob([rows().map(row => row.map(cell).join(",")).join("\n") + "\n"])) };
     return Object.keys(kinds).map(kind => {
       const button = document.createElement("button");

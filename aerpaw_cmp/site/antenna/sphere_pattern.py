@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ...common.cells import guarded_comment
 from ...common.errors import InputError, parsed
 from ...common.provenance import marks, trained_on
 from ...common.units import BoolArray, FloatArray, db_from_power, power_from_db
@@ -103,7 +104,7 @@ def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] =
     """
     rows, columns = gain_dbi.shape
     theta, phi = np.linspace(0.0, 180.0, rows), np.arange(columns) * (360.0 / columns)
-    lines = [f"# {note}" for note in notes] + [",".join(COLUMNS)]
+    lines = [guarded_comment(f"# {note}") for note in notes] + [",".join(COLUMNS)]
     for i in range(rows):
         lines += [
             f"{phi[j]:g},{90.0 - theta[i]:g},{gain_dbi[i, j]:.{decimals}f},{sd_db[i, j]:.{decimals}f}"

@@ -82,6 +82,11 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
     return data, hashlib.sha256(data).hexdigest()
 
 
+def read_head(place: Path) -> bytes:
+    """Return the first bytes of a log on disk, as much as the sniffers look at; InputError if it cannot be read."""
+    return as_utf8(_raw(place, HEAD_BYTES))
+
+
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
     """Content of a packed file, other content as it is."""
     most = min(MAX_BYTES, archives.most_bytes(len(raw)))

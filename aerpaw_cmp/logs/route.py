@@ -20,6 +20,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from xml.etree import ElementTree
@@ -31,7 +32,7 @@ from ..common.counting import counted
 from ..common.errors import InputError, parsing
 from ..common.xmlfiles import named, outermost, plain, xml_root
 from . import dictionary
-from .ingest import as_utf8, read_bytes, read_file
+from .ingest import as_utf8, read_bytes, read_file, read_head
 from .readers import HEAD_BYTES, ReadOptions, claims
 
 if TYPE_CHECKING:
@@ -44,6 +45,22 @@ _SEA_LEVEL_FRAMES, _RELATIVE_FRAMES, _TERRAIN_FRAMES = (0, 5), (3, 6), (10, 11)
 _WAYPOINTS = (16, 17, 18, 19, 31, 82)
 _TAKEOFFS, _LANDINGS, _TURN, _RETURN = (22, 84), (21, 85), 115, 20
 _ARDUPILOT = 3
+
+
+# Most points of a route or of a table of points, and most bytes of a file that lists them: a longer one is a log or a
+# mistake, and is refused before all of it is in memory.
+MOST_POINTS = 2_000_000
+MOST_BYTES = 256 << 20
+
+
+def too_many_points(path: str | Path | None = None) -> InputError:
+    """Return the error for a file of more than :data:`MOST_POINTS` points."""
+    return InputError(
+        f"more than {MOST_POINTS} points",
+        expected=f"at most {MOST_POINTS} points",
+        cause="too fine a grid, or a point for each sample of a receiver; thin it out",
+        path=path,
+    )
 
 
 def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFrame:
@@ -69,6 +86,16 @@ def read_route(path: str | Path, *, height_m: float | None = None) -> pd.DataFra
         If the file is no route, or points have no height and ``height_m`` does not say it.
     """
     with parsing(path, _EXPECTED):
+        place = Path(path)
+        if place.is_file() and place.stat().st_size > MOST_BYTES:
+            # the readers of logs take a large file in pieces
+            if not any(reader.kinds for reader in claims(read_head(place))):
+                raise InputError(
+                    f"the file has {place.stat().st_size} bytes",
+                    expected=f"at most {MOST_POINTS} points and {MOST_BYTES} bytes",
+                    cause="not a route, or a point for each sample of a receiver; thin it out",
+                )
+            return _table(_log(path), height_m)
         return _table(_route(as_utf8(read_bytes(path)[0]), path), height_m)
 
 
@@ -80,6 +107,8 @@ class _Route:
     remarks: list[str] = field(default_factory=list)
 
     def add(self, latitude: float, longitude: float, height: float = math.nan, yaw: float = math.nan) -> None:
+        if len(self.points) >= MOST_POINTS:
+            raise too_many_points()
         self.points.append((latitude, longitude, height, yaw, math.nan))
 
     def remark(self, text: str) -> None:
@@ -100,7 +129,7 @@ def _route(data: bytes, path: str | Path) -> _Route:
         return _kml(data)
     if b"\0" in head:
         raise InputError("binary content that is no route", expected=_EXPECTED)
-    return _sheet(data.decode("utf-8", "replace"))
+    return _sheet(data)
 
 
 _EXPECTED = "a QGroundControl .plan, QGC WPL waypoints, a KML with a line, a CSV with lat, lon, alt, or a log"
@@ -337,30 +366,34 @@ def read_areas(path: str | Path) -> list[list[tuple[float, float]]]:
 # --- tables ------------------------------------------------------------------------------------------
 
 
-def _sheet(text: str) -> _Route:
+def _sheet(data: bytes) -> _Route:
     """Waypoints of a table; without a header: latitude, longitude, height, yaw."""
-    lines = [line for line in text.splitlines() if line.strip() and not line.lstrip().startswith("#")]
-    if not lines:
+    # one line at a time: a table that is refused at its limit is never a list of all its cells
+    text = io.TextIOWrapper(io.BytesIO(data), encoding="utf-8", errors="replace")
+    lines = (line for line in text if line.strip() and not line.lstrip().startswith("#"))
+    head = next(lines, None)
+    if head is None:
         raise InputError("the file is empty", expected=_EXPECTED)
-    sign = max(",;\t", key=lines[0].count)
+    sign = max(",;\t", key=head.count)
     # quoted names may hold the separator
-    rows = list(csv.reader(io.StringIO("\n".join(lines)), delimiter=sign, skipinitialspace=True))
-    known = [dictionary.meaning(name) for name in rows[0]]
+    rows = csv.reader(chain([head], lines), delimiter=sign, skipinitialspace=True)
+    first = next(rows)
+    known = [dictionary.meaning(name) for name in first]
     above_sea = [m is not None and m.quantity.datum in ("sea level", "ellipsoid") for m in known]
     columns = {
         key: next((i for i, m in enumerate(known) if m and m.quantity.name == key and not above_sea[i]), -1)
         for key in COLUMNS[:4]
     }
-    first = 1
+    begin = 2
     if columns["latitude_deg"] < 0 or columns["longitude_deg"] < 0:
-        if not all(_is_number(cell) for cell in rows[0]) or not 2 <= len(rows[0]) <= 4:
-            raise InputError(f"no route: {lines[0][:60]!r}", expected=_EXPECTED)
-        columns = {key: index if index < len(rows[0]) else -1 for index, key in enumerate(COLUMNS[:4])}
-        first = 0
+        if not all(_is_number(cell) for cell in first) or not 2 <= len(first) <= 4:
+            raise InputError(f"no route: {head.rstrip()[:60]!r}", expected=_EXPECTED)
+        columns = {key: index if index < len(first) else -1 for index, key in enumerate(COLUMNS[:4])}
+        rows, begin = chain([first], rows), 1
     elif columns["altitude_m"] < 0 and any(above_sea):
         raise InputError("heights above sea level", expected="a column 'altitude_m' of heights above take-off")
     route = _Route()
-    for number, row in enumerate(rows[first:], start=first + 1):
+    for number, row in enumerate(rows, start=begin):
         _add_row(route, row, columns, [m.unit if m else "" for m in known], number)
     return route
 

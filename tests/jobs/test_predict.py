@@ -20,7 +20,7 @@ from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.learning.calibrate import observe
 from aerpaw_cmp.jobs.learning.calibrate_rank import rank_samples
-from aerpaw_cmp.jobs.prediction import corrected_map, sources
+from aerpaw_cmp.jobs.prediction import corrected_map, sources, where
 from aerpaw_cmp.jobs.prediction import predict as job
 from aerpaw_cmp.jobs.prediction.against import score_against
 from aerpaw_cmp.jobs.prediction.sources import named_flights
@@ -142,6 +142,22 @@ def test_a_file_without_positions_is_refused(tmp_path):
     (tmp_path / "p.csv").write_text("east_m,north_m,height_m\n,,\n")
     with pytest.raises(InputError, match="no point has a position"):
         find_targets(tmp_path / "p.csv", load_site("lake_wheeler"), TargetOptions())
+
+
+def test_a_table_of_points_is_refused_before_all_of_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr(where, "MOST_POINTS", 100)
+    (tmp_path / "p.csv").write_text("east_m,north_m,height_m\n" + "1,2,30\n" * 1000)
+    read, rows = pd.read_csv, []
+
+    def counted(*args, **options):
+        table = read(*args, **options)
+        rows.append(len(table))
+        return table
+
+    monkeypatch.setattr(pd, "read_csv", counted)
+    with pytest.raises(InputError, match=r"p\.csv: more than 2000000 points"):
+        find_targets(tmp_path / "p.csv", load_site("lake_wheeler"), TargetOptions())
+    assert rows == [101]
 
 
 def test_files_agree_with_each_other(tmp_path, prediction):

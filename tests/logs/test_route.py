@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import route
 from aerpaw_cmp.logs.route import COLUMNS, read_route
 from tests.parsers import samples
 
@@ -198,3 +199,33 @@ def test_a_route_cut_off_is_refused_with_its_line(tmp_path: Path) -> None:
     file.write_bytes(FILES["line.kml"][:-60])
     with pytest.raises(InputError, match=r"cut\.kml, line \d+: not XML"):
         read_route(file)
+
+
+@pytest.mark.parametrize("form", ["csv", "csv without header", "wpl", "kml"])
+def test_a_route_is_refused_when_its_limit_is_passed(
+    form: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The row behind the limit is read, and none of the rows behind that one, which would each be an error."""
+    monkeypatch.setattr(route, "MOST_POINTS", 3)
+    rows = [f"{HOME[0]},{HOME[1]},40"] * 4 + ["x,y,z"]
+    text = {
+        "csv": "\n".join(["latitude,longitude,altitude", *rows]),
+        "csv without header": "\n".join(rows),
+        "wpl": "QGC WPL 110\n" + "".join(f"{i}\t0\t3\t16\t0\t0\t0\t0\t35.7\t-78.7\t40\t1\n" for i in range(6)),
+        "kml": kml(f"<LineString><coordinates>{LINE} {LINE}</coordinates></LineString>").decode(),
+    }[form]
+    (tmp_path / "r").write_text(text)
+    with pytest.raises(InputError, match="more than 3 points"):
+        read_route(tmp_path / "r")
+
+
+def test_a_large_file_that_is_no_log_is_refused_by_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with (tmp_path / "sparse.csv").open("wb") as file:
+        file.truncate(route.MOST_BYTES + 1)
+
+    def never(*_: object) -> None:
+        raise AssertionError("the file was read")
+
+    monkeypatch.setattr(route, "read_bytes", never)
+    with pytest.raises(InputError, match=r"the file has 268435457 bytes; expected at most 2000000 points"):
+        read_route(tmp_path / "sparse.csv")

@@ -19,7 +19,8 @@ from ...flight.pose.track import interpolated
 from ...flight.replay import attitude_rotation
 from ...flight.settings import FlightFile
 from ...flight.simulate import LEAN_DEG_PER_MPS, planned_poses
-from ...logs.route import read_route
+from ...logs.readers import HEAD_BYTES
+from ...logs.route import MOST_POINTS, read_route, too_many_points
 from ...maps.grid import Grid
 from ...propagation.geometry.arrays import rotation_from_axes
 from ...site.inputs import inputs_of_site
@@ -31,8 +32,6 @@ STEP_M = 10.0
 
 # Of a route without times.
 SPEED_MPS = 8.0
-
-_MOST_POINTS = 2_000_000
 
 # Upward axis of level flight.
 UPRIGHT = np.array([0.0, 0.0, 1.0])
@@ -195,8 +194,8 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
         targets = _route(where, site, options)
     if options.heading_deg is not None:
         targets = replace(targets, yaw_deg=np.full(len(targets), options.heading_deg % 360.0))
-    if len(targets) > _MOST_POINTS:
-        raise UsageError(f"{len(targets)} points", expected=f"at most {_MOST_POINTS}", cause="too fine a spacing")
+    if len(targets) > MOST_POINTS:
+        raise UsageError(f"{len(targets)} points", expected=f"at most {MOST_POINTS}", cause="too fine a spacing")
     if not targets.known.any():
         places = "east, north and height in metres, or latitude and longitude"
         raise InputError("no point has a position near the site", expected=places, path=where)
@@ -257,16 +256,27 @@ def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
     )
 
 
+# Columns of a table of points; the last two may be missing.
+_COLUMNS = ("east_m", "north_m", "height_m", "yaw_deg", "time_s")
+
+
 def _local_points(path: Path) -> Targets | None:
     """Points of a CSV with east_m, north_m and height_m (and yaw_deg, time_s); None for another file."""
     if path.suffix.lower() != ".csv":
         return None
     with parsing(path, "columns east_m, north_m, height_m"):
-        names = [n.strip() for n in path.read_text(encoding="utf-8", errors="replace").partition("\n")[0].split(",")]
-        if not {"east_m", "north_m", "height_m"} <= set(names):
+        with path.open("rb") as file:
+            head = file.readline(HEAD_BYTES).decode("utf-8-sig", errors="replace")
+        if not set(_COLUMNS[:3]) <= {name.strip() for name in head.split(",")}:
             return None
-        table = pd.read_csv(path, skipinitialspace=True)
-    numbers = table.reindex(columns=["east_m", "north_m", "height_m", "yaw_deg", "time_s"])
+        # a longer table is refused when its limit is passed, not when all of it is in memory
+        table = pd.read_csv(
+            path, skipinitialspace=True, nrows=MOST_POINTS + 1, encoding="utf-8-sig", index_col=False,
+            usecols=lambda name: name.strip() in _COLUMNS,
+        ).rename(columns=str.strip)  # fmt: skip
+        if len(table) > MOST_POINTS:
+            raise too_many_points(path)
+    numbers = table.reindex(columns=list(_COLUMNS))
     numbers = numbers.apply(pd.to_numeric, errors="coerce")
     position = numbers[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
     lost = int((~(np.abs(position) < NEAR_M).all(axis=1)).sum())

@@ -423,8 +423,9 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
     if item["type"] == "extra_forbidden":
         names = _field_names(*_models_at(model, location[:-1]))
         near = nearest(location[-1], names)
+        homes = sorted(_homes(model, location[-1]), key=lambda home: home.count("."))
         cause = f"did you mean '{near}'?" if near else f"valid keys are {_listed(names)}"
-        return f"unknown key '{where}'", cause
+        return f"unknown key '{where}'", f"'{location[-1]}' belongs in {' or '.join(homes[:3])}" if homes else cause
     if item["type"] == "missing" and isinstance(location[-1], int):
         return f"{'.'.join(map(str, location[:-1]))}: entry {location[-1] + 1} of the list is missing", None
     if item["type"] == "missing":
@@ -438,6 +439,17 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
     shown = repr(item["input"])
     shown = shown if len(shown) <= 60 else shown[:57] + "..."
     return f"{where}: found {shown}; expected {message}", None
+
+
+def _homes(model: type[pydantic.BaseModel], key: object, above: str = "") -> Iterator[str]:
+    """Yield the parts of a file, in words, that have a key of this name."""
+    for name, info in model.model_fields.items():
+        path, kind = f"{above}{name}", typing.get_origin(info.annotation)
+        inner = {list: "a line of '{}:'", dict: "an entry of '{}:'"}.get(kind, "'{}:'") if kind else "'{}:'"
+        for part in _models_in(info.annotation):
+            if key in _field_names(part):
+                yield inner.format(path)
+            yield from _homes(part, key, f"{path}.")
 
 
 def _listed(names: Iterable[str]) -> str:

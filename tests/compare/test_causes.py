@@ -123,7 +123,7 @@ def test_each_trouble_comes_back_with_its_number_and_a_step(name: str) -> None:
         assert "00:02:01 UTC" in cause.sentence
     assert name != "lock" or "%" not in cause.sentence, "the caution has the share of the samples, not of the seconds"
     if name == "floor":  # followed, the advice ends: three decibels above it, and no floor of what was cut
-        assert cause.next_step == f"`floor_db: {cause.estimate + 3.0:.0f}` for this log"
+        assert cause.next_step == f"`floor_db: {cause.estimate + 3.0:.0f}` in this `logs:` line"
         assert _named(replace(evidence, floored=True)) != "floor"
 
 

@@ -7,7 +7,8 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.gains.memory import load_with_learned
 from aerpaw_cmp.flight.settings import ArraySettings, FlightFile
 
@@ -106,3 +107,18 @@ def test_learned_settings_name_no_file_outside_their_folder(tmp_path: Path, name
     (folder / "calibrated.yaml").write_text(text)
     with pytest.raises(InputError, match=r"leaves its folder|no file of its folder"):
         load_with_learned(flight, folder / "calibrated.yaml")
+
+
+@pytest.mark.parametrize(
+    ("line", "home"),
+    [
+        ("rss: {floor_db: -49.36}", "a line of 'logs:'"),
+        ("rt: {samples: 100}", "'rt.advanced:'"),
+        ("carrier_hz: 3.3e9", "'link.rss:'"),
+        ("rss: {lagg: 3}", "did you mean 'lag'?"),
+    ],
+)
+def test_a_key_in_the_wrong_place_is_refused_with_the_right_one(line: str, home: str) -> None:
+    with pytest.raises(UsageError, match="line 3: unknown key") as caught:
+        parse_yaml(f"flight: f\nlogs: [{{path: a}}]\n{line}\n", FlightFile)
+    assert home in str(caught.value)

@@ -717,7 +717,7 @@ def _tower(e: LevelEvidence) -> Iterator[Trial]:
     for name, level in e.other_towers_db.items():
         yield Trial(
             name="tower", cost=math.log(len(e.other_towers_db)), sentence=f"the log is that of {name}",
-            next_step=f"`node: {name}` for this log", change_db=level - e.predicted_db,
+            next_step=f"`node: {name}` in this `logs:` line", change_db=level - e.predicted_db,
         )  # fmt: skip
 
 
@@ -829,8 +829,8 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
         yield Trial(
             name="no detection", cost=0.0, clipped=e.least, estimate=(level, level, level),
-            sentence=f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: nothing was detected",
-            next_step=f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` for this log",
+            sentence=f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: not detected",
+            next_step=f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` in this `logs:` line",
         )  # fmt: skip
 
 
@@ -913,7 +913,7 @@ _OVER_FLOOR_DB = 3.0
 
 
 _LIMITS = {
-    1.0: ("floor", "the receiver shows no level below {level}", "`floor_db: {typed}` for this log"),
+    1.0: ("floor", "the receiver shows no level below {level}", "`floor_db: {typed}` in this `logs:` line"),
     -1.0: ("saturation", "the receiver shows no level above {level}", "lower the gain; trust lower levels alone"),
 }
 

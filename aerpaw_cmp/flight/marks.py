@@ -1,9 +1,15 @@
-"""Marks of a log: what its readings did from moment to moment, whatever their unit, rate, clock and file are.
+"""Fingerprints of logs: they recognise a changed copy of a log, and not a second flight of the same route.
 
-A mark is the change of a level or a rank every half second: its mean over one second less its mean over ten, in steps
-of 0.4 robust standard deviations, a digit each; a power in watts counts by its logarithm. Two marks are of one log
-where they correlate at some lag: so do those of a part and of a thinned, resampled, rounded, shifted or scaled copy.
-Flights of one route share what is slower. A mark begins with the clock of its log: of other clocks more is asked.
+A fingerprint ``<start>f<digits>f<runs>`` has three parts:
+
+- ``start``: half seconds since 1970, empty if the log has no wall clock.
+- ``digits``: the change of a level or a rank every half second, one digit each: mean over 1 s minus mean over 10 s, in
+  steps of 0.4 robust standard deviations. Powers in watts count by their logarithm.
+- ``runs``: the smallest hashes of short runs of raw readings (a bottom-k sketch, Broder 1997), 8 hex digits each.
+
+Two fingerprints are of one log if they share runs, or if their clocks agree and their digits correlate at some lag. The
+digits of a part and of a thinned, resampled, rounded or scaled copy do. Repeated flights of one route share the
+ripple of the ground reflection, so their digits correlate, too: only the clock or the raw readings distinguish them.
 """
 
 from __future__ import annotations
@@ -29,7 +35,17 @@ _SLACK, _HOUR = 120, 7200
 
 # Half seconds that two marks share; correlation, and Fisher's z over its standard deviation, from which they are of one
 # log. Largest z of two logs of the field: 7.3, the next 5.7; of a changed copy of most of a log the least is 8.6.
-_FEWEST, _LEAST_R, _LEAST_Z, _LEAST_Z_APART = 80, 0.5, 7.5, 9.0
+_FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
+
+# Readings of a run, changes in it (a constant level repeats in every log), and every how many-th reading is taken: a
+# copy with half or a quarter of the rows has the same runs.
+_RUN, _LEAST_CHANGES, _STRIDES = 24, 8, (1, 2, 4)
+
+# Runs in a mark, and shared ones from which two marks are of one log: of 64, a tenth of a log shares about 6.
+_RUNS, _LEAST_SHARED = 64, 3
+
+# Multiplier of the hashes: 2^64 over the golden ratio, odd, so that it has an inverse.
+_ODD = 0x9E3779B97F4A7C15
 
 # Readings that are all positive, and below one or over so many decades, are powers.
 _POWER_RATIO = 1e3
@@ -74,7 +90,36 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
     # half seconds, so that it counts in steps of the mark
     first = time[known[0]]
     start = round((first - np.datetime64(0, "ns")) / np.timedelta64(500, "ms")) if has_wall_clock(first) else ""
-    return f"{start}{_BEGIN}{digits}"
+    return f"{start}{_BEGIN}{digits}{_BEGIN}{_runs(values)}"
+
+
+def _runs(values: FloatArray) -> str:
+    """Return the smallest hashes of runs of changes [1/1000]; changes, because a gain shifts a copy."""
+    found = np.concatenate([_hashes(values[phase::stride]) for stride in _STRIDES for phase in range(stride)])
+    # a few of them alone are sorted: millions would take a second
+    least = np.partition(found, 10 * _RUNS)[: 10 * _RUNS] if len(found) > 10 * _RUNS else found
+    return "".join(f"{code:08x}" for code in np.unique(least)[:_RUNS].tolist())
+
+
+def _hashes(values: FloatArray) -> AnyArray:
+    """Return the hash of each run of readings that changes often enough: a rolling polynomial modulo 2^64."""
+    steps = np.rint(np.diff(values) * 1e3).astype(np.int64).view(np.uint64)
+    if len(steps) < _RUN:
+        return np.zeros(0, dtype=np.uint64)
+    mixed = steps * np.uint64(_ODD)
+    mixed ^= mixed >> np.uint64(29)
+    total = _before(mixed * np.cumprod(np.full(len(steps), _ODD, dtype=np.uint64)))
+    run = total[_RUN:] - total[:-_RUN]
+    run *= np.cumprod(np.full(len(run), pow(_ODD, -1, 1 << 64), dtype=np.uint64))
+    run ^= run >> np.uint64(31)
+    changes = _before(steps != 0)
+    return np.asarray((run * np.uint64(_ODD) >> np.uint64(32))[changes[_RUN:] - changes[:-_RUN] >= _LEAST_CHANGES])
+
+
+def _before(values: AnyArray) -> AnyArray:
+    """Return the sums of the values before each place, and of all."""
+    total = np.cumsum(values)
+    return np.concatenate([np.zeros(1, dtype=total.dtype), total])
 
 
 def among(mark: str, marks: Iterable[str]) -> bool:
@@ -84,8 +129,10 @@ def among(mark: str, marks: Iterable[str]) -> bool:
 
 @lru_cache(maxsize=4096)
 def _same(first: str, second: str) -> bool:
-    begin, own = _parts(first)
-    other, digits = _parts(second)
+    begin, own, runs = _parts(first)
+    other, digits, others = _parts(second)
+    if len(runs & others) >= _LEAST_SHARED:
+        return True
     if min(len(own), len(digits)) < _FEWEST:
         return False
     z, near = _evidence(own, digits), np.True_
@@ -93,13 +140,14 @@ def _same(first: str, second: str) -> bool:
         lags = np.arange(len(z))
         apart = np.abs(np.where(lags < len(digits), lags, lags - len(z)) + other - begin) + _SLACK
         near = (apart % _HOUR <= 2 * _SLACK) & (apart <= 14 * _HOUR + 2 * _SLACK)
-    return bool((z >= np.where(near, _LEAST_Z, _LEAST_Z_APART)).any())
+    return bool(((z >= _LEAST_Z) & near).any())
 
 
-def _parts(mark: str) -> tuple[int | None, str]:
-    """Begin of a mark in half seconds of 1970, None without a wall clock, and its digits."""
-    begin, _, digits = mark.rpartition(_BEGIN)
-    return int(begin) if begin.isdecimal() and len(begin) < 12 else None, digits
+def _parts(mark: str) -> tuple[int | None, str, frozenset[str]]:
+    """Return the start of a mark in half seconds since 1970 (None without a wall clock), its digits and its runs."""
+    begin, digits, runs = [*mark.split(_BEGIN, 2), "", ""][:3]
+    start = int(begin) if begin.isdecimal() and len(begin) < 12 else None
+    return start, digits, frozenset(runs[i : i + 8] for i in range(0, len(runs) - 7, 8))
 
 
 def _evidence(first: str, second: str) -> FloatArray:

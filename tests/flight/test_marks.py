@@ -81,13 +81,27 @@ def test_a_part_is_known_whatever_its_clock(start: str) -> None:
         assert among(one, [other])
 
 
-def test_less_is_asked_of_logs_with_one_clock() -> None:
-    """A correlation that tells a flight's own copy from all others of its hour, and not from those of years."""
-    one, other = "100f" + "7" * 90, "100f" + "7" * 90
-    for z, begin, known in ((8.0, "100f", True), (8.0, "5000f", False), (9.5, "5000f", True), (7.0, "100f", False)):
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(marks, "_evidence", lambda *_, z=z: np.array([z]))
-            assert among(one, [begin + other.partition("f")[2] + "." * round(z)]) == known
+def test_a_repeat_flight_of_the_same_ripple_is_another_flight() -> None:
+    """An automated route repeats the ripple of the ground reflection: r is 0.9 here, on another day and hour."""
+    t = np.arange(0.0, 600.0, 0.5)
+    ripple = 6 * np.sin(2 * np.pi * t / 9.7) * np.sin(2 * np.pi * (t / 130) ** 2)
+    levels = [np.round(-70 + ripple + np.random.default_rng(i).normal(0, 2, len(t)), 1) for i in range(2)]
+    start = "2025-06-01T10:00:00"
+    for other in ("2025-06-02T10:00:00", "2025-06-01T10:20:00", "2025-06-01T13:31:00"):
+        assert not among(mark(t, levels[1], other), [mark(t, levels[0], start)])
+        assert among(mark(t[99:], levels[0][99:], other), [mark(t, levels[0], start)])
+    # at one time, or at another time zone, nothing but the correlation is necessary
+    for same in (start, "2025-06-01T14:00:00"):
+        assert among(mark(t, levels[1], same), [mark(t, levels[0], start)])
+
+
+def test_runs_of_a_quantised_level_are_shared_by_copies_only() -> None:
+    """Whole dB repeat by chance: none of 20 pairs of flights may share three runs of 64."""
+    t = np.arange(0.0, 1200.0, 0.25)
+    levels = [np.round(-90 + np.random.default_rng(i).normal(0, 0.8, len(t))) for i in range(6)]
+    runs = [marks._parts(mark(t, level))[2] for level in levels]
+    assert all(len(one) == 64 for one in runs)
+    assert max(len(runs[i] & runs[j]) for i in range(6) for j in range(i)) == 0
 
 
 def test_what_tells_too_little_has_no_mark() -> None:
@@ -144,7 +158,7 @@ def test_real_flights_are_known_by_changed_copies_and_never_for_each_other(fligh
     """Three of dataset 12 and five of AFAR flew one route each."""
     known = [[m for _, s in data.series if (m := series_mark(s))] for data in flights]
     assert all(known)
-    digits = [[m.rpartition("f")[2] for m in group] for group in known]  # not even without the clocks
+    digits = [[m.split("f")[1] for m in group] for group in known]  # not even without the clocks
     pairs = [(i, j) for i in range(len(known)) for j in range(i)]
     assert [(FLIGHTS[i], FLIGHTS[j]) for i, j in pairs if any(among(m, digits[j]) for m in digits[i])] == []
     missed = []

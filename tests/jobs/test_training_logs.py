@@ -241,7 +241,7 @@ def test_two_logs_of_one_flight_in_two_flight_files(folder: Path) -> None:
 def test_campaign_counts_a_copy_once(folder: Path, tmp_path: Path) -> None:
     flights = ["first.yaml", copy_of(folder, zipped_twice).name, "second.yaml"]
     path = write_yaml(folder / "campaign.yaml", {"campaign": "copies", "flights": flights})
-    assert main(["campaign", str(path), "-o", str(tmp_path / "out"), "--fresh"]) == 0
+    assert main(["campaign", str(path), "-o", str(tmp_path / "out"), "--fresh"]) == 1
     campaign = json.loads((tmp_path / "out" / "campaign.json").read_text())
     assert [row["flight"] for row in campaign["rss"]] == ["first", "second"]
     (failure,) = campaign["failures"]
@@ -261,7 +261,7 @@ def test_campaign_counts_a_thinned_copy_once(folder: Path, tmp_path: Path) -> No
         "settings": {"a": {}, "b": {"rss": {"minimum_height_m": 25}}},
     }
     assert (
-        main(["campaign", str(write_yaml(folder / "thin.yaml", variants)), "-o", str(tmp_path / "out"), "--fresh"]) == 0
+        main(["campaign", str(write_yaml(folder / "thin.yaml", variants)), "-o", str(tmp_path / "out"), "--fresh"]) == 1
     )
     campaign = json.loads((tmp_path / "out" / "campaign.json").read_text())
     assert sorted((row["flight"], row["setting"]) for row in campaign["rss"]) == [

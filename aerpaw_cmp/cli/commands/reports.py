@@ -167,7 +167,7 @@ def campaign(
     ] = None,
     fresh: Annotated[bool, Option("--fresh", help="Ignore stored outcomes and store none.")] = False,
     dry_run: DryRun = False,
-    strict: Annotated[bool, Option("--strict", help="Exit code 1 when a flight or a stated check failed.")] = False,
+    strict: Annotated[bool, Option("--strict", help="Exit code 1 also when a stated check failed.")] = False,
     force: Force = False,
 ) -> int:
     """Many flights and settings, with what can be said only of several flights."""
@@ -184,7 +184,7 @@ def campaign(
     if not (outcome.metrics["rss"] or outcome.metrics["rank"] or outcome.metrics["season"]["nodes"]):
         # no flight could be compared: their inputs are at fault, whatever the settings
         return 3
-    return 1 if strict and outcome.failed_checks else 0
+    return 1 if outcome.metrics["failures"] or (strict and outcome.failed_checks) else 0
 
 
 def _print_campaign_summary(outcome: Any) -> None:

@@ -18,7 +18,7 @@ from ..common.counting import counted
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..common.yamlfile import nearest
-from ..logs.ingest import Held, IngestedFile, ingest, read_log
+from ..logs.ingest import Held, IngestedFile, ingest, named_log, read_log
 from ..logs.records import COLUMNS, Stream
 from ..propagation.geometry.arrays import Link
 from ..site.site import Site, Tower
@@ -308,6 +308,9 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
         raise UsageError("the flight file lists no log", expected="one or more lines under 'logs:'")
     # a flight file of several logs is read once
     root, cache = logs_root or folder, Held()
+    for log in settings.logs:
+        # a missing log is reported before minutes of reading those above it
+        named_log(root, log.path)
     return tuple(
         read_log(root, log.path, log.options(settings.timezone), reader=log.reader, held=cache) for log in settings.logs
     )

@@ -140,8 +140,10 @@ class WebServer:
         self.limits = limits or Limits()
         self._printed = not token
         self.token = token or secrets.token_urlsafe(12)
-        # not the token itself: other servers of this machine see the cookies of its name, whatever the port
+        # not the token itself, and below a path that only this server knows: a browser sends cookies of 127.0.0.1 to
+        # every port of this computer, where another user may listen
         self.pass_word = hmac.new(self.token.encode(), b"cookie", "sha256").hexdigest()
+        self.base = f"/{hmac.new(self.token.encode(), b'path', 'sha256').hexdigest()[:32]}/"
         self.closing = False
         try:
             self._server = _Server(self)
@@ -333,12 +335,19 @@ class _Handler(BaseHTTPRequestHandler):
         except ValueError:
             self.send_error(HTTPStatus.BAD_REQUEST)
             return
-        refusal = self._refusal(parts.path, query)
+        base = self.server.web.base
+        private = parts.path.startswith(base)
+        path = f"/{parts.path[len(base) :]}" if private else parts.path
+        refusal = self._refusal(path, query, private)
         if refusal is not None:
             self._text(*refusal)
         elif not self.server.let_in(self.request):
             self._text(HTTPStatus.SERVICE_UNAVAILABLE, "too many browsers have this page open")
-        elif parts.path == "/":
+        elif path == "/" and not private:
+            self.send_response(HTTPStatus.SEE_OTHER)
+            self.send_header("Location", f"{base}?{parts.query}")
+            self.end_headers()
+        elif path == "/":
             body = self.server.web.page.body
             self._head("text/html; charset=utf-8", len(body), cookie=True)
             self._pieces(body)
@@ -346,8 +355,8 @@ class _Handler(BaseHTTPRequestHandler):
             self._head("text/event-stream", None)
             self._events(self.headers.get("Last-Event-ID") or query.get("from", ""))
 
-    def _refusal(self, path: str, query: dict[str, str]) -> tuple[HTTPStatus, str] | None:
-        """Status and reason with which the request is refused, None if it is answered."""
+    def _refusal(self, path: str, query: dict[str, str], private: bool) -> tuple[HTTPStatus, str] | None:
+        """Return status and reason with which the request is refused, None if it is answered."""
         web, headers = self.server.web, self.headers
         hosts, origins = headers.get_all("Host", []), headers.get_all("Origin", [])
         if len(hosts) != 1 or not _own_host(hosts[0], web.address.loopback):
@@ -357,7 +366,7 @@ class _Handler(BaseHTTPRequestHandler):
         opened = path == "/" and headers.get("Sec-Fetch-Dest", "document") == "document"
         if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin") and not opened:
             return HTTPStatus.FORBIDDEN, "the request comes from another site"
-        if not self._has_token(query):
+        if not self._has_token(query, private):
             return HTTPStatus.FORBIDDEN, _TOKEN_WANTED
         if path not in ("/", "/events"):
             return HTTPStatus.NOT_FOUND, "there is one page here: /"
@@ -367,10 +376,10 @@ class _Handler(BaseHTTPRequestHandler):
     def _cookie(self) -> str:
         return f"aerpaw_tap_{self.server.web.address.port}"
 
-    def _has_token(self, query: dict[str, str]) -> bool:
-        """Check whether a request has the token in its address, or the cookie of an earlier visit."""
+    def _has_token(self, query: dict[str, str], private: bool) -> bool:
+        """Check whether a request has the token in its address, or below the private path the cookie of a visit."""
         pairs = (item.strip().partition("=") for item in self.headers.get("Cookie", "").split(";"))
-        cookie = next((value for name, _, value in pairs if name == self._cookie), "")
+        cookie = next((value for name, _, value in pairs if private and name == self._cookie), "")
         # compared in constant time: how long a refusal takes must not tell how much was right
         given = (query.get("token", ""), self.server.web.token), (cookie, self.server.web.pass_word)
         return any(hmac.compare_digest(text.encode(), secret.encode()) for text, secret in given)
@@ -395,7 +404,9 @@ class _Handler(BaseHTTPRequestHandler):
         self.send_header("Content-Type", kind)
         if cookie:
             secret = self.server.web.pass_word
-            self.send_header("Set-Cookie", f"{self._cookie}={secret}; Path=/; HttpOnly; SameSite=Strict")
+            self.send_header(
+                "Set-Cookie", f"{self._cookie}={secret}; Path={self.server.web.base}; HttpOnly; SameSite=Strict"
+            )
         if length is not None:
             self.send_header("Content-Length", str(length))
         self.end_headers()

@@ -142,8 +142,10 @@ def ingest(
     chosen = by_name(reader) if reader is not None else None
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
-    for path in [paths] if isinstance(paths, (str, Path)) else paths:
-        inside, skipped_below = _below(Path(path), options, chosen)
+    places = [Path(path) for path in ([paths] if isinstance(paths, (str, Path)) else paths)]
+    _check_readable(places)
+    for place in places:
+        inside, skipped_below = _below(place, options, chosen)
         files += inside
         skipped += skipped_below
     if any(file.result.reader == "generic_csv" for file in files):
@@ -159,6 +161,27 @@ def ingest(
         lacking[0].others = Ingested(files, [item for item in skipped if item.error not in lacking])
         raise lacking[0]
     return Ingested(files, skipped)
+
+
+def _check_readable(places: Sequence[Path]) -> None:
+    """Raise InputError for all files that cannot be opened: reading the folder before them may take minutes."""
+    errors = []
+    # a path may name a member of an archive, which is no file
+    for place in (place for place in places if not _is_folder(place) and _part_of(place) is None):
+        try:
+            _raw(place, 1)
+        except InputError as error:
+            errors.append(error)
+    if len(errors) > 1:
+        listed = "; ".join(f"{one_line(str(error.path))}: {error.found}" for error in errors[:5])
+        more = f"; and {len(errors) - 5} more" if len(errors) > 5 else ""
+        raise InputError(
+            f"{len(errors)} of {len(places)} paths cannot be read: {listed}{more}",
+            expected="files and folders that exist",
+            cause=errors[0].cause,
+        )
+    if errors:
+        raise errors[0]
 
 
 # Logs that were read, and files that are none.
@@ -236,6 +259,15 @@ def _beginning(place: Path, count: int = DEEP_BYTES) -> bytes:
 Held = dict[Path, list[IngestedFile]]
 
 
+def named_log(root: Path, name: str) -> Path:
+    """Return the path of a log that a flight file names; InputError if there is no such file, folder or member."""
+    path = root / name
+    if not exists(path):
+        cause = "a wrong path, or --logs-root"
+        raise InputError("there is no such log", expected=f"a log below '{root}'", cause=cause, path=path)
+    return path
+
+
 def read_log(
     root: Path, name: str, options: ReadOptions, *, reader: str | None = None, held: Held | None = None
 ) -> IngestedFile:
@@ -266,10 +298,7 @@ def read_log(
     UsageError
         No such reader; options that the reader asks for.
     """
-    path = root / name
-    if not exists(path):
-        cause = "a wrong path, or --logs-root"
-        raise InputError("there is no such log", expected=f"a log below '{root}'", cause=cause, path=path)
+    path = named_log(root, name)
     if reader is not None:
         _refuse_other_kind(path, by_name(reader))
     if (part := _in_flight_file(path)) is not None:

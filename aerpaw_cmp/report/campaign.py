@@ -731,7 +731,8 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
             written.append(write_file(folder / name, guarded(table).to_csv(index=False, lineterminator="\n")))
     specs = list(figure_specs(data))
     drawn, pictures = write_figures(specs, folder / "figures", ("svg", "png"))
-    page = write_file(folder / "campaign.html", campaign_page(data, drawn, [path.name for path in written]))
+    files = [*(path.name for path in written), *["figures/"] * bool(pictures)]
+    page = write_file(folder / "campaign.html", campaign_page(data, drawn, files))
     return [page, *written, *pictures]
 
 

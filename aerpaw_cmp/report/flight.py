@@ -137,8 +137,8 @@ def write_report(
         for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
             # written even without rows: a reader finds the same files in every report
             written.append(write_file(folder / name, text))
-        _, paths = write_figures(specs, folder / "figures", formats, style, stages.progress)
-    written += paths
+        _, pictures = write_figures(specs, folder / "figures", formats, style, stages.progress)
+    written += pictures
     if exports:
         from .exports import of_report, write_exports
 
@@ -147,6 +147,8 @@ def write_report(
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
     offered = (folder, folder / FOLDER)
     files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in offered)]
+    # a page names the folder of pictures only if it was written
+    files += ["figures/"] * bool(pictures)
     with stages("report"):
         html = write_file(folder / "report.html", page(data, files))
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))

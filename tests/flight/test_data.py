@@ -273,3 +273,12 @@ def test_a_ratio_becomes_a_level_where_its_noise_is_known(given: dict[str, float
         (_stream("rank", "snr", frame), False),
     ):  # fmt: skip
         assert data.is_ratio(stream) is ratio
+
+
+def test_a_missing_log_is_reported_before_the_others_are_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "large.txt").write_text("x")
+    logs = [{"path": "large.txt"}, {"path": "missing.txt"}]
+    settings = FlightFile.model_validate({"flight": "f", "site": "lake_wheeler", "logs": logs})
+    monkeypatch.setattr(data, "read_log", lambda *_, **__: pytest.fail("a log was read"))
+    with pytest.raises(InputError, match=r"missing\.txt: there is no such log"):
+        read_logs(settings, tmp_path)

@@ -6,6 +6,7 @@ import http.client
 import json
 import math
 import random
+import re
 import socket
 import threading
 import time
@@ -81,6 +82,8 @@ def cookie_of(web):
 def ask(web, path="/", method="GET", host="127.0.0.1", **headers):
     """Answer to a browser that was there before, unless its cookie is given."""
     headers.setdefault("Cookie", cookie_of(web))
+    # the cookie counts below the path that it is bound to
+    path = path if headers["Cookie"] is None else web.base + path.removeprefix("/")
     link = http.client.HTTPConnection("127.0.0.1", web.address.port, timeout=5)
     link.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
     for name, value in {"Host": host, **{k.replace("_", "-"): v for k, v in headers.items()}}.items():
@@ -88,7 +91,7 @@ def ask(web, path="/", method="GET", host="127.0.0.1", **headers):
             link.putheader(name, value)
     link.endheaders()
     answer = link.getresponse()
-    body = b"" if answer.status == 200 and path.startswith("/events") else answer.read()
+    body = b"" if answer.status == 200 and "/events" in path else answer.read()
     parts = answer.status, dict(answer.getheaders()), body
     link.close()
     return parts
@@ -172,7 +175,7 @@ def test_a_token_is_wanted_everywhere(host, tools):
                 "=;;=",
             ):
                 assert ask(web, path, Cookie=wrong)[0] == 403
-        for path, status in (("/", 200), ("/events", 200), ("/other", 404)):
+        for path, status in (("/", 303), (web.base, 200), ("/events", 200), ("/other", 404)):
             assert ask(web, f"{path}?{query}", Cookie=None)[0] == status
         # a name that is not ours may have been rebound; an address cannot be
         assert ask(web, f"/?{query}", host="evil.example")[0] == 403
@@ -182,19 +185,29 @@ def test_a_token_is_wanted_everywhere(host, tools):
 
 def test_the_first_visit_gives_a_cookie_that_scripts_and_other_sites_never_see(tools):
     with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", 0), limits=QUIET) as web:
-        status, headers, body = ask(web, f"/?token={web.token}", Cookie=None)
+        status, headers, _ = ask(web, f"/?token={web.token}", Cookie=None)
+        assert (status, headers["Location"]) == (303, f"{web.base}?token={web.token}")
+        assert "Set-Cookie" not in headers
+        status, headers, body = ask(web, headers["Location"], Cookie=None)
         cookie, *marks = headers["Set-Cookie"].split("; ")
-        assert (status, sorted(marks)) == (200, ["HttpOnly", "Path=/", "SameSite=Strict"])
+        assert (status, sorted(marks)) == (200, ["HttpOnly", f"Path={web.base}", "SameSite=Strict"])
+        assert re.fullmatch("/[0-9a-f]{32}/", web.base), "no server of another port can guess the path"
+        assert web.base.encode() not in body
         assert headers["Referrer-Policy"] == "no-referrer"
         assert web.token not in cookie
         assert web.token.encode() not in body
         assert ask(web, "/", Cookie=f"other=1; {cookie}")[0] == 200
         assert ask(web, "/events", Cookie=cookie)[0] == 200
+        link = http.client.HTTPConnection("127.0.0.1", web.address.port, timeout=5)
+        for path in ("/", "/events", web.base[:-2] + "x/"):
+            link.request("GET", path, headers={"Cookie": cookie})
+            assert link.getresponse().status == 403, "the cookie counts nowhere else"
+            link.close()
 
 
 def test_a_token_that_was_set_is_not_printed(tools):
     with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", 0), token="of the unit") as web:
-        assert ask(web, "/?token=of%20the%20unit", Cookie=None)[0] == 200
+        assert ask(web, f"{web.base}?token=of%20the%20unit", Cookie=None)[0] == 200
         assert not [url for url in web.urls if "unit" in url]
 
 
@@ -217,7 +230,7 @@ def test_a_flood_of_an_address_keeps_neither_others_out_nor_who_has_the_token(to
         until(lambda: len(web._server._waiting) == 256, 10.0)
         assert answer("127.0.0.2", "/?x") == ""
         for source in ("127.0.0.3", "127.0.0.2"):
-            assert answer(source, f"/?token={web.token}") == "200"
+            assert answer(source, f"{web.base}?token={web.token}") == "200"
         assert answer("127.0.0.3", "/?x") == "403"  # its own allowance is untouched
         for link in silent:
             link.close()

@@ -196,6 +196,18 @@ def test_a_named_file_that_is_no_log(tmp_path: Path, content: bytes, message: st
         ingest(path, options=OPTIONS, reader="vehicle_out")
 
 
+def test_missing_paths_are_reported_before_anything_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All of them at once: a folder before them may take minutes."""
+    folder = tmp_path / "logs"
+    folder.mkdir()
+    (folder / "log.txt").write_text("a log\n")
+    monkeypatch.setattr(room, "_below", lambda *_: pytest.fail("a path was read"))
+    with pytest.raises(InputError, match=r"nothing\.txt: the file does not exist"):
+        ingest([folder, tmp_path / "nothing.txt"], options=OPTIONS)
+    with pytest.raises(InputError, match=r"2 of 3 paths cannot be read: .*a\.txt: the file .*; .*b\.txt: the file"):
+        ingest([folder, tmp_path / "a.txt", tmp_path / "b.txt"], options=OPTIONS)
+
+
 def test_missing_file(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         ingest(tmp_path / "nothing.txt", options=OPTIONS)

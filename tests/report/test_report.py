@@ -49,3 +49,12 @@ def test_importing_the_room_draws_nothing():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("drawn", ["none", "svg"])
+def test_a_page_names_the_folder_of_pictures_only_if_it_was_written(small_report, tmp_path, drawn):
+    data = dataclasses.replace(small_report, rss=(), pairs=(), rank=())
+    write.write_report(data, tmp_path, drawn=drawn)
+    text = (tmp_path / "report.html").read_text()
+    assert ("figures/" in text) == (tmp_path / "figures").is_dir() == (drawn == "svg")
+    assert ("with --figures svg" in text) == (drawn == "none")

@@ -58,11 +58,11 @@
 
   // --- the connection -----------------------------------------------------------------------------------------------
 
-  history.replaceState(null, "", "/"); // the token does its work once: the cookie is there, and nobody reads it in the bar
+  history.replaceState(null, "", location.pathname); // the token does its work once: the cookie is there, and nobody reads it in the bar
   let source = null, opening = 0;
   function connect() {
     if (source) source.close();
-    source = new EventSource(state.cursor ? `/events?from=${encodeURIComponent(state.cursor)}` : "/events");
+    source = new EventSource(state.cursor ? `events?from=${encodeURIComponent(state.cursor)}` : "events");
     opening = Date.now();
     source.onmessage = event => receive(event.data, event.lastEventId);
     source.onerror = () => later(draw);

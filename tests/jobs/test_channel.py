@@ -172,6 +172,63 @@ def test_the_table_of_an_emulator_has_a_row_per_instant_and_tower(written, folde
     assert table.delay_s.to_numpy().reshape(16, 2) == pytest.approx(book.delay_s.to_numpy()[0], rel=1e-8)
 
 
+def along(folder, name, edits, *formats):
+    """Folder and NetCDF content of the same plan after some replacements in its text."""
+    text = PLAN
+    for old, new in edits.items():
+        assert old in text
+        text = text.replace(old, new)
+    (folder / f"{name}.yaml").write_text(text)
+    chosen = ChannelOptions(link="rank", towers=("LW1", "LW2"), step_s=2.0, formats=("netcdf", *formats))
+    run_channel(folder / f"{name}.yaml", chosen, RunOptions(out=folder / name))
+    with xarray.open_dataset(folder / name / "channel.nc") as book:
+        return folder / name, book.load()
+
+
+def test_the_frequency_response_is_the_channel_at_another_carrier(written, folder):
+    """A second route to H(f0 + f): the same route replayed at f0 + f, where the phase of each path turns backwards."""
+    _, book = written
+    (number,) = np.flatnonzero(book.subcarrier_hz.to_numpy() == 2.5e6)
+    _, other = along(folder, "other_carrier", {"3.4e9": "3.4025e9"})
+    h, cfr = complex_of(other, "h"), complex_of(book, "cfr")[..., number]
+    # 0.09 rad: delays are those of the array centres, and the tower's array is 1.8 m wide
+    assert np.linalg.norm(cfr - h) < 0.15 * np.linalg.norm(h)
+    assert np.linalg.norm(complex_of(book, "h") - h) > 0.5 * np.linalg.norm(h), "the phase turns between the two"
+
+
+@pytest.mark.parametrize("uav_transmits", ["false", "true"])
+def test_angles_of_a_deepmimo_scenario_leave_the_tower_whoever_transmits(uav_transmits, folder):
+    """Its towers are the transmitters: departure looks from the tower to the UAV, arrival back."""
+    edits = {"uav_transmits: false": f"uav_transmits: {uav_transmits}"}
+    place, book = along(folder, f"mimo_{uav_transmits}", edits, "deepmimo")
+    (scenario,) = (place / "deepmimo").iterdir()
+    uav = book[["east_m", "north_m", "up_m"]].to_array().to_numpy().T
+    for number in (0, 1):
+        tower = book[["tower_east_m", "tower_north_m", "tower_up_m"]].to_array().to_numpy().T[number]
+        for name, way in (("aod", uav - tower), ("aoa", tower - uav)):
+            azimuth, zenith = (
+                np.load(scenario / f"{name}_{axis}_t000_tx00{number}_r001.npz")[f"{name}_{axis}"][:, 0]
+                for axis in ("az", "el")
+            )
+            off = azimuth - np.degrees(np.arctan2(way[:, 1], way[:, 0]))
+            np.testing.assert_allclose((off + 180.0) % 360.0, 180.0, atol=1e-6)
+            down = np.degrees(np.arccos(way[:, 2] / np.linalg.norm(way, axis=1)))
+            np.testing.assert_allclose(zenith, down, atol=1e-6)
+
+
+@pytest.mark.parametrize("field", ["power", "coherent"])
+def test_the_gain_of_an_emulator_has_no_transmit_power_and_sums_as_the_flight_says(field, folder):
+    edits = {"{carrier_hz: 3.4e9,": "{carrier_hz: 3.4e9, transmit_power_dbm: 30,",
+             "\nlink:": f"\nrss: {{field: {field}}}\nlink:"}  # fmt: skip
+    place, book = along(folder, f"gain_{field}", edits, "csv")
+    gain = complex_of(book, "gain")
+    powers = {"power": (np.abs(gain) ** 2).sum(axis=0), "coherent": np.abs(gain.sum(axis=0)) ** 2}
+    expected = {name: 10.0 * np.log10(power.mean(axis=(2, 3))) for name, power in powers.items()}
+    assert np.abs(expected["power"] - expected["coherent"]).max() > 0.5, "the two are told apart"
+    given = pd.read_csv(place / "channel.csv").gain_db.to_numpy().reshape(16, 2)
+    np.testing.assert_allclose(given, expected[field], atol=1e-3)
+
+
 def test_a_deepmimo_scenario_is_read_as_its_loader_reads_it(written, folder, monkeypatch):
     """By the loader itself where it is installed; else by the names and keys that DeepMIMO 4 documents."""
     _, book = written

@@ -327,6 +327,11 @@ def is_ratio(stream: Stream, names: Sequence[str] = RATIOS) -> bool:
     return stream.kind == "rss" and any(name is not None and name.lower() in names for name in known)
 
 
+def is_own_radio(stream: Stream) -> bool:
+    """Check whether a level is that of the autopilot's telemetry radio, which hears no tower of the experiment."""
+    return stream.kind == "rss" and _text(stream, "quantity") == "telemetry radio RSSI"
+
+
 def rank_quantity(stream: Stream, reader: str) -> str:
     """Rank that a stream holds, as its reader names it; the reader where that names none."""
     return _text(stream, "source") or reader
@@ -398,7 +403,8 @@ def gather(
         warnings += [f"{log.path}: {text}" for text in file.result.warnings]
         streams = [stream for stream in file.result.streams if stream.name not in log.skip]
         telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
-        for stream in (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s)):
+        levels = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
+        for stream in (s for s in levels if log.node or not is_own_radio(s)):
             # the sounder writes power and quality to files of their own
             elsewhere = (candidate for source in files if source is not file for candidate in source.result.streams)
             locked, remark = lock_of(stream, [*file.result.streams, *elsewhere])

@@ -168,7 +168,7 @@ def _radio(rows: _rows.Rows, radio: Series, timed: BoolArray) -> Iterator[Stream
             yield rows.stream("kpi", channel, {"value": level_dbm}, where=known, unit="dBm", quantity="noise")
         else:
             yield rows.stream("rss", channel, {"rss_db": level_dbm}, where=known, channel=channel, unit="dBm",
-                              quantity="RSSI", source="telemetry radio, by SiK's scale")  # fmt: skip
+                              quantity="telemetry radio RSSI", source="MAVLink radio status, by SiK's scale")  # fmt: skip
 
 
 def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:

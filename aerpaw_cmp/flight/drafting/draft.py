@@ -23,7 +23,7 @@ from ...logs.records import Stream, has_wall_clock
 from ...site.antenna.learned import Learned, read_learned
 from ...site.site import Site
 from ...site.siteyaml import load_site
-from ..data import is_ratio, rank_quantity, site_place
+from ..data import is_own_radio, is_ratio, rank_quantity, site_place
 from ..gains.losses import sight_shares
 from ..gains.memory import with_learned
 from ..marks import mark_of
@@ -528,7 +528,8 @@ class _Entries:
         entry, comment = _entry(file, path, self.towers_known)
         origin = None if self.options.time_origin else self._origin(streams)
         if self.placer is not None:
-            levels = [self._dated(s, origin) for s in streams if s.kind == "rss" and not is_ratio(s)]
+            proper = (s for s in streams if not (self.has_level and is_own_radio(s)))
+            levels = [self._dated(s, origin) for s in proper if s.kind == "rss" and not is_ratio(s)]
             if comment:
                 comment = self._place(file, entry, comment, levels, self.placer)
             else:
@@ -763,6 +764,8 @@ class _Entries:
             return "the times of the track are relative; read it again with --time-origin"
         if self.flown is not None and not relative and not meet(span, self.flown[1]):
             return _late(span, self.flown[1], self.options.timezone)
+        if self.has_level and is_own_radio(stream):
+            return "the telemetry radio, beside levels of the experiment"
         return _RATIO if self.has_level and is_ratio(stream) else None
 
 
@@ -817,7 +820,8 @@ def _has_positions(stream: Stream) -> bool:
 
 def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None) -> bool:
     """Check whether some stream of the flight is RSS in the proper sense."""
-    levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
+    proper = (s for file in files for s in file.result.streams if not is_own_radio(s))
+    levels = [s for s in proper if s.kind == "rss" and not is_ratio(s)]
     spans = [span for s in levels if (span := stream_span(s))]
     return any(flown is None or meet(span, flown[1]) for span in spans)
 

@@ -113,7 +113,8 @@ def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
 
         text = f"aerpaw-cmp: {error}".rstrip(".")
         gap = "\n  " if "\n" in text else " " if text.endswith("?") else ". "
-        return f"{text}{gap}Next: {next_step(error, arguments)}", error.exit_code
+        step = next_step(error, arguments)
+        return f"{text}{gap}Next: {step}" if step else text, error.exit_code
     if callable(wording := getattr(error, "format_message", None)):
         # a wrong option or argument; known by its method, since typer may bring its own copy of click
         context = getattr(error, "ctx", None)

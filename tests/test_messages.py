@@ -74,8 +74,8 @@ def table() -> str:
     lines = [
         "# Messages of the command line",
         "",
-        "Each kind of fault, some commands that can meet it, and what they say: found, expected, likely cause. The next step, which",
-        "every message ends with, is left off here.",
+        "Each kind of fault, some commands that can meet it, and what they say: found, expected, likely cause. The next step, with",
+        "which a message ends if there is one, is not shown here.",
         "Made by the program `tests/test_messages.py`. Commands stand without `aerpaw-cmp`. `exit` is the exit code: 2 wrong usage or configuration, 3 an input",
         "that cannot be read or an output that cannot be written.",
     ]
@@ -106,7 +106,8 @@ def test_a_message_says_what_was_found_what_is_expected_and_what_to_type(kind: s
     parts = re.split(r"; expected |\. Likely cause: |[.?] Next: |; did you mean ", text)
     assert len(parts[0].split()) >= 3
     assert re.search(r"expected |Likely cause: |did you mean |problems\n", text), "neither expected nor likely cause"
-    assert re.search(r"Next: \S|did you mean ", text), "nothing to type next"
+    # a log that is known for what it is leaves nothing to type
+    assert re.search(r"Next: \S|did you mean ", text) or line.startswith("ingest "), "nothing to type next"
     assert len(text.splitlines()[0]) < 420
 
 

@@ -14,7 +14,7 @@ _OF_LOGS = [["report"], ["explain"], ["calibrate"], ["campaign"], ["predict"], [
 
 
 def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
-    """The step that most likely mends a failure of a command line.
+    """Return the step that most likely remedies a failure of a command line; empty if there is none.
 
     Parameters
     ----------
@@ -57,7 +57,9 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if not place.is_file():
         return f"'ls {one_line(str(place))}' shows what the folder holds"
     if words[:1] == ["ingest"]:
-        return "'aerpaw-cmp formats' lists what can be read"
+        # a file that is known for what it is, or a hint of columns, leaves nothing else to type
+        unknown = "no reader knows" in error.found and "--map" not in (error.cause or "")
+        return "'aerpaw-cmp formats' lists what can be read" if unknown else ""
     if "--tower NAME=" in (error.expected or ""):
         return "the same command with --tower NAME=LATITUDE,LONGITUDE,HEIGHT"
     if words[:1] in _OF_LOGS:

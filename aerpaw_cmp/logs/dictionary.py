@@ -63,9 +63,11 @@ class Quantity:
 
 # Where a row takes _UP[2:], a word stands in front and the mark of a word's beginning is left out.
 _UP = r"\b(alt|altitude|height|hgt|elevation|ele|hoehe|h he)"
+_ATT = r"\b(att(itude)?|ahrs2?|euler)( t)? "
 _ANGLE = (-360.0, 360.0)
 _SPEED = (-400.0, 400.0)
 _DBM, _DB = (-200.0, 30.0), (-60.0, 100.0)
+_FULL_SCALE = "dB re full scale"
 
 QUANTITIES: tuple[Quantity, ...] = (
     # when; the surest first
@@ -100,7 +102,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(l nge|laenge|l ngengrad|laengengrad|longitud)( deg)?$",
     ), "deg", can_be=(-180.0, 180.0)),
     Quantity("grid", "grid", (
-        r"\b(easting|northing|utm|ecef)\b",
+        r"\b(easting|northing|utm|ecef|ned|enu)\b", r"^(pos(ition)? )?(north|east|down)( m| meters)?$",
         r"^(geom(etry)?|wkt|lat ?(lon|lng)|coordinates?|(gps )?(position|location))$",
     )),
     # how high: the datum that the name tells; heights of home and of the terrain are not the aircraft's
@@ -132,10 +134,11 @@ QUANTITIES: tuple[Quantity, ...] = (
     ), "m", can_be=(-1000.0, 20_000.0), datum="unknown"),
     # how it lies; a gimbal's or camera's angles are not the aircraft's
     Quantity("gimbal", "other", (r"\b(gimbal|camera|mount|payload|des|desired|target|setpoint|sp)\b",)),
-    Quantity("roll_deg", "angle", (r"^(osd )?roll( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
-    Quantity("pitch_deg", "angle", (r"^(osd )?pitch( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
+    Quantity("roll_deg", "angle", (r"^(osd )?roll( deg| degrees| rad)?$", rf"{_ATT}roll\b",), "deg", can_be=_ANGLE),
+    Quantity("pitch_deg", "angle", (r"^(osd )?pitch( deg| degrees| rad)?$", rf"{_ATT}pitch\b",), "deg", can_be=_ANGLE),
     Quantity("yaw_deg", "angle", (
-        r"^(osd )?yaw( deg| degrees| rad)?$", r"^compass heading( degrees)?$", r"^(heading|hdg)( deg| degrees| cdeg)?$",
+        r"^(osd )?yaw( deg| degrees| rad)?$", rf"{_ATT}yaw\b",
+        r"^compass heading( degrees)?$", r"^(heading|hdg)( deg| degrees| cdeg)?$",
     ), "deg", can_be=_ANGLE),
     Quantity("velocity_north_mps", "velocity", (
         r"^velocity ?(north|x)( mps)?$", r"^vn$", r"^vel n m s$", r"^(osd )?x ?speed", r"^speed ?x$", r"^vx$",
@@ -171,7 +174,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("serving", "cell", (r"^(is ?)?(registered|serving|connected)( cell)?$",)),
     Quantity("neighbouring", "cell", (r"^(is ?)?neighbou?r(ing)?( cell)?$",)),
     # how strong; 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
-    Quantity("power", "rss", (r"^link power$",), "dB re full scale"),
+    Quantity("power", "rss", (r"^link power$", r"^lw ?[1-5]$"), _FULL_SCALE),
     Quantity("quality", "rss", (r"^link quality$",), "dB"),
     Quantity("SNR", "rss", (r"^link snr$",), "dB"),
     # 'rank' alone may be that of any list: described() takes it where levels stand beside; 0 is no report
@@ -428,6 +431,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
         ("bps", 1.0), ("bit/s", 1.0), ("kbps", 1e3), ("kbit/s", 1e3), ("mbps", 1e6), ("mbit/s", 1e6), ("gbps", 1e9),
         ("gbit/s", 1e9))},
     "db": ("dB", _times(1.0)),
+    "dbfs": (_FULL_SCALE, _times(1.0)),
     "linear": ("dB", _milliwatts(1.0)),
     "mv": ("V", _times(1e-3)),
     "dbm": ("dBm", _times(1.0)),
@@ -440,7 +444,7 @@ OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
 # Units that a name may have without brackets: 'alt_ft_agl', 'rsrp_dbm'.
 _SUFFIXES = ("ft", "kft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps",
-             "dbm", "dbw", "mw", "uw", "nw", "e6", "e7", "cdeg", "kbps", "mbps", "db", "linear")  # fmt: skip
+             "dbm", "dbfs", "dbw", "mw", "uw", "nw", "e6", "e7", "cdeg", "kbps", "mbps", "db", "linear")  # fmt: skip
 
 
 def is_unit(text: str) -> bool:
@@ -500,7 +504,6 @@ _MAVLINK_UNITS = {
     "relative alt": "mm", "alt": "mm", "vx": "cm/s", "vy": "cm/s", "vz": "cm/s", "hdg": "cdeg", "lat": "e7",
     "lon": "e7", "voltage battery": "mv",
 }  # fmt: skip
-_FULL_SCALE = "dB re full scale"
 AERPAW_MAT = _program(
     "AERPAW .mat", "mx,my,mz", "lat s,lon s", "lat all,lon all", datum="take-off", angles="deg",
     words={
@@ -536,10 +539,40 @@ PROGRAMS: tuple[Program, ...] = (
         r"signal": "rsrp", r"psc or pci": "pci", r"type": "network type"}),
     _program("phone", "cellname", datum="sea level"),
     _program("MAVLink, positions alone", "lat,lon,relative alt", "lat,lon,alt,hdg", units=_MAVLINK_UNITS),
+    _program("Open DroneLog", "vps height m,height m", datum="sea level", words={
+        r"height m": "height above takeoff", r"velocity ([xyz]) ms": r"velocity \1"}),
+    # dB stands for dBm; 1RSS and 2RSS are heard by the aircraft, TRSS by the transmitter; FrSky's RSSI is no dBm, and
+    # Hdg is the course over ground
+    _program("EdgeTX", "date,time,txbat v", "rqly,rsnr db", "date,time,rxbt v", words={
+        r"([12])rss( dbm?)?": r"rssi \1", r"trss( dbm?)?": "rssi telemetry", r"rsnr( db)?": "sinr 1",
+        r"tsnr( db)?": "sinr telemetry", r"rssi( db)?": "rssi count", r"ptch( rad)?": "pitch", r"hdg( .*)?": "course",
+        r"ele": "stick", r"galt( m)?": "altitude msl"},
+        units={"1rss db": "dbm", "2rss db": "dbm", "trss db": "dbm"}),
     _program("aerpaw-cmp tap", "query,ri raw", words={r"ri raw": "raw", r"rank": "rank indicator"}),
     _program("AERPAW monitoring", "transmitter,receiver,log type", words={
         r"power": "link power", r"quality": "link quality", r"snr": "link snr"}),
 )  # fmt: skip
+
+
+# What a level of another program may be called, and what only sounds so: an altitude above sea level, a battery.
+_LIKE_A_LEVEL = re.compile(
+    r"^value$|power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss|strength|\bampl|magnitude|rsrp"
+)
+_UNLIKE_A_LEVEL = re.compile(
+    r"batt|volt|current|throttle|gps|water|fuel|noise|gain|loss|\btx|alt|height|elev|\bsea\b|type|quality|source|bars"
+    r"|\basu|mode|state|status|charge|energy|consum|\b(avg|mean|min|max|std|log|audio|sound|light|id)\b|threshold|count"
+)
+
+
+def like_levels(names: Iterable[str]) -> list[str]:
+    """Return the names that a level may have, of names that no row knows; a power beside a voltage is electric."""
+    words = {name: plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name)) for name in names}
+    electric = any(re.search(r"volt|batt|\bcurrent", text) for text in words.values())
+    return [
+        name for name, text in words.items()
+        if _LIKE_A_LEVEL.search(text) and not _UNLIKE_A_LEVEL.search(text)
+        and not (electric and re.fullmatch(r"(.* )?(power|pwr)( m?w)?", text))
+    ]  # fmt: skip
 
 
 def program(names: Collection[str]) -> Program | None:
@@ -573,7 +606,7 @@ def described(
         common = next(forms, bare)
         what = meaning(name, None if common == bare else common)
         unit = what.unit if what else without_unit(name)[1]
-        if known and not unit:
+        if known and (not unit or bare in known.units):
             unit = known.units.get(bare, known.angles if what and what.quantity.role == "angle" else "")
         columns.append((what, unit, common))
     return known, columns

@@ -20,7 +20,17 @@ from ..common.jsonable import named
 from ..common.stages import duration
 from .files import archives, chunks, packed
 from .flight_file import IngestedFile, read_flight
-from .readers import DEEP_BYTES, HEAD_BYTES, Reader, ReadOptions, by_name, catalogue, claims, identify
+from .readers import (
+    DEEP_BYTES,
+    HEAD_BYTES,
+    Reader,
+    ReadOptions,
+    blaming,
+    by_name,
+    catalogue,
+    claims,
+    identify,
+)
 from .records import ReadResult, RejectedLine, RejectedReason, Stream, by_reason, has_wall_clock
 
 if TYPE_CHECKING:
@@ -526,7 +536,8 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     """Result of a reader, its impossible values flagged; messages name the file, which readers do not know."""
     from . import limits, origins  # load pandas, as any reader does
 
-    with parsing(path, f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"):
+    expected, cause = f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"
+    with parsing(path, expected, cause), blaming(reader, f"reader {reader.name!r} read it", InputError):
         result = origins.stated(limits.check(read()), reader, options)
     if not result.accepted:
         first = f": {result.rejected[0].reason}" if result.rejected else ""

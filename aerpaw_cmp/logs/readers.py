@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Literal
 
-from ..common.errors import InputError, UsageError
+from ..common.errors import AerpawCmpError, InputError, UsageError, one_line
 from .records import Kind, ReadResult, Stream
 
 ENTRY_POINT_GROUP = "aerpaw_cmp.readers"
@@ -120,30 +121,59 @@ class Reader:
     height_from: str = "assumed: above take-off"
 
 
+@contextmanager
+def blaming(source: Reader | str, doing: str, kind: type[AerpawCmpError] = UsageError) -> Iterator[None]:
+    """Name the plug-in, or that of a reader, whose code raises inside; errors of this project (empty name) pass."""
+    try:
+        yield
+    except Exception as error:
+        plugin = source if isinstance(source, str) else plugins().get(source.name, (source, ""))[1]
+        if not plugin or isinstance(error, AerpawCmpError):
+            raise
+        raise kind(
+            f"the plug-in {plugin!r} failed while {doing} ({type(error).__name__}: {one_line(str(error)[:200])})",
+            expected="readers as in docs/adding_a_reader.md",
+            cause="an error in the plug-in: update or uninstall it",
+        ) from error
+
+
 @cache
-def catalogue() -> tuple[Reader, ...]:
-    """All readers of the entry-point group, read once.
+def plugins() -> dict[str, tuple[Reader, str]]:
+    """Return each reader of the entry-point group by its name, and its plug-in; empty for readers of this project.
 
     Raises
     ------
     UsageError
-        If the group is empty or two readers share a name.
+        If the group is empty, two readers share a name, or a plug-in cannot be loaded.
     """
     from importlib.metadata import entry_points
 
-    readers: list[Reader] = []
+    readers: dict[str, tuple[Reader, str]] = {}
     for point in entry_points(group=ENTRY_POINT_GROUP):
-        readers.extend(point.load())
+        plugin = "" if point.value.startswith("aerpaw_parsers:") else point.name
+        with blaming(plugin, "it was loaded"):
+            for reader in point.load():
+                if reader.name in readers:
+                    found = f"two installed readers share the name {reader.name!r}"
+                    raise UsageError(found, expected="unique reader names")
+                readers[reader.name] = reader, plugin
     if not readers:
         raise UsageError(
             f"no readers are installed under the entry-point group {ENTRY_POINT_GROUP!r}",
             cause="the package was not installed: run 'pip install -e .' in the checkout",
         )
-    names = [reader.name for reader in readers]
-    double = sorted({name for name in names if names.count(name) > 1})
-    if double:
-        raise UsageError(f"two installed readers share the name {double[0]!r}", expected="unique reader names")
-    return tuple(readers)
+    return readers
+
+
+@cache
+def catalogue() -> tuple[Reader, ...]:
+    """Return all readers; see :func:`plugins`."""
+    return tuple(reader for reader, _ in plugins().values())
+
+
+def _accepts(reader: Reader, head: bytes) -> bool:
+    with blaming(reader, f"reader {reader.name!r} looked at a file"):
+        return reader.sniff(head)
 
 
 def by_name(name: str) -> Reader:
@@ -175,7 +205,7 @@ def claims(data: bytes) -> list[Reader]:
     heads = (data[:HEAD_BYTES], data) if len(data) > HEAD_BYTES else (data,)
     # log readers first, with little and then with more: a page of text may quote a log
     tried = [(head, True) for head in heads] + [(head, False) for head in reversed(heads)]
-    accepting = ([r for r in catalogue() if bool(r.kinds) is of_logs and r.sniff(head)] for head, of_logs in tried)
+    accepting = ([r for r in catalogue() if bool(r.kinds) is of_logs and _accepts(r, head)] for head, of_logs in tried)
     return next((readers for readers in accepting if readers), [])
 
 
@@ -229,24 +259,38 @@ def _way_out(head: bytes) -> str:
     if len(names) > 1 and not first.startswith(("{", "[", "<", "$")) and all(not name[:1].isdigit() for name in names):
         if len(head) == HEAD_BYTES and b"\n" not in head:
             return f"no line ends in the first {HEAD_BYTES >> 10} KiB: an aborted copy, or no table"
-        plain = {name: name.lower().replace("_", " ") for name in names}
-        fits = {what: [name for name in names if re.search(words, plain[name])] for what, words in _LIKE.items()}
-        pairs = [f"--map {named[0]!r}={quantity}" for quantity, named in fits.items() if named]
-        lacking = [quantity for quantity in ("time", "rss_db") if not fits[quantity]]
-        example = f": {' '.join(pairs)}" if pairs else ""
-        missing = f"; no column looks like {' or '.join(lacking)}" if lacking else ""
-        return f"a table of another kind: name what its columns hold{example}{missing}"
+        return _way_to_map(names)
     words = re.split(r"[,;\s|]+", first)
     if len(words) > 1 and (re.fullmatch(r"[-+.\d]+", words[0] + words[-1]) or "time" in words):
         return "a table without names or commas: write a line such as 'time,rss_db' above it, commas between its cells"
     return "a log of a kind that is not supported: docs/adding_a_reader.md"
 
 
-# Words that a column of a quantity may have in its name, where the dictionary does not know it.
+# Words that a column of a quantity may have in its name, where the dictionary does not know it; the surest first.
 _LIKE = {
-    "time": r"time|date|clock|stamp|epoch|utc", "rss_db": r"power|level|signal|strength|rss|dbm|rsrp",
-    "latitude_deg": r"\blat", "longitude_deg": r"\b(lon|lng)", "altitude_m": r"\b(alt|height|elev)",
+    "time": (r"time", r"date|clock|stamp|epoch|utc|^when"), "latitude_deg": (r"\blat",),
+    "longitude_deg": (r"\b(lon|lng)",), "altitude_m": (r"\b(alt|height|elev)",),
 }  # fmt: skip
+
+
+def _way_to_map(names: list[str]) -> str:
+    """Return the options that read a table of another kind, if its names allow a track or a level."""
+    from . import dictionary
+
+    plain = {name: dictionary.plain(name) for name in names}
+    found = {
+        what: next((name for words in forms for name in names if re.search(words, plain[name])), None)
+        for what, forms in _LIKE.items()
+    }
+    found["rss_db"] = next(iter(dictionary.like_levels(names)), None)
+    track = all(found[what] for what in ("latitude_deg", "longitude_deg", "altitude_m"))
+    if not found["time"] or not (found["rss_db"] or track):
+        lacking = [what for what in ("time", "rss_db") if not found[what]]
+        return f"a table of another kind; no column looks like {' or '.join(lacking)}"
+    place = [what for what in ("latitude_deg", "longitude_deg") if found["latitude_deg"] and found["longitude_deg"]]
+    wanted = ["time", *place, *(["altitude_m"] if place else []), "rss_db"]
+    pairs = [f"--map {found[what]!r}={what}" for what in wanted if found[what]]
+    return f"a table of another kind: name what its columns hold: {' '.join(pairs)}"
 
 
 def _excerpt(head: bytes) -> str:

@@ -166,9 +166,9 @@ def _radio(rows: _rows.Rows, radio: Series, timed: BoolArray) -> Iterator[Stream
         level_dbm = steps / 1.9 - 127.0
         if "noise" in name:
             yield rows.stream("kpi", channel, {"value": level_dbm}, where=known, unit="dBm", quantity="noise")
-        else:
-            yield rows.stream("rss", channel, {"rss_db": level_dbm}, where=known, channel=channel, unit="dBm",
-                              quantity="telemetry radio RSSI", source="MAVLink radio status, by SiK's scale")  # fmt: skip
+            continue
+        about = {"unit": "dBm", "quantity": "telemetry radio RSSI", "source": "MAVLink radio status, by SiK's scale"}
+        yield rows.stream("rss", channel, {"rss_db": level_dbm}, where=known, channel=channel, about=about)
 
 
 def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:

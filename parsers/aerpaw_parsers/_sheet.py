@@ -359,7 +359,34 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
     header = _header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
     if header is None:
         return None
-    return cut(_lines.split(data), *header)
+    sheet = cut(_lines.split(data), *header)
+    _split_places(sheet)
+    return sheet
+
+
+# Latitude and longitude in one cell, in brackets or not: ``35.7275 -78.6960``; WKT has the longitude first.
+_PAIR = re.compile(
+    r"(?:POINT ?Z? ?)?[\[(]?\s?(-?\d{1,3}\.\d{3,15})\s?[ ,;]\s?(-?\d{1,3}\.\d{3,15})(?:[ ,].{0,20})?[\])]?",
+    re.IGNORECASE,
+)
+
+
+def _split_places(sheet: Sheet) -> None:
+    """Add columns of latitude and longitude where one column has both, such as ``GPS`` of EdgeTX."""
+    for i, name in enumerate(sheet.names if sheet.find("latitude_deg") is None else ()):
+        texts = sheet.texts(i)
+        pairs = [_PAIR.fullmatch(text) for text in texts]
+        if not any(pairs[:50]) or 2 * sum(map(bool, pairs)) <= sum(map(bool, texts)):
+            continue
+        swapped = re.match(r"(?i)POINT", texts[0]) or re.match(r"lon|lng", sheet.plain[i])
+        swapped = swapped or any(abs(float(pair[1])) > 90 for pair in pairs if pair)
+        columns = [[pair[part] if pair else "" for pair in pairs] for part in ((2, 1) if swapped else (1, 2))]
+        sheet.names[i] = f"{name} in one text"
+        for angle, cells in zip(("latitude", "longitude"), columns, strict=True):
+            sheet.add(angle, cells)
+        order = "longitude, latitude" if swapped else "latitude, longitude"
+        sheet.notes[i] = f"column {name!r}: read as {order}"
+        return
 
 
 def of_readings(
@@ -582,11 +609,16 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     else:
         assert column is not None
         clock, cells, warnings = _times(sheet, column, options, mapped=mapped)
+    start = next((found for text in (sheet.cells or [[]])[0] if (found := _START.search(text))), None)
+    if clock.startswith("relative") and start is not None:
+        options = replace(options, time_origin=options.time_origin or start[1])
     timed = _rows.built(
         sheet.lines, sheet.row, {"time": cells}, options, reader=reader, reason=lambda _line: None, clock=clock,
         extra=sheet.rejected, markup=sheet.blank_rows, closed=sheet.closed,
     )  # fmt: skip
     timed.warnings += warnings
+    if clock.startswith("relative") and start is not None:
+        timed.clock_from = "written"
     if len(timed.row) < len(sheet.row):
         inside = np.zeros(len(sheet.row), dtype=bool)
         inside[timed.at] = True
@@ -602,6 +634,10 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
             lines = counted(int(invalid.sum()), "row")
             timed.warnings.append(f"column {sheet.names[valid]!r}: {lines} flagged marked_invalid; not scored")
     return timed
+
+
+# Begin of a log in a cell of JSON, as Open DroneLog writes it beside relative times.
+_START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')
 
 
 def _time_column(sheet: Sheet) -> int | None:
@@ -667,17 +703,13 @@ _ZONELESS = re.compile(r"\d{4}-.*:[\d.]+")
 _DAY_OR_MONTH = re.compile(r"\b(d{1,2}[/.-]m{1,3}|m{1,2}[/.-]d{1,2})[/.-]y")
 
 
-_LIKE_A_LEVEL = re.compile(
-    r"^lw ?[1-5]$|^value$|\b(asu|csq)\b|^(?!.*(batt|volt|throttle|gps|water|fuel|noise|gain|loss|tx)).*"
-    r"(power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss\b|strength|\bampl|magnitude)"
-)
 _MAPPED = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
 
 
 def way_to_level(sheet: Sheet) -> list[str]:
     """A sentence with the options that read as the level a column whose name only looks like one, or the RSRQ."""
-    unknown = [i for i, meaning in enumerate(sheet.meanings) if meaning is None]
-    named = [i for i in unknown if _LIKE_A_LEVEL.search(dictionary.plain(sheet.names[i]))]
+    like = dictionary.like_levels(sheet.names)
+    named = [i for i, meaning in enumerate(sheet.meanings) if meaning is None and sheet.names[i] in like]
     filled = [i for i in (*named, sheet.find("RSRQ")) if i is not None and np.isfinite(sheet.numbers(i)).any()]
     time = _time_column(sheet) if sheet.find("time") is not None else sheet.find("gps_seconds")
     if not filled or time is None:

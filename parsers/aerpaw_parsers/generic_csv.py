@@ -85,12 +85,13 @@ def _values(sheet: _sheet.Sheet, column: int, name: str, options: ReadOptions) -
             expected="one quantity and unit: mend the mapping, --unit or the header",
         )
     wanted = next(unit for end, unit in (*_UNITS.items(), ("", "")) if name.endswith(end))
-    right = unit in ("dBm", "dB") if name == "rss_db" else unit == wanted
+    right = unit in ("dBm", "dB", "dB re full scale") if name == "rss_db" else unit == wanted
     bracketed = "[" in written or unit in {known for known, _ in dictionary.UNITS.values()}
     if unit and wanted and not right and bracketed:
         raise UsageError(f"column {written!r} is in {unit} and mapped to {name}", expected=f"a column in {wanted}")
-    if name == "rss_db" and unit == "dBm" and options.unit not in (None, "dBm"):
-        raise UsageError(f"column {sheet.names[column]!r} says dBm and --unit says {options.unit}", expected="one unit")
+    same = {"dBm": (None, "dBm"), "dB re full scale": (None, "dB", "dB re full scale")}.get(unit, (options.unit,))
+    if name == "rss_db" and options.unit not in same:
+        raise UsageError(f"column {written!r} is in {unit} and --unit says {options.unit}", expected="one unit")
     if name == "rss_db" and unit == "dB" and options.unit == "dBm":
         sheet.notes[column] = f"column {written!r} says dB and --unit dBm: read as dBm"
     return values

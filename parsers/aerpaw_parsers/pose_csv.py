@@ -6,6 +6,7 @@ brought to heights above the first position. Times without a zone are local unle
 
 from __future__ import annotations
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_cmp.readers import dictionary
@@ -15,7 +16,8 @@ from . import _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, vehicle_out
 
 def is_header(names: list[str]) -> bool:
     """Check whether names hold a position and a time, and no quantity of a radio."""
-    return {*_pose.PLACE[:2]} <= _quantities(names) and has_time(names) and not has_radio(names)
+    known = _quantities(names)
+    return ({*_pose.PLACE[:2]} <= known or "grid" in known) and has_time(names) and not has_radio(names)
 
 
 def has_radio(names: list[str]) -> bool:
@@ -43,8 +45,20 @@ def sniff(head: bytes) -> bool:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Telemetry ``vehicle``; UsageError if the clock has no zone and none is given."""
+    """Return the telemetry ``vehicle``; UsageError if the clock has no zone and none is given.
+
+    Raises
+    ------
+    InputError
+        If the positions are on a local grid.
+    """
     sheet = _sheet.read(data, is_header)
+    if sheet is not None and sheet.find("latitude_deg") is None and (grid := sheet.find("grid")) is not None:
+        raise InputError(
+            f"positions on a grid, such as column {sheet.names[grid]!r} (NED, ENU, UTM)",
+            expected="columns of latitude and longitude",
+            cause="an export in local coordinates, whose origin the table does not contain",
+        )
     rows = None if sheet is None else _sheet.rows(sheet, options, reader="pose_csv")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "pose_csv", "no header with a time, a latitude and a longitude")

@@ -4,11 +4,12 @@ Dataset 12 (``captures[]``): ``measurement:values`` {mX, mY, mZ, RSS1, RSS2} wit
 ``gps:position`` {x, y, z} with ``gps:time_stamp``; x is the longitude, y the latitude, z the height above take-off;
 RSS in dB re full scale. A value is a list (a flight) or a number (a burst); a global field of the same name holds
 for captures without it. Sounder: ``core:timestamp`` (epoch), ``core:rx_location``, ``core:rotation``,
-``core:velocity``, ``core:frequency``.
+``core:velocity``, ``core:frequency``. SigMF 1.x: ``core:geolocation`` of each capture, above the ellipsoid.
 
 Captures of several frequencies give a series each; the bytes of headers (``core:header_bytes``) are no samples, and
 unsigned samples count from the middle of their range. Without values the power of each 20 ms of samples is read from
 the ``.sigmf-data`` beside: 10 log10 of the mean of abs(x)^2 over all of the burst, dB re full scale of the data type.
+Clipped samples and a DC part are reported.
 The lines of the account are those values.
 """
 
@@ -27,9 +28,11 @@ from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 
-from . import _json, _stamps
+from . import _json, _pose, _stamps
 
 _BURST_S = 0.02
+# Part of full scale at which a value is clipped, and the share of such values that is reported.
+_FULL, _CLIPPED_SHARE = 0.999, 1e-3
 _SAMPLES = {
     "cf64": ("f8", 1.0), "cf32": ("f4", 1.0), "ci32": ("i4", 2.0**31), "ci16": ("i2", 2.0**15), "ci8": ("i1", 2.0**7),
     "cu8": ("u1", 2.0**7), "cu16": ("u2", 2.0**15), "cu32": ("u4", 2.0**31), "ru8": ("u1", 2.0**7),
@@ -57,7 +60,12 @@ def _list(value: Any) -> list[Any]:
 def _merged(meta: dict[str, Any]) -> list[dict[str, Any]]:
     """Captures, each with the global fields that it lacks."""
     common = {key: value for key, value in _json.inside(meta, "global").items() if ":" in key}
-    return [{**common, **capture} for capture in _json.listed(meta, "captures")] or [common]
+    captures = _json.listed(meta, "captures")
+    for capture in captures:
+        # one place for all captures, a global field, is that of a receiver on the ground and no track
+        point = [*_list(_json.inside(capture, "core:geolocation").get("coordinates")), None, None]
+        capture |= {"geolocation": dict(zip("xyz", point, strict=False))} if point[0] is not None else {}
+    return [{**common, **capture} for capture in captures] or [common]
 
 
 def _column(captures: list[dict[str, Any]], field: str, *names: str) -> FloatArray:
@@ -158,7 +166,7 @@ def _levels(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tu
 def _track(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tuple[_rows.Rows, Stream]]:
     """Positions: of the measurements, of the GPS, or of the receiver."""
     fields = ("measurement:values", "measurement:time_stamp"), ("gps:position", "gps:time_stamp")
-    for field, time in (*fields, ("core:rx_location", "core:timestamp")):
+    for field, time in (*fields, ("core:rx_location", "core:timestamp"), ("geolocation", "core:datetime")):
         texts = _times(captures, time)
         columns = {name: _column(captures, field, *names) for name, names in _PLACE}
         if not texts or len(columns["latitude_deg"]) != len(texts) or len(columns["longitude_deg"]) != len(texts):
@@ -166,8 +174,12 @@ def _track(captures: list[dict[str, Any]], options: ReadOptions) -> Iterator[tup
         turns = (("roll_deg", "roll"), ("pitch_deg", "pitch"), ("yaw_deg", "yaw"))
         columns |= {name: _column(captures, "core:rotation", key) for name, key in turns}
         rows = _rows_of(texts, options)
-        values = {name: column[rows.at] for name, column in columns.items() if len(column) == len(texts)}
-        if (stream := rows.stream("telemetry", "vehicle", values, source=field)) is not None:
+        values: dict[str, AnyArray] = {k: column[rows.at] for k, column in columns.items() if len(column) == len(texts)}
+        about: _pose.Height = {}
+        if field == "geolocation":
+            rows.height_from = "written"
+            values["altitude_m"], about = _pose.above_takeoff(rows, values, "ellipsoid", _pose.clean(rows, values))
+        if (stream := rows.stream("telemetry", "vehicle", values, source=field, about=about)) is not None:
             yield rows, stream
         return
 
@@ -191,6 +203,7 @@ def _powers(
     middle = full_scale - 0.5 if samples.dtype.kind == "u" else 0.0
     bursts: list[tuple[str, float, float]] = []  # stamp of the capture, seconds behind it, frequency
     powers: list[FloatArray] = []
+    means, clipped, most = [], [], 0.0
     starts = [min(max(_integer(item.get("core:sample_start")) - zero, 0), len(samples)) for item in captures]
     for capture, start, end in zip(captures, starts, [*starts[1:], len(samples)], strict=True):
         stamp = next((capture[key] for key in _TIMES if key in capture), None)
@@ -203,11 +216,23 @@ def _powers(
             bursts.append((str(stamp), (at - start) / rate, _json.number(capture.get("core:frequency"))))
             with np.errstate(all="ignore"):  # damaged samples may be any number
                 powers.append((piece**2).sum(axis=2).mean(axis=0))
+                means.append(piece.mean(axis=0))
+                clipped.append((np.abs(piece) >= _FULL * full_scale - 1.0 * (full_scale > 1)).mean(axis=(0, 2)))
+                most = max(most, float(np.abs(piece).max()))
     if not bursts:
         return
     stamps, later_s, tuned = zip(*bursts, strict=True)
     with np.errstate(all="ignore"):
         level = 10 * np.log10(np.array(powers)) - 20 * np.log10(full_scale)
+        dc = (np.mean(means, axis=0) ** 2).sum(axis=1)
+        above_db = 10 * np.log10(dc / np.maximum(np.mean(powers, axis=0) - dc, 1e-12 * dc))
+    for i, (share, dc_db) in enumerate(zip(np.mean(clipped, axis=0), above_db, strict=True)):
+        # floats beyond one are of another scale
+        if share > _CLIPPED_SHARE and most <= full_scale * 1.001:
+            warnings.append(f"USRP{i + 1}: {share:.1%} of the values are at full scale: clipped, levels are too low")
+        if dc_db > 0:
+            reason = "the receiver's own offset, or a carrier at the centre frequency"
+            warnings.append(f"USRP{i + 1}: its levels are those of a DC part {dc_db:.0f} dB above the rest ({reason})")
     rows = _rows_of(list(stamps), options)
     rows.time = rows.time + np.round(np.array(later_s)[rows.at] * 1e9).astype("timedelta64[ns]")
     for i in range(level.shape[1]):

@@ -159,7 +159,7 @@ BAD: dict[str, tuple[str, type[Exception], str]] = {
     "a latitude of 999": (table("time,lat,lon,pci,rsrp", EPOCH + ",999,35.7,-78.7,{l}"), InputError, SHIFTED),
     "weeks modulo 1024": (table("week,tow,pci,rsrp", "322,22401{i},11,{l}"), InputError, "modulo 1024"),
     "a month of no language": (phone("Time", "10 foo 2025 10:00:0{i}"), InputError, "of a form that is not read"),
-    "a scan of access points": ("WigleWifi-1.4,appRelease=2.53\nMAC,SSID,FirstSeen,RSSI\n", InputError, "a Wi-Fi scan"),
+    "a scan of access points": ("WigleWifi-1.4,appRelease=2.53\nMAC,SSID,FirstSeen,RSSI\n", InputError, "of WiGLE: its cells"),
     "answers of another modem": (
         table("", '[2025-06-10 10:00:0{i}] #RFSTS: "310 26",1795,-101,-67,-15,2242'), InputError, "AT answers of a modem"),
     "an index in front of AERPAW's positions": (
@@ -203,7 +203,7 @@ def test_a_header_and_a_mapping_that_disagree_are_refused(tmp_path: Path) -> Non
     (tmp_path / "y.csv").write_text(table("time,cqi", f"{EPOCH},2"))
     with pytest.raises(UsageError, match="'cqi' says CQI, the mapping ri_raw"):
         read(tmp_path / "y.csv", ("time=time", "cqi=ri_raw"), {"ri_base": "one"})
-    with pytest.raises(UsageError, match="says dBm"):
+    with pytest.raises(UsageError, match="is in dBm and --unit says"):
         read(tmp_path / "x.csv", place, {"unit": "dB re full scale"})
 
 

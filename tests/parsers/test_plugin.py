@@ -59,6 +59,25 @@ def test_a_reader_with_a_known_name_is_refused(installed: Path) -> None:
     assert "two installed readers share the name 'sounder_log'" in answer.stderr
 
 
+@pytest.mark.parametrize(
+    ("old", "new", "code"),
+    [
+        ("yield rows.stream(", "raise KeyError('level')\n    yield rows.stream(", 3),
+        ('"""Spectrum monitor', 'raise RuntimeError("no")\n"""Spectrum monitor', 2),
+        ("READERS = (READER,)", "from dataclasses import replace\nREADERS = (replace(READER, sniff=lambda head: head['x']),)", 2),
+    ],
+    ids=["read", "import", "sniff"],
+)  # fmt: skip
+def test_an_exception_of_a_plug_in_names_the_plug_in(installed: Path, old: str, new: str, code: int) -> None:
+    module = installed / "my_monitor.py"
+    module.write_text(module.read_text().replace(old, new, 1))
+    (installed / "monitor.txt").write_text(block("text"))
+    answer = ask(installed, "ingest", "--timezone", "America/New_York", str(installed / "monitor.txt"))
+    assert answer.returncode == code, answer.stderr
+    assert "the plug-in 'monitor' failed" in answer.stderr
+    assert "fault of the program" not in answer.stderr
+
+
 def test_the_guide_keeps_its_promise_of_length() -> None:
     code = [line for line in block("python").splitlines() if line.strip()]
     assert len(code) <= 40

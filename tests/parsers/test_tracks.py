@@ -1,11 +1,15 @@
 """Tracks of receivers and drones: the same positions as other libraries read, and the levels of a telemetry radio."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
+from aerpaw_cmp import open_flight
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.jobs.run import run_ingest
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from tests.parsers import autopilots
@@ -111,3 +115,87 @@ def test_levels_of_a_telemetry_radio_are_those_of_its_scale() -> None:
     assert np.allclose(streams["radio_noise"].frame["value"], -107.0)
     seconds = (streams["radio"].frame["time"] - streams["vehicle"].frame["time"]).dt.total_seconds()
     assert np.allclose(seconds, 0.2)
+
+
+def recording(folder: Path, samples: np.ndarray, kind: str, **captures: object) -> list[str]:
+    """Warnings of a SigMF recording of one second."""
+    meta = {
+        "global": {"core:datatype": kind, "core:sample_rate": len(samples)},
+        "captures": [{"core:sample_start": 0, "core:datetime": "2025-06-01T14:00:00Z", **captures}],
+    }
+    (folder / "a.sigmf-meta").write_text(json.dumps(meta))
+    samples.tofile(folder / "a.sigmf-data")
+    (file,) = ingest(folder / "a.sigmf-meta")
+    return list(file.result.warnings)
+
+
+def test_clipping_and_dc_of_a_recording_are_reported(tmp_path: Path) -> None:
+    rng = np.random.default_rng(7)
+    noise = rng.normal(size=(5000, 2))
+    clipped = np.clip(np.round(noise * 32767), -32768, 32767).astype("<i2")
+    share = f"{(np.abs(noise) >= 0.999).mean():.1%} of the values are at full scale"  # some 32 %
+    assert any(share in text for text in recording(tmp_path, clipped, "ci16_le"))
+    assert not recording(tmp_path, np.round(noise * 6000).astype("<i2"), "ci16_le")
+    assert not recording(tmp_path, (noise * 500).astype("<f4"), "cf32_le")  # floats of another scale
+    offset = (0.001 * noise + [0.05, 0.0]).astype("<f4")  # 0.05^2 over 2 x 0.001^2: 31 dB
+    assert any("a DC part 31 dB above the rest" in text for text in recording(tmp_path, offset, "cf32_le"))
+
+
+def test_a_position_per_capture_is_a_track_and_one_for_all_is_not(tmp_path: Path) -> None:
+    places = [{"type": "Point", "coordinates": [-78.696, 35.7275 + i / 1000, 150.0 + i]} for i in range(2)]
+    meta = {
+        "global": {"core:datatype": "ru8", "core:sample_rate": 1000},
+        "captures": [
+            {"core:sample_start": 500 * i, "core:datetime": f"2025-06-01T14:00:0{i}Z", "core:geolocation": places[i]}
+            for i in range(2)
+        ],
+    }
+    (tmp_path / "a.sigmf-meta").write_text(json.dumps(meta))
+    (tmp_path / "a.sigmf-data").write_bytes(bytes(range(100, 150)) * 20)
+    (file,) = ingest(tmp_path / "a.sigmf-meta")
+    (track,) = [stream for stream in file.result.streams if stream.kind == "telemetry"]
+    assert track.frame["latitude_deg"].tolist() == [35.7275, 35.7285]
+    assert track.frame["altitude_m"].tolist() == [0.0, 1.0]
+    meta["global"]["core:geolocation"] = places[0]
+    for capture in meta["captures"]:
+        del capture["core:geolocation"]
+    (tmp_path / "a.sigmf-meta").write_text(json.dumps(meta))
+    (file,) = ingest(tmp_path / "a.sigmf-meta")
+    assert [stream.kind for stream in file.result.streams] == ["rss"]
+
+
+def test_an_autopilots_telemetry_radio_is_no_tower_beside_levels_of_the_experiment(tmp_path: Path) -> None:
+    (tmp_path / "a.bin").write_bytes(autopilots.dataflash(20, radio=True))
+    line = "[2025-03-02 10:00:{:02d}.250000] {:07o} {:15.4f}\n"
+    power = "".join(line.format(i, 4 * i, -40.0 - i) for i in range(20))
+    (tmp_path / "LW1").mkdir()
+    (tmp_path / "LW1" / "power_log.txt").write_text(power)
+    run_ingest([tmp_path], draft=tmp_path / "flight.yaml", timezone="America/New_York")
+    settings = yaml.safe_load((tmp_path / "flight.yaml").read_text())
+    (autopilot,) = [log for log in settings["logs"] if log["path"] == "a.bin"]
+    assert autopilot == {"path": "a.bin", "reader": "ardupilot_bin", "skip": ["radio", "radio_remote"]}
+    text = (tmp_path / "flight.yaml").read_text().replace(", skip: [radio, radio_remote]", "")
+    (tmp_path / "old.yaml").write_text(text)  # a flight file of before, whose autopilot logged the radio, too
+    assert open_flight(tmp_path / "old.yaml").rss["tower"].unique().tolist() == ["LW1"]
+
+
+@pytest.mark.parametrize(
+    ("header", "hint"),
+    [
+        ("when,altitude - sea level (m),lte_asu,signalType", "no column looks like rss_db"),
+        ("when,battery_voltage,avg_power,power", "no column looks like rss_db"),
+        ("start_date,up time,rx power", "--map 'up time'=time --map 'rx power'=rss_db"),
+        ("when_utc,y lat,x lon,strength", "--map 'when_utc'=time --map 'y lat'=latitude_deg"),
+    ],
+)
+def test_a_hint_proposes_what_can_be_typed_and_no_height_power_or_index(header: str, hint: str, tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text(f"{header}\n")
+    with pytest.raises(InputError) as refused:
+        ingest(tmp_path / "a.csv")
+    assert hint in str(refused.value)
+
+
+def test_positions_on_a_local_grid_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "a.csv").write_text("t,unix_time,north_m,east_m,down_m\n0,1749564000,0,0,-30\n")
+    with pytest.raises(InputError, match="positions on a grid, such as column 'north_m'"):
+        ingest(tmp_path / "a.csv")

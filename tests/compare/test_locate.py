@@ -1,6 +1,8 @@
 """Where a node stands, by levels: the evidence a second way, and regions over simulated flights."""
 
+import tracemalloc
 from collections.abc import Iterator
+from time import process_time
 
 import numpy as np
 import pytest
@@ -182,7 +184,8 @@ def test_levels_are_medians_of_four_seconds_and_at_most_120(length_s: float, win
 
 def test_the_grid_reaches_400_m_beyond_the_flight_and_the_region_a_tenth_of_the_tail() -> None:
     track = LevelTrack(np.zeros(2), np.array([[0.0, 100.0, 30.0], [200.0, 130.0, 30.0]]), np.zeros(2))
-    grid = locating._grid(track)
+    grid, spacing = locating._grid(track)
+    assert spacing == 40.0
     assert (grid.min(axis=0).tolist(), grid.max(axis=0).tolist()) == ([-400.0, -300.0], [600.0, 540.0])
     assert set(np.diff(np.unique(grid[:, 0]))) == set(np.diff(np.unique(grid[:, 1]))) == {40.0}
     assert len(grid) == 26 * 22
@@ -194,14 +197,14 @@ def test_the_grid_reaches_400_m_beyond_the_flight_and_the_region_a_tenth_of_the_
         ((0, 501.0), 1),
         ((0, -261), 1),
     ):
-        assert locating._on_edge(np.array([[*place, 1.5]]), grid).tolist() == [bool(edge)]
+        assert locating._on_edge(np.array([[*place, 1.5]]), grid, spacing).tolist() == [bool(edge)]
     far = np.array([[0.0, 0.0], [500.0, 0.0]])
     # all here; five percent far away: of the rest 18 in 19 are within; twenty percent: half of those far away
     for shares, radius in (((1, 0), 20 * np.sqrt(-2 * np.log(0.1))), ((0.95, 0.05), 20 * np.sqrt(-2 * np.log(1 / 19))),
                            ((0.8, 0.2), 500.0)):  # fmt: skip
         regions = locating.Regions.of(far, np.array(shares))
         assert regions.radius_m(far[0], 0.9) == pytest.approx(radius, abs=1.5)
-    moved = locating._refined(np.array([[0.0, 0.0, 1.5], [100.0, 40.0, 10.0]]))
+    moved = locating._divided(np.array([[0.0, 0.0, 1.5], [100.0, 40.0, 10.0]]), (-40 / 3, 0.0, 40 / 3))
     steps = {(e, n, 1.5) for e in (-1, 0, 1) for n in (-1, 0, 1)}
     assert {tuple(row) for row in np.round(moved[:9] / [40 / 3, 40 / 3, 1], 9).tolist()} == steps
     assert moved[9:].mean(axis=0) == pytest.approx([100.0, 40.0, 10.0])
@@ -266,3 +269,37 @@ def test_a_part_that_holds_almost_nothing_is_no_place_of_its_own() -> None:
     places = np.array([[0.0, 0.0], [500.0, 0.0], [-400.0, 300.0]])
     regions = locating.Regions.of(places, np.array([0.6, 0.38, 0.02]))
     assert [mode.place_m.round(-1).tolist() for mode in regions.modes(0.995)] == [[0.0, 0.0], [500.0, 0.0]]
+
+
+def test_the_least_part_of_likelier_cells_is_that_of_the_likeliest_cell() -> None:
+    """Cells of 0.5, 0.3 and 0.2: 0, 0.5 and 0.8 of the posterior are in likelier cells."""
+    regions = locating.Regions(np.arange(3.0), np.zeros(1), np.array([[0.2], [0.5], [0.3]]))
+    assert regions.likelier().ravel() == pytest.approx([0.8, 0.0, 0.5])
+
+
+@pytest.mark.parametrize(("length_m", "across_m", "noise_db"), [(7e3, 2e3, 3.0), (15e3, 15e3, 3.0), (15e3, 0.0, 1.0)])
+def test_a_track_of_15_km_finds_its_node_in_little_memory(length_m: float, across_m: float, noise_db: float) -> None:
+    """The memory grew with the square of the places: 200 GiB at 15 km."""
+    time, rng = np.arange(0.0, 1800.0), np.random.default_rng(1)
+    east, north = np.linspace(-0.5, 0.5, 1800) * length_m, 0.5 * across_m * np.sin(2 * np.pi * time / 450.0)
+    position = np.column_stack([east, north, np.full(1800, 60.0)])
+    node = np.array([0.2 * length_m, 150.0, 1.5])
+    level = -30.0 * np.log10(np.linalg.norm(position - node, axis=1)) + rng.normal(0.0, noise_db, 1800)
+    tracemalloc.start()
+    before = process_time()
+    estimate = locate(level_track(time, position, level))
+    modes = estimate.regions.modes()
+    spent_s, peak = process_time() - before, tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert any(np.hypot(*(mode.place_m - node[:2])) <= mode.radius_m for mode in modes)
+    assert peak < 400 * 2**20
+    assert spent_s < 5.0
+
+
+def test_levels_that_say_nothing_leave_a_long_track_undivided() -> None:
+    """Every place is possible: the region stays as wide as the search, and in one part."""
+    time, rng = np.arange(0.0, 1800.0), np.random.default_rng(1)
+    position = np.column_stack([10.0 * time, 3000.0 * np.sin(time / 70.0), np.full(1800, 60.0)])
+    estimate = locate(level_track(time, position, rng.normal(-60.0, 3.0, 1800)))
+    assert estimate.radius90_m > 5000.0
+    assert len(estimate.regions.modes()) == 1

@@ -61,8 +61,12 @@ _HEIGHTS_M = {1.5: 0.7, 10.0: 0.3}
 # Bins of a level that a search needs.
 FEWEST = 20
 
-# Places up to so far beyond the track are tried, at this spacing; likely ones again at half of it.
+# Places up to this far beyond the track are tried, at this spacing; likely ones again at a third of it.
 _REACH_M, _SPACING_M = 400.0, 40.0
+
+# Long tracks: the first grid has at most this many positions, at 2, 4, 8 ... times the spacing; then the likeliest
+# places are divided until the spacing is reached. A place costs 0.2 ms of processor time.
+_MOST_GRID, _MOST_DIVIDED = 3000, 500
 
 # The level of a node so far away hardly changes along a flight; levels that fit it as well as the best place tell none.
 # Log odds of the best place: 4 to 76 on six real flights with a rover in reach, at most 0.3 of constants and hovers.
@@ -258,8 +262,8 @@ def _likelihood(track: LevelTrack, latent: FloatArray, noise: float) -> tuple[Fl
     return value.sum(axis=1), gradient, weight
 
 
-# Cells of the regions [m]; parts of a region that hold less are none.
-_CELL_M, _LEAST_SHARE = 5.0, 0.03
+# Cells of the regions [m] and their largest number; parts of a region that hold less are none.
+_CELL_M, _MOST_CELLS, _LEAST_SHARE = 5.0, 1_000_000, 0.03
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,14 +302,13 @@ class Regions:
     share: FloatArray
 
     @classmethod
-    def of(cls, places: FloatArray, share: FloatArray) -> Regions:
-        """Places (m, 2 or more) that hold shares (m,), each blurred by :data:`SYSTEMATIC_M`."""
-        reach = 4.0 * SYSTEMATIC_M
-        axes = [np.arange(p.min() - reach, p.max() + reach + _CELL_M, _CELL_M) for p in places.T[:2]]
-        weights = [
-            np.exp(-0.5 * ((axis[:, None] - p) / SYSTEMATIC_M) ** 2) for axis, p in zip(axes, places.T, strict=False)
-        ]
-        density = (weights[0] * share) @ weights[1].T
+    def of(cls, places: FloatArray, share: FloatArray, sd_m: float = SYSTEMATIC_M) -> Regions:
+        """Blur the shares (m,) of places (m, 2 or more) by a standard deviation per axis [m]."""
+        reach = 4.0 * sd_m
+        area = float(np.prod(np.ptp(places[:, :2], axis=0) + 2.0 * reach))
+        cell = max(_CELL_M * sd_m / SYSTEMATIC_M, float(np.sqrt(area / _MOST_CELLS)))
+        axes = [np.arange(p.min() - reach, p.max() + reach + cell, cell) for p in places.T[:2]]
+        density = _blurred(places, share, axes, sd_m)
         return cls(axes[0], axes[1], density / density.sum())
 
     def likelier(self) -> FloatArray:
@@ -334,6 +337,17 @@ class Regions:
         """Radius of the circle about a place that holds a part of the posterior."""
         east, north = np.meshgrid(self.east_m - place_m[0], self.north_m - place_m[1], indexing="ij")
         return _within(np.column_stack([east.ravel(), north.ravel()]), self.share.ravel(), part)
+
+
+def _blurred(places: FloatArray, share: FloatArray, axes: Sequence[FloatArray], sd_m: float) -> FloatArray:
+    """Return the blurred shares on a grid (columns, rows); places lie on a lattice, so each axis is blurred alone."""
+    (east, i), (north, j) = (np.unique(p.round(6), return_inverse=True) for p in places.T[:2])
+    lattice = np.zeros((len(east), len(north)))
+    np.add.at(lattice, (i, j), share)
+    columns, rows = (
+        np.exp(-0.5 * ((axis[:, None] - p) / sd_m) ** 2) for axis, p in zip(axes, (east, north), strict=True)
+    )
+    return np.asarray(columns @ lattice @ rows.T)
 
 
 def _within(step_m: FloatArray, share: FloatArray, part: float) -> float:
@@ -405,22 +419,22 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
             expected=f"{FEWEST}",
             cause="a short flight, or logs of two flights",
         )
-    grid = _grid(track)
-    places = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
-    evidence = fit_places(track, places, model).evidence + _log_prior(places)
-    anywhere = float(logsumexp(evidence)) - np.log(len(grid))
+    grid, spacing = _grid(track)
+    places, evidence, step, anywhere = _searched(track, grid, spacing, model)
     afar = fit_places(track, track.position_m[:1] + np.array([_AFAR_M, 0.0, 0.0]), model).evidence[0]
     places = places[evidence > evidence.max() - _POSSIBLE]
     if len(places) <= _MOST_REFINED:
-        places = _refined(places)
+        places = _divided(places, (-step / 3.0, 0.0, step / 3.0))
     fits = fit_places(track, places, model)
     log_share = fits.evidence + _log_prior(places)
     share = np.exp(log_share - logsumexp(log_share))
-    apart = np.hypot(*(places[:, None, :2] - places[None, :, :2]).transpose(2, 0, 1))
-    density = np.exp(-0.5 * (apart / SYSTEMATIC_M) ** 2) @ share
+    # places that are far apart are blurred more: the region must not fall into spots
+    sd_m = SYSTEMATIC_M * step / _SPACING_M
+    (east, i), (north, j) = (np.unique(p.round(6), return_inverse=True) for p in places.T[:2])
+    density = _blurred(places, share, (east, north), sd_m)[i, j]
     # rounded: a place and its mirror image differ in the last digit alone
     best = int(np.lexsort((-share, -density.round(12)))[0])
-    regions = Regions.of(places, share)
+    regions = Regions.of(places, share, sd_m)
     heights = [h for h in _HEIGHTS_M if share[places[:, 2] == h].sum() > 0.05]
     return NodeEstimate(
         place_m=places[best],
@@ -430,7 +444,7 @@ def locate(track: LevelTrack, model: LevelModel = UNKNOWN) -> NodeEstimate:
         slope_sd=float(fits.slope_sd[best]),
         anywhere=anywhere,
         placed=bool(fits.evidence.max() - afar > _PLACED_ODDS),
-        at_edge=bool(share[_on_edge(places, grid)].sum() > _LEAST_SHARE),
+        at_edge=bool(share[_on_edge(places, grid, spacing)].sum() > _LEAST_SHARE),
         regions=regions,
     )
 
@@ -440,22 +454,53 @@ def _log_prior(places: FloatArray) -> FloatArray:
     return np.log([_HEIGHTS_M[height] for height in places[:, 2].tolist()])
 
 
-def _grid(track: LevelTrack, spacing_m: float = _SPACING_M) -> FloatArray:
-    """Places (m, 2) at equal spacing, as far as :data:`_REACH_M` beyond the track."""
+def _grid(track: LevelTrack, spacing_m: float = _SPACING_M) -> tuple[FloatArray, float]:
+    """Return positions (m, 2) at equal spacing, up to :data:`_REACH_M` beyond the track, and the spacing [m].
+
+    The spacing is doubled until there are at most :data:`_MOST_GRID` positions.
+    """
     low, high = track.position_m[:, :2].min(axis=0) - _REACH_M, track.position_m[:, :2].max(axis=0) + _REACH_M
+    while np.prod((high - low) / spacing_m + 1.0) > _MOST_GRID:
+        spacing_m *= 2.0
     axes = [np.arange(a, b + spacing_m, spacing_m) for a, b in zip(low, high, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2), spacing_m
 
 
-def _on_edge(places: FloatArray, grid: FloatArray) -> BoolArray:
-    low, high = grid.min(axis=0) + _SPACING_M, grid.max(axis=0) - _SPACING_M
+def _at_heights(grid: FloatArray) -> FloatArray:
+    return np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
+
+
+def _searched(
+    track: LevelTrack, grid: FloatArray, spacing_m: float, model: LevelModel
+) -> tuple[FloatArray, FloatArray, float, float]:
+    """Divide the likeliest places of a grid until their spacing is :data:`_SPACING_M`.
+
+    Returns places (m, 3), their log evidence (m,), their spacing [m] and the log evidence of any place of the grid. If
+    too many places are possible, the spacing stays: the levels do not determine the place better.
+    """
+    from scipy.special import logsumexp
+
+    places, weight, others = _at_heights(grid), -float(np.log(len(grid))), list[FloatArray]()
+    while True:
+        evidence = fit_places(track, places, model).evidence + _log_prior(places)
+        possible = np.count_nonzero(evidence > evidence.max() - _POSSIBLE)
+        if spacing_m <= _SPACING_M or possible > _MOST_DIVIDED:
+            break
+        order = np.argsort(-evidence, kind="stable")
+        others.append(evidence[order[_MOST_DIVIDED:]] + weight)
+        places = _divided(places[order[:_MOST_DIVIDED]], (-spacing_m / 4.0, spacing_m / 4.0))
+        spacing_m, weight = spacing_m / 2.0, weight - float(np.log(4.0))
+    return places, evidence, spacing_m, float(logsumexp(np.concatenate([*others, evidence + weight])))
+
+
+def _on_edge(places: FloatArray, grid: FloatArray, spacing_m: float) -> BoolArray:
+    low, high = grid.min(axis=0) + spacing_m, grid.max(axis=0) - spacing_m
     return np.asarray(((places[:, :2] < low) | (places[:, :2] > high)).any(axis=1))
 
 
-def _refined(places: FloatArray) -> FloatArray:
-    """Nine places in each cell of the grid."""
-    third = _SPACING_M / 3.0
-    moved = np.array([(e, n, 0.0) for e in (-third, 0.0, third) for n in (-third, 0.0, third)])
+def _divided(places: FloatArray, steps_m: Sequence[float]) -> FloatArray:
+    """Return each place (m, 3) moved by all pairs of steps to the east and to the north."""
+    moved = np.array([(e, n, 0.0) for e in steps_m for n in steps_m])
     return np.asarray((places[:, None] + moved).reshape(-1, 3))
 
 
@@ -483,8 +528,8 @@ def place_odds(track: LevelTrack, known_m: ArrayLike) -> FloatArray:
     """
     from scipy.special import logsumexp
 
-    known, grid = unmasked(known_m).reshape(-1, 3), _grid(track, _RIVAL_SPACING_M)
-    free = np.concatenate([np.column_stack([grid, np.full(len(grid), height)]) for height in _HEIGHTS_M])
+    known, (grid, _) = unmasked(known_m).reshape(-1, 3), _grid(track, _RIVAL_SPACING_M)
+    free = _at_heights(grid)
     places = np.concatenate([known, free])
     away = np.hypot(*(places[:, None, :2] - track.position_m[:, :2]).transpose(2, 0, 1)).min(axis=1)
     shadows = [_inverse_root(track, *shadow) for shadow in _SHADOWS]

@@ -17,7 +17,7 @@ from ...common.errors import InputError, parsing
 from ...common.files import LARGEST_TABLE, read_bounded
 from ...common.units import FloatArray
 from ...compare.judge import season
-from ...compare.judge.steps import NodeOffset, node_offsets, stepped
+from ...compare.judge.steps import NightOffsets, NodeOffset, node_offsets, stepped
 from ...compare.statistics.passes import cell_means
 from ...logs.ingest import ingest
 from ...logs.readers import ReadOptions
@@ -205,7 +205,7 @@ def soundings(paths: Sequence[Path], timezone: str | None) -> tuple[NodeOffset, 
         raise InputError("no log names transmitter and receiver", expected="soundings", path=paths[0])
     table = pd.concat(levels).rename_axis("night").reset_index()
     nights = sorted(table["night"].unique())
-    nodes: dict[str, FloatArray] = {}
+    nodes: dict[str, NightOffsets] = {}
     for band, part in table.groupby("band", dropna=False):
         wide = part.pivot_table("offset", "night", ["transmitter", "receiver"], aggfunc="median").reindex(nights)
         name = f"{band / 1e6:.0f} MHz, " if np.isfinite(band) else ""

@@ -409,17 +409,20 @@ def headline(data: CampaignData) -> list[str]:
 
 
 def step_words(data: CampaignData) -> list[str]:
-    """Steps of offsets that the last date shows, and how small ones it can show."""
+    """Return a sentence per step of an offset, the latest first, and how small a step the last date can show."""
     judged = [node for node in data.season.nodes if np.isfinite(node.smallest_db)]
     if not judged:
         return []
     last = max(node.night[-1] for node in judged)
-    steps = [(node.node, step) for node in judged for step in node.steps if last == step.shown and not step.back]
+    steps = sorted(((step.night, node.node, step) for node in judged for step in node.steps), key=lambda s: s[:2])
     out = [
-        f"On {last} the offset of {name} steps by {step.step_db:+.1f} dB "
-        f"(95 %: {step.step_ci95_db[0]:+.1f} to {step.step_ci95_db[1]:+.1f} dB)."
-        for name, step in steps
-    ] or [f"No offset steps on {last}, the last date."]
+        f"On {night} the offset of {name} steps by {step.step_db:+.1f} dB "
+        f"(95 %: {step.step_ci95_db[0]:+.1f} to {step.step_ci95_db[1]:+.1f} dB)"
+        + (f" and is back on {step.back}." if step.back else ".")
+        for night, name, step in reversed(steps)
+    ]
+    if not any(step.shown == last for _, _, step in steps):
+        out.insert(0, f"No offset steps on {last}, the last date.")
     smallest = max(judged, key=lambda node: node.smallest_db)
     return [
         *out,

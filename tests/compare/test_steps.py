@@ -7,7 +7,6 @@ import sys
 
 import numpy as np
 import pytest
-
 from scipy import stats
 
 from aerpaw_cmp.compare.judge.steps import NightOffsets, NodeOffset, _Stretch, node_offsets, stepped

@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.compare.judge.steps import NodeOffset, Step
 from aerpaw_cmp.report import campaign as campaign_figures
 from aerpaw_cmp.report import campaign as campaign_html
 from aerpaw_cmp.report import campaign as campaign_words
@@ -39,6 +40,21 @@ def test_two_flights_show_no_difference_and_the_words_say_so():
     words = " ".join(campaign_words.headline(fabricated.season(2, 3, 1, 1)))
     assert "Too few flights" in words
     assert "Not significantly worse" not in words
+
+
+def test_every_date_of_a_step_is_named_with_the_latest_first(data):
+    """The terminal spoke of the last date alone: a receiver that lost 2 dB a week ago was not named."""
+    nights = tuple(f"2026-06-{day:02}" for day in range(1, 25))
+    sizes = {"night": nights, "offset_db": (0.0,) * 24, "sd_db": 0.3, "smallest_db": 1.2}
+    old = Step(night="2026-06-13", shown="2026-06-14", step_db=1.9, step_ci95_db=(1.2, 2.6))
+    rain = Step(night="2026-06-20", shown="2026-06-20", step_db=-3.0, step_ci95_db=(-4.0, -2.0), back="2026-06-21")
+    nodes = (NodeOffset(node="LW3", steps=(old,), **sizes), NodeOffset(node="LW1", steps=(rain,), **sizes))
+    words = campaign_words.step_words(dataclasses.replace(data, season=dataclasses.replace(data.season, nodes=nodes)))
+    assert words[:-1] == [
+        "No offset steps on 2026-06-24, the last date.",
+        "On 2026-06-20 the offset of LW1 steps by -3.0 dB (95 %: -4.0 to -2.0 dB) and is back on 2026-06-21.",
+        "On 2026-06-13 the offset of LW3 steps by +1.9 dB (95 %: +1.2 to +2.6 dB).",
+    ]
 
 
 def test_hostile_names_stay_text(data):

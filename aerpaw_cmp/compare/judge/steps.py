@@ -85,8 +85,8 @@ def node_offsets(offset_db: ArrayLike, links: Sequence[tuple[str, str]]) -> dict
     -----
     ``offset(night, link) = link + transmitter(night) + receiver(night)`` by least squares with Huber's weights. The
     part of a link is the median of its residuals, fitted in turns: its plain median would depend on the nights that
-    the link misses on either side of a step. What transmitters or receivers share (weather) is the median of the others, and is taken off
-    where there are four or more.
+    the link misses on either side of a step. What transmitters or receivers share (weather) is the median of the
+    others, and is subtracted if there are four or more.
 
     Examples
     --------

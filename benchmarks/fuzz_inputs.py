@@ -2,10 +2,11 @@
 
 Every reader of the catalogue, flight.yaml, site.yaml, campaign.yaml, map files, MATLAB files, flight files, antenna
 files, the path cache and elevation models are given mutated seeds. Seeds are the samples of the tests, pieces of a few
-lines of ``sample_logs`` and of ``$AERPAW_CMP_FIELD_DATA``; mutations change bytes, lines, numbers (infinities, 1e30,
--0, integers of forty digits), encodings and clocks. Checked for each input: the accounting law; no exception but the
-package's own; at most 2 s of the processor and 300 MiB; the process lives. Input ``i`` of a target depends on the
-seed, the target and ``i`` alone, so a violation is made again with ``--reproduce TARGET I``.
+lines of ``sample_logs`` and of ``$AERPAW_CMP_FIELD_DATA``; each is accepted as it is. In two of three inputs one value
+of a seed is replaced, so that what lies behind the first check is tested, too; in the others bytes, lines, numbers
+(infinities, 1e30, -0, integers of forty digits), encodings and clocks change. Checked for each input: the accounting
+law; no exception but the package's own; at most 2 s of the processor and 300 MiB; the process lives. Input ``i`` of a
+target depends on the seed, the target and ``i`` alone, so a violation is made again with ``--reproduce TARGET I``.
 
 ``--inputs 20000 --workers 2`` is the recorded run of docs/security.md: some 1 300 s of the processor for all readers.
 Each row is printed as soon as it is done, so that what an interrupted run has done counts.
@@ -32,7 +33,7 @@ import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache, partial
 from importlib import import_module
 from itertools import chain
@@ -95,6 +96,8 @@ class Target:
     name: str
     seeds: tuple[bytes, ...]
     run: Callable[[bytes, int], bool]
+    refuses: bool = False
+    """True for a reader that only names files that are not logs."""
 
 
 # --- mutations -------------------------------------------------------------------------------------------------------
@@ -214,14 +217,45 @@ def _case(data: bytes, chance: np.random.Generator) -> bytes:
     return data[:start] + data[start:end].swapcase() + data[end:]
 
 
+# Values of a text: numbers and words, dates and names among them.
+_VALUE = re.compile(rb"[-+]?\d[\d.eE+\-:/]*|[A-Za-z_][\w.]*")
+
+
+def _near(value: bytes, chance: np.random.Generator) -> bytes:
+    """A value that resembles a valid one: another digit or letter, the other sign, ten times as much."""
+    at = int(chance.integers(len(value)))
+    kind = int(chance.integers(4))
+    if kind == 0 and value[:1].isdigit():
+        return b"-" + value
+    if kind == 1 and value[-1:].isdigit():
+        return value + b"0"
+    letter = b"%d" % chance.integers(10) if value[at : at + 1].isdigit() else b"abcxyz"[at % 6 : at % 6 + 1]
+    return value[:at] + letter + value[at + 1 :]
+
+
+def one_value(data: bytes, chance: np.random.Generator) -> bytes:
+    """Return a file with one value replaced, half the time by a value that resembles it; in a binary file one bit."""
+    values = [] if b"\0" in data[:2000] else [match.span() for match in _VALUE.finditer(data)]
+    if not values:
+        at = int(chance.integers(len(data)))
+        return data[:at] + bytes([data[at] ^ (1 << int(chance.integers(8)))]) + data[at + 1 :]
+    start, stop = values[int(chance.integers(len(values)))]
+    if chance.random() < 0.5:
+        return data[:start] + _near(data[start:stop], chance) + data[stop:]
+    hostile = NUMBERS if data[start:stop][-1:].isdigit() else (*NUMBERS, *WORDS)
+    return data[:start] + hostile[int(chance.integers(len(hostile)))] + data[stop:]
+
+
 MUTATIONS = (_bytes, _cut, _truncate, _copy, _insert, _number, _number, _number, _clock, _lines, _lines, _encode, _case)
 
 
 def mutated(target: Target, seed: int, index: int) -> bytes:
-    """Input ``index`` of a target: one of its seeds (or two, joined), changed one to five times."""
+    """Return input ``index`` of a target: a seed with one value replaced, or some seeds changed one to five times."""
     name = int.from_bytes(hashlib.sha256(target.name.encode()).digest()[:8], "big")
     chance = np.random.default_rng([seed, name, index])
     data = target.seeds[int(chance.integers(len(target.seeds)))]
+    if index % 3:
+        return one_value(data, chance)[:200_000]
     if index % JOINED_EVERY == 0:
         data += b"".join(target.seeds[i] for i in chance.integers(len(target.seeds), size=chance.integers(4)))
     if chance.random() < 0.05:
@@ -286,6 +320,8 @@ def _read_log(reader: Reader, binary: bool, data: bytes, index: int) -> bool:
         for candidate in catalogue():
             candidate.sniff(head)
     options = OPTIONS[index % len(OPTIONS)]
+    if reader.name == "iq_burst":  # dated by its name
+        options = replace(options, file_name="results_3320000000.0_2000000.0_2025_03_02_10_00_00_250.mat")
     result = limits.check(reader.read(data, options))
     check_law(result, data, binary)
     if reader.read_pieces is not None and not data.startswith(b"\xef\xbb\xbf"):  # ingest takes it off
@@ -397,8 +433,8 @@ logs:
   - {path: b.txt, reader: sounder_log, node: LW1, channel: USRP1, clock: local, floor_db: -200, skip: [quality]}
 link: {rss: {carrier_hz: 3.3e9, tower: {layout: linear, elements: 2, slant_deg: [45, -45], antenna: {model: dipole}}}}
 rt: {engine: image, max_depth: 1, attitude: logged, foliage: attenuating}
-rss: {span_db: [-50, 50], lag: apply, advanced: {step_db: 0.1}}
-rank: {tower: LW1, k: [10, 100], advanced: {bootstrap: 50}}
+rss: {span_db: [-50, 50], lag: apply}
+rank: {tower: LW1, k: [10, 100]}
 report: {waypoints: [{label: W, east_m: 1, north_m: 2, height_m: 3}]}
 """
 CAMPAIGN = b"""campaign: c
@@ -449,9 +485,13 @@ def _mat(data: bytes, _index: int) -> bool:
 
 
 def _gzipped(data: bytes, index: int) -> bool:
+    import gzip
+
     from aerpaw_cmp.logs.ingest import read_file
 
-    with _file(data, "log.gz") as path:
+    # two of three: a sound archive of a damaged log
+    packed = gzip.compress(data, compresslevel=1, mtime=0)
+    with _file(packed if index % 3 else packed[: -1 - index % 50], "log.gz") as path:
         return read_file(path, options=OPTIONS[index % len(OPTIONS)]).result.accepted > 0
 
 
@@ -505,8 +545,7 @@ def _zipped(name: str, data: bytes, kind: int) -> bytes:
 
 def targets() -> list[Target]:
     """Everything that reads a file, with its seeds."""
-    import gzip
-
+    from aerpaw_cmp.logs.flight_file import _SEAL
     from tests.site import test_mutilated_files as maps
 
     logs = _log_seeds()
@@ -515,15 +554,19 @@ def targets() -> list[Target]:
     for name, seeds in sorted(logs.items()):
         # SigMF is accounted for by its values, as binary files are, not by the lines of its JSON
         binary = name == "sigmf" or any(b"\0" in seed[:200] for seed in seeds)
-        out.append(Target(f"reader:{name}", tuple(seeds), partial(_read_log, readers[name], binary)))
-    some = [seeds[0] for name, seeds in sorted(logs.items()) if name != "generic_csv"]
-    packed = tuple(gzip.compress(s, mtime=0) for s in some)
-    out.append(Target("ingest:gzip", packed, _gzipped))
+        read = partial(_read_log, readers[name], binary)
+        out.append(Target(f"reader:{name}", tuple(seeds), read, refuses=not readers[name].kinds))
+    # a burst is dated by its name, which a packed file has lost
+    reads = {name for name, reader in readers.items() if reader.kinds} - {"generic_csv", "iq_burst"}
+    some = [seeds[0] for name, seeds in sorted(logs.items()) if name in reads]
+    out.append(Target("ingest:gzip", tuple(some), _gzipped))
     mats = [s for seeds in logs.values() for s in seeds if s.startswith((b"MATLAB", b"\x89HDF"))]
     out.append(Target("matfile", tuple(mats), _mat))
     vehicle = next(iter(logs["vehicle_out"]))
     file = partial(_by_path, "f.h5", _loader("logs.flight_file", "read_flight"))
-    out.append(Target("flight_file", (_flight_bytes(vehicle),), file))
+    sealed = _flight_bytes(vehicle)
+    # without its seal, too: damage that the seal would find first
+    out.append(Target("flight_file", (sealed, sealed[: sealed.rindex(_SEAL)]), file))
     out.append(Target("path_cache", (_cache_entry(),), _path_cache))
     sample = (ROOT / "sample_logs/flight.yaml").read_bytes()[:MEDIUM_BYTES]
     yamls: list[tuple[str, tuple[bytes, ...], Callable[[Path], Any]]] = [
@@ -550,18 +593,34 @@ def targets() -> list[Target]:
     return out
 
 
-def _scene(path: Path) -> None:
+def _scene(path: Path) -> Any:
     from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
 
     (path.parent / "mesh.ply").write_bytes(PLY)
-    read_scene(path)
+    return read_scene(path)
 
 
-def _report(path: Path) -> None:
+def _report(path: Path) -> Any:
+    """Differences of a report from itself; the tables beside its numbers have no rows."""
     from aerpaw_cmp.jobs.diff_reports import run_diff
+    from aerpaw_cmp.report.columns import RANK_COLUMNS, RSS_COLUMNS
 
-    place = path.rename(path.with_name("metrics.json"))
-    run_diff(place, place)
+    with tempfile.TemporaryDirectory(dir=SCRATCH) as folder:
+        path.rename(Path(folder) / "metrics.json")
+        for name, columns in (("rss.csv", RSS_COLUMNS), ("rank.csv", RANK_COLUMNS)):
+            (Path(folder) / name).write_text(",".join(columns) + "\n", encoding="utf-8")
+        return run_diff(Path(folder), Path(folder))
+
+
+def _receiver_file() -> bytes:
+    """The packaged rank receiver with two of its twenty members."""
+    import gzip
+
+    folder = ROOT / "aerpaw_cmp" / "site" / "data" / "lake_wheeler.learned"
+    content = json.loads(gzip.decompress(next(folder.glob("*.receiver.json.gz")).read_bytes()))
+    for tower in content["towers"].values():
+        tower |= {name: tower[name][:2] for name in ("geometries", "members")}
+    return json.dumps(content).encode()
 
 
 _VERTICES = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
@@ -586,8 +645,10 @@ SCENE = (
 SPHERE = b"azimuth_deg,elevation_deg,gain_dbi\n" + b"".join(
     b"%d,%d,0.0\n" % (a, e) for a in range(0, 360, 60) for e in range(-90, 91, 30)
 )
-REPORT = json.dumps({"flight": "f", "rss": {}, "rank": {}, "inputs": [], "rt": {}, "versions": {}}).encode()
-RECEIVER = json.dumps({"format": "aerpaw-cmp receiver 1", "towers": {"LW1": {"weights": [1.0]}}}).encode()
+REPORT = json.dumps({
+    "flight": "f", "rss": {"LW1": {"U": {"offset_db": 1.5, "rmse_db": 2.5, "n": 200}}}, "rank": {}, "settings": {},
+    "inputs": [{"path": "a.txt", "sha256": "0" * 64, "reader": "sounder_log"}], "rt": {}, "versions": {},
+}).encode()  # fmt: skip
 WAYPOINT = b"%d\t0\t%d\t16\t0\t0\t0\t0\t35.7275\t-78.696\t100\t1\n"
 _ROUTE = _loader("logs.route", "read_route", height_m=40.0)
 # Files of one seed each: what the tool asks a stranger for beside logs and maps.
@@ -599,7 +660,7 @@ SMALL_FILES: dict[str, tuple[bytes, Callable[[Path], Any]]] = {
     "mesh:ply": (PLY, _loader("site.mesh_scenes.meshfiles", "read_mesh")),
     "scene:xml": (SCENE, _scene),
     "sphere:csv": (SPHERE, _loader("site.antenna.sphere_pattern", "read_sphere_csv")),
-    "receiver:json": (RECEIVER, _loader("jobs.learning.calibrate_rank", "read_receiver")),
+    "receiver:json": (_receiver_file(), _loader("jobs.learning.calibrate_rank", "read_receiver")),
     "report:json": (REPORT, _report),
 }
 

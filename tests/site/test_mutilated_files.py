@@ -31,7 +31,7 @@ KML = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><name>fence</na
 SITE = b"""name: test
 origin: {latitude_deg: 35.7275, longitude_deg: -78.696, ground: {height_m: 79, reference: orthometric}}
 towers:
-  T: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna: {height_m: 90, reference: orthometric}}
+  T: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna_height_m: 11}
 buildings:
 - {name: a, height_m: 4, material: wood, polygon_m: [[10, 10], [20, 10], [20, 20]]}
 forests:

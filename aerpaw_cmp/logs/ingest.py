@@ -537,7 +537,7 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
     from . import limits, origins  # load pandas, as any reader does
 
     expected, cause = f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"
-    with parsing(path, expected, cause), blaming(reader, f"reader {reader.name!r} read it", InputError):
+    with parsing(path, expected, cause), blaming(reader.plugin, f"reader {reader.name!r} read it", InputError):
         result = origins.stated(limits.check(read()), reader, options)
     if not result.accepted:
         first = f": {result.rejected[0].reason}" if result.rejected else ""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import Literal
 
@@ -106,6 +106,8 @@ class Reader:
     clock_from, height_from : str
         ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.origins`. A stream's own
         attribute of that name wins.
+    plugin : str
+        Entry point of a third-party reader; set by :func:`catalogue`.
     """
 
     name: str
@@ -119,27 +121,27 @@ class Reader:
     read_sections: _ReadSections | None = None
     clock_from: str = "assumed: local wall time"
     height_from: str = "assumed: above take-off"
+    plugin: str = ""
 
 
 @contextmanager
-def blaming(source: Reader | str, doing: str, kind: type[AerpawCmpError] = UsageError) -> Iterator[None]:
-    """Name the plug-in, or that of a reader, whose code raises inside; errors of this project (empty name) pass."""
+def blaming(plugin: str, doing: str, kind: type[AerpawCmpError] = UsageError) -> Iterator[None]:
+    """Name the plug-in whose code raises inside; the empty name is this project, whose errors pass."""
     try:
         yield
     except Exception as error:
-        plugin = source if isinstance(source, str) else plugins().get(source.name, (source, ""))[1]
         if not plugin or isinstance(error, AerpawCmpError):
             raise
         raise kind(
-            f"the plug-in {plugin!r} failed while {doing} ({type(error).__name__}: {one_line(str(error)[:200])})",
+            f"the plug-in {plugin!r} failed when {doing} ({type(error).__name__}: {one_line(str(error)[:200])})",
             expected="readers as in docs/adding_a_reader.md",
             cause="an error in the plug-in: update or uninstall it",
         ) from error
 
 
 @cache
-def plugins() -> dict[str, tuple[Reader, str]]:
-    """Return each reader of the entry-point group by its name, and its plug-in; empty for readers of this project.
+def catalogue() -> tuple[Reader, ...]:
+    """Return all readers of the entry-point group, read once.
 
     Raises
     ------
@@ -148,31 +150,25 @@ def plugins() -> dict[str, tuple[Reader, str]]:
     """
     from importlib.metadata import entry_points
 
-    readers: dict[str, tuple[Reader, str]] = {}
+    readers: list[Reader] = []
     for point in entry_points(group=ENTRY_POINT_GROUP):
         plugin = "" if point.value.startswith("aerpaw_parsers:") else point.name
         with blaming(plugin, "it was loaded"):
-            for reader in point.load():
-                if reader.name in readers:
-                    found = f"two installed readers share the name {reader.name!r}"
-                    raise UsageError(found, expected="unique reader names")
-                readers[reader.name] = reader, plugin
+            readers += [replace(reader, plugin=plugin) for reader in point.load()]
     if not readers:
         raise UsageError(
             f"no readers are installed under the entry-point group {ENTRY_POINT_GROUP!r}",
             cause="the package was not installed: run 'pip install -e .' in the checkout",
         )
-    return readers
-
-
-@cache
-def catalogue() -> tuple[Reader, ...]:
-    """Return all readers; see :func:`plugins`."""
-    return tuple(reader for reader, _ in plugins().values())
+    names = [reader.name for reader in readers]
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
+        raise UsageError(f"two installed readers share the name {double[0]!r}", expected="unique reader names")
+    return tuple(readers)
 
 
 def _accepts(reader: Reader, head: bytes) -> bool:
-    with blaming(reader, f"reader {reader.name!r} looked at a file"):
+    with blaming(reader.plugin, f"reader {reader.name!r} looked at a file"):
         return reader.sniff(head)
 
 
@@ -277,19 +273,14 @@ def _way_to_map(names: list[str]) -> str:
     """Return the options that read a table of another kind, if its names allow a track or a level."""
     from . import dictionary
 
-    plain = {name: dictionary.plain(name) for name in names}
-    found = {
-        what: next((name for words in forms for name in names if re.search(words, plain[name])), None)
+    fits = {
+        what: [name for words in forms for name in names if re.search(words, dictionary.plain(name))]
         for what, forms in _LIKE.items()
-    }
-    found["rss_db"] = next(iter(dictionary.like_levels(names)), None)
-    track = all(found[what] for what in ("latitude_deg", "longitude_deg", "altitude_m"))
-    if not found["time"] or not (found["rss_db"] or track):
-        lacking = [what for what in ("time", "rss_db") if not found[what]]
-        return f"a table of another kind; no column looks like {' or '.join(lacking)}"
-    place = [what for what in ("latitude_deg", "longitude_deg") if found["latitude_deg"] and found["longitude_deg"]]
-    wanted = ["time", *place, *(["altitude_m"] if place else []), "rss_db"]
-    pairs = [f"--map {found[what]!r}={what}" for what in wanted if found[what]]
+    } | {"rss_db": dictionary.like_levels(names)}
+    if not fits["time"] or not (fits["rss_db"] or all(fits[what] for what in _LIKE)):
+        lacking = " or ".join(what for what in ("time", "rss_db") if not fits[what])
+        return f"a table of another kind; no column looks like {lacking}"
+    pairs = [f"--map {named[0]!r}={what}" for what, named in fits.items() if named]
     return f"a table of another kind: name what its columns hold: {' '.join(pairs)}"
 
 

@@ -119,7 +119,7 @@ def result(
         Sound messages; each of ``damaged`` comes on top.
     damaged : list of RejectedLine
     radio : Series
-        Status of the telemetry radio: MAVLink's ``rssi``, ``remrssi``, ``noise``, ``remnoise`` in steps of the radio.
+        ``RSSI``, ``RemRSSI``, ``Noise`` and ``RemNoise`` of the telemetry radio, in its steps.
     """
     zero_ns, offset = _time.origin_ns(options, needed_by=reader), flights[0].utc_minus_clock_s
     if offset is not None:
@@ -145,12 +145,11 @@ def result(
         rows.warnings.append(f"{len(flights)} vehicles (systems {systems}): a track of its own for each")
     of = owner[timed]
     tracks = [_track(rows.part(of == i), flight, timed[owner == i]) for i, flight in enumerate(flights)]
-    at = owner == len(flights)
-    return rows.result([*tracks, *_radio(rows.part(of == len(flights)), radio, timed[at])])
+    return rows.result([*tracks, *_radio(rows.part(of == len(flights)), radio, timed[owner == len(flights)])])
 
 
 # Channels of the radio: its own receiver and that of the other end, each with its noise.
-_ENDS = {"rssi": "radio", "remrssi": "radio_remote", "noise": "radio_noise", "remnoise": "radio_remote_noise"}
+_ENDS = {"RSSI": "radio", "RemRSSI": "radio_remote", "Noise": "radio_noise", "RemNoise": "radio_remote_noise"}
 
 
 def _radio(rows: _rows.Rows, radio: Series, timed: BoolArray) -> Iterator[Stream | None]:
@@ -160,15 +159,15 @@ def _radio(rows: _rows.Rows, radio: Series, timed: BoolArray) -> Iterator[Stream
     -----
     SiK radios report steps of 1/1.9 dB from -127 dBm (ArduPilot wiki, "SiK Telemetry Radio"); 0 and 255 are unknown.
     """
+    about = {"unit": "dBm", "source": "MAVLink radio status, by SiK's scale"}
     for name, channel in _ENDS.items():
         steps = radio.columns.get(name, np.zeros(len(timed)))[timed]
-        known = (steps > 0) & (steps < 255)
-        level_dbm = steps / 1.9 - 127.0
-        if "noise" in name:
-            yield rows.stream("kpi", channel, {"value": level_dbm}, where=known, unit="dBm", quantity="noise")
-            continue
-        about = {"unit": "dBm", "quantity": "telemetry radio RSSI", "source": "MAVLink radio status, by SiK's scale"}
-        yield rows.stream("rss", channel, {"rss_db": level_dbm}, where=known, channel=channel, about=about)
+        known, level_dbm = (steps > 0) & (steps < 255), steps / 1.9 - 127.0
+        if "Noise" in name:
+            yield rows.stream("kpi", channel, {"value": level_dbm}, where=known, about={**about, "quantity": "noise"})
+        else:
+            about_level = {**about, "channel": channel, "quantity": "telemetry radio RSSI"}
+            yield rows.stream("rss", channel, {"rss_db": level_dbm}, where=known, about=about_level)
 
 
 def _track(rows: _rows.Rows, flight: Flight, timed: BoolArray) -> Stream | None:

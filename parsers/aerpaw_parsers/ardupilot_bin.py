@@ -163,10 +163,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         position=position, attitude=_named(series["ATT"]), velocity=_named(filters), fix=_named(gps),
         utc_minus_clock_s=_offset(gps), home=home, source="ArduPilot dataflash log", battery=_named(series["BAT"]),
     )  # fmt: skip
-    status = _autopilot.Series(
-        series["RAD"].time_s, series["RAD"].number, {name.lower(): v for name, v in series["RAD"].columns.items()}
-    )
-    return _autopilot.result("ardupilot_bin", options, [flight], count, damaged, status)
+    return _autopilot.result("ardupilot_bin", options, [flight], count, damaged, series["RAD"])
 
 
 def _named(series: _autopilot.Series, *names: str) -> _autopilot.Series:

@@ -50,10 +50,9 @@ def _sentences(lines: _lines.Lines, rejected: list[RejectedLine]) -> list[tuple[
     return intact
 
 
-def _day_s(clock: str) -> float | None:
+def _day_s(clock: str) -> float:
     """Return the second of the day of ``hhmmss.ss``."""
-    time = _CLOCK.fullmatch(clock)
-    return int(time[1]) * 3600 + int(time[2]) * 60 + float(time[3]) if time else None
+    return int(clock[:2]) * 3600 + int(clock[2:4]) * 60 + float(clock[4:])
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -66,30 +65,26 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     high = source[0] != "RMC"
     dates = [(i, f[8], f[0]) for i, _, kind, f in sentences if kind == "RMC" and f[1] == "A"]
     dates = dates or [(i, f[1] + f[2] + f[3], f[0]) for i, _, kind, f in sentences if kind == "ZDA"]
-    dated = [
-        (i, np.datetime64(f"20{date[3]}-{date[2]}-01") + int(date[1]) - 1, second)
-        for i, day, clock in dates
-        if (date := _DATE.fullmatch(day)) and (second := _day_s(clock)) is not None
-    ]
-    at, readings = np.array([i for i, *_ in dated]), []
+    dates = [date for date in dates if _DATE.fullmatch(date[1]) and _CLOCK.fullmatch(date[2])]
+    at, readings = np.array([i for i, *_ in dates]), []
     for i, talker, kind, fields in sentences:
         if (kind, talker) != source:
             continue
-        if (now := _day_s(fields[0])) is None:
+        if not _CLOCK.fullmatch(fields[0]):
             rejected.append(lines.reject(i, "a position without a time"))
             continue
         time = _CLOCK.sub(r"\1:\2:\3Z", fields[0])
-        if dated:
-            _, day, second = dated[max(int(np.searchsorted(at, i)) - 1, 0)]
+        if dates:
+            _, day, clock = dates[max(int(np.searchsorted(at, i)) - 1, 0)]
             # the date is of another sentence, which may lie on the other side of midnight
-            time = f"{day + round((second - now) / 86_400)}T{time}"
+            days = int(day[:2]) - 1 + round((_day_s(clock) - _day_s(fields[0])) / 86_400)
+            time = f"{np.datetime64(f'20{day[-2:]}-{day[2:4]}-01') + days}T{time}"
         latitude, north, longitude, east = fields[1:5] if high else fields[2:6]
-        cells = {
-            "time": time, "fix": _FIX.get(fields[5 if high else 1][:1], ""),
-            "latitude": latitude and f"{latitude[:2]} {latitude[2:]} {north}",
-            "longitude": longitude and f"{longitude[:3]} {longitude[3:]} {east}",
-        }  # fmt: skip
-        readings.append((i, cells | ({"satellites": fields[6], "altitude msl": fields[8]} if high else {})))
+        cells = {"time": time, "fix": _FIX.get(fields[5 if high else 1][:1], "")}
+        cells |= {"satellites": fields[6], "altitude msl": fields[8]} if high else {}
+        cells |= {"latitude": f"{latitude[:2]} {latitude[2:]} {north}"} if latitude else {}
+        cells |= {"longitude": f"{longitude[:3]} {longitude[3:]} {east}"} if longitude else {}
+        readings.append((i, cells))
     return _pose.of_readings(lines, readings, rejected, options, reader=READER.name)
 
 

@@ -23,6 +23,7 @@ from ..logs.records import COLUMNS, Stream
 from ..propagation.geometry.arrays import Link
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
+from .idle import idle_log_keys, idle_settings
 from .pose.cross_checks import doubts
 from .pose.heights import at_height, lacks_height, raised
 from .pose.hour_shift import clock_trap
@@ -420,8 +421,12 @@ def gather(
         keys = [*log.skip, *(key for key in log.cells if isinstance(key, str))]
         if unknown := [name for name in keys if name not in names]:
             warnings.append(f"{log.path}: no stream is named {', '.join(unknown)}: its streams are {', '.join(names)}")
+        warnings += idle_log_keys(log, file)
         warnings += _of_ratios(settings.link, log, file.result.streams)
         warnings += _of_carriers(settings.link, log, streams)
+    warnings += idle_settings(settings, {*(["rss"] if rss else []), *(["rank"] if rank else [])})
+    if settings.rank.tower not in {RankSettings().tower, *(series.tower for _, series in rank)}:
+        warnings.append("rank.tower has no effect: no log has ranks without its own 'node'")
     if rank and settings.link.rank.bandwidth_hz is None:
         warnings.append(
             "link.rank: no bandwidth_hz: ranks count as in coverage down to the thermal noise of 1 Hz (-174 dBm)"

@@ -67,6 +67,8 @@ class AntennaSettings(StrictModel):
     def _file_where_needed(self) -> AntennaSettings:
         if (self.file is None) != (self.model not in ("file", "gain_grid", "sphere")):
             raise ValueError("'file' belongs to model 'file', 'gain_grid' or 'sphere', and only there")
+        if self.variable is not None and self.model != "gain_grid":
+            raise ValueError("'variable' belongs to model 'gain_grid'")
         if self.elevation is not None and self.model != "file":
             raise ValueError("'elevation' belongs to model 'file', beside an azimuth cut")
         return self
@@ -82,13 +84,21 @@ class ArraySettings(StrictModel):
     """
 
     layout: Literal["single", "linear", "tower_comparison", "uav_comparison", "custom"] = "single"
-    elements: Annotated[int, Field(ge=1, le=64)] = 4
+    elements: Annotated[int, Field(ge=1, le=64)] | None = None
+    """Number of elements of layout ``linear``; 4 by default."""
     positions_m: Annotated[list[tuple[float, float, float]], Field(max_length=64)] | None = None
     antenna: AntennaSettings = AntennaSettings()
     slant_deg: float | list[float] = 0.0
     yaw_deg: float = 0.0
     pitch_deg: float = 0.0
     roll_deg: float = 0.0
+
+    @model_validator(mode="after")
+    def _of_its_layout(self) -> ArraySettings:
+        for key, layout in (("elements", "linear"), ("positions_m", "custom")):
+            if getattr(self, key) is not None and self.layout != layout:
+                raise ValueError(f"'{key}' belongs to layout '{layout}', and this is '{self.layout}'")
+        return self
 
     def positions(self, wavelength: float) -> FloatArray:
         """Element positions (elements, 3) in the device frame [m]."""
@@ -100,7 +110,7 @@ class ArraySettings(StrictModel):
             return uav_comparison_array(wavelength).positions_m
         if self.layout == "tower_comparison":
             return tower_comparison_array().positions_m
-        return linear_array(1 if self.layout == "single" else self.elements, wavelength / 2).positions_m
+        return linear_array(1 if self.layout == "single" else self.elements or 4, wavelength / 2).positions_m
 
     def build(self, wavelength: float, folder: Path) -> Array:
         """The array, with patterns loaded from files relative to ``folder``."""

@@ -300,6 +300,7 @@ class FlightSimulator:
         self.start_utc = start.tz_convert("UTC").tz_localize(None)
         self.truth_: dict[str, Any] = {"flight": self.settings.flight.name, "synthetic": True, "rss": {}, "rank": {}}
         self._check_names(out)
+        self._check_plan()
         writers = {log.path: self._writer(log) for log in self.settings.logs}
         stages = stages or Stages()
         with OutputFolder(out, job="simulate", inputs=inputs, force=force) as output:
@@ -336,6 +337,19 @@ class FlightSimulator:
             inside(out, name, out / FLIGHT, error=UsageError)
             if names.count(name) > 1 or name in (_TRUTH, FLIGHT, SUMS):
                 raise UsageError(f"two files of this flight are named {name!r}", expected="a name of its own for each")
+
+    def _check_plan(self) -> None:
+        """UsageError for offsets and clock shifts of logs that are not simulated."""
+        links = [f"{log.node}.{log.channel}" for log in self.settings.logs if log.node and log.channel]
+        towers = [log.node for log in self.settings.logs if log.node]
+        asked = {f"{tower}.{channel}": links for tower, each in self.plan.offsets_db.items() for channel in each}
+        for name, valid in {**asked, **dict.fromkeys(self.plan.clock_shift_s, towers)}.items():
+            if name not in valid:
+                key = "clock_shift_s" if valid is towers else "offsets_db"
+                raise UsageError(
+                    f"flight.plan.{key}: no log is of {name!r}",
+                    expected="one of " + ", ".join(dict.fromkeys(valid)),
+                )
 
     def _writer(self, log: LogSettings) -> Callable[[], bytes]:
         """Function that computes a log; UsageError for one that cannot be."""

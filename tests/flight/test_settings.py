@@ -25,7 +25,10 @@ POSITIVE = {
 LIMITS: dict[str, tuple[list[Any], list[Any]]] = {
     **{f"{part}.{key}": ([TINY], [0.0]) for part, keys in POSITIVE.items() for key in keys.split()},
     **dict.fromkeys(("flight.plan.fading_db", "rt.reflection_loss_db"), ([0.0], [-TINY])),
-    "link.rss.uav.elements": ([1, 64], [0, 65]),
+    "link.rss.uav": (
+        [{"layout": "linear", "elements": n} for n in (1, 64)],
+        [{"layout": "linear", "elements": n} for n in (0, 65)] + [{"elements": 4}, {"positions_m": [[0, 0, 0]]}],
+    ),
     **dict.fromkeys(("logs.frequency_hz", "link.rss.carrier_hz"), ([1e6, 1e12], [3.3, 3300.0, 3.3e12])),
     "logs.height_m": ([-1000, 20_000], [-1000.1, 20_000.1]),
     "flight.plan.waypoints": ([[POINT, POINT]], [[POINT]]),

@@ -13,7 +13,11 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.flight import simulate
+from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import FlightSimulator, correlated_noise, plan_trajectory, telemetry_frame
+from aerpaw_cmp.site.siteyaml import load_site
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs"
 
 POINTS = [(0, 0, 2, 3), (30, 40, 2, 0), (30, 40, 22, 0), (30, 40, 22, 4), (33, 44, 42, 0)]  # east, north, height, hold
 
@@ -144,3 +148,16 @@ logs:
   - {path: a.txt, reader: sounder_log, node: LW1, channel: A}
   - {path: b.csv, reader: quectel_ri, node: LW1}
 """
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "name"),
+    [("offsets_db", {"LW1": {"USRP9": 3.0}}, "LW1.USRP9"), ("clock_shift_s", {"LW9": 1.0}, "LW9")],
+)
+def test_a_plan_for_a_log_that_is_not_simulated_is_refused(tmp_path: Path, key: str, value: dict, name: str) -> None:
+    settings = load_flight(SAMPLE / "flight.yaml")
+    assert settings.flight.plan is not None
+    plan = settings.flight.plan.model_copy(update={key: value})
+    changed = settings.model_copy(update={"flight": settings.flight.model_copy(update={"plan": plan})})
+    with pytest.raises(UsageError, match=rf"flight.plan.{key}: no log is of '{name}'"):
+        FlightSimulator(changed, load_site("lake_wheeler"), SAMPLE).run(tmp_path / "out")

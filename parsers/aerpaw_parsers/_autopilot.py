@@ -220,12 +220,13 @@ def _height(rows: _rows.Rows, flight: Flight, time_s: FloatArray, values: dict[s
     known = np.flatnonzero(np.isfinite(altitude))
     if not len(known):
         return altitude
-    home = np.isfinite(flight.home.columns.get("altitude_m", flight.home.time_s))
+    columns, unknown = flight.home.columns, np.full(len(flight.home.time_s), np.nan)
+    home = np.isfinite(columns.get("altitude_m", unknown))
     if not home.any():
         rest = _pose.at_rest(rows.time[known], *(values[name][known] for name in _pose.PLACE))
         rows.warnings.append(f"no home is known: heights count from {'the first position' if rest is None else 'rest'}")
         return altitude - float(altitude[known[0]] if rest is None else rest)
-    home_m = flight.home.columns["altitude_m"][home]
+    home_m = columns["altitude_m"][home]
     return _pose.above_home(rows, time_s, altitude, flight.home.time_s[home], home_m)
 
 

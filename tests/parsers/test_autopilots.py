@@ -25,6 +25,16 @@ def test_damage_costs_a_message_and_not_the_log() -> None:
     assert len(by_name("ardupilot_bin").read(hole, ReadOptions()).rejected) >= 1
 
 
+def test_a_home_without_an_altitude_is_no_home() -> None:
+    """Its message is there, and the field of its altitude has another name."""
+    nameless = LOGS["px4_ulog"].replace(
+        b"home_position:uint64_t timestamp;float alt;", b"home_position:uint64_t timestamp;float alx;"
+    )
+    result = by_name("px4_ulog").read(nameless, ReadOptions())
+    assert result.accepted == COUNT
+    assert any("no home is known" in text for text in result.warnings)
+
+
 def test_without_utc_the_times_are_relative() -> None:
     silent = LOGS["px4_ulog"].replace(b"time_utc_usec", b"time_xxx_usec")
     result = by_name("px4_ulog").read(silent, ReadOptions())

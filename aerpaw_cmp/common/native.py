@@ -32,7 +32,7 @@ _MOST_ITEMS = 100_000
 _MOST_MEMORY = 4 << 30
 SECONDS = 60
 _REFUSED = 3
-_NAMES = {"hdf5": "HDF5", "matlab": "MATLAB 7.3", "geotiff": "GeoTIFF"}
+_NAMES = {"hdf5": "HDF5", "matlab": "MATLAB 7.3", "netcdf": "NetCDF-4", "geotiff": "GeoTIFF"}
 
 _CHILD = "import sys; sys.path[:] = sys.argv[2:]; from aerpaw_cmp.common.native import main; main(sys.argv[1])"
 
@@ -44,7 +44,8 @@ def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     ----------
     kind : str
         ``hdf5`` (numeric data sets by their path; notes: ``attributes`` of the root, ``classes`` of MATLAB variables),
-        ``matlab`` (the same of the root group alone) or ``geotiff`` (``band``; notes: ``transform crs unit``).
+        ``matlab`` (the same of the root group alone), ``netcdf`` (those and texts; notes: also ``dims`` and ``units``
+        by variable) or ``geotiff`` (``band``; notes: ``transform crs unit``).
     data : bytes
         The file.
 
@@ -134,7 +135,7 @@ def give_up_rights() -> None:
 Read = Callable[[bytes], tuple[dict[str, AnyArray], dict[str, Any]]]
 
 
-def _hdf5(depth: int) -> Read:
+def _hdf5(depth: int, netcdf: bool = False) -> Read:
     """The reader of HDF5 files, with all loaded that it needs."""
     import encodings.ascii
     import encodings.latin_1
@@ -144,7 +145,7 @@ def _hdf5(depth: int) -> Read:
 
     def read(data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
         with h5py.File(h5py.h5f.open_file_image(data)) as book:
-            items = _Items(book, depth)
+            items = _Items(book, depth, "fiubSO" if netcdf else "fiub")
             most = min(MOST_BYTES, MOST_RATIO * len(data) + FREE_BYTES)
             total = sum(item.nbytes for item in items.data_sets.values())
             if total > most:
@@ -156,11 +157,20 @@ def _hdf5(depth: int) -> Read:
             classes = {name: _text(item.attrs.get("MATLAB_class", b"")) for name, item in items.data_sets.items()}
             attributes = {name: _text(value) for name, value in book.attrs.items() if np.ndim(value) == 0}
             notes = {"attributes": attributes, "classes": {name: word for name, word in classes.items() if word}}
-            return {name: np.asarray(item[()]) for name, item in items.data_sets.items()}, notes
+            if netcdf:
+                notes["dims"] = {name: _dimensions(item) for name, item in items.data_sets.items()}
+                units = {name: _text(item.attrs.get("units", b"")) for name, item in items.data_sets.items()}
+                notes["units"] = {name: unit for name, unit in units.items() if unit}
+            return {name: _plain(np.asarray(item[()])) for name, item in items.data_sets.items()}, notes
 
     with h5py.File("warm", "w", driver="core", backing_store=False) as book:
         book.create_dataset("x", data=np.arange(300.0), compression="gzip", shuffle=True)
         book["y"] = np.ones(3, dtype=np.bool_)
+        if netcdf:
+            book["words"] = np.array(["a", "b"], dtype=h5py.string_dtype())
+            book["x"].make_scale("x")
+            book["z"] = np.zeros(300)
+            book["z"].dims[0].attach_scale(book["x"])
         for name, value in (("version", 1), ("text", "a"), ("MATLAB_class", np.bytes_(b"double"))):
             book["x"].attrs[name] = book.attrs[name] = value
         book.flush()
@@ -168,6 +178,25 @@ def _hdf5(depth: int) -> Read:
     # loads zipfile, which answer() needs when nothing can be opened any more
     np.savez(io.BytesIO(), np.zeros(1))
     return read
+
+
+def _dimensions(item: Any) -> list[str]:
+    """Return the names of the dimensions of a NetCDF variable; a dimension's own variable has its own name."""
+    own = item.name.lstrip("/")
+    return [next((scale.name.lstrip("/") for scale in dimension.values()), own) for dimension in item.dims]
+
+
+def _plain(values: AnyArray) -> AnyArray:
+    """Return an array that needs no pickle: rows of characters and texts become arrays of text."""
+    if values.dtype.kind == "S" and values.dtype.itemsize == 1 and values.ndim:
+        joined = [
+            b"".join(row).decode("utf-8", "replace").rstrip("\0 ") for row in values.reshape(-1, values.shape[-1])
+        ]
+        return np.array(joined, dtype=np.str_).reshape(values.shape[:-1])
+    if values.dtype.kind in "SO":
+        words = [v.decode("utf-8", "replace") if isinstance(v, bytes) else str(v) for v in values.ravel()]
+        return np.array(words, dtype=np.str_).reshape(values.shape)
+    return values
 
 
 def _text(value: Any) -> str | int:
@@ -179,10 +208,11 @@ def _text(value: Any) -> str | int:
 class _Items:
     """Numeric data sets below a group by their path, none of which lies outside of the file."""
 
-    def __init__(self, book: Any, depth: int) -> None:
+    def __init__(self, book: Any, depth: int, kinds: str = "fiub") -> None:
         import h5py
 
         self._h5py = h5py
+        self._kinds = kinds
         self._seen: set[Any] = set()
         self.data_sets: dict[str, Any] = {}
         self._walk(book, "", depth)
@@ -209,7 +239,7 @@ class _Items:
     def _take(self, place: str, item: Any) -> None:
         if item.is_virtual or item.external:
             raise _lies_elsewhere(f"the data of {place!r} lie in other files")
-        if item.dtype.kind in "fiub":
+        if item.dtype.kind in self._kinds:
             self.data_sets[place] = item
 
 
@@ -254,5 +284,6 @@ def _geotiff() -> Read:
 READERS: dict[str, Callable[[], Read]] = {
     "hdf5": lambda: _hdf5(32),
     "matlab": lambda: _hdf5(1),
+    "netcdf": lambda: _hdf5(1, netcdf=True),
     "geotiff": _geotiff,
 }

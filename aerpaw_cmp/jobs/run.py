@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Sequence
 from contextlib import ExitStack
@@ -14,6 +15,7 @@ from ..common.counting import counted
 from ..common.errors import UsageError, noting_interrupts
 from ..common.files import cache_folder
 from ..common.inputs import input_files
+from ..common.jsonable import json_safe
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import PlannedStage, Stages
 from .tasks.options import DEFAULT, JobOutcome, RunOptions
@@ -183,8 +185,10 @@ class ReportOptions:
         Where the flight file with the settings of the recommended model is written.
     learned : path, optional
         calibrated.yaml whose antennas, ground and receiver take the place of those of the flight file.
-    against : path, optional
-        Output folder of ``predict``: what it said of this flight is scored.
+    against : sequence of path
+        Predictions of this flight that are scored: output folders of ``predict``, or files of other programs.
+    against_distance_m : float
+        Largest distance between a sample and its predicted position, for other programs.
     figures : {"none", "svg", "png", "pdf", "all"}
         Figures drawn as files: none, or every one in one format or in all.
     style : {"screen", "paper"}
@@ -195,7 +199,8 @@ class ReportOptions:
     audit: str | None = None
     recommend: Path | None = None
     learned: Path | str | None = None
-    against: Path | str | None = None
+    against: Sequence[Path] = ()
+    against_distance_m: float = 5.0
     figures: str = "none"
     style: str = "screen"
     export: Sequence[str] = ()
@@ -239,10 +244,15 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
         with stages("read"):
             data = load_data(settings, flight.parent, options.logs_root)
             before = None
-            if chosen.against is not None:
+            if own := [path for path in chosen.against if (path / "prediction.csv").is_file()]:
                 from .prediction.against import score_against  # loads what calibration and prediction need
 
-                before = score_against(data, Path(chosen.against))
+                before = score_against(data, own[0])
+            given = []
+            if chosen.against:
+                from .prediction.foreign import read_foreign
+
+                given = [read_foreign(path, data) for path in chosen.against]
         if chosen.recommend is not None:
             check_recommended(data)
         stages.checked(lambda: report_stages(data, chosen.figures))
@@ -259,6 +269,14 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
         if before is not None:
             extra = {**record.extra_metrics, "against": before.metrics()}
             record = replace(record, against=before, extra_metrics=extra)
+        cards: list[dict[str, Any]] = []
+        if given:
+            from .prediction.referee import judged
+
+            with stages("score predictions"):
+                verdicts = judged(data, flight_run.result, given, chosen.against_distance_m)
+            cards = [json_safe(verdict.metrics()) for verdict in verdicts]
+            record = replace(record, extra_metrics={**record.extra_metrics, "referee": cards})
         if target is not None:
             text, sentence = recommended_text(load_flight(flight), flight_run.ladder, flight)
             target.write(sealed(text))
@@ -267,6 +285,9 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             written = write_report(
                 record, place, drawn=chosen.figures, style=chosen.style, exports=formats, stages=stages
             )
+            if cards:
+                text = json.dumps(cards, indent=1, ensure_ascii=False)
+                (place / "card.json").write_text(text + "\n", encoding="utf-8")
     metrics = metrics_of(written.data)
     return JobOutcome(folder=folder, metrics=metrics, failed_checks=_failed_checks(metrics))
 
@@ -298,7 +319,9 @@ def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> 
 
     learned = None if chosen.learned is None else Path(chosen.learned)
     settings = _with_audit(load_with_learned(flight, learned), chosen.audit)
-    inputs = [*inputs_of_flight(settings, flight, options.logs_root), *([] if learned is None else [learned])]
+    inputs = [
+        *inputs_of_flight(settings, flight, options.logs_root), *([] if learned is None else [learned]), *chosen.against
+    ]  # fmt: skip
     return settings, inputs, options.out or Path("reports") / settings.flight.name
 
 

@@ -24,6 +24,7 @@ from ..shown import answered, number, print_files, records, say, show, table, wa
         "aerpaw-cmp report flight.yaml --export kmz",
         "aerpaw-cmp report flight.yaml --with calibrated.yaml",
         "aerpaw-cmp report flight.yaml --against prediction",
+        "aerpaw-cmp report flight.yaml --against matlab.csv --against sionna_map.npz",
         "aerpaw-cmp report flight.yaml --strict --json --quiet",
     ],
 )
@@ -42,9 +43,17 @@ def report(
         Option("--with", metavar="CALIBRATED", help="calibrated.yaml with antennas, ground and receiver."),
     ] = None,
     against: Annotated[
-        Path | None,
-        Option("--against", metavar="PREDICTION", help="Score what 'predict' said of this flight (its folder)."),
+        list[Path] | None,
+        Option(
+            "--against",
+            metavar="PREDICTION",
+            help="Score a prediction of this flight; repeatable: a folder of 'predict', or CSV, NetCDF, .npz or logs "
+            "of another program.",
+        ),
     ] = None,
+    against_distance: Annotated[
+        float, Option(min=0.01, help="Largest distance from a sample to a predicted position [m].")
+    ] = 5.0,
     strict: Annotated[bool, Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
         Literal["none", "svg", "png", "pdf", "all"],
@@ -64,7 +73,8 @@ def report(
         audit=audit,
         recommend=recommend,
         learned=learned,
-        against=against,
+        against=tuple(against or ()),
+        against_distance_m=against_distance,
         figures=figures,
         style=style,
         export=export or (),
@@ -74,6 +84,28 @@ def report(
     if not answered(outcome.metrics):
         _print_report_summary(outcome)
     return max(_verdict(outcome, strict), _nothing_compared(outcome.metrics))
+
+
+def _print_cards(verdict: Mapping[str, Any]) -> None:
+    """Print the sentence and the small table of one prediction of another program."""
+    show(verdict["sentence"])
+    columns = {
+        "model": "model", "channels": "channels", "bias dB": "bias_db:.1f", "RMSE dB": "rmse_db:.2f",
+        "after offset": "rmse_offset_db:.2f", "1 s": "rmse_1s_db:.2f", "CRPS dB": "crps_db:.2f",
+        "inside 90 %": "coverage_90:.0%",
+    }  # fmt: skip
+    title = f"{verdict['prediction']} and other models on the same samples, means over channels (each in card.json)"
+    records(verdict["means"], columns, title)
+    if verdict["program"] == "emulated flight":
+        nodes = [
+            {"series": f"{tower} {channel}", "floor_db": entry["floor_db"], **entry["cards"][verdict["prediction"]]}
+            for tower, channels in verdict["levels"].items()
+            for channel, entry in channels.items()
+        ]
+        columns = {"series": "series", "offset dB": "offset_db:.1f", "slope": "slope:.2f", "floor dB": "floor_db:.1f"}
+        records(nodes, columns, "The emulator: offset (added to the measurement), slope, detection floor")
+    for remark in verdict["remarks"]:
+        say.warn(remark)
 
 
 def _nothing_compared(metrics: Mapping[str, Any]) -> int:
@@ -151,6 +183,8 @@ def _print_report_summary(outcome: Any) -> None:
     records(thresholds, {**columns, "n": "n"}, "Rank, measured against replayed")
     _print_forecasts(outcome.metrics["rank"])
     show(" ".join([outcome.metrics["sentence"], *outcome.metrics["offsets"]]))
+    for verdict in outcome.metrics.get("referee", []):
+        _print_cards(verdict)
     if "against" in outcome.metrics:
         show(outcome.metrics["against"]["sentence"])
     for text in outcome.metrics["antennas"]:

@@ -1,0 +1,74 @@
+"""The metric card against closed forms."""
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.referee import PredictedLevel, detection_floor_db, level_card, measured_thresholds
+
+N = 4000
+
+
+def series(seed: int = 3) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    time = np.arange(N) * 10.0  # farther apart than the window of means
+    level = rng.normal(-80.0, 6.0, N)
+    return time, level + rng.normal(0.0, 2.0, N), level
+
+
+def test_card_of_a_shifted_prediction_with_a_true_band() -> None:
+    time, measured, level = series()
+    card = level_card(
+        time, measured, PredictedLevel(level_db=level - 5.0, sd_db=np.full(N, np.hypot(2.0, 5.0))), (-80.0,)
+    )
+    error = measured - level + 5.0
+    assert card.bias_db == pytest.approx(error.mean(), abs=1e-9)
+    assert card.rmse_db == pytest.approx(np.sqrt(np.mean(error**2)), abs=1e-9)
+    assert card.offset_db == pytest.approx(-5.0, abs=0.1)
+    assert card.rmse_offset_db == pytest.approx(2.0, abs=0.1)
+    assert card.rmse_1s_db == pytest.approx(card.rmse_offset_db, abs=1e-6)  # one sample per window
+    assert card.correlation == pytest.approx(6.0 / np.hypot(6.0, 2.0), abs=0.01)
+    assert card.slope == pytest.approx(1.0, abs=0.03)
+    (share,) = card.exceedance
+    assert share.measured == pytest.approx(0.5, abs=0.03)
+    assert share.predicted == pytest.approx(0.5 - 0.298, abs=0.03)  # 5 / 6 of a standard deviation: Phi(0.833) = 0.798
+
+
+def test_crps_and_coverage_of_a_calibrated_normal_band() -> None:
+    time, measured, level = series()
+    card = level_card(time, measured, PredictedLevel(level_db=level, sd_db=np.full(N, 2.0)), ())
+    assert card.crps_db == pytest.approx(2.0 / np.sqrt(np.pi), rel=0.03)  # expected CRPS of N(0, sd) is sd / sqrt(pi)
+    assert card.coverage_90 == pytest.approx(0.9, abs=0.015)
+    band = PredictedLevel(level_db=level, low_db=level - 1.0, high_db=level + 1.0)
+    assert level_card(time, measured, band, ()).coverage_90 == pytest.approx(0.383, abs=0.02)  # half a sd
+
+
+def test_relative_levels_have_no_bias_and_exceed_after_the_offset() -> None:
+    time, measured, level = series()
+    card = level_card(time, measured, PredictedLevel(level_db=level + 140.0, absolute=False), (-80.0,))
+    assert (card.bias_db, card.rmse_db, card.crps_db, card.coverage_90) == (None, None, None, None)
+    assert card.rmse_offset_db == pytest.approx(2.0, abs=0.1)
+    assert card.exceedance[0].predicted == pytest.approx(0.5, abs=0.03)
+
+
+def test_outages_on_either_side_are_counted_and_lie_below_any_threshold() -> None:
+    time, measured, level = series()
+    measured[:100], level[50:300] = np.nan, np.nan
+    asked = np.ones(N)
+    card = level_card(time, measured, PredictedLevel(level_db=level, asked=asked), (-200.0,))
+    assert (card.outages_missed, card.outages_invented, card.n) == (50, 200, N - 300)
+    assert card.exceedance[0].measured == pytest.approx(1.0 - 100 / N)
+    assert card.exceedance[0].predicted == pytest.approx(1.0 - 250 / N)
+
+
+def test_floor_is_the_lowest_level_if_it_is_repeated() -> None:
+    level = np.linspace(-120.0, -60.0, 600)
+    assert detection_floor_db(level) is None
+    assert detection_floor_db(np.maximum(level, -110.0)) == -110.0
+    assert detection_floor_db(np.full(50, -90.0)) is None
+    assert detection_floor_db(np.full(3, np.nan)) is None
+
+
+def test_thresholds_are_those_of_an_snr_or_measured_deciles() -> None:
+    assert measured_thresholds(np.array([1.0]), ratio=True) == (0.0, 10.0, 20.0)
+    assert measured_thresholds(np.linspace(-100.0, 0.0, 101), ratio=False) == (-90.0, -50.0, -10.0)
+    assert measured_thresholds(np.array([np.nan]), ratio=False) == ()

@@ -1,0 +1,187 @@
+"""Predictions of other programs, scored on the sample flight as ours is."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from aerpaw_cmp.__main__ import main
+
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with the sample flight and the table of its report."""
+    place = tmp_path_factory.mktemp("flight")
+    assert main(["sample", "-o", str(place / "s"), "-q"]) == 0
+    plan = yaml.safe_load((place / "s" / "flight.yaml").read_text())
+    # two towers and no ranks: each report takes a third of the time
+    plan["logs"] = [
+        log for log in plan["logs"] if log.get("node") in ("LW1", "LW3", None) and "modem" not in log["path"]
+    ]
+    (place / "s" / "flight.yaml").write_text(yaml.safe_dump(plan))
+    words = ["report", str(place / "s" / "flight.yaml"), "-o", str(place / "r"), "--audit", "none", "-q"]
+    assert main(words) == 0
+    table = pd.read_csv(place / "r" / "rss.csv")
+    table[table["tower"].isin(["LW1", "LW3"])].to_csv(place / "rss.csv", index=False)
+    return place
+
+
+def ours(flight: Path) -> pd.DataFrame:
+    return pd.read_csv(flight / "rss.csv")
+
+
+def scored(flight: Path, *files: Path, near: str = "5") -> list[dict]:
+    out = flight / "out"
+    words = ["report", str(flight / "s" / "flight.yaml"), "-o", str(out), "--audit", "none", "-q", "--force"]
+    assert main([*words, "--against-distance", near, *(w for file in files for w in ("--against", str(file)))]) == 0
+    cards = json.loads((out / "card.json").read_text())
+    assert json.loads((out / "metrics.json").read_text())["referee"] == cards
+    return cards
+
+
+def refused(flight: Path, file: Path, capsys: pytest.CaptureFixture[str]) -> str:
+    capsys.readouterr()
+    words = ["report", str(flight / "s" / "flight.yaml"), "-o", str(flight / "no"), "--audit", "none", "-q", "--force"]
+    assert main([*words, "--against", str(file)]) == 3
+    assert not (flight / "no").exists()
+    return " ".join(capsys.readouterr().err.split())
+
+
+def test_a_copy_of_our_levels_in_three_formats_scores_as_ours_do(flight: Path) -> None:
+    table = ours(flight)
+    by_time = table[["time_utc", "tower", "channel"]].assign(level_dbm=table["simulated_dbm"])
+    by_time.to_csv(flight / "matlab.csv", index=False)
+    place = table[["east_m", "north_m", "up_m", "tower"]].rename(columns={"up_m": "height_m"})
+    loss = place.assign(path_loss_db=30.0 - table["simulated_dbm"]).dropna()
+    loss.drop_duplicates(["east_m", "north_m", "height_m", "tower"]).to_csv(flight / "loss.csv", index=False)
+    xarray = pytest.importorskip("xarray")
+    wide = by_time[by_time["channel"] == "USRP1"].pivot(index="time_utc", columns="tower", values="level_dbm")
+    times = pd.to_datetime(wide.index.to_numpy()).tz_localize(None)
+    xarray.Dataset(
+        {"level_dbm": (("time", "tower"), wide.to_numpy())}, coords={"time": times, "tower": list(wide.columns)}
+    ).to_netcdf(flight / "python.nc")
+    cards = scored(flight, flight / "matlab.csv", flight / "loss.csv", flight / "python.nc", near="0.01")
+    assert [card["prediction"] for card in cards] == ["matlab.csv", "loss.csv", "python.nc"]
+    for card in cards:
+        assert set(card["levels"]) == {"LW1", "LW3"}
+        for channels in card["levels"].values():
+            for entry in channels.values():
+                theirs, mine = entry["cards"][card["prediction"]], entry["cards"]["ray tracing (this report)"]
+                assert theirs["n"] > 300
+                assert theirs["rmse_offset_db"] == pytest.approx(mine["rmse_offset_db"], abs=0.15)
+                assert entry["differences"]["ray tracing (this report)"]["verdict"] != "worse"
+    assert cards[0]["fitted_on_this_flight"] == ["the offset of each model and channel"]
+
+
+def test_noise_is_significantly_worse_and_its_band_covers(flight: Path) -> None:
+    table = ours(flight)
+    rng = np.random.default_rng(5)
+    frame = table[["time_utc", "tower", "channel"]].assign(
+        level_db=table["measured_db"] + rng.normal(0.0, 8.0, len(table)), sd_db=8.0
+    )
+    frame.to_csv(flight / "noisy.csv", index=False)
+    (card,) = scored(flight, flight / "noisy.csv")
+    entry = card["levels"]["LW1"]["USRP1"]
+    score = entry["cards"]["noisy.csv"]
+    assert score["rmse_db"] == pytest.approx(8.0, abs=0.8)
+    assert score["coverage_90"] == pytest.approx(0.9, abs=0.04)
+    assert score["crps_db"] == pytest.approx(8.0 / np.sqrt(np.pi), rel=0.12)
+    assert entry["differences"]["ray tracing (this report)"]["verdict"] == "worse"
+    assert "significantly worse" in card["sentence"]
+
+
+def test_half_a_route_is_counted_as_unmatched(flight: Path) -> None:
+    table = ours(flight)
+    first = table.query("tower == 'LW1' and channel == 'USRP1'")
+    half = first.iloc[: len(first) // 2]
+    half[["time_utc", "tower"]].assign(level_dbm=half["simulated_dbm"]).drop_duplicates("time_utc").to_csv(
+        flight / "half.csv", index=False
+    )
+    (card,) = scored(flight, flight / "half.csv")
+    entry = card["levels"]["LW1"]["USRP1"]
+    assert entry["unmatched"] > 0.2 * entry["matched"]
+    assert any("are not scored" in remark for remark in card["remarks"])
+
+
+def test_a_radio_map_of_sionna_is_matched_by_position(flight: Path) -> None:
+    east, north = np.meshgrid(np.arange(-300.0, 301.0, 5.0), np.arange(-300.0, 301.0, 5.0))
+    centre = np.stack([east, north, np.full_like(east, 30.0)], axis=-1)
+    gain = 1e-4 / (1.0 + east**2 + north**2)
+    np.savez(flight / "map.npz", path_gain=gain[None], cell_centers=centre, tx_names=np.array(["LW1"]))
+    (card,) = scored(flight, flight / "map.npz", near="12")
+    assert card["levels"]["LW1"]["USRP1"]["cards"]["map.npz"]["bias_db"] is None
+    assert card["levels"]["LW1"]["USRP1"]["matched"] >= 20
+
+
+def test_a_twin_folder_states_offset_slope_and_floor(flight: Path) -> None:
+    table = ours(flight)
+    emulated = table[table["channel"] == "USRP1"].copy()
+    level = np.maximum(0.5 * emulated["simulated_dbm"] - 10.0, -45.0)
+    frame = emulated[["east_m", "north_m", "up_m", "tower"]].rename(columns={"up_m": "height_m"}).assign(level_db=level)
+    frame.drop_duplicates(["east_m", "north_m", "height_m", "tower"]).to_csv(flight / "twin.csv", index=False)
+    (card,) = scored(flight, flight / "twin.csv")
+    entry = card["levels"]["LW3"]["USRP1"]
+    assert entry["floor_db"] == -45.0
+    assert card["levels"]["LW1"]["USRP1"]["cards"]["twin.csv"]["slope"] > 1.5
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda f: f.assign(tower="BS1"), "towers BS1; expected towers of the flight: LW1"),
+        (lambda f: f.rename(columns={"level_dbm": "rss"}), "the unit of 'rss' is not in its name"),
+        (lambda f: f.assign(level_dbm=10 ** (f["level_dbm"] / 10)), "watts or milliwatts"),
+        (lambda f: f.assign(time_utc=f["time_utc"].str.replace("T14", "T18")), "another time zone, +4 h"),
+        (lambda f: f.rename(columns={"time_utc": "time"}).assign(time="2025-06-01 14:00:00"), "times without a zone"),
+        (lambda f: pd.concat([f, f.assign(level_dbm=-50.0)]), "with another level at the same place"),
+        (lambda f: f.drop(columns="tower"), "no column tower"),
+        (lambda f: f.drop(columns="time_utc"), "without a time and without a position"),
+        (
+            lambda f: f.drop(columns="time_utc").assign(latitude_deg=-78.696, longitude_deg=35.7275, height_m=30.0),
+            "latitude and longitude are swapped",
+        ),
+        (
+            lambda f: f.drop(columns="time_utc").assign(east_m=708000.0, north_m=3955000.0, height_m=30.0),
+            "map coordinates (UTM)",
+        ),
+        (lambda f: f.rename(columns={"level_dbm": "path_loss_db"}), "a path gain; its negative is the loss"),
+    ],
+)  # fmt: skip
+def test_a_prediction_that_cannot_be_scored_is_one_message(
+    change, words: str, flight: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    table = ours(flight).query("channel == 'USRP1' and tower == 'LW1'")
+    frame = table[["time_utc", "tower"]].assign(level_dbm=table["simulated_dbm"])
+    change(frame).to_csv(flight / "bad.csv", index=False)
+    assert words in refused(flight, flight / "bad.csv", capsys)
+
+
+def test_damaged_files_are_one_message(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    for name, content in (
+        ("empty.csv", b""), ("cut.nc", b"\x89HDF\r\n\x1a\n" + b"\0" * 60), ("old.nc", b"CDF\x01" + b"\0" * 60),
+        ("zip.npz", b"PK\x03\x04" + b"\0" * 30), ("words.csv", b"\xff\xfe\0\0"),
+    ):  # fmt: skip
+        (flight / name).write_bytes(content)
+        assert name in refused(flight, flight / name, capsys)
+    assert "gone.csv" in refused(flight, flight / "gone.csv", capsys)
+
+
+def test_the_logs_of_an_emulated_flight_are_a_prediction(flight: Path) -> None:
+    """The twin is the sample flown again by the simulator: its noise differs, its offsets and floors do not."""
+    twin, plan = flight / "twin", flight / "s" / "twin.yaml"
+    plan.write_text((flight / "s" / "flight.yaml").read_text().replace("seed: 7", "seed: 8"))
+    assert main(["simulate", str(plan), "-o", str(twin), "-q"]) == 0
+    (card,) = scored(flight, twin)
+    assert card["program"] == "emulated flight"
+    entry = card["levels"]["LW1"]["USRP1"]
+    assert entry["cards"]["twin"]["slope"] == pytest.approx(1.0, abs=0.15)
+    assert entry["cards"]["twin"]["n"] > 300
+
+
+def test_the_folder_of_the_flight_itself_is_no_prediction(flight: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert "logs of the scored flight itself" in refused(flight, flight / "s", capsys)

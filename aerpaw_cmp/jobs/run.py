@@ -652,12 +652,12 @@ def run_calibrate(
         if settings.rank:
             with stages("rank"):
                 ranked = fit_rank(reports)
-        calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked)
+        command = f"aerpaw-cmp calibrate {path.name}" + (f" --into-site {into_site}" if into_site is not None else "")
+        calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked, command)
         with output.filling() as place:
             metrics, text = write_files(calibrated, place, folder.name, stages.seconds)
         file.write(sealed(text))
     if into_site is not None:
-        command = f"aerpaw-cmp calibrate {path.name} --into-site {into_site}"
-        entry, tables = site_entry(calibrated, command)
+        entry, tables = site_entry(calibrated)
         metrics["into_site"] = [str(f) for f in remember(into_site, settings.calibration, entry, tables)]
     return JobOutcome(folder=folder, metrics=metrics, files=(target,))

@@ -580,7 +580,7 @@ def run_campaign(
 
 def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
     """A file per failed task in ``failures/``: its message, and where in the program it came from."""
-    from ..report.page import safe_name
+    from ..report.texts import safe_name
 
     for failure in failures:
         if failure.traceback:

@@ -27,7 +27,8 @@ from ...flight.data import FlightData, RssSeries, quantity_of
 from ...flight.training import flight_logs, marks_of
 from ...logs.records import has_wall_clock
 from ...report.calibration import AntennaMap, CalibrationData, calibration_metrics, write_calibration
-from ...report.page import safe_name, write_file
+from ...report.page import write_file
+from ...report.texts import safe_name
 from ...site.antenna.known_directions import KnownDirections
 from ...site.antenna.learned import (
     Entry,

@@ -216,7 +216,22 @@ def settings_card(made: Any, *settings: Mapping[str, Any], fold: bool = False) -
 
 
 def write_page(folder: Path, name: str, page: Page, numbers: Mapping[str, Any]) -> list[Path]:
-    """Write the page NAME.html of a job and ``metrics.json`` with its numbers; the page comes first."""
+    """Write the page and the ``metrics.json`` of a job.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        The page is written as NAME.html.
+    page : Page
+    numbers : mapping
+        Content of metrics.json.
+
+    Returns
+    -------
+    list of Path
+        The page first.
+    """
     return [
         write_file(folder / f"{name}.html", page.html()),
         write_file(folder / "metrics.json", json_text(numbers)),

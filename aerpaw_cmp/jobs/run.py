@@ -301,6 +301,8 @@ def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[
     for word, words in ((chosen.figures, FIGURES), (chosen.style, STYLES)):
         if word not in words:
             raise UsageError(f"found {word!r}", expected="one of " + ", ".join(words), cause="--figures or --style")
+    if chosen.style != "screen" and chosen.figures == "none":
+        raise UsageError(f"--style {chosen.style} without figures", expected="--figures svg, png, pdf or all, too")
     beside, home = (chosen.recommend or flight).parent, flight.parent
     if options.logs_root is None and os.path.realpath(beside) != os.path.realpath(home):
         # paths in a flight file are relative to its folder
@@ -550,6 +552,8 @@ def run_campaign(
     from .campaigns.season import find_reports, soundings, with_season
     from .tasks.manifest import inputs_of_flights
 
+    if fresh and keep is not None:
+        raise UsageError("--fresh and --keep", expected="one of them: --fresh neither reads nor writes a folder")
     campaign = load_campaign(path)
     sounded = [(options.logs_root or path.parent) / name for name in campaign.soundings]
     flights = inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)

@@ -324,7 +324,13 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
     patterns: dict[str, GainOf] = {}
     if settings.patterns.uav is not None:
         patterns["uav"] = gain_of(settings.patterns.uav, folder)
-    for antenna in dict.fromkeys(o.samples.antenna for o in observed):
+    antennas = list(dict.fromkeys(o.samples.antenna for o in observed))
+    if unknown := sorted(settings.patterns.towers.keys() - set(antennas)):
+        raise UsageError(
+            f"patterns.towers.{unknown[0]}: the flights have no such tower and channel",
+            expected="one of " + ", ".join(antennas),
+        )
+    for antenna in antennas:
         chosen = settings.patterns.towers.get(antenna, settings.patterns.tower)
         if chosen is not None:
             patterns[antenna] = gain_of(chosen, folder)

@@ -190,7 +190,8 @@ def named(
     if alone and quantity.name == "SINR":
         quantity = replace(quantity, name="SNR", role="rss")
     short = re.sub(r"\W+", "_", dictionary.plain(name))
-    if quantity.kind == "rss" and meaning is not None and not meaning.indirect and not meaning.place.startswith("n"):
+    other = meaning is None or meaning.indirect or meaning.place.startswith("n") or unit == "%"
+    if quantity.kind == "rss" and not other:
         level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))
         return rows.stream(
             "rss", short, {"rss_db": level}, where=where, flag=flag, channel=rows.options.channel or short,

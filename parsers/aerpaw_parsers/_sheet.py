@@ -365,10 +365,8 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
 
 
 # Latitude and longitude in one cell, in brackets or not: ``35.7275 -78.6960``; WKT has the longitude first.
-_PAIR = re.compile(
-    r"(?:POINT ?Z? ?)?[\[(]?\s?(-?\d{1,3}\.\d{3,15})\s?[ ,;]\s?(-?\d{1,3}\.\d{3,15})(?:[ ,].{0,20})?[\])]?",
-    re.IGNORECASE,
-)
+_ONE = r"(-?\d{1,3}\.\d{3,15}[\u00b0 ]{0,2}[NSEW]?)"
+_PAIR = re.compile(rf"(?:POINT ?Z? ?)?[\[(]? ?{_ONE} ?[ ,;] ?{_ONE}(?:[ ,].{{0,20}})?[\])]?", re.IGNORECASE)
 
 
 def _split_places(sheet: Sheet) -> None:
@@ -379,7 +377,7 @@ def _split_places(sheet: Sheet) -> None:
         if not any(pairs[:50]) or 2 * sum(map(bool, pairs)) <= sum(map(bool, texts)):
             continue
         swapped = re.match(r"(?i)POINT", texts[0]) or re.match(r"lon|lng", sheet.plain[i])
-        swapped = swapped or any(abs(float(pair[1])) > 90 for pair in pairs if pair)
+        swapped = swapped or any(abs(_angle(pair[1])[0]) > 90 for pair in pairs if pair)
         columns = [[pair[part] if pair else "" for pair in pairs] for part in ((2, 1) if swapped else (1, 2))]
         sheet.names[i] = f"{name} in one text"
         for angle, cells in zip(("latitude", "longitude"), columns, strict=True):

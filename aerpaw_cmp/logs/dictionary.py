@@ -45,6 +45,8 @@ class Quantity:
         Possible values, in its unit: what lies beyond belongs to another column.
     datum : str
         Of a height: ``take-off``, ``ground``, ``sea level``, ``ellipsoid`` or ``unknown``.
+    open_unit : bool
+        Programs write the quantity in several units: numbers without a unit are of an unknown one.
     """
 
     name: str
@@ -54,6 +56,7 @@ class Quantity:
     none: tuple[float, ...] = ()
     can_be: tuple[float, float] = _ANY
     datum: str = ""
+    open_unit: bool = False
 
     @property
     def kind(self) -> Kind:
@@ -63,7 +66,6 @@ class Quantity:
 
 # Where a row takes _UP[2:], a word stands in front and the mark of a word's beginning is left out.
 _UP = r"\b(alt|altitude|height|hgt|elevation|ele|hoehe|h he)"
-_ATT = r"\b(att(itude)?|ahrs2?|euler)( t)? "
 _ANGLE = (-360.0, 360.0)
 _SPEED = (-400.0, 400.0)
 _DBM, _DB = (-200.0, 30.0), (-60.0, 100.0)
@@ -82,7 +84,10 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
     )),
     Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$", r"^(datum|fecha)$")),
-    Quantity("zone", "time", (r"^((time ?)?zone|tz)( ?(name|id|offset))?$", r"^(utc|gmt) ?offset( (h|min|s))?$")),
+    Quantity("zone", "time", (
+        r"^((time ?)?zone|tz)( ?(name|id|offset))?( (h|hours?|min|minutes?|s|sec|seconds?))?$",
+        r"^(utc|gmt) ?offset( (h|hours?|min|minutes?|s|sec|seconds?))?$",
+    )),
     Quantity("gps_week", "time", (r"^gps ?(week|wk)( number| no)?$", r"^gwk$", r"^(week|wn)( number| no)?$")),
     Quantity("gps_seconds", "time", (
         r"^(gps ?)?(tow|i ?tow|seconds? of week|week seconds?|sow|gps seconds?)( s| ms)?$", r"^gms$",
@@ -98,7 +103,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     ), "deg", can_be=(-90.0, 90.0)),
     Quantity("longitude_deg", "position", (
         r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67]| [ew])?$",
-        r" (lon|lng|long|longitude)( deg)?$",
+        r" (lon|lng|longitude)( deg)?$",
         r"^(l nge|laenge|l ngengrad|laengengrad|longitud)( deg)?$",
     ), "deg", can_be=(-180.0, 180.0)),
     Quantity("grid", "grid", (
@@ -133,12 +138,14 @@ QUANTITIES: tuple[Quantity, ...] = (
         _UP + r" baro$",
     ), "m", can_be=(-1000.0, 20_000.0), datum="unknown"),
     # how it lies; a gimbal's or camera's angles are not the aircraft's
-    Quantity("gimbal", "other", (r"\b(gimbal|camera|mount|payload|des|desired|target|setpoint|sp)\b",)),
-    Quantity("roll_deg", "angle", (r"^(osd )?roll( deg| degrees| rad)?$", rf"{_ATT}roll\b",), "deg", can_be=_ANGLE),
-    Quantity("pitch_deg", "angle", (r"^(osd )?pitch( deg| degrees| rad)?$", rf"{_ATT}pitch\b",), "deg", can_be=_ANGLE),
+    Quantity("gimbal", "other", (
+        r"\b(gimbal|camera|mount|payload|des|desired|target|setpoint|sp|cmd|command|ref|reference|error|err|delta|rate"
+        r"|initial|home|antenna|tower)\b",
+    )),
+    Quantity("roll_deg", "angle", (r"(^| )roll( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
+    Quantity("pitch_deg", "angle", (r"(^| )pitch( deg| degrees| rad)?$",), "deg", can_be=_ANGLE),
     Quantity("yaw_deg", "angle", (
-        r"^(osd )?yaw( deg| degrees| rad)?$", rf"{_ATT}yaw\b",
-        r"^compass heading( degrees)?$", r"^(heading|hdg)( deg| degrees| cdeg)?$",
+        r"(^| )yaw( deg| degrees| rad)?$", r"^compass heading( degrees)?$", r"^(heading|hdg)( deg| degrees| cdeg)?$",
     ), "deg", can_be=_ANGLE),
     Quantity("velocity_north_mps", "velocity", (
         r"^velocity ?(north|x)( mps)?$", r"^vn$", r"^vel n m s$", r"^(osd )?x ?speed", r"^speed ?x$", r"^vx$",
@@ -166,7 +173,8 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("network", "identity", (
         r"^(network )?(operator|carrier|provider|plmn|sim|slot|sub|subscription)( ?(id|name|code|slot|no|index))?$",
         r"^network name$", r"^query$",
-        r"^mcc$", r"^mnc$", r"^mcc ?mnc$", r"^(receiver|rx|cent(er|re)|carrier) freq(uency)?( hz| mhz| ghz)?$",
+        r"^mcc$", r"^mnc$", r"^mcc ?mnc$", r"^(c ?)?rnti$", r"^(ap|access point|ssid)( ?(id|name|no|mac))?$",
+        r"^(receiver|rx|cent(er|re)|carrier) freq(uency)?( hz| mhz| ghz)?$",
     )),
     Quantity("technology", "cell", (
         r"^(network ?(tech|mode|type)|net ?type|rat|technology|access technology|radio( type| access)?|act|cell type)$",
@@ -174,7 +182,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("serving", "cell", (r"^(is ?)?(registered|serving|connected)( cell)?$",)),
     Quantity("neighbouring", "cell", (r"^(is ?)?neighbou?r(ing)?( cell)?$",)),
     # how strong; 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
-    Quantity("power", "rss", (r"^link power$", r"^(power )?lw ?[1-5]( (power|level))?( dbm?)?$"), _FULL_SCALE),
+    Quantity("power", "rss", (r"^link power$", r"^lw ?[1-5]$"), _FULL_SCALE),
     Quantity("quality", "rss", (r"^link quality$",), "dB"),
     Quantity("SNR", "rss", (r"^link snr$",), "dB"),
     # 'rank' alone may be that of any list: described() takes it where levels stand beside; 0 is no report
@@ -201,9 +209,9 @@ QUANTITIES: tuple[Quantity, ...] = (
     ), none=(-1.0,), can_be=(0.0, 3_279_165.0)),
     Quantity("CQI", "kpi", (r"\bcqi\b",), none=(255.0,), can_be=(0.0, 100.0)),
     Quantity("path loss", "kpi", (r"\bpath ?loss\b",), "dB"),
-    Quantity("throughput", "kpi", (r"\b(throughput|tput|bit ?rate|thr?put)\b",), "bit/s"),
+    Quantity("throughput", "kpi", (r"\b(throughput|tput|bit ?rate|thr?put)\b",), "bit/s", open_unit=True),
     Quantity("MCS", "kpi", (r"\bmcs\b",), can_be=(0.0, 100.0)),
-    Quantity("BLER", "kpi", (r"\bbler\b",), "%"),
+    Quantity("BLER", "kpi", (r"\bbler\b",), "%", open_unit=True),
 )  # fmt: skip
 
 
@@ -240,6 +248,11 @@ _INDIRECT = re.compile(
 )
 
 
+# Levels beside the one that the receiver measured: averaged over time, or of one of its ports.
+_MEAN = re.compile(r"\b(mean|avg|average|averaged|filtered|filt|smooth(ed)?|median|ema|rolling|moving)\b")
+_PORT = re.compile(r"\b(rx|ant(enna)?|port|branch|chain|path) ?\d\b")
+
+
 @dataclass(frozen=True, slots=True)
 class Meaning:
     """Content of a column.
@@ -255,6 +268,8 @@ class Meaning:
         ``serving``, ``scell1``, ``n2`` (the second neighbour; ``n0`` where it has no number), ``cell2``, ``sim2``.
     indirect : bool
         Of the uplink, a statistic or a model: no level that the receiver measured.
+    part : str
+        ``mean`` of a level averaged over time, ``port`` of one receive port alone; empty for the cell's own level.
     """
 
     quantity: Quantity
@@ -262,6 +277,7 @@ class Meaning:
     rat: str = ""
     place: str = "serving"
     indirect: bool = False
+    part: str = ""
 
 
 def plain(name: str) -> str:
@@ -319,7 +335,8 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
     place = f"n{number}" if _NEIGHBOUR.search(text) else f"scell{second[1]}" if second else "serving"
     if place == "serving" and (other := _OTHER.search(text)):
         place = (other[1] or other[2] or f"cell{other[3]}").replace(" ", "")
-    return Meaning(row, unit, rat, place, indirect=_INDIRECT.search(text) is not None)
+    part = "mean" if _MEAN.search(text) else "port" if _PORT.search(text) else ""
+    return Meaning(row, unit, rat, place, indirect=_INDIRECT.search(text) is not None, part=part)
 
 
 def without_unit(name: str) -> tuple[str, str]:
@@ -425,7 +442,6 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     **{word: ("deg", _times(factor)) for word, factor in (
         ("deg", 1.0), ("degree", 1.0), ("degrees", 1.0), ("\u00b0", 1.0), ("rad", 180 / np.pi),
         ("radians", 180 / np.pi), ("1e-7 deg", 1e-7), ("1e-7deg", 1e-7), ("dege7", 1e-7), ("deg e7", 1e-7),
-        ("semicircles", 180 / 2**31),
         ("degrees e7", 1e-7), ("e7", 1e-7), ("deg*1e7", 1e-7), ("1e7", 1e-7), ("e6", 1e-6), ("1e-6 deg", 1e-6),
         ("microdegrees", 1e-6), ("cdeg", 0.01), ("centidegrees", 0.01), ("mrad", 0.18 / np.pi))},
     **{word: ("bit/s", _times(factor)) for word, factor in (
@@ -441,7 +457,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     "\u00b5w": ("dBm", _milliwatts(1e-3)), "nw": ("dBm", _milliwatts(1e-6)), "pw": ("dBm", _milliwatts(1e-9)),
 }  # fmt: skip
 # Units of numbers that MAVLink writes as integers: of a table in decimals they are another program's.
-OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7", "semicircles")
+OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
 # Units that a name may have without brackets: 'alt_ft_agl', 'rsrp_dbm'.
 _SUFFIXES = ("ft", "kft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps",
@@ -534,14 +550,13 @@ PROGRAMS: tuple[Program, ...] = (
     _program("G-NetTrack KML", "technology,mode,pc", "technology,pc,layer", datum="sea level", words={r"pc": "pci"}),
     _program("G-NetTrack", "networktech", "networkmode", datum="sea level",
              units={"dl bitrate": "kbps", "ul bitrate": "kbps"}),
-    _program("srsUE", "time,cc,earfcn,rsrp,cfo", words={r"pl": "path loss"}, units={"time": "ms"}),
+    _program("srsUE", "time,cc,earfcn,rsrp,cfo", words={r"pl": "path loss"},
+             units={"time": "ms", "dl bler": "%", "ul bler": "%"}),
     _program("Tower Collector", "psc,short cell id,net type", datum="sea level", words={r"psc": "pci"}),
     _program("CellMapper", "signal,psc or pci", datum="sea level", words={
         r"signal": "rsrp", r"psc or pci": "pci", r"type": "network type"}),
     _program("phone", "cellname", datum="sea level"),
     _program("MAVLink, positions alone", "lat,lon,relative alt", "lat,lon,alt,hdg", units=_MAVLINK_UNITS),
-    _program("Garmin FIT", "position lat,position long", datum="sea level", units={
-        "position lat": "semicircles", "position long": "semicircles"}),
     _program("Open DroneLog", "vps height m,height m", datum="sea level", words={
         r"height m": "height above takeoff", r"velocity ([xyz]) ms": r"velocity \1"}),
     # dB stands for dBm; 1RSS and 2RSS are heard by the aircraft, TRSS by the transmitter; FrSky's RSSI is no dBm, and

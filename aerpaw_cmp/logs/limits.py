@@ -104,7 +104,7 @@ _MOST_DBM = {"RSRP": -20.0}
 # path gains 20 dB from one reading to the next and loses it again.
 _LOST_DB, _FAR_DB, _LOST_SHARE = 1.0, 20.0, 0.2
 # Levels that alternate from record to record: further apart than fading, and back with the next.
-_APART_DB, _BACK_SHARE, _FEW_ALTERNATE = 10.0, 0.2, 6
+_APART_DB, _BACK_SHARE, _FEW_ALTERNATE, _MOST_TURNS = 10.0, 0.2, 6, 5
 
 
 class _Check:
@@ -220,19 +220,25 @@ class _Check:
             self._flag(near, "level_lost", first, why, ["rss_db"])
 
     def _two_levels(self) -> None:
-        """Say where the levels of a series alternate between two: of two devices, SIMs or networks."""
+        """Report a series whose levels take turns, or are several at one time: of several devices, SIMs or networks."""
         # the beginning: two devices alternate all along
-        level = self._values("rss_db")[:10_000]
-        level = level[np.isfinite(level)]
+        level, time = self._values("rss_db")[:10_000], self.frame["time"].to_numpy("datetime64[ns]")[:10_000]
+        level, time = level[np.isfinite(level)], time[np.isfinite(level)]
         if len(level) < _FEW_ALTERNATE:
             return
-        step, back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in (1, 2))
-        # with the next record but one it is back: fading does not come back so closely
-        if step > _APART_DB and back < _BACK_SHARE * step:
-            self._said.append(
-                f"{self._what}: its levels alternate, {step:.0f} dB apart from record to record: two devices, SIMs "
-                "or networks in one series, which no column known as a name tells apart"
-            )
+        lags = [lag for lag in range(1, _MOST_TURNS + 1) if len(level) >= 3 * lag]
+        step, *back = (float(np.median(np.abs(level[lag:] - level[:-lag]))) for lag in lags)
+        # with one of the next records it is back: fading does not come back so closely
+        turns = step > _APART_DB and min(back) < _BACK_SHARE * step
+        at_once = pd.Series(level).groupby(time).agg(["min", "max", "size"])
+        apart_db = (at_once["max"] - at_once["min"])[at_once["size"] > 1]
+        if not turns and (2 * len(apart_db) < len(at_once) or apart_db.median() < _APART_DB):
+            return
+        how = f"{step:.0f} dB apart from record to record" if turns else f"{apart_db.median():.0f} dB apart at one time"
+        self._said.append(
+            f"{self._what}: its levels alternate, {how}: several devices, SIMs or networks in one series, which no "
+            "column known as a name tells apart"
+        )
 
     def _near_in_time(self) -> None:
         """Flag a few stamps that lie days from all the others."""

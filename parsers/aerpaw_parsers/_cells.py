@@ -36,6 +36,8 @@ class Reading(NamedTuple):
     rsrp_dbm : float
     serving : bool
         Does the log call it the serving cell?
+    more : str
+        Name of what distinguishes it from other cells of its PCI and carrier, such as a beam.
     rsrq_db, rssi_dbm, sinr_db, pathloss_db : float
     """
 
@@ -45,13 +47,14 @@ class Reading(NamedTuple):
     arfcn: float
     rsrp_dbm: float
     serving: bool = False
+    more: str = ""
     rsrq_db: float = np.nan
     rssi_dbm: float = np.nan
     sinr_db: float = np.nan
     pathloss_db: float = np.nan
 
 
-QUALITIES = Reading._fields[6:]
+QUALITIES = Reading._fields[7:]
 
 
 def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -> Reading:
@@ -71,7 +74,12 @@ QUANTITIES = {"pci": "PCI", "arfcn": "ARFCN", "rsrp_dbm": "RSRP", "rsrq_db": "RS
 
 
 def streams(
-    rows: _rows.Rows, readings: pd.DataFrame | Iterable[Reading], *, source: str, quantity: str = "RSRP"
+    rows: _rows.Rows,
+    readings: pd.DataFrame | Iterable[Reading],
+    *,
+    source: str,
+    quantity: str = "RSRP",
+    more: Mapping[str, Mapping[str, Attribute]] | None = None,
 ) -> list[Stream]:
     """A stream per cell: radio access, PCI and carrier. Every reading with a level is a record.
 
@@ -87,6 +95,8 @@ def streams(
     source : str
     quantity : str
         The level that they hold.
+    more : mapping, optional
+        Further attributes of the cells, by the readings' ``more``.
     """
     rows_or_table = readings if isinstance(readings, pd.DataFrame) else [*readings]
     table = pd.DataFrame(rows_or_table, columns=list(Reading._fields))
@@ -100,14 +110,16 @@ def streams(
         several = len(carriers) > 1
         for carrier in [*carriers, np.nan] if several else [*carriers, np.nan][:1]:
             mine = cell_rows["arfcn"].eq(carrier) | (cell_rows["arfcn"].isna() & np.isnan(carrier))
-            part = cell_rows[mine] if several else cell_rows
+            of_carrier = cell_rows[mine] if several else cell_rows
             about: dict[str, Attribute | None] = {"quantity": quantity, "rat": rat or None}
             about["pci"] = int(identity) if identity >= 0 else None
             about["arfcn"] = int(carrier) if np.isfinite(carrier) else None
             words = [rat, f"pci{about['pci']}" if identity >= 0 else "rsrp"]
             words += [f"arfcn{about['arfcn']}"] if several and np.isfinite(carrier) else []
-            name = "_".join(word for word in words if word)
-            per_cell += [_stream(rows, part, name, {**about, "source": source})] if len(part) else []
+            for further, part in of_carrier.groupby("more"):
+                name = "_".join(word for word in (*words, str(further)) if word)
+                known = {**about, **(more or {}).get(str(further), {}), "source": source}
+                per_cell.append(_stream(rows, part, name, known))
     return per_cell
 
 
@@ -115,7 +127,7 @@ def _serving(table: pd.DataFrame) -> FloatArray:
     """1 where the reading is of the cell that serves, 0 where another does, NaN where nothing is known."""
     row, rats, serving = (table[name].to_numpy() for name in ("row", "rat", "serving"))
     # NaN equals nothing: cells without a carrier are compared as -1
-    cell = np.stack([table["pci"], table["arfcn"].fillna(-1.0)])
+    cell = np.stack([table["pci"], table["arfcn"].fillna(-1.0), pd.factorize(table["more"])[0]])
     served = np.full(len(table), np.nan)
     for rat in np.unique(rats[serving.astype(bool)]).tolist():
         of_rat = np.flatnonzero(rats == rat)
@@ -190,12 +202,13 @@ def named(
     if alone and quantity.name == "SINR":
         quantity = replace(quantity, name="SNR", role="rss")
     short = re.sub(r"\W+", "_", dictionary.plain(name))
-    other = meaning is None or meaning.indirect or meaning.place.startswith("n") or unit == "%"
-    if quantity.kind == "rss" and not other:
+    direct = meaning is not None and not meaning.indirect and not meaning.place.startswith("n")
+    if quantity.kind == "rss" and direct and "statistic" not in (about or {}):
         level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))
         return rows.stream(
             "rss", short, {"rss_db": level}, where=where, flag=flag, channel=rows.options.channel or short,
             unit=rows.options.unit or unit or quantity.unit, quantity=quantity.name, about=about,
         )  # fmt: skip
-    about = {"unit": unit or quantity.unit, "quantity": quantity.name, **(about or {})}
+    unit = unit or ("unknown" if quantity.open_unit else quantity.unit)
+    about = {"unit": unit, "quantity": quantity.name, **(about or {})}
     return rows.stream("kpi", short, {"value": values}, where=where, about=about)

@@ -29,7 +29,7 @@ _MOST = 1e9
 def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
     """The telemetry stream of a table; None where it has no position.
 
-    Rows without a position are left out unless all are.
+    Rows whose cells of the position are empty are left out unless all are.
 
     Parameters
     ----------
@@ -51,6 +51,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
         rows.warnings.append(f"several columns of positions ({', '.join(alike)}): {alike[0]!r} was read, a guess")
     values: dict[str, AnyArray] = {key: sheet.numbers(i) for key, i in zip(PLACE, (latitude, longitude), strict=False)}
     fix = sheet.find("fix")
+    written = np.isfinite(values[PLACE[0]]) & np.isfinite(values[PLACE[1]])
     if fix is not None and (sheet.numbers(fix) > 0).any():  # some leave the column at 0 throughout
         values[PLACE[0]] = np.where(sheet.numbers(fix) == 0, np.nan, values[PLACE[0]])
     lost = clean(rows, values)
@@ -71,7 +72,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
         if (column := sheet.find(key)) is not None:
             count = sheet.numbers(column)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
-    where = None if lost.all() else ~lost
+    where = None if lost.all() else written  # a row of 0, 0 is a reading without a fix
     return rows.stream("telemetry", name, values, where=where, source=source, about=about)
 
 
@@ -221,11 +222,6 @@ def above_takeoff(
     altitude: FloatArray = values["altitude_m"]
     about: Height = {"height_from": rows.height_from, "height_datum": datum}
     known = np.flatnonzero(np.isfinite(altitude) & ~lost)
-    seconds = np.maximum(np.diff(rows.time[known]) / np.timedelta64(1, "s"), 0.1)
-    rate_mps = np.abs(np.diff(altitude[known])) / seconds
-    if 2 * (rate_mps > _FASTEST_MPS).sum() > (rate_mps > 0).sum():
-        text = f"most heights change by more than {_FASTEST_MPS:g} m/s, such as {rate_mps.max():.0f} m/s: another unit?"
-        rows.warnings.append(text)
     if datum in ("take-off", "ground") or not len(known):
         return altitude, about
     altitude = _without_first_zeros(altitude, rows.time if datum == "unknown" else None)
@@ -249,8 +245,6 @@ def above_takeoff(
     return altitude - first, about
 
 
-# No small aircraft climbs so fast [m/s].
-_FASTEST_MPS = 60.0
 # What begins within a few metres of zero is relative to take-off.
 _NEAR_ZERO_M = 10.0
 _REST_S, _REST_M, _REST_MPS, _CLIMB_M, _CLIMB_MPS = 2.0, 3.0, 0.3, 5.0, 20.0

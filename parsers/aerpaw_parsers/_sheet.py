@@ -11,7 +11,7 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -19,10 +19,10 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.counting import counted
-from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.limits import NEAR_DEG
-from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
@@ -31,8 +31,8 @@ from aerpaw_cmp.readers import ReadOptions, dictionary
 from . import _stamps
 
 SEPARATORS = (",", ";", "\t", "|")
-# Lines in front of a header, at most.
-TITLES = 60
+# Lines in front of a header, at most, and rows below it that a sniffer looks at.
+TITLES, _LOOKED_AT = 60, 5
 _NUMBER = re.compile(r"([-+]?\d{0,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?) ?([^\d\s,.][^\d\s]{0,9})?")
 
 _IsHeader = Callable[[list[str]], bool]
@@ -78,7 +78,15 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
     if header is None:
         return False
     at, separator, names = header
-    below = [line for line in lines[at + 1 :] if line.strip()][:5]
+    below, unclosed = list[bytes](), False
+    for line in (line for line in lines[at + 1 :] if line.strip()):
+        if unclosed:  # a line break within a quoted cell
+            below[-1] += b" " + line
+        elif len(below) == _LOOKED_AT:
+            break
+        else:
+            below.append(line)
+        unclosed = below[-1].count(b'"') % 2 == 1 and below[-1].count(b" ") < 1000
     widths = [len(split_row(line, separator)) for line in below]
     # rows may miss trailing cells, or have one more behind a separator at their end
     return 2 * sum(len(names) < 2 * width and width <= len(names) + 1 for width in widths) >= len(widths)
@@ -93,6 +101,21 @@ def _number(text: str) -> tuple[float, str]:
         return float(match[1].replace(",", ".")), (match[2] or "").lower()
     except ValueError:
         return np.nan, ""
+
+
+# Words for the fix of a GNSS receiver, the first that fits, and MAVLink's numbers for them.
+_FIXES = tuple((re.compile(form), number) for form, number in (
+    (r"\bno\b|no ?(fix|gps|gnss)|invalid|none|lost|searching", "0"), (r"float", "5"), (r"rtk|fixed|\bint\b", "6"),
+    (r"dgps|dgnss|diff|sbas", "4"), (r"\b2 ?d", "2"), (r"\b3 ?d|single|autonomous|spp|\bok\b|valid|\bfix\b", "3"),
+))  # fmt: skip
+
+
+def _fix(text: str) -> str:
+    """Return the number of a fix that is written as a word, such as ``NO_FIX`` or ``RTK_FIXED``; other texts as is."""
+    word = re.sub(r"[^a-z0-9]+", " ", text.lower()).strip()
+    if not re.search("[a-z]", word) or word in ("nan", "n a"):
+        return text
+    return next((number for form, number in _FIXES if form.search(word)), text)
 
 
 # 35.728 N; N 35 43.68; degrees, minutes and seconds with their marks or colons.
@@ -276,6 +299,8 @@ class Sheet:
         elif meaning is not None and meaning.quantity.role == "cell" and self.has_decimal_commas:
             texts = [text.replace(".", "") for text in texts]  # an EARFCN of 2.300 is no fraction
         reads = _angle if meaning is not None and meaning.quantity.role == "position" else _number
+        if meaning is not None and meaning.quantity.name == "fix":
+            texts = [_fix(text) for text in texts]
         counts = Counter(texts)  # tables repeat themselves
         parsed = {text: reads(text) for text in counts}
         values = np.array([parsed[text][0] for text in texts], dtype=np.float64)
@@ -365,8 +390,10 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
 
 
 # Latitude and longitude in one cell, in brackets or not: ``35.7275 -78.6960``; WKT has the longitude first.
-_ONE = r"(-?\d{1,3}\.\d{3,15}[\u00b0 ]{0,2}[NSEW]?)"
-_PAIR = re.compile(rf"(?:POINT ?Z? ?)?[\[(]? ?{_ONE} ?[ ,;] ?{_ONE}(?:[ ,].{{0,20}})?[\])]?", re.IGNORECASE)
+_PAIR = re.compile(
+    r"(?:POINT ?Z? ?)?[\[(]?\s?(-?\d{1,3}\.\d{3,15})\s?[ ,;]\s?(-?\d{1,3}\.\d{3,15})(?:[ ,].{0,20})?[\])]?",
+    re.IGNORECASE,
+)
 
 
 def _split_places(sheet: Sheet) -> None:
@@ -377,7 +404,7 @@ def _split_places(sheet: Sheet) -> None:
         if not any(pairs[:50]) or 2 * sum(map(bool, pairs)) <= sum(map(bool, texts)):
             continue
         swapped = re.match(r"(?i)POINT", texts[0]) or re.match(r"lon|lng", sheet.plain[i])
-        swapped = swapped or any(abs(_angle(pair[1])[0]) > 90 for pair in pairs if pair)
+        swapped = swapped or any(abs(float(pair[1])) > 90 for pair in pairs if pair)
         columns = [[pair[part] if pair else "" for pair in pairs] for part in ((2, 1) if swapped else (1, 2))]
         sheet.names[i] = f"{name} in one text"
         for angle, cells in zip(("latitude", "longitude"), columns, strict=True):
@@ -430,9 +457,43 @@ def cut(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> Sheet
     numbers = np.flatnonzero(below).tolist()
     group = [text.strip() for text in split_row(lines.raw(at - 1), separator)] if at else []
     table = _Table(_unlike(names, group), [*range(at + 1)])
-    for i, fields in _fitted([(i, split_row(lines.raw(i), separator)) for i in numbers], names):
+    written = [(i, split_row(lines.raw(i), separator)) for i in numbers]
+    if any(lines.raw(i).count(b'"') % 2 for i in numbers):
+        written = _joined(lines, written, separator, len(names), table.comments)
+    for i, fields in _fitted(written, names):
         table.add(i, fields)
     return table.sheet(lines, numbers[-1] if numbers else at)
+
+
+# A cell with line breaks has at most so many lines.
+_MOST_LINES = 40
+
+
+def _joined(
+    lines: _lines.Lines, rows: list[tuple[int, list[str]]], separator: str, width: int, comments: list[int]
+) -> list[tuple[int, list[str]]]:
+    """Rows whose quoted cells have line breaks, on their first lines; their further lines are added to the comments.
+
+    A lone quote, such as the sign of inches, joins nothing: the joined row has to have the width of the header.
+    """
+    joined, last = list[tuple[int, list[str]]](), -1
+    for place, (i, fields) in enumerate(rows):
+        if i <= last:
+            continue
+        text, end = lines.raw(i), i
+        if text.count(b'"') % 2 and len(fields) != width:
+            for end, _ in rows[place + 1 : place + _MOST_LINES]:
+                text += b" " + lines.raw(end)
+                if lines.raw(end).count(b'"') % 2:
+                    break
+            whole = split_row(text, separator)
+            if len(whole) == width:
+                joined.append((i, whole))
+                comments += [number for number, _ in rows if i < number <= end]
+                last = end
+                continue
+        joined.append((i, fields))
+    return joined
 
 
 def _unlike(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:
@@ -598,7 +659,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
         _refuse_positions_beside(sheet)
         bounded = {i: q for i, q in known.items() if q.role in ("position", "cell", "rss") and q.can_be[1] < np.inf}
         _refuse_shifted([(sheet.names[i], q, sheet.numbers(i)) for i, q in bounded.items()])
-    column = _time_column(sheet) if column is None else column
+    column = _time_column(sheet, options) if column is None else column
     weeks = None if mapped and column != sheet.find("gps_seconds") else _gps_weeks(sheet, column)
     if column is None and weeks is None:
         return None
@@ -617,6 +678,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
     timed.warnings += warnings
     if clock.startswith("relative") and start is not None:
         timed.clock_from = "written"
+    _to_utc(timed, sheet, column)
     if len(timed.row) < len(sheet.row):
         inside = np.zeros(len(sheet.row), dtype=bool)
         inside[timed.at] = True
@@ -638,15 +700,55 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, column: int | None 
 _START = re.compile(r'"start_time" ?: ?"([^"]{10,40})"')
 
 
-def _time_column(sheet: Sheet) -> int | None:
-    """The surest column of times; where that is a local one, or has no zone, the one beside it that is UTC."""
+def _to_utc(timed: _rows.Rows, sheet: Sheet, column: int | None) -> None:
+    """Bring times of a scale without leap seconds, which the name of their column writes, to UTC in place."""
+    words = {*(() if column is None else sheet.plain[column].split())}
+    scale = next((scale for scale in _stamps.SCALES_S if scale in words), None)
+    if scale is None or timed.relative or any("leap seconds" in text for text in timed.warnings):
+        return
+    timed.time = timed.time - np.timedelta64(_stamps.SCALES_S[scale], "s")
+    timed.warnings.append(f"the times are {scale.upper()}: {_stamps.SCALES_S[scale]} s were taken off for UTC")
+
+
+def _time_column(sheet: Sheet, options: ReadOptions | None = None) -> int | None:
+    """Return the surest column of times: not a local one beside UTC, nor the time of a fix that stands still."""
     column = sheet.find("time")
-    if column is None or "utc" in sheet.plain[column].split():
-        return column
     times = [i for i, meaning in enumerate(sheet.meanings) if meaning and meaning.quantity.name == "time"]
-    utc = [i for i in times if "utc" in sheet.plain[i].split()]
-    both = [i for i in utc if all(_ZONELESS.fullmatch(text) for j in (i, column) for text in sheet.texts(j)[:3])]
-    return next(iter(utc if "local" in sheet.plain[column] else both), column)
+    if column is None or len(times) < 2:
+        return column
+    if "utc" not in sheet.plain[column].split():
+        utc = [i for i in times if "utc" in sheet.plain[i].split()]
+        both = [i for i in utc if all(_ZONELESS.fullmatch(text) for j in (i, column) for text in sheet.texts(j)[:3])]
+        column = next(iter(utc if "local" in sheet.plain[column] else both), column)
+    texts, time_of = pd.Series(sheet.texts(column), dtype=object), dictionary.QUANTITIES[0]
+    if options is None or not (texts == texts.shift()).any():
+        return column
+    rest = sorted((i for i in times if i != column), key=lambda i: dictionary.rank_of(time_of, sheet.plain[i]))
+    moving = next((i for i in rest if _moves_on(sheet, i, texts, options)), column)
+    if moving != column:
+        text = f"column {sheet.names[column]!r} stands still while {sheet.names[moving]!r} runs on: the latter was read"
+        sheet.notes[moving] = f"{text} (the former may be the time of the last fix)"
+    return moving
+
+
+# A clock stands still where another runs on by more while it shows one time [s].
+_STANDS_S = 2.0
+
+
+def _moves_on(sheet: Sheet, column: int, standing: pd.Series[str], options: ReadOptions) -> bool:
+    """Check whether a column of dated times runs on while another shows the same time."""
+    if not _stamps.is_dated(next(filter(None, sheet.texts(column)), "")) and sheet.find("date") is None:
+        return False
+    try:
+        clock, cells, _ = _times(sheet, column, options, mapped=False)
+        _, instants, valid = _rows.times(cells, options, clock=clock, reader="the table")
+    except (InputError, UsageError):
+        return False
+    if clock.startswith("relative") or not valid.all():
+        return False
+    run = (standing != standing.shift()).cumsum().to_numpy()
+    spans = pd.Series(instants.time).groupby(run).agg(["min", "max"])
+    return bool(((spans["max"] - spans["min"]).dt.total_seconds() > _STANDS_S).any())
 
 
 def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> tuple[str, FloatArray, list[str]]:
@@ -671,8 +773,15 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
     first = _DAY_OR_MONTH.search(heads)
     return _stamps.read(
         texts, options, unit=count, european=sheet.has_decimal_commas, zone=zone, gps=gps,
-        day_first=None if first is None else first[1].startswith("d"),
+        day_first=None if first is None else first[1].startswith("d"), device=_devices(sheet),
     )  # fmt: skip
+
+
+def _devices(sheet: Sheet) -> IntArray | None:
+    """Return the number of the device of each row, by all columns of devices; None if there is none."""
+    columns = [i for i, meaning in enumerate(sheet.meanings) if meaning and meaning.quantity.name == "device"]
+    texts = zip(*(sheet.texts(i) for i in columns), strict=True) if columns else ()
+    return pd.factorize(pd.Series(list(texts), dtype=object))[0] if columns else None
 
 
 def _zone_beside(sheet: Sheet, column: int, zone: str, texts: list[str], options: ReadOptions) -> tuple[str, list[str]]:
@@ -833,116 +942,6 @@ def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
         rows.warnings.append("the column of milliseconds does not go with the times: it is left out")
         return
     rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")
-
-
-# More values of a key than these are no devices or networks: they count something.
-_MOST_PARTS = 64
-
-
-def parts(rows: _rows.Rows, sheet: Sheet, key: str) -> Iterator[tuple[str, _rows.Rows, Sheet]]:
-    """A table by an identity (``device``, ``network``): the name of each part, its rows and its cells.
-
-    Parameters
-    ----------
-    rows : Rows
-    sheet : Sheet
-    key : str
-        Quantity of the dictionary; of several columns of it, the combination counts.
-
-    Yields
-    ------
-    tuple of str, Rows and Sheet
-        The name is empty where the table has one part.
-    """
-    columns = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name == key]
-    marks = None if columns or key not in ("device", "network") else _tells_apart(rows, sheet, key)
-    if marks is not None:
-        columns.append(marks)
-        rows.warnings.append(f"column {sheet.names[marks]!r} tells the rows apart: a series for each of its values")
-    counted = {i: "device" if i == marks or sheet.plain[i].startswith(("sim", "slot", "sub")) else key for i in columns}
-    values_of = {i: {text for text in sheet.texts(i) if _says(text, counted[i])} for i in columns}
-    several = [i for i, values in values_of.items() if 1 < len(values) <= _MOST_PARTS]
-    alone = {sheet.plain[i]: next(iter(values)) for i, values in values_of.items() if len(values) == 1}
-    if not several:
-        yield "", replace(rows, about=rows.about | identities(alone)), sheet
-        return
-    # rows that name none are one part, whatever they write
-    texts = [[text if text in values_of[i] else "" for text in sheet.texts(i)] for i in several]
-    rows_of: dict[tuple[str, ...], list[int]] = {}
-    for row, values in enumerate(zip(*texts, strict=True)):
-        rows_of.setdefault(values, []).append(row)
-    for values, mine in rows_of.items():
-        where = np.zeros(len(sheet), dtype=bool)
-        where[mine] = True
-        written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if text}
-        about = rows.about | identities(alone | written)
-        label = "_".join(_label(name, text) for name, text in written.items())
-        yield label, replace(rows.part(where), about=about), sheet.part(where)
-
-
-_OF_A_CELL = re.compile(
-    r"(tower|node|site|base ?station|bs|[eg]nb|cell|sector|e?ci|nci|[en]?cgi|channel|port|antenna|pol(ari[sz]ation)?"
-    r"|freq(uency)?|band) ?(id|identity|name|no|idx|index|[mgk]?hz)?"
-)
-
-
-def _tells_apart(rows: _rows.Rows, sheet: Sheet, key: str) -> int | None:
-    """The column of no known name whose values are networks or devices of their own; None if none.
-
-    Of networks it says whose level a row holds where no PCI does (a tower, a cell's number, a carrier), or is that
-    without which most instants have several rows (a node, a beam, a direction); of devices, several positions.
-    """
-    if key == "network" and sheet.find("PCI") is None:
-        named = (i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and _OF_A_CELL.fullmatch(words))
-        if (i := next((i for i in named if 1 < len({*sheet.texts(i)} - {""}) <= _MOST_PARTS), None)) is not None:
-            return i
-    time, place = pd.Series(rows.time), sheet.find("latitude_deg")
-    if (repeated := time.duplicated().mean()) < _REPEATED:  # most tables: no column of theirs is read for it
-        return None
-    if key == "device":
-        at = pd.DataFrame({"time": time, "at": "" if place is None else sheet.texts(place)})
-        if repeated - at.duplicated().mean() < _REPEATED:
-            return None
-    cells = [i for i, meaning in enumerate(sheet.meanings) if meaning is not None and meaning.quantity.name in _CELL]
-    keys = pd.DataFrame({"time": rows.time, **{str(i): sheet.texts(i) for i in cells}})
-    if keys.duplicated().mean() < _REPEATED:
-        return None
-    for i, meaning in enumerate(sheet.meanings):
-        texts = pd.Series(sheet.texts(i) if meaning is None else [], dtype=object)
-        if 1 < texts.nunique() <= _MOST_MARKS and not keys.assign(mark=texts).duplicated().any():
-            return i
-    return None
-
-
-_CELL = ("PCI", "ARFCN", "technology", "device")
-_REPEATED, _MOST_MARKS = 0.3, 16
-
-
-def identities(written: Mapping[str, str]) -> dict[str, Attribute]:
-    """Attributes of a part: its identities as written, a frequency in Hz."""
-    about: dict[str, Attribute] = {}
-    for name, text in written.items():
-        value, unit = _SI.fullmatch(text), re.search(r"\b[kmg](?=hz$)", name)
-        if "freq" in name and value is not None and (value[2] or unit or float(value[1]) > 1e6):
-            si = value[2] or (unit[0] if unit else "")
-            about["frequency_hz"] = float(value[1]) * {"k": 1e3, "m": 1e6, "g": 1e9, "": 1.0}[si.lower()]
-        else:
-            about["node" if name in ("tower", "site") else name.replace(" ", "_")] = text
-    return about
-
-
-_SI = re.compile(r"(\d{1,12}(?:\.\d{1,9})?) ?([kMG])?(?:Hz)?")
-
-
-def _says(text: str, key: str) -> bool:
-    """Check whether a cell names something; networks have no number 0, devices and SIMs may."""
-    return text.lower() not in NO_VALUE and text not in ("2147483647", "65535") and (key == "device" or text != "0")
-
-
-def _label(name: str, value: str) -> str:
-    # a name begins with a letter: 'sim1', not '1'
-    word = re.sub(r"\W+", "_", value).strip("_")
-    return word if word[:1].isalpha() else name.split()[0] + word
 
 
 def nothing(data: bytes, reader: str, reason: str) -> ReadResult:

@@ -16,7 +16,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 import numpy as np
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
@@ -130,6 +130,12 @@ class _Order:
         if day_first is not None:
             self.day_first = day_first
             return
+        # a log that passes midnight: in one of the orders its days follow each other, in the other they are weeks apart
+        distinct = {match.group("a", "b", "c"): match for match in dates}.values()
+        spans_d = [self._span_d(distinct, first) for first in (False, True)]
+        if abs(spans_d[0] - spans_d[1]) >= _WEEKS_D:
+            self.day_first = spans_d[1] < spans_d[0]
+            return
         date = _date_in_name(name)
         fits = [first for first in (True, False) if date and self._dated(dates[0], first) == date]
         self.day_first = fits[0] if len(fits) == 1 else european
@@ -149,6 +155,12 @@ class _Order:
         word = "first" if self.year_first else "last"
         self.warnings.append(f"the years of the dates have two digits: the {word} number was taken, a guess")
 
+    def _span_d(self, dates: Iterable[re.Match[str]], day_first: bool) -> float:
+        """Return how many days the dates span in one order of day and month, to a day or two."""
+        parts = (self.parts(match, day_first=day_first) for match in dates)
+        days = [365.25 * int(year) + 30.44 * month + day for year, month, day in parts]
+        return max(days) - min(days)
+
     def _dated(self, match: re.Match[str], day_first: bool) -> str:
         year, month, day = self.parts(match, day_first=day_first)
         return f"{year}-{month:02d}-{day:02d}"
@@ -166,6 +178,8 @@ class _Order:
         return _year(c), int(b if first else a), int(a if first else b)
 
 
+# Two orders of the same dates whose spans differ by as many days are told apart.
+_WEEKS_D = 20
 # Two digits of years in which logs of this kind are written.
 _FIRST_YEAR, _LAST_YEAR = 15, 40
 
@@ -288,12 +302,14 @@ def header_zone(name: str, brackets: str) -> str:
     ('EDT', 'UTC', '')
     """
     inside = brackets.strip()
+    if inside and inside.lower() in SCALES_S:
+        return "UTC"
     if inside and ("/" in inside or re.fullmatch(_NAMED_ZONE, inside.upper()) or inside.upper() in _WITH_SUMMER):
         return "" if inside.lower() in ("ms", "us", "s", "local", "iso", "date", "time", "unix", "epoch") else inside
     if (offset := re.search(r"\b(?:UTC|GMT) ?[+-]\d{1,2}(?::?\d\d)?\b", name, re.IGNORECASE)) is not None:
         return offset[0]
     words = re.split(r"[^A-Za-z0-9+]+", name)
-    if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu"}:
+    if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu", *SCALES_S}:
         return "UTC"
     last = words[-1].upper() if len(words[-1]) > 2 else ""  # 'time_edt'
     return next((word for word in (*words, last) if word in {*_HOURS, *_time.WINTER, *_WITH_SUMMER}), "")
@@ -321,7 +337,7 @@ def beside(text: str) -> str:
 
 def read(
     texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, european: bool = False, zone: str = "",
-    gps: bool = False, day_first: bool | None = None,
+    gps: bool = False, day_first: bool | None = None, device: IntArray | None = None,
 ) -> tuple[str, AnyArray, list[str]]:  # fmt: skip
     """A column of times in any of the known forms.
 
@@ -339,6 +355,8 @@ def read(
         Does the name of the column say that numbers are GPS time?
     day_first : bool, optional
         The order of dates that the name of the column gives.
+    device : int array, shape (n,), optional
+        Number of the device that wrote each row: a midnight is one of a device.
 
     Returns
     -------
@@ -353,6 +371,7 @@ def read(
         text.strip(' \t"[]') if text[-1:] != "]" or text[:1] == "[" else _PLACE.sub(r"\1", text.strip())
         for text in texts
     ]
+    shown = _padded(shown)
     filled = [text for text in shown if text]
     if 2 * sum((match := _COMPACT.fullmatch(text)) is not None and bool(match[1] or zone) for text in filled) > len(
         filled
@@ -365,7 +384,7 @@ def read(
     if counts * 2 > len(filled) and not any(_DIGITS.fullmatch(text) for text in filled[:3]):
         return _numbers(shown, unit, options, gps=gps)
     if sum(_OF_DAY.fullmatch(text) is not None for text in filled) * 2 > len(filled):
-        return _of_day(shown, options, zone)
+        return _of_day(shown, options, zone, device)
     plain = [text for text in filled if not _COMMON.fullmatch(text)]
     order = _Order(plain, options.file_name, european=european, day_first=day_first)
     warnings = order.warnings
@@ -378,6 +397,20 @@ def read(
         else _written(text, order, zones) for text in shown
     ]  # fmt: skip
     return "wall", _lines.cells(cells), warnings
+
+
+_COUNTED = re.compile(r"(.*\d:\d\d:\d\d:)(\d{1,9})(?!\d)(.*)")
+
+
+def _padded(texts: list[str]) -> list[str]:
+    """Return times whose part behind a third colon is a count of ms, us or ns with its leading zeros."""
+    matches = {text: match for text in set(texts) if (match := _COUNTED.fullmatch(text))}
+    widths = {len(match[2]) for match in matches.values()}
+    if len(widths) < 2:
+        return texts
+    width = 3 * -(-max(widths) // 3)
+    padded = {text: f"{match[1]}{match[2]:0>{width}}{match[3]}" for text, match in matches.items()}
+    return [padded.get(text, text) for text in texts]
 
 
 # The date and the time of day of a GPS receiver, six digits each: ddmmyy or yymmdd, hhmmss.
@@ -443,6 +476,8 @@ def _numbers(
 
 # GPS time counts from 6 January 1980; since 2017 it is 18 s ahead of UTC (IERS Bulletin C 52).
 GPS_S, LEAP_S = 315_964_800, 18
+# Scales of time without leap seconds, and how far they are ahead of UTC since 2017 [s].
+SCALES_S = {"gpst": LEAP_S, "gpstime": LEAP_S, "tai": 37}
 _GPS_COUNT = "the times count from 1980 (GPS time): 18 leap seconds were taken off"
 # Date of number zero, and the numbers of the years 2000 to 2099.
 _DAY_NUMBERS = (("1899-12-30", 36_526.0, 73_051.0, "a spreadsheet"), ("-001-12-31", 730_486.0, 767_011.0, "MATLAB"))
@@ -459,12 +494,17 @@ def _are_days(value: FloatArray, low: float, high: float) -> bool:
 _MILLISECONDS = "the times are whole numbers beyond a day of seconds: read as milliseconds"
 
 
-def _of_day(texts: Sequence[str], options: ReadOptions, zone: str) -> tuple[str, AnyArray, list[str]]:
+def _of_day(
+    texts: Sequence[str], options: ReadOptions, zone: str, device: IntArray | None = None
+) -> tuple[str, AnyArray, list[str]]:
     """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
     matches = [_OF_DAY.fullmatch(text) for text in texts]
     seconds = np.array([_seconds(item.groupdict()) if item else np.nan for item in matches], dtype=np.float64)
-    # back by more than half a day is midnight; less is a clock that was set
-    seconds += 86_400.0 * np.cumsum(np.nan_to_num(np.diff(seconds, prepend=np.nan)) < -43_200)
+    # back by more than half a day is midnight; less is a clock that was set; forward, where another device's rows
+    # begin, is the day before
+    step = np.nan_to_num(np.diff(seconds, prepend=np.nan))
+    other = np.zeros(len(step), dtype=bool) if device is None else np.diff(device, prepend=device[:1]) != 0
+    seconds += 86_400.0 * (np.cumsum(step < -43_200) - np.cumsum((step > 43_200) & other))
     written = next((item["zone"] for item in matches if item and item["zone"]), None) or zone
     first = seconds[np.isfinite(seconds)][:1]
     named, start_s = _NEMO_NAME.search(options.file_name), _session_start_s(options)

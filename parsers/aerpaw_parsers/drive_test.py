@@ -22,12 +22,13 @@ from aerpaw_cmp.logs.records import ReadResult, Stream
 from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
-from . import _cells, _pose, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri
+from . import _cells, _identity, _pose, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri
 
 # A tower of Lake Wheeler that a column is named by.
 _TOWER = re.compile(r"\blw ?([1-5])\b")
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
-_NO, _YES = ("false", "0", "no"), ("true", "1", "yes")
+# A cell that nobody calls serving is not known to serve: one of several does.
+_NO, _YES = ("false", "0", "no", "", "n/a", "none", "null", "nan", "-"), ("true", "1", "yes")
 _NEIGHBOURS = ("neighbor", "neighbour", "neighboring", "neighbouring", "detected", "monitored")
 
 
@@ -50,6 +51,7 @@ class _Cell:
     rat: str
     place: str
     columns: dict[str, int] = field(default_factory=dict)  # by the fields of a reading
+    ports: list[int] = field(default_factory=list)  # levels of single ports beside the cell's own
 
     @property
     def serving(self) -> bool:
@@ -69,20 +71,28 @@ _OWNERS = ("sim", "slot", "dev", "modem", "phone", "ue")
 def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
     """Cells of the table, columns of other quantities, columns of rank."""
     cells: dict[tuple[str, str], _Cell] = {}
+    fields: dict[tuple[str, str], dict[str, list[int]]] = {}
     others, ranks = [], []
     for i, meaning in enumerate(sheet.meanings):
         if meaning is None or meaning.quantity.role not in ("rss", "rank", "kpi", "cell"):
             continue
         name, role = _FIELDS.get(meaning.quantity.name), meaning.quantity.role
-        if meaning.indirect or sheet.unit(i) == "%" or (name is None and role in ("rss", "kpi")):
+        if meaning.indirect or (name is None and role in ("rss", "kpi")):
             others.append(i)
         elif role == "rank":
             ranks.append(i)
         elif name is not None:
             place = (meaning.rat, meaning.place)
-            columns = cells.setdefault(place, _Cell(*place)).columns
-            others += [i] if name in columns and name not in _IDENTITY else []  # a second one is kept as a KPI
-            columns.setdefault(name, i)
+            fields.setdefault(place, {}).setdefault(name, []).append(i)
+    for place, columns in fields.items():
+        cells[place] = cell = _Cell(*place)
+        for name, listed in columns.items():
+            cell.columns[name], *second = (
+                listed if name in _IDENTITY else sorted(listed, key=lambda i: _doubts(sheet, i))
+            )
+            if name == "rsrp_dbm":
+                cell.ports = [i for i in second if _part(sheet, i) != "mean"]
+            others += [i for i in second if i not in cell.ports and name not in _IDENTITY]  # kept as KPIs
     if sheet.find("neighbouring") is not None and (common := cells.get(("", "serving"))) is not None:
         of_row = {name: column for name, column in common.columns.items() if name in _IDENTITY}
         for cell in cells.values():  # a cell a row: the identity is that of whichever level the row has
@@ -94,6 +104,18 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
 
 
 _FIELDS = {quantity: name for name, quantity in _cells.QUANTITIES.items()}
+
+
+def _part(sheet: _sheet.Sheet, column: int) -> str:
+    meaning = sheet.meanings[column]
+    return "" if meaning is None else meaning.part
+
+
+def _doubts(sheet: _sheet.Sheet, column: int) -> tuple[bool, bool, bool, int]:
+    """Order of columns of one quantity of one cell: filled, no mean, no single port, then with most distinct values."""
+    known = sheet.numbers(column)
+    count = len(np.unique(known[np.isfinite(known)]))
+    return not count, _part(sheet, column) == "mean", _part(sheet, column) == "port", -count
 
 
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
@@ -128,7 +150,7 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
     return list(cells.values())
 
 
-def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> pd.DataFrame:
+def _readings(sheet: _sheet.Sheet, cells: list[_Cell], more: list[str]) -> pd.DataFrame:
     technology = sheet.find("technology")
     of_row = np.array([] if technology is None else [_rat(text) for text in sheet.texts(technology)], dtype=object)
     idle, tables = _idle(sheet), []
@@ -140,10 +162,18 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> pd.DataFrame:
         pci = np.where(values["pci"] == np.round(values["pci"]), values["pci"], np.nan)  # a fraction is no identity
         rat = of_row if technology is not None and not cell.rat else cell.rat
         about = {"row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle}
+        about["more"] = more if cell.place == "serving" else ""
         # a leg or a neighbour that is not there is no reading
         tables.append(pd.DataFrame({**values, **about, "pci": pci})[np.isfinite(level) & ~np.asarray(none)])
     joined: pd.DataFrame = pd.concat(tables) if tables else pd.DataFrame(columns=list(_cells.Reading._fields))
     return joined
+
+
+def _identities(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[str]:
+    """PCI and carrier of the serving cell in each row, as text."""
+    columns = next((cell.columns for cell in cells if cell.place == "serving"), {})
+    texts = [sheet.texts(columns[name]) for name in _IDENTITY if name in columns]
+    return ["\t".join(row) for row in zip(*texts, strict=True)] if texts else [""] * len(sheet)
 
 
 def _idle(sheet: _sheet.Sheet) -> BoolArray:
@@ -182,10 +212,10 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
     """Streams of a table whose columns have the names of a drive-test program: of each device, of each network."""
     _settle_names(sheet)
     streams: list[Stream | None] = []
-    for device, of_device, table in _sheet.parts(rows, sheet, "device"):
+    for device, of_device, table in _identity.parts(rows, sheet, "device"):
         name = f"phone_{device}" if device else "phone"
         streams.append(_pose.from_sheet(of_device, table, name=name, source="table of a phone"))
-        for network, part, cells in _sheet.parts(of_device, table, "network"):
+        for network, part, cells in _identity.parts(of_device, table, "network"):
             suffix = "_".join(word for word in (network, device) if word)
             streams += [_renamed(stream, suffix) for stream in _radio(part, cells)]
     levels = [stream for stream in streams if stream is not None and stream.kind in ("rss", "rank")]
@@ -197,19 +227,87 @@ def of_sheet(rows: _rows.Rows, sheet: _sheet.Sheet) -> ReadResult:
 
 def _radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     cells, others, ranks = _places(sheet)
-    owned: dict[str, list[_Cell]] = {}
+    more, about = _identity.further(sheet, _identities(sheet, cells))
+    owned: dict[tuple[str, str], list[_Cell]] = {}
     for cell in cells:
-        owned.setdefault(cell.place if cell.place.startswith(_OWNERS) else "", []).append(cell)
+        owner = cell.place if cell.place.startswith(_OWNERS) else ""
+        owned.setdefault((owner, ""), []).append(cell)
+        for port in cell.ports:  # of the same cell, under a name of its own
+            columns = {name: i for name, i in cell.columns.items() if name in _IDENTITY} | {"rsrp_dbm": port}
+            owned.setdefault((owner, _short(sheet, port)), []).append(replace(cell, columns=columns))
+    several = len({owner for owner, _ in owned}) > 1
     levels = [
-        _renamed(stream, owner if len(owned) > 1 else "")
-        for owner, part in owned.items()
-        for stream in _cells.streams(rows, _readings(sheet, part), source="drive test")
+        _renamed(stream, "_".join(word for word in (owner if several else "", port) if word))
+        for (owner, port), part in owned.items()
+        for stream in _cells.streams(rows, _readings(sheet, part, more), source="drive test", more=about)
     ]
+    _name_others(rows, sheet, cells, others)
     columns = [*ranks, *others, *_event_columns(sheet, cells)]
     direct = [what.quantity.role for what in sheet.meanings if what is not None and not what.indirect]
     # alone, a ratio to the noise is what a receiver says of the level
-    alone = not {"rss", "rank"} & {*direct}
-    return [*levels, *(_rank(rows, sheet, i) if i in ranks else _other(rows, sheet, i, alone) for i in columns)]
+    alone = not {"rss", "rank"} & {*direct} and not _of_a_scheduler(rows, sheet)
+    shown: list[Stream | None] = []
+    for i in columns:
+        if i in ranks or not _is_level(sheet, i, alone):
+            shown.append(_rank(rows, sheet, i) if i in ranks else _other(rows, sheet, i, alone))
+        else:
+            parts = _identity.parts(rows, sheet, "PCI", "ARFCN", found=False)
+            shown += [_renamed(_other(part, inner, i, alone), label) for label, part, inner in parts]
+    return [*levels, *shown]
+
+
+def _is_level(sheet: _sheet.Sheet, column: int, alone: bool) -> bool:
+    meaning = sheet.meanings[column]
+    of_cell = meaning is not None and not meaning.indirect and meaning.place == "serving"
+    of_cell = of_cell and not _is_statistic(sheet, column)
+    return (
+        of_cell
+        and meaning is not None
+        and (meaning.quantity.role == "rss" or (alone and meaning.quantity.name == "SINR"))
+    )
+
+
+def _is_statistic(sheet: _sheet.Sheet, column: int) -> bool:
+    """Check whether a column is the mean of a level that the table has as measured, too."""
+    own = sheet.meanings[column]
+    if own is None or own.part != "mean":
+        return False
+    measured = (other for other in sheet.meanings if other is not None and not other.part and not other.indirect)
+    return any((m.quantity, m.rat, m.place) == (own.quantity, own.rat, own.place) for m in measured)
+
+
+def _of_a_scheduler(rows: _rows.Rows, sheet: _sheet.Sheet) -> bool:
+    """Check whether a table is of a base station, with columns of the uplink alone: its ratios are of the uplink."""
+    words = {word for name in sheet.plain for word in name.split()}
+    if not (words & {"ul", "uplink", "pusch", "pucch"}) or words & {"dl", "downlink", "pdsch", "csi"}:
+        return False
+    if not words & {"rnti", "ue", "nprb", "prb", "prbs"}:
+        return False
+    rows.warnings.append(
+        "the table of a scheduler of the uplink: its ratios to the noise are no levels of the downlink"
+    )
+    return True
+
+
+def _short(sheet: _sheet.Sheet, column: int) -> str:
+    """Words of a column that are not its quantity, as a name."""
+    words = re.sub(r"\b(\w*rsrp|dbm|lte|nr|4g|5g|serving)\b", " ", sheet.plain[column])
+    return "_".join(words.split()) or f"column{column + 1}"
+
+
+def _name_others(rows: _rows.Rows, sheet: _sheet.Sheet, cells: list[_Cell], others: list[int]) -> None:
+    """Report which of several columns of a cell's level was read, and what became of the others."""
+    for cell in cells:
+        level = cell.columns["rsrp_dbm"]
+        means = [
+            i
+            for i in others
+            if (m := sheet.meanings[i]) and m.part == "mean" and (m.rat, m.place) == (cell.rat, cell.place)
+        ]
+        for listed, what in ((cell.ports, "series of their own"), (means, "KPIs")):
+            if listed:
+                shown = ", ".join(repr(sheet.names[i]) for i in listed)
+                rows.warnings.append(f"the level of the cell is {sheet.names[level]!r}; read as {what}: {shown}")
 
 
 def _renamed(stream: Stream | None, suffix: str) -> Stream | None:
@@ -280,6 +378,8 @@ def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int, alone: bool) -> S
     if tower and name == f"snr {tower[0]}":
         return _rows.snr(rows, about["node"], values)
     where, unit = np.isfinite(values), sheet.unit_read(column)
+    if _is_statistic(sheet, column):
+        about["statistic"] = "mean"
     return _cells.named(rows, name, values, unit=unit, where=where, about=about, alone=alone)
 
 

@@ -21,7 +21,7 @@ from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
-from . import _pose, _sheet
+from . import _identity, _pose, _sheet
 
 _EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
 # What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track.
@@ -146,8 +146,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     if not any(sheet.unit(where[name]) for name in angles) and _pose.are_small(angles):
         rows.warnings.append(_pose.small_angles(angles))
     streams: list[Stream | None] = []
-    for device, of_device, table in _sheet.parts(rows, sheet, "device"):
-        for label, part, cells in _divided(of_device, table, kind):
+    for device, of_device, table in _identity.parts(rows, sheet, "device"):
+        divided = _identity.parts(of_device, table, *_KEYS) if kind != "telemetry" else [("", of_device, table)]
+        for label, part, cells in divided:
             words = "_".join(word for word in (options.channel or kind, label, device) if word)
             streams.append(_stream(part, cells, kind, where, words, options.unit or unit))
         if kind == "rss":
@@ -162,17 +163,6 @@ def _tables(lines: _lines.Lines, first: int) -> Iterator[tuple[int, str, list[st
         line = lines.raw(i).removeprefix(b"\xef\xbb\xbf")
         separator = max(_sheet.SEPARATORS, key=lambda sign: line.count(sign.encode()))
         yield i, separator, [name.strip() for name in _sheet.split_row(line, separator)]
-
-
-def _divided(rows: _rows.Rows, sheet: _sheet.Sheet, kind: Kind) -> list[tuple[str, _rows.Rows, _sheet.Sheet]]:
-    parts = [("", rows, sheet)]
-    for key in _KEYS if kind != "telemetry" else ():
-        parts = [
-            ("_".join(word for word in (label, more) if word), inner, cells)
-            for label, part, table in parts
-            for more, inner, cells in _sheet.parts(part, table, key)
-        ]
-    return parts
 
 
 def _stream(

@@ -62,7 +62,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         raise InputError("a GPX track without times", expected="<time> in its points", cause="a route or a drawn track")
     row = lines.number_at(at for at, _ in points)
     placed = [values for _, values in points]
-    clock, time, warnings = _stamps.read([values[b"time"].decode("ascii", "replace") for values in placed], options)
+    texts = [values[b"time"].decode("ascii", "replace") for values in placed]
+    clock, time, warnings = _stamps.read(texts, options, zone="UTC")  # as GPX defines it
     names = (b"lat", b"lon", b"ele")
     column = {name.decode(): _lines.cells([values.get(name, b"") for values in placed]) for name in names}
     rows = _rows.built(

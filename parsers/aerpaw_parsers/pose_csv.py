@@ -11,7 +11,7 @@ from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_cmp.readers import dictionary
 
-from . import _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, vehicle_out
+from . import _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, vehicle_out
 
 
 def is_header(names: list[str]) -> bool:
@@ -65,7 +65,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows.warnings += _sheet.way_to_level(sheet)
     tracks = [
         _pose.from_sheet(part, cells, name=f"vehicle_{label}" if label else "vehicle", source="table of positions")
-        for label, part, cells in _sheet.parts(rows, sheet, "device")
+        for label, part, cells in _identity.parts(rows, sheet, "device")
     ]
     rows.warnings += sheet.unread()
     return rows.result(tracks)

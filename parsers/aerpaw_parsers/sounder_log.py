@@ -26,7 +26,7 @@ from aerpaw_cmp.logs.text import clocks as _time
 from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_cmp.logs.text import make_frames as _frames
 
-from . import _sheet
+from . import _identity
 
 _STAMP = 28  # "[" + 26 characters of time + "]"
 _VALUE = 16  # od -f: right-aligned in sixteen columns
@@ -356,7 +356,7 @@ def _stream(
         quantity="SNR" if name.lower() == "snr" else None, repeated_samples=tally["repeated"],
     )  # fmt: skip
     if link := _SOUNDING.match(options.file_name):
-        attributes |= _sheet.identities({key: text for key, text in link.groupdict().items() if text != "null"})
+        attributes |= _identity.attributes_of({key: text for key, text in link.groupdict().items() if text != "null"})
     return Stream("rss", name, frame.iloc[section.known :] if section.known else frame, attributes)
 
 

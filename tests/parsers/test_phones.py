@@ -73,7 +73,7 @@ def test_a_neighbour_that_nobody_names_is_no_level_of_the_serving_cell() -> None
     [
         ("LTE PDSCH throughput (Mbit/s)", "bit/s", 3e6),
         ("LTE PDSCH throughput [kbps]", "bit/s", 3e3),
-        ("LTE PDSCH throughput", "bit/s", 3.0),
+        ("LTE PDSCH throughput", "unknown", 3.0),
         ("DL_bitrate", "bit/s", 3e3),  # G-NetTrack's
         ("LTE BLER [%]", "%", 3.0),
         ("LTE SINR [dB]", "dB", 3.0),

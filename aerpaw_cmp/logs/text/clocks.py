@@ -354,9 +354,25 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
     ambiguous, nonexistent = np.zeros((2, len(wall)), dtype=bool)
     if not naive.any():
         return Instants(utc, ambiguous, nonexistent, zoned=bool(valid.any())), valid
+    zones = np.unique(offset[zoned & valid])
+    alike = (wall[naive] - zones[0] * 1_000_000_000).astype("datetime64[ns]") if len(zones) == 1 else None
+    if alike is not None and _beside(alike, utc[zoned & valid]):
+        # one program wrote them all: what some of its rows lack is what the others have
+        where = f"UTC {zones[0] / 3600:+g} h"
+        text = f"{counted(int(naive.sum()), 'time')} without a zone between times at {where}: read as at {where}, too"
+        utc[naive] = alike
+        return Instants(utc, ambiguous, nonexistent, (text,), zoned=True), valid
     local = wall_to_utc(wall[naive], options, needed_by=needed_by)
     utc[naive], ambiguous[naive], nonexistent[naive] = local.time, local.ambiguous, local.nonexistent
     return Instants(utc, ambiguous, nonexistent, local.warnings), valid
+
+
+def _beside(times: AnyArray, others: AnyArray) -> bool:
+    """Check whether most times lie within a quarter of an hour of some others."""
+    ordered = np.sort(others)
+    at = np.searchsorted(ordered, times)
+    apart = [np.abs(times - ordered[place.clip(0, len(ordered) - 1)]) for place in (at - 1, at)]
+    return bool(np.median(np.minimum(*apart)) < np.timedelta64(_BUCKET_S, "s"))
 
 
 def origin_ns(options: ReadOptions, *, needed_by: str) -> int | None:

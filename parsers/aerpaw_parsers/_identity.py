@@ -1,0 +1,279 @@
+"""Whose reading a row of a table holds: all columns that name a device, a network, a cell or a beam, taken together.
+
+A column joins the key of a series if it distinguishes rows that the other columns of the key do not: a cell's number
+beside its PCI does not, unless one PCI has two. A column of an unknown name joins it where rows of one time, or rows
+that take turns, differ in it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+
+from aerpaw_cmp.common.units import BoolArray, FloatArray
+from aerpaw_cmp.logs.records import Attribute
+from aerpaw_cmp.logs.text import rows as _rows
+
+from . import _sheet
+
+# Texts of each column, by its number.
+_Texts = Mapping[int, list[str]]
+
+# More values of a key than these are no devices or networks: they count something.
+_MOST_PARTS = 64
+# A program's lag at a handover: at most so many rows of a value, and this share of the rows of the other columns' key.
+_LAG_ROWS, _LAG_SHARE = 2, 0.1
+
+
+def parts(
+    rows: _rows.Rows, sheet: _sheet.Sheet, *keys: str, found: bool = True
+) -> Iterator[tuple[str, _rows.Rows, _sheet.Sheet]]:
+    """A table by its identities: the name of each part, its rows and its cells.
+
+    Parameters
+    ----------
+    rows : Rows
+    sheet : Sheet
+    keys : str
+        Quantities of the dictionary, such as ``device`` or ``network``; the combination of all their columns counts.
+    found : bool
+        Look for columns of unknown names that distinguish rows, too.
+
+    Yields
+    ------
+    tuple of str, Rows and Sheet
+        The name is empty if the table has one part.
+    """
+    columns = [
+        i for i, what in enumerate(sheet.meanings) if what and what.quantity.name in keys and _of_row(what.place)
+    ]
+    marks = _marks(rows, sheet, keys, columns) if found else []
+    texts = {i: _named(sheet, i) for i in (*columns, *marks)}
+    counted = _with_level(sheet)
+    several = [i for i in columns if 1 < len({texts[i][row] for row in np.flatnonzero(counted)}) <= _MOST_PARTS]
+    base = ["\t".join(row) for row in zip(*(texts[i] for i in several), strict=True)]
+    several += refining({i: texts[i] for i in marks}, counted, base)
+    if unknown := [sheet.names[i] for i in several if i in marks and sheet.meanings[i] is None]:
+        shown = ", ".join(map(repr, unknown))
+        rows.warnings.append(f"column {shown} tells the rows apart: a series for each of its values")
+    alone = {sheet.plain[i]: next(iter(values)) for i, values in _values(texts).items() if len(values) == 1}
+    alone = {name: text for name, text in alone.items() if not any(sheet.plain[i] == name for i in several)}
+    if not several:
+        yield "", replace(rows, about=rows.about | attributes_of(alone)), sheet
+        return
+    rows_of: dict[tuple[str, ...], list[int]] = {}
+    for row, values in enumerate(zip(*(texts[i] for i in several), strict=True)):
+        rows_of.setdefault(values, []).append(row)
+    for values, mine in rows_of.items():
+        where = np.zeros(len(sheet), dtype=bool)
+        where[mine] = True
+        written = {sheet.plain[i]: text for i, text in zip(several, values, strict=True) if text}
+        label = "_".join(_label(name, text) for name, text in written.items())
+        yield label, replace(rows.part(where), about=rows.about | attributes_of(alone | written)), sheet.part(where)
+
+
+def _of_row(place: str) -> bool:
+    return not place.startswith("n")
+
+
+def _values(texts: _Texts) -> dict[int, set[str]]:
+    return {i: {*cells} - {""} for i, cells in texts.items()}
+
+
+def _levels(sheet: _sheet.Sheet) -> list[str]:
+    """Which levels, ratios and ranks each row has; empty if it has none."""
+    columns = [
+        np.isfinite(sheet.numbers(i))
+        for i, meaning in enumerate(sheet.meanings)
+        if meaning is not None and (meaning.quantity.role in ("rss", "rank") or meaning.quantity.name == "SINR")
+    ]
+    filled = (" ".join(str(i) for i, has in enumerate(row) if has) for row in zip(*columns, strict=True))
+    return list(filled) if columns else [""] * len(sheet)
+
+
+def _with_level(sheet: _sheet.Sheet) -> BoolArray:
+    """Mask of the rows with a level, a ratio or a rank; of all, if the table has none."""
+    filled = np.array([bool(text) for text in _levels(sheet)], dtype=bool)
+    return filled if filled.any() else np.ones(len(sheet), dtype=bool)
+
+
+def refining(texts: _Texts, counts: BoolArray, base: Sequence[str] = ()) -> list[int]:
+    """Return the columns, in order, that divide the rows further than the columns before them do.
+
+    Parameters
+    ----------
+    texts : mapping of int to list of str, length n
+        Texts of each column, empty where it names nothing.
+    counts : bool array, shape (n,)
+        Rows that count.
+    base : sequence of str, length n, optional
+        Identity that is known before.
+    """
+    picked = np.flatnonzero(counts).tolist()
+    key = [base[row] for row in picked] if len(base) else [""] * len(picked)
+    chosen = []
+    for i, cells in texts.items():
+        values = {*cells} - {""}
+        if not values or len(values) > _MOST_PARTS:
+            continue
+        both = Counter((before, cells[row]) for before, row in zip(key, picked, strict=True))
+        if _divides(both, alone=len(values) == 1):
+            chosen.append(i)
+            key = [f"{before}\t{cells[row]}" for before, row in zip(key, picked, strict=True)]
+    return chosen
+
+
+def _divides(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
+    """Check whether a key has two values of a column, the few rows of a program's lag aside."""
+    totals, values = Counter[str](), Counter[str]()
+    for (before, _), count in counts.items():
+        totals[before] += count
+    several = len(totals) > 1
+    for (before, _), count in counts.items():
+        # beside another column a value of few rows is a lag of it; of a column alone each value counts
+        lag = count <= _LAG_ROWS and count <= _LAG_SHARE * totals[before]
+        values[before] += not (lag and (several or alone))
+    return max(values.values(), default=0) > 1
+
+
+_OF_A_CELL = re.compile(
+    r"((serving|lte|nr|nr5g|4g|5g|e ?utran?|global|full|dl|rx|tx|carrier|cent(er|re)) )*(tower|node|site|base ?station"
+    r"|bs|[eg]nb|cell|sector|e?ci|nci|l?cid|[en]?cgi|channel|(antenna |ant )?port|antenna|ant|pol(ari[sz]ation)?"
+    r"|freq(uency)?|band|beam|ssb|csi ?rs)( (global|beam|port))? ?(id(entity|x)?|name|no|num(ber)?|index|[mgk]?hz)?"
+)
+# Whose words name another cell than that of the row's level, or what somebody does.
+_OTHERS = re.compile(r"\b(serving|best|target|source|dest|destination|strongest|prev|previous|next|handover)\b")
+
+
+def of_a_cell(sheet: _sheet.Sheet) -> list[int]:
+    """Columns whose names are of a cell, and that the dictionary does not know."""
+    return [i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and _OF_A_CELL.fullmatch(words)]
+
+
+def _marks(rows: _rows.Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int]) -> list[int]:
+    """Columns of no known quantity whose values are networks or devices of their own.
+
+    Networks are distinguished by the names of cells where no PCI does it, and by columns without which most times have
+    several rows (a node, a beam, a direction), or that take turns with the level; devices by several positions.
+    """
+    key = keys[0]
+    marks = of_a_cell(sheet) if key == "network" and ("PCI" in keys or sheet.find("PCI") is None) else []
+    columns = [*known, *marks, *(i for i, m in enumerate(sheet.meanings) if m is not None and m.quantity.name in _CELL)]
+    columns = list(dict.fromkeys(columns))
+    table = pd.DataFrame({"time": rows.time, "levels": _levels(sheet), **{str(i): sheet.texts(i) for i in columns}})
+    place = sheet.find("latitude_deg")
+    if key == "device":
+        at = pd.DataFrame({"time": rows.time, "at": "" if place is None else sheet.texts(place)})
+        if at["time"].duplicated().mean() - at.duplicated().mean() < _REPEATED:
+            return []
+        table = table[["time", "levels", *(str(i) for i in known)]]
+    unknown = [
+        i for i, m in enumerate(sheet.meanings) if m is None and i not in marks and not _OTHERS.search(sheet.plain[i])
+    ]
+    while (repeated := table.duplicated().mean()) >= _REPEATED:
+        # the column that leaves fewest rows of one time and one key, then the next
+        left = {i: table.assign(mark=sheet.texts(i)).duplicated().mean() for i in unknown if _few(sheet.texts(i))}
+        best = min(left, key=lambda i: left[i], default=-1)
+        if best < 0 or left[best] > repeated - _REPEATED / 2:
+            break
+        marks.append(best)
+        unknown.remove(best)
+        table[str(best)] = sheet.texts(best)
+    if key == "network":
+        marks += [i for i in unknown if _takes_turns(rows, sheet, i)]
+    return marks
+
+
+_CELL = ("PCI", "ARFCN", "technology", "device", "network")
+_REPEATED, _MOST_MARKS = 0.3, 16
+
+
+def _few(texts: Iterable[str]) -> bool:
+    return 1 < len({*texts}) <= _MOST_MARKS
+
+
+# Of rows in turns this share follows the order of the rows before, and steps within a device are so much smaller.
+_IN_TURN, _SMALLER, _FEWEST_TURNS = 0.8, 0.5, 8
+
+
+def _takes_turns(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> bool:
+    """Check whether the values of a column take turns from row to row, and the level with them."""
+    level = next((i for name in ("RSRP", "RSSI", "SNR", "SINR", "power") if (i := sheet.find(name)) is not None), None)
+    texts = np.array(sheet.texts(column), dtype=object)
+    if level is None or not _few(texts.tolist()) or len(texts) < _FEWEST_TURNS:
+        return False
+    order = np.argsort(rows.time, kind="stable")
+    texts, values = texts[order], sheet.numbers(level)[order]
+    count = len({*texts.tolist()})
+    if len(texts) < 2 * count or (texts[1:] != texts[:-1]).mean() < _IN_TURN:
+        return False
+    if (texts[count:] == texts[:-count]).mean() < _IN_TURN:
+        return False
+    within = [np.abs(np.diff(values[texts == text])) for text in {*texts.tolist()}]
+    return _typical(np.concatenate(within)) < _SMALLER * _typical(np.abs(np.diff(values)))
+
+
+def _typical(steps: FloatArray) -> float:
+    known = steps[np.isfinite(steps)]
+    return float(np.median(known)) if len(known) else np.nan
+
+
+def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
+    """Texts of a column, empty where they name nothing; networks have no number 0, devices, beams and SIMs may."""
+    meaning = sheet.meanings[column]
+    zero = (
+        meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(("sim", "slot", "sub"))
+    )
+    return [text if _says(text, zero=zero) else "" for text in sheet.texts(column)]
+
+
+def further(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[str, dict[str, Attribute]]]:
+    """Return the name of what distinguishes cells of one PCI and carrier in each row, and attributes by that name.
+
+    Parameters
+    ----------
+    sheet : Sheet
+    base : sequence of str, length n
+        PCI and carrier of each row.
+    """
+    texts = {i: _named(sheet, i) for i in of_a_cell(sheet)}
+    chosen = refining(texts, _with_level(sheet), base)
+    labels, about = [""] * len(sheet), {"": dict[str, Attribute]()}
+    for row in range(len(sheet)) if chosen else ():
+        written = {sheet.plain[i]: texts[i][row] for i in chosen if texts[i][row]}
+        labels[row] = "_".join(_label(name, text) for name, text in written.items())
+        about.setdefault(labels[row], attributes_of(written))
+    return labels, about
+
+
+def attributes_of(written: Mapping[str, str]) -> dict[str, Attribute]:
+    """Attributes of a part: its identities as written, a frequency in Hz."""
+    about: dict[str, Attribute] = {}
+    for name, text in written.items():
+        value, unit = _SI.fullmatch(text), re.search(r"\b[kmg](?=hz$)", name)
+        if "freq" in name and value is not None and (value[2] or unit or float(value[1]) > 1e6):
+            si = value[2] or (unit[0] if unit else "")
+            about["frequency_hz"] = float(value[1]) * {"k": 1e3, "m": 1e6, "g": 1e9, "": 1.0}[si.lower()]
+        else:
+            about["node" if name in ("tower", "site") else name.replace(" ", "_")] = text
+    return about
+
+
+_SI = re.compile(r"(\d{1,12}(?:\.\d{1,9})?) ?([kMG])?(?:Hz)?")
+_NO_IDENTITY = ("2147483647", "4294967295", "268435455", "65535", "-1", "9223372036854775807")
+
+
+def _says(text: str, *, zero: bool) -> bool:
+    """Check whether a cell names something."""
+    return text.lower() not in _sheet.NO_VALUE and text not in _NO_IDENTITY and (zero or text != "0")
+
+
+def _label(name: str, value: str) -> str:
+    # a name begins with a letter: 'sim1', not '1'
+    word = re.sub(r"\W+", "_", value).strip("_")
+    return word if word[:1].isalpha() else name.split()[0] + word

@@ -1,0 +1,106 @@
+"""Whose reading a row holds: two sources never become one series without a warning, and one source never becomes two."""
+
+import random
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.records import ReadResult
+
+# Names of identities and what they write for the first, the second and the third source.
+IDENTITIES = {
+    "pci": ("11", "12", "500"), "cell_id": ("51200001", "51200514", "7"), "ECI": ("900", "901", "902"),
+    "eNB ID": ("3001", "3002", "3003"), "sector": ("1", "2", "3"), "beam": ("0", "1", "2"), "ssb_index": ("4", "0", "2"),
+    "rnti": ("f055", "6584", "17"), "antenna_port": ("0", "1", "2"), "device": ("A", "B", "C"), "IMEI": ("35", "36", "37"),
+    "sim_slot": ("0", "1", "2"), "operator": ("T", "V", "A"), "transmitter": ("LW1", "LW2", "LW3"),
+    "receiver": ("rx-a", "rx-b", "rx-c"), "earfcn": ("2300", "5110", "66486"), "Freq (MHz)": ("739", "2145", "3460"),
+    "cgi": ("310260-1", "310260-2", "310260-3"), "bssid": ("aa:01", "aa:02", "aa:03"), "tower": ("LW1", "LW2", "LW3"),
+}  # fmt: skip
+# What changes along a flight, and says nothing of who.
+OTHERS = {
+    "waypoint": lambda i: str(i // 12), "flight_mode": lambda i: "AUTO" if i % 40 > 9 else "LOITER",
+    "height_step": lambda i: str(30 + 10 * (i // 20)), "battery": lambda i: str(100 - i // 5), "armed": lambda _i: "1",
+}  # fmt: skip
+BASES = (-70, -95, -120)
+
+
+def rows_of(sources: int, order: str, count: int, shuffle: random.Random) -> list[tuple[float, int, int]]:
+    """Time, source and number of each reading: at the same times, in turns, or a source after the other."""
+    if order == "turns":
+        return [(i * 0.3, i % sources, i // sources) for i in range(count * sources)]
+    if order == "blocks":
+        return [(float(i), i // 20 % sources, i) for i in range(count * sources)]
+    rows = []
+    for i in range(count):
+        group = [(float(i), source, i) for source in range(sources)]
+        shuffle.shuffle(group)
+        rows += group
+    return rows
+
+
+def written(names: list[str], rows: list[tuple[float, int, int]]) -> str:
+    lines = []
+    for at, (time, source, number) in enumerate(rows):
+        cells = {"timestamp": f"{1749564000 + time:.1f}", "rsrp": f"{BASES[source] - number % 4}"}
+        cells |= {name: values[source] for name, values in IDENTITIES.items()}
+        cells |= {name: value(at) for name, value in OTHERS.items()}
+        cells |= {f"{name} copy": values[source] for name, values in IDENTITIES.items()}
+        lines.append(",".join(cells[name] for name in names))
+    return ",".join(names) + "\n" + "\n".join(lines) + "\n"
+
+
+def read(path: Path, text: str) -> ReadResult:
+    path.write_text(text)
+    (file,) = ingest([path])
+    return file.result
+
+
+def sources_of(result: ReadResult) -> list[set[int]]:
+    """Sources in each series of levels."""
+    return [
+        {round((-70 - level - 2) / 25) for level in stream.frame["rss_db"].dropna()}
+        for stream in result.streams
+        if stream.kind == "rss"
+    ]
+
+
+@settings(max_examples=120, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_the_series_are_the_sources(data: st.DataObject, tmp_path: Path) -> None:
+    sources = data.draw(st.integers(1, 3))
+    known = data.draw(st.lists(st.sampled_from(sorted(IDENTITIES)), min_size=1, max_size=3, unique=True))
+    twice = [f"{known[0]} copy"] if data.draw(st.booleans()) else []
+    more = data.draw(st.lists(st.sampled_from(sorted(OTHERS)), max_size=3, unique=True))
+    names = data.draw(st.permutations(["timestamp", "rsrp", *known, *twice, *more]))
+    rows = rows_of(sources, data.draw(st.sampled_from(["turns", "blocks", "at once"])), 40, data.draw(st.randoms()))
+    found = sources_of(read(tmp_path / "x.csv", written(names, rows)))
+    assert all(len(part) == 1 for part in found), (names, found)
+    assert sorted(next(iter(part)) for part in found) == list(range(sources)), (names, found)
+
+
+@pytest.mark.parametrize("order", ["turns", "at once"])
+@pytest.mark.parametrize("sources", [2, 3])
+def test_sources_that_no_column_names_are_reported(order: str, sources: int, tmp_path: Path) -> None:
+    rows = rows_of(sources, order, 40, random.Random(1))
+    result = read(tmp_path / "x.csv", written(["timestamp", "rsrp", "waypoint"], rows))
+    assert any("its levels alternate" in text for text in result.warnings)
+
+
+@pytest.mark.parametrize("name", ["unit", "probe", "who"])
+@pytest.mark.parametrize("order", ["turns", "at once"])
+def test_a_column_of_an_unknown_name_that_takes_turns_with_the_level_joins_the_key(
+    name: str, order: str, tmp_path: Path
+) -> None:
+    rows = rows_of(3, order, 40, random.Random(1))
+    text = written(["timestamp", "operator copy", "rsrp"], rows).replace("operator copy", name)
+    found = sources_of(read(tmp_path / "x.csv", text))
+    assert sorted(map(sorted, found)) == [[0], [1], [2]]
+
+
+def test_rows_whose_identity_is_empty_are_no_part_of_another(tmp_path: Path) -> None:
+    rows = "".join(f"{1749564000 + i},{'' if i % 2 else 'A'},{-70 - 40 * (i % 2)}\n" for i in range(20))
+    levels = [set(s.frame["rss_db"]) for s in read(tmp_path / "x.csv", f"time,operator,rsrp\n{rows}").streams]
+    assert levels == [{-70.0}, {-110.0}]

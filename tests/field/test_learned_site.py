@@ -56,7 +56,7 @@ def first_words(folder: Path, site: Path, log: str) -> tuple[str, dict]:
     out = folder / draft.stem
     assert main(["report", str(draft), "-o", str(out), "--audit", "none", "--figures", "none"]) == 0
     page = (out / "report.html").read_text(encoding="utf-8")
-    begin = page.index('class="verdict">') + len('class="verdict">')
+    begin = page.index(">", page.index('class="verdict"')) + 1
     return page[begin : page.index("</p>", begin)], json.loads((out / "metrics.json").read_text(encoding="utf-8"))
 
 

@@ -123,7 +123,8 @@ def try_replay(data: FlightData) -> None:
     def first(series: SeriesT, known: BoolArray) -> SeriesT:
         at = np.flatnonzero(known & data.tower_at(series.tower, series.time)[1])[:1]
         every = ((field.name, getattr(series, field.name)) for field in dataclasses.fields(series))
-        return dataclasses.replace(series, **{name: a[at] for name, a in every if isinstance(a, np.ndarray)})
+        arrays: dict[str, Any] = {name: a[at] for name, a in every if isinstance(a, np.ndarray)}
+        return dataclasses.replace(series, **arrays)
 
     replay_rss(dataclasses.replace(data, rss=tuple(first(s, data.poses_at(s.time).valid) for s in data.rss)))
     ranked = tuple(first(s, rank_positions(s, data.track)[1]) for s in data.rank)

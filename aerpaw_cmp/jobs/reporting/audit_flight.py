@@ -237,7 +237,8 @@ def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -
 
 def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> reference.ExpectedArray:
     """An array of flight.yaml, laid out a second time."""
-    positions = reference.layout_positions(settings.layout, wavelength, settings.elements, settings.positions_m)
+    elements = settings.elements or 4  # of layout linear
+    positions = reference.layout_positions(settings.layout, wavelength, elements, settings.positions_m)
     slants = settings.slant_deg if isinstance(settings.slant_deg, list) else [settings.slant_deg]
     pattern = scalar_pattern(load_pattern(settings.antenna, folder, reference.C_MPS / wavelength))
     return reference.ExpectedArray(

@@ -18,7 +18,7 @@ from ..common.counting import counted
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
 from ..common.yamlfile import nearest
-from ..logs.ingest import Held, IngestedFile, ingest, named_log, read_log
+from ..logs.ingest import ROLLOVER_DAYS, Held, IngestedFile, ingest, named_log, read_log
 from ..logs.records import COLUMNS, Stream
 from ..propagation.geometry.arrays import Link
 from ..site.site import Site, Tower
@@ -878,6 +878,14 @@ def _check_shared(data: FlightData, what: str, time: Times, track: Track, node: 
 
 
 def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: np.datetime64) -> str:
+    apart = (time.min() - start) / np.timedelta64(ROLLOVER_DAYS, "D") if len(time) else 0.0
+    late = time - np.timedelta64(ROLLOVER_DAYS * round(apart), "D")
+    if round(apart) and late.min() <= end and late.max() >= start:
+        of, count = ("telemetry", round(apart)) if apart > 0 else ("radio log", -round(apart))
+        return (
+            f"the week number of a GPS receiver rolled over: the {of} is {count * ROLLOVER_DAYS} days "
+            f"({count * 1024} weeks) early; write 'gps_rollovers: {count}' beside its path"
+        )
     trap = clock_trap((time.min(), time.max()), (start, end), timezone) if len(time) else None
     return "logs of different flights, or a wrong 'timezone' or 'clock'" if trap is None else trap.advice()
 

@@ -224,6 +224,8 @@ class LogSettings(StrictModel):
     timezone: str | None = None
     clock: Literal["local", "utc", "local_as_utc"] | None = None
     time_origin: str | None = None
+    gps_rollovers: Annotated[int, Field(ge=0, le=3)] = 0
+    """Rollovers of the week number of the log's GPS receiver: each adds 1 024 weeks to the times."""
     ri_base: Literal["zero", "one"] | None = None
     columns: dict[str, str] = {}
     kind: Kind | None = None
@@ -241,7 +243,7 @@ class LogSettings(StrictModel):
         return ReadOptions(
             timezone=self.timezone or timezone,
             ri_base=self.ri_base,
-            **named(self, "clock time_origin columns kind node channel frequency_hz unit floor_db"),
+            **named(self, "clock time_origin gps_rollovers columns kind node channel frequency_hz unit floor_db"),
         )
 
 

@@ -11,6 +11,7 @@ import os
 from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
+from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -538,7 +539,7 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
 
     expected, cause = f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"
     with parsing(path, expected, cause), blaming(reader.plugin, f"reader {reader.name!r} read it", InputError):
-        result = origins.stated(limits.check(read()), reader, options)
+        result = origins.stated(limits.check(_later(read(), options.gps_rollovers)), reader, options)
     if not result.accepted:
         first = f": {result.rejected[0].reason}" if result.rejected else ""
         raise InputError(
@@ -548,6 +549,21 @@ def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[]
             path=path,
         )
     return result
+
+
+# GPS receivers count weeks modulo 1 024 (IS-GPS-200): their dates fall back by so many days.
+ROLLOVER_DAYS = 7 * 1024
+
+
+def _later(result: ReadResult, rollovers: int) -> ReadResult:
+    """Return a result with 1 024 weeks added to its times for each rollover of the receiver's week number."""
+    if not rollovers:
+        return result
+    days = rollovers * ROLLOVER_DAYS
+    shift = timedelta(days=days)
+    streams = [replace(s, frame=s.frame.assign(time=s.frame["time"] + shift)) for s in result.streams]
+    text = f"{counted(rollovers, 'rollover')} of the GPS week number: {days} days were added to the times"
+    return replace(result, streams=tuple(streams), warnings=(*result.warnings, text))
 
 
 def _folder(folder: Path, options: _OptionsFor | None, chosen: Reader | None) -> _Found:

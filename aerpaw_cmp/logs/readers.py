@@ -39,6 +39,8 @@ class ReadOptions:
         Overrides the reader's own rule; ``local_as_utc`` is local wall time stored as if it were UTC.
     time_origin : str, optional
         ISO time (with zone, or local in ``timezone``) of a log whose times are relative.
+    gps_rollovers : int
+        How often the week number of the log's GPS receiver has rolled over: each adds 1 024 weeks to its times.
     ri_base : {"zero", "one"}, optional
         What the source prints for rank 1. Readers that know their base ignore it.
     columns : mapping, optional
@@ -65,6 +67,7 @@ class ReadOptions:
     timezone: str | None = None
     clock: Literal["local", "utc", "local_as_utc"] | None = None
     time_origin: str | None = None
+    gps_rollovers: int = 0
     ri_base: Literal["zero", "one"] | None = None
     columns: Mapping[str, str] = field(default_factory=dict)
     kind: Kind | None = None

@@ -81,6 +81,23 @@ def test_a_level_frozen_to_all_digits_in_flight_is_not_scored(digits: int, froze
     assert any("repeat one level" in text for text in flight.warnings) is bool(frozen)
 
 
+def test_a_receiver_whose_week_number_rolled_over_is_named_and_shifted(tmp_path: Path) -> None:
+    """1024 weeks before 1 June 2025 is 16 October 2005."""
+    track = next(SAMPLE.glob("UAV/*vehicleOut.txt")).read_text().replace("2025-06-01", "2005-10-16")
+    (tmp_path / "v_vehicleOut.txt").write_text(track)
+    lines = "flight: f\ntimezone: America/New_York\nlogs:\n  - {path: v_vehicleOut.txt}\n"
+    level = f"  - {{path: {SAMPLE / 'LW1/USRP1_power_log.txt'}, node: LW1, channel: USRP1}}\n"
+    (tmp_path / "flight.yaml").write_text(lines + level)
+    with pytest.raises(InputError, match=r"telemetry is 7168 days \(1024 weeks\) early; write 'gps_rollovers: 1'"):
+        load_data(load_flight(tmp_path / "flight.yaml"), tmp_path)
+    (tmp_path / "flight.yaml").write_text(lines.replace("Out.txt}", "Out.txt, gps_rollovers: 1}") + level)
+    shifted = load_data(load_flight(tmp_path / "flight.yaml"), tmp_path)
+    right = _flight(tmp_path, level.strip(" -{}\n")).track
+    assert shifted.track is not None
+    assert right is not None
+    assert (shifted.track.start_ns, shifted.track.end_ns) == (right.start_ns, right.end_ns)
+
+
 def test_a_rank_log_in_two_parts_is_one_record(tmp_path: Path) -> None:
     log = "UAV/modem_ri.csv"
     (uncut,) = _flight(tmp_path, f"path: {SAMPLE / log}").rank

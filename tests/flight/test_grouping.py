@@ -222,3 +222,31 @@ def test_a_log_may_lie_twelve_metres_beside_the_track(aside_m: float, agrees: bo
         assert estimate.distance_m == pytest.approx(0.9 * aside_m, abs=0.3)
     assert origin_of(stream_of(log.iloc[:19]), stream_of(flown)) is None
     assert origin_of(stream_of(flown.iloc[40:240]), stream_of(flown)) is None, "its times are times of a day"
+
+
+@pytest.mark.parametrize(
+    ("radio", "asked"),
+    [
+        ("flight2_LW1_power_log.txt", "its name has flight 2, that of the track flight 1: which flight?"),
+        ("flight01_LW1_power_log.txt", ""),
+        ("LW1_power_log.txt", ""),
+    ],
+)
+def test_names_of_two_flights_are_not_paired_without_a_question(radio: str, asked: str, tmp_path: Path) -> None:
+    write_flight(tmp_path / "logs", "2025-03-02T15:00:00")
+    (tmp_path / "logs/x_vehicleOut.txt").rename(tmp_path / "logs/flight1_vehicleOut.txt")
+    (tmp_path / "logs/LW1_power_log.txt").rename(tmp_path / "logs" / radio)
+    (flight,) = flights(ingest(tmp_path / "logs", options=OPTIONS))
+    assert flight.unsure == ({str(tmp_path / "logs" / radio): asked} if asked else {})
+
+
+@pytest.mark.parametrize(("date", "asked"), [("2025-03-05", True), ("2025-03-02", False), ("2025-03-01", False)])
+def test_a_log_without_a_clock_whose_name_has_another_date_is_asked_about(
+    date: str, asked: bool, tmp_path: Path
+) -> None:
+    write_flight(tmp_path / "logs", "2025-03-02T15:00:00")
+    (tmp_path / "logs/LW1_power_log.txt").unlink()
+    rows = "".join(f"{i},11,-90\n" for i in range(20))
+    (tmp_path / "logs" / f"{date}_phone.csv").write_text(f"elapsed,pci,rsrp\n{rows}")
+    (flight,) = flights(ingest(tmp_path / "logs", options=OPTIONS))
+    assert bool(flight.unsure) is asked

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -74,7 +75,36 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     for file in files:
         if _span_of(file) is None:
             _home(file, groups).files.append(file)
+    for flight in groups:
+        tracks = [file for file in flight.files if _tracks(file)]
+        for file in flight.files if tracks else ():
+            if file.path not in flight.unsure and (text := _otherwise(file, tracks[0])):
+                flight.unsure[file.path] = text
     return sorted(groups, key=lambda group: (group.span is None, (group.span or ())[:1]))
+
+
+# A number of a flight, and a date, in the name of a log or of its folder.
+_FLIGHT_NUMBER = re.compile(r"(?<![a-z])(flight|flt|sortie|mission)[ _.-]?0*(\d{1,3})(?!\d)", re.IGNORECASE)
+_DATE = re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)")
+
+
+def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
+    """Return the question about a log whose name has another flight or date than the track's; empty if it has none."""
+    names = ["/".join(Path(item.path).parts[-2:]) for item in (file, track)]
+    first, second = ({(word.lower(), number) for word, number in _FLIGHT_NUMBER.findall(name)} for name in names)
+    if first and second and not first & second:
+        (shown, other) = (" ".join(min(found)) for found in (first, second))
+        return f"its name has {shown}, that of the track {other}: which flight?"
+    # a clock of its own says more than a name: an evening's flight has the next day in UTC
+    if _span_of(file) is not None:
+        return ""
+    dates = [{"-".join(parts) for parts in _DATE.findall(name)} for name in names]
+    flown = _span_of(track)
+    if flown is not None:
+        dates[1] |= {str(flown[0].astype("datetime64[D]") + day) for day in (-1, 0, 1)}
+    if dates[0] and dates[1] and not dates[0] & dates[1]:
+        return f"its name has {min(dates[0])}, the track is of {max(dates[1])}: which flight?"
+    return ""
 
 
 def _span_of(file: IngestedFile) -> Span | None:

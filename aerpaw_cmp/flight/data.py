@@ -404,8 +404,8 @@ def gather(
         warnings += [f"{log.path}: {text}" for text in file.result.warnings]
         streams = [stream for stream in file.result.streams if stream.name not in log.skip]
         telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
-        levels = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
-        for stream in (s for s in levels if log.node or not is_own_radio(s)):
+        heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
+        for stream in (s for s in heard if log.node or not is_own_radio(s)):
             # the sounder writes power and quality to files of their own
             elsewhere = (candidate for source in files if source is not file for candidate in source.result.streams)
             locked, remark = lock_of(stream, [*file.result.streams, *elsewhere])

@@ -403,8 +403,8 @@ def _split_places(sheet: Sheet) -> None:
         pairs = [_PAIR.fullmatch(text) for text in texts]
         if not any(pairs[:50]) or 2 * sum(map(bool, pairs)) <= sum(map(bool, texts)):
             continue
-        swapped = re.match(r"(?i)POINT", texts[0]) or re.match(r"lon|lng", sheet.plain[i])
-        swapped = swapped or any(abs(float(pair[1])) > 90 for pair in pairs if pair)
+        swapped = any(re.match(r"(?i)POINT", text) for text in texts[:50]) or sheet.plain[i].startswith(("lon", "lng"))
+        swapped |= any(abs(_angle(pair[1])[0]) > 90 for pair in pairs if pair)
         columns = [[pair[part] if pair else "" for pair in pairs] for part in ((2, 1) if swapped else (1, 2))]
         sheet.names[i] = f"{name} in one text"
         for angle, cells in zip(("latitude", "longitude"), columns, strict=True):

@@ -32,7 +32,7 @@ def sniff(head: bytes) -> bool:
 
 
 def _reading(text: bytes) -> dict[str, str]:
-    """Return the cells of a subtitle; without a position they have no latitude."""
+    """Return the cells of a subtitle, with an empty latitude if it has no position."""
     cells = {"latitude": "", "longitude": ""}
     for name, value in _FIELD.findall(text):
         cells[_NAMES.get(name.decode(), name.decode())] = value.decode()
@@ -52,7 +52,7 @@ def _reading(text: bytes) -> dict[str, str]:
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Return the telemetry ``vehicle``; UsageError if the times have no zone and none is given."""
+    """Return the telemetry ``vehicle``."""
     lines = _lines.split(data)
     begin = [match.start() for match in _BEGIN.finditer(data)]
     number = lines.number_at(begin).tolist()

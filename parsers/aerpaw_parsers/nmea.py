@@ -1,7 +1,8 @@
-"""NMEA 0183 sentences of a GNSS receiver: positions of ``GGA``, ``GNS`` or ``RMC``; dates of ``RMC``, else of ``ZDA``.
+"""NMEA 0183 sentences of a GNSS receiver.
 
-Times are UTC. A sentence counts if its checksum is right; text in front of the ``$``, such as a logger's own time, is
-not read. The fix is that of MAVLink: 3 single, 4 differential, 5 and 6 RTK. Altitudes are above mean sea level.
+Positions are those of ``GGA``, ``GNS`` or ``RMC``, dates those of ``RMC``, else of ``ZDA``. Times are UTC. A sentence
+counts if its checksum is right. Text in front of the ``$``, such as a logger's own time, is not read. The fix is that
+of MAVLink: 3 single, 4 differential, 5 and 6 RTK. Altitudes are above mean sea level.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ def sniff(head: bytes) -> bool:
 
 
 def _sentences(lines: _lines.Lines, rejected: list[RejectedLine]) -> list[tuple[int, str, str, list[str]]]:
-    """Return the 0-based line, talker, kind and fields of each intact sentence; at least ten fields."""
+    """Return the 0-based line, talker, kind and fields (ten or more) of each intact sentence."""
     intact, unchecked = [], b"*" not in lines.data
     for i in np.flatnonzero(~lines.blank).tolist():
         found = _SENTENCE.fullmatch(lines.raw(i))
@@ -76,7 +77,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         time = _CLOCK.sub(r"\1:\2:\3Z", fields[0])
         if dates:
             _, day, clock = dates[max(int(np.searchsorted(at, i)) - 1, 0)]
-            # the date is of another sentence, which may lie on the other side of midnight
+            # the sentence with the date may lie on the other side of midnight
             days = int(day[:2]) - 1 + round((_day_s(clock) - _day_s(fields[0])) / 86_400)
             time = f"{np.datetime64(f'20{day[-2:]}-{day[2:4]}-01') + days}T{time}"
         latitude, north, longitude, east = fields[1:5] if high else fields[2:6]

@@ -1,7 +1,7 @@
 """Position solutions of RTKLIB (``.pos``): latitude, longitude and height.
 
-A comment line (``%``) names the columns; its first name is the time scale, GPST, UTC or JST, and times are a
-date with a clock, or GPS weeks with seconds. The fix is that of MAVLink: 3 single, 4 differential, 5 and 6 RTK, 8 PPP.
+A comment line (``%``) names the columns. Its first name is the time scale: GPST, UTC or JST. Times are a date with a
+clock, or a GPS week with its second. The fix is that of MAVLink: 3 single, 4 differential, 5 and 6 RTK, 8 PPP.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _FIX = dict(zip("123456", "653438", strict=True))
 
 def sniff(head: bytes) -> bool:
     """Check whether a comment names the columns of a solution."""
-    return _HEADER.search(head) is not None
+    return head.startswith(b"%") and _HEADER.search(head) is not None
 
 
 def _time(day: str, clock: str, scale_s: int) -> str:
-    """Return UTC of a date and a clock, or of a GPS week and its second; an empty text for neither."""
+    """Return UTC of a date and a clock, or of a GPS week and its second, an empty text for neither."""
     try:
         if "/" in day:
             time = np.datetime64(f"{day.replace('/', '-')}T{clock}", "us")

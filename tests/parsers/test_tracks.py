@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -143,7 +144,7 @@ def test_clipping_and_dc_of_a_recording_are_reported(tmp_path: Path) -> None:
 
 def test_a_position_per_capture_is_a_track_and_one_for_all_is_not(tmp_path: Path) -> None:
     places = [{"type": "Point", "coordinates": [-78.696, 35.7275 + i / 1000, 150.0 + i]} for i in range(2)]
-    meta = {
+    meta: dict[str, Any] = {
         "global": {"core:datatype": "ru8", "core:sample_rate": 1000},
         "captures": [
             {"core:sample_start": 500 * i, "core:datetime": f"2025-06-01T14:00:0{i}Z", "core:geolocation": places[i]}

@@ -603,7 +603,7 @@ def _scene(path: Path) -> Any:
 def _report(path: Path) -> Any:
     """Differences of a report from itself; the tables beside its numbers have no rows."""
     from aerpaw_cmp.jobs.diff_reports import run_diff
-    from aerpaw_cmp.report.columns import RANK_COLUMNS, RSS_COLUMNS
+    from aerpaw_cmp.report.page import RANK_COLUMNS, RSS_COLUMNS
 
     with tempfile.TemporaryDirectory(dir=SCRATCH) as folder:
         path.rename(Path(folder) / "metrics.json")

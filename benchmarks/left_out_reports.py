@@ -72,8 +72,8 @@ def site_without(recipe: Path, flight: str, field: Path, folder: Path) -> Path:
         learned=learn([o.samples for o in observed], chosen), curve=(), ground=_NO_RAY, warnings=(), words=(),
         locks=learned_locks(observed, chosen, learned),
     )  # fmt: skip
-    calibrated = Calibrated(settings, tuple(flights), (), calibration, ranked)
-    remember(site, recipe.stem, *site_entry(calibrated, "left out"))
+    calibrated = Calibrated(settings, tuple(flights), (), calibration, ranked, "left out")
+    remember(site, recipe.stem, *site_entry(calibrated))
     return site
 
 

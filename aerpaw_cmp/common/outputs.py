@@ -71,6 +71,24 @@ def is_sealed(path: Path) -> bool:
     return head == seal.encode("ascii")
 
 
+def check_seal(path: Path) -> None:
+    """Refuse a file with a seal of :func:`sealed` whose other lines were changed; one without a seal is accepted.
+
+    Raises
+    ------
+    UsageError
+    """
+    with explained_os_errors(path), path.open("rb") as stream:
+        begins = stream.read(len(_SEAL)) == _SEAL.encode("ascii")
+    if begins and not is_sealed(path):
+        raise UsageError(
+            "a line of this file was changed after it was written (SHA-256 in its first line)",
+            expected="the file as 'aerpaw-cmp calibrate' wrote it; run it again",
+            cause="an edited value",
+            path=path,
+        )
+
+
 def read_sums(folder: Path) -> dict[str, str] | None:
     """SHA-256 of each file of a result folder by its relative name; None where there is no list of this tool.
 

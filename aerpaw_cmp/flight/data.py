@@ -338,6 +338,12 @@ def rank_quantity(stream: Stream, reader: str) -> str:
     return _text(stream, "source") or reader
 
 
+def quantity_of(data: FlightData, series: RankSeries) -> str:
+    """Return the name of a rank in its log, as :func:`rank_quantity`."""
+    file = data.files[int(series.log[0])]
+    return next(rank_quantity(stream, file.result.reader) for stream in file.result.streams if stream.kind == "rank")
+
+
 def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettings]:
     """Noise [dBm] under an SNR, where the flight file gives it, and the link as such a receiver hears it.
 

@@ -24,6 +24,7 @@ from pydantic import (
 from ..common.errors import UsageError
 from ..common.files import inside
 from ..common.jsonable import named
+from ..common.outputs import check_seal
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, carrier_fault, noise_floor_dbm, wavelength_m
 from ..common.yamlfile import StrictModel, load_yaml, nearest_zone
 from ..logs.readers import ReadOptions
@@ -39,6 +40,8 @@ from ..propagation.geometry.arrays import (
 )
 from ..propagation.options import Diffraction
 from ..site.antenna.antennas import Isotropic
+from ..site.antenna.learned import LearnedAntenna, Written
+from ..site.antenna.pair_gain import read_pair
 from ..site.antenna.sphere_pattern import read_sphere_csv
 
 Positive = Annotated[float, Field(gt=0)]
@@ -62,6 +65,8 @@ class AntennaSettings(StrictModel):
     """Name of the grid inside a .mat file."""
     elevation: str | None = None
     """CSV of the elevation cut, where ``file`` is one of the azimuth cut."""
+    learned: LearnedAntenna | None = None
+    """Of a learned ``sphere``: SHA-256 of its table, and its error model."""
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
@@ -150,12 +155,25 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
             return read_cut_files(file, folder / settings.elevation)
         return read_pattern_file(file, carrier_hz=carrier_hz)
     if settings.model == "sphere":
-        return read_sphere_csv(file)
+        return _sphere(settings, file, folder)
     if settings.model == "gain_grid":
         if settings.variable is None:
             raise UsageError("a gain grid without 'variable'", expected="the name of the grid inside the .mat file")
         return antennas.read_gain_grid(file, settings.variable)
     return Isotropic()
+
+
+def _sphere(settings: AntennaSettings, file: Path, folder: Path) -> Pattern:
+    """Return the pattern of a full sphere; a learned one is verified, with its error model."""
+    known = settings.learned
+    if known is None:
+        return read_sphere_csv(file)
+    pattern = read_sphere_csv(file, Written(known.sha256, known.command))
+    pattern.spread = known.spread
+    if (pair := known.pair) is not None:
+        written = None if pair.sha256 is None else Written(pair.sha256, known.command)
+        pattern.pair = read_pair(folder / pair.file, pair.length, pair.prior_sd_db, written)
+    return pattern
 
 
 class LinkSettings(StrictModel):
@@ -237,6 +255,8 @@ class LogSettings(StrictModel):
     """Of a track whose log has no altitude: above take-off, in all of it."""
     skip: list[str] = []
     """Streams of the file to leave out, by name."""
+    receiver: str = ""
+    """Name of the receiver that wrote the log, where the log has none: learned levels belong to a receiver."""
 
     def options(self, timezone: str | None) -> ReadOptions:
         """The reader options, with the flight's zone as default."""
@@ -576,8 +596,10 @@ def joined(settings: FlightFile, learned: Path) -> FlightFile:
     Raises
     ------
     UsageError
-        A file that is not a calibrated.yaml, or whose settings do not fit this flight.
+        A file that is not a calibrated.yaml, that was edited, or whose settings do not fit this flight.
     """
+    if learned.is_file():
+        check_seal(learned)
     known = files_of(load_yaml(learned, LearnedSettings).model_dump(exclude_unset=True), learned.parent, learned)
     taught: dict[str, Any] = known.get("link", {}).get("channels", {})
     # what the file says, no defaults: a stated default would keep a learned value out

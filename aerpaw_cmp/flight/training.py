@@ -16,8 +16,8 @@ from ..common.errors import InputError
 from ..common.provenance import union
 from ..propagation.geometry.arrays import Link
 from ..site.antenna.antennas import MeasuredPattern
-from ..site.antenna.learned import folder_of
-from ..site.antenna.sphere_pattern import LEARNED, SpherePattern, read_sphere_csv
+from ..site.antenna.learned import LEARNED, folder_of
+from ..site.antenna.sphere_pattern import SpherePattern, read_sphere_csv
 from .data import FlightData, RankSeries, RssSeries
 from .marks import among, mark_of
 from .settings import FlightFile

@@ -60,7 +60,8 @@ class ChannelOptions:
         Of :data:`aerpaw_cmp.report.channel.FORMATS`.
     bandwidth_hz : float, optional
         Also H at the subcarriers of a band.
-    subcarriers : int
+    subcarriers : int, optional
+        1024 by default.
     """
 
     route: Path | None = None
@@ -69,7 +70,7 @@ class ChannelOptions:
     step_s: float = 1.0
     formats: Sequence[str] = ("netcdf",)
     bandwidth_hz: float | None = None
-    subcarriers: int = 1024
+    subcarriers: int | None = None
 
 
 def channel_parts(
@@ -102,6 +103,8 @@ def channel_parts(
     stages, settings, remarks = stages or Stages(), data.settings, list[str]()
     name, link_settings = _chosen_link(settings, chosen)
     towers = _chosen_towers(data, chosen, remarks)
+    if chosen.subcarriers is not None and chosen.bandwidth_hz is None:
+        raise UsageError("--subcarriers without a band", expected="--bandwidth HZ, too")
     check_band(chosen.bandwidth_hz or 0.0, link_settings.carrier_hz)
     link = link_settings.build(towers, data.folder)
     along = _flown(data, chosen, towers) if chosen.route is None else _planned(data, chosen.route, chosen.step_s)
@@ -113,7 +116,7 @@ def channel_parts(
         along = replace(along, velocity_mps=velocity, tower_mps=other)
     else:
         remarks.append("No Doppler shift: no point has a neighbour in time, so the UAV has no velocity.")
-    offsets = None if chosen.bandwidth_hz is None else subcarriers_hz(chosen.bandwidth_hz, chosen.subcarriers)
+    offsets = None if chosen.bandwidth_hz is None else subcarriers_hz(chosen.bandwidth_hz, chosen.subcarriers or 1024)
     levels = _levels_of(data, link, name, remarks)
     along = replace(along, remarks=(*remarks, *along.remarks))
     count, links = len(along.poses), len(along.poses) * len(towers)

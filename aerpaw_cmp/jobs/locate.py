@@ -12,12 +12,12 @@ from ..common.errors import InputError, UsageError
 from ..common.jsonable import json_object, named
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
-from ..compare.gains.spread import NO_SPREAD, Spread
 from ..compare.learning.locate import UNKNOWN, LevelModel, LevelTrack, NodeEstimate, locate
 from ..flight.data import check_place, choose_site, is_ratio, read_logs, site_place
 from ..flight.drafting.draft import receiver_floor_db
 from ..flight.drafting.node import Placer
-from ..flight.drafting.remembered import searching_airframe, taught
+from ..flight.drafting.remembered import taught
+from ..flight.gains.learned_gain import spread_of
 from ..flight.gains.memory import load_with_learned
 from ..flight.marks import mark_of
 from ..flight.rows.lock import LOCK_FLOOR_DB, is_sounder_power
@@ -111,10 +111,11 @@ def _antennas(
     if isinstance(uav, MeasuredPattern) and file.sha256 not in uav.trained_on:
         return node if isinstance(node, SpherePattern) else None, uav
     mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
-    place, series = site_place(settings.site.file, flight.parent), (level.channel, file.result.reader)
-    every = taught(place, series, (file.sha256, mark)).items()
-    both = next(((ends.tower, ends.uav) for name, ends in every if ends and name not in site.towers), None)
-    return both or (None, searching_airframe(place, site.towers, series, (file.sha256, mark)))
+    if not is_sounder_power(level):
+        return None, None
+    every = taught(site_place(settings.site.file, flight.parent), (file.sha256, mark), loses_lock=True)
+    both = (ends for name, each in every.items() if name not in site.towers for ends in each)
+    return next(((ends.tower, ends.uav) for ends in both), (None, None))
 
 
 def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -> list[str]:
@@ -133,7 +134,7 @@ def _cautions(settings: FlightFile, channel: str, uav: MeasuredPattern | None) -
 
 def _model_of(node: Any) -> LevelModel:
     """Levels about antennas that are known at both ends, near free space."""
-    spread = Spread.from_text(node.notes) or NO_SPREAD
+    spread = spread_of(node.spread)
     scatter_db = spread.noise_sd_db or UNKNOWN.scatter_sd_db
     return LevelModel(slope=2.0, slope_sd=0.2, elevation_sd_db=spread.own_sd_db, scatter_sd_db=scatter_db)
 

@@ -301,6 +301,8 @@ def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[
     for word, words in ((chosen.figures, FIGURES), (chosen.style, STYLES)):
         if word not in words:
             raise UsageError(f"found {word!r}", expected="one of " + ", ".join(words), cause="--figures or --style")
+    if chosen.style != "screen" and chosen.figures == "none":
+        raise UsageError(f"--style {chosen.style} without figures", expected="--figures svg, png, pdf or all, too")
     beside, home = (chosen.recommend or flight).parent, flight.parent
     if options.logs_root is None and os.path.realpath(beside) != os.path.realpath(home):
         # paths in a flight file are relative to its folder
@@ -550,6 +552,8 @@ def run_campaign(
     from .campaigns.season import find_reports, soundings, with_season
     from .tasks.manifest import inputs_of_flights
 
+    if fresh and keep is not None:
+        raise UsageError("--fresh and --keep", expected="one of them: --fresh neither reads nor writes a folder")
     campaign = load_campaign(path)
     sounded = [(options.logs_root or path.parent) / name for name in campaign.soundings]
     flights = inputs_of_flights((path.parent / name for name in campaign.flights), options.logs_root)
@@ -580,7 +584,7 @@ def run_campaign(
 
 def _write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
     """A file per failed task in ``failures/``: its message, and where in the program it came from."""
-    from ..report.page import safe_name
+    from ..report.texts import safe_name
 
     for failure in failures:
         if failure.traceback:
@@ -652,12 +656,12 @@ def run_calibrate(
         if settings.rank:
             with stages("rank"):
                 ranked = fit_rank(reports)
-        calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked)
+        command = f"aerpaw-cmp calibrate {path.name}" + (f" --into-site {into_site}" if into_site is not None else "")
+        calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked, command)
         with output.filling() as place:
             metrics, text = write_files(calibrated, place, folder.name, stages.seconds)
         file.write(sealed(text))
     if into_site is not None:
-        command = f"aerpaw-cmp calibrate {path.name} --into-site {into_site}"
-        entry, tables = site_entry(calibrated, command)
+        entry, tables = site_entry(calibrated)
         metrics["into_site"] = [str(f) for f in remember(into_site, settings.calibration, entry, tables)]
     return JobOutcome(folder=folder, metrics=metrics, files=(target,))

@@ -103,7 +103,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     ), "deg", can_be=(-90.0, 90.0)),
     Quantity("longitude_deg", "position", (
         r"^(osd |gps )?(lon|lng|long|longitude)( deg| degrees| int| d?ddmm\w*)?( ?1?e ?[67]| [ew])?$",
-        r" (lon|lng|longitude)( deg)?$",
+        r" (lon|lng|long|longitude)( deg)?$",
         r"^(l nge|laenge|l ngengrad|laengengrad|longitud)( deg)?$",
     ), "deg", can_be=(-180.0, 180.0)),
     Quantity("grid", "grid", (
@@ -182,7 +182,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("serving", "cell", (r"^(is ?)?(registered|serving|connected)( cell)?$",)),
     Quantity("neighbouring", "cell", (r"^(is ?)?neighbou?r(ing)?( cell)?$",)),
     # how strong; 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
-    Quantity("power", "rss", (r"^link power$", r"^lw ?[1-5]$"), _FULL_SCALE),
+    Quantity("power", "rss", (r"^link power$", r"^(power )?lw ?[1-5]( (power|level))?( dbm?)?$"), _FULL_SCALE),
     Quantity("quality", "rss", (r"^link quality$",), "dB"),
     Quantity("SNR", "rss", (r"^link snr$",), "dB"),
     # 'rank' alone may be that of any list: described() takes it where levels stand beside; 0 is no report
@@ -442,6 +442,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     **{word: ("deg", _times(factor)) for word, factor in (
         ("deg", 1.0), ("degree", 1.0), ("degrees", 1.0), ("\u00b0", 1.0), ("rad", 180 / np.pi),
         ("radians", 180 / np.pi), ("1e-7 deg", 1e-7), ("1e-7deg", 1e-7), ("dege7", 1e-7), ("deg e7", 1e-7),
+        ("semicircles", 180 / 2**31),
         ("degrees e7", 1e-7), ("e7", 1e-7), ("deg*1e7", 1e-7), ("1e7", 1e-7), ("e6", 1e-6), ("1e-6 deg", 1e-6),
         ("microdegrees", 1e-6), ("cdeg", 0.01), ("centidegrees", 0.01), ("mrad", 0.18 / np.pi))},
     **{word: ("bit/s", _times(factor)) for word, factor in (
@@ -457,7 +458,7 @@ UNITS: dict[str, tuple[str, Callable[[FloatArray], FloatArray]]] = {
     "\u00b5w": ("dBm", _milliwatts(1e-3)), "nw": ("dBm", _milliwatts(1e-6)), "pw": ("dBm", _milliwatts(1e-9)),
 }  # fmt: skip
 # Units of numbers that MAVLink writes as integers: of a table in decimals they are another program's.
-OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7")
+OF_INTEGERS = ("mm", "cm/s", "cdeg", "e7", "semicircles")
 _DDMM = ("ddmm.mmmm", "dddmm.mmmm", "ddmm.mmmmm", "dddmm.mmmmm", "ddmm.mm", "dddmm.mm", "nmea")
 # Units that a name may have without brackets: 'alt_ft_agl', 'rsrp_dbm'.
 _SUFFIXES = ("ft", "kft", "feet", "m", "meters", "metres", "cm", "mm", "km", "deg", "degrees", "rad", "mph", "mps",
@@ -557,6 +558,8 @@ PROGRAMS: tuple[Program, ...] = (
         r"signal": "rsrp", r"psc or pci": "pci", r"type": "network type"}),
     _program("phone", "cellname", datum="sea level"),
     _program("MAVLink, positions alone", "lat,lon,relative alt", "lat,lon,alt,hdg", units=_MAVLINK_UNITS),
+    _program("Garmin FIT", "position lat,position long", datum="sea level", units={
+        "position lat": "semicircles", "position long": "semicircles"}),
     _program("Open DroneLog", "vps height m,height m", datum="sea level", words={
         r"height m": "height above takeoff", r"velocity ([xyz]) ms": r"velocity \1"}),
     # dB stands for dBm; 1RSS and 2RSS are heard by the aircraft, TRSS by the transmitter; FrSky's RSSI is no dBm, and

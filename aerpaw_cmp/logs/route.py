@@ -376,7 +376,7 @@ def _sheet(data: bytes) -> _Route:
         raise InputError("the file is empty", expected=_EXPECTED)
     sign = max(",;\t", key=head.count)
     # quoted names may hold the separator
-    rows = csv.reader(chain([head], lines), delimiter=sign, skipinitialspace=True)
+    rows: Iterator[list[str]] = csv.reader(chain([head], lines), delimiter=sign, skipinitialspace=True)
     first = next(rows)
     known = [dictionary.meaning(name) for name in first]
     above_sea = [m is not None and m.quantity.datum in ("sea level", "ellipsoid") for m in known]

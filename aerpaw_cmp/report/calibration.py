@@ -9,15 +9,18 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from ..common.jsonable import json_object, named
 from ..common.units import FloatArray
 from ..compare.judge.verdicts import Verdict, antenna_or_place, by_flight
 from ..compare.learning.calibration import BASELINES, Score, mean_rmse
 from ..compare.learning.learning_curve import CurvePoint, with_one_more
+from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, write_page
 from .flight_words import said_of
-from .page import Made, about, write_page
+from .page import Made, about
 from .places import BODY, COMPASS, Places, payload
+from .texts import minute, number, percent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -257,16 +260,102 @@ def _groups(data: CalibrationData) -> Iterator[Places]:
         )
 
 
+def scores_card(data: CalibrationData) -> Card:
+    """Return the card of held-out errors, by what was left out and by flight and channel."""
+    each = {"as logged": 2, "4 s means": 2}
+    baselines = dict.fromkeys(BASELINES.values(), 2)
+    rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
+    keys = ("rmse_db", "rmse_4s_db", *BASELINES)
+    means = Table(
+        caption="RMSE in dB after one offset per flight and channel, mean over flights and channels; a dash: could not "
+        "be left out.",
+        columns={"What was left out": HEAD, **each, **baselines, "series": 0},
+        rows=[(SPLIT_TITLE.get(name, name), *(_mean(of, key) for key in keys), len(of)) for name, of in rows.items()],
+    )  # fmt: skip
+    curve = [(point["flights"], point["rmse_db"], point["rmse_4s_db"]) for point in data.curve]
+    more = Table(
+        caption=f"Expected gain of one flight more: mean RMSE in dB over {data.curve[0]['series'] if curve else 0} "
+        "series, each predicted by subsets of the other flights. The last row is extrapolated: the squared error as a "
+        "constant and a part that falls with the number of flights.",
+        columns={"Flights learned from": 0, **each},
+        rows=[*curve, (curve[-1][0] + 1, data.one_more_rmse_db, "")] if len(curve) > 1 else [],
+    )  # fmt: skip
+    every = Table(
+        caption="RMSE in dB after the flight's own offset; \"offset of the training flights\": with their mean offset.",
+        columns={"Left out": TEXT, "Flight": HEAD, "Tower": TEXT, "Channel": TEXT, **each,
+                 "offset of the training flights": 2, **baselines, "samples": 0},
+        rows=_rows(data.scores, ("flight", "tower", "channel", "rmse_db", "rmse_4s_db", "rmse_shared_offset_db",
+                                 *BASELINES, "n")),
+    )  # fmt: skip
+    parts = [Card(title="Every flight and channel", fold=True, tables=[every])]
+    return Card(title="Scores", id="scores", text=[data.words[1:]], tables=[means, more], parts=parts)
+
+
+def _rows(splits: Mapping[str, Sequence[Mapping[str, Any]]] | None, keys: Sequence[str]) -> list[tuple[Any, ...]]:
+    """Return a row per score: what was left out, then its numbers by key."""
+    known = (splits or {}).items()
+    return [(SPLIT_TITLE.get(split, split), *(row[key] for key in keys)) for split, of in known for row in of]
+
+
+def mounts_card(data: CalibrationData) -> Card:
+    """Return the card of the mounts of antennas with a measured pattern."""
+    table = Table(
+        caption="Mounts of antennas with a measured pattern; azimuth counter-clockwise from east (tower) or from the "
+        "nose (UAV).",
+        columns={"Antenna": HEAD, "azimuth": RIGHT, "sd": RIGHT, "identified": TEXT},
+        rows=[(name, number(m["azimuth_deg"], 0, "deg"), number(m["azimuth_sd_deg"], 0, "deg"),
+               "yes" if m["identified"] else "no") for name, m in data.mounts.items()],
+    )  # fmt: skip
+    return Card(title="Antennas", id="antennas", tables=[table])
+
+
+def gains_card(data: CalibrationData) -> Card:
+    """Return the card with the gain of each antenna over the sphere."""
+    if not data.antennas:
+        return Card()
+    seen = ", ".join(f"{percent(_share_seen(a))} of the sphere of {a.name}" for a in data.antennas)
+    text = (
+        f"Flights saw directions within 10 degrees of {seen}. Elsewhere the gain is a guess, and its standard "
+        "deviation says so. The level is normalised to a mean of 0 dBi over the sphere: it is not identified beside "
+        "the offsets."
+    )
+    shown = Positions(view="places", data=payload(list(_groups(data))))
+    return Card(title="Gain of the antennas", positions=shown, text=[text])
+
+
+def ground_card(data: CalibrationData) -> Card:
+    """Return the card of the likelihood of a coherent ground ray."""
+    table = Table(
+        caption="Log likelihood of a coherent ground ray against none, by height of roughness (0: a mirror).",
+        columns={"roughness": RIGHT, "log likelihood": 1},
+        rows=[(str(row[0]), row[1]) for row in (data.ground or {}).get("rows", ())],
+    )  # fmt: skip
+    return Card(title="Ground", id="ground", tables=[table])
+
+
+def rank_card(data: CalibrationData) -> Card:
+    """Return the card of the receiver's held-out forecasts of the rank."""
+    table = Table(
+        caption="A receiver fitted on the other flights; log score in nats per report, less is better; the constant "
+        "forecast is the shares of the flights that were fitted. Total variation: of the expected histogram.",
+        columns={"Left out": TEXT, "Flight": HEAD, "Tower": TEXT, "kappa": 2, "log score": 3, "constant": 3,
+                 "total variation": 3, "agreement": 2, "always the commonest": 2},
+        rows=_rows(data.rank, ("flight", "tower", "kappa", "log_score", "constant_log_score",
+                               "total_variation_expected",
+                               "agreement", "majority_agreement")),
+    )  # fmt: skip
+    return Card(title="Rank", id="rank", tables=[table])
+
+
+CARDS = (scores_card, mounts_card, gains_card, ground_card, rank_card)
+
+
 def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:
     """Write ``calibration.html`` and ``metrics.json``."""
-    numbers = calibration_metrics(data)
-    rows = {**data.scores, **{f"control: {name}": scores for name, scores in data.controls.items()}}
-    columns = ("rmse_db", "rmse_4s_db", *BASELINES)
-    return write_page(
-        folder, "calibration", numbers, payload(list(_groups(data))) if data.antennas else {},
-        data=data,
-        metrics=numbers,
-        split_title=SPLIT_TITLE,
-        baselines=BASELINES,
-        means={name: ([_mean(scores, key) for key in columns], len(scores)) for name, scores in rows.items()},
+    settings = Markup("<pre>{}</pre>").format(data.settings_text)
+    page = Page(
+        kind="calibration", title=data.name, verdict=data.words[0] if data.words else "", cautions=data.warnings,
+        about=[f"Flights: {', '.join(data.flights)}. Made {minute(data.generated)}"],
+        cards=[*(card(data) for card in CARDS), Card(title="In flight.yaml", id="settings", text=[settings])],
     )  # fmt: skip
+    return write_page(folder, "calibration", page, calibration_metrics(data))

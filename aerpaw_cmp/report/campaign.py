@@ -4,29 +4,32 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 
 from ..common.cells import guarded
 from ..common.counting import counted
 from ..common.jsonable import fields_of, json_safe, named
 from ..common.units import FloatArray, IntArray
 from ..compare.flight_verdict import pooled_db
-from ..compare.judge.steps import NodeOffset
+from ..compare.judge.steps import NodeOffset, Step
 from ..compare.judge.verdicts import Verdict, campaign_verdict
 from ..compare.level.rss import LEARNED_HERE
 from ..compare.offset import Moments, difference_moments
 from ..compare.statistics.intervals import Interval
 from ..site.site import Site
 from .canvas import FigureSpec, Picture, beyond, colour_bar, draw_tower, frame_around, plan_axes, subplots
+from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Table, bold, estimate, settings_card
 from .charts import COLOURS
 from .flight_words import first_sentence, judge, pretty, ranking_sentence, said_of
-from .page import Made, about, json_text, k_key, rendered, write_figures, write_file
+from .page import Made, about, json_text, write_figures, write_file
+from .texts import interval, k_key, minute, more, number
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -541,8 +544,8 @@ def season_nodes(data: CampaignData) -> Figure:
     fig, ax = subplots((9.2, 3.6))
     order = sorted(data.season.nodes, key=lambda node: (not node.steps, -np.ptp(node.offset_db or (0.0,))))
     dates = sorted({night for node in data.season.nodes for night in node.night})
-    for number, node in enumerate(order[:_NODES_SHOWN]):
-        colour = COLOURS[number % len(COLOURS)]
+    for place, node in enumerate(order[:_NODES_SHOWN]):
+        colour = COLOURS[place % len(COLOURS)]
         at = [dates.index(night) for night in node.night]
         ax.plot(at, node.offset_db, marker=".", linewidth=0.6, color=colour, alpha=0.7, label=node.node)
         for step in node.steps:
@@ -687,32 +690,212 @@ def _errors_of_pairs(data: CampaignData) -> list[tuple[Any, float, float]]:
     return [(pair, error(pair, pair.first), error(pair, pair.second)) for pair in data.repeats]
 
 
+# --- cards ----------------------------------------------------------------------------------------------------------
+
+
+def result_card(data: CampaignData) -> Card:
+    """Return the card of the result: settings in order of their error, the worst flights, K of other flights."""
+    tables = [_ranking(data), _worst(data), _mean_errors(data), _transfers(data)]
+    return Card(title="Result", id="result", link="Result", text=headline(data), tables=tables)
+
+
+def _ranking(data: CampaignData) -> Table:
+    held_out = "held-out error over flights: each flight scored with the offset of the other flights"
+    kind = held_out if data.season.held_out else "error over flights, each with an offset of its own samples"
+    return Table(
+        caption=f"Settings by their mean {kind}. Difference from the best setting: mean difference on the same "
+        "flights, towers and channels, with a 95 % interval over flights; the first was chosen on these flights.",
+        columns={"Place": 0, "Setting": HEAD, "Flights": 0, "Mean error [dB]": RIGHT, "Median [dB]": 2,
+                 "10 % to 90 % [dB]": RIGHT, "Difference from the best setting [dB]": 2, "95 %": 2, "Shown": TEXT},
+        rows=[
+            (place, r.setting, r.n_flights, bold(number(r.mean_db, 2)), r.quantiles_db[3],
+             f"{number(r.quantiles_db[1], 2)} to {number(r.quantiles_db[5], 2)}", r.difference_db,
+             r.difference_ci95_db or "", r.verdict)
+            for place, r in enumerate(data.season.over_all(), 1)
+        ],
+    )  # fmt: skip
+
+
+def _worst(data: CampaignData) -> Table:
+    season, worst = data.season, worst_flights(data)
+    reports = season.reports
+    few = f", {_FEW_FLIGHTS} of {len(worst)}" if len(worst) > _FEW_FLIGHTS else ""
+    link, first = Markup('<a href="{}">{}</a>'), next((r.setting for r in season.over_all()), "")
+    return Table(
+        caption=f"Flights with the largest error under “{first}”{few}.",
+        columns={"Flight": HEAD, "Start (UTC)": TEXT, "Error [dB]": 2, "Worst link": TEXT},
+        rows=[(link.format(reports[name], name) if name in reports else name, season.started.get(name, ""), error, at)
+              for name, error, at in worst[:_FEW_FLIGHTS]],
+    )  # fmt: skip
+
+
+def _mean_errors(data: CampaignData) -> Table:
+    flights = rss_flights(data)
+    shown = (data.rss or not data.rank) and 0 < len(flights) <= _FEW_FLIGHTS
+    return Table(
+        caption="Mean RMSE over towers and channels [dB], each with an offset fitted on its own samples.",
+        columns={"Setting": HEAD, **dict.fromkeys(flights, 2)},
+        rows=[(setting, *(by[f] for f in flights)) for setting, by in mean_rmse(data).items()] if shown else [],
+    )  # fmt: skip
+
+
+def _transfers(data: CampaignData) -> Table:
+    return Table(
+        caption="Rank: K chosen on the other flights, and what it leaves here (transferred), beside the best K of "
+        f"the flight itself (fitted here){more(data.rank_transfers, ROWS_SHOWN)}.",
+        columns={"Setting": TEXT, "Flight": HEAD, "Tower": TEXT, "Chosen on": TEXT, "K": RIGHT,
+                 "Total variation, transferred": RIGHT, "Kappa": 2, "Own K": RIGHT, "Total variation, fitted here": 3},
+        rows=[(t.setting, t.flight, t.tower, ", ".join(t.chosen_on), k_key(t.k), bold(number(t.total_variation, 3)),
+               t.kappa, k_key(t.own_k), t.own_total_variation) for t in data.rank_transfers[:ROWS_SHOWN]],
+    )  # fmt: skip
+
+
+def season_card(data: CampaignData, pictures: Sequence[Picture]) -> Card:
+    """Return the card of the season: its figures, and steps of offsets."""
+    steps = any(picture.spec.name == "season_nodes" for picture in pictures)
+    table = Table(
+        caption="Steps of offsets: date of the first, size with its 95 % interval, date on which the old level was "
+        "back. “Shows”: the step that its first date shows with a chance of 90 %. campaign.json has every date.",
+        columns={"Node": HEAD, "Dates": 0, "Std. dev. [dB]": 2, "Shows [dB]": 1, "Steps": TEXT},
+        rows=[(n.node, len(n.night), n.sd_db, n.smallest_db, "; ".join(map(_step, n.steps)) or "none")
+              for n in data.season.nodes] if steps else [],
+    )  # fmt: skip
+    parts = [Card(tables=[table])]
+    return Card(title="Over the season", id="season", chart=pictures, parts=parts) if pictures else Card()
+
+
+def _step(step: Step) -> str:
+    back = f", back on {step.back}" if step.back else ""
+    return f"{step.night}: {step.step_db:+.1f} dB ({interval(step.step_ci95_db)}){back}"
+
+
+def failures_card(data: CampaignData) -> Card:
+    """Return the card of flights and settings without numbers."""
+    first = f", the first {ROWS_SHOWN} of {len(data.failures)}; all stand in campaign.csv"
+    table = Table(
+        caption=f"Flights and settings without numbers{first if len(data.failures) > ROWS_SHOWN else ''}.",
+        columns={"Flight": HEAD, "Setting": TEXT, "Why": TEXT}, look="tall",
+        rows=[(f.flight, f.setting, f.message) for f in data.failures[:ROWS_SHOWN]],
+    )  # fmt: skip
+    return Card(title="Failures", id="failures", link="Failures", tables=[table])
+
+
+def offsets_card(data: CampaignData) -> Card:
+    """Return the card of shared offsets, and of pairs of flights at the same places."""
+    title = "Offsets and repeatability"
+    return Card(title=title, id="offsets", link="Offsets", fold=True, tables=[_pooled(data), _pairs(data)])
+
+
+def _pooled(data: CampaignData) -> Table:
+    return Table(
+        caption=f"Offsets shared per {data.calibration} (added to the measurement), the spread of the members' own "
+        f"offsets, and the mean RMSE that either leaves{more(data.pooled, ROWS_SHOWN)}.",
+        columns={"Setting": TEXT, "Group": HEAD, "Members": 0, "Shared offset [dB]": RIGHT, "Own offsets [dB]": 1,
+                 "Std. dev. [dB]": 2, "RMSE, own offsets [dB]": 2, "RMSE, shared [dB]": 2},
+        rows=[(g.setting, g.group, len(g.members), number(g.offset_db) + (" (edge)" if g.at_search_edge else ""),
+               g.range_db, g.spread_db, g.own_rmse_db, g.pooled_rmse_db) for g in data.pooled[:ROWS_SHOWN]],
+    )  # fmt: skip
+
+
+def _pairs(data: CampaignData) -> Table:
+    pairs = _errors_of_pairs(data)
+    return Table(
+        caption=f"Two flights at the same places (within {number(data.radius_m, 0, 'm')}, headings within "
+        f"{number(data.heading_within_deg, 0)}°), beside the RMSE of the setting “{data.reference}”. “After the "
+        f"model”: what their residuals still differ by. “By place”: mean residuals in cells of "
+        f"{number(data.cell_m, 0, 'm')}, whatever the heights; a correlation near 1 says that the model errs the same "
+        f"way on both flights{more(pairs, ROWS_SHOWN)}.",
+        columns={"Link": HEAD, "Flights": TEXT, "Pairs": 0, "Share": SHARE, "Differ by [dB]": RIGHT, "95 %": 1,
+                 "One pass (÷√2)": 1, "After the model": 1, "RMSE of both": RIGHT, "By place: RMS": 1, "Correlation": 2,
+                 "Cells": 0, "Height apart": RIGHT},
+        rows=[
+            (f"{r.tower} {r.channel}", f"{r.first}, {r.second}", r.n, r.share, bold(number(r.rmse_db)),
+             r.rmse_ci95_db or "", r.single_db, r.residual_rmse_db, f"{number(a)}, {number(b)}", r.place_rmse_db,
+             r.place_correlation, r.cells, number(r.height_difference_m, 0, "m"))
+            for r, a, b in pairs[:ROWS_SHOWN]
+        ],
+    )  # fmt: skip
+
+
+def rows_card(data: CampaignData) -> Card:
+    """Return the card of all numbers: a row per flight, setting and link, or K."""
+    return Card(title="All numbers", id="rows", link="All numbers", fold=True, tables=[_levels(data), _ranks(data)])
+
+
+def _levels(data: CampaignData) -> Table:
+    rows: Sequence[RssRow] = data.rss
+    few = ""
+    if len(rows) > ROWS_SHOWN:
+        few = f"; the {ROWS_SHOWN} rows of largest error of {len(rows)}, all stand in campaign.csv"
+        rows = sorted(rows, key=lambda r: -np.nan_to_num(r.rmse_db, nan=-1.0))[:ROWS_SHOWN]
+    models = list(dict.fromkeys(name for row in data.rss for name in row.baselines))
+    return Table(
+        caption=f"RSS. Offset and RMSE are fitted on the row's own samples; baselines have an offset of their "
+        f"own{few}.",
+        columns={"Flight": HEAD, "Setting": TEXT, "Link": TEXT, "Offset [dB]": RIGHT, "RMSE [dB]": RIGHT, "95 %": 2,
+                 "Held-out RMSE [dB]": 2, **{f"{pretty(name)} [dB]": 2 for name in models},
+                 "Against baselines (95 %)": TEXT, "RMSE, shared offset [dB]": 2, "Corr.": 2, "Samples": 0,
+                 "Out of coverage": 0, "Clock": TEXT, "Fitted here": TEXT},
+        rows=[
+            (r.flight, r.setting, r.link, number(r.offset_db) + (" (edge)" if r.at_search_edge else ""),
+             bold(number(r.rmse_db, 2)), r.rmse_ci95_db or "", r.held_out_rmse_db,
+             *(r.baselines.get(name) for name in models), against_baselines(r), r.pooled_rmse_db, r.correlation, r.n,
+             r.n_out_of_coverage, _clock(r),
+             ", ".join(r.fitted))
+            for r in rows
+        ],
+        look="dense",
+    )  # fmt: skip
+
+
+def _clock(r: RssRow) -> str:
+    return f"ok, {number(r.lag_s, 2, 's')}" if r.lag_verdict == "ok" else r.lag_verdict or "–"
+
+
+def _ranks(data: CampaignData) -> Table:
+    return Table(
+        caption="Rank: agreement by pose, Cohen's kappa (0 is chance) and total variation between the histograms, for "
+        f"each K{more(data.rank, ROWS_SHOWN)}.",
+        columns={"Flight": HEAD, "Setting": TEXT, "Tower": TEXT, "K": RIGHT, "Samples": 0, "Agreement": RIGHT,
+                 "Commonest rank agrees": 2, "Kappa": 2, "Total variation": RIGHT, "Best K": 1},
+        rows=[(r.flight, r.setting, r.tower, k_key(r.k), r.n, estimate(r.agreement, r.agreement_ci95),
+               r.commonest_agreement, r.kappa, estimate(r.total_variation, r.total_variation_ci95, 3, "<b>{}</b>"),
+               r.best_k) for r in data.rank[:ROWS_SHOWN]],
+    )  # fmt: skip
+
+
+def settings_of(data: CampaignData, files: Sequence[str]) -> Card:
+    """Return the card of the settings, versions and files of the campaign."""
+    code = Markup("<code>{}: {}</code>")
+    table = Table(
+        caption="What each setting changes in the flight files.", columns={"Setting": HEAD, "Changes": TEXT},
+        rows=[(name, Markup(", ").join(code.format(*entry) for entry in change.items()) or "nothing")
+              for name, change in data.settings.items()],
+    )  # fmt: skip
+    method = "Method: D. Lee, O. Ozdemir, A. Ram, I. Guvenc, arXiv 2502.10324."
+    beside = f"Beside this page: {', '.join(files)}. {method}"
+    return replace(settings_card(data, {"workers": data.workers}), tables=[table], text=[beside])
+
+
+# Cards in the order of the page, after the figures. A new card is one function more.
+CARDS = (failures_card, offsets_card, rows_card)
+
+
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
-    """The whole page."""
-    return rendered(
-        "campaign",
-        data=data,
-        pictures=pictures,
-        mean_rmse=mean_rmse(data),
-        pair_errors=_errors_of_pairs(data),
-        headline=headline(data),
-        verdict=verdict(data),
-        against_baselines=against_baselines,
-        warnings=warnings(data),
-        baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
-        rss_flights=rss_flights(data),
-        pretty=pretty,
-        files=files,
-        season=data.season.over_all(),
-        worst=worst_flights(data),
-        worst_rows=sorted(data.rss, key=lambda r: -np.nan_to_num(r.rmse_db, nan=-1.0))[:ROWS_SHOWN]
-        if len(data.rss) > ROWS_SHOWN
-        else data.rss,
-        few=FEW,
-        many=MANY,
-        few_flights=_FEW_FLIGHTS,
-        rows_shown=ROWS_SHOWN,
-    )
+    """Return the whole page."""
+    known, failed = warnings(data), len({failure.flight for failure in data.failures})
+    beyond = [f"{len(known) - MANY} more stand in campaign.json."] if len(known) > MANY else []
+    lead = "Soundings between towers."
+    if data.flights:
+        failures = f" ({failed} with failures)" if failed else ""
+        flights, settings = counted(len(data.flights), "flight"), counted(len(data.settings), "setting")
+        lead = f"{flights}{failures} under {settings}, measured against ray tracing."
+    return Page(
+        kind="campaign", title=data.title, tag="synthetic" if data.synthetic else "", verdict=" ".join(verdict(data)),
+        cautions=[*known[:MANY], *beyond], about=[f"{lead} Made {minute(data.generated)}"],
+        cards=[result_card(data), season_card(data, pictures), *(card(data) for card in CARDS),
+               settings_of(data, files)],
+    ).html()  # fmt: skip
 
 
 def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:

@@ -16,7 +16,8 @@ from ..compare.statistics.intervals import Interval
 from ..logs.records import has_wall_clock
 from .flight_data import RANKS, ReportData
 from .flight_words import audit_summary, cautions, offset_sentences, paragraph
-from .page import RANK_COLUMNS, RSS_COLUMNS, about, iso_time, k_key, merge
+from .page import RANK_COLUMNS, RSS_COLUMNS, about, merge
+from .texts import iso_time, k_key
 
 # 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable.
 DECIMALS = 4

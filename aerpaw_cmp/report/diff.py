@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from markupsafe import Markup
 
 from ..common.counting import counted
 from ..common.jsonable import fields_of, json_object
 from ..common.units import Printed
 from ..compare.judge.report_difference import LevelDifference, Overlap, RankDifference
 from ..compare.statistics.intervals import PairedDifference
+from .cards import HEAD, RIGHT, TEXT, Card, Page, Table, bold
 from .flight_words import count
-from .page import json_text, rendered, write_file
+from .page import json_text, write_file
+from .texts import interval, minute, number
 
 # Differences up to this count as none: the tables hold four decimals, offsets one.
 TOLERANCE_DB = 0.01
@@ -133,8 +137,92 @@ def diff_metrics(diff: ReportDiff) -> dict[str, Any]:
 
 
 def diff_page(diff: ReportDiff) -> str:
-    """The whole page."""
-    return rendered("diff", diff=diff, tolerance_db=TOLERANCE_DB, verdict=verdict(diff))
+    """Return the whole page."""
+    first, second = diff.first, diff.second
+    both = "" if second.flight == first.flight else f" and {second.flight}"
+    made = [f"{side.folder}, made {minute(side.generated)} by {side.version}." for side in (first, second)]
+    return Page(
+        kind="diff", title=f"{first.flight}{both}: two reports", verdict=verdict(diff), cautions=diff.remarks,
+        about=[f"First: {made[0]} Second: {made[1]} Every difference is second minus first."],
+        cards=[numbers_card(diff), changes_card(diff)],
+    ).html()  # fmt: skip
+
+
+def numbers_card(diff: ReportDiff) -> Card:
+    """Return the card of levels and ranks on the samples that both reports have."""
+    title = f"Every difference beyond {TOLERANCE_DB} dB ({len(diff.differences)})"
+    return Card(
+        title="Numbers on common samples", id="numbers", link="Numbers", tables=[_levels(diff), _ranks(diff)],
+        parts=[Card(title=title, fold=True, text=[diff.differences])] if diff.levels or diff.ranks else [],
+    )  # fmt: skip
+
+
+def _both(pair: Any, decimals: int) -> str:
+    """Values of the first and of the second report in one cell."""
+    return f"{number(pair.first, decimals)}, {number(pair.second, decimals)}"
+
+
+def _alone_in_each(samples: Overlap) -> str:
+    return f"{number(samples.only_first, 0)}, {number(samples.only_second, 0)}"
+
+
+def _levels(diff: ReportDiff) -> Table:
+    return Table(
+        caption="RSS. RMSE on the samples that both reports score, each about its own best offset there; intervals are "
+        "95 %, by blocks of the paired difference.",
+        columns={"Link": HEAD, "Change of RMSE [dB]": RIGHT, "95 %": 3, "Second is": TEXT, "RMSE first, second": RIGHT,
+                 "Offset first, second": RIGHT, "Replay moved: RMS, most": RIGHT, "Measured moved: most": 3,
+                 "Scored first, second, both": RIGHT, "Samples in one report only": RIGHT},
+        rows=[
+            (f"{one.tower} {one.channel}", bold(number(one.rmse.difference_db, 3)), one.rmse.difference_ci95_db,
+             one.rmse.verdict, f"{number(one.rmse.other_rmse_db, 3)}, {number(one.rmse.rmse_db, 3)}",
+             _both(one.offset_db, 1), f"{number(one.simulated_rms_db, 3)}, {number(one.simulated_max_db, 3)}",
+             one.measured_max_db, f"{_both(one.scored, 0)}, {number(one.scored.common, 0)}",
+             _alone_in_each(one.samples))
+            for one in diff.levels
+        ],
+        look="dense",
+    )  # fmt: skip
+
+
+def _ranks(diff: ReportDiff) -> Table:
+    return Table(
+        caption="Rank on the samples that both reports have; agreement and kappa where all four ranks exist.",
+        columns={"Tower": HEAD, "K": RIGHT, "Simulated ranks changed": RIGHT, "Change of agreement, 95 %": RIGHT,
+                 "Agreement first, second": RIGHT, "Change of kappa, 95 %": RIGHT, "Kappa first, second": RIGHT,
+                 "Reported ranks changed": 0, "Samples in both": 0, "In one report only": RIGHT},
+        rows=[
+            (one.tower, one.k, bold(number(one.n_changed, 0)),
+             f"{number(one.agreement.difference, 3)} {interval(one.agreement.ci95, 3)}", _both(one.agreement, 3),
+             f"{number(one.kappa.difference, 3)} {interval(one.kappa.ci95, 3)}", _both(one.kappa, 3),
+             one.n_reported_changed, one.samples.common, _alone_in_each(one.samples))
+            for one in diff.ranks
+        ],
+        look="dense",
+    )  # fmt: skip
+
+
+def changes_card(diff: ReportDiff) -> Card:
+    """Return the card of settings, inputs and versions that differ."""
+    same = {
+        "The settings are the same.": diff.settings,
+        "The inputs are the same files, byte by byte.": diff.inputs,
+        "Code and packages have the same versions.": diff.versions,
+    }
+    inputs = Table(
+        caption="Inputs.", columns={"File": HEAD, "Role": TEXT, "What": TEXT},
+        rows=[(entry.path, entry.role, entry.what) for entry in diff.inputs],
+    )  # fmt: skip
+    settings = _entries("Settings as used (flight.yaml, defaults and command line together).", diff.settings)
+    return Card(
+        title="What changed", id="changes", link="What changed", text=[text for text, of in same.items() if not of],
+        tables=[settings, inputs, _entries("Versions.", diff.versions)],
+    )  # fmt: skip
+
+
+def _entries(caption: str, entries: Sequence[Entry]) -> Table:
+    rows = [(Markup("<code>{}</code>").format(one.key), one.first, one.second) for one in entries]
+    return Table(caption=caption, columns={"Key": HEAD, "First": "entry", "Second": "entry"}, rows=rows)
 
 
 def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:

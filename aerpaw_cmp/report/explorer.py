@@ -22,7 +22,7 @@ from .charts import Chart
 from .flight_data import GEOMETRY, PosePaths, ReportData, Source, start_of
 from .flight_words import instants, nearest_k, pretty
 from .packed import PackedArrays, packed, scene
-from .page import k_key
+from .texts import k_key
 
 # Samples of all series together that the page holds; beyond them each series is thinned, extremes kept.
 POINTS = 50_000

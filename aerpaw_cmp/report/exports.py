@@ -33,7 +33,8 @@ from ..site.site import Site
 from .canvas import keep_extremes
 from .columns import DECIMALS, rank_tables, rss_tables
 from .flight_data import ReportData, Track
-from .page import RANK_COLUMNS, RSS_COLUMNS, iso_time
+from .page import RANK_COLUMNS, RSS_COLUMNS
+from .texts import iso_time
 
 # 1 mm.
 _DEGREE_DECIMALS = 8

@@ -3,24 +3,33 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+from markupsafe import Markup
+
+from ..common.counting import counted
 from ..common.stages import Stages
+from ..common.units import AnyArray
 from ..compare.judge.ladder import LadderRow
-from ..compare.level.rss import PART_DB
+from ..compare.level.field_difference import FieldAudit
+from ..compare.level.rss import PART_DB, ErrorSpan
+from ..compare.result import AuditResult, RankResult, RssResult
 from ..logs.records import has_wall_clock
 from . import flight_figures as figures
 from . import flight_words as words
 from .canvas import FORMATS
+from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, paragraph, settings_card
 from .charts import charts_of, shown_confusion
 from .columns import further_numbers, metrics, rank_csv, rss_csv
 from .explorer import payload
 from .exports import FOLDER
-from .flight_data import RANKS, ReportData, start_of
-from .flight_words import headlines, paragraph
-from .page import RANK_COLUMNS, RSS_COLUMNS, embedded, environment, json_text, rendered, write_figures, write_file
+from .flight_data import RANKS, InputFile, ReportData, start_of
+from .page import RANK_COLUMNS, RSS_COLUMNS, json_text, rendered, write_figures, write_file
+from .texts import clock, coded, cut, duration, flat, interval, k_key, minute, number, percent
 
 # Rejected lines shown per file; the flight file holds all.
 _REJECTED_SHOWN = 20
@@ -28,23 +37,334 @@ _REJECTED_SHOWN = 20
 # Figures that are drawn as files: none, or every one in a format or in all.
 FIGURES = ("none", "svg", "png", "pdf", "all")
 
-# what the templates of a flight's page alone use
-_FILTERS = {"audit_summary": words.audit_summary, "further": further_numbers, "instants": words.instants}
+# --- cards ----------------------------------------------------------------------------------------------------------
 
 
-def _ladder_table(ladder: Sequence[LadderRow]) -> list[tuple[str, bool, float, dict[str, LadderRow]]]:
-    """Model, whether recommended, seconds, and its rows by tower and channel."""
-    table: dict[str, dict[str, LadderRow]] = {}
-    for row in ladder:
-        table.setdefault(row.model, {})[f"{row.tower} {row.channel}".strip()] = row
-    return [
-        (model, any(r.recommended for r in rows.values()), max(r.seconds for r in rows.values()), rows)
-        for model, rows in table.items()
+def result_card(data: ReportData) -> Card:
+    """Return the card of all errors: levels by channel, ranks by tower and K."""
+    best = words.ladder_verdict(data.ladder)
+    return Card(
+        title="Result", id="result", link="Result", chart="forecast",
+        text=[paragraph(bold(best)) if best else "", words.headline(data)],
+        tables=[_levels(data), _ranks(data)],
+        parts=[Card(title="In words, channel by channel", fold=True, text=[words.verdicts(data.rss, data.rank)])],
+    )  # fmt: skip
+
+
+def _levels(data: ReportData) -> Table:
+    models = list(dict.fromkeys(name for item in data.rss for name in item.baselines))
+    return Table(
+        caption="RSS after the best constant offset. RMSE in dB; every model has its own offset. Brackets: 95 % "
+        "interval.",
+        columns={"Tower": HEAD, "Channel": TEXT, "Offset [dB]": RIGHT, "RMSE ray tracing": RIGHT,
+                 **{f"RMSE {words.pretty(name)}": 2 for name in models},
+                 "Correlation": 2, "Samples": 0, "Out of coverage": 0},
+        rows=[
+            (p.tower, p.channel, number(p.score.offset_db) + (" (edge)" if p.score.at_edge else ""),
+             estimate(p.score.rmse_db, p.score.rmse_ci95_db, mark="<b>{}</b>"),
+             *(p.baselines[name].rmse_db if name in p.baselines else None for name in models),
+             p.score.correlation, p.score.n, p.score.n_out_of_coverage)
+            for p in data.rss
+        ],
+        notes=words.offset_sentences(data.rss),
+    )  # fmt: skip
+
+
+def _ranks(data: ReportData) -> Table:
+    rows: list[Sequence[Any]] = []
+    for p in data.rank:
+        rows.append((p.tower, "measured", *p.score.histogram, "", "", "", ""))
+        for k, at in p.score.simulated.items():
+            by_ground = (p.further.agreement_sd_by_ground or {}).get(f"{k:g}")
+            sd = (
+                ""
+                if by_ground is None
+                else Markup(' <span class="small">±{}</span>').format(number(100 * by_ground, 0))
+            )
+            rows.append(("", f"K = {k_key(k)}", *at.histogram, estimate(at.total_variation, at.total_variation_ci95),
+                         Markup(percent(at.agreement)) + sd, at.kappa, at.out_of_coverage))  # fmt: skip
+    grounds = any(p.further.agreement_sd_by_ground for p in data.rank)
+    return Table(
+        caption="Channel rank: shares of rank 1 to 4 in coverage, and distance of the simulation from the reported "
+        "rank."
+        + (" ±: by the shape of the ground between its known heights, one standard deviation." if grounds else ""),
+        columns={"Tower": HEAD, "Source": TEXT, **{f"Rank {rank}": SHARE for rank in RANKS},
+                 "Total variation": RIGHT, "Agreement": RIGHT, "Kappa": 2, "Z": 0},
+        rows=rows,
+    )  # fmt: skip
+
+
+def channels_card(data: ReportData) -> Card:
+    """Return the card of the received levels, with a part for each channel and each pair of channels."""
+    parts = [_channel(data, panel) for panel in data.rss]
+    caption = f"Segments in which the two channels differ by more than {PART_DB:.0f} dB."
+    for p in data.pairs:
+        table = _spans(data, p.time, p.score.spans, caption)
+        parts.append(Card(title=f"{p.tower}: {p.first} against {p.second}", group="rss-channel", tables=[table]))
+    return Card(title="Received signal strength", id="rss", link="RSS", fold=True, parts=parts if data.rss else ())
+
+
+def _channel(data: ReportData, p: RssResult) -> Card:
+    score, independent = p.score, p.score.intervals.autocorrelation.n_effective
+    counts_as = f"The {number(score.n, 0)} samples count as about {number(independent, 0)} independent samples."
+    lag = f"Clock check: {p.clock_verdict}, radio minus telemetry {number(score.lag_s, 2, 's')}."
+    return Card(
+        title=p.name, group="rss-channel", chart=f"rss/{p.tower}/{p.channel}",
+        text=[paragraph(
+            words.rss_verdict(p),
+            f"Fitted on the scored samples: {', '.join(score.fitted_on_scored) or 'nothing'}.",
+            f"Offset {number(score.offset_db)} dB {interval(score.intervals.offset_db)}.",
+            counts_as if math.isfinite(independent) else "", lag if p.clock_verdict else "",
+        )],
+        parts=[Card(tables=[_spans(data, p.time, p.spans, f"Segments with the largest error, {p.name}.")]),
+               _more_numbers(p, f"Further numbers of {p.name}.")],
+    )  # fmt: skip
+
+
+def _spans(data: ReportData, time: AnyArray, spans: Sequence[ErrorSpan], caption: str) -> Table:
+    start = start_of(data)
+    unit = "UTC" if has_wall_clock(start) else "s"
+    rows = [
+        (*(clock(at, start) for at in words.instants(time, span)), *span.position_m, span.mean_db)
+        for span in spans or ()
     ]
+    heads = {f"From ({unit})": TEXT, "To": TEXT, "East [m]": 0, "North [m]": 0, "Up [m]": 0, "Mean [dB]": 1}
+    return Table(caption=caption, columns=heads, rows=rows)
+
+
+def _more_numbers(series: RssResult | RankResult, caption: str) -> Card:
+    rows = list(flat(further_numbers(series)))
+    table = Table(caption=caption, columns={"Name": HEAD, "Value": TEXT}, rows=rows)
+    return Card(title="More numbers", fold=True, tables=[table])
+
+
+def against_card(data: ReportData) -> Card:
+    """Return the card of the prediction that was made before the flight."""
+    before = data.against
+    if before is None:
+        return Card()
+    made = f"Prediction {before.folder}, made {minute(before.generated)} from {', '.join(before.flights)}."
+    table = Table(
+        caption="Levels as predicted, offset included; the last error column is after the flight's own offset. Samples "
+        "further than 30 m from a predicted point do not count.",
+        columns={"Tower, channel": HEAD, "RMSE [dB]": 2, "over 4 s": 2, "own offset": 2, "Measured above predicted": 1,
+                 "CRPS [dB]": 2, "Log score [nat]": 2, "In 50 %": SHARE, "In 90 %": SHARE, "In 95 %": SHARE,
+                 "Mean SD [dB]": 1, "Samples": 0, "Predicted share": SHARE},
+        rows=[(name, *(s[key] for key in _AGAINST)) for name, s in before.scores.items()], look="dense",
+    )  # fmt: skip
+    text = [paragraph(bold(coded(before.words)), made)]
+    return Card(title="Predicted before this flight", id="against", text=text, tables=[table], chart="against")
+
+
+_AGAINST = ("rmse_db", "rmse_4s_db", "own_offset_rmse_db", "bias_db", "crps_db", "log_score", "coverage_50",
+            "coverage_90", "coverage_95", "mean_sd_db", "n", "share_near")  # fmt: skip
+
+
+def ladder_card(data: ReportData) -> Card:
+    """Return the card that compares models by their error on held-out segments."""
+    models: dict[str, dict[str, LadderRow]] = {}
+    for row in data.ladder:
+        models.setdefault(row.model, {})[f"{row.tower} {row.channel}".strip()] = row
+    channels = list(next(iter(models.values()), {}))
+    table = Table(
+        caption="RMSE in dB on held-out segments, and its difference to the best model on the same samples with a 95 % "
+        "interval. Marked: the simplest model within one standard error of the best, over all channels.",
+        columns={"Model": HEAD, **{c + of: form for c in channels for of, form in (("", 2), (": difference", RIGHT))},
+                 "Seconds": 1},
+        rows=[
+            (Markup("<b>{}</b> (recommended)").format(model) if any(r.recommended for r in rows.values()) else model,
+             *(cell for c in channels for cell in (
+                 rows[c].rmse_heldout_db,
+                 estimate(rows[c].difference_to_best_db, rows[c].difference_to_best_ci95_db))),
+             max(r.seconds for r in rows.values()))
+            for model, rows in models.items()
+        ],
+    )  # fmt: skip
+    text = (
+        f"{words.ladder_verdict(data.ladder)} The flight is cut into eight segments. Each segment is scored with the "
+        "offset of the remaining seven; nothing else is fitted. Each stage (antennas, trees, ground, buildings) adds "
+        "its variants to the best model so far."
+    )
+    title = "Model comparison (cross-validated)"
+    shown = [text] if models else []
+    return Card(title=title, id="ladder", link="Models", text=shown, tables=[table], chart="ladder" if models else "")
+
+
+def serving_card(data: ReportData) -> Card:
+    """Return the card that compares the cells that served with those predicted strongest."""
+    serving = data.serving
+    if serving is None or not serving.n:
+        return Card()
+    names, counts = shown_confusion(serving)
+    table = Table(
+        caption="Samples by the cell that served (rows) and the cell predicted strongest. Levels are as simulated, "
+        "without offsets.",
+        columns={"Served": HEAD, **dict.fromkeys(names, 0), "no path": 0},
+        rows=[(name, *row.tolist()) for name, row in zip(names, counts, strict=True)],
+    )  # fmt: skip
+    text = paragraph(
+        "The cell predicted strongest served in", bold(percent(serving.hit_share, 1)),
+        f"of {number(serving.n, 0)} samples; always naming the cell that served most hits "
+        f"{percent(serving.majority_share, 1)}.",
+        "The prediction is no better than that." if serving.hit_share <= serving.majority_share else "",
+        "The whole matrix stands in metrics.json, serving.",
+    )  # fmt: skip
+    return Card(title="Serving cells", id="serving", link="Serving cells", fold=True, text=[text], tables=[table])
+
+
+def ranks_card(data: ReportData) -> Card:
+    """Return the card of the channel rank, with a part for each tower."""
+    parts = [_tower(panel) for panel in data.rank]
+    return Card(title="Channel rank", id="rank", link="Rank", fold=True, parts=parts)
+
+
+def _tower(p: RankResult) -> Card:
+    score = p.score
+    best = f"Over continuous K the best is {number(score.best_k)} {interval(score.curve.best_k_interval)}."
+    table = Table(
+        caption=f"Distances between the reported and the simulated rank at {p.tower}. Brackets: 95 % interval. p: "
+        "chance of such a distance if both had one distribution.",
+        columns={"K": HEAD, "Agreement by pose": RIGHT, "Kappa": 2, "Total variation": RIGHT, "Wasserstein": 2, "p": 3,
+                 "Z": 0},
+        rows=[
+            (k_key(k), estimate(at.agreement, at.agreement_ci95), at.kappa,
+             estimate(at.total_variation, at.total_variation_ci95), at.wasserstein, at.p_histogram, at.out_of_coverage)
+            for k, at in score.simulated.items()
+        ],
+    )  # fmt: skip
+    text = [paragraph(words.rank_verdict(p), best if math.isfinite(score.best_k) else "")]
+    more = _more_numbers(p, f"Further numbers of the rank at {p.tower}.")
+    return Card(title=p.tower, group="rank-tower", text=text, tables=[table], parts=[more])
+
+
+def engine_card(data: ReportData) -> Card:
+    """Return the card of the replay engine and its audit."""
+    e = data.engine
+    if e is None:
+        return Card()
+    extent = ", ".join([counted(e.links, "link"), *([] if e.paths is None else [counted(e.paths, "path")])])
+    text = [paragraph("Engine", Markup("<b>{}</b>:").format(e.engine), f"{extent} in {duration(e.seconds)}.")]
+    audit = e.audit
+    return Card(
+        title="Replay engine and its audit", id="engine", link="Engine", fold=True,
+        text=[*text, "This replay was not audited." if audit is None else words.audit_summary(audit)],
+        tables=[] if audit is None else [_audited_paths(audit), *_audited_fields(audit.fields)],
+        parts=[Card(title=f"Left out of the replay: {len(e.left_out)}", fold=True, text=[e.left_out])],
+    )  # fmt: skip
+
+
+def _audited_paths(a: AuditResult) -> Table:
+    return Table(
+        caption="Paths and levels of the two engines on a spread of links.",
+        columns={"Reference": HEAD, "Links": 0, "Paths missing": 0,
+                 "Paths only in our engine (Sionna did not sample them)": 0, "Largest RSS difference [dB]": 3,
+                 **{f"Other rank at K = {k_key(k)}": RIGHT for k in a.rank_disagreement},
+                 "Time": RIGHT, "Time of the reference": RIGHT},
+        rows=[(a.reference, a.links, a.missing_paths, a.extra_paths, a.rss_max_error_db,
+               *(percent(share, 1) for share in a.rank_disagreement.values()),
+               duration(a.seconds), duration(a.reference_seconds))],
+        notes=[a.note] if a.note else [],
+    )  # fmt: skip
+
+
+def _audited_fields(f: FieldAudit | None) -> list[Table]:
+    if f is None:
+        return []
+    rows = [
+        ("Sionna RT, per path, both slants", f"{counted(f.paths, 'path')}, phases of {number(f.phases, 0)}",
+         number(f.power_max_db, 3, "dB"), number(f.power_rms_db, 4, "dB"), number(f.phase_max_rad, 5, "rad"),
+         number(f.phase_rms_rad, 6, "rad"), f"RSS of a link: {number(f.link_rss_max_db, 3)} dB"),
+        ("Second implementation, per element pair",
+         f"{counted(f.reference_links, 'link')}, {counted(f.reference_paths, 'path')}",
+         number(f.rss_max_error_db, 6, "dB"), "", "", "",
+         f"H: {f.h_max_error:.1e} of its size; other rank: {number(f.rank_differs, 0)}; missing, impossible paths: "
+         f"{number(f.missing_paths, 0)}, {number(f.phantom_paths, 0)}"),
+        ("Attitude, turned a second time", f"{number(f.attitude_rows, 0)} telemetry rows", "", "",
+         f"{f.attitude_max_rad:.1e} rad", "", ""),
+    ]  # fmt: skip
+    passed = (
+        "All within tolerance: 0.05 dB and 0.01 rad (below 300 m) against Sionna's float32, 1e-6 of H against the "
+        "second implementation (float64)."
+    )
+    failed = Markup("<b>{} failed:</b> {}.").format(counted(f.failed, "check"), "; ".join(f.failures))
+    doubtful = f"{number(f.doubtful, 0)} paths or links were not judged, since rounding decides them."
+    note = paragraph(
+        failed if f.failed else passed, doubtful if f.doubtful else "", f"Not covered: {'; '.join(f.not_covered)}.",
+        "The second implementation alone checks foliage, array layouts and patterns that Sionna does not have. Both "
+        "references use the paths of the array centre.",
+    )  # fmt: skip
+    return [Table(
+        caption="The fields, whose code both engines share, checked by Sionna RT's own coefficients and by a second "
+        "implementation written from the recommendations.",
+        columns={"Against": HEAD, "Checked": TEXT, "Power, worst": RIGHT, "Power, RMS": RIGHT, "Phase, worst": RIGHT,
+                 "Phase, RMS": RIGHT, "Also": TEXT},
+        rows=rows if f.attitude_rows else rows[:2], notes=[note],
+    )]  # fmt: skip
+
+
+def inputs_card(data: ReportData) -> Card:
+    """Return the card of all input files with the account of their lines."""
+    table = Table(
+        caption="Every line is accepted, rejected with a reason, or blank (comments and headers count as blank).",
+        columns={"File": HEAD, "Reader": TEXT, "Lines": 0, "Accepted": 0, "Rejected": 0, "Blank": 0, "SHA-256": "hash"},
+        rows=[
+            (Markup('{} <span class="small">{}</span>').format(f.path, f"({f.role})" if f.role else ""),
+             *((f.reader, f.lines, f.accepted, f.rejected, f.blank) if f.reader else ("no log", "", "", "", "")),
+             Markup('<span title="{}">{}…</span>').format(f.sha256, f.sha256[:16]))
+            for f in data.inputs
+        ],
+    )  # fmt: skip
+    parts = [
+        Card(
+            title=f"{f.path}: {counted(f.rejected, 'rejected line')}, {counted(len(f.warnings), 'remark')}",
+            fold=not f.warnings, text=[f.warnings], tables=[_rejected(f)],
+        )
+        for f in data.inputs
+    ]  # fmt: skip
+    text = [] if data.inputs else ["No input file was named."]
+    title = "Inputs and their account"
+    return Card(title=title, id="inputs", link="Inputs", fold=True, text=text, tables=[table], parts=parts)
+
+
+def _rejected(f: InputFile) -> Table:
+    first = f", the first {_REJECTED_SHOWN} of {number(f.rejected, 0)}" if f.rejected > _REJECTED_SHOWN else ""
+    rows = [
+        (
+            line.number,
+            line.reason,
+            Markup("<code>{}</code>").format(cut(line.text)),
+        )
+        for line in f.rejected_lines[:_REJECTED_SHOWN]
+    ]
+    return Table(caption=f"Rejected lines{first}.", columns={"Line": RIGHT, "Reason": TEXT, "Text": TEXT}, rows=rows)
+
+
+def method_card(data: ReportData, files: Sequence[str]) -> Card:
+    """Return the card of the method, the notes of site and flight, and the columns of the files beside the page."""
+    notes = list(dict.fromkeys([*data.site.notes, *data.notes]))  # a flight repeats what its site says
+    tables = [
+        Table(caption=caption, columns={"Column": HEAD, "Meaning": TEXT}, rows=list(columns.items()))
+        for caption, columns in (
+            ("Columns of rss.csv, followed by one level per baseline [dBm].", RSS_COLUMNS),
+            ("Columns of rank.csv, followed by one simulated rank per K (0: no path), the simulated level and the "
+             "ratios of singular values.", RANK_COLUMNS),
+        )
+    ]  # fmt: skip
+    pictures = "The command writes every figure as a picture with --figures svg, png, pdf or all."
+    beside = [f"{', '.join(files)}. {'' if 'figures/' in files else pictures}"]
+    return Card(
+        title="Method and files", id="method", link="Method", fold=True, text=[Markup(rendered("method"))],
+        parts=[Card(text=[Markup("<h3>Notes</h3>"), notes] if notes else []),
+               Card(title="Files beside this page and their columns", fold=True, text=beside, tables=tables)],
+    )  # fmt: skip
+
+
+# Cards in the order of the page. A new card is one function more.
+CARDS = (result_card, channels_card, against_card, ladder_card, serving_card, ranks_card, engine_card, inputs_card)
 
 
 def page(data: ReportData, files: Sequence[str]) -> str:
-    """The whole page.
+    """Return the whole page.
 
     Parameters
     ----------
@@ -54,34 +374,18 @@ def page(data: ReportData, files: Sequence[str]) -> str:
     """
     charts = charts_of(data)
     linked = payload(data, charts) if data.rss or data.rank else None
-    environment().filters.update(_FILTERS)
-    return rendered(
-        "report",
-        ("uplot.min.js", "common.js", "explorer.js") if linked else (),
-        data=data,
-        charts=charts,
-        explorer=embedded(linked),
-        first_words=paragraph(data),
-        numbers=headlines(data),
-        serving=shown_confusion(data.serving) if data.serving is not None and data.serving.n else None,
-        start=start_of(data),
-        clock_unit="UTC" if has_wall_clock(start_of(data)) else "s",
-        files=files,
-        notes=list(dict.fromkeys([*data.site.notes, *data.notes])),  # a flight repeats what its site says
-        ranks=RANKS,
-        parted_db=PART_DB,
-        headline=words.headline(data),
-        verdicts=words.verdicts(data.rss, data.rank),
-        ladder_verdict=words.ladder_verdict(data.ladder),
-        ladder=_ladder_table(data.ladder),
-        cautions=words.cautions(data),
-        offsets=words.offset_sentences(data.rss),
-        baselines=list(dict.fromkeys(name for item in data.rss for name in item.baselines)),
-        rss_columns=RSS_COLUMNS,
-        rank_columns=RANK_COLUMNS,
-        rejected_shown=_REJECTED_SHOWN,
-        pretty=words.pretty,
-    )
+    made = f"Made {minute(data.generated)} · site {data.site.name}"
+    if data.engine:
+        replayed = f"{number(data.engine.links, 0)} positions x channels replayed in {duration(data.engine.seconds)}"
+        made += f" · {replayed}"
+    settings = [data.settings, {"engine": data.engine.settings} if data.engine else {}]
+    return Page(
+        kind="report", title=data.title, tag="synthetic flight" if data.synthetic else "",
+        verdict=words.paragraph(data), cautions=words.cautions(data), about=[made, " ".join(data.antennas)],
+        numbers=words.headlines(data), charts=charts,
+        first=[Card(positions=Positions(view="explorer", data=linked))] if linked else [],
+        cards=[*(card(data) for card in CARDS), settings_card(data, *settings, fold=True), method_card(data, files)],
+    ).html()  # fmt: skip
 
 
 # --- the folder -----------------------------------------------------------------------------------------------------

@@ -43,7 +43,7 @@ from .canvas import (
 )
 from .flight_data import RANKS, ReportData, Track, start_of, used_towers
 from .flight_words import count, instants, pretty, signed
-from .page import k_key, safe_name
+from .texts import k_key, safe_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

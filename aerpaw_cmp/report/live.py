@@ -12,7 +12,8 @@ from markupsafe import Markup
 from ..common.units import AnyArray, FloatArray
 from ..site.site import Site
 from .packed import PackedArrays, plan_of
-from .page import as_json, digest, environment, k_key, script
+from .page import as_json, digest, environment, script
+from .texts import k_key
 
 _POLICY = (
     "default-src 'none'; script-src {script}; style-src {style}; connect-src 'self'; img-src data:; base-uri 'none'; "

@@ -11,8 +11,9 @@ import numpy as np
 from ..common.units import FloatArray
 from ..compare.learning.locate import Regions
 from ..site.site import Site
-from .page import write_page
+from .cards import HEAD, SHARE, Card, Page, Positions, Table, write_page
 from .places import Places, payload
+from .texts import minute
 
 
 def write_locate(
@@ -43,7 +44,22 @@ def write_locate(
         cell_m=float(regions.east_m[1] - regions.east_m[0]),
     )
     crosses = [np.array([[m["east_m"], m["north_m"]]]) + 8.0 * arm for m in numbers["modes"] for arm in _CROSS]
-    return write_page(folder, "locate", numbers, payload([places], site, lines=[track_m, *crosses]), data=numbers)
+    shown = payload([places], site, lines=[track_m, *crosses])
+    table = Table(
+        caption="Parts of the 90 % region; within that distance of the place lie nine tenths of a part",
+        columns={"Place": HEAD, "East [m]": 0, "North [m]": 0, "Share": SHARE, "Within [m]": 0},
+        rows=[(f"{m['latitude_deg']:.7f}, {m['longitude_deg']:.7f}", m["east_m"], m["north_m"], m["share"],
+               m["radius_m"])
+              for m in numbers["modes"]],
+    )  # fmt: skip
+    page = Page(
+        kind="locate", title=f"Ground node of {numbers['flight']}, {numbers['channel']}", verdict=numbers["sentence"],
+        cautions=numbers["warnings"], about=[f"Made {minute(numbers['generated'])}."],
+        cards=[Card(title="Map", positions=Positions(view="places", data=shown)),
+               Card(title="Region", id="places", tables=[table]),
+               Card(title="Assumptions", id="assumed", text=[numbers["assumed"]])],
+    )  # fmt: skip
+    return write_page(folder, "locate", page, numbers)
 
 
 _CROSS = np.array([[[-1.0, 0.0], [1.0, 0.0]], [[0.0, -1.0], [0.0, 1.0]]])

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from ..common.counting import counted
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import json_object, json_safe, named
 from ..common.kml import CLASS_COLOURS
@@ -26,12 +27,14 @@ from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from . import canvas
 from .canvas import TOWER, FigureSpec, beyond, colour_bar, draw_credit, draw_tower, placed
+from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, bold, paragraph, settings_card
 from .charts import Chart, drawn, flown
 from .flight_data import RANKS, ReportData
 from .flight_figures import channel_specs
 from .flight_words import said_of
 from .packed import NONE, PackedArrays, ends_of_scale, listed, packed, plan_of, step_for
-from .page import Made, about, embedded, json_text, k_key, merge, rendered, safe_name, write_figures, write_file
+from .page import Made, about, json_text, merge, write_figures, write_file
+from .texts import k_key, minute, number, percent, safe_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -417,10 +420,9 @@ def map_axes(data: MapsData, count: int, right_in: float = 0.15) -> tuple[Figure
         ax.set_visible(False)
     for row in grid:
         row[0].set_ylabel("North [m]")
-    for number in range(count):
-        if number + columns >= count:
-            axes[number].set_xlabel("East [m]")
-            axes[number].tick_params(labelbottom=True)
+    for ax in axes[max(count - columns, 0) : count]:
+        ax.set_xlabel("East [m]")
+        ax.tick_params(labelbottom=True)
     return fig, axes[:count]
 
 
@@ -851,50 +853,109 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
     return numbers
 
 
-def coverage_table(data: MapsData) -> tuple[list[str], list[tuple[list[str], list[float | None]]]]:
-    """Column heads (heights) and rows (antennas, foliage, tower; share per height)."""
+# --- cards ----------------------------------------------------------------------------------------------------------
+
+
+def result_card(data: MapsData) -> Card:
+    """Return the card of the shares in coverage, and of the paper's numbers beside ours."""
+    paper = Table(
+        caption="What the paper (arXiv 2502.10324) states, and what this run gives.",
+        columns={"Where": HEAD, "What": TEXT, "Paper": TEXT, "Here": TEXT, "Figure": TEXT},
+        rows=[(p.where, p.what, p.paper, p.ours, p.figure) for p in data.paper],
+    )  # fmt: skip
+    return Card(title="Result", id="result", link="Result", tables=[coverage_table(data), paper])
+
+
+def coverage_table(data: MapsData) -> Table:
+    """Return the share of positions in coverage by antennas, foliage and tower, a column per height."""
     heights = sorted({m.altitude_m for m in data.rss})
     rows = []
     for key, maps in grouped(data.rss, lambda m: (m.antennas, m.foliage, m.tower)).items():
-        share = {m.altitude_m: m.coverage for m in maps}
-        rows.append(([str(part) for part in key], [share.get(h) for h in heights]))
-    return [f"{h:g} m" for h in heights], rows
+        share = {m.altitude_m: percent(m.coverage, 1) for m in maps}
+        rows.append((*key, *(share.get(height) for height in heights)))
+    columns = {"Antennas": TEXT, "Foliage": TEXT, "Tower": HEAD, **{f"{height:g} m": RIGHT for height in heights}}
+    return Table(caption="Share of positions in coverage.", columns=columns, rows=rows)
 
 
-def error_tables(
-    errors: Sequence[MapError],
-) -> list[tuple[str, list[str], list[tuple[str, str, list[float | None], float]]]]:
-    """Per evaluation: title, heights, and rows of (method, K, MAE per height, mean over heights)."""
-    result = []
+def levels_card(data: MapsData) -> Card:
+    """Return the card of the distribution of levels."""
+    title = "Distribution of received signal strength"
+    return Card(title=title, id="rss", link="RSS", fold=True, grid=True, chart="rss" if data.rss else "")
+
+
+def flights_card(data: MapsData) -> Card:
+    """Return the card of the flights that corrected the map."""
+    title = "Measured and simulated along the flights"
+    return Card(title=title, id="flights", fold=True, chart="flights" if data.flights else "")
+
+
+def ranks_card(data: MapsData) -> Card:
+    """Return the card of the rank against height."""
+    table = Table(
+        caption="Share of positions with each rank.",
+        columns={"K": HEAD, "Foliage": TEXT, "Height": RIGHT, "Z": RIGHT, **{f"Rank {rank}": RIGHT for rank in RANKS}},
+        rows=[(k_key(m.k or 0.0), m.foliage, number(m.altitude_m, 0, "m"), *(percent(share, 1) for share in m.share))
+              for m in data.rank],
+    )  # fmt: skip
+    parts = [Card(title="The shares as a table", fold=True, tables=[table])]
+    chart = "rank" if data.rank else ""
+    title = "Channel rank against height"
+    return Card(title=title, id="rank", link="Rank", fold=True, grid=True, chart=chart, parts=parts)
+
+
+def interpolation_card(data: MapsData) -> Card:
+    """Return the card of correlation and interpolation."""
+    chart = "kriging" if data.correlation or data.errors else ""
+    parts = [Card(tables=error_tables(data.errors))]
+    title = "Correlation and interpolation"
+    return Card(title=title, id="kriging", link="Interpolation", fold=True, grid=True, chart=chart, parts=parts)
+
+
+def error_tables(errors: Sequence[MapError]) -> list[Table]:
+    """Return a table for each way of evaluation: a row per method and K, a column per height."""
+    tables = []
     for evaluation, members in grouped(errors, lambda e: e.evaluation).items():
         heights = sorted({e.altitude_m for e in members})
         rows = []
         for (method, k), group in grouped(members, lambda e: (e.method, e.k)).items():
             mae = {e.altitude_m: e.mae for e in group}
-            mean = sum(mae.values()) / len(mae)
-            rows.append((method, k_key(k), [mae.get(h) for h in heights], mean))
-        result.append((evaluation, [f"{h:g} m" for h in heights], rows))
-    return result
+            mean = bold(number(sum(mae.values()) / len(mae), 3))
+            rows.append((method, k_key(k), *(mae.get(height) for height in heights), mean))
+        columns = {"Method": HEAD, "K": TEXT, **{f"{height:g} m": 3 for height in heights}, "Mean": RIGHT}
+        caption = f"Mean absolute error of the interpolated rank, {evaluation}."
+        tables.append(Table(caption=caption, columns=columns, rows=rows))
+    return tables
+
+
+# Cards in the order of the page. A new card is one function more.
+CARDS = (result_card, levels_card, flights_card, ranks_card, interpolation_card)
 
 
 def maps_page(data: MapsData, files: Sequence[str]) -> str:
-    """The whole page."""
+    """Return the whole page."""
     charts = [chart for plate in plates(data) for chart in plate.charts]
     charts += [chart for flight in data.flights for chart in flown(flight)]
     linked = payload(data, charts) if data.rss or data.rank or data.layers else None
-    return rendered(
-        "map",
-        ("common.js", "map_explorer.js") if linked else (),
-        data=data,
-        verdict=first_words(data),
-        warnings=warnings(data),
-        notes=notes(data),
-        charts=charts,
-        coverage=coverage_table(data),
-        errors=error_tables(data.errors),
-        files=files,
-        explorer=embedded(linked),
+    shown = Positions(view="map_explorer", data=linked) if linked else None
+    columns, rows = len(data.east_m), len(data.north_m)
+    extent = [f"{columns} × {rows} = {counted(columns * rows, 'position')}"]
+    extent += [counted(len(data.rss), "RSS map")] if data.rss else []
+    extent += [counted(len(data.rank), "rank map")] if data.rank else []
+    about = f"Predicted coverage and channel rank over {data.site.name}: {', '.join(extent)}."
+    if data.corrected:
+        about += " Levels corrected by flights stand beside the ray tracing, with their standard deviation."
+    beside = paragraph(
+        f"Beside this page: {', '.join(files)}; every map and chart as a picture in figures/ with --figures png, svg "
+        "or pdf. Method: D. Lee, O. Ozdemir, A. Ram, I. Guvenc, arXiv 2502.10324."
     )
+    settings = settings_card(data, data.settings)
+    remarks = Card(title="Notes", text=[notes(data), beside])
+    return Page(
+        kind="maps", title=data.title, verdict=first_words(data), cautions=warnings(data), charts=charts,
+        about=[f"{about} Made {minute(data.generated)}"],
+        cards=[Card(title="Map", link="Map", positions=shown), *(card(data) for card in CARDS),
+               replace(settings, parts=[*settings.parts, remarks])],
+    ).html()  # fmt: skip
 
 
 def write_maps(data: MapsData, folder: str | Path, drawn: str = "none") -> list[Path]:

@@ -14,8 +14,10 @@ from ..common.cells import guarded
 from ..common.jsonable import json_object, named
 from ..common.units import FloatArray
 from ..site.site import Site
-from .page import Made, about, write_file, write_page
+from .cards import HEAD, TEXT, Card, Page, Positions, Table, write_page
+from .page import Made, about, write_file
 from .places import COMPASS, Places, payload
+from .texts import minute, number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,21 +47,57 @@ class PlanPage(Made):
     warnings: Sequence[str]
 
 
+def _sd_now_db(data: PlanPage) -> float:
+    """Root mean square of the standard deviations before the flight [dB]."""
+    return float(np.sqrt(np.mean(data.before_db**2)))
+
+
 def plan_metrics(data: PlanPage) -> dict[str, Any]:
     """The numbers of the page under stable names."""
     return json_object(
         **named(data, "target sentence antennas flights candidates warnings"),
-        sd_now_db=float(np.sqrt(np.mean(data.before_db**2))),
+        sd_now_db=_sd_now_db(data),
         length=data.curve,
         **about(data),
     )
 
 
+def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:
+    """Return the page; ``shown`` is the data of its map."""
+    candidates = Table(
+        caption="Expected standard deviation over the target after each flight, dB; now "
+        f"{number(_sd_now_db(data), 2)} dB.",
+        columns={"Route": HEAD, "SD [dB]": 2, "Length [km]": 1, "Time [min]": 1, "May be flown": TEXT},
+        rows=[(c["name"], c["sd_db"], c["length_m"] / 1000, c["minutes"], c["refused"] or "yes")
+              for c in data.candidates],
+        notes=["The number is the error to expect of a predicted level about the mean of a later flight, without that "
+               "flight's own shadowing, fading and noise. It depends on positions and headings alone, not on the "
+               "levels that will be measured. Choosing a flight by it pays; placing single waypoints by it does not "
+               "beat a lawnmower of the same length."],
+    )  # fmt: skip
+    curve = Table(
+        caption="What a shorter or longer flight leaves: the best of three candidates, flown for a part of the battery "
+        "or beyond it. A longer flight may hold the shorter one.",
+        columns={"Time [min]": 1, "Length [km]": 1, "SD [dB]": 2},
+        rows=[(p["minutes"], p["length_m"] / 1000, p["sd_db"]) for p in data.curve],
+    )  # fmt: skip
+    known = f"Known flights: {', '.join(data.flights)}."
+    if not data.flights:
+        known = "No flight is known: antennas are as the model assumes them."
+    return Page(
+        kind="plan", title=f"Next flight, target {data.target}", verdict=data.sentence, cautions=data.warnings,
+        about=[f"{known} Antennas: {', '.join(data.antennas)}. Made {minute(data.generated)}. "
+               f"Files: {', '.join(data.files)}."],
+        cards=[Card(title="Target and route", positions=Positions(view="places", data=shown)),
+               Card(title="Candidates", id="candidates", tables=[candidates]),
+               Card(title="Flight time", id="length", tables=[curve])],
+    )  # fmt: skip
+
+
 def write_plan(data: PlanPage, folder: Path) -> list[Path]:
     """Write the page and all files beside it; the page first."""
-    numbers = plan_metrics(data)
     shown = payload(list(_groups(data)), data.site, lines=[data.track_m], rings=[data.outline_m, *data.holes_m])
-    written = write_page(folder, "plan", numbers, shown, data=data, metrics=numbers)
+    written = write_page(folder, "plan", plan_page(data, shown), plan_metrics(data))
     written += [write_file(folder / name, text) for name, text in data.files.items()]
     columns = dict(zip(("east_m", "north_m", "height_m"), data.place_m.T, strict=True))
     table: pd.DataFrame = pd.DataFrame({**columns, "sd_before_db": data.before_db, "sd_after_db": data.after_db})

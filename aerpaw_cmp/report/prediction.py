@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 from numpy.typing import ArrayLike
 
 from ..common.cells import guarded
@@ -23,10 +24,12 @@ from ..compare.statistics.intervals import mean_interval, paired_difference
 from ..site.antenna.learned import Entry, LearnedSeries
 from ..site.site import Site
 from .against import AgainstSeries
+from .cards import HEAD, SHARE, TEXT, Card, Page, Positions, Table, bold, paragraph, write_page
 from .flight_data import RANKS
 from .flight_words import before_flight, filled, said_of
-from .page import Made, about, write_file, write_page
+from .page import Made, about, write_file
 from .places import BAND, LIKELIEST, Places, payload
+from .texts import minute, number
 
 TITLES = {
     "learned": "antennas learned from the named flights",
@@ -211,7 +214,17 @@ def prior_words(carrier_hz: float, power_dbm: float) -> str:
 
 
 def prior_caution(offset_db: float, antennas_db: float, shadowing_db: float, fading_db: float) -> str:
-    """Return the sentence on the parts of the standard deviation before any flight [dB]."""
+    """Return the sentence on the parts of the standard deviation before any flight.
+
+    Parameters
+    ----------
+    offset_db, antennas_db, shadowing_db, fading_db : float
+        Standard deviations [dB].
+
+    Returns
+    -------
+    str
+    """
     return (
         f"The standard deviation is a prior: offset {offset_db:g} dB, antennas {antennas_db:g} dB, shadowing "
         f"{shadowing_db:g} dB, fading {fading_db:g} dB. One flight determines the offset and most of the rest."
@@ -350,6 +363,56 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
     )
 
 
+def prediction_page(data: PredictionPage, numbers: Mapping[str, Any], shown: Mapping[str, Any]) -> Page:
+    """Return the page from its numbers; ``shown`` is the data of its map."""
+    about = f"Learned from {', '.join(data.flights)}. " if data.flights else ""
+    about += f"Made {minute(data.generated)}. prediction.csv beside this page holds every point."
+    return Page(
+        kind="prediction", title=data.name, verdict=data.verdict, cautions=data.warnings, about=[about],
+        cards=[Card(title="Map", positions=Positions(view="places", data=shown)),
+               _levels_card(numbers, lock="p_lock" in data.table), _model_card(data)],
+    )  # fmt: skip
+
+
+def _levels_card(numbers: Mapping[str, Any], *, lock: bool) -> Card:
+    columns = {"Tower, channel": HEAD, "Unit": TEXT, "Points": 0, "Level": 1, "SD [dB]": 1,
+               **({"P(lock)": 2} if lock else {}), "Outside flown places": SHARE}  # fmt: skip
+    keys = ("unit", "points", "mean_level_db", "mean_sd_db", *(["mean_p_lock"] if lock else []), "share_outside_flown")
+    levels = Table(
+        caption="Means over all points. The standard deviation is that of one sample.", columns=columns,
+        rows=[(name, *(series[key] for key in keys)) for name, series in numbers["series"].items()],
+    )  # fmt: skip
+    ranks = Table(
+        caption="Mean probability of each rank over all points, by the receiver that flights taught.",
+        columns={"Tower": HEAD, **{f"rank {rank}": 2 for rank in RANKS}},
+        rows=[(tower, *share.values()) for tower, share in numbers["ranks"].items()],
+    )  # fmt: skip
+    return Card(title="Levels", id="series", tables=[levels, ranks])
+
+
+def _model_card(data: PredictionPage) -> Card:
+    chosen = bold(data.chosen["title"])
+    if not data.candidates:
+        text = paragraph(
+            "No flight is named:", Markup("{}.").format(chosen), "The standard deviation holds the gains of both "
+            "antennas, the flight's own shadowing, the offset of a new flight and fading.",
+        )  # fmt: skip
+        return Card(title="Model", id="model", text=[text])
+    errors = Table(
+        caption=f"Errors of 4 s means on {data.chosen['left_out']} left out, dB; new flights about their own mean.",
+        columns={"Model": HEAD, "Residual field": TEXT, "RMSE": 2, "CRPS": 3}, look="dense",
+        rows=[(row["base"], row["field"], row["rmse_db"], row["crps_db"]) for row in data.candidates],
+    )  # fmt: skip
+    scales = Table(caption="As fitted.", columns={"Name": HEAD, "Value": 2}, rows=list(data.model.items()))
+    text = paragraph(
+        "Chosen on what was left out of the named flights:", Markup("{}.").format(chosen),
+        f"Standard deviations are multiplied by {number(data.chosen['sd_factor'], 2)}, the ratio of seen to stated "
+        "errors there.",
+    )  # fmt: skip
+    parts = [Card(title="Residual field: strengths and scales", fold=True, tables=[scales])]
+    return Card(title="Model", id="model", text=[text], tables=[errors], parts=parts)
+
+
 # Rows of prediction.csv that are rounded and written together: bounds the memory.
 _ROWS_AT_ONCE = 100_000
 
@@ -370,7 +433,7 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
     """
     numbers = prediction_metrics(data)
     shown = payload(list(_groups(data)), data.site, lines=[np.asarray(line).T for line in data.flown.values()])
-    written = write_page(folder, "prediction", numbers, shown, data=data, metrics=numbers, flags=FLAGS)
+    written = write_page(folder, "prediction", prediction_page(data, numbers, shown), numbers)
     digits = {c: 3 for c in data.table.columns if c.endswith(("_db", "_m", "_deg", "_s"))}
     digits |= {c: 4 for c in data.table.columns if c.startswith("p_")}
     with (folder / "prediction.csv").open("w", encoding="utf-8", newline="") as book:

@@ -15,7 +15,8 @@ from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from . import canvas
 from .packed import at_height, listed, scene
-from .page import embedded, rendered, safe_name, write_file
+from .page import embedded, rendered, write_file
+from .texts import safe_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

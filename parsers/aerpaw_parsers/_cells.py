@@ -202,7 +202,7 @@ def named(
     if alone and quantity.name == "SINR":
         quantity = replace(quantity, name="SNR", role="rss")
     short = re.sub(r"\W+", "_", dictionary.plain(name))
-    direct = meaning is not None and not meaning.indirect and not meaning.place.startswith("n")
+    direct = meaning is not None and not (meaning.indirect or meaning.place.startswith("n") or unit == "%")
     if quantity.kind == "rss" and direct and "statistic" not in (about or {}):
         level, flag = rows.level(np.where(dictionary.is_none(quantity, values), np.nan, values))
         return rows.stream(

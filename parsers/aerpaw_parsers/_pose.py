@@ -222,6 +222,11 @@ def above_takeoff(
     altitude: FloatArray = values["altitude_m"]
     about: Height = {"height_from": rows.height_from, "height_datum": datum}
     known = np.flatnonzero(np.isfinite(altitude) & ~lost)
+    seconds = np.maximum(np.diff(rows.time[known]) / np.timedelta64(1, "s"), 0.1)
+    rate_mps = np.abs(np.diff(altitude[known])) / seconds
+    if 2 * (rate_mps > _FASTEST_MPS).sum() > (rate_mps > 0).sum():
+        text = f"most heights change by more than {_FASTEST_MPS:g} m/s, such as {rate_mps.max():.0f} m/s: another unit?"
+        rows.warnings.append(text)
     if datum in ("take-off", "ground") or not len(known):
         return altitude, about
     altitude = _without_first_zeros(altitude, rows.time if datum == "unknown" else None)
@@ -245,6 +250,8 @@ def above_takeoff(
     return altitude - first, about
 
 
+# No small aircraft climbs so fast [m/s].
+_FASTEST_MPS = 60.0
 # What begins within a few metres of zero is relative to take-off.
 _NEAR_ZERO_M = 10.0
 _REST_S, _REST_M, _REST_MPS, _CLIMB_M, _CLIMB_MPS = 2.0, 3.0, 0.3, 5.0, 20.0

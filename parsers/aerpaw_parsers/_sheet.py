@@ -390,10 +390,8 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
 
 
 # Latitude and longitude in one cell, in brackets or not: ``35.7275 -78.6960``; WKT has the longitude first.
-_PAIR = re.compile(
-    r"(?:POINT ?Z? ?)?[\[(]?\s?(-?\d{1,3}\.\d{3,15})\s?[ ,;]\s?(-?\d{1,3}\.\d{3,15})(?:[ ,].{0,20})?[\])]?",
-    re.IGNORECASE,
-)
+_ONE = r"(-?\d{1,3}\.\d{3,15}[\u00b0 ]{0,2}[NSEW]?)"
+_PAIR = re.compile(rf"(?:POINT ?Z? ?)?[\[(]? ?{_ONE} ?[ ,;] ?{_ONE}(?:[ ,].{{0,20}})?[\])]?", re.IGNORECASE)
 
 
 def _split_places(sheet: Sheet) -> None:

@@ -77,7 +77,7 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
         if meaning is None or meaning.quantity.role not in ("rss", "rank", "kpi", "cell"):
             continue
         name, role = _FIELDS.get(meaning.quantity.name), meaning.quantity.role
-        if meaning.indirect or (name is None and role in ("rss", "kpi")):
+        if meaning.indirect or sheet.unit(i) == "%" or (name is None and role in ("rss", "kpi")):
             others.append(i)
         elif role == "rank":
             ranks.append(i)

@@ -29,6 +29,7 @@ _DATE = re.compile(r"(0[1-9]|[12]\d|3[01])(0[1-9]|1[0-2])(?:20)?(\d\d)")
 _FIX = dict(zip("0VN1A2D3P4R5F", "0003344336655", strict=True))
 # Kinds with positions, the preferred last: RMC has no height.
 _PLACED = ("RMC", "GNS", "GGA")
+_PLACE = ("latitude [ddmm.mmmm]", "lat dir", "longitude [ddmm.mmmm]", "lon dir")
 
 
 def sniff(head: bytes) -> bool:
@@ -80,11 +81,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             # the sentence with the date may lie on the other side of midnight
             days = int(day[:2]) - 1 + round((_day_s(clock) - _day_s(fields[0])) / 86_400)
             time = f"{np.datetime64(f'20{day[-2:]}-{day[2:4]}-01') + days}T{time}"
-        latitude, north, longitude, east = fields[1:5] if high else fields[2:6]
-        cells = {"time": time, "fix": _FIX.get(fields[5 if high else 1][:1], "")}
+        cells = dict(zip(_PLACE, fields[1:5] if high else fields[2:6], strict=True))
+        cells |= {"time": time, "fix": _FIX.get(fields[5 if high else 1][:1], "")}
         cells |= {"satellites": fields[6], "altitude msl": fields[8]} if high else {}
-        cells |= {"latitude": f"{latitude[:2]} {latitude[2:]} {north}"} if latitude else {}
-        cells |= {"longitude": f"{longitude[:3]} {longitude[3:]} {east}"} if longitude else {}
         readings.append((i, cells))
     return _pose.of_readings(lines, readings, rejected, options, reader=READER.name)
 

@@ -53,13 +53,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     lines, rejected, readings, header = _lines.split(data), [], [], _HEADER.search(data)
     if header is not None and header[2] != b"latitude(deg)":
         raise InputError(
-            f"an RTKLIB solution of {header[2].decode()}", expected="latitude and longitude in degrees",
+            f"an RTKLIB solution of {ascii(header[2])[2:-1]}", expected="latitude and longitude in degrees",
             cause="the option out-solformat: solve again with 'llh' and out-degform 'deg'",
         )  # fmt: skip
     scale_s = _SCALE_S[header[1]] if header is not None else 0
-    names = ("time", "latitude", "longitude", "height ellipsoid", "fix", "satellites")
-    if header is None or b"ellipsoid" not in data[: header.start()]:
-        names = ("time", "latitude", "longitude", "altitude msl", "fix", "satellites")
+    above_sea = header is not None and b"geodetic" in data[: header.start()]  # the default is the ellipsoid
+    names = ("time", "latitude", "longitude", "altitude msl" if above_sea else "height hae", "fix", "satellites")
     for i in np.flatnonzero(~lines.blank).tolist():
         found = _ROW.fullmatch(lines.text(i))
         if found is not None and (time := _time(found[1], found[2], scale_s)):

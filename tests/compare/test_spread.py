@@ -89,13 +89,6 @@ def test_two_parts_hold_their_share_and_their_score_is_the_integral_over_levels(
     assert np.isnan(normal.crps_db(np.array([np.nan, 2.0])))
 
 
-def test_a_file_says_its_spread_and_one_of_another_kind_none() -> None:
-    spread = Spread(own_sd_db=2.1, noise_sd_db=1.5, fading_sd_db=2.25, fading_kurtosis=0.75, bin_s=4.0)
-    assert Spread.from_text(f"# a note\n# {spread.text()}\n") == spread
-    for text in ("", "# spread: own_sd_db 2", "# spread: own_sd_db two noise_sd_db 1", spread.text()):
-        assert Spread.from_text(text) is None
-
-
 def test_fading_does_not_depend_on_the_zero_of_the_clock() -> None:
     """Bins begin with the first sample, whatever its time is called."""
     random = np.random.default_rng(8)

@@ -264,7 +264,7 @@ def test_a_cut_flight_keeps_a_tower_whose_antennas_flights_taught(
     """Of a node elsewhere the tower's antennas explain nothing."""
     monkeypatch.setattr(node, "place_odds", lambda _, towers: np.full(len(towers), -9.0))
     placer, gains = _placer(), _taught()
-    placement = placer.propose(_flown(placer, gains, at, part), {"LW1": gains})
+    placement = placer.propose(_flown(placer, gains, at, part), {"LW1": [gains]})
     assert placement is not None
     assert (placement.node == "LW1") == keeps
     if keeps:
@@ -279,7 +279,7 @@ def test_of_towers_that_fit_alike_the_receivers_own_is_proposed(
     """Log odds of the second quarter of a flight about LW1."""
     monkeypatch.setattr(node, "place_odds", lambda _, towers: np.array([1.6, 1.9, -1.2, -1.4, -3.8])[: len(towers)])
     placer, gains = _placer(), _taught()
-    placement = placer.propose(_flown(placer, gains, "LW1", slice(0, 500)), dict.fromkeys(usual))
+    placement = placer.propose(_flown(placer, gains, "LW1", slice(0, 500)), {name: [] for name in usual})
     assert placement is not None
     assert placement.node == said
     assert f"the levels fit LW2 or LW1 as well as any place: is it {said}?" in placement.question

@@ -12,13 +12,12 @@ from aerpaw_cmp.common.units import BoolArray, FloatArray
 from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term
 from aerpaw_cmp.compare.learning.calibration import Learned, Observed, Recipe, flight_left_out, learn
 from aerpaw_cmp.compare.level.detection import DetectionForecast, learn_detection
-from aerpaw_cmp.flight.data import RssSeries
 from aerpaw_cmp.flight.drafting.remembered import lock_elsewhere
 from aerpaw_cmp.flight.rows.lock import LOCK_FLOOR_DB
-from aerpaw_cmp.flight.settings import LinkSettings
 from aerpaw_cmp.jobs.learning import calibrate_lock as locking
 from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks, lock_words
-from aerpaw_cmp.site.antenna.learned import Entry, LearnedLock, LearnedSeries, read_learned, remember
+from aerpaw_cmp.site.antenna.learned import LearnedLock, read_learned, remember
+from tests.learned_entries import learned_entry, learned_series
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
 RECIPE = Recipe(MODEL)
@@ -104,21 +103,13 @@ def test_what_a_site_remembers_of_the_lock_is_used_with_its_airframe_alone(tmp_p
         gain_db=-95.0, per_db=0.1, share=0.7, locked_db=-15.0, locked_per_db=0.7, locked_sd_db=7.0, lost_db=-27.0, lost_per_db=0.5, lost_sd_db=8.0, flights=3, brier=0.13, constant_brier=0.2, log_score=0.42,
         constant_log_score=0.6, floor_db=-15.0, floor_rmse_db=8.2, free_space_floor_rmse_db=10.3,
     )  # fmt: skip
-    series = LearnedSeries(
-        tower="ROVER", channel="power", reader="flight_mat", carrier_hz=3.32e9, tower_file="t.gz", uav_file="u.gz",
-        sd_db=3.0, lock=lock,
-    )  # fmt: skip
-    entry = Entry(command="c", made="2026-01-02", flights=["a", "b"], flown=[], trained_on=["a" * 64], series=[series])
+    entry = learned_entry(learned_series("power", tower="ROVER", carrier_hz=3.32e9, lock=lock))
     remember(tmp_path / "mine.yaml", "afar", entry, {})
     assert read_learned(tmp_path / "mine.yaml").entries["afar"].series[0].lock == lock
-    times, none = np.zeros(0, dtype="datetime64[ns]"), np.zeros(0, dtype=np.int64)
-    link = LinkSettings(carrier_hz=3.32e9)
 
-    def known(channel: str, antennas: dict[str, str]) -> LearnedLock | None:
-        series = RssSeries("NODE", channel, "dB re full scale", times, np.zeros(0), link, "", none, none)
-        return lock_elsewhere(antennas, series, tmp_path)
+    def known(antennas: dict[str, str]) -> LearnedLock | None:
+        return lock_elsewhere(antennas, tmp_path)
 
-    assert known("power", {"uav": "mine/afar_uav"}) == lock
-    assert known("power", {}) is None
-    assert known("RSRP", {"uav": "mine/afar_uav"}) is None
-    assert known("power", {"uav": "mine/nobody_uav"}) is None
+    assert known({"uav": "mine/afar_uav"}) == lock
+    assert known({}) is None
+    assert known({"uav": "mine/nobody_uav"}) is None

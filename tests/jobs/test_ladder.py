@@ -19,8 +19,9 @@ from aerpaw_cmp.flight.drafting.remembered import offered
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.reporting.flight_run import next_step, run_flight, unrivalled
 from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_changes
-from aerpaw_cmp.site.antenna.learned import Entry, Errors, LearnedSeries, folder_of, remember
+from aerpaw_cmp.site.antenna.learned import Errors, folder_of, remember
 from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv, unit_mean_gain
+from tests.learned_entries import learned_entry, learned_series, learned_tables
 from tests.simulated import planned, simulate, write_yaml
 from tests.tables import eastwards, rss_log
 
@@ -150,7 +151,7 @@ def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> N
         assert not any(path[0] in ("link", "antennas") for path in kept)
 
 
-def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64) -> Path:
+def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64, tower: str = "LW1") -> Path:
     """The planted flight at a site whose memory has antennas for its tower and channel; its own file names none."""
     site = folder / "mine.yaml"
     site.write_bytes(Path(str(folder_of("lake_wheeler"))).with_suffix(".yaml").read_bytes())
@@ -158,16 +159,9 @@ def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64) -> 
     table = 2.0 * np.cos(np.radians(15.0 * columns)) + 0.1 * rows
     table = unit_mean_gain(table)
     sphere = sphere_csv(table, np.ones(table.shape), (f"aerpaw-cmp calibrate: some, trained_on: {trained_on}",))
-    files = dict.fromkeys(("t.csv.gz", "u.csv.gz"), sphere.encode())
-    series = LearnedSeries(
-        tower="LW1", channel="A", reader="generic_csv", carrier_hz=3.3e9, tower_file="t.csv.gz", uav_file="u.csv.gz",
-        sd_db=1.0,
-    )  # fmt: skip
-    entry = Entry(
-        command="made here", made="2026-11-23", flights=["a", "b"], flown=[], trained_on=[trained_on], series=[series],
-        errors=Errors(series=2, rmse_db=learned_db, rmse_4s_db=2.0, free_space_rmse_db=5.0, inside_90=0.9),
-    )  # fmt: skip
-    remember(site, "some", entry, files)
+    errors = Errors(series=2, rmse_db=learned_db, rmse_4s_db=2.0, free_space_rmse_db=5.0, inside_90=0.9)
+    entry = learned_entry(learned_series("A", tower=tower), errors=errors, trained_on=[trained_on])
+    remember(site, "some", entry, learned_tables("A", t=sphere.encode(), u=sphere.encode()))
     path = flight(folder)
     path.write_text(path.read_text().replace("file: lake_wheeler", "file: mine.yaml"), encoding="utf-8")
     return path
@@ -177,9 +171,7 @@ def remembering(folder: Path, learned_db: float, trained_on: str = "a" * 64) -> 
 def test_a_node_of_the_flight_is_offered_what_rovers_of_others_taught(
     taught: str, own: str, fits: bool, tmp_path: Path
 ) -> None:
-    path = remembering(tmp_path, 3.5)
-    index = tmp_path / "mine.learned" / "learned.yaml"
-    index.write_text(index.read_text().replace("tower: LW1", f"tower: {taught}"))
+    path = remembering(tmp_path, 3.5, tower=taught)
     node = "{latitude_deg: 35.7275, longitude_deg: -78.6962, antenna_height_m: 1.5}"
     text = path.read_text(encoding="utf-8").replace("LW1", own)
     path.write_text(f"{text}\ntowers: {{{own}: {node}}}\n", encoding="utf-8")

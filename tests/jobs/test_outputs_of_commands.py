@@ -139,7 +139,7 @@ def test_a_bad_folder_is_told_before_the_computation(
         "flight.data.gather",
         "jobs.campaigns.campaign.run",
         "jobs.mapping.coverage_map.make_maps",
-        "report.pages.site.plan",
+        "report.site.plan",
     ):
         monkeypatch.setattr(f"aerpaw_cmp.{name}", never)
     command = commands[job]

@@ -27,8 +27,8 @@ from aerpaw_cmp.jobs.prediction.sources import named_flights
 from aerpaw_cmp.jobs.prediction.where import TargetOptions, Targets, find_targets
 from aerpaw_cmp.propagation.geometry.arrays import Link, rotation_from_aircraft, single_element
 from aerpaw_cmp.propagation.trace import trace
-from aerpaw_cmp.report.page import coded
 from aerpaw_cmp.report.prediction import prediction_metrics, write_prediction
+from aerpaw_cmp.report.texts import coded
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import unlisted
 

@@ -1,6 +1,7 @@
 """Prediction from what a site remembers: planted tables, and a flight that nobody named, against its planted offset."""
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from aerpaw_cmp.site.antenna.learned import (
     Errors,
     LearnedLevel,
     LearnedLock,
-    LearnedSeries,
+    LearnedSpread,
     folder_of,
     read_learned,
     remember,
@@ -26,6 +27,7 @@ from aerpaw_cmp.site.antenna.learned import (
 from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.jobs.calibrated import OFFSET_DB, past_sector_antenna
+from tests.learned_entries import learned_entry, learned_series, learned_tables
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
 
@@ -51,20 +53,16 @@ def copied(folder: Path) -> Path:
 
 
 def entry(level: LearnedLevel | None, lock: LearnedLock | None = None) -> Entry:
-    series = LearnedSeries(
-        tower="LW1", channel="A", reader="sounder_log", carrier_hz=3.3e9, tower_file="t.csv.gz", uav_file="u.csv.gz",
-        sd_db=1.0, level=level, lock=lock,
-    )  # fmt: skip
     errors = Errors(series=2, rmse_db=3.7, rmse_4s_db=3.0, free_space_rmse_db=6.1, inside_90=0.9)
-    return Entry(command="c", made="2026-01-02", flights=["a", "b"], flown=["2025-06-01"], trained_on=["a" * 64],
-                 errors=errors, series=[series])  # fmt: skip
+    series = learned_series("A", sd_db=1.0, level=level, lock=lock, spread=LearnedSpread(**asdict(SPREAD)))
+    return learned_entry(series, errors=errors)
 
 
 @pytest.fixture(scope="module")
 def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A site that remembers one channel at LW1: cosines of 4 dB and 2 dB at its ends."""
     place = copied(tmp_path_factory.mktemp("memory"))
-    files = {"t.csv.gz": table(4.0, (1.0, 5.0), SPREAD.text()), "u.csv.gz": table(2.0, (0.5, 0.5), f"marks: {MARK}")}
+    files = learned_tables("A", t=table(4.0, (1.0, 5.0)), u=table(2.0, (0.5, 0.5), f"marks: {MARK}"))
     remember(place, "planted", entry(LEVEL), files)
     tower = load_site("lake_wheeler").towers["LW1"].position_m
     ends = (300.0, 90.0), (300.0, 270.0), (-300.0, 90.0), (9000.0, 90.0)
@@ -100,7 +98,7 @@ def test_a_receiver_that_loses_its_lock_is_forecast_in_two_parts(site: Path, tmp
         constant_log_score=0.6, floor_db=-80.0, floor_rmse_db=3.0, free_space_floor_rmse_db=5.0,
     )  # fmt: skip
     place = copied(tmp_path)
-    remember(place, "planted", entry(LEVEL, lock), {"t.csv.gz": table(4.0, (1, 1)), "u.csv.gz": table(2.0, (1, 1))})
+    remember(place, "planted", entry(LEVEL, lock), learned_tables("A", t=table(4.0, (1, 1)), u=table(2.0, (1, 1))))
     points = site.parent / "p.csv"
     plain, said = (job.predict(points, [], TargetOptions(site=str(at))) for at in (site, place))
     levels, before = (x.table[x.table["channel"] == "A"] for x in (said, plain))
@@ -154,7 +152,7 @@ def test_maps_are_corrected_by_the_memory_alone(site: Path) -> None:
 def test_a_site_without_learned_levels_is_predicted_by_the_prior_and_says_so(tmp_path: Path) -> None:
     place = copied(tmp_path)
     assert job.predict(place, []).page.chosen["base"] == "prior"
-    remember(place, "old", entry(None), {"t.csv.gz": table(4.0, (1, 1)), "u.csv.gz": table(2.0, (1, 1))})
+    remember(place, "old", entry(None), learned_tables("A", t=table(4.0, (1, 1)), u=table(2.0, (1, 1))))
     page = job.predict(place, []).page
     assert page.chosen["base"] == "prior"
     assert any("have no level" in text for text in page.warnings)

@@ -183,3 +183,34 @@ def test_a_quiet_draft_shows_the_lines_to_check_and_takes_the_bandwidth_from_nam
     assert "check: rss: {carrier_hz: 3.3e9" in message
     assert "can be compared" not in message
     assert yaml.safe_load((tmp_path / "f.yaml").read_text())["link"]["rss"]["bandwidth_hz"] == "5e6"
+
+
+@pytest.mark.parametrize(
+    ("command", "found"),
+    [
+        (["ingest", "{flight}", "--site", "lake_wheeler"], "--site without --draft"),
+        (["report", "{flight}", "--style", "paper"], "--style paper without figures"),
+        (["campaign", "{campaign}", "--fresh", "--keep", "kept"], "--fresh and --keep"),
+        (["campaign", "{zoned}"], "'timezone' without 'soundings'"),
+        (["predict", "{route}", "--site", "lake_wheeler", "--spacing", "10"], "--spacing along a route"),
+        (["channel", "{flight}", "--subcarriers", "8"], "--subcarriers without a band"),
+        (["calibrate", "{calibration}"], "patterns.towers.LW9.A: the flights have no such tower and channel"),
+        (["tap", "--telemetry", "vehicle.txt"], "--telemetry without --flight"),
+    ],
+)
+def test_an_option_that_cannot_act_is_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture, monkeypatch: pytest.MonkeyPatch, command: list[str], found: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    write_flight(tmp_path)
+    texts = {
+        "campaign": "campaign: c\nflights: [flight.yaml]\n",
+        "zoned": "campaign: c\nflights: [flight.yaml]\ntimezone: UTC\n",
+        "calibration": "calibration: c\nflights: [flight.yaml]\npatterns: {towers: {LW9.A: {model: dipole}}}\n",
+    }
+    for name, text in texts.items():
+        (tmp_path / f"{name}.yaml").write_text(text)
+    (tmp_path / "route.csv").write_text("latitude_deg,longitude_deg,height_m\n35.7275,-78.696,30\n35.7285,-78.697,30\n")
+    places = {name: f"{name}.yaml" for name in ("flight", *texts)} | {"route": "route.csv"}
+    assert main([word.format(**places) for word in command]) == 2
+    assert found in capsys.readouterr().err

@@ -100,7 +100,7 @@ def test_every_learned_file_names_the_logs_by_content(folder: Path) -> None:
     assert len(own) == 2
     place = folder / "calibrated"
     files = [folder / "calibrated.yaml", *place.glob("LW1*.csv"), *place.glob("*.msi"), place / "metrics.json"]
-    assert len(files) == 6
+    assert len(files) == 7
     for file in files:
         text = file.read_text(encoding="utf-8")
         assert set(trained_on(text)) == logs, file
@@ -308,7 +308,9 @@ def test_what_was_learned_from_ranks_alone_names_its_logs_too(tmp_path: Path) ->
     flights = (load_data(load_flight(sample / "flight.yaml"), sample),)
     (tmp_path / "calibrated").mkdir()
     ranked = RankCalibration(receivers={}, scores={}, warnings=())
-    learned = Calibrated(CalibrationFile(calibration="c", flights=["flight.yaml"]), flights, (), None, ranked)
+    learned = Calibrated(
+        CalibrationFile(calibration="c", flights=["flight.yaml"]), flights, (), None, ranked, "calibrate"
+    )
     _, text = write_files(learned, tmp_path / "calibrated", "calibrated", {})
     (tmp_path / "calibrated.yaml").write_text(text)
     assert set(trained_on(text)) == set(flight_logs(flights[0]))

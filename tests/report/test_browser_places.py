@@ -63,6 +63,16 @@ def test_the_map_names_its_towers_and_reads_the_point_under_the_pointer(driver, 
     assert drawn.count("A 3.5 3.5") == 2 * len(driver.execute_script("return places.drawn()"))  # circles in halves
 
 
+def test_a_saved_table_has_no_formula_of_a_name(driver):
+    """As the tables that Python writes; numbers stay numbers."""
+    driver.execute_script("""
+        const rows = () => [["=1+1", "a;@b", "plain"], [-1.5, null, "+2"]], button = common.downloads(document.createElement("canvas"), "t", rows, () => {})[2];
+        button.id = "guarded"; document.body.append(button);
+    """)
+    (text,) = saved(driver, "#guarded").values()
+    assert text == "'=1+1,a;'@b,plain\n-1.5,,'+2\n"
+
+
 def test_directions_lie_on_a_sphere_that_turns(driver):
     """From above north is up and the zenith in the middle; from the side the middle is the south."""
     from selenium.webdriver import Keys

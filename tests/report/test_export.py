@@ -8,6 +8,7 @@ import pytest
 from aerpaw_cmp.compare.result import EngineResult
 from aerpaw_cmp.report import columns as export
 from aerpaw_cmp.report import page as names
+from aerpaw_cmp.report import texts
 from benchmarks.fabricated import with_numbers
 
 
@@ -164,7 +165,7 @@ def test_panels_with_different_baselines_share_one_table(report_data):
     ],
 )
 def test_time_is_rounded_not_cut(stored, text):
-    assert names.iso_time([np.datetime64(stored, "ns")]).tolist() == [text]
+    assert texts.iso_time([np.datetime64(stored, "ns")]).tolist() == [text]
 
 
 def test_no_engine_no_audit(report_data):

@@ -20,16 +20,15 @@ from tests.report.shown import DATA, PAGES
 ROOT = Path(__file__).parents[2] / "aerpaw_cmp" / "report"
 TABLE = Path(__file__).with_name("sentences.md")
 GAP = "…"
+SHELL = ("cards.py", "templates/page.html.jinja")
 SOURCES = {
-    "report": ("flight_words.py", "flight_figures.py", "charts.py", "templates/report.html.jinja",
-               "templates/explorer.html.jinja", "templates/method.html.jinja", "templates/plates.html.jinja",
-               "templates/spans.html.jinja", "templates/site_view.html.jinja"),
-    "map": ("maps.py", "charts.py", "templates/map.html.jinja", "templates/plates.html.jinja",
-            "templates/map_explorer.html.jinja"),
-    "campaign": ("campaign.py", "templates/campaign.html.jinja"),
-    "calibration": ("calibration.py", "templates/calibration.html.jinja"),
-    "diff": ("diff.py", "templates/diff.html.jinja"),
-    "prediction": ("prediction.py", "templates/prediction.html.jinja", "templates/places.html.jinja"),
+    "report": (*SHELL, "flight.py", "flight_words.py", "flight_figures.py", "charts.py", "columns.py",
+               "templates/explorer.html.jinja", "templates/method.html.jinja", "templates/site_view.html.jinja"),
+    "map": (*SHELL, "maps.py", "charts.py", "templates/map_explorer.html.jinja"),
+    "campaign": (*SHELL, "campaign.py"),
+    "calibration": (*SHELL, "calibration.py"),
+    "diff": (*SHELL, "diff.py"),
+    "prediction": (*SHELL, "prediction.py", "templates/places.html.jinja"),
 }  # fmt: skip
 WORD = re.compile(r"[A-Za-z][A-Za-z'-]*")
 INLINE = {"b", "i", "em", "strong", "code", "a", "br", "sup", "sub", "abbr"}

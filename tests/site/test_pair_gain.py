@@ -6,10 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.flight.gains.learned_gain import learned_gain, pair_db
 from aerpaw_cmp.propagation.geometry.arrays import Array, Link, Poses, rotation_from_aircraft, single_element
-from aerpaw_cmp.site.antenna.pair_gain import PairGain
-from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, read_sphere_csv, sphere_csv
+from aerpaw_cmp.site.antenna.pair_gain import PairGain, read_pair
+from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern
 
 RNG = np.random.default_rng(3)
 SHA = {"one": "a" * 64, "other": "b" * 64}
@@ -29,9 +30,9 @@ def planted(n: int = 40) -> PairGain:
 
 
 def pattern(pair: PairGain | None, trained_on: str) -> SpherePattern:
-    lines = (f"trained_on: {trained_on}", *(pair.notes() if pair else ()))
-    notes = "\n".join(f"# {line}" for line in lines)
-    return SpherePattern("a", np.zeros((19, 36)), np.full((19, 36), 2.0), notes=notes)
+    sphere = SpherePattern("a", np.zeros((19, 36)), np.full((19, 36), 2.0), notes=f"# trained_on: {trained_on}")
+    sphere.pair = pair
+    return sphere
 
 
 def array(sphere: SpherePattern) -> Array:
@@ -41,15 +42,12 @@ def array(sphere: SpherePattern) -> Array:
 def test_a_file_gives_back_what_was_written(tmp_path: Path) -> None:
     pair = planted()
     path = tmp_path / "a.csv"
-    path.write_text(sphere_csv(np.zeros((7, 8)), np.ones((7, 8)), ("trained_on: x", *pair.notes())))
-    read = read_sphere_csv(path).pair
-    assert read is not None
+    path.write_text(pair.table(("trained_on: x",)))
+    read = read_pair(path, pair.length, pair.prior_sd_db)
     np.testing.assert_allclose(read.directions, pair.directions, atol=2e-3)
     gain, sd = read.at(pair.directions, np.full(40, 9.0))
     assert np.abs(gain - pair.gain_db).max() < 0.03
     assert np.abs(sd - pair.sd_db).max() < 0.3
-    path.write_text(sphere_csv(np.zeros((7, 8)), np.ones((7, 8)), ("trained_on: x",)))
-    assert read_sphere_csv(path).pair is None  # a file of 0.3
 
 
 def test_far_from_every_direction_both_ends_count_alone() -> None:
@@ -59,11 +57,12 @@ def test_far_from_every_direction_both_ends_count_alone() -> None:
     assert sd[0] == pytest.approx(np.hypot(2.0, 1.5), rel=1e-3)
 
 
-@pytest.mark.parametrize("damage", ["length 0", "length x", "length 0.35 sd_db 1.5\n# pair: 1,2,3,4,nan,1"])
-def test_damaged_comments_are_no_gain(damage: str) -> None:
-    text = "\n".join(f"# {line}" for line in planted().notes())
-    head = next(line for line in text.splitlines() if "length" in line)
-    assert PairGain.from_notes(text.replace(head, f"# pair: {damage}")) is None
+@pytest.mark.parametrize("damage", ["1,2,3,4,nan,1", "1,2,3", "1,2,3,4,x,1"])
+def test_a_damaged_table_is_refused(damage: str, tmp_path: Path) -> None:
+    path = tmp_path / "a.csv"
+    path.write_text(planted(3).table(()) + damage + "\n")
+    with pytest.raises(InputError):
+        read_pair(path, 0.35, 1.5)
 
 
 def test_it_counts_along_the_direct_line_and_only_between_ends_learned_together() -> None:

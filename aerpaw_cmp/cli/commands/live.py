@@ -64,6 +64,9 @@ def tap(
     """Log the modem's rank indicator until interrupted."""
     _needs_posix("tap")
     from ...common.jsonable import json_safe
+
+    if telemetry is not None and flight is None:
+        raise UsageError("--telemetry without --flight", expected="--flight FILE, whose telemetry it is")
     from ...jobs.live.live_tap import Shown, tap_modems
     from ...live.session import TapSettings
 

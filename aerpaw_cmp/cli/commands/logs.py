@@ -48,6 +48,8 @@ def ingest(
     from ...jobs import run
     from ...logs.ingest import summary as account
 
+    if site is not None and draft is None:
+        raise UsageError("--site without --draft", expected="--draft FILE: the site is that of the draft")
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
     if columns:
         # what the user says outweighs what a mapping implies, such as the number of rank 1

@@ -187,7 +187,9 @@ def channel(
     bandwidth: Annotated[
         float | None, Option(min=1.0, help="Also H at the subcarriers of a band of this width [Hz] (NetCDF).")
     ] = None,
-    subcarriers: Annotated[int, Option(min=1, max=65536, help="Subcarriers of the band.")] = 1024,
+    subcarriers: Annotated[
+        int | None, Option(min=1, max=65536, help="Subcarriers of the band  [default: 1024]")
+    ] = None,
     logs_root: LogsRoot = None,
     force: Force = False,
 ) -> None:

@@ -192,7 +192,7 @@ def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
     return samples.at_uav if frame == "body" else samples.at_tower
 
 
-def _kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
+def term_kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
     """Covariance (n, m) of a term between arguments [dB^2].
 
     Gains of airframes have details of every size: an exponential leaves 0.1 dB less than sums of Gaussians.
@@ -211,12 +211,12 @@ def _kernel(term: Term, at: FloatArray, to: FloatArray) -> FloatArray:
 
 @lru_cache(maxsize=len(ANTENNA_TERMS))
 def _last_kernel(term: Term, at: bytes, to: bytes) -> FloatArray:
-    """:func:`_kernel` of float64 arguments, kept for the next series: channels of one log have the same directions."""
+    """Return :func:`term_kernel` of float64 arguments, kept: channels of one log have the same directions."""
     width = 6 if term.frame == "pair" else 3
-    return _kernel(term, np.frombuffer(at).reshape(-1, width), np.frombuffer(to).reshape(-1, width))
+    return term_kernel(term, np.frombuffer(at).reshape(-1, width), np.frombuffer(to).reshape(-1, width))
 
 
-def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
+def gain_covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Sequence[LinkSamples]) -> FloatArray:
     """Covariance (n, m) of the gains between samples of some series and of others [dB^2]."""
     rows, columns = _antennas(first), _antennas(second)
     out = np.zeros((sum(map(len, first)), sum(map(len, second))))
@@ -227,7 +227,7 @@ def _covariance(terms: Sequence[Term], first: Sequence[LinkSamples], second: Seq
             if term.per == "antenna" and name != other:  # gains of two antennas share nothing
                 continue
             key = at[mine].tobytes(), to[theirs].tobytes()  # channels of one log have the same directions
-            blocks[key] = _kernel(term, at[mine], to[theirs]) if key not in blocks else blocks[key]
+            blocks[key] = term_kernel(term, at[mine], to[theirs]) if key not in blocks else blocks[key]
             out[mine, theirs] += blocks[key]
     return out
 
@@ -256,7 +256,7 @@ def _expected(
     return gain
 
 
-def _own_covariance(model: GainModel, samples: LinkSamples) -> FloatArray:
+def own_covariance(model: GainModel, samples: LinkSamples) -> FloatArray:
     """Covariance (n, n) of a series' offset, nuisance and noise [dB^2]."""
     from scipy.spatial.distance import cdist
 
@@ -268,10 +268,10 @@ def _own_covariance(model: GainModel, samples: LinkSamples) -> FloatArray:
 
 def _covariance_of_levels(model: GainModel, rows: Sequence[LinkSamples]) -> FloatArray:
     """Covariance (n, n) of the levels of all rows: gains, and what each series has of its own [dB^2]."""
-    out, start = _covariance(model.terms, rows, rows), 0
+    out, start = gain_covariance(model.terms, rows, rows), 0
     for samples in rows:
         block = slice(start, start + len(samples))
-        out[block, block] += _own_covariance(model, samples)
+        out[block, block] += own_covariance(model, samples)
         start = block.stop
     return out
 
@@ -392,14 +392,26 @@ class GainFit:
         finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1))
         return np.flatnonzero(finite.all(axis=1))
 
+    def covariance(self, frame: Frame, antenna: str, direction: FloatArray) -> FloatArray:
+        """Return the covariance (n, n) of :meth:`gain` towards directions (n, 3) [dB^2]."""
+        terms = [t for t in self.model.terms if t.frame == frame]
+        at, about = directed(antenna, np.asarray(direction, dtype=np.float64)), self._rows_of(antenna)
+        centre = gain_covariance(terms, about, [at, *self.rows]).mean(axis=0)
+        across = gain_covariance(terms, [at], self.rows) - centre[len(at) :]
+        centre = centre[: len(at)]
+        prior = gain_covariance(terms, [at], [at]) - centre[:, None] - centre
+        prior += gain_covariance(terms, about, about).mean()
+        spread = self._factor.whiten(across.T)
+        return np.asarray(prior - spread.T @ spread)
+
     def _moments(
         self, terms: Sequence[Term], at: LinkSamples, about: Sequence[LinkSamples]
     ) -> tuple[FloatArray, FloatArray]:
         """Sum of some terms along samples about its mean over others: mean and standard deviation (n,)."""
-        centre = _covariance(terms, about, [at, *self.rows]).mean(axis=0)
-        across = _covariance(terms, [at], self.rows) - centre[len(at) :]
+        centre = gain_covariance(terms, about, [at, *self.rows]).mean(axis=0)
+        across = gain_covariance(terms, [at], self.rows) - centre[len(at) :]
         # between samples of one antenna every term counts
-        prior = sum(t.sd_db**2 for t in terms) - 2.0 * centre[: len(at)] + _covariance(terms, about, about).mean()
+        prior = sum(t.sd_db**2 for t in terms) - 2.0 * centre[: len(at)] + gain_covariance(terms, about, about).mean()
         spread = self._factor.whiten(across.T)
         return across @ self._weights, np.sqrt(np.maximum(prior - (spread**2).sum(axis=0), 0.0))
 
@@ -462,7 +474,7 @@ def _solved(model: GainModel, rows: Sequence[LinkSamples], covariance: FloatArra
     misfit = float(target @ weights)
     # what the equations leave to the gains
     parts = np.split(weights, np.cumsum([len(s) for s in rows])[:-1])
-    gain = target - np.concatenate([_own_covariance(model, s) @ w for s, w in zip(rows, parts, strict=True)])
+    gain = target - np.concatenate([own_covariance(model, s) @ w for s, w in zip(rows, parts, strict=True)])
     return GainFit(
         model=model,
         rows=tuple(rows),
@@ -485,7 +497,7 @@ def chosen_fit(series: Sequence[LinkSamples], model: GainModel | None = None) ->
     if not 0 < len(mast) < len(model.terms):
         return _solved(model, rows, _covariance_of_levels(model, rows)).scaled()
     others = dataclasses.replace(model, terms=tuple(t for t in model.terms if t not in mast))
-    of_others, of_towers = _covariance_of_levels(others, rows), _covariance(mast, rows, rows)
+    of_others, of_towers = _covariance_of_levels(others, rows), gain_covariance(mast, rows, rows)
     fits = []
     for factor in _TOWER_FACTORS:
         terms = tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) if t in mast else t for t in model.terms)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -86,21 +85,6 @@ class Spread:
             skew2 = _FADE_SKEWNESS2 * np.maximum(k, 0.0) * (self.fading_sd_db / total) ** 2
         third, fifth = z**3 - 3.0 * z, z**5 - 10.0 * z**3 + 15.0 * z
         return np.asarray(total * (z + third * k / 24.0 + fifth * skew2 / 72.0))
-
-    def text(self) -> str:
-        """For the comments of an antenna file."""
-        return "spread: " + " ".join(f"{name} {value:.4g}" for name, value in asdict(self).items())
-
-    @classmethod
-    def from_text(cls, text: str) -> Spread | None:
-        """From :meth:`text` somewhere in the comments of an antenna file; None where there is none."""
-        line = re.search(r"^# spread: (.*)$", text, re.MULTILINE)
-        words = [] if line is None else line[1].split()
-        try:
-            return cls(**{name: float(value) for name, value in zip(words[::2], words[1::2], strict=True)})
-        # a line that somebody changed: as of a file that states no spread
-        except (TypeError, ValueError):
-            return None
 
 
 # Of learned files that state the standard deviation of the gain alone.

@@ -444,12 +444,15 @@ def parts_left_out(
 
 def altitude_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
     """The commonest height of the scored flight, and all other heights."""
-    height = scored.samples.position_m[:, 2]
-    # to a metre: of heights to the centimetre none would be the commonest
-    heights, count = np.unique(np.round(height), return_counts=True)
-    cruise = float(heights[count.argmax()])
+    height, cruise = scored.samples.position_m[:, 2], cruise_height_m(scored)
     mine = np.abs(height - cruise) < _CRUISE_M
     return [(mine, np.abs(source.samples.position_m[:, 2] - cruise) >= _CRUISE_M)]
+
+
+def cruise_height_m(observed: Observed) -> float:
+    """Return the commonest height of a flight, to a metre [m]."""
+    heights, count = np.unique(np.round(observed.samples.position_m[:, 2]), return_counts=True)
+    return float(heights[count.argmax()])
 
 
 def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:

@@ -20,12 +20,10 @@ from ...common.yamlfile import parse_yaml
 from ...logs.ingest import IngestedFile, name_inside, read_log
 from ...logs.origins import named_tower
 from ...logs.records import Stream, has_wall_clock
-from ...site.antenna.learned import Learned, read_learned
 from ...site.site import Site
 from ...site.siteyaml import load_site
-from ..data import is_own_radio, is_ratio, rank_quantity, site_place
+from ..data import FlightData, is_own_radio, is_ratio, site_place
 from ..gains.losses import sight_shares
-from ..gains.memory import with_learned
 from ..marks import mark_of
 from ..pose.cross_checks import questions
 from ..pose.grouping import Flight, Span, flights, meet, stream_span
@@ -152,15 +150,20 @@ def draft(
     parts += ["logs:\n", *entries.lines.values()]
     parts += [_NO_TRACK] if entries.without_track else []
     parts += [f"  # left out: {remark}\n" for remark in entries.out]
-    known = _remembered(entries, site, folder)
     link = _DOWNLINK if entries.downlink and all(entries.downlink) else LINK
     link = link.replace("20e6", f"{_bandwidth_mhz([file.path for file in own]):g}e6")
-    parts += _learned_lines(known, link) if "rss" in entries.kinds else []
-    parts += [RANK] if "rank" in entries.kinds else []
-    parts += _settings(entries, known)
-    text = "".join(parts)
+
+    def text_with(known: Proposal) -> str:
+        lines = _learned_lines(known, link) if "rss" in entries.kinds else []
+        lines += [RANK] if "rank" in entries.kinds else []
+        return "".join([*parts, *lines, *_settings(entries, known)])
+
     # the draft is read and gathered as a report would: what it promises is true
-    proof = _proof(text, folder, {file.path: file for file in files}, list(entries.lines))
+    proof = _proof(text_with(Proposal()), folder, {file.path: file for file in files}, list(entries.lines))
+    known, remark = _remembered(entries, site, folder, proof.data)
+    text = text_with(known)
+    parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
+    entries.out += remark
     if proof.reason:
         text = text.replace(HEAD, f"{HEAD}# No sample of this draft can be compared: {proof.reason}.\n", 1)
     # questions stand at the ends of lines, so that the file itself can be searched for them
@@ -173,10 +176,7 @@ def draft(
 
 def _proof(text: str, folder: Path, files: Mapping[str, IngestedFile], paths: Sequence[str]) -> DryRun:
     """Dry run of the draft's report: the samples it would score; logs whose times the draft moves are read again."""
-    settings = parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
-    # a band that the memory does not know changes what can be compared
-    settings = with_learned(settings, folder)
-    read = []
+    settings, read = parse_yaml(text, FlightFile), []
     for log, path in zip(settings.logs, paths, strict=True):
         moved = log.time_origin is not None and any("clock" in s.attributes for s in files[path].result.streams)
         same = not moved and log.clock is None
@@ -290,16 +290,16 @@ _QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers t
 _SURE_M = 100.0
 
 
-def _remembered(entries: _Entries, site: str, folder: Path) -> Proposal:
-    """Fitting part of the site's memory; nothing, and a remark, where the memory cannot be read."""
-    try:
-        known = read_learned(site_place(site, folder))
-    except (InputError, UsageError) as error:
-        entries.out.append(f"what site {site} remembers: {error.found}")
-        known = Learned()
+def _remembered(entries: _Entries, site: str, folder: Path, data: FlightData | None) -> tuple[Proposal, list[str]]:
+    """Return the learned antennas that fit; nothing, and a remark, if they cannot be read."""
+    if data is None:
+        return Proposal(), []
     towers = () if entries.placer is None else tuple(entries.placer.site.towers)
     nodes = Nodes(placed=frozenset(entries.sure), fixed=towers)
-    return propose(known, str(Path(site).with_suffix("")), entries.series, nodes)
+    try:
+        return propose(data, site_place(site, folder), str(Path(site).with_suffix("")), nodes), []
+    except (InputError, UsageError) as error:
+        return Proposal(), [f"learned antennas of site {site}: {error.found}; expected: {error.expected}"]
 
 
 # Sampling rate in the names of sounder files and folders, such as 70m_fs20MHz.
@@ -325,7 +325,7 @@ _SOUNDER_MHZ = 20.0
 def _learned_lines(known: Proposal, link: str) -> list[str]:
     """``antennas`` and ``link``."""
     if not known.antennas:
-        return [link]
+        return [link, *([f"# antennas: {known.antennas_about}\n"] if known.antennas_about else [])]
     assert known.carrier_hz is not None
     return [
         f"antennas: {_plain(dict(known.antennas))}  # {known.antennas_about}; the same airframe?\n",
@@ -389,7 +389,7 @@ def _shaded(entries: _Entries) -> tuple[str, list[str]]:
     if entries.placer is None:
         return "", []
     site, positions = entries.placer.site, entries.placer.positions_m(_SIGHTS)
-    names = sorted({tower for tower, *_ in entries.series} & set(site.towers))
+    names = sorted(entries.at_towers & set(site.towers))
     if not names or not len(positions):
         return "", []
     wooded, hidden = (float(share) for share in np.mean([sight_shares(site, n, positions) for n in names], axis=0))
@@ -462,8 +462,8 @@ class _Entries:
     lines: dict[str, str] = field(default_factory=dict)
     """By the path as it was given."""
     kinds: set[str] = field(default_factory=set)
-    series: list[tuple[str, str, str]] = field(default_factory=list)
-    """Tower, channel and reader of each level and rank."""
+    at_towers: set[str] = field(default_factory=set)
+    """Towers of all levels and ranks."""
     out: list[str] = field(default_factory=list)
     without_track: bool = False
     """A record was entered that needs a track, and there is none."""
@@ -576,9 +576,7 @@ class _Entries:
             self.offsets_db += [offset for offset in offsets if offset is not None]
         self.kinds |= {s.kind for s in compared}
         self.tops_m += [_top_m(s) for s in compared if _has_positions(s)]
-        reader = file.result.reader
-        self.series += [(*_key(s, entry), reader) for s in compared if s.kind == "rss"]
-        self.series += [(*_key(s, entry), rank_quantity(s, reader)) for s in compared if s.kind == "rank"]
+        self.at_towers |= {_key(s, entry)[0] for s in compared if s.kind in ("rss", "rank")}
         self.downlink += [s.attributes.get("quantity") == "RSRP" for s in compared if s.kind == "rss"]
         self.without_track |= self.flown is None and not all(_has_positions(s) for s in compared)
 
@@ -645,12 +643,11 @@ class _Entries:
             # the first of its kind: receivers of one node stand at one place
             level = next((s for s in levels if pci is None or _cell_of(s) == pci), None)
             if level is not None:
-                series = _key(level, entry)[1], file.result.reader
                 mark = mark_of(level.frame["time"].to_numpy(), level.frame["rss_db"].to_numpy(np.float64))
                 log = file.sha256, mark
-                airframe = searching_airframe(memory, placer.site.towers, series, log)
+                airframe = searching_airframe(memory, placer.site.towers, log) if is_sounder_power(level) else None
                 levels_on_track = placer.levels(level, self._floor_db(level), airframe)
-                places[pci] = placer.propose(levels_on_track, taught(memory, series, log))
+                places[pci] = placer.propose(levels_on_track, taught(memory, log, loses_lock=False))
         for pci, place in places.items():
             if place is None:
                 continue

@@ -28,11 +28,14 @@ class DryRun:
         The message with which a report would stop; empty where it would not.
     lost : tuple of str
         Per series of which none, or less than half, is compared: which, and the reason.
+    data : FlightData or None
+        The gathered flight; None if the report would stop.
     """
 
     samples: int = 0
     refused: str = ""
     lost: tuple[str, ...] = ()
+    data: FlightData | None = None
 
     @property
     def reason(self) -> str:
@@ -57,7 +60,7 @@ def dry_run(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) -
         counts = _counts(*rank_positions(rank, data.track), rank.rank, settings.rank.minimum_height_m)
         samples += counts[-1]
         lost[f"rank of {rank.tower}"] = _loss(data, rank.time, counts)
-    return DryRun(samples=samples, lost=tuple(f"{name}: {why}" for name, why in lost.items() if why))
+    return DryRun(samples=samples, lost=tuple(f"{name}: {why}" for name, why in lost.items() if why), data=data)
 
 
 def _counts(place: FloatArray, known: BoolArray, value: FloatArray, lowest_m: float | None) -> tuple[int, int, int]:

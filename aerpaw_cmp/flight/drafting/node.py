@@ -12,6 +12,8 @@ from typing import Any
 import numpy as np
 
 from ...common.units import FloatArray, spread_out
+from ...compare.gains.direction_gain import LinkSamples, link_directions
+from ...compare.gains.evidence import LEAST_ODDS, FlightEvidence, Moments
 from ...compare.learning.locate import FEWEST, LevelModel, LevelTrack, fit_places, level_track, locate, place_odds
 from ...logs.records import Stream
 from ...propagation.field.baselines import free_space_dbm
@@ -104,6 +106,8 @@ class Taught:
     tower: MeasuredPattern
     uav: MeasuredPattern
     model: LevelModel
+    moments: Moments | None = None
+    """Gain of both ends with its covariance, by which it must win against a gain of the flight's own."""
 
 
 @dataclass
@@ -168,15 +172,15 @@ class Placer:
         return track if airframe is None else replace(track, airframe_db=self._gain_db(track, airframe, node))
 
     def propose(
-        self, track: LevelTrack, taught: Mapping[str, Taught | None] = MappingProxyType({})
+        self, track: LevelTrack, taught: Mapping[str, Sequence[Taught]] = MappingProxyType({})
     ) -> Placement | None:
         """Tower, listed place or estimated place that the levels fit; None where they are too few.
 
         Parameters
         ----------
         track : LevelTrack
-        taught : mapping of str to Taught or None
-            Gains of towers and airframe that other flights with such a receiver taught, by tower; None of its own.
+        taught : mapping of str to sequence of Taught
+            Gains of towers and airframe that other flights taught, by tower; none for those of its own log.
         """
         if len(track.level_db) < FEWEST:
             return None
@@ -187,11 +191,15 @@ class Placer:
         odds_tower, odds_listed = odds[: len(towers)].copy(), odds[len(towers) :]
         # the search takes longer than all else: only where a tower's antennas or a place of its own need it
         estimate = locate(track) if any(taught.values()) or odds_tower.max() < _TOWER_ODDS else None
+        known = np.full(len(towers), -np.inf)
         for i, tower in enumerate(towers):
-            if estimate is not None and (gains := taught.get(tower.name)) is not None:
-                known = self._taught_odds(track, tower.name, gains)
+            gains = taught.get(tower.name, ()) if estimate is not None else ()
+            if gains := [each for each in gains if self._supports(track, tower.name, each)]:
+                taught_odds = max(self._taught_odds(track, tower.name, each) for each in gains) - np.log(len(gains))
                 # as odds against any place, like those of the search
-                odds_tower[i] = max(odds_tower[i], known - estimate.anywhere - _TAUGHT_MORE)
+                taught_odds -= estimate.anywhere + _TAUGHT_MORE
+                known[i] = taught_odds if taught_odds >= _TOWER_ODDS else -np.inf
+                odds_tower[i] = max(odds_tower[i], taught_odds)
         if len(listed) and odds_listed.max() >= max(_LISTED_ODDS, odds_tower.max()):
             # a list of rover places holds neighbours some metres apart: all likely lines are named
             order = np.argsort(-odds_listed)
@@ -203,9 +211,10 @@ class Placer:
         best = int(odds_tower.argmax())
         if odds_tower[best] >= _TOWER_ODDS:
             how = "with the antennas that flights taught" if odds_tower[best] > odds[best] else "as well as any place"
-            alike = [towers[i].name for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
-            # a part of a flight that circles no tower fits several: the receiver's own tower is the likeliest
-            name = next((tower for tower in alike if tower in taught), alike[0])
+            near = [i for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
+            alike = [towers[i].name for i in near]
+            # a part of a flight that circles no tower fits several: that with learned antennas is the likeliest
+            name = towers[max(near, key=lambda i: (known[i], towers[i].name in taught))].name
             asked = "is it this tower?" if len(alike) == 1 else f"is it {name}?"
             return Placement(name, None, f"the levels fit {' or '.join(alike)} {how}: {asked}")
         assert estimate is not None  # no tower stands
@@ -220,6 +229,18 @@ class Placer:
         place = estimate.place_m
         node = self._node(place, float(latitude[0]), float(longitude[0]), float(place[2]), about)
         return replace(node, radius_m=estimate.radius90_m)
+
+    def _supports(self, track: LevelTrack, tower: str, gains: Taught) -> bool:
+        """Check whether levels support the learned antennas of a tower against a gain of their own."""
+        if gains.moments is None or track.rotation is None:
+            return True
+        place = self.site.towers[tower].position_m
+        at_uav, at_tower = link_directions(place, track.position_m, track.rotation)
+        free = free_space_dbm(place[None, :], track.position_m, CARRIER_HZ, POWER_DBM)[:, 0]
+        level = np.where(track.below, np.nan, track.level_db)
+        samples = LinkSamples("", tower, "", track.time_s, track.position_m, at_uav, at_tower, level - free)
+        odds = FlightEvidence([samples]).of_link(0, gains.moments)
+        return odds.over_own >= LEAST_ODDS and odds.over_turned > 0.0
 
     def _taught_odds(self, track: LevelTrack, tower: str, gains: Taught) -> float:
         """Log evidence of a tower with the antennas at both ends that flights taught."""

@@ -10,7 +10,9 @@ import numpy as np
 from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.units import FloatArray
 from ...compare.gains.direction_gain import link_directions
+from ...compare.gains.spread import NO_SPREAD, Spread
 from ...propagation.geometry.arrays import Link, Pattern, Poses
+from ...site.antenna.learned import LearnedSpread
 from ...site.antenna.sphere_pattern import SpherePattern
 
 
@@ -24,13 +26,13 @@ class LearnedGain:
         Gain towards both ends at once, to be added to the level [dB]; zero where the files hold none.
     sd_db : (poses,)
         Standard deviation of all learned gain together [dB].
-    notes : tuple of str
-        Comments of the files, the tower's last.
+    spread : Spread
+        Error model of the level besides ``sd_db``: that of the tower's antenna, else of the UAV's.
     """
 
     pair_db: FloatArray
     sd_db: FloatArray
-    notes: tuple[str, ...]
+    spread: Spread
 
 
 def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain | None:
@@ -58,7 +60,13 @@ def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain 
     if not ends:
         return None
     pair_db, sd_db = pair_and_sd_db(ends)
-    return LearnedGain(pair_db=pair_db, sd_db=sd_db, notes=tuple(p.notes for p, _ in reversed(ends.values())))
+    stated = (pattern.spread for pattern, _ in reversed(ends.values()) if pattern.spread is not None)
+    return LearnedGain(pair_db=pair_db, sd_db=sd_db, spread=spread_of(next(stated, None)))
+
+
+def spread_of(stated: LearnedSpread | None) -> Spread:
+    """Return the error model that a learned antenna states; that of the gain alone if it states none."""
+    return NO_SPREAD if stated is None else Spread(**stated.model_dump())
 
 
 def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tuple[FloatArray, FloatArray]:

@@ -13,7 +13,7 @@ from typing import Any
 
 from ...common.errors import InputError, UsageError
 from ...site.antenna.learned import Named, UnknownName, find_named
-from ...site.antenna.named import antenna_file, receiver_file
+from ...site.antenna.named import learned_antenna, receiver_file
 from ..overrides import Overrides, overridden
 from ..settings import AntennaSettings, ArraySettings, Caution, FlightFile, LinkSettings, joined, load_flight
 
@@ -60,7 +60,7 @@ class _Ends:
         before = link.uav if key == "uav" else link.towers.get(tower, link.tower)
         instead = "an isotropic antenna is used instead" if before == ArraySettings() else "that of 'link' is used"
         try:
-            file = antenna_file(named, key, channel or "", link.carrier_hz)
+            file, known = learned_antenna(named, "uav" if key == "uav" else "tower", link.carrier_hz)
         except (InputError, UsageError) as error:
             text = f"the learned antenna {name} is not used ({_reason(error)}); {instead}"
             self.cautions.append(Caution(key=f"antennas.{key}", channel=channel, text=text))
@@ -68,7 +68,7 @@ class _Ends:
         if before != ArraySettings():
             text = f"the learned antenna {name} replaces the array of 'link'"
             self.cautions.append(Caution(key=f"antennas.{key}", channel=channel, text=text, used=True))
-        array = ArraySettings(antenna=AntennaSettings(model="sphere", file=str(file)))
+        array = ArraySettings(antenna=AntennaSettings(model="sphere", file=str(file), learned=known))
         end: dict[str, Any] = {"uav": array} if key == "uav" else {"towers": {**link.towers, tower: array}}
         self.used.add(key)
         if channel is None:

@@ -57,6 +57,12 @@ def load_campaign(path: Path) -> CampaignFile:
     campaign = load_yaml(path, CampaignFile)
     if not campaign.flights + campaign.soundings:
         raise UsageError("no flights and no soundings", expected="flights: [FLIGHT.yaml, ...]", path=path)
+    if campaign.timezone is not None and not campaign.soundings:
+        raise UsageError(
+            "'timezone' without 'soundings', whose times it is for",
+            expected="the time zone of a flight in its own flight.yaml",
+            path=path,
+        )
     return campaign
 
 

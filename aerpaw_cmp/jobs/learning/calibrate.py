@@ -27,10 +27,10 @@ from ...compare.learning.learning_curve import CurvePoint, learning_curve
 from ...flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ...flight.gains.learned_gain import mean_gain_db, sphere_angles
 from ...flight.gains.memory import flight_of, load_with_learned
-from ...flight.rows.lock import LOCK_FLOOR_DB
+from ...flight.observed import observed_series
 from ...flight.settings import AntennaSettings, load_pattern
 from ...flight.training import counted_once, flight_logs, marks_of
-from ...propagation.field.baselines import free_space_dbm, two_ray_dbm
+from ...propagation.field.baselines import two_ray_dbm
 from ...report.calibration import sentences
 from ...site.antenna.learned import LearnedLock, Source
 from .calibrate_lock import learned_locks, lock_words
@@ -102,6 +102,11 @@ class Calibration:
     def fit(self) -> direction_gain.GainFit:
         """The learned gain over direction: every ``fit.gain`` has one."""
         return self.learned.fit
+
+    @property
+    def pair_term(self) -> direction_gain.Term | None:
+        """The term of the gain towards both ends at once; None if none was learned."""
+        return next((term for term in self.fit.model.terms if term.frame == "pair"), None)
 
     @property
     def names(self) -> list[str]:
@@ -295,7 +300,7 @@ def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | Non
         remarks.append(
             f"{data.settings.flight.name}: {series.tower} {SNR} stands for a level: the noise is taken as constant"
         )
-    observed, guessed, lost = _observe(data, series)
+    observed, guessed, lost = observed_series(data, series)
     if not np.isfinite(observed.samples.residual_db).any():
         return None, [*remarks, f"{name} has no level at a known pose and is left out"]
     if guessed > 0.01:
@@ -304,49 +309,6 @@ def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | Non
     if lost > 0.01:
         remarks.append(f"{name}: {100 * lost:.0f} % of the levels have no position and are left out")
     return observed, remarks
-
-
-def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float, float]:
-    """One series, the share of its attitudes that stand for an unknown one, and of its levels without a position."""
-    if data.track is None:
-        raise InputError(f"flight {data.settings.flight.name} has no telemetry", expected="positions and attitude")
-    place, known = data.tower_at(series.tower, series.time)
-    pose = data.track.pose_at(series.time).where(known)
-    low = data.settings.rss.minimum_height_m
-    with np.errstate(invalid="ignore"):
-        keep = pose.valid if low is None else pose.valid & (pose.position_m[:, 2] >= low)
-    position = pose.position_m[keep]
-    if series.tower in data.nodes:
-        place = place[keep]
-    at_uav, at_tower = direction_gain.link_directions(place, position, pose.rotation[keep])
-    ends = place[:, None, :] if series.tower in data.nodes else place
-    free = free_space_dbm(ends, position, series.link.carrier_hz, series.link.transmit_power_dbm)[:, 0]
-    time = series.time[keep]
-    seconds = (time - time.min()) / np.timedelta64(1, "s") if len(time) else np.zeros(0)
-    order = np.argsort(seconds, kind="stable")
-    samples = direction_gain.LinkSamples(
-        flight=data.settings.flight.name,
-        tower=series.tower,
-        channel=series.channel,
-        time_s=np.asarray(seconds, dtype=np.float64),
-        position_m=position,
-        at_uav=at_uav,
-        at_tower=at_tower,
-        residual_db=series.measured_db[keep] - free,
-        floor_db=None if series.locked is None else LOCK_FLOOR_DB - free,
-    )
-    guessed = float(np.mean(~pose.attitude_known[keep])) if keep.any() else 0.0
-    moving = place if series.tower in data.nodes else None
-    observed = Observed(
-        samples,
-        free,
-        pose.heading_deg[keep],
-        moving,
-        time.min() if len(time) else None,
-        locked=None if series.locked is None else series.locked[keep],
-        sent_dbm=series.link.transmit_power_dbm,
-    )
-    return observed.part(order), guessed, 1.0 - float(np.mean(pose.valid))
 
 
 # --- what is learned -----------------------------------------------------------------------------------------------
@@ -362,7 +324,13 @@ def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: P
     patterns: dict[str, GainOf] = {}
     if settings.patterns.uav is not None:
         patterns["uav"] = gain_of(settings.patterns.uav, folder)
-    for antenna in dict.fromkeys(o.samples.antenna for o in observed):
+    antennas = list(dict.fromkeys(o.samples.antenna for o in observed))
+    if unknown := sorted(settings.patterns.towers.keys() - set(antennas)):
+        raise UsageError(
+            f"patterns.towers.{unknown[0]}: the flights have no such tower and channel",
+            expected="one of " + ", ".join(antennas),
+        )
+    for antenna in antennas:
         chosen = settings.patterns.towers.get(antenna, settings.patterns.tower)
         if chosen is not None:
             patterns[antenna] = gain_of(chosen, folder)

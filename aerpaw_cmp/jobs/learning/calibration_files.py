@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import math
 from collections.abc import Mapping, Sequence
@@ -12,28 +13,33 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import yaml
 
 from ...common.gaussian import determining, gaussian_kernel
 from ...common.jsonable import named
 from ...common.provenance import KEY, MARKS, union
 from ...common.units import spread_out
 from ...compare.gains.direction_gain import Frame, directed
-from ...compare.gains.spread import student_factor
-from ...compare.learning.calibration import mean_rmse
+from ...compare.gains.spread import Spread, student_factor
+from ...compare.learning.calibration import cruise_height_m, mean_rmse
 from ...compare.learning.learning_curve import with_one_more
-from ...flight.data import FlightData, RankSeries, RssSeries, rank_quantity
+from ...flight.data import FlightData, RssSeries, quantity_of
 from ...flight.training import flight_logs, marks_of
 from ...logs.records import has_wall_clock
 from ...report.calibration import AntennaMap, CalibrationData, calibration_metrics, write_calibration
-from ...report.page import safe_name, write_file
+from ...report.page import write_file
+from ...report.texts import safe_name
+from ...site.antenna.known_directions import KnownDirections
 from ...site.antenna.learned import (
     Entry,
     Errors,
+    LearnedAntenna,
     LearnedLevel,
     LearnedLock,
+    LearnedPair,
     LearnedReceiver,
     LearnedSeries,
-    receiver_of,
+    LearnedSpread,
 )
 from ...site.antenna.pair_gain import PairGain
 from ...site.antenna.sphere_pattern import (
@@ -51,6 +57,9 @@ _MARK = "# aerpaw-cmp calibrate"
 
 # Share of the variance over both directions that the stored directions leave, and their largest number.
 _PAIR_SHARE, _MOST_PAIRS = 0.01, 400
+
+# The same for the directions at the UAV. Of 60, 100 and 200 the evidence for an airframe differs by at most 3 nat.
+_KNOWN_SHARE, _MOST_KNOWN = 0.002, 100
 
 
 def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
@@ -100,16 +109,13 @@ def _antenna_files(
     out: dict[str, str] = {}
     for (antenna, end), gains in maps.items():
         stem = safe_name(f"{antenna}.{end}")
-        out[f"{stem}.csv"] = sphere_csv(gains.gain_dbi, gains.sd_db, (*notes, *_notes(calibration, antenna, end)))
+        out[f"{stem}.csv"] = sphere_csv(gains.gain_dbi, gains.sd_db, (*notes, *_provenance_notes(calibration)))
+        pair = _pair_gain(calibration, antenna) if end == "tower" else None
+        if pair is not None:
+            out[f"{safe_name(f'{antenna}.pair')}.csv"] = pair.table((*notes[:1], *_provenance_notes(calibration)))
         pattern = SpherePattern(stem, gains.gain_dbi, gains.sd_db)
         out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz, _provenance_notes(calibration))
     return out
-
-
-def _notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
-    """Notes of an antenna file that its readers use: training logs and marks, spread, the gain towards both ends."""
-    notes = _provenance_notes(calibration)
-    return (*notes, calibration.learned.spread(antenna).text(), *_pair_notes(calibration, antenna, end))
 
 
 def _provenance_notes(calibration: Calibration) -> Sequence[str]:
@@ -117,12 +123,11 @@ def _provenance_notes(calibration: Calibration) -> Sequence[str]:
     return f"{KEY}: {' '.join(calibration.trained_on)}", f"{MARKS}: {' '.join(calibration.marks)}"
 
 
-def _pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[str]:
-    """Notes of the tower's file about the gain towards both ends at once; empty where none was learned."""
+def _pair_gain(calibration: Calibration, antenna: str) -> PairGain | None:
+    """Return the gain towards both ends at once of an antenna; None if none was learned."""
     fit = calibration.fit
-    term = next((t for t in fit.model.terms if t.frame == "pair"), None)
-    if term is None or end == "uav":
-        return ()
+    if (term := calibration.pair_term) is None:
+        return None
     flown, length = fit.seen("pair", antenna), term.length
     at = flown[determining(flown, lambda a, b: gaussian_kernel(a, b, length), _PAIR_SHARE, _MOST_PAIRS)]
     return PairGain(
@@ -131,7 +136,18 @@ def _pair_notes(calibration: Calibration, antenna: str, end: str) -> Sequence[st
         sd_db=fit.predict(directed(antenna, at), ("body", "mast", "pair"))[1],
         length=term.length,
         prior_sd_db=term.sd_db,
-    ).notes()
+    )
+
+
+def _known_directions(calibration: Calibration, antenna: str) -> KnownDirections:
+    """Return the directions at the UAV that determine its gain, and the covariance there."""
+    from scipy.spatial.distance import cdist
+
+    fit = calibration.fit
+    flown = fit.seen("body", antenna)
+    # as far apart as rounding to a tenth of a degree keeps them
+    at = flown[determining(flown, lambda a, b: np.exp(-cdist(a, b)), _KNOWN_SHARE, _MOST_KNOWN)]
+    return KnownDirections(directions=at, covariance_db2=fit.covariance("body", antenna, at))
 
 
 def _listed(key: str, entries: Sequence[str]) -> list[str]:
@@ -140,8 +156,46 @@ def _listed(key: str, entries: Sequence[str]) -> list[str]:
     return [f"# {comment}", f"{key}:", *(f"  - '{entry}'" for entry in entries)] if entries else []
 
 
-def settings_text(calibration: Calibration, folder_name: str) -> str:
-    """calibrated.yaml: the part of a flight.yaml that names the learned antennas."""
+def _learned_antenna(
+    calibration: Calibration, antenna: str, end: str, files: Mapping[str, str], place: str, command: str
+) -> str:
+    """Return the value of ``antenna`` in calibrated.yaml: table, SHA-256 and error model of an antenna, on one line."""
+
+    def sha256(file: str) -> str:
+        return hashlib.sha256(files[file].encode()).hexdigest()
+
+    file, pair_file = (safe_name(f"{antenna}.{part}") + ".csv" for part in (end, "pair"))
+    pair, spread = calibration.pair_term if end == "tower" else None, calibration.learned.spread(antenna)
+    both = None if pair is None else LearnedPair(
+        file=f"{place}/{pair_file}", sha256=sha256(pair_file), length=pair.length, prior_sd_db=_rounded(pair.sd_db)
+    )  # fmt: skip
+    known = LearnedAntenna(sha256=sha256(file), command=command, pair=both, spread=rounded_spread(spread))
+    content = {"model": "sphere", "file": f"{place}/{file}", "learned": known.model_dump(exclude_none=True)}
+    return str(yaml.safe_dump(content, default_flow_style=True, sort_keys=False, width=10_000)).strip()
+
+
+def rounded_spread(spread: Spread) -> LearnedSpread:
+    """Return an error model with four digits, as it is written."""
+    return LearnedSpread(**{name: _rounded(value) for name, value in dataclasses.asdict(spread).items()})
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def settings_text(calibration: Calibration, folder_name: str, files: Mapping[str, str], command: str) -> str:
+    """Return calibrated.yaml: the part of a flight.yaml that names the learned antennas.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    folder_name : str
+        Folder of the antenna files.
+    files : mapping of str to str
+        Content of the antenna files by name.
+    command : str
+        Command that makes them.
+    """
     lines = [
         f"{_MARK}: {calibration.settings.calibration}. Learned from {', '.join(calibration.names)}.",
         *(f"# {text}" for text in calibration.words),
@@ -152,13 +206,13 @@ def settings_text(calibration: Calibration, folder_name: str) -> str:
     ]
     for antenna in calibration.fit.antennas:
         channel, link = antenna.partition(".")[2], calibration.first_series(antenna)[1].link
-        ends = {end: f"{folder_name}/{safe_name(f'{antenna}.{end}')}.csv" for end in ("tower", "uav")}
+        ends = {e: _learned_antenna(calibration, antenna, e, files, folder_name, command) for e in ("tower", "uav")}
         lines += [
             f"    {channel}:" if channel.isidentifier() else f"    {channel!r}:",
             f"      carrier_hz: {link.carrier_hz:.6g}",
             f"      transmit_power_dbm: {link.transmit_power_dbm:g}",
-            f"      tower: {{antenna: {{model: sphere, file: {ends['tower']}}}}}",
-            f"      uav: {{antenna: {{model: sphere, file: {ends['uav']}}}}}",
+            f"      tower: {{antenna: {ends['tower']}}}",
+            f"      uav: {{antenna: {ends['uav']}}}",
         ]
     rough = calibration.ground.used_m
     lines += [
@@ -226,6 +280,7 @@ class Calibrated:
     remarks: tuple[str, ...]
     calibration: Calibration | None
     ranked: RankCalibration | None
+    command: str
 
 
 def write_files(
@@ -255,9 +310,10 @@ def write_files(
     if calibration is not None:
         maps = _antenna_maps(calibration)
         carrier = next(s.link.carrier_hz for data in calibrated.flights for s in data.rss)
-        for file, content in _antenna_files(calibration, maps, carrier).items():
+        files = _antenna_files(calibration, maps, carrier)
+        for file, content in files.items():
             write_file(folder / file, content)
-        text = settings_text(calibration, name)
+        text = settings_text(calibration, name, files, calibrated.command)
         record = dataclasses.replace(
             _record_of(calibration, maps, text, stages_s),
             rank=rank,
@@ -280,14 +336,12 @@ def write_files(
     return metrics, text
 
 
-def site_entry(calibrated: Calibrated, command: str) -> tuple[Entry, dict[str, bytes]]:
-    """Entry that a site remembers of a calibration, antennas and rank receivers, and its tables by name.
+def site_entry(calibrated: Calibrated) -> tuple[Entry, dict[str, bytes]]:
+    """Return the entry of a calibration for a site, antennas and rank receivers, and its tables by name.
 
     Parameters
     ----------
     calibrated : Calibrated
-    command : str
-        That makes the entry.
 
     Returns
     -------
@@ -296,7 +350,7 @@ def site_entry(calibrated: Calibrated, command: str) -> tuple[Entry, dict[str, b
     """
     begins = [s.time.min() for data in calibrated.flights for _, s in data.series]
     made = Entry(
-        command=command,
+        command=calibrated.command,
         made=datetime.now(timezone.utc).date().isoformat(),
         flights=[data.settings.flight.name for data in calibrated.flights],
         flown=sorted({str(begin.astype("datetime64[D]")) for begin in begins if has_wall_clock(begin)}),
@@ -322,23 +376,37 @@ def _learned_series(calibration: Calibration) -> tuple[list[LearnedSeries], dict
     tables: dict[str, bytes] = {}
     series = []
     for antenna in calibration.fit.antennas:
-        files = {}
+        # the UAV has one antenna for all towers
+        shared = calibration.fit.antennas[0]
+        parts = {"tower": antenna, "pair": antenna, "uav": shared, "known": shared}
+        files = {part: f"{safe_name(f'{name}.{owner}.{part}')}.csv.gz" for part, owner in parts.items()}
+        notes = {p: (f"aerpaw-cmp calibrate: {name}, {antenna} {p}", *_provenance_notes(calibration)) for p in files}
+        # these two are never named alone, and fingerprints are most of a table
+        notes |= {part: notes[part][:2] for part in ("known", "pair")}
         for end in ("tower", "uav"):
-            gains = maps[antenna, end]
-            files[end] = f"{safe_name(f'{name}.{antenna}.{end}')}.csv.gz"
-            notes = (f"aerpaw-cmp calibrate: {name}, {antenna} {end}", *_notes(calibration, antenna, end))
-            tables[files[end]] = sphere_csv(gains.gain_dbi, gains.sd_db, notes, decimals=2).encode()
+            gains = maps[parts[end], end]
+            content = sphere_csv(gains.gain_dbi, gains.sd_db, notes[end], decimals=2)
+            tables.setdefault(files[end], content.encode())
+        if files["known"] not in tables:
+            tables[files["known"]] = _known_directions(calibration, antenna).table(notes["known"]).encode()
+        both = None
+        if (pair := _pair_gain(calibration, antenna)) is not None:
+            tables[files["pair"]] = pair.table(notes["pair"]).encode()
+            both = LearnedPair(file=files["pair"], length=pair.length, prior_sd_db=_rounded(pair.prior_sd_db))
         samples = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
-        (data, first), ends = calibration.first_series(antenna), (maps[antenna, "uav"], maps[antenna, "tower"])
+        (data, first), ends = calibration.first_series(antenna), (maps[shared, "uav"], maps[antenna, "tower"])
         sds = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), _SD_SAMPLES)))[1] for o in samples])
         series.append(
             LearnedSeries(
                 tower=samples[0].tower,
                 channel=samples[0].channel,
-                reader=receiver_of(data.files[int(first.log[0])].result.reader),  # or the first of its receiver's
+                receiver=data.settings.logs[int(first.log[0])].receiver,
                 carrier_hz=first.link.carrier_hz,
                 tower_file=files["tower"],
                 uav_file=files["uav"],
+                known_file=files["known"],
+                pair=both,
+                spread=rounded_spread(calibration.learned.spread(antenna)),
                 sd_db=round(float(np.nanmean(sds)), 2),
                 lock=_at_unit_gain(calibration.locks.get(antenna), *ends),
                 level=_level(calibration, first, *ends),
@@ -398,23 +466,23 @@ def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, f
         }
         link = first[0].settings.link.rank
         receivers.append(
-            LearnedReceiver(tower=tower, quantity=_quantity_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
+            LearnedReceiver(tower=tower, quantity=quantity_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
         )
     return receivers
 
 
-def _quantity_of(data: FlightData, series: RankSeries) -> str:
-    """Rank that a series holds, as its log calls it."""
-    file = data.files[int(series.log[0])]
-    return next(rank_quantity(stream, file.result.reader) for stream in file.result.streams if stream.kind == "rank")
-
-
 def _errors(calibration: Calibration) -> Errors | None:
-    scores, sectors = (calibration.scores[f"{name}_left_out"] for name in ("flight", "sector"))
+    scores = calibration.scores["flight_left_out"]
     if not scores:
         return None
+    parts = {name: calibration.scores[f"{split}_left_out"] for name, split in _PARTS.items()}
     values = {
         name: round(mean_rmse(scores, name), 3) for name in ("rmse_db", "rmse_4s_db", "free_space_rmse_db", "inside_90")
     }
-    sector = round(mean_rmse(sectors), 3) if sectors else None
-    return Errors(series=len(scores), sector_rmse_db=sector, **values)
+    values |= {f"{name}_rmse_db": round(mean_rmse(some), 3) for name, some in parts.items() if some}
+    heights = sorted({float(cruise_height_m(o)) for o in calibration.observed})
+    return Errors(series=len(scores), heights_m=heights, **values)
+
+
+# Parts of a flight that no other flight has, by the prefix of their error.
+_PARTS = {"sector": "sector", "height": "altitude", "heading": "heading"}

@@ -18,7 +18,7 @@ from ...maps.job import Antennas
 from ...maps.link_budget import PAPER_BUDGET
 from ...maps.study import rank_fields
 from ...report.maps import PaperRow
-from ...report.page import k_key
+from ...report.texts import k_key
 from .coverage_map import INTERPOLATORS, MapOutcome
 
 # Horizontal distance of "near the tower" in the rows about rank 2.

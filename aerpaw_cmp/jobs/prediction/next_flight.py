@@ -25,8 +25,8 @@ from ...flight.pose.patterns import NOSES, Pattern, Route, Waypoint, allowed_are
 from ...flight.pose.route_files import plan_text, waypoints_csv
 from ...flight.training import counted_once
 from ...logs.route import read_areas
-from ...report.page import safe_name
 from ...report.plan import PlanPage, plan_metrics, write_plan
+from ...report.texts import safe_name
 from ...site.imports.outlines import MAX_CROSSINGS, is_tangled
 from ...site.site import Site
 from ..learning.calibrate import learned_antennas, observe

@@ -192,6 +192,8 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
         targets = local
     else:
         targets = _route(where, site, options)
+    if targets.grid is None and options.spacing_m != TargetOptions().spacing_m:
+        raise UsageError("--spacing along a route", expected="a site: the spacing is that of a grid")
     if options.heading_deg is not None:
         targets = replace(targets, yaw_deg=np.full(len(targets), options.heading_deg % 360.0))
     if len(targets) > MOST_POINTS:

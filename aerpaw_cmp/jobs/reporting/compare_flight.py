@@ -22,7 +22,7 @@ from ...common.units import BoolArray, FloatArray, IntArray, spread_out
 from ...compare import offset as offsets
 from ...compare import rank as ranks
 from ...compare.flight_verdict import flight_verdict, with_corrected_verdicts
-from ...compare.gains.spread import NO_SPREAD, LostLock, Spread, StatedSpread, inside_shares
+from ...compare.gains.spread import LostLock, StatedSpread, inside_shares
 from ...compare.judge.ladder import log_distance_level_db
 from ...compare.level import rss
 from ...compare.level.detection import DetectionForecast, DetectionScore, score_detection
@@ -209,8 +209,7 @@ def stated_spread(replayed: Replayed) -> StatedSpread | None:
     """Error bars of the simulated level that learned antennas state, along the direct line; None where none does.
 
     Where only one end is learned, or files hold no gain towards both ends at once, the gains of both ends count as
-    independent; they are learned from the same levels, so the true standard deviation is rather smaller. Files of 0.3
-    state that of the gain alone.
+    independent; they are learned from the same levels, so the true standard deviation is rather smaller.
 
     Parameters
     ----------
@@ -223,8 +222,7 @@ def stated_spread(replayed: Replayed) -> StatedSpread | None:
     gain = replayed.learned
     if gain is None:
         return None
-    spread = next((s for s in map(Spread.from_text, gain.notes) if s is not None), NO_SPREAD)
-    return StatedSpread(gain_sd_db=replayed.spread(gain.sd_db), spread=spread)
+    return StatedSpread(gain_sd_db=replayed.spread(gain.sd_db), spread=gain.spread)
 
 
 def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> StatedSpread | None:
@@ -253,7 +251,7 @@ def _lock(case: _Case) -> LearnedLock | None:
     """Lock that other flights taught; None of a receiver that never loses it."""
     if case.series.locked is None:
         return None
-    return lock_elsewhere(case.data.settings.antennas, case.series, case.data.folder)
+    return lock_elsewhere(case.data.settings.antennas, case.data.folder)
 
 
 def _forecast(series: RssSeries, lock: LearnedLock) -> DetectionForecast:

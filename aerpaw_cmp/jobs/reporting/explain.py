@@ -33,7 +33,7 @@ from ...propagation.drivers.moving import site_with_tower_at
 from ...propagation.geometry.arrays import Link, Poses
 from ...propagation.options import Engine
 from ...propagation.replay import Replay
-from ...report.page import iso_time
+from ...report.texts import iso_time
 from ...site.site import Site
 
 

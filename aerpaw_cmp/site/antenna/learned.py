@@ -9,7 +9,10 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import json
 from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Literal
@@ -24,19 +27,12 @@ from ...common.yamlfile import StrictModel, dump_yaml, load_yaml
 
 _INDEX = "learned.yaml"
 
-# Share by which a carrier may differ from the one that an antenna was learned at.
+# Share by which a carrier may differ from the one that a tower's antenna was learned at.
 # Lake Wheeler's bands at 3.3, 3.4 and 3.51 GHz lie 3 % apart: other antennas, other gains.
 BAND = 0.02
 
-
-# Readers of exports of one receiver: what the one taught holds for the other.
-# The same phone and the same readings, saved by its program as KML or as CSV.
-_EXPORTS = {"nemo_kml": "nemo_csv"}
-
-
-def receiver_of(reader: str) -> str:
-    """Name of the receiver whose readings a reader reads: that of the first of its readers."""
-    return _EXPORTS.get(reader, reader)
+# The same for an airframe: 3.3 and 3.51 GHz share 90 % of the variance of its gain. Farther bands were never compared.
+AIRFRAME_BAND = 0.07
 
 
 class Source(StrictModel):
@@ -49,7 +45,11 @@ class Source(StrictModel):
 
 
 class Errors(StrictModel):
-    """On flights left out, means over series: RMSE [dB] after one offset, and the share inside 90 % intervals."""
+    """Means over held-out series: RMSE [dB] after one offset, and the share inside 90 % intervals.
+
+    ``rmse_db`` is that of held-out flights; ``height_rmse_db``, ``sector_rmse_db`` and ``heading_rmse_db`` are those of
+    heights, sectors of azimuth at the tower and headings that no other flight has. ``heights_m``: the cruise heights.
+    """
 
     series: int
     rmse_db: float
@@ -57,6 +57,9 @@ class Errors(StrictModel):
     free_space_rmse_db: float
     inside_90: float
     sector_rmse_db: float | None = None
+    height_rmse_db: float | None = None
+    heading_rmse_db: float | None = None
+    heights_m: list[float] = Field(default_factory=list)
 
 
 class LearnedLock(StrictModel):
@@ -97,20 +100,86 @@ class LearnedLevel(StrictModel):
     unit: str
 
 
+class LearnedSpread(StrictModel):
+    """Error model of a level besides the SD of the gain: see :class:`aerpaw_cmp.compare.gains.spread.Spread`."""
+
+    own_sd_db: Annotated[float, Field(ge=0)]
+    noise_sd_db: Annotated[float, Field(ge=0)]
+    fading_sd_db: Annotated[float, Field(ge=0)]
+    fading_kurtosis: float
+    bin_s: Annotated[float, Field(gt=0)]
+
+
+class LearnedPair(StrictModel):
+    """Gain towards both ends at once: its table, and the kernel that interpolates it."""
+
+    file: str
+    sha256: str | None = None
+    """Of the table, where no index names it."""
+    length: Annotated[float, Field(gt=0)]
+    prior_sd_db: Annotated[float, Field(ge=0)]
+
+
+class LearnedAntenna(StrictModel):
+    """Knowledge about a learned antenna besides its table, as a flight file or calibrated.yaml contains it."""
+
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    """Of the table; another table is refused."""
+    command: str
+    """Command that learns it again."""
+    pair: LearnedPair | None = None
+    spread: LearnedSpread
+
+
+class LearnedHealth(StrictModel):
+    """Errors of held-out flights of one channel, by which faults of a later flight are judged; None: not measured.
+
+    ``slow_sd_db`` is the SD of the correlated part of the error, with its correlation time and length; ``white_sd_db``
+    the SD of the rest of 4-s means. ``channel_difference_db`` are differences of the offset to other channels, by name.
+    ``run`` is the usual longest run of equal readings.
+    """
+
+    rmse_db: float | None = None
+    slow_sd_db: float | None = None
+    correlation_s: float | None = None
+    correlation_m: float | None = None
+    white_sd_db: float | None = None
+    offset_db: float | None = None
+    offset_sd_db: float | None = None
+    channel_difference_db: dict[str, float] = Field(default_factory=dict)
+    channel_difference_sd_db: dict[str, float] = Field(default_factory=dict)
+    below_lock_share: float | None = None
+    run: float | None = None
+
+
 class LearnedSeries(StrictModel):
-    """Antennas of one tower and channel, and what the log of that channel looks like."""
+    """Antennas of one tower and channel, and the properties of the levels of that channel."""
 
     tower: str
     channel: str
-    reader: str
+    """Label of the antenna in the flights that were learned from; a name, not a condition."""
+    receiver: str = ""
+    """Receiver whose level ``level`` and ``lock`` describe, as ``receiver`` of a flight file; empty: not named."""
     carrier_hz: float
     tower_file: str
     uav_file: str
+    known_file: str
+    """Directions at the UAV that determine its gain, and the covariance of the gain there."""
+    pair: LearnedPair | None = None
+    spread: LearnedSpread
     sd_db: float
     """Mean standard deviation of the level over directions that were flown."""
+    shares_airframe: bool = True
+    """False if the gain of the UAV does not predict held-out flights of its own campaign: it is not used elsewhere."""
     lock: LearnedLock | None = None
     level: LearnedLevel | None = None
     """Of receivers that lose their lock: of the levels in lock."""
+    health: LearnedHealth | None = None
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the tables."""
+        return [self.tower_file, self.uav_file, self.known_file, *([] if self.pair is None else [self.pair.file])]
 
 
 class LearnedReceiver(StrictModel):
@@ -127,13 +196,16 @@ class LearnedReceiver(StrictModel):
 
 
 class Entry(StrictModel):
-    """One calibration."""
+    """Antennas and receivers of one campaign, as one calibration learned them."""
 
     command: str
     made: str
     flights: list[str]
     flown: list[str]
+    joined: list[str] = Field(default_factory=list)
+    """Other campaigns whose flights the gain of the UAV was learned from as well."""
     trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]]
+    """SHA-256 of all logs of the calibration."""
     source: Source = Source()
     errors: Errors | None = None
     series: list[LearnedSeries] = Field(default_factory=list)
@@ -141,11 +213,20 @@ class Entry(StrictModel):
     ground_roughness_m: float | None = None
     tables: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
     """SHA-256 of the tables as they were written: nothing else is ever replaced or removed."""
+    sha256: str = ""
+    """Of all other values of the entry."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the values, without ``sha256``."""
+        values = self.model_dump(mode="json", exclude={"sha256"}, exclude_none=True)
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
     def about(self) -> str:
-        """One sentence: learned from what, and what error to expect."""
+        """Return one sentence: learned from which flights, and which error to expect."""
         days = f" of {', '.join(self.flown)}" if self.flown else ""  # none where the logs have relative times
         text = f"learned on {counted(len(self.flights), 'flight')}{days}"
+        text += f", the UAV also on {', '.join(self.joined)}" if self.joined else ""
         if self.errors is not None:
             text += (
                 f"; expect an RMSE of {self.errors.rmse_db:.1f} dB on another flight, free space "
@@ -172,7 +253,7 @@ _Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
 class Learned(StrictModel):
     """All that a site remembers, by name."""
 
-    format: Literal["aerpaw-cmp learned 2"] = "aerpaw-cmp learned 2"
+    format: Literal["aerpaw-cmp learned 3"] = "aerpaw-cmp learned 3"
     entries: dict[_Name, Entry] = Field(default_factory=dict)
 
 
@@ -198,11 +279,21 @@ def read_learned(site: str | Path) -> Learned:
     Raises
     ------
     UsageError
-        An index that is damaged, or of another version.
+        An index that is damaged, or of another version; values that were edited.
     InputError
         It names a file outside its folder.
     """
-    return _read(folder_of(site), Learned)
+    folder = folder_of(site)
+    memory = _read(folder, Learned)
+    for name, entry in memory.entries.items():
+        if entry.sha256 != entry.digest:
+            raise UsageError(
+                f"the values of {name!r} are not those that were written (SHA-256)",
+                expected=f"an entry as calibrate writes it; learn it again: {entry.command}",
+                cause="an edited value",
+                path=folder / _INDEX,
+            )
+    return memory
 
 
 def _read(folder: Path, model: type[Learned]) -> Learned:
@@ -233,7 +324,7 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
     Raises
     ------
     UsageError
-        A file of the name of a table that no calibration wrote, or that was changed since; a damaged index.
+        A file of the name of a table that no calibration wrote; a damaged index.
     InputError, OutputError
         As :func:`read_learned`; the folder cannot be written.
     """
@@ -246,19 +337,22 @@ def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, byte
         # two calibrations of one site at once: each must see the other's entry
         with locked(folder):
             memory = _read(folder, _Index)
-            # what an entry names with its digest is ours; all else is somebody's file
+            # what an entry names with its digest is ours, and so is an edited table or one of a killed calibration
             written = {item for known in memory.entries.values() for item in known.tables.items()}
             for file in packed:
                 place = inside(folder, file, folder / _INDEX, plain=True)
-                if place.exists() and (file, file_digest(place)) not in {*written, *tables.items()}:
+                known = {*written, *tables.items()}
+                if place.exists() and (file, file_digest(place)) not in known and not _is_table(place):
                     raise UsageError(
-                        "no calibration wrote this file, or it was changed since",
+                        "no calibration wrote this file",
                         expected="another 'calibration:' name, or that file moved away",
                         path=place,
                     )
             for file, content in packed.items():
                 write_whole(folder / file, content)
-            entries = dict(sorted({**memory.entries, name: entry.model_copy(update={"tables": tables})}.items()))
+            made = entry.model_copy(update={"tables": tables})
+            made = made.model_copy(update={"sha256": made.digest})
+            entries = dict(sorted({**memory.entries, name: made}.items()))
             text = dump_yaml(memory.model_copy(update={"entries": entries}).model_dump(mode="json", exclude_none=True))
             # after the tables that it names: a reader meets no entry without its files
             write_whole(folder / _INDEX, text)
@@ -305,19 +399,54 @@ def files_of(entry: Entry | _Foreign) -> set[str]:
     """Names of the tables of an entry."""
     if isinstance(entry, _Foreign):
         return set(entry.tables)
-    return {f for s in entry.series for f in (s.tower_file, s.uav_file)} | {r.file for r in entry.receivers}
+    return {file for s in entry.series for file in s.files} | {r.file for r in entry.receivers}
 
 
-def read_table(path: Path, expected: str) -> bytes:
-    """Content of a table, packed or not.
+# Begins the comment that names a calibration and, after ``, from``, its flights.
+LEARNED = "# aerpaw-cmp calibrate: "
+
+
+def _is_table(place: Path) -> bool:
+    """Check whether a file is a table of some calibration: it begins as one, or is a rank receiver."""
+    with suppress(InputError, OSError, EOFError):
+        content = read_table(place, "a table")
+        return content.startswith(LEARNED.encode()) or (content.startswith(b"{") and b'"trained_on"' in content)
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """SHA-256 of a file as a calibration wrote it, and the command that writes it again."""
+
+    sha256: str
+    command: str
+
+
+def read_table(path: Path, expected: str, written: Written | None = None) -> bytes:
+    """Return the content of a table, packed or not.
+
+    Parameters
+    ----------
+    path : Path
+    expected : str
+        What the table is, for messages.
+    written : Written, optional
+        The table must be as it was written.
 
     Raises
     ------
     OSError
     InputError
-        Too large, or a damaged packed file.
+        Too large, a damaged packed file, or not as it was written.
     """
     content = read_bounded(path, LARGEST_TABLE, expected)
+    if written is not None and hashlib.sha256(content).hexdigest() != written.sha256:
+        raise InputError(
+            f"this table is not the one that was learned (SHA-256 {written.sha256[:12]}...)",
+            expected=f"{expected} as it was written; learn it again: {written.command}",
+            cause="an edited table, or a calibration that was killed while it wrote",
+            path=path,
+        )
     if not content.startswith(b"\x1f\x8b"):
         return content
     with parsing(path, expected, "a cut copy"), gzip.open(path) as book:
@@ -335,13 +464,16 @@ class Named(StrictModel):
     part: str
     folder: Path
 
-    def antenna(self, tower: str, channel: str, end: str) -> LearnedSeries | None:
-        """The series whose antenna fits an end (``uav``, ``tower``) of a link; of an airframe, of any channel."""
+    def antenna(self, end: str, carrier_hz: float) -> LearnedSeries | None:
+        """Return the series whose antenna fits an end (``uav``, ``tower``) of a link; None if there is none."""
         if end == "tower":
             return next((s for s in self.entry.series if f"{s.tower}.{s.channel}" == self.part), None)
-        exact = [s for s in self.entry.series if (s.tower, s.channel) == (tower, channel)]
-        # an airframe carries one antenna, whichever channel taught it
-        return next(iter([*exact, *self.entry.series]), None)
+        # an airframe has one antenna for all channels of a band
+        return min(self.entry.series, key=lambda s: abs(s.carrier_hz / carrier_hz - 1.0), default=None)
+
+    def written(self, file: str) -> Written:
+        """Return the SHA-256 of a table of the entry, and the command that writes it."""
+        return Written(self.entry.tables[file], self.entry.command)
 
 
 class UnknownName(UsageError):  # noqa: N818  # a case of its base, which is the error

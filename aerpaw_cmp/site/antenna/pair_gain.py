@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
+from ...common.errors import InputError, parsed
 from ...common.gaussian import Factor, gaussian_kernel
 from ...common.geodesy import azimuth_rad, elevation_rad
 from ...common.units import FloatArray
+from .learned import Written, read_table
 
 # Share of the variance by which rounded values may miss the function.
-# The file has gains to 0.01 dB and angles to 0.1 deg: neighbours may contradict by as much.
+# The table has gains to 0.01 dB and angles to 0.1 deg: neighbours may contradict by as much.
 _NUGGET = 1e-3
-
-_HEAD = re.compile(r"^# pair: length (\S+) sd_db (\S+)$", re.MULTILINE)
-_ROW = re.compile(r"^# pair: (\S+,\S+,\S+,\S+,\S+,\S+)$", re.MULTILINE)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -85,40 +84,58 @@ class PairGain:
             sd[part] = np.sqrt(known * near + (1.0 - known) * away)
         return gain, sd
 
-    def notes(self) -> Sequence[str]:
-        """Lines for the comments of the tower's antenna file."""
-        angles = np.concatenate([_angles(self.directions[:, :3]), _angles(self.directions[:, 3:])], axis=1)
+    def table(self, notes: Sequence[str]) -> str:
+        """Return the content of a table of the directions, gains and standard deviations, with comments at its head."""
+        angles = np.concatenate([angles_of(self.directions[:, :3]), angles_of(self.directions[:, 3:])], axis=1)
         rows = np.column_stack([angles, self.gain_db, self.sd_db])
-        return [
-            f"pair: length {self.length:g} sd_db {self.prior_sd_db:.3f}",
-            *(f"pair: {a:.1f},{b:.1f},{c:.1f},{d:.1f},{g:.2f},{s:.2f}" for a, b, c, d, g, s in rows),
-        ]
-
-    @classmethod
-    def from_notes(cls, text: str) -> PairGain | None:
-        """From :meth:`notes` among the comments of an antenna file; None where there are none, or damaged ones."""
-        head, rows = _HEAD.search(text), _ROW.findall(text)
-        try:
-            table = np.array([[float(cell) for cell in row.split(",")] for row in rows])
-            length, prior = (float(head[1]), float(head[2])) if head else (0.0, 0.0)
-        except ValueError:
-            return None
-        if not len(table) or not np.isfinite(table).all() or not length > 0:
-            return None
-        return cls(
-            directions=np.concatenate([_vectors(table[:, :2]), _vectors(table[:, 2:4])], axis=1),
-            gain_db=table[:, 4],
-            sd_db=table[:, 5],
-            length=length,
-            prior_sd_db=prior,
-        )
+        lines = [f"# {note}" for note in notes] + [",".join(COLUMNS)]
+        lines += [f"{a:.1f},{b:.1f},{c:.1f},{d:.1f},{g:.2f},{s:.2f}" for a, b, c, d, g, s in rows]
+        return "\n".join(lines) + "\n"
 
 
-def _angles(vectors: FloatArray) -> FloatArray:
+COLUMNS = ("uav_azimuth_deg", "uav_elevation_deg", "tower_azimuth_deg", "tower_elevation_deg", "gain_db", "sd_db")
+
+
+@parsed("a table of the gain towards both ends")
+def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | None = None) -> PairGain:
+    """Read a table of :meth:`PairGain.table`.
+
+    Parameters
+    ----------
+    path : Path
+    length, prior_sd_db : float
+        Kernel of the gain, as in :class:`PairGain`.
+    written : Written, optional
+        The table must be as it was written.
+
+    Raises
+    ------
+    InputError
+        Other columns, no row, values that are not finite; a table that is not as it was written.
+    """
+    text = read_table(path, "a table of the gain towards both ends", written).decode("utf-8-sig")
+    lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
+    table = np.loadtxt(lines[1:], delimiter=",", ndmin=2) if len(lines) > 1 else np.zeros((0, len(COLUMNS)))
+    if lines[:1] != [",".join(COLUMNS)] or not len(table) or table.shape[1] != len(COLUMNS):
+        raise InputError("not the columns, or no row", expected=", ".join(COLUMNS), path=path)
+    if not np.isfinite(table).all():
+        raise InputError("values that are not finite", expected="angles [deg], gains and SDs [dB]", path=path)
+    return PairGain(
+        directions=np.concatenate([vectors_of(table[:, :2]), vectors_of(table[:, 2:4])], axis=1),
+        gain_db=table[:, 4],
+        sd_db=table[:, 5],
+        length=length,
+        prior_sd_db=prior_sd_db,
+    )
+
+
+def angles_of(vectors: FloatArray) -> FloatArray:
+    """Return azimuths and elevations (n, 2) [deg] of unit vectors (n, 3)."""
     return np.column_stack([np.degrees(azimuth_rad(vectors)) % 360.0, np.degrees(elevation_rad(vectors))])
 
 
-def _vectors(angles_deg: FloatArray) -> FloatArray:
+def vectors_of(angles_deg: FloatArray) -> FloatArray:
+    """Return unit vectors (n, 3) of azimuths and elevations (n, 2) [deg]."""
     azimuth, elevation = np.radians(angles_deg).T
     across = np.cos(elevation)
     return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])

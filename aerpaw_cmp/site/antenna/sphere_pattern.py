@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import csv
 import io
 from collections.abc import Sequence
@@ -16,7 +17,7 @@ from ...common.errors import InputError, parsed
 from ...common.provenance import marks, trained_on
 from ...common.units import BoolArray, FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
-from .learned import read_table
+from .learned import LearnedSpread, Written, read_table
 from .pair_gain import PairGain
 
 COLUMNS = ("azimuth_deg", "elevation_deg", "gain_dbi", "gain_sd_db")
@@ -31,8 +32,14 @@ class SpherePattern(MeasuredPattern):
     gain_dbi, sd_db : (thetas, phis)
         Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
     notes : str
-        Comments of the file, of which its provenance is read; of a tower's antenna they may hold ``pair``, the gain
-        towards both ends at once.
+        Comments of the file, from which its provenance is read.
+
+    Attributes
+    ----------
+    pair : PairGain or None
+        Gain towards both ends at once, besides that of a tower's antenna.
+    spread : LearnedSpread or None
+        Error model of a level besides the SD of the gain.
     """
 
     def __init__(
@@ -46,7 +53,8 @@ class SpherePattern(MeasuredPattern):
         super().__init__(name, np.sqrt(power_from_db(gain_dbi)).astype(np.complex128), None, frequency_hz)
         self.trained_on, self.marks = trained_on(notes), marks(notes)
         self.notes = notes
-        self.pair = PairGain.from_notes(notes)
+        self.pair: PairGain | None = None
+        self.spread: LearnedSpread | None = None
         self._sd_db = np.asarray(sd_db, dtype=np.float64)
 
     @property
@@ -114,16 +122,23 @@ def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] =
 
 
 @parsed("a table of gain over direction")
-def read_sphere_csv(path: str | Path) -> SpherePattern:
-    """An antenna file of :func:`sphere_csv`; azimuth counter-clockwise from the device's x axis, elevation up.
+def read_sphere_csv(path: str | Path, written: Written | None = None) -> SpherePattern:
+    """Read an antenna file of :func:`sphere_csv`; azimuth counter-clockwise from the device's x axis, elevation up.
+
+    Parameters
+    ----------
+    path : str or Path
+    written : Written, optional
+        The file must be as it was written.
 
     Raises
     ------
     InputError
-        Missing columns or directions, values that are no gains; with the line.
+        Missing columns or directions, values that are no gains, with the line; a file that is not as it was written.
     """
     path = Path(path)
-    return _pattern_of(read_table(path, "an antenna file").decode("utf-8-sig"), path)
+    # shallow: the pattern of a text is kept, and pair and spread belong to one use of it
+    return copy.copy(_pattern_of(read_table(path, "an antenna file", written).decode("utf-8-sig"), path))
 
 
 @lru_cache(maxsize=64)
@@ -155,10 +170,6 @@ def _pattern_of(text: str, path: Path) -> SpherePattern:
     pattern = SpherePattern(path.stem, gain, sd, notes=notes)
     check_power(pattern, path)
     return pattern
-
-
-# Begins the comment that names a calibration and, after ``, from``, its flights.
-LEARNED = "# aerpaw-cmp calibrate: "
 
 
 def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> FloatArray:

@@ -50,6 +50,8 @@ class FilledPatch:
 _FILLED_CELLS = 4
 # ... if the ground around it is further away than this [m]: four cells of a slope in whole metres are not.
 _FILLED_JUMP_M = 20.0
+# Cells on each side of a position among which its patch is searched.
+_WINDOW_CELLS = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,16 +156,18 @@ class Dem:
         if not (0 <= row < rows and 0 <= column < columns):
             return None
         height = float(self.height_m[row, column])
-        beside = self.height_m[max(row - 1, 0) : row + 2, max(column - 1, 0) : column + 2]
-        # on real ground hardly any neighbour has the same height: only then is all of a large grid searched
-        if height != 0.0 and int((beside == height).sum()) < 2:
-            return None
-        labels, _ = label(self.height_m == height)
-        patch = labels == labels[row, column]
+        # a window bounds the work on large grids; only a patch that fills the window needs all of the grid
+        for reach in (_WINDOW_CELLS, max(rows, columns)):
+            top, left = max(row - reach, 0), max(column - reach, 0)
+            window = self.height_m[top : row + reach + 1, left : column + reach + 1]
+            labels, _ = label(window == height)
+            patch = labels == labels[row - top, column - left]
+            if not patch.all():
+                break
         cells = int(patch.sum())
         if cells < _FILLED_CELLS and height != 0.0:
             return None
-        around = self.height_m[binary_dilation(patch) & ~patch]
+        around = window[binary_dilation(patch) & ~patch]
         around = around[np.isfinite(around)]
         jump = float(np.median(np.abs(around - height))) if len(around) else 0.0
         return FilledPatch(height_m=height, cells=cells, jump_m=jump) if jump > _FILLED_JUMP_M else None

@@ -1,0 +1,238 @@
+"""A page as a list of cards: a page is a function that returns cards, and a new card is one function.
+
+A :class:`Card` has a heading, paragraphs, tables, charts and positions; ``page.html.jinja`` shows every card of every
+page in the same way. A card or table without content is not shown, so the functions need no conditions.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from ..compare.statistics.intervals import Interval
+from .canvas import Picture
+from .page import json_text, rendered, write_file
+from .texts import flat, interval, number, percent, short
+
+# Forms of a column: text, the head of a row, right-aligned text, a percentage. A number is a number of decimals.
+TEXT, HEAD, RIGHT, SHARE = "text", "head", "right", "share"
+
+# Scripts of a page, by the view of its positions.
+_SCRIPTS = {
+    "explorer": ("uplot.min.js", "common.js", "explorer.js"),
+    "map_explorer": ("common.js", "map_explorer.js"),
+    "places": ("common.js", "places.js"),
+}
+
+
+def cell(value: Any, form: str | int) -> Any:
+    """Return the text of a table's cell: text as it is, an interval in brackets, a number with the column's decimals.
+
+    Examples
+    --------
+    >>> cell(1.25, 1), cell((0.5, 1.5), 1), cell(0.5, SHARE), cell(None, TEXT)
+    ('1.2', '[0.5, 1.5]', '50\u202f%', '–')
+    """
+    if isinstance(value, str):
+        return value
+    if isinstance(form, int):
+        return interval(value, form) if isinstance(value, tuple) else number(value, form)
+    return percent(value) if form == SHARE else short(value)
+
+
+def _numeric(form: str | int) -> bool:
+    """Check whether a column is aligned to the right."""
+    return isinstance(form, int) or form in (RIGHT, SHARE)
+
+
+def estimate(value: float | None, ends: Interval | None, decimals: int = 2, mark: str = "{}") -> Markup:
+    """Return a number with its interval in small type.
+
+    Parameters
+    ----------
+    value : float, optional
+    ends : Interval, optional
+    decimals : int
+    mark : str
+        HTML around the number, as ``<b>{}</b>``.
+
+    Returns
+    -------
+    Markup
+    """
+    text = Markup(mark).format(number(value, decimals))
+    return Markup('{} <span class="small">{}</span>').format(text, interval(ends, decimals))
+
+
+def bold(text: Any) -> Markup:
+    """Return a text in bold type."""
+    return Markup("<b>{}</b>").format(text)
+
+
+def paragraph(*parts: Any) -> Markup:
+    """Return a paragraph of texts and Markup."""
+    return Markup("<p>{}</p>").format(Markup(" ").join(part for part in parts if part))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """A table of a card; it is not shown without rows.
+
+    Parameters
+    ----------
+    caption : str
+    columns : mapping of str to str or int
+        Heads, each with the form of its cells: :data:`TEXT`, :data:`HEAD`, :data:`RIGHT`, :data:`SHARE` or decimals.
+    rows : sequence of sequences
+        Cells, as :func:`cell` takes them.
+    look : str
+        ``dense`` for many columns, ``tall`` for many rows.
+    notes : sequence of str
+        Paragraphs below the table.
+    marked : int, optional
+        Number of the row that is shaded.
+    """
+
+    caption: str
+    columns: Mapping[str, str | int]
+    rows: Sequence[Sequence[Any]]
+    look: str = ""
+    notes: Sequence[str] = ()
+    marked: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Positions:
+    """Data of the canvas that shows positions; ``view`` is explorer, map_explorer or places."""
+
+    view: str
+    data: Mapping[str, Any]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Card:
+    """A part of a page: heading, paragraphs, tables, charts and positions, in this order, then further cards.
+
+    Parameters
+    ----------
+    title : str
+    text : sequence
+        A string is a paragraph with commands between backquotes; a list is a list; Markup stands as it is.
+    tables : sequence of Table
+    chart : str or sequence of Picture
+        Section of the charts that stand here (:class:`~aerpaw_cmp.report.charts.Chart`), or drawn figures.
+    positions : Positions, optional
+    id, link : str
+        Anchor of a section, and its name in the navigation.
+    fold : bool
+        Closed until a reader opens it.
+    group : str
+        Name of folds of which one is open at a time.
+    grid : bool
+        Charts stand side by side.
+    parts : sequence of Card
+    """
+
+    title: str = ""
+    text: Sequence[Any] = ()
+    tables: Sequence[Table] = ()
+    chart: str | Sequence[Picture] = ""
+    positions: Positions | None = None
+    id: str = ""
+    link: str = ""
+    fold: bool = False
+    group: str = ""
+    grid: bool = False
+    parts: Sequence[Card] = ()
+
+    @property
+    def empty(self) -> bool:
+        """True if there is nothing to show below the heading."""
+        filled = any(self.text) or any(table.rows for table in self.tables) or self.chart or self.positions
+        return not (filled or any(not part.empty for part in self.parts))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Page:
+    """A page: its head, and cards below it.
+
+    Parameters
+    ----------
+    kind, title, tag : str
+        Of which command, the heading, and a word beside the command.
+    verdict : str
+        The result in a paragraph.
+    cautions : sequence of str
+        What a reader must know before believing a number: three are shown, the others unfold.
+    about : sequence of str
+        Lines in small type.
+    numbers : sequence
+        Records with ``label``, ``value``, ``interval`` and ``reference``.
+    first, cards : sequence of Card
+        Above the navigation and below it.
+    charts : sequence of Chart
+        Those of the script, in the order of its data.
+    """
+
+    kind: str
+    title: str
+    tag: str = ""
+    verdict: str = ""
+    cautions: Sequence[str] = ()
+    about: Sequence[str] = ()
+    numbers: Sequence[Any] = ()
+    first: Sequence[Card] = ()
+    cards: Sequence[Card] = ()
+    charts: Sequence[Any] = ()
+
+    @property
+    def view(self) -> str:
+        """The view of the page's positions; empty without any."""
+        return next((card.positions.view for card in (*self.first, *self.cards) if card.positions), "")
+
+    def html(self) -> str:
+        """Return the page as one file."""
+        cards = [card for card in self.cards if not card.empty]
+        scripts = _SCRIPTS.get(self.view, ())
+        return rendered("page", scripts, page=self, cards=cards, cell=cell, numeric=_numeric)
+
+
+def settings_card(made: Any, *settings: Mapping[str, Any], fold: bool = False) -> Card:
+    """Return the card of nested settings, versions and seconds; ``made`` has the fields of :class:`Made`."""
+    rows = [row for part in settings for row in flat(part)]
+    checked = Table(caption="The checked settings.", columns={"Key": HEAD, "Value": TEXT}, rows=rows)
+    software = Table(caption="Software.", columns={"Name": HEAD, "Version": TEXT}, rows=list(made.versions.items()))
+    stages = list(made.stages_s.items())
+    seconds = Table(caption="Seconds per stage.", columns={"Stage": HEAD, "Seconds": 2}, rows=stages)
+    parts = (
+        Card(title="Settings", tables=[checked], fold=True),
+        Card(title="Versions and seconds per stage", tables=[software, seconds], fold=True),
+    )
+    return Card(title="Settings, versions, time", id="settings", link="Settings", fold=fold, parts=parts)
+
+
+def write_page(folder: Path, name: str, page: Page, numbers: Mapping[str, Any]) -> list[Path]:
+    """Write the page and the ``metrics.json`` of a job.
+
+    Parameters
+    ----------
+    folder : Path
+    name : str
+        The page is written as NAME.html.
+    page : Page
+    numbers : mapping
+        Content of metrics.json.
+
+    Returns
+    -------
+    list of Path
+        The page first.
+    """
+    return [
+        write_file(folder / f"{name}.html", page.html()),
+        write_file(folder / "metrics.json", json_text(numbers)),
+    ]

@@ -1,0 +1,201 @@
+"""A flight gets the same learned antennas and the same error in every form of its logs, whatever its names are."""
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+from scipy.io import savemat
+from scipy.signal import lfilter
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.compare.gains.direction_gain import ANTENNA_TERMS, link_directions, term_kernel
+from aerpaw_cmp.flight.gains.learned_gain import sphere_angles
+from aerpaw_cmp.logs.writers import format_power_log
+from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
+from aerpaw_cmp.site.antenna.known_directions import KnownDirections
+from aerpaw_cmp.site.antenna.learned import folder_of, remember
+from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, sphere_csv, sphere_grid, unit_mean_gain
+from aerpaw_cmp.site.siteyaml import load_site
+from tests.learned_entries import learned_entry, learned_series
+
+ZONE = "America/New_York"
+SITE = load_site("lake_wheeler")
+TIMES = pd.Timestamp("2026-05-06T14:00:00") + pd.to_timedelta(np.arange(3600) * 0.2, unit="s")
+RNG = np.random.default_rng(7)
+
+
+def lobes(*directions: tuple[float, float, float]) -> np.ndarray:
+    """A gain of some 5 dB with lobes towards unit vectors."""
+    _, _, v = sphere_grid()
+    return unit_mean_gain(
+        sum(6.0 * np.exp(-((v - d / np.linalg.norm(d)) ** 2).sum(axis=-1)) for d in np.array(directions))
+    )
+
+
+UAV = lobes((1, 0.3, -0.4), (-0.6, -1, -0.6))
+TOWERS = {"USRP1": lobes((1, 0.2, 0.3), (-0.2, -1, 0.4)), "USRP2": lobes((-1, 0.7, 0.3), (0.3, 1, 0.4))}
+
+
+def table(gain: np.ndarray) -> bytes:
+    return sphere_csv(gain, np.full(gain.shape, 0.7), (f"trained_on: {'a' * 64}",)).encode()
+
+
+def known_site(folder: Path, turn_deg: int = 0) -> Path:
+    """The packaged site that knows these antennas; the airframe rotated by whole steps of the table."""
+    place = folder / "mine.yaml"
+    place.write_bytes(folder_of("lake_wheeler").with_suffix(".yaml").read_bytes())
+    _, _, v = sphere_grid(20.0)
+    at = v.reshape(-1, 3)[18:-17]
+    known = KnownDirections(directions=at, covariance_db2=0.05 * term_kernel(ANTENNA_TERMS[0], at, at)).table(())
+    files, series = {"u.csv.gz": table(np.roll(UAV, turn_deg // 5, axis=1)), "k.csv.gz": known.encode()}, []
+    for channel, gain in TOWERS.items():
+        files[f"{channel}.t.csv.gz"] = table(gain)
+        series.append(learned_series(channel, uav_file="u.csv.gz", known_file="k.csv.gz"))
+    remember(place, "past", learned_entry(*series), files)
+    return place
+
+
+def flown() -> tuple[pd.DataFrame, dict[str, np.ndarray], list[float]]:
+    """Telemetry of legs at four headings about LW1, the level of both channels, and the RMSE of its added error."""
+    t = np.arange(len(TIMES)) * 0.2
+    east = 180.0 * np.sin(2 * np.pi * t / 97.0)
+    north = 60.0 + 220.0 * np.sin(2 * np.pi * t / 241.0)
+    up = np.minimum(2.0 * t, 45.0)
+    yaw = 90.0 * np.floor(t / 60.0) % 360.0 + 20.0
+    place = np.stack([east, north, up], axis=1)
+    zeros = np.zeros(len(t))
+    rotation = rotation_from_aircraft(zeros, zeros, yaw)
+    at_uav, at_tower = link_directions(SITE.towers["LW1"].position_m, place, rotation)
+    away_db = 20.0 * np.log10(np.linalg.norm(place - SITE.towers["LW1"].position_m, axis=1))
+    pattern = SpherePattern("u", UAV, np.zeros(UAV.shape))
+    levels, errors = {}, []
+    for number, (channel, gain) in enumerate(TOWERS.items()):
+        tower = SpherePattern("t", gain, np.zeros(gain.shape))
+        slow = lfilter([1.0], [1.0, -0.98], RNG.normal(0.0, 0.25, len(t)))
+        gains = pattern.gain_dbi(*sphere_angles(at_uav)) + tower.gain_dbi(*sphere_angles(at_tower))
+        error = slow + RNG.normal(0.0, 1.0, len(t))
+        levels[channel] = gains - away_db + 9.0 - 4.0 * number + error
+        errors.append(float(error[up >= 5.0].std()))
+    latitude, longitude = SITE.frame.to_geographic(east, north)
+    track = pd.DataFrame({
+        "latitude": latitude, "longitude": longitude, "height": up, "roll": zeros, "pitch": zeros, "yaw": yaw
+    })  # fmt: skip
+    return track, levels, errors
+
+
+TRACK, LEVELS, ADDED_DB = flown()
+UTC = [f"{time.isoformat()}Z" for time in TIMES]
+
+
+def pose_table(folder: Path, name: str = "track.csv") -> None:
+    frame = TRACK.rename(columns={"height": "height_above_takeoff(m)"})
+    frame.insert(0, "timestamp", UTC)
+    frame.to_csv(folder / name, index=False)
+
+
+def merged_mat(folder: Path) -> None:
+    names = {"mY": "latitude", "mX": "longitude", "mZ": "height", "mRoll": "roll", "mPitch": "pitch", "mYaw": "yaw"}
+    columns = {name: TRACK[column].to_numpy() for name, column in names.items()}
+    columns |= {f"mpower{i}": level for i, level in enumerate(LEVELS.values(), 1)}
+    seconds = (TIMES - pd.Timestamp(0)) / pd.Timedelta(seconds=1)
+    savemat(folder / "merged.mat", {**columns, "timestamp_meas": seconds.to_numpy()})
+
+
+def raw_logs(folder: Path) -> None:
+    pose_table(folder)
+    for channel, level in LEVELS.items():
+        (folder / "LW1" / channel).mkdir(parents=True)
+        log = folder / "LW1" / channel / "2026-05-06_10_00_00_power_log.txt"
+        log.write_bytes(format_power_log(TIMES.to_numpy(), level, ZONE))
+
+
+def renamed_log(folder: Path) -> None:
+    """One of the logs, in a folder and with a file name that say nothing."""
+    pose_table(folder, "gps.csv")
+    (folder / "left_power_log.txt").write_bytes(format_power_log(TIMES.to_numpy(), LEVELS["USRP2"], ZONE))
+
+
+def level_tables(folder: Path) -> None:
+    pose_table(folder)
+    for name, level in zip(("b", "a"), LEVELS.values(), strict=True):
+        frame = pd.DataFrame({"timestamp": UTC, f"rss_{name} (dBm)": level})
+        frame.to_csv(folder / f"meter {name}.csv", index=False)
+
+
+def sigmf(folder: Path) -> None:
+    capture = {
+        "core:sample_start": 0,
+        "measurement:time_stamp": UTC,
+        "measurement:values": {
+            **{key: TRACK[name].tolist() for key, name in (("mX", "longitude"), ("mY", "latitude"), ("mZ", "height"))},
+            **{f"RSS{i}": level.tolist() for i, level in enumerate(LEVELS.values(), 1)},
+        },
+        "core:rotation": {name: TRACK[name].tolist() for name in ("roll", "pitch", "yaw")},
+    }
+    meta = {"global": {"core:datatype": "cf32_le", "core:version": "1.0.0"}, "captures": [capture], "annotations": []}
+    (folder / "flight.sigmf-meta").write_text(json.dumps(meta))
+
+
+FORMS: tuple[Callable[[Path], None], ...] = (merged_mat, raw_logs, renamed_log, level_tables, sigmf)
+
+
+def drafted(write: Callable[[Path], None], folder: Path, site: Path) -> tuple[Path, dict]:
+    """The draft of a form of the flight, and its content."""
+    logs = folder / "logs"
+    logs.mkdir()
+    write(logs)
+    draft = folder / "flight.yaml"
+    assert main(["ingest", str(logs), "--timezone", ZONE, "--site", str(site), "--draft", str(draft)]) == 0
+    return draft, yaml.safe_load(draft.read_text())
+
+
+def errors_of(draft: Path) -> list[float]:
+    out = draft.parent / "out"
+    words = ["report", str(draft), "-o", str(out), "--audit", "none", "--figures", "none", "--force"]
+    assert main(words) == 0
+    channels = json.loads((out / "metrics.json").read_text())["rss"]["LW1"].values()
+    return sorted(round(channel["rmse_db"], 2) for channel in channels)
+
+
+@pytest.mark.parametrize("write", FORMS)
+def test_every_form_of_a_flight_gets_the_same_antennas_and_error(write, tmp_path, capsys) -> None:
+    site = known_site(tmp_path)
+    draft, content = drafted(write, tmp_path, site)
+    known = {"mine/past_LW1.USRP1": ADDED_DB[0], "mine/past_LW1.USRP2": ADDED_DB[1]}
+    if write is renamed_log:
+        del known["mine/past_LW1.USRP1"]
+    assert sorted(content["antennas"].values()) == [*known, "mine/past_uav"]
+    assert content["rt"]["attitude"] == "logged"
+    assert errors_of(draft) == pytest.approx(sorted(known.values()), abs=0.03)
+    capsys.readouterr()
+
+
+def test_a_flight_file_without_antennas_is_offered_the_same(tmp_path, capsys) -> None:
+    site = known_site(tmp_path)
+    _, content = drafted(merged_mat, tmp_path, site)
+    names = content.pop("antennas")
+    (tmp_path / "bare.yaml").write_text(yaml.safe_dump(content))
+    words = [
+        "report",
+        str(tmp_path / "bare.yaml"),
+        "-o",
+        str(tmp_path / "bare"),
+        "--audit",
+        "none",
+        "--figures",
+        "none",
+    ]
+    assert main([*words, "--recommend", str(tmp_path / "best.yaml")]) == 0
+    assert yaml.safe_load((tmp_path / "best.yaml").read_text())["antennas"] == names
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize("turn_deg", [90, 180, 270])
+def test_a_rotated_airframe_is_refused(turn_deg, tmp_path, capsys) -> None:
+    _, content = drafted(raw_logs, tmp_path, known_site(tmp_path, turn_deg))
+    assert "antennas" not in content
+    capsys.readouterr()

@@ -1,0 +1,55 @@
+"""A page is a list of cards: a card without content is not shown, and a new card is one function."""
+
+import dataclasses
+import inspect
+
+import pytest
+from markupsafe import Markup
+
+from aerpaw_cmp.report import calibration, campaign, flight, maps
+from aerpaw_cmp.report.cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Table
+from aerpaw_cmp.report.page import environment
+
+TABLE = Table(caption="c", columns={"name": HEAD, "text": TEXT, "dB": 2, "share": SHARE, "made": RIGHT}, rows=[])
+
+
+def shown(*cards: Card) -> str:
+    return Page(kind="report", title="t", cards=cards).html()
+
+
+def test_cells_have_the_form_of_their_column() -> None:
+    rows = [("a<b", None, 1.234, 0.5, Markup("<b>x</b>")), ("b", "t", (1.0, 2.0), None, "y")]
+    html = shown(Card(title="T", id="t", tables=[dataclasses.replace(TABLE, rows=rows)]))
+    assert '<th scope="row">a&lt;b</th><td>–</td><td class="n">1.23</td>' in html.replace("\n", "")
+    assert '<td class="n">50\N{NARROW NO-BREAK SPACE}%</td><td class="n"><b>x</b></td>' in html.replace("\n", "")
+    assert '<td class="n">[1.00, 2.00]</td>' in html
+
+
+@pytest.mark.parametrize("card", [Card(), Card(title="T", id="t", link="L", tables=[TABLE], parts=[Card(text=[[]])])])
+def test_a_card_without_content_is_not_shown(card: Card) -> None:
+    html = shown(card)
+    assert "<section" not in html
+    assert "<nav" not in html
+    assert "<table" not in html
+
+
+def test_a_part_without_content_leaves_the_others() -> None:
+    html = shown(Card(title="T", id="t", text=["one `two`"], parts=[Card(title="empty", tables=[TABLE], fold=True)]))
+    assert "<p>one <code>two</code></p>" in html
+    assert "empty" not in html
+
+
+def test_every_card_function_of_a_page_stands_on_it() -> None:
+    for module in (flight, maps, campaign, calibration):
+        made = {name for name, of in inspect.getmembers(module, inspect.isfunction) if name.endswith("_card")}
+        mine = {name for name in made if getattr(module, name).__module__ == module.__name__}
+        source = inspect.getsource(module)
+        assert mine
+        assert all(source.count(name) > 1 for name in mine)  # defined, and in CARDS or the page
+
+
+def test_no_page_changes_the_template_environment(report_data, maps_data) -> None:
+    known = dict(environment().filters), dict(environment().globals), dict(environment().tests)
+    flight.page(report_data, [])
+    maps.maps_page(maps_data, [])
+    assert (environment().filters, environment().globals, environment().tests) == known

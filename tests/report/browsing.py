@@ -53,25 +53,27 @@ def frame(driver) -> None:
     driver.execute_async_script("const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(done));")
 
 
-def saved(driver, buttons: str) -> dict[str, str]:
-    """What buttons of charts that are shown would save, by name of file: a selector of CSS chooses them."""
+def saved(driver, menus: str) -> dict[str, str]:
+    """What every choice of the menus of charts that are shown would save, by name of file: CSS chooses the menus."""
     from selenium.webdriver.support.ui import WebDriverWait
 
-    clicked = driver.execute_script(
+    chosen = driver.execute_script(
         "window.files = {}; URL.createObjectURL = blob => { window.last = blob; return 'blob:'; };"
         "HTMLAnchorElement.prototype.click = function () { window.last.text().then(t => { files[this.download] = t; }); };"
-        "const all = [...document.querySelectorAll(arguments[0])].filter(b => b.checkVisibility()); all.forEach(b => b.click());"
-        "return new Set(all.map(b => b.title + b.textContent)).size",
-        buttons,
+        "const all = [...document.querySelectorAll(arguments[0])].filter(m => m.checkVisibility());"
+        "const choices = all.flatMap(m => [...m.options].filter(o => o.value).map(o => [m, o.value]));"
+        "for (const [m, value] of choices) { m.value = value; m.dispatchEvent(new Event('change')); }"
+        "return new Set(choices.map(([m, value]) => m.title + value)).size",
+        menus,
     )
-    WebDriverWait(driver, 20).until(lambda d: d.execute_script("return Object.keys(files).length") == clicked)
+    WebDriverWait(driver, 20).until(lambda d: d.execute_script("return Object.keys(files).length") == chosen)
     return driver.execute_script("return files")
 
 
 def saves_every_chart(driver) -> dict[str, str]:
-    """One button for SVG a canvas that is shown and no scale of another, each giving a picture with marks."""
+    """One menu a canvas that is shown and no scale of another, each giving a picture with marks."""
     shown = "[...document.querySelectorAll('canvas:not(#legend)')].filter(c => c.checkVisibility()).length"
-    files = saved(driver, ".saves button, .key button")
+    files = saved(driver, ".saves select, .key select")
     drawn = [text for name, text in files.items() if name.endswith(".svg")]
     assert len(drawn) == driver.execute_script(f"return {shown}") > 0
     for text in drawn:

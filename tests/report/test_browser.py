@@ -273,10 +273,10 @@ def test_no_error_of_a_model_is_shown_on_the_flight_it_was_learned_from(small_re
 
 
 def test_every_chart_is_saved_as_it_is_shown(driver):
-    """Buttons of a chart: the same marks and words as SVG, the picture, and a row for each of its points."""
+    """The menu of a chart: the same marks and words as SVG, the picture, and a row for each of its points."""
     driver.execute_script("document.querySelectorAll('details').forEach(d => { d.open = true; })")
     frame(driver)
-    files = saved(driver, ".key button")
+    files = saved(driver, ".key select")
     assert files["Residuals.svg"].count("<rect") == 31  # the paper and the bars
     assert "Samples</text>" in files["Residuals.svg"]
     shown = driver.execute_script("return explorer.series(explorer.data.rss[0].time).length")

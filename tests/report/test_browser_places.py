@@ -58,8 +58,9 @@ def test_the_map_names_its_towers_and_reads_the_point_under_the_pointer(driver, 
     assert "400, 100, 0.0 m" in text
     assert "−80.0 dBm" in text
     assert driver.find_element("id", "along").is_displayed()
-    assert [b.text for b in driver.find_elements("css selector", "#saves button")] == ["SVG", "PNG", "CSV"]
-    (drawn,) = (text for name, text in saved(driver, "#saves button").items() if name.endswith(".svg"))
+    (menu,) = driver.find_elements("css selector", "#saves select")
+    assert menu.text.split() == ["Save", "as", "SVG", "PNG", "CSV"]
+    (drawn,) = (text for name, text in saved(driver, "#saves select").items() if name.endswith(".svg"))
     assert drawn.count("A 3.5 3.5") == 2 * len(driver.execute_script("return places.drawn()"))  # circles in halves
 
 

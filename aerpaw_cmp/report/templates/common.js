@@ -236,7 +236,7 @@ const common = (() => {
     return `<svg xmlns="http://www.w3.org/2000/svg" width="${canvas.clientWidth}" viewBox="0 0 ${canvas.width} ${canvas.height}">${out.join("")}${left}</svg>`;
   }
 
-  // buttons that save a chart: drawn anew by ``draw`` as SVG, as a picture, and the rows of its numbers
+  // a menu that saves a chart: drawn again by ``draw`` as SVG, as a picture, or the rows of its numbers
   function downloads(canvas, name, rows, draw) {
     const save = (kind, blob) => { const a = document.createElement("a"); a.href = URL.createObjectURL(blob); a.download = `${name}.${kind}`; a.click(); URL.revokeObjectURL(a.href); };
     // texts as aerpaw_cmp.common.cells guards them: a spreadsheet must not take a name for a formula
@@ -244,18 +244,18 @@ const common = (() => {
     const quoted = v => /[",\n]/.test(v) ? `"${String(v).replaceAll('"', '""')}"` : v;
     const cell = v => v === null || Number.isNaN(v) ? "" : quoted(guarded(v));
     const kinds = { svg: () => save("svg", new Blob([drawnAsSvg(canvas, draw)])), png: () => canvas.toBlob(blob => save("png", blob)), csv: () => save("csv", new Blob([rows().map(row => row.map(cell).join(",")).join("\n") + "\n"])) };
-    return Object.keys(kinds).map(kind => {
-      const button = document.createElement("button");
-      button.type = "button"; button.textContent = kind.toUpperCase(); button.title = `Save: ${name}`; button.addEventListener("click", kinds[kind]);
-      return button;
-    });
+    const menu = Object.assign(document.createElement("select"), { title: `Save: ${name}` });
+    menu.setAttribute("aria-label", menu.title);
+    menu.append(new Option("Save as", ""), ...Object.keys(kinds).map(kind => new Option(kind.toUpperCase(), kind)));
+    menu.addEventListener("change", () => { kinds[menu.value]?.(); menu.value = ""; });
+    return menu;
   }
 
   // the same in a line of its own below the chart, or below its scale
   function saves(canvas, name, rows, draw, above = canvas) {
     let place = above.nextElementSibling;
     if (!place?.classList.contains("saves")) above.after(place = Object.assign(document.createElement("p"), { className: "key saves" }));
-    place.replaceChildren(...downloads(canvas, name, rows, draw));
+    place.replaceChildren(downloads(canvas, name, rows, draw));
   }
 
   function whenResized(element, job) {

@@ -278,7 +278,7 @@
     const canvas = at(id);
     if (!canvas) continue;
     const saves = Object.assign(document.createElement("p"), { className: "saves" });
-    saves.append(...common.downloads(canvas, id.slice(6), () => listed("rows"), () => scales.get(id)?.again()));
+    saves.append(common.downloads(canvas, id.slice(6), () => listed("rows"), () => scales.get(id)?.again()));
     canvas.previousElementSibling.before(saves); // floats beside the heading: no line is lost in the field
     canvas.addEventListener("pointermove", e => {
       const s = scales.get(id);

@@ -142,5 +142,5 @@ function corners() {
     ...scene.buildings.flatMap(b => of("building", b.name, b.faces.flat())), ...scene.trees.flatMap(([e, n, g, high], i) => of("tree", i + 1, [[e, n, g], [e, n, g + high]])),
     ...all("forest", scene.forests), ...all("geofence", scene.fences)];
 }
-box("saves").append(...common.downloads(canvas, document.title, corners, draw));
+box("saves").append(common.downloads(canvas, document.title, corners, draw));
 view(-0.45, 0.55);

@@ -14,14 +14,14 @@ import numpy as np
 
 from ..common.kml import CLASS_COLOURS
 from ..common.units import AnyArray
-from ..compare.judge.ladder import LadderRow, ModelCost, costs
+from ..compare.judge.ladder import LadderRow, ModelCost, costs, distinct
 from ..compare.level.detection import DetectionScore
 from ..compare.level.serving import ServingComparison
 from ..compare.result import RankResult
 from ..logs.records import has_wall_clock
 from .canvas import placed, seconds_since
 from .flight_data import RANKS, ReportData, start_of
-from .flight_words import learned_on
+from .flight_words import AS_SET, learned_on
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -94,7 +94,7 @@ def charts_of(data: ReportData) -> list[Chart]:
             section="ladder", title="Models from the simplest to the richest",
             caption="RMSE on held-out segments. Whiskers: 95 % interval of the difference to the best model on the "
             "same samples.",
-            content=_ladder(data.ladder),
+            content=_ladder(distinct(data.ladder, AS_SET)[0]),
         ))  # fmt: skip
         charts.append(Chart(
             section="ladder", title="What does accuracy cost?",

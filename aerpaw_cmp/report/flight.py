@@ -14,7 +14,7 @@ from markupsafe import Markup
 from ..common.counting import counted
 from ..common.stages import Stages
 from ..common.units import AnyArray
-from ..compare.judge.ladder import LadderRow
+from ..compare.judge.ladder import LadderRow, distinct
 from ..compare.level.field_difference import FieldAudit
 from ..compare.level.rss import PART_DB, ErrorSpan
 from ..compare.result import AuditResult, RankResult, RssResult
@@ -163,7 +163,8 @@ _AGAINST = ("rmse_db", "rmse_4s_db", "own_offset_rmse_db", "bias_db", "crps_db",
 def ladder_card(data: ReportData) -> Card:
     """Return the card that compares models by their error on held-out segments."""
     models: dict[str, dict[str, LadderRow]] = {}
-    for row in data.ladder:
+    kept, same = distinct(data.ladder, words.AS_SET)
+    for row in kept:
         models.setdefault(row.model, {})[f"{row.tower} {row.channel}".strip()] = row
     channels = list(next(iter(models.values()), {}))
     table = Table(
@@ -179,6 +180,7 @@ def ladder_card(data: ReportData) -> Card:
              max(r.seconds for r in rows.values()))
             for model, rows in models.items()
         ],
+        notes=[f"Within 0.01 dB of a row above on every channel: {'; '.join(same)}."] if same else [],
     )  # fmt: skip
     text = (
         f"{words.ladder_verdict(data.ladder)} The flight is cut into eight segments. Each segment is scored with the "

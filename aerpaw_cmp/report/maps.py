@@ -867,12 +867,19 @@ def result_card(data: MapsData) -> Card:
 
 
 def coverage_table(data: MapsData) -> Table:
-    """Return the share of positions in coverage by antennas, foliage and tower, a column per height."""
+    """Return the share of positions in coverage, a column per height; rows that are 100.0 % everywhere are one."""
     heights = sorted({m.altitude_m for m in data.rss})
-    rows = []
+    rows: list[Sequence[str | None]] = []
+    full = 0
     for key, maps in grouped(data.rss, lambda m: (m.antennas, m.foliage, m.tower)).items():
         share = {m.altitude_m: percent(m.coverage, 1) for m in maps}
-        rows.append((*key, *(share.get(height) for height in heights)))
+        if set(share.values()) == {percent(1.0, 1)}:
+            full += 1
+        else:
+            rows.append((*key, *(share.get(height) for height in heights)))
+    if full:
+        whose = f"the other {counted(full, 'row')}" if rows else "every antenna, foliage and tower"
+        rows.append((whose, "", "", *[percent(1.0, 1)] * len(heights)))
     columns = {"Antennas": TEXT, "Foliage": TEXT, "Tower": HEAD, **{f"{height:g} m": RIGHT for height in heights}}
     return Table(caption="Share of positions in coverage.", columns=columns, rows=rows)
 

@@ -10,6 +10,7 @@ from aerpaw_cmp.compare.judge.ladder import (
     Rung,
     climb,
     costs,
+    distinct,
     held_out_error_db,
     held_out_lines,
     log_distance_level_db,
@@ -204,3 +205,23 @@ def test_the_knee_is_the_fastest_model_that_no_series_tells_from_the_best() -> N
     unknown = [dataclasses.replace(row, difference_to_best_ci95_db=(np.nan, np.nan)) for row in rows]
     assert [at.model for at in costs(unknown) if at.knee] == ["rich"]
     assert costs([]) == []
+
+
+def test_models_that_cannot_differ_are_one_row() -> None:
+    """Of models without a path through what they add the first stays, with those of the flight file and the advice."""
+
+    def rows(model: str, *errors_db: float, recommended: bool = False) -> list[LadderRow]:
+        return [
+            LadderRow(model=model, tower="LW1", channel=f"USRP{i}", rmse_heldout_db=error, difference_to_best_db=0.0,
+                      difference_to_best_ci95_db=(0.0, 0.0), n=99, seconds=1.0, recommended=recommended)
+            for i, error in enumerate(errors_db)
+        ]  # fmt: skip
+
+    ladder = [
+        *rows("ground", 3.0, 4.0), *rows("woods", 3.001, 3.999), *rows("half", 3.0, np.nan), *rows("edges", 3.0, 4.02),
+        *rows("opaque", np.nan, np.nan), *rows("none", np.nan, np.nan),
+        *rows("relief", 3.0, 4.0, recommended=True), *rows("as set", 3.0, 4.0),
+    ]  # fmt: skip
+    kept, same = distinct(ladder, "as set")
+    assert same == ["woods"]
+    assert [row.model for row in kept[::2]] == ["ground", "half", "edges", "opaque", "none", "relief", "as set"]

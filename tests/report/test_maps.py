@@ -10,6 +10,7 @@ from aerpaw_cmp.report import maps as maps_figures
 from aerpaw_cmp.report import maps as maps_html
 from aerpaw_cmp.report.charts import flown
 from aerpaw_cmp.report.maps import MapsData
+from aerpaw_cmp.report.texts import percent
 
 
 @pytest.fixture
@@ -114,6 +115,18 @@ def test_tables(maps_data):
     method, k, *mae, mean = table.rows[0]
     assert (method, k) == ("Kriging", "10")
     assert f"{np.mean(mae):.3f}" in mean
+
+
+@pytest.mark.parametrize("all_full", [True, False])
+def test_rows_in_full_coverage_are_one(maps_data, all_full):
+    """A map where every path arrives tells no tower from another."""
+    full = [dataclasses.replace(m, coverage=1.0 if all_full or m.tower != "LW4" else 0.98765) for m in maps_data.rss]
+    rows = maps_html.coverage_table(dataclasses.replace(maps_data, rss=tuple(full))).rows
+    towers = len({m.tower for m in full})
+    whose = "every antenna, foliage and tower" if all_full else f"the other {2 * (towers - 1)} rows"
+    assert [row[0] for row in rows] == ([whose] if all_full else ["SISO", "MIMO", whose])
+    assert {row[-1] for row in rows if row[0] == whose} == {percent(1.0, 1)}
+    assert all(row[-1] == percent(0.98765, 1) for row in rows if row[0] != whose)
 
 
 def test_hostile_names_are_escaped(maps_data):

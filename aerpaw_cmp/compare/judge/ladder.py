@@ -72,6 +72,42 @@ class LadderRow:
     elsewhere_db: tuple[float, float] | None = None
 
 
+# Models that differ by less than this on every channel [dB] are one row: the tables show hundredths.
+_SAME_DB = 0.01
+
+
+def distinct(rows: Sequence[LadderRow], keep: str) -> tuple[list[LadderRow], list[str]]:
+    """Return the rows of models that differ from every model before them, and the names of the others.
+
+    Parameters
+    ----------
+    rows : sequence of LadderRow
+        In the order of the models, with the same channels for each.
+    keep : str
+        Model that stays; so does the recommended one.
+
+    Returns
+    -------
+    rows : list of LadderRow
+    same : list of str
+        Models whose error is that of a model before them within 0.01 dB on every channel.
+    """
+    models: dict[str, list[LadderRow]] = {}
+    for row in rows:
+        models.setdefault(row.model, []).append(row)
+    known: dict[str, FloatArray] = {}
+    same = []
+    for name, own in models.items():
+        error = np.array([row.rmse_heldout_db for row in own])
+        alike = any(np.nanmax(np.abs(error - other), initial=0.0) < _SAME_DB for other in known.values()
+                    if np.array_equal(np.isnan(error), np.isnan(other)))  # fmt: skip
+        if alike and np.isfinite(error).any() and name != keep and not any(row.recommended for row in own):
+            same.append(name)
+        else:
+            known[name] = error
+    return [row for name in known for row in models[name]], same
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Ladder:
     """All rungs, scored: ``error_db[rung][series]`` (n,), NaN outside the shared samples.

@@ -98,7 +98,9 @@ def _difference(measured_db: ArrayLike, simulated_db: ArrayLike) -> FloatArray:
     if measured.shape != simulated.shape:
         raise ValueError(f"measured has shape {measured.shape}, simulated {simulated.shape}: they must be pairs")
     ok = np.isfinite(measured) & np.isfinite(simulated)
-    return np.asarray(simulated[ok] - measured[ok])
+    # a difference of +-1e308 would overflow: no level is near it
+    limit = 1e300
+    return np.asarray(np.clip(simulated[ok], -limit, limit) - np.clip(measured[ok], -limit, limit))
 
 
 def _mean_and_variance(values: FloatArray) -> tuple[float, float]:

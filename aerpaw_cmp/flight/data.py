@@ -24,13 +24,13 @@ from ..propagation.geometry.arrays import Link
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .idle import idle_log_keys, idle_settings
-from .pose.cross_checks import doubts
+from .pose.cross_checks import check_heights, doubts
 from .pose.heights import at_height, lacks_height, raised
 from .pose.hour_shift import clock_trap
 from .pose.track import Track, TrackPoses, good_positions
 from .rows.frozen import FLAG, frozen
 from .rows.lock import lock_of
-from .rows.scored import scored_rows, unscored
+from .rows.scored import scored_rows, unscored, without_values
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, RankSettings, SiteChoice
 
 Times = NDArray[np.datetime64]
@@ -404,11 +404,17 @@ def gather(
     data = unread(settings, folder, logs_root)
     site, warnings = data.site, [*data.warnings]
     telemetry, placed = list[tuple[str, Stream]](), list[tuple[str, Stream]]()
+    void: list[InputError] = []
     rss: list[tuple[str, RssSeries]] = []
     rank: list[tuple[str, RankSeries]] = []
     for number, (log, file) in enumerate(zip(settings.logs, files, strict=True)):
         warnings += [f"{log.path}: {text}" for text in file.result.warnings]
         streams = [stream for stream in file.result.streams if stream.name not in log.skip]
+        measured = (s for s in streams if s.kind in ("rss", "rank"))
+        errors = {s.name: error for s in measured if (error := without_values(s, log.path)) is not None}
+        streams = [s for s in streams if s.kind not in ("rss", "rank") or s.name not in errors]
+        warnings += [f"{log.path}: {error.found}: it is left out" for error in errors.values()]
+        void += errors.values()
         telemetry += [(log.path, stream) for stream in streams if stream.kind == "telemetry"]
         heard = (s for s in streams if s.kind == "rss" and not _unnamed_cell(log, s))
         for stream in (s for s in heard if log.node or not is_own_radio(s)):
@@ -430,6 +436,8 @@ def gather(
         warnings += idle_log_keys(log, file)
         warnings += _of_ratios(settings.link, log, file.result.streams)
         warnings += _of_carriers(settings.link, log, streams)
+    if void and not rss and not rank:
+        raise void[0]
     warnings += idle_settings(settings, {*(["rss"] if rss else []), *(["rank"] if rank else [])})
     if settings.rank.tower not in {RankSettings().tower, *(series.tower for _, series in rank)}:
         warnings.append("rank.tower has no effect: no log has ranks without its own 'node'")
@@ -464,6 +472,7 @@ def gather(
     asked = tuple(site.cautions(series.tower for series in (*data.rss, *data.rank)))
     if track is not None:
         asked += doubts(track, telemetry[0][1], _times_on_track(data), _undated(data, telemetry[0][0]))
+        asked += check_heights(site, *telemetry[0])
     # after the overlap was checked: a flight that shares no time stops with its own message
     every = (*cautions, *_idle_attitude(data), *data.warnings, *(f"{text}." for text in asked))
     return dataclasses.replace(data, doubts=asked, warnings=every, cautions=cautions)

@@ -170,6 +170,8 @@ class Site:
         Clauses on ground heights that the site file states and its elevation model contradicts.
     takeoff_ground_m : float
         Up of the take-off point, from which ``altitude_m`` of logs counts.
+    ground_above_sea_m : float or None
+        Height of the ground at the origin above the geoid or the ellipsoid; None if the site file has none.
     dem : Dem or None
         Ground heights; blocks lines of sight.
     scene : TriangleScene or None
@@ -191,6 +193,7 @@ class Site:
     notes: tuple[str, ...] = ()
     disagreements: tuple[str, ...] = ()
     takeoff_ground_m: float = 0.0
+    ground_above_sea_m: float | None = None
     dem: Dem | None = None
     scene: TriangleScene | None = None
 

@@ -423,9 +423,16 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         notes=tuple(notes),
         disagreements=_disagreements(model, towers, dem),
         takeoff_ground_m=model.origin.takeoff_ground_m,
+        ground_above_sea_m=_ground_above_sea_m(model, dem),
         dem=dem,
         scene=scene,
     )
+
+
+def _ground_above_sea_m(model: SiteModel, dem: Dem | None) -> float | None:
+    if model.origin.ground is not None:
+        return model.origin.ground.height_m
+    return None if dem is None else float(dem.absolute_m(0.0, 0.0))
 
 
 # Elevation models and surveys agree within this [m]; geoid and ellipsoid do not.

@@ -170,3 +170,8 @@ def test_the_grid_is_the_multiples_of_its_step(step, first, last):
     assert nearest_offset(np.array([-1.0, 0.0, 1.0]), 0.5, 1.0) == 1
     assert nearest_offset(np.array([-1.0, 0.0, 1.0]), -0.5, 1.0) == 1
     assert nearest_offset(np.array([-1.0, 0.0, 1.0]), 0.6, 1.0) == 2
+
+
+def test_levels_at_the_end_of_float64_have_no_finite_error_and_raise_nothing() -> None:
+    fit = grid_offset([1e308, -1e308], [-1e308, 1e308])
+    assert (fit.n, fit.rmse_db) == (2, float("inf"))

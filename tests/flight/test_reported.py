@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 import aerpaw_cmp
+from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, _entry, draft
 from aerpaw_cmp.flight.pose.cross_checks import doubts, questions
@@ -150,7 +151,7 @@ def test_a_height_of_another_datum_is_doubted(case: Path, up_m: float, asked: bo
     telemetry = next(s for file in data.files for s in file.result.streams if s.kind == "telemetry")
     frame = telemetry.frame.assign(altitude_m=telemetry.frame["altitude_m"].abs() + up_m)
     clauses = doubts(data.track, replace(telemetry, frame=frame), [])
-    assert any("as of another datum" in text for text in clauses) == asked
+    assert any("probably above another datum" in text for text in clauses) == asked
 
 
 def test_a_draft_takes_the_one_tower_of_the_users_site(tmp_path: Path) -> None:
@@ -187,3 +188,29 @@ def test_a_track_with_its_times_in_another_unit_is_asked_about(tmp_path: Path) -
     assert any("times in another unit" in text for text in file.result.warnings)
     asked = questions(file, file.result.streams, None)
     assert any("m/s throughout: are its times in another unit" in text and text.endswith("?") for text in asked)
+
+
+def test_heights_above_the_sea_and_a_level_that_is_always_empty(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A UAV is not 1.7 km up; a phone writes -1 for a network that it does not receive."""
+    (tmp_path / "site.yaml").write_text(
+        "name: s\norigin: {latitude_deg: 35.7275, longitude_deg: -78.696}\n"
+        "towers: {T1: {latitude_deg: 35.7275, longitude_deg: -78.697, antenna_height_m: 10.0}}\n"
+    )
+    for up_m, code in ((30.0, 0), (1690.0, 3)):
+        rows = [
+            f"{1749564000000 + 1000 * i};426;{-78 - i % 7}.1;-9;5230;-1;-78.69628;{35.7253 + 4e-5 * i:.6f};{up_m}"
+            for i in range(60)
+        ]
+        head = "Timestamp;PCI;RSRP;RSRQ;ARFCN;SS_RSRP;Longitude;Latitude;height_above_takeoff_m"
+        (tmp_path / "phone.csv").write_text("\n".join([head, *rows]) + "\n")
+        (tmp_path / "f.yaml").write_text(
+            "flight: f\nsite: site.yaml\nlogs: [{path: phone.csv, node: T1, cells: {426: T1}}]\n"
+        )
+        assert (
+            main(["report", str(tmp_path / "f.yaml"), "--audit", "none", "-o", str(tmp_path / "out"), "--force"])
+            == code
+        )
+        said = capsys.readouterr().err
+        assert ("takeoff_ground_m: -1690" if code else "it is left out") in said

@@ -11,11 +11,13 @@ from zoneinfo import ZoneInfo
 
 import numpy as np
 
+from ...common.errors import InputError
 from ...common.units import AnyArray
 from ...logs.files import archives
 from ...logs.ingest import IngestedFile, read_bytes
-from ...logs.jumps import jumps_of
+from ...logs.jumps import PLACE, jumps_of
 from ...logs.records import Stream, has_wall_clock
+from ...site.site import Site
 from .grouping import stream_span
 from .track import Track
 
@@ -117,8 +119,76 @@ def doubts(
         texts.append(f"{_listed(undated)} has no clock: by its positions it may be of another flight on this route")
     low_m, assumed = _lowest_m(telemetry), telemetry.attributes.get("height_from") == "assumed"
     if low_m is not None and (low_m > _TOO_HIGH_M or (assumed and abs(low_m) > _GROUND_M)):
-        texts.append(f"the lowest height above take-off is {low_m:.0f} m, as of another datum")
+        texts.append(f"the lowest height above take-off is {low_m:.0f} m, probably above another datum")
     return tuple(texts)
+
+
+# A flight has samples below this height above its take-off [m]; else its heights count from the sea.
+_FLOWN_M = 300.0
+
+# Heights that begin within this of the site's ground above the sea probably count from the sea [m].
+_NEAR_GROUND_M = 50.0
+
+# A UAV at rest: for this long it does not move by more than this [s, m], and then it climbs [m].
+_REST_S, _REST_M, _CLIMB_M = 5.0, 0.5, 5.0
+
+
+def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
+    """Check that the heights of a flight count from its take-off, and not from the sea.
+
+    Parameters
+    ----------
+    site : Site
+    path : str
+        Path of the log, for the message.
+    telemetry : Stream
+
+    Returns
+    -------
+    tuple of str
+        A clause for the first words of a report if the lowest height is about that of the site's ground above the sea.
+
+    Raises
+    ------
+    InputError
+        If no sample is below :data:`_FLOWN_M`, or if the UAV rests and takes off at about the height of the site's
+        ground above the sea.
+    """
+    low_m, sea_m = _lowest_m(telemetry), site.ground_above_sea_m
+    if low_m is None or "takeoff_from" in telemetry.attributes:
+        return ()
+    low_m += site.takeoff_ground_m
+    near = sea_m is not None and low_m > _GROUND_M and abs(low_m - sea_m) < _NEAR_GROUND_M
+    if low_m > _FLOWN_M or (near and _takes_off(telemetry)):
+        ground = "the ground of the take-off above the sea [m]" if sea_m is None else f"the ground is {sea_m:g} m up"
+        raise InputError(
+            f"the lowest height above take-off is {low_m:.0f} m",
+            expected=f"samples below {_FLOWN_M:.0f} m, or a log that begins on the ground",
+            cause="heights above sea level that are read as above take-off: "
+            f"write 'takeoff_ground_m: {-(low_m if sea_m is None else sea_m):.0f}' under 'origin:' of the site "
+            f"file (minus {ground}), or add the rows of the take-off to the log",
+            path=path,
+        )
+    if near:
+        return (
+            f"the lowest height above take-off is {low_m:.0f} m, about the ground of the site above the sea "
+            f"({sea_m:.0f} m): if the heights count from the sea, write 'takeoff_ground_m: {-(sea_m or 0.0):.0f}' "
+            "under 'origin:' of the site file",
+        )
+    return ()
+
+
+def _takes_off(telemetry: Stream) -> bool:
+    """Check whether a track begins with a UAV at rest that then climbs."""
+    frame = telemetry.frame.dropna(subset=["time", *PLACE])
+    if len(frame) < 2:
+        return False
+    latitude, longitude, height = (frame[name].to_numpy(np.float64) for name in PLACE)
+    seconds = (frame["time"].to_numpy() - frame["time"].to_numpy()[0]) / np.timedelta64(1, "s")
+    first = seconds <= _REST_S
+    moved = np.hypot(latitude - latitude[0], (longitude - longitude[0]) * np.cos(np.radians(latitude[0]))) * 111_000.0
+    still = np.maximum(moved, np.abs(height - height[0]))[first].max() <= _REST_M and first.sum() > 2
+    return bool(still and height.max() > height[0] + _CLIMB_M and height.min() > height[0] - _CLIMB_M)
 
 
 def _listed(names: Sequence[str]) -> str:

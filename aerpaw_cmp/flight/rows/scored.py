@@ -23,6 +23,26 @@ def unscored(frame: pd.DataFrame) -> BoolArray:
     return out
 
 
+def without_values(stream: Stream, path: str) -> InputError | None:
+    """Return the error of a series of which no row can be scored; None if a row can.
+
+    A phone writes -1 for each level of a network that it does not receive: its other series are still good.
+    """
+    try:
+        frame, _ = scored_rows(stream, path)
+    except InputError as error:
+        return error
+    value = frame["rss_db" if stream.kind == "rss" else "rank"]
+    if value.notna().any() or not len(frame):
+        return None
+    return InputError(
+        f"{stream.kind} {stream.name!r} has no value in any row",
+        expected="a number",
+        cause="a column that the program left empty",
+        path=path,
+    )
+
+
 def scored_rows(stream: Stream, path: str) -> tuple[pd.DataFrame, dict[str, int]]:
     """The rows that are scored, and how many the others are per flag.
 

@@ -40,7 +40,7 @@ $(READY_DEV): $(READY) requirements/dev.txt
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv dev
 	@touch $@
 
-$(LLVM): $(READY) tools/setup_llvm.py aerpaw_cmp/propagation/native/llvm.py
+$(LLVM): $(READY) tools/setup_llvm.py aerpaw_cmp/propagation/llvm.py
 	@$(BIN)/python tools/setup_llvm.py
 	@touch $@
 

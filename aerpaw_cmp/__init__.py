@@ -13,14 +13,14 @@ __version__ = "0.4.0"
 
 # Where each public name lives.
 _HOME = {
-    "Array": "propagation.geometry.arrays",
-    "BiExponential": "maps.biexponential",
+    "Array": "propagation.geometry",
+    "BiExponential": "maps.variogram",
     "Comparison": "jobs.notebook",
     "Flight": "jobs.notebook",
-    "Link": "propagation.geometry.arrays",
+    "Link": "propagation.geometry",
     "Logs": "logs.frames",
     "OrdinaryKriging": "maps.kriging",
-    "Poses": "propagation.geometry.arrays",
+    "Poses": "propagation.geometry",
     "Replay": "propagation.replay",
     "ReplayedFlight": "jobs.notebook",
     "Site": "site.site",
@@ -30,7 +30,7 @@ _HOME = {
     "load_site": "site.siteyaml",
     "open_flight": "jobs.notebook",
     "read": "logs.frames",
-    "trace": "propagation.trace",
+    "trace": "propagation.replay",
 }
 
 __all__ = [

@@ -6,14 +6,14 @@ from aerpaw_cmp.jobs.notebook import ReplayedFlight as ReplayedFlight
 from aerpaw_cmp.jobs.notebook import open_flight as open_flight
 from aerpaw_cmp.logs.frames import Logs as Logs
 from aerpaw_cmp.logs.frames import read as read
-from aerpaw_cmp.maps.biexponential import BiExponential as BiExponential
 from aerpaw_cmp.maps.kriging import OrdinaryKriging as OrdinaryKriging
+from aerpaw_cmp.maps.variogram import BiExponential as BiExponential
 from aerpaw_cmp.maps.variogram import Variogram as Variogram
-from aerpaw_cmp.propagation.geometry.arrays import Array as Array
-from aerpaw_cmp.propagation.geometry.arrays import Link as Link
-from aerpaw_cmp.propagation.geometry.arrays import Poses as Poses
+from aerpaw_cmp.propagation.geometry import Array as Array
+from aerpaw_cmp.propagation.geometry import Link as Link
+from aerpaw_cmp.propagation.geometry import Poses as Poses
 from aerpaw_cmp.propagation.replay import Replay as Replay
-from aerpaw_cmp.propagation.trace import trace as trace
+from aerpaw_cmp.propagation.replay import trace as trace
 from aerpaw_cmp.site.site import Site as Site
 from aerpaw_cmp.site.siteyaml import load_site as load_site
 

@@ -21,7 +21,7 @@ import os
 import signal
 import sys
 
-from .common import interrupts, terminal
+from .common import interrupts
 from .common.interrupts import SIGNALLED
 
 INTERNAL_ERROR = 70
@@ -46,7 +46,7 @@ NEW_OBJECTS = 10_000
 
 def help_text() -> str:
     """Text that ``aerpaw-cmp --help`` prints."""
-    from .common.commands import COMMANDS
+    from .common.text import COMMANDS
 
     width = max(map(len, COMMANDS))
     lines = [f"  {name:<{width}}  {line}" for name, line in COMMANDS.items()]
@@ -74,7 +74,7 @@ def help_text() -> str:
 def _unknown_command(name: str) -> str:
     from difflib import get_close_matches
 
-    from .common.commands import COMMANDS
+    from .common.text import COMMANDS
 
     near = get_close_matches(name, COMMANDS, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else "; 'aerpaw-cmp --help' lists the commands"
@@ -83,7 +83,7 @@ def _unknown_command(name: str) -> str:
 
 def _quick_answer(arguments: list[str]) -> int | None:
     """Answer what needs no library; None when the command line itself has to run."""
-    from .common.commands import COMMANDS
+    from .common.text import COMMANDS
 
     if _COMPLETE in os.environ:
         return None
@@ -109,7 +109,7 @@ def _message(error: BaseException, arguments: list[str]) -> tuple[str, int]:
     from .common.errors import AerpawCmpError
 
     if isinstance(error, AerpawCmpError):
-        from .common.next_step import next_step
+        from .common.errors import next_step
 
         text = f"aerpaw-cmp: {error}".rstrip(".")
         gap = "\n  " if "\n" in text else " " if text.endswith("?") else ". "
@@ -182,7 +182,7 @@ def main(arguments: list[str] | None = None) -> int:
             os.environ.setdefault(name, "1")
         gc.set_threshold(NEW_OBJECTS)
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    terminal.guard()
+    interrupts.guard()
     before_dashes = arguments[: arguments.index("--")] if "--" in arguments else arguments
     debug = "--debug" in before_dashes or os.environ.get("AERPAW_CMP_DEBUG", "0") not in ("", "0")
     if "--debug" in before_dashes:
@@ -229,7 +229,7 @@ def _failed(error: Exception, debug: bool, arguments: list[str]) -> int:
 
 def _code_of_output(code: int) -> int:
     """The exit code, if standard output takes what was printed: seen here, not at the interpreter's exit."""
-    fault = terminal.output_fault()
+    fault = interrupts.output_fault()
     if fault is None or code:
         return code
     if isinstance(fault, BrokenPipeError):

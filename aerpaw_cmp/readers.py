@@ -11,10 +11,9 @@ from .common.errors import InputError, UsageError
 from .logs import dictionary
 from .logs.readers import ENTRY_POINT_GROUP, Reader, ReadOptions
 from .logs.records import COLUMNS, Kind, ReadResult, RejectedLine, RejectedReason, Stream
-from .logs.text.clocks import TIME, ZONE
-from .logs.text.lines import NUMBER, Lines, add_flag, first_lines, mostly, split
-from .logs.text.rows import Rows, built, matched, of_ues
-from .logs.text.textlog import reader as text_reader
+from .logs.rows import Rows, built, matched, of_ues
+from .logs.rows import reader as text_reader
+from .logs.text import NUMBER, TIME, ZONE, Lines, add_flag, first_lines, mostly, split
 
 __all__ = [
     "COLUMNS",

@@ -15,8 +15,7 @@ import numpy as np
 from shapely.geometry import box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.propagation.geometry.faces import inside_solids, site_faces
-from aerpaw_cmp.propagation.geometry.paths import Links
+from aerpaw_cmp.propagation.geometry import Links, inside_solids, site_faces
 from aerpaw_cmp.propagation.search.mirror import find_paths
 from aerpaw_cmp.site.site import Building, Site, Tower
 

@@ -17,10 +17,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from aerpaw_cmp.common.errors import AerpawCmpError
+from aerpaw_cmp.flight.clock import CANNOT_TELL, SHIFTED, ClockEstimate, judge_clock
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, drafts
-from aerpaw_cmp.flight.gains.memory import load_with_learned
-from aerpaw_cmp.flight.pose.clock import CANNOT_TELL, SHIFTED, ClockEstimate, judge_clock
+from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.replay import clock_channels, same_computer
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions

@@ -30,7 +30,7 @@ from scipy.stats import binomtest, multivariate_normal, norm
 
 from aerpaw_cmp.common.units import FloatArray, IntArray
 from aerpaw_cmp.compare.rank import compare_ranks
-from aerpaw_cmp.compare.statistics.intervals import (
+from aerpaw_cmp.compare.statistics import (
     PairedDifference,
     corrected,
     mean_interval,
@@ -41,7 +41,7 @@ from aerpaw_cmp.compare.statistics.intervals import (
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import correlated_noise
-from aerpaw_cmp.jobs.reporting.flight_run import run_flight
+from aerpaw_cmp.jobs.flight_run import run_flight
 
 SHADOW_DB, CHANNELS, APART_DB = 4.0, 10, 0.3
 CUTS = np.array([-0.8, 0.5, 1.6])

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from aerpaw_cmp.compare.statistics.intervals import paired_difference
+from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.jobs.notebook import open_flight
 
 VERDICTS = {"better": "it pays", "worse": "it costs"} | dict.fromkeys(

@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.flight_verdict import flight_verdict
-from aerpaw_cmp.compare.level.rss import compare_rss, error_spans
+from aerpaw_cmp.compare.level import compare_rss, error_spans
 from aerpaw_cmp.compare.rank import channel_rank, commonest_rank, compare_rank, singular_values
 from aerpaw_cmp.compare.result import ModelLevel, RankFurther, RankResult, RssFurther, RssResult
-from aerpaw_cmp.jobs.campaigns.season import with_season
+from aerpaw_cmp.compare.verdict import flight_verdict
+from aerpaw_cmp.jobs.campaign import with_season
 from aerpaw_cmp.report.campaign import CampaignData, Failure, RssRow
 from aerpaw_cmp.report.flight_data import ReportData, Track
 from aerpaw_cmp.site.siteyaml import load_site

@@ -1,7 +1,7 @@
 """Predictions before any flight, scored on real flights as if nothing were known of them.
 
 Each flight's track is predicted by ray tracing with isotropic antennas and the stated prior of
-:class:`~aerpaw_cmp.jobs.prediction.sources.Prior`. One offset per flight is subtracted, because before a flight no
+:class:`~aerpaw_cmp.jobs.sources.Prior`. One offset per flight is subtracted, because before a flight no
 power, cable or receiver gain is known. Printed per campaign: the share of samples inside the 90 % band, the CRPS
 beside that of free space with one constant standard deviation (the best constant for all campaigns, which favours free
 space), and the mean standard deviation. The exit code is 1 if the pooled share lies outside 82 to 96 %, a campaign's
@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from aerpaw_cmp.compare.judge.entries import crps_normal
-from aerpaw_cmp.flight.gains.memory import load_with_learned
+from aerpaw_cmp.compare.level import crps_normal
+from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import LinkSettings
-from aerpaw_cmp.jobs.learning.calibrate import observe
-from aerpaw_cmp.jobs.prediction.sources import PRIOR_OFFSET_DB, NamedFlight, Prior
+from aerpaw_cmp.jobs.calibrate import observe
+from aerpaw_cmp.jobs.sources import PRIOR_OFFSET_DB, NamedFlight, Prior
 
 FLIGHTS = Path(__file__).parents[1] / "tests" / "field"
 CAMPAIGNS = {

@@ -34,8 +34,8 @@ import aerpaw_cmp
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.bench import random_scene
-from aerpaw_cmp.propagation.geometry.arrays import Poses, single_element
-from aerpaw_cmp.propagation.native import compiled
+from aerpaw_cmp.propagation import compiled
+from aerpaw_cmp.propagation.geometry import Poses, single_element
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
 
@@ -80,7 +80,7 @@ def street() -> tuple[Any, Any, Any] | None:
     spec = find_spec("sionna")
     if spec is None or find_spec("numba") is None:
         return None
-    from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
+    from aerpaw_cmp.site.mitsuba import read_scene
 
     folder = Path(next(iter(spec.submodule_search_locations or []))) / "rt" / "scenes" / "simple_street_canyon"
     site, link, poses = random_scene(200, buildings=0)

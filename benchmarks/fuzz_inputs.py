@@ -49,7 +49,7 @@ from aerpaw_cmp.common import native  # noqa: E402
 from aerpaw_cmp.common.errors import AerpawCmpError  # noqa: E402
 from aerpaw_cmp.common.geodesy import SiteFrame  # noqa: E402
 from aerpaw_cmp.logs import limits  # noqa: E402
-from aerpaw_cmp.logs.files.chunks import whole_lines  # noqa: E402
+from aerpaw_cmp.logs.files import whole_lines  # noqa: E402
 from aerpaw_cmp.logs.readers import HEAD_BYTES, Reader, ReadOptions, catalogue  # noqa: E402
 from aerpaw_cmp.logs.records import ReadResult  # noqa: E402
 
@@ -453,7 +453,7 @@ def _loader(module: str, name: str, **options: Any) -> Callable[[Path], Any]:
 
 
 def _flight(path: Path) -> bool:
-    from aerpaw_cmp.flight.gains.memory import load_with_learned
+    from aerpaw_cmp.flight.gains import load_with_learned
     from aerpaw_cmp.flight.simulate import plan_trajectory
 
     settings = load_with_learned(path)
@@ -467,13 +467,13 @@ def _flight(path: Path) -> bool:
 
 
 def _map(path: Path) -> Any:
-    from aerpaw_cmp.site.imports.footprints import import_footprints
+    from aerpaw_cmp.site.footprints import import_footprints
 
     return import_footprints([path], FRAME)
 
 
 def _dem(path: Path) -> Any:
-    from aerpaw_cmp.site.relief.dem import read_dem
+    from aerpaw_cmp.site.relief import read_dem
 
     return read_dem(path, FRAME, crs="local" if path.suffix == ".asc" else None)
 
@@ -496,15 +496,15 @@ def _gzipped(data: bytes, index: int) -> bool:
 
 
 def _path_cache(data: bytes, _index: int) -> bool:
-    from aerpaw_cmp.propagation.engine.engines import PathCache
+    from aerpaw_cmp.propagation.engines import PathCache
 
     with _file(data, "key.npz") as path:
         return PathCache(path.parent).load(path.stem) is not None
 
 
 def _cache_entry() -> bytes:
-    from aerpaw_cmp.propagation.engine.engines import PathCache
-    from aerpaw_cmp.propagation.geometry.paths import PathSet
+    from aerpaw_cmp.propagation.engines import PathCache
+    from aerpaw_cmp.propagation.geometry import PathSet
 
     with tempfile.TemporaryDirectory() as folder:
         paths = PathSet(
@@ -571,7 +571,7 @@ def targets() -> list[Target]:
     sample = (ROOT / "sample_logs/flight.yaml").read_bytes()[:MEDIUM_BYTES]
     yamls: list[tuple[str, tuple[bytes, ...], Callable[[Path], Any]]] = [
         ("flight.yaml", (FLIGHT, sample), _flight),
-        ("campaign.yaml", (CAMPAIGN,), _loader("jobs.campaigns.campaign", "load_campaign")),
+        ("campaign.yaml", (CAMPAIGN,), _loader("jobs.campaign", "load_campaign")),
         ("site.yaml", (maps.SITE,), _loader("site.siteyaml", "load_site")),
     ]
     for name, seeds, load in yamls:
@@ -586,7 +586,7 @@ def targets() -> list[Target]:
     out.append(Target("dem:asc", (maps.DEM,), partial(_by_path, "d.asc", _dem)))
     if (tiff := _geotiff()) is not None:
         out.append(Target("dem:tif", (tiff,), partial(_by_path, "d.tif", _dem)))
-    pattern = partial(_by_path, "p.txt", _loader("site.antenna.antennas", "read_pattern_text"))
+    pattern = partial(_by_path, "p.txt", _loader("site.antennas", "read_pattern_text"))
     out.append(Target("antenna:text", (maps.PATTERN,), pattern))
     for name, (seed, load) in SMALL_FILES.items():
         out.append(Target(name, (seed,), partial(_by_path, name.replace(":", "."), load)))
@@ -594,7 +594,7 @@ def targets() -> list[Target]:
 
 
 def _scene(path: Path) -> Any:
-    from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
+    from aerpaw_cmp.site.mitsuba import read_scene
 
     (path.parent / "mesh.ply").write_bytes(PLY)
     return read_scene(path)
@@ -657,10 +657,10 @@ SMALL_FILES: dict[str, tuple[bytes, Callable[[Path], Any]]] = {
     "route:plan": (PLAN, _ROUTE),
     "route:wpl": (b"QGC WPL 110\n" + WAYPOINT % (0, 0) + WAYPOINT % (1, 3), _ROUTE),
     "fence:kml": (FENCE, _loader("logs.route", "read_areas")),
-    "mesh:ply": (PLY, _loader("site.mesh_scenes.meshfiles", "read_mesh")),
+    "mesh:ply": (PLY, _loader("site.mitsuba", "read_mesh")),
     "scene:xml": (SCENE, _scene),
-    "sphere:csv": (SPHERE, _loader("site.antenna.sphere_pattern", "read_sphere_csv")),
-    "receiver:json": (_receiver_file(), _loader("jobs.learning.calibrate_rank", "read_receiver")),
+    "sphere:csv": (SPHERE, _loader("site.learned", "read_sphere_csv")),
+    "receiver:json": (_receiver_file(), _loader("jobs.calibrate_rank", "read_receiver")),
     "report:json": (REPORT, _report),
 }
 

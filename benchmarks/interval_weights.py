@@ -19,8 +19,7 @@ from scipy.special import expit, gammaincc, logit, ndtri, stdtr
 from scipy.stats import norm
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.statistics.intervals import undecided
-from aerpaw_cmp.compare.statistics.memory import (
+from aerpaw_cmp.compare.statistics import (
     CALM,
     RATES,
     WHITE_SHARES,
@@ -29,6 +28,7 @@ from aerpaw_cmp.compare.statistics.memory import (
     likelihoods,
     memories,
     stretches,
+    undecided,
     weights,
 )
 

@@ -29,16 +29,14 @@ from scipy.spatial.distance import cdist
 from scipy.special import log_softmax, softmax
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.compare.gains.direction_gain import LinkSamples
-from aerpaw_cmp.compare.gains.spread import fading_of
-from aerpaw_cmp.compare.judge.entries import crps_normal
-from aerpaw_cmp.compare.learning.calibration import Observed, score
-from aerpaw_cmp.compare.learning.correction import BIN_S, OFF, Correction, choose
-from aerpaw_cmp.compare.learning.field_gp import FieldFit, FieldModel, Rows, fit_field
-from aerpaw_cmp.compare.statistics.intervals import mean_interval
+from aerpaw_cmp.compare.calibration import BIN_S, OFF, Correction, Observed, choose, score
+from aerpaw_cmp.compare.field_gp import FieldFit, FieldModel, Rows, fit_field
+from aerpaw_cmp.compare.gains import LinkSamples, fading_of
+from aerpaw_cmp.compare.level import crps_normal
+from aerpaw_cmp.compare.statistics import mean_interval
 from aerpaw_cmp.flight.settings import AntennaSettings
-from aerpaw_cmp.jobs.learning.calibrate import gain_of, learned_antennas, observe
-from aerpaw_cmp.jobs.learning.calibrate_rank import FittedReceiver, RankSamples, Tried, rank_samples
+from aerpaw_cmp.jobs.calibrate import gain_of, learned_antennas, observe
+from aerpaw_cmp.jobs.calibrate_rank import FittedReceiver, RankSamples, Tried, rank_samples
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 
 sys.path.insert(0, str(Path(__file__).parents[1]))

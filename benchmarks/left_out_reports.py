@@ -28,20 +28,20 @@ from typing import Any
 import yaml
 from scipy.io import loadmat, savemat
 
-from aerpaw_cmp.compare.learning.calibration import SPLITS, Learned, Score, flight_left_out, flights_of, learn
+from aerpaw_cmp.compare.calibration import SPLITS, Learned, Score, flight_left_out, flights_of, learn
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.learning.calibrate import (
+from aerpaw_cmp.jobs.calibrate import (
     Calibration,
     GroundFit,
+    learned_locks,
     load_calibration,
     observe,
     read_flights,
     recipe_of,
 )
-from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks
-from aerpaw_cmp.jobs.learning.calibrate_rank import fit_rank, samples_by_tower
-from aerpaw_cmp.jobs.learning.calibration_files import Calibrated, site_entry
-from aerpaw_cmp.site.antenna.learned import folder_of, remember
+from aerpaw_cmp.jobs.calibrate_rank import fit_rank, samples_by_tower
+from aerpaw_cmp.jobs.calibration_files import Calibrated, site_entry
+from aerpaw_cmp.site.learned import folder_of, remember
 
 RECIPES = Path(__file__).parents[1] / "tests" / "field" / "learned"
 TIMEZONE = "America/New_York"

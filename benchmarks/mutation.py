@@ -80,7 +80,6 @@ COMPILED = {
         f"{_ALIKE}more_pairs_than_lanes_and_paths_in_any_order",
     ),
     "aerpaw_cmp/propagation/search/beams.py": _BEAMS,
-    "aerpaw_cmp/propagation/search/boxtree.py": _BEAMS,
     "aerpaw_cmp/propagation/search/merging.py": _BEAMS,
 }  # fmt: skip
 

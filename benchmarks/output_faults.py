@@ -146,9 +146,7 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
 
     main = installed_program()
     from aerpaw_cmp.flight import replay
-    from aerpaw_cmp.jobs.campaigns import campaign
-    from aerpaw_cmp.jobs.mapping import coverage_map
-    from aerpaw_cmp.jobs.reporting import flight_run
+    from aerpaw_cmp.jobs import campaign, coverage_map, flight_run
     from aerpaw_cmp.maps import export
     from aerpaw_cmp.report import campaign as campaign_figures
     from aerpaw_cmp.report import canvas
@@ -261,7 +259,7 @@ class Runs:
 
     def litter(self) -> list[str]:
         """Everything below the root that is neither target nor in it, and hidden places in it."""
-        from aerpaw_cmp.site.antenna.learned import folder_of
+        from aerpaw_cmp.site.learned import folder_of
 
         memory = folder_of(self.target)  # of a site, copied from that of its base
         own = (self.folder, self.target, *([memory, *memory.iterdir()] if (memory / "learned.yaml").exists() else []))

@@ -19,9 +19,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from aerpaw_cmp.compare.judge import causes
-from aerpaw_cmp.compare.judge.causes import LevelEvidence, Trial, flight_cause
-from aerpaw_cmp.flight.pose.clock import Along, ClockChannel, judge_clock
+from aerpaw_cmp.compare import causes
+from aerpaw_cmp.compare.causes import LevelEvidence, Trial, flight_cause
+from aerpaw_cmp.flight.clock import Along, ClockChannel, judge_clock
 from aerpaw_cmp.site.siteyaml import load_site
 
 Array = NDArray[np.float64]

@@ -63,16 +63,16 @@ FAULTS = (
     Fault("mirrored by half the height", f"{P}.field.geometry", 'geometry', 'image = image - 2.0 *', 'image = image - 1.99 *'),
     Fault("H not transposed for a transmitting UAV", f"{P}.field.sum", 'channel_matrices', 'if link.uav_transmits else matrices', 'if not link.uav_transmits else matrices'),
     Fault("foliage as 10 log of an amplitude", f"{P}.field.sum", 'channel_matrices', 'amplitude_from_db(-(loss_db', 'amplitude_from_db(-2.0 * (loss_db'),
-    Fault("tower ports from the right", f"{P}.geometry.arrays", "_centred_line", "along_m.mean() - along_m", "along_m - along_m.mean()"),
-    Fault("UAV ports row by row", f"{P}.geometry.arrays", "uav_comparison_array", "[0, half, -half], [0, -half, half]", "[0, -half, half], [0, half, -half]"),
-    Fault("UAV array at a whole wavelength", f"{P}.geometry.arrays", "uav_comparison_array", "wavelength_m / 4", "wavelength_m / 2"),
-    Fault("roll sign of a mount", f"{P}.geometry.arrays", "rotation_from_yaw_pitch_roll", "np.cos(roll), np.sin(roll)", "np.cos(roll), -np.sin(roll)"),
-    Fault("yaw of a mount clockwise", f"{P}.geometry.arrays", "rotation_from_yaw_pitch_roll", "np.cos(yaw), np.sin(yaw)", "np.cos(yaw), -np.sin(yaw)"),
-    Fault("roll sign of the aircraft", f"{P}.geometry.arrays", "rotation_from_aircraft", ", np.radians(roll_deg))", ", -np.radians(roll_deg))"),
-    Fault("pitch sign of the aircraft", f"{P}.geometry.arrays", "rotation_from_aircraft", "-np.radians(pitch_deg)", "np.radians(pitch_deg)"),
-    Fault("heading from south", f"{P}.geometry.arrays", "rotation_from_aircraft", "np.pi / 2 - np", "-np.pi / 2 - np"),
-    Fault("heading plus 2 degrees", f"{P}.geometry.arrays", "rotation_from_aircraft", "np.pi / 2 - np", "np.radians(92.0) - np"),
-    Fault("angles of the aircraft in another order", f"{P}.geometry.arrays", "rotation_from_aircraft", "-np.radians(pitch_deg), np.radians(roll_deg)", "np.radians(roll_deg), -np.radians(pitch_deg)"),
+    Fault("tower ports from the right", f"{P}.geometry", "_centred_line", "along_m.mean() - along_m", "along_m - along_m.mean()"),
+    Fault("UAV ports row by row", f"{P}.geometry", "uav_comparison_array", "[0, half, -half], [0, -half, half]", "[0, -half, half], [0, half, -half]"),
+    Fault("UAV array at a whole wavelength", f"{P}.geometry", "uav_comparison_array", "wavelength_m / 4", "wavelength_m / 2"),
+    Fault("roll sign of a mount", f"{P}.geometry", "rotation_from_yaw_pitch_roll", "np.cos(roll), np.sin(roll)", "np.cos(roll), -np.sin(roll)"),
+    Fault("yaw of a mount clockwise", f"{P}.geometry", "rotation_from_yaw_pitch_roll", "np.cos(yaw), np.sin(yaw)", "np.cos(yaw), -np.sin(yaw)"),
+    Fault("roll sign of the aircraft", f"{P}.geometry", "rotation_from_aircraft", ", np.radians(roll_deg))", ", -np.radians(roll_deg))"),
+    Fault("pitch sign of the aircraft", f"{P}.geometry", "rotation_from_aircraft", "-np.radians(pitch_deg)", "np.radians(pitch_deg)"),
+    Fault("heading from south", f"{P}.geometry", "rotation_from_aircraft", "np.pi / 2 - np", "-np.pi / 2 - np"),
+    Fault("heading plus 2 degrees", f"{P}.geometry", "rotation_from_aircraft", "np.pi / 2 - np", "np.radians(92.0) - np"),
+    Fault("angles of the aircraft in another order", f"{P}.geometry", "rotation_from_aircraft", "-np.radians(pitch_deg), np.radians(roll_deg)", "np.radians(roll_deg), -np.radians(pitch_deg)"),
     Fault("concrete as brick", "aerpaw_cmp.site.materials", "material", "return Material(key, band,", "return Material(key, _TABLE['brick' if key == 'concrete' else key][1],"),
     Fault("ground of wet earth", "aerpaw_cmp.site.materials", "material", "return Material(key, band,", "return Material(key, _TABLE['wet_ground' if key == 'medium_dry_ground' else key][1],"),
     Fault("permittivity with a gain", "aerpaw_cmp.site.materials", "Material.relative_permittivity", "-loss)", "loss)"),
@@ -88,10 +88,10 @@ FAULTS = (
     Fault("paths of two reflections dropped", f"{P}.search.mirror", "find_paths", "for level in levels:", "for level in levels[:2]:"),
     Fault("every fifth path dropped", f"{P}.search.mirror", "find_paths", "return merge(pieces, max_depth, faces)", "return (lambda p: p.select(np.arange(len(p)) % 5 > 0))(merge(pieces, max_depth, faces))"),
     Fault("direct paths dropped", f"{P}.search.mirror", "find_paths", "for level in levels:", "for level in levels[1:]:"),
-    Fault("nothing hides", f"{P}.search.occlusion", "Occlusion.segments", "if not self.pieces:", "if self.pieces:"),
-    Fault("walls 5 m longer than they are", f"{P}.geometry.faces", "inside", "(faces.upper + tolerance_m)", "(faces.upper + 5.0)"),
+    Fault("nothing hides", f"{P}.search.mirror", "Occlusion.segments", "if not self.pieces:", "if self.pieces:"),
+    Fault("walls 5 m longer than they are", f"{P}.geometry", "inside", "(faces.upper + tolerance_m)", "(faces.upper + 5.0)"),
     Fault("reflection points off by 1 % of the way", f"{P}.search.mirror", "trace_back", "share = behind / (behind + ahead)", "share = 0.99 * behind / (behind + ahead)"),
-    Fault("walls moved by 5 cm", f"{P}.geometry.faces", "_walls", "offset_m=float(normal[:2] @ start)", "offset_m=float(normal[:2] @ start) + 0.05"),
+    Fault("walls moved by 5 cm", f"{P}.geometry", "_walls", "offset_m=float(normal[:2] @ start)", "offset_m=float(normal[:2] @ start) + 0.05"),
     Fault("antenna 30 cm higher", "aerpaw_cmp.site.site", "Tower.position_m", "self.ground_m + self.antenna_height_m", "self.ground_m + self.antenna_height_m + 0.3"),
     Fault("power summed over the receiving ports", f"{P}.field.sum", "mean_pair_power", "parts, parts) / pairs)", "parts, parts) / pairs * h.shape[-2])"),
     Fault("transmit power 1 dB more", f"{P}.field.sum", "rss_dbm", "transmit_power_dbm + db", "transmit_power_dbm + 1.0 + db"),
@@ -118,8 +118,8 @@ def planted(fault: Fault) -> Iterator[None]:
 
 def _forget() -> None:
     """What the package keeps of the functions as they were."""
+    from aerpaw_cmp.propagation import geometry as faces
     from aerpaw_cmp.propagation.field import foliage
-    from aerpaw_cmp.propagation.geometry import faces
 
     faces._faces.cache_clear()
     faces._solids.cache_clear()
@@ -275,7 +275,7 @@ def change(clean: Any, faulty: Any, clean_ranks: list[Any], faulty_ranks: list[A
 
 def failures(data: Any, replays: Any, *, sionna: bool = True) -> list[str]:
     """What ``report --strict`` would name, of the audit."""
-    from aerpaw_cmp.jobs.reporting import audit_flight
+    from aerpaw_cmp.jobs import audit_flight
 
     if sionna:
         audit = audit_flight.audit_replays(data, replays).audit
@@ -288,8 +288,8 @@ def failures(data: Any, replays: Any, *, sionna: bool = True) -> list[str]:
 
 def reference_only(data: Any, replays: Any) -> Any:
     """The audit without Sionna: the second implementation and the attitude."""
-    from aerpaw_cmp.jobs.reporting.audit_flight import attitude_checked, expectations
-    from aerpaw_cmp.propagation.check.field_audit import against_reference, spread_over_paths
+    from aerpaw_cmp.jobs.audit_flight import attitude_checked, expectations
+    from aerpaw_cmp.propagation.check.audit import against_reference, spread_over_paths
 
     total = attitude_checked(data, replays)
     for replayed, expected in zip(replays, expectations(data, replays), strict=True):

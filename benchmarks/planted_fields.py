@@ -13,7 +13,7 @@ import time
 
 import numpy as np
 
-from aerpaw_cmp.compare.learning.field_gp import FieldFit, FieldModel, Rows, covariance, fit_field
+from aerpaw_cmp.compare.field_gp import FieldFit, FieldModel, Rows, covariance, fit_field
 
 PLANTED = FieldModel(place_sd_db=2.5, length_m=60, height_m=25, turn=0.8, drift_sd_db=1.2, drift_s=90)
 SHARES = {0.5: 0.6745, 0.9: 1.6449, 0.95: 1.96}

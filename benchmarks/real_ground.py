@@ -20,7 +20,7 @@ import numpy as np
 from scipy.stats import t as student
 
 import aerpaw_cmp
-from aerpaw_cmp.compare.statistics.intervals import paired_difference
+from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.flight.data import FlightData
 from aerpaw_cmp.flight.replay import replay_flight
 

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.jobs.bench import random_scene
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses
+from aerpaw_cmp.propagation.geometry import Link, Poses
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 

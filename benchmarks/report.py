@@ -24,7 +24,7 @@ import yaml
 ROOT = Path(__file__).parents[1]
 # What every report with its audit has to load, as a program.
 IMPORTS = (
-    "from aerpaw_cmp.propagation.native.llvm import let_sionna_load; let_sionna_load(); "
+    "from aerpaw_cmp.propagation.llvm import let_sionna_load; let_sionna_load(); "
     "import sionna.rt, matplotlib.pyplot, pandas"
 )
 LIGHT = "import matplotlib.pyplot, pandas"

@@ -9,7 +9,7 @@ import time
 
 import numpy as np
 
-from aerpaw_cmp.compare.learning.rolling import RouteAhead
+from aerpaw_cmp.compare.field_gp import RouteAhead
 
 
 def main() -> None:

@@ -83,7 +83,7 @@ def faces(count: int) -> dict[str, float]:
     from shapely.geometry import box
 
     from aerpaw_cmp.jobs.bench import random_scene
-    from aerpaw_cmp.propagation.geometry.arrays import Poses
+    from aerpaw_cmp.propagation.geometry import Poses
     from aerpaw_cmp.propagation.replay import replay
     from aerpaw_cmp.site.site import Building
 
@@ -109,7 +109,7 @@ def samples(count: int) -> dict[str, float]:
     """One channel whose residual remembers a second and a half, ten samples a second."""
     from scipy.signal import lfilter
 
-    from aerpaw_cmp.compare.level.rss import compare_rss
+    from aerpaw_cmp.compare.level import compare_rss
 
     generator = np.random.default_rng(1)
     decay = math.exp(-0.1 / 1.5)
@@ -160,8 +160,8 @@ def report(hours: float) -> dict[str, float]:
 
 def flights(count: int, workers: int = 1) -> dict[str, float]:
     """A campaign; its flights are simulated before."""
+    from aerpaw_cmp.jobs.options import RunOptions
     from aerpaw_cmp.jobs.run import run_campaign, run_simulate
-    from aerpaw_cmp.jobs.tasks.options import RunOptions
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

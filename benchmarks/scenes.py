@@ -31,10 +31,10 @@ from typing import Any
 import numpy as np
 from shapely.geometry import box
 
-from aerpaw_cmp.propagation.geometry.paths import Links
+from aerpaw_cmp.propagation.geometry import Links
 from aerpaw_cmp.propagation.search.beams import grow_paths
 from aerpaw_cmp.propagation.search.merging import merged
-from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene, read_scene
+from aerpaw_cmp.site.mitsuba import TriangleScene, read_scene
 
 SOURCES = {
     "munich": (8.5, 21.0, 27.0),
@@ -141,9 +141,9 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
 def prism_row(task: dict[str, Any]) -> dict[str, Any]:
     """A town of prisms through the replay's own search."""
     from aerpaw_cmp.common.geodesy import SiteFrame
-    from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
+    from aerpaw_cmp.propagation.geometry import Link, Poses, single_element
     from aerpaw_cmp.propagation.scene import Scene
-    from aerpaw_cmp.propagation.search import prisms
+    from aerpaw_cmp.propagation.search import beams
     from aerpaw_cmp.site.site import Building, Site, Tower
 
     compile_s = warm_up()
@@ -163,7 +163,7 @@ def prism_row(task: dict[str, Any]) -> dict[str, Any]:
     scene = Scene.of(site, Link(CARRIER_HZ, {"T": single_element()}, single_element()), poses)
     setup = clock.since()
     clock = Clock()
-    paths = prisms.find_paths(scene.faces, scene.links_to(poses), max_depth=task["depth"])
+    paths = beams.find_paths(scene.faces, scene.links_to(poses), max_depth=task["depth"])
     return {
         **task,
         "scene": f"{count} prisms",

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from aerpaw_cmp.live.serial.simulator import FlightModem, ModemSimulator, framed
-from aerpaw_cmp.logs.files.checksums import Record, decode_record
+from aerpaw_cmp.live.simulator import FlightModem, ModemSimulator, framed
+from aerpaw_cmp.logs.files import Record, decode_record
 
 
 @dataclass(frozen=True, slots=True)

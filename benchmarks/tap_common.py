@@ -20,7 +20,7 @@ CHILD = """
 import json, sys
 from pathlib import Path
 from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.live.record.log import LogSettings
+from aerpaw_cmp.live.log import LogSettings
 from aerpaw_cmp.live.tap import TapSettings
 from benchmarks.tap_common import run_tap
 values = json.loads(sys.argv[1])
@@ -28,7 +28,7 @@ log = LogSettings(**values.pop("log", {}))
 show = values.pop("show_status", False)
 if capture := values.pop("capture", None):  # a copy of what the kernel gives, a file per opening of the port
     import itertools
-    from aerpaw_cmp.live.serial.ports import SerialPort
+    from aerpaw_cmp.live.ports import SerialPort
     numbers, opened, read = itertools.count(), SerialPort.__init__, SerialPort.read
 
     def begin(self, *arguments):

@@ -25,9 +25,9 @@ import numpy as np
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import db_from_power, power_from_db, wavelength_m
-from aerpaw_cmp.propagation.geometry.arrays import Array, Link, rotation_from_yaw_pitch_roll, single_element
-from aerpaw_cmp.propagation.trace import trace
-from aerpaw_cmp.site.antenna.antennas import TR38901
+from aerpaw_cmp.propagation.geometry import Array, Link, rotation_from_yaw_pitch_roll, single_element
+from aerpaw_cmp.propagation.replay import trace
+from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.site import Site, Tower
 
 ELEMENTS, SPACING = 8, 0.8

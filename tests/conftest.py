@@ -18,7 +18,7 @@ import pytest
 from _pytest.doctest import DoctestModule
 from hypothesis import settings
 
-from aerpaw_cmp.common.counting import counted
+from aerpaw_cmp.common.text import counted
 from tests.real_logs import REAL
 
 # In CI the same examples run every time, so that a red run can be repeated; elsewhere every run looks further.
@@ -177,7 +177,7 @@ def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest
 @pytest.fixture(scope="module")
 def sionna() -> Any:
     """The module that drives Sionna RT, its variant loaded; skips where Sionna or a device for Dr.Jit is missing."""
-    from aerpaw_cmp.propagation.native.llvm import let_sionna_load
+    from aerpaw_cmp.propagation.llvm import let_sionna_load
 
     let_sionna_load()
     pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")

@@ -5,9 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.site.antenna.known_directions import KnownDirections
-from aerpaw_cmp.site.antenna.learned import Entry, LearnedSeries, LearnedSpread
-from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv
+from aerpaw_cmp.site.learned import Entry, KnownDirections, LearnedSeries, LearnedSpread, sphere_csv
 
 SPREAD = LearnedSpread(own_sd_db=0.0, noise_sd_db=0.0, fading_sd_db=0.0, fading_kurtosis=0.0, bin_s=4.0)
 ENDS = {"t": "tower_file", "u": "uav_file", "k": "known_file"}

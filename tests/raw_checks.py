@@ -23,7 +23,7 @@ from aerpaw_cmp.flight.data import FlightData, RankSeries, RssSeries
 from aerpaw_cmp.flight.replay import Replayed, attitude_rotation
 from aerpaw_cmp.flight.settings import LogSettings
 from aerpaw_cmp.logs.ingest import IngestedFile
-from aerpaw_cmp.propagation.check.field_audit import Expected
+from aerpaw_cmp.propagation.check.audit import Expected
 from aerpaw_cmp.propagation.check.reference import Mirror, Reference
 from aerpaw_cmp.site.site import Tower
 from tests.raw_bytes import LOWEST_M, Log, Matrix, Pose, RawPath, Reading, east_north_m, level, read_log

@@ -8,7 +8,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.jobs import bench
-from aerpaw_cmp.propagation.native import llvm
+from aerpaw_cmp.propagation import llvm
 from tests.geojson import collection, feature, polygon
 
 ROOT = Path(__file__).parents[1]

@@ -11,8 +11,8 @@ import typer
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.cli.app import app
-from aerpaw_cmp.common.commands import COMMANDS
-from aerpaw_cmp.live.session import TapSummary
+from aerpaw_cmp.common.text import COMMANDS
+from aerpaw_cmp.live.ports import TapSummary
 from tests import json_page
 from tests.json_page import listed
 

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.commands import COMMANDS
 from aerpaw_cmp.common.outputs import OutputFolder
+from aerpaw_cmp.common.text import COMMANDS
 from tests.geojson import collection, feature, polygon
 from tests.test_docs import PROGRAM, check
 
@@ -104,7 +104,7 @@ def test_json_of_the_commands_that_only_write_files(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     from aerpaw_cmp.jobs import run
-    from aerpaw_cmp.jobs.tasks.options import JobOutcome
+    from aerpaw_cmp.jobs.options import JobOutcome
 
     written = JobOutcome(folder=Path(), files=(Path("a.txt"), Path("b.txt")))
     for name, line in (("run_site_show", ["site", "show"]), ("run_simulate", ["simulate", "plan.yaml"])):
@@ -152,7 +152,7 @@ def test_an_interrupted_campaign_says_where_its_outcomes_are(
     def stop(*_: Any, **__: Any) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("aerpaw_cmp.jobs.campaigns.campaign.run", stop)
+    monkeypatch.setattr("aerpaw_cmp.jobs.campaign.run", stop)
     file = tmp_path / "campaign.yaml"
     file.write_text(f"campaign: c\nflights: [{SAMPLE / 'flight.yaml'}]\n")
     line = ["campaign", str(file), "-o", str(tmp_path / "out")]

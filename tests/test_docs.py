@@ -170,7 +170,7 @@ def test_the_pages_build_strictly_and_ask_no_network(pages: Path) -> None:
 @needs_mkdocs
 def test_the_reference_has_every_public_name_and_every_command(pages: Path) -> None:
     import aerpaw_cmp
-    from aerpaw_cmp.common.commands import COMMANDS
+    from aerpaw_cmp.common.text import COMMANDS
 
     python = (pages / "reference" / "python.html").read_text()
     for name, home in aerpaw_cmp._HOME.items():

@@ -12,10 +12,9 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.result import BASELINE_TITLE
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.replay import replay_rank
-from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series
+from aerpaw_cmp.flight.settings import load_flight, overridden
+from aerpaw_cmp.jobs.compare_flight import compare_rank_series
 from aerpaw_cmp.logs.ingest import Ingested
 from aerpaw_cmp.logs.readers import ReadOptions
 from tests.real_logs import REAL

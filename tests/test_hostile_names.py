@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.commands import COMMANDS as SAID
+from aerpaw_cmp.common.text import COMMANDS as SAID
 from tests.geojson import collection, feature, polygon
 from tests.simulated import simulate, write_yaml
 

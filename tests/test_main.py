@@ -10,8 +10,8 @@ import pytest
 
 import aerpaw_cmp
 from aerpaw_cmp import __main__ as program
-from aerpaw_cmp.common.commands import COMMANDS
 from aerpaw_cmp.common.errors import CheckError, InputError, UsageError
+from aerpaw_cmp.common.text import COMMANDS
 from aerpaw_cmp.common.versions import tool_version
 
 pytestmark = pytest.mark.usefixtures("few_pictures")

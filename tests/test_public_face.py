@@ -47,9 +47,7 @@ def test_using_one_name_loads_only_its_room() -> None:
     assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
 
 
-@pytest.mark.parametrize(
-    "name", ["propagation.trace", "propagation.check.audit", "propagation.replay", "logs.ingest", "compare.rank"]
-)
+@pytest.mark.parametrize("name", ["propagation.replay", "propagation.check.audit", "logs.ingest", "compare.rank"])
 def test_no_function_hides_a_module(name: str) -> None:
     module = importlib.import_module(f"aerpaw_cmp.{name}")
     package, _, last = name.rpartition(".")
@@ -154,7 +152,7 @@ def test_a_replayed_flight_has_levels_matrices_and_paths_that_agree(flight: ac.F
 
 
 def test_trace_takes_plain_positions_and_equals_free_space_where_nothing_reflects() -> None:
-    from aerpaw_cmp.propagation.geometry.arrays import single_element
+    from aerpaw_cmp.propagation.geometry import single_element
 
     link = ac.Link(3.4e9, {"LW1": single_element()}, single_element(), transmit_power_dbm=40.0)
     site = ac.load_site("lake_wheeler")

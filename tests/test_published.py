@@ -16,7 +16,7 @@ import pytest
 
 import aerpaw_cmp
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.compare.statistics.intervals import bootstrap_means
+from aerpaw_cmp.compare.statistics import bootstrap_means
 from benchmarks.published import __main__ as published
 from benchmarks.published import entrants, tasks
 from benchmarks.published.score import block_of, intervals, rmse_replicates

@@ -15,7 +15,7 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.propagation.native import llvm
+from aerpaw_cmp.propagation import llvm
 
 
 def say(text: str) -> None:

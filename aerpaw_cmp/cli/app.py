@@ -6,7 +6,7 @@ A command is a function in a module of this package::
     def diff(first: Annotated[Path, Argument(help="...")], force: Force = False) -> int:
         from ..jobs.diff import run_diff  # here, so that help and completion load nothing
 
-and a line of :mod:`aerpaw_cmp.common.commands`. What it returns is the exit code; nothing is 0. ``-h``, ``--json``,
+and a line of :mod:`aerpaw_cmp.common.text`. What it returns is the exit code; nothing is 0. ``-h``, ``--json``,
 ``--quiet`` and the examples below the options come with the decorator; :func:`.answered` prints the object.
 """
 
@@ -23,9 +23,9 @@ import typer
 from typer import Option
 from typer.core import TyperCommand
 
-from ..common.commands import COMMANDS
 from ..common.errors import UsageError
 from ..common.stages import NotRun
+from ..common.text import COMMANDS
 from .shown import print_plan, say
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -100,7 +100,7 @@ def command(
     of : typer.Typer
         The program, or a group of commands such as ``site_app``.
     text : str, optional
-        One line of help; without it that of :data:`aerpaw_cmp.common.commands.COMMANDS`.
+        One line of help; without it that of :data:`aerpaw_cmp.common.text.COMMANDS`.
     kind : type, optional
         Reads the arguments in its own way.
     """

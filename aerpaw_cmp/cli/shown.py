@@ -11,8 +11,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from ..common.counting import counted
 from ..common.errors import one_line, printable
+from ..common.text import counted
 
 _EVERY_S = 30.0
 

@@ -14,7 +14,7 @@ import numpy as np
 from .errors import UsageError
 from .geodesy import SiteFrame
 from .interrupts import held
-from .sink import Sink
+from .outputs import Sink
 from .units import AnyArray
 from .versions import tool_version, utc_now
 

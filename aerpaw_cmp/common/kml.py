@@ -2,6 +2,8 @@
 
 Logs in KML are read by pattern, line by line (:data:`DATA`, :data:`POINT`): each line has to be accounted for, also of
 a cut file. Maps and routes are read as XML.
+
+XML files of others, refused where they could explode or read other files.
 """
 
 from __future__ import annotations
@@ -13,12 +15,62 @@ from collections.abc import Iterator, Mapping
 from html import escape  # that of xml.sax would load OpenSSL
 from pathlib import Path
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 import numpy as np
 
 from .errors import InputError, one_line
 from .units import FloatArray
-from .xmlfiles import named, plain
+
+
+def xml_root(data: bytes, path: Path | None, expected: str) -> ElementTree.Element:
+    """The root element of an XML text; tags keep their prefix, declared or not (:func:`plain` cuts it).
+
+    Raises
+    ------
+    InputError
+        No XML, with the line; entities, or another encoding than UTF-8.
+    """
+    # UTF-16 would hide entities from this look
+    if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
+        raise InputError("the XML declares entities, or is not UTF-8", expected=expected, path=path)
+    builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()  # a KML with gx:Track and no xmlns:gx is common
+    # one piece of text for an element: expat hands it on line by line else
+    parser.buffer_text = True
+    parser.StartElementHandler = builder.start
+    parser.EndElementHandler, parser.CharacterDataHandler = builder.end, builder.data
+    try:
+        parser.Parse(data, True)
+        return builder.close()
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        line = error.lineno if isinstance(error, expat.ExpatError) else None
+        why = str(error).split(": line")[0]
+        raise InputError(f"not XML: {why}", cause="the file was cut off?", path=path, line=line) from None
+
+
+def plain_tag(tag: str) -> str:
+    """A tag without its namespace's prefix."""
+    return tag.rpartition(":")[2]
+
+
+def named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
+    """All elements of a name, in order."""
+    return (element for element in root.iter() if plain_tag(element.tag) == name)
+
+
+def outermost(root: ElementTree.Element, names: set[str]) -> Iterator[ElementTree.Element]:
+    """Elements below a root with one of the names, in order; nothing inside of them is looked at.
+
+    Map formats nest none of them in itself: a file that does would be walked through once per level.
+    """
+    walk = list(reversed(root))
+    while walk:
+        element = walk.pop()
+        if plain_tag(element.tag) in names:
+            yield element
+        else:
+            walk += reversed(element)
+
 
 # Of a legend.
 _DPI = 110
@@ -42,9 +94,9 @@ def data_of(parts: Iterator[ElementTree.Element]) -> dict[str, str]:
     """Names and values of ``Data`` and ``SimpleData`` among elements."""
     tags = {}
     for part in parts:
-        if plain(part.tag) == "Data":
+        if plain_tag(part.tag) == "Data":
             tags[part.get("name", "")] = next((str(v.text or "") for v in named(part, "value")), "")
-        elif plain(part.tag) == "SimpleData":
+        elif plain_tag(part.tag) == "SimpleData":
             tags[part.get("name", "")] = str(part.text or "")
     return tags
 
@@ -64,7 +116,7 @@ def places_of(shape: ElementTree.Element) -> list[tuple[float, ...]]:
     InputError
         A coordinate that is no number, or alone; joined numbers that are not the threes of one area.
     """
-    if plain(shape.tag) == "Track":
+    if plain_tag(shape.tag) == "Track":
         cells = [str(place.text or "").split() for place in named(shape, "coord")]
     else:
         texts = " ".join(str(places.text or "") for places in named(shape, "coordinates"))

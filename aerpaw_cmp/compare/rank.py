@@ -13,18 +13,22 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, unmasked
-from .statistics.inertia import LANES, LARGEST, certain_rank
-from .statistics.intervals import (
+from .statistics import (
+    LANES,
+    LARGEST,
     NO_INTERVAL,
     REPLICATES,
+    SAME_PLACE_M,
     SEED,
     Interval,
+    Visit,
     autocorrelation,
     bootstrap_means,
+    certain_rank,
     interval,
+    same_places,
     share_interval,
 )
-from .statistics.passes import SAME_PLACE_M, Visit, same_places
 
 # Ranks of the histograms: 1 to 4 (RI of the AERPAW modems).
 MAX_RANK = 4

@@ -8,9 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray
-from .gains.spread import BAND
-from .judge.entries import crps_normal
-from .level.rss import local_mean_db
+from .gains import BAND
+from .level import crps_normal, local_mean_db
 from .offset import grid_offset
 
 # Averaging window of the second error [s].

@@ -15,16 +15,21 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed, db_from_amplitude
-from .gains.spread import StatedSpread
-from .judge.causes import Cause
-from .judge.ladder import LadderRow
-from .level.detection import DetectionScore
-from .level.field_difference import FieldAudit
-from .level.rss import LEARNED_HERE, ChannelDifference, ErrorSpan, RssComparison
-from .level.serving import ServingComparison
+from .causes import Cause
+from .gains import StatedSpread
+from .ladder import LadderRow
+from .level import (
+    LEARNED_HERE,
+    ChannelDifference,
+    DetectionScore,
+    ErrorSpan,
+    FieldAudit,
+    RssComparison,
+    ServingComparison,
+)
 from .rank import CommonestRank, RankComparison, RankRepeat
-from .ranks.forecast import ForecastScore
-from .statistics.intervals import Interval, PairedDifference
+from .receiver import ForecastScore
+from .statistics import Interval, PairedDifference
 
 # Models that a replay is held against, with their names in words; the last two know no physics.
 BASELINE_TITLE = {
@@ -110,7 +115,7 @@ class RssFurther:
     the replay is better or worse on the same samples; ``averaged`` is by simulation and window.
     ``n_outliers`` samples lie far outside the distribution of the channel's own levels: they count in all numbers but
     ``rmse_without_outliers_db``. ``identifiable_db``, ``block_length`` and the other counts are those of
-    :class:`~aerpaw_cmp.compare.level.rss.RssComparison`.
+    :class:`~aerpaw_cmp.compare.level.RssComparison`.
     """
 
     n_measured_out: int

@@ -2,34 +2,31 @@
 
 Top-level keys of flight.yaml: ``flight site timezone logs link rt rss rank report``. Unknown and duplicate keys
 are errors that name the nearest valid key. Relative paths resolve against the file's folder, or ``--logs-root``.
+
+Checked flight settings with single keys changed, in dotted form: ``rt.max_depth``, ``link.rss.tower.yaw_deg``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from copy import deepcopy
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    Field,
-    PrivateAttr,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, Field, PrivateAttr, ValidationError, field_validator, model_validator
 
 from ..common.errors import UsageError
 from ..common.files import inside
 from ..common.jsonable import named
 from ..common.outputs import check_seal
 from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, carrier_fault, noise_floor_dbm, wavelength_m
-from ..common.yamlfile import StrictModel, load_yaml, nearest_zone
+from ..common.yamlfile import StrictModel, load_yaml, nearest, nearest_zone
 from ..logs.readers import ReadOptions
 from ..logs.records import Kind
-from ..propagation.geometry.arrays import (
+from ..propagation.geometry import (
     Array,
     Link,
     Pattern,
@@ -39,10 +36,8 @@ from ..propagation.geometry.arrays import (
     uav_comparison_array,
 )
 from ..propagation.options import Diffraction
-from ..site.antenna.antennas import Isotropic
-from ..site.antenna.learned import LearnedAntenna, Written
-from ..site.antenna.pair_gain import read_pair
-from ..site.antenna.sphere_pattern import read_sphere_csv
+from ..site.antennas import Isotropic
+from ..site.learned import LearnedAntenna, Written, read_pair, read_sphere_csv
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -140,7 +135,7 @@ class ArraySettings(StrictModel):
 
 def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | None = None) -> Pattern:
     """The element pattern of the settings; files resolve against ``folder``, the carrier chooses among frequencies."""
-    from ..site.antenna import antennas
+    from ..site import antennas
 
     # a named model has no file, and none is opened for it
     file = folder / str(settings.file)
@@ -149,7 +144,7 @@ def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | No
     if settings.model == "tr38901":
         return antennas.TR38901()
     if settings.model == "file":
-        from ..site.antenna.pattern_files import read_cut_files, read_pattern_file
+        from ..site.pattern_files import read_cut_files, read_pattern_file
 
         if settings.elevation is not None:
             return read_cut_files(file, folder / settings.elevation)
@@ -554,7 +549,7 @@ def load_flight(path: str | Path) -> FlightFile:
     Returns
     -------
     FlightFile
-        The settings as they are written; :func:`aerpaw_cmp.flight.gains.memory.load_with_learned` adds the learned
+        The settings as they are written; :func:`aerpaw_cmp.flight.gains.load_with_learned` adds the learned
         antennas that they name.
 
     Raises
@@ -638,3 +633,67 @@ def _replaced(key: str, taught: Mapping[str, Any], channel: str | None = None) -
         return any("uav" in link for link in taught.values())
     link = taught.get(channel or name, {})
     return "uav" in link if tower == "uav" else "tower" in link or tower in link.get("towers", {})
+
+
+Overrides = Mapping[str, Any]
+
+
+def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
+    """Checked flight settings with dotted keys changed.
+
+    A channel that ``link.channels`` does not name starts as a copy of ``link.rss``; a tower that ``towers`` does not
+    name as a copy of ``tower``.
+
+    Raises
+    ------
+    UsageError
+        A key that flight files do not have (the nearest one is named), a value of the wrong kind.
+    """
+    if not overrides:
+        return settings
+    plain = settings.model_dump(mode="python")
+    # what copies are made of comes first, so that they have it, too
+    for key in sorted(overrides, key=lambda key: (key.startswith("link.channels."), ".towers." in key)):
+        _set(plain, key, overrides[key])
+    try:
+        other = FlightFile.model_validate(plain)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        # the message names what was typed, also where the mistake is found above or below it
+        key = next((k for k in overrides if k.startswith(where) or where.startswith(k)), where)
+        message = str(first["msg"]).removeprefix("Value error, ")
+        raise UsageError(f"the override {key!r}: found {first['input']!r} at {where}", expected=message) from None
+    # a campaign changes a channel that some of its flights do not have
+    return other.changed({}, lent={*settings.lent, *(other.link.channels.keys() - settings.link.channels.keys())})
+
+
+def _set(plain: dict[str, Any], key: str, value: Any) -> None:
+    level: Any = plain
+    holder, parts = plain, key.split(".")
+    for depth, part in enumerate(parts):
+        if not isinstance(level, dict):
+            raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which is no group of keys")
+        if part not in level:
+            _add(plain, level, parts[:depth], part, key)
+        holder, level = level, level[part]
+    holder[parts[-1]] = value
+
+
+def _add(plain: dict[str, Any], level: dict[str, Any], above: list[str], part: str, key: str) -> None:
+    """Make an entry of a mapping with free names; every other unknown key is a mistake."""
+    if above == ["link", "channels"]:
+        level[part] = deepcopy(plain["link"]["rss"])
+        return
+    if above[-1:] == ["towers"] and above[0] == "link":
+        parent: Any = plain
+        for name in above[:-1]:
+            parent = parent[name]
+        level[part] = deepcopy(parent["tower"])
+        return
+    near = nearest(part, level)
+    raise UsageError(
+        f"the override {key!r}: there is no key {part!r}" + (f" below {'.'.join(above)!r}" if above else ""),
+        expected="a key of flight.yaml in dotted form",
+        cause=f"did you mean {near!r}?" if near else None,
+    )

@@ -27,12 +27,12 @@ from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
 from ..common.yamlfile import dump_yaml
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
-from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
+from ..propagation.geometry import Link, Poses, rotation_from_aircraft
 from ..site.site import Site
 from .data import site_place
-from .pose.track import interpolated
 from .replay import replay_poses
 from .settings import FlightFile, LogSettings, PlanSettings, files_of
+from .track import interpolated
 
 # What was planted.
 _TRUTH = "truth.json"

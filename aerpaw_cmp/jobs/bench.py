@@ -15,21 +15,15 @@ import numpy as np
 from shapely import affinity
 from shapely.geometry import Point, box
 
-from ..common.counting import counted
 from ..common.errors import parsing
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import named
 from ..common.stages import Progress, begin_peak, logged, peak_mib
+from ..common.text import counted
 from ..common.units import wavelength_m
-from ..compare.judge.ladder import LadderRow, costs
+from ..compare.ladder import LadderRow, costs
 from ..propagation.check.audit import RANK_K, compare
-from ..propagation.geometry.arrays import (
-    Link,
-    Poses,
-    rotation_from_aircraft,
-    tower_comparison_array,
-    uav_comparison_array,
-)
+from ..propagation.geometry import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from ..propagation.options import Run, Search
 from ..propagation.replay import Replay, replay
 from ..propagation.scene import Scene

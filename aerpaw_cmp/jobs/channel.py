@@ -10,30 +10,29 @@ from typing import Any
 
 import numpy as np
 
-from ..common.counting import counted
+from ..common.content import union
 from ..common.errors import InputError, UsageError
 from ..common.geodesy import bearing_deg
 from ..common.jsonable import named
 from ..common.outputs import OutputFolder
-from ..common.provenance import union
 from ..common.stages import Stages
+from ..common.text import counted
 from ..common.units import FloatArray
 from ..flight.data import FlightData, load_data, unread
-from ..flight.gains.memory import load_with_learned
-from ..flight.pose.track import interpolated, velocities_mps
+from ..flight.gains import load_with_learned
 from ..flight.replay import replay_poses, valid_poses
 from ..flight.settings import FlightFile, LinkSettings
+from ..flight.track import interpolated, velocities_mps
 from ..flight.training import flight_logs
-from ..propagation.geometry.arrays import Link, Poses, rotation_from_aircraft
+from ..propagation.geometry import Link, Poses, rotation_from_aircraft
 from ..propagation.options import Job
-from ..propagation.path_table import check_band, subcarriers_hz
+from ..propagation.replay import check_band, subcarriers_hz
 from ..report.channel import FORMATS, STREAMED, Along, Channel, write_channel
 from ..report.exports import chosen_formats
-from ..site.antenna.learned import BAND
-from .prediction.sources import Source, memory_of
-from .prediction.where import TargetOptions, find_targets, target_files
-from .tasks.manifest import inputs_of_flight
-from .tasks.options import DEFAULT, JobOutcome, RunOptions
+from ..site.learned import BAND
+from .options import DEFAULT, JobOutcome, RunOptions
+from .sources import Source, TargetOptions, find_targets, memory_of, target_files
+from .tasks import inputs_of_flight
 
 _MOST_POSES = 10_000_000
 

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from ..common.cells import unguarded
+from ..common.content import KEY
 from ..common.errors import InputError, UsageError, one_line, parsing
 from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.outputs import OutputFolder, changed_files
-from ..common.provenance import KEY
+from ..common.text import unguarded
 from ..common.units import FloatArray
-from ..compare.judge import report_difference
-from ..compare.statistics.intervals import pooled_difference
+from ..compare import verdict
+from ..compare.statistics import pooled_difference
 from ..report.diff import Entry, InputEntry, ReportDiff, ReportSide
 from ..report.page import RANK_COLUMNS, RSS_COLUMNS, links_of
 
@@ -254,7 +254,7 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
 # --- samples --------------------------------------------------------------------------------------------------------
 
 
-def _matched(mine: Any, theirs: Any) -> tuple[report_difference.Overlap, Any, Any]:
+def _matched(mine: Any, theirs: Any) -> tuple[verdict.Overlap, Any, Any]:
     """Rows of two tables of one link at the same instant, in time order; several at one instant in their order."""
 
     def keyed(table: Any) -> Any:
@@ -265,9 +265,9 @@ def _matched(mine: Any, theirs: Any) -> tuple[report_difference.Overlap, Any, An
     first, second = keyed(mine), keyed(theirs)
     # most pairs: two reports of the same logs, whose join would take most of the time
     if first.index.equals(second.index):
-        return report_difference.Overlap(first=len(first), second=len(second), common=len(first)), first, second
+        return verdict.Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)
-    overlap = report_difference.Overlap(first=len(first), second=len(second), common=len(common))
+    overlap = verdict.Overlap(first=len(first), second=len(second), common=len(common))
     return overlap, first.loc[common], second.loc[common]
 
 
@@ -288,9 +288,9 @@ def _instants(table: Any) -> FloatArray:
     return np.asarray(seconds.fillna(table["time_s"]), dtype=np.float64)
 
 
-def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[report_difference.LevelDifference], list[_Residuals]]:
+def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[verdict.LevelDifference], list[_Residuals]]:
     """Each link that both have, and the residuals of its common samples."""
-    differences: list[report_difference.LevelDifference] = []
+    differences: list[verdict.LevelDifference] = []
     residuals: list[_Residuals] = []
     names = ("measured_db", "simulated_dbm", "residual_db")
     for (tower, channel), numbers in links_of(mine.metrics["rss"]).items():
@@ -304,7 +304,7 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[report_differenc
         scored = [int(table["residual_db"].notna().sum()) for table in tables]
         residuals.append((_instants(a), second[2], first[2]))  # second minus first
         differences.append(
-            report_difference.level_difference(
+            verdict.level_difference(
                 tower, channel, overlap, first, second,
                 scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]),
             )
@@ -312,7 +312,7 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[report_differenc
     return differences, residuals
 
 
-def _ranks(first: ReadReport, second: ReadReport) -> Iterator[report_difference.RankDifference]:
+def _ranks(first: ReadReport, second: ReadReport) -> Iterator[verdict.RankDifference]:
     ks = [
         c.removeprefix(_SIMULATED) for c in first.rank.columns if c.startswith(_SIMULATED) and c in second.rank.columns
     ]
@@ -322,4 +322,4 @@ def _ranks(first: ReadReport, second: ReadReport) -> Iterator[report_difference.
         overlap, a, b = _matched(*(s.rank[s.rank["tower"] == tower] for s in (first, second)))
         for k in ks:
             pairs = [(_values(t, "measured_rank"), _values(t, f"{_SIMULATED}{k}")) for t in (a, b)]
-            yield report_difference.rank_difference(tower, k, overlap, pairs[0], pairs[1])
+            yield verdict.rank_difference(tower, k, overlap, pairs[0], pairs[1])

@@ -12,25 +12,23 @@ from ..common.errors import InputError, UsageError
 from ..common.jsonable import json_object, named
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
-from ..compare.learning.locate import UNKNOWN, LevelModel, LevelTrack, NodeEstimate, locate
+from ..compare.locate import UNKNOWN, LevelModel, LevelTrack, NodeEstimate, locate
 from ..flight.data import check_place, choose_site, is_ratio, read_logs, site_place
 from ..flight.drafting.draft import receiver_floor_db
-from ..flight.drafting.node import Placer
-from ..flight.drafting.remembered import taught
-from ..flight.gains.learned_gain import spread_of
-from ..flight.gains.memory import load_with_learned
-from ..flight.marks import mark_of
-from ..flight.rows.lock import LOCK_FLOOR_DB, is_sounder_power
+from ..flight.drafting.proposals import Placer, taught
+from ..flight.gains import load_with_learned, spread_of
+from ..flight.rows import LOCK_FLOOR_DB, is_sounder_power
 from ..flight.settings import FlightFile
+from ..flight.training import mark_of
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream
 from ..report.locate import write_locate
 from ..report.page import Made, about
-from ..site.antenna.antennas import MeasuredPattern
-from ..site.antenna.sphere_pattern import SpherePattern
+from ..site.antennas import MeasuredPattern
+from ..site.learned import SpherePattern
 from ..site.site import Site
-from .tasks.manifest import inputs_of_flight
-from .tasks.options import DEFAULT, JobOutcome, RunOptions
+from .options import DEFAULT, JobOutcome, RunOptions
+from .tasks import inputs_of_flight
 
 
 def run_locate(flight: Path, options: RunOptions = DEFAULT, channel: str | None = None) -> JobOutcome:

@@ -12,25 +12,23 @@ import numpy as np
 import pandas as pd
 
 from ..common.cf import library
-from ..common.counting import counted
 from ..common.errors import UsageError, from_python
-from ..common.htmltable import html_table
 from ..common.jsonable import named
+from ..common.text import counted, html_table
 from ..common.units import ComplexArray, FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.result import FlightResult
 from ..flight.data import FlightData, gather, load_data, rank_positions
 from ..flight.drafting.draft import draft, flights_by_name
-from ..flight.gains.memory import with_learned
-from ..flight.overrides import overridden
+from ..flight.gains import with_learned
 from ..flight.replay import FlightReplay, Replayed, replay_flight
-from ..flight.settings import FlightFile, load_flight
+from ..flight.settings import FlightFile, load_flight, overridden
 from ..logs.flight_file import is_flight_file
 from ..logs.ingest import ingest
-from ..propagation.geometry.paths import PathSet
+from ..propagation.geometry import PathSet
 from ..site.site import Site
-from .reporting.compare_flight import compare_flight
-from .tasks.options import RunOptions
+from .compare_flight import compare_flight
+from .options import RunOptions
 
 # Tower and channel of an RSS series; tower and ``"rank"`` of a rank series.
 Series = tuple[str, str]

@@ -11,14 +11,14 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from ..common.counting import counted
 from ..common.errors import UsageError, noting_interrupts
 from ..common.files import cache_folder
-from ..common.inputs import input_files
 from ..common.jsonable import json_safe
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import PlannedStage, Stages
-from .tasks.options import DEFAULT, JobOutcome, RunOptions
+from ..common.text import counted
+from ..common.yamlfile import input_files
+from .options import DEFAULT, JobOutcome, RunOptions
 
 _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
 
@@ -86,7 +86,7 @@ def run_ingest(
     from ..logs.flight_file import fill, is_flight_file
     from ..logs.ingest import ingest, summary
     from ..logs.readers import ReadOptions
-    from ..logs.text.clocks import zone
+    from ..logs.text import zone
 
     if name := options.get("timezone"):
         zone(name, needed_by="--timezone")  # misspelt, it is no fault of the first log
@@ -158,9 +158,9 @@ def run_simulate(flight: Path, options: RunOptions = DEFAULT) -> JobOutcome:
         As :meth:`aerpaw_cmp.flight.simulate.FlightSimulator.run`.
     """
     from ..flight.data import choose_site
-    from ..flight.gains.memory import load_with_learned
+    from ..flight.gains import load_with_learned
     from ..flight.simulate import FlightSimulator
-    from .tasks.manifest import inputs_of_flight
+    from .tasks import inputs_of_flight
 
     settings = load_with_learned(flight)
     site = choose_site(settings.site, flight.parent)
@@ -221,15 +221,14 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     JobOutcome
     """
     from ..flight.data import load_data
+    from ..flight.gains import foliage_notes
     from ..flight.replay import replay_flight
     from ..flight.settings import load_flight
     from ..report.columns import metrics as metrics_of
     from ..report.flight import write_report
     from ..report.flight_data import pose_paths, report_data
-    from .reporting.flight_run import report_stages, run_flight
-    from .reporting.foliage_notes import foliage_notes
-    from .reporting.ladder import check_recommended, recommended_text
-    from .tasks.manifest import other_inputs
+    from .flight_run import check_recommended, recommended_text, report_stages, run_flight
+    from .tasks import other_inputs
 
     formats = _checked(flight, chosen, options)
     settings, inputs, folder = _report_inputs(flight, chosen, options)
@@ -245,12 +244,12 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             data = load_data(settings, flight.parent, options.logs_root)
             before = None
             if own := [path for path in chosen.against if (path / "prediction.csv").is_file()]:
-                from .prediction.against import score_against  # loads what calibration and prediction need
+                from .predict import score_against  # loads what calibration and prediction need
 
                 before = score_against(data, own[0])
             given = []
             if chosen.against:
-                from .prediction.foreign import read_foreign
+                from .referee import read_foreign
 
                 given = [read_foreign(path, data) for path in chosen.against]
         if chosen.recommend is not None:
@@ -271,7 +270,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
             record = replace(record, against=before, extra_metrics=extra)
         cards: list[dict[str, Any]] = []
         if given:
-            from .prediction.referee import judged
+            from .referee import judged
 
             with stages("score predictions"):
                 verdicts = judged(data, flight_run.result, given, chosen.against_distance_m)
@@ -316,8 +315,8 @@ def _checked(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[
 
 def _report_inputs(flight: Path, chosen: ReportOptions, options: RunOptions) -> tuple[Any, list[Path], Path]:
     """Settings with what the command line says instead, files that they name, folder of the results."""
-    from ..flight.gains.memory import load_with_learned
-    from .tasks.manifest import inputs_of_flight
+    from ..flight.gains import load_with_learned
+    from .tasks import inputs_of_flight
 
     learned = None if chosen.learned is None else Path(chosen.learned)
     settings = _with_audit(load_with_learned(flight, learned), chosen.audit)
@@ -395,8 +394,8 @@ def run_site_import(
     list of str
         A line per thing that was done.
     """
-    from ..site.antenna.learned import carry_memory
-    from ..site.imports.footprints import import_site, site_yaml
+    from ..site.footprints import import_site, site_yaml
+    from ..site.learned import carry_memory
 
     inputs = [*files, *([] if base is None else [Path(base)])]
     with OutputFile(out, own=is_sealed, inputs=inputs, force=force) as output:
@@ -422,8 +421,7 @@ def run_site_show(site: str, options: RunOptions = DEFAULT) -> JobOutcome:
     JobOutcome
     """
     from ..report.site import write_site_view
-    from ..site.inputs import inputs_of_site
-    from ..site.siteyaml import load_site
+    from ..site.siteyaml import inputs_of_site, load_site
 
     out = options.out or Path("reports") / f"site-{Path(site).stem}"
     with OutputFolder(out, job="site show", inputs=inputs_of_site(site), force=options.force) as output:
@@ -461,12 +459,11 @@ def run_map(
     """
     from ..maps.grid import Grid
     from ..report.maps import maps_metrics, write_maps
-    from ..site.inputs import inputs_of_site
-    from ..site.siteyaml import load_site
-    from .mapping import coverage_map as mapping
-    from .mapping.paper_table import paper_markdown, paper_rows
-    from .prediction.sources import files_of, named_flights
-    from .tasks.workers import open_workers
+    from ..site.siteyaml import inputs_of_site, load_site
+    from . import coverage_map as mapping
+    from .paper_table import paper_markdown, paper_rows
+    from .sources import files_of, named_flights
+    from .tasks import open_workers
 
     # before the site: a misspelt flight is told without reading a map
     known = named_flights(flights)
@@ -486,7 +483,7 @@ def run_map(
                 store=folder.with_name(f"{folder.name}.zarr"), force=options.force,
             )  # fmt: skip
         if flights:
-            from .prediction.corrected_map import corrected_maps
+            from .predict import corrected_maps
 
             heights = settings.rss_altitudes_m, settings.rank_altitudes_m
             outcome.corrected = corrected_maps(site, settings.spacing_m, heights, known, options.logs_root, stages)
@@ -511,7 +508,7 @@ def run_map(
 def _compared(flight: Any, options: RunOptions, stages: Stages) -> Any:
     """A flight replayed and compared, for the figures of a map."""
     from ..report.flight_data import report_data
-    from .reporting.flight_run import run_flight
+    from .flight_run import run_flight
 
     data = flight.load(options.logs_root)
     return report_data(data, run_flight(data, stages, audit=False).result)
@@ -547,10 +544,9 @@ def run_campaign(
         A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
     """
     from ..report.campaign import campaign_metrics, warnings, write_campaign
-    from .campaigns.campaign import load_campaign
-    from .campaigns.campaign import run as run_all
-    from .campaigns.season import find_reports, soundings, with_season
-    from .tasks.manifest import inputs_of_flights
+    from .campaign import find_reports, load_campaign, soundings, with_season
+    from .campaign import run as run_all
+    from .tasks import inputs_of_flights
 
     if fresh and keep is not None:
         raise UsageError("--fresh and --keep", expected="one of them: --fresh neither reads nor writes a folder")
@@ -623,13 +619,12 @@ def run_calibrate(
     JobOutcome
         The settings file is the first of its ``files``.
     """
-    from ..site.antenna.learned import read_learned, remember
-    from ..site.inputs import inputs_of_site
-    from ..site.siteyaml import site_model
-    from .learning.calibrate import calibrate, load_calibration, read_flights
-    from .learning.calibrate_rank import fit_rank, samples_by_tower
-    from .learning.calibration_files import Calibrated, site_entry, write_files
-    from .tasks.manifest import inputs_of_flights
+    from ..site.learned import read_learned, remember
+    from ..site.siteyaml import inputs_of_site, site_model
+    from .calibrate import calibrate, load_calibration, read_flights
+    from .calibrate_rank import fit_rank, samples_by_tower
+    from .calibration_files import Calibrated, site_entry, write_files
+    from .tasks import inputs_of_flights
 
     settings = load_calibration(path, further)
     if into_site is not None:

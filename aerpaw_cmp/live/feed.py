@@ -20,9 +20,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from ..logs.files.checksums import Record
-from .serial.modem import RI_QUERY
-from .session import TapStatus
+from ..logs.files import Record
+from .modem import RI_QUERY
+from .ports import TapStatus
 
 # Rows that stay: two hours at 10 Hz, ten at 2 Hz.
 ROWS = 72_000

@@ -1,7 +1,7 @@
 """The tap: polls the modem, writes every answer down, survives what happens in a field.
 
 One polling thread, one command in flight. A record is in the kernel's hands before the next command goes out, unless
-the disk stalls (:class:`~aerpaw_cmp.live.record.log.LogWriter`). The port may vanish and come back under another
+the disk stalls (:class:`~aerpaw_cmp.live.log.LogWriter`). The port may vanish and come back under another
 number, the disk may fill, the clock may step, signals may come: each leaves its own record, and the polling goes on.
 """
 
@@ -19,15 +19,40 @@ from typing import Any
 
 from ..common.errors import InputError
 from ..common.versions import tool_version
-from ..logs.files.checksums import SCHEMA, Record
+from ..logs.files import SCHEMA, Record
+from .log import Clock, LogWriter, SegmentLog, boot_id, clock_synchronised
+from .modem import (
+    OTHER_QUERIES,
+    QUERIES,
+    RI_QUERY,
+    Answer,
+    Decoded,
+    Event,
+    Framer,
+    Late,
+    Redactor,
+    Unsolicited,
+    csi_write,
+    decode,
+    encode,
+    is_unsolicited,
+)
+from .ports import (
+    PortGoneError,
+    PortInfo,
+    Schedule,
+    SerialPort,
+    StatusNotifier,
+    Stop,
+    TapSettings,
+    TapStatus,
+    TapSummary,
+    find_candidates,
+    find_port,
+    format_status,
+    modem_manager,
+)
 from .predict import Asked, Predict, PredictionWorker
-from .record.log import Clock, LogWriter, SegmentLog, boot_id, clock_synchronised
-from .schedule import Schedule
-from .serial.framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
-from .serial.modem import OTHER_QUERIES, QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
-from .serial.ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
-from .session import StatusNotifier, TapSettings, TapStatus, TapSummary, format_status
-from .stop import Stop
 
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status"]
 

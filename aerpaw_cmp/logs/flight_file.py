@@ -30,8 +30,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..common.errors import InputError, parsed, parsing
 from ..common.jsonable import named
-from ..common.outputs import OutputFile
-from ..common.sink import Sink
+from ..common.outputs import OutputFile, Sink
 from .records import ReadResult, RejectedLine, RejectedReason, Stream
 
 if TYPE_CHECKING:

@@ -14,13 +14,11 @@ from zoneinfo import ZoneInfo
 
 import pandas as pd
 
-from ..common.counting import counted
 from ..common.errors import InputError, from_python
-from ..common.htmltable import html_table
+from ..common.text import counted, html_table
 from .flight_file import IngestedFile, write_flight
 from .ingest import Ingested, account_notes, ingest, summary
-from .origins import named_tower
-from .readers import ReadOptions
+from .readers import ReadOptions, named_tower
 
 # A file, a folder, a pattern such as ``"logs/*.txt"``, or an open binary file; ``~`` is the home folder.
 Source: TypeAlias = str | os.PathLike[str] | BinaryIO

@@ -15,11 +15,13 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..common.counting import counted
 from ..common.errors import AerpawCmpError, InputError, UsageError, one_line, parsing
 from ..common.jsonable import named
 from ..common.stages import duration
-from .files import archives, chunks, packed
+from ..common.text import counted
+from . import files as archives
+from . import files as chunks
+from . import files as packed
 from .flight_file import IngestedFile, read_flight
 from .readers import (
     DEEP_BYTES,
@@ -101,7 +103,7 @@ def read_head(place: Path) -> bytes:
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
     """Content of a packed file, other content as it is."""
     most = min(MAX_BYTES, archives.most_bytes(len(raw)))
-    return raw if packed.form(raw) is None else packed.unpacked(raw, path, most)
+    return raw if packed.packed_form(raw) is None else packed.unpacked(raw, path, most)
 
 
 def _raw(place: Path, limit: int | None = None) -> bytes:
@@ -240,11 +242,11 @@ _present, _is_folder = os.path.exists, os.path.isdir
 
 def exists(path: Path) -> bool:
     """Check whether a path names a file, a folder, or a member of an archive."""
-    return _present(path) or archives.inside(path) is not None
+    return _present(path) or archives.path_in_archive(path) is not None
 
 
 def _part_of(path: Path) -> tuple[Path, str] | None:
-    return None if _present(path) else archives.inside(path)
+    return None if _present(path) else archives.path_in_archive(path)
 
 
 def sniffers_of(path: Path) -> list[str]:
@@ -255,7 +257,7 @@ def sniffers_of(path: Path) -> list[str]:
         return [reader.name for reader in claims(_beginning(path)) if reader.kinds]
     if _in_flight_file(path) is not None:
         return []  # a flight file knows the reader of each log
-    content = archives.members(read_bytes(part[0])[0], part[0])
+    content = archives.archive_members(read_bytes(part[0])[0], part[0])
     data = as_utf8(content[part[1]].read(DEEP_BYTES)) if part[1] in content else b""
     return [reader.name for reader in claims(data) if reader.kinds]
 
@@ -263,7 +265,7 @@ def sniffers_of(path: Path) -> list[str]:
 def _beginning(place: Path, count: int = DEEP_BYTES) -> bytes:
     """The first bytes of a log, unpacked and as UTF-8; none of a damaged packed file."""
     head = _raw(place, count)
-    return as_utf8(head if packed.form(head) is None else packed.head_of(place, count))
+    return as_utf8(head if packed.packed_form(head) is None else packed.head_of(place, count))
 
 
 # Logs of flight files that were read, by the flight file.
@@ -370,7 +372,7 @@ def _archive(place: Path, options: _OptionsFor | None, chosen: Reader | None) ->
     """All logs of an archive; what cannot be read is reported, not fatal."""
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
-    content = archives.members(read_bytes(place)[0], place)
+    content = archives.archive_members(read_bytes(place)[0], place)
     if "xl/workbook.xml" in content:
         raise InputError("a spreadsheet (.xlsx)", expected="its table saved as CSV", path=place)
     for name, member in content.items():
@@ -392,7 +394,12 @@ def _member(
     """One file of an archive; what its first bytes show to be no log is not unpacked."""
     # only the beginning: a data set holds recordings of GiB beside its logs
     head = member.read(DEEP_BYTES)
-    if chosen is None and member.size > DEEP_BYTES and packed.form(head) is None and not archives.is_archive(head):
+    if (
+        chosen is None
+        and member.size > DEEP_BYTES
+        and packed.packed_form(head) is None
+        and not archives.is_archive(head)
+    ):
         chosen = identify(as_utf8(head), path=str(path))
     unpacked = _unpacked(member.read(None), path)
     digest = hashlib.sha256(unpacked).hexdigest()
@@ -423,7 +430,7 @@ def read_file(path: str | Path, *, options: _OptionsFor | None = None, reader: R
         archive, name = part
         if _in_flight_file(place) is not None:
             return _of_kind(_source(archive, name), reader, archive)
-        content = archives.members(read_bytes(archive)[0], archive)
+        content = archives.archive_members(read_bytes(archive)[0], archive)
         if name not in content:
             raise InputError(f"the archive has no member {name!r}", cause="a misspelt path", path=archive)
         return _member(place, content[name], content, options, reader)
@@ -535,11 +542,11 @@ def _read(
 
 def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[], ReadResult]) -> ReadResult:
     """Result of a reader, its impossible values flagged; messages name the file, which readers do not know."""
-    from . import limits, origins  # load pandas, as any reader does
+    from . import limits, readers  # load pandas, as any reader does
 
     expected, cause = f"lines such as {reader.sample!r}", "a log of another kind, or a damaged one"
     with parsing(path, expected, cause), blaming(reader.plugin, f"reader {reader.name!r} read it", InputError):
-        result = origins.stated(limits.check(_later(read(), options.gps_rollovers)), reader, options)
+        result = readers.stated(limits.check(_later(read(), options.gps_rollovers)), reader, options)
     if not result.accepted:
         first = f": {result.rejected[0].reason}" if result.rejected else ""
         raise InputError(

@@ -28,9 +28,9 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..common import kml
-from ..common.counting import counted
 from ..common.errors import InputError, parsing
-from ..common.xmlfiles import named, outermost, plain, xml_root
+from ..common.kml import named, outermost, plain_tag, xml_root
+from ..common.text import counted
 from . import dictionary
 from .ingest import as_utf8, read_bytes, read_file, read_head
 from .readers import HEAD_BYTES, ReadOptions, claims
@@ -312,7 +312,7 @@ def _kml(data: bytes) -> _Route:
     """Lines and tracks of a map; where it has none, its points in their order."""
     root = _root(data)
     shapes = list(outermost(root, {"LineString", "Point", "Track"}))
-    lines = [shape for shape in shapes if plain(shape.tag) != "Point"]
+    lines = [shape for shape in shapes if plain_tag(shape.tag) != "Point"]
     if not lines and len(shapes) < 2:
         what = "a geofence, which has areas alone" if any(named(root, "Polygon")) else "a map without a line"
         raise InputError(f"no route: {what}", expected="a KML with a line (LineString, gx:Track) or points")

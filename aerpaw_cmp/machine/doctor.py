@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import Any, Literal
 
 from ..common import versions
-from ..common.counting import counted
 from ..common.errors import AerpawCmpError
 from ..common.files import cache_folder
-from ..propagation.native import llvm
+from ..common.text import counted
+from ..propagation import llvm
 
 Status = Literal["ok", "warn", "fail"]
 
@@ -209,7 +209,7 @@ def readers_check() -> Check:
 def holders(device: str) -> list[str]:
     """Processes that have a device open, as ``name (pid)``; those of other users are visible to root only."""
     try:
-        from ..live.serial import ports
+        from ..live import ports
     except ImportError:  # no termios: not a system that the tap runs on
         return []
     return [f"{holder.name} ({holder.pid})" for holder in ports.holders(Path(device), others_only=False)]

@@ -1,19 +1,332 @@
-"""Quality of an interpolator: the paper's leave-one-out, and tests in which neighbours do not give the answer away.
+"""Baselines that Kriging is measured against.
+
+The paper's two (arXiv 2502.10324, section VI-C): the samples near a target are sorted by position index, and a
+one-dimensional interpolant over the index is read at the target's index. They follow MATLAB's ``interp1`` with
+``'extrap'``:
+
+- ``spline``: cubic with not-a-knot ends; three samples give the parabola, two the line.
+- ``makima``: modified Akima piecewise cubic Hermite; two samples give the line.
+
+Beyond the first and last sample the end piece is continued; one sample gives its value, none NaN.
+
+A reader will ask for three more: the nearest sample, inverse distance, and the mean over the area that a tower serves.
+All classes share ``fit(points_m, values)``, ``predict(targets_m)`` and ``leave_one_out()`` with
+:class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`; none knows its error, so the variance they return is NaN.
+
+Quality of an interpolator: the paper's leave-one-out, and tests in which neighbours do not give the answer away.
 
 Errors are in the unit of the field (rank, dB). Rank is not rounded: the paper's MAE (section VII-C) compares the
 interpolated number. A position without a value (NaN, out of coverage) or without an estimate is not scored.
+
+Correlation and interpolation of maps: the paper's comparison (section VII-C).
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import UsageError
 from ..common.units import FloatArray, IntArray, unmasked
+from . import kriging, variogram
+from .grid import Grid, MapResult, serving_tower
+from .kriging import OrdinaryKriging, coverage_patterns
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+
+# Targets whose samples are stacked at once; bounds the memory.
+CHUNK = 512
+
+
+# --- pure functions, batched ----------------------------------------------------------------------------------------
+
+
+def makima(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
+    """Modified Akima interpolation, one curve per row.
+
+    Parameters
+    ----------
+    index : (..., m)
+        Distinct abscissae in any order, m >= 1.
+    values : (..., m, fields)
+        Ordinates.
+    at : (...)
+        One abscissa per row; outside the data the end piece is continued.
+
+    Returns
+    -------
+    ndarray, (..., fields)
+
+    References
+    ----------
+    .. [1] Akima, J. ACM 17 (1970) 589, doi:10.1145/321607.321609; the modification is that of MATLAB's ``makima``.
+
+    Examples
+    --------
+    >>> makima([[3.0, 1.0, 2.0]], [[[9.0], [1.0], [4.0]]], [4.0]).shape
+    (1, 1)
+    """
+    x, y, at = _sorted(index, values, at)
+    m = x.shape[-1]
+    if m == 1:
+        return y[..., 0, :]
+    slope = np.diff(y, axis=-2) / np.diff(x, axis=-1)[..., None]
+    tangent = np.repeat(slope, 2, axis=-2) if m == 2 else _makima_tangents(slope)
+    return _hermite(x, y, tangent, at)
+
+
+def _makima_tangents(slope: FloatArray) -> FloatArray:
+    """Tangents (..., m, fields) from slopes (..., m - 1, fields), m >= 3."""
+    # Akima's two further slopes at each end: those of a parabola through the last samples
+    before = 2 * slope[..., :1, :] - slope[..., 1:2, :]
+    after = 2 * slope[..., -1:, :] - slope[..., -2:-1, :]
+    padded = np.concatenate(
+        [2 * before - slope[..., :1, :], before, slope, after, 2 * after - slope[..., -1:, :]], axis=-2
+    )
+    # the term with the sum is MATLAB's: Akima's own weights overshoot where data turn flat
+    weight = np.abs(np.diff(padded, axis=-2)) + np.abs(padded[..., 1:, :] + padded[..., :-1, :]) / 2
+    left, right = weight[..., 2:, :], weight[..., :-2, :]
+    total = left + right
+    some = total > 0
+    # both weights vanish only where the data are flat on both sides: the tangent is 0 there
+    mixed = left * padded[..., 1:-2, :] + right * padded[..., 2:-1, :]
+    return np.where(some, mixed / np.where(some, total, 1.0), 0.0)
+
+
+def spline(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
+    """Cubic spline with not-a-knot ends, one curve per row; shapes as in :func:`makima`."""
+    x, y, at = _sorted(index, values, at)
+    m = x.shape[-1]
+    if m == 1:
+        return y[..., 0, :]
+    step = np.diff(x, axis=-1)
+    slope = np.diff(y, axis=-2) / step[..., None]
+    if m == 2:
+        tangent = np.repeat(slope, 2, axis=-2)
+    elif m == 3:
+        tangent = _parabola_tangents(step, slope)
+    else:
+        tangent = _not_a_knot_tangents(step, slope)
+    return _hermite(x, y, tangent, at)
+
+
+def _parabola_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
+    first, second = step[..., :1, None], step[..., 1:, None]
+    bend = (slope[..., 1:, :] - slope[..., :1, :]) / (first + second)
+    start = slope[..., :1, :] - bend * first
+    return np.concatenate([start, start + 2 * bend * first, start + 2 * bend * (first + second)], axis=-2)
+
+
+def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
+    """Tangents of the C2 cubic whose first two and last two pieces are one polynomial each (de Boor, chapter IV)."""
+    rows, m = step.shape[:-1], step.shape[-1] + 1
+    system = np.zeros((*rows, m, m))
+    inner = np.arange(1, m - 1)
+    system[..., inner, inner - 1] = step[..., 1:]
+    system[..., inner, inner] = 2 * (step[..., :-1] + step[..., 1:])
+    system[..., inner, inner + 1] = step[..., :-1]
+    right = np.empty((*rows, m, slope.shape[-1]))
+    h = step[..., None]
+    right[..., 1:-1, :] = 3 * (h[..., 1:, :] * slope[..., :-1, :] + h[..., :-1, :] * slope[..., 1:, :])
+    for end, a, b in ((0, 0, 1), (m - 1, -1, -2)):
+        near, far = step[..., a], step[..., b]
+        span = near + far
+        system[..., end, end] = far
+        system[..., end, 1 if end == 0 else m - 2] = span
+        right[..., end, :] = (
+            (near + 2 * span)[..., None] * far[..., None] * slope[..., a, :] + near[..., None] ** 2 * slope[..., b, :]
+        ) / span[..., None]
+    # dense, since NumPy solves a stack of small systems at once and SciPy's banded solver one at a time
+    return np.asarray(np.linalg.solve(system, right))
+
+
+def _hermite(x: FloatArray, y: FloatArray, tangent: FloatArray, at: FloatArray) -> FloatArray:
+    """Piecewise cubic Hermite at one abscissa per row; the end pieces continue outside."""
+    m = x.shape[-1]
+    # clipped: beyond the data the end piece is continued, as interp1 with 'extrap' does
+    piece = np.clip((x <= at[..., None]).sum(axis=-1) - 1, 0, m - 2)[..., None]
+    left, right = np.take_along_axis(x, piece, -1), np.take_along_axis(x, piece + 1, -1)
+    low, high = piece[..., None], piece[..., None] + 1
+    y0, y1 = np.take_along_axis(y, low, -2)[..., 0, :], np.take_along_axis(y, high, -2)[..., 0, :]
+    t0, t1 = np.take_along_axis(tangent, low, -2)[..., 0, :], np.take_along_axis(tangent, high, -2)[..., 0, :]
+    h = right - left
+    u = (at[..., None] - left) / h
+    # by differences from the left sample, so that equal samples come back to the last digit
+    rise = y1 - y0
+    return np.asarray(y0 + u * (h * t0 + u * (3 * rise - h * (2 * t0 + t1) + u * (h * (t0 + t1) - 2 * rise))))
+
+
+def _sorted(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    x = unmasked(index)
+    y = unmasked(values)
+    if y.ndim != x.ndim + 1 or y.shape[:-1] != x.shape or x.shape[-1] < 1:
+        raise UsageError(
+            f"index of shape {x.shape}, values of shape {y.shape}", expected="(..., m) and (..., m, fields)"
+        )
+    order = np.argsort(x, axis=-1, kind="stable")
+    x = np.take_along_axis(x, order, -1)
+    if (np.diff(x, axis=-1) <= 0).any():
+        raise UsageError("two samples with the same position index", expected="distinct positions")
+    return x, np.take_along_axis(y, order[..., None], -2), unmasked(at)
+
+
+# --- predictors -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Near:
+    """Input of an interpolant at t targets: m samples each (t, m, dims), their values (t, m, fields), distances."""
+
+    points_m: FloatArray
+    values: FloatArray
+    distance_m: FloatArray
+    targets_m: FloatArray
+
+
+@dataclass(eq=False, kw_only=True)
+class _Local:
+    """Samples, neighbours and field-by-field handling of NaN, shared by the predictors that use near samples."""
+
+    neighbours: int = 20
+    radius_m: float = 150.0
+    selection: Literal["nearest", "random"] = "nearest"
+    seed: int = 0
+
+    def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
+        """Store samples (n, dims) with values (n,) or (n, fields); NaN is out of coverage."""
+        self.points_m_ = unmasked(points_m)
+        fields = unmasked(values)
+        if len(fields) != len(self.points_m_):
+            raise UsageError(f"{len(fields)} values for {len(self.points_m_)} points")
+        self._one_field = fields.ndim == 1
+        self.values_ = fields[:, None] if self._one_field else fields
+        return self
+
+    def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Estimate at targets (t, dims), ``(t,)`` or ``(t, fields)``, and NaN for the variance."""
+        return self._estimate(unmasked(targets_m), leave_out=False)
+
+    def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
+        """Estimate at each sample from the others, and NaN for the variance."""
+        return self._estimate(self.points_m_, leave_out=True)
+
+    def _estimate(self, targets: FloatArray, *, leave_out: bool) -> tuple[FloatArray, FloatArray]:
+        estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
+        for covered, columns in coverage_patterns(self.values_):
+            samples, values = self.points_m_[covered], self.values_[np.ix_(covered, columns)]
+            skip = kriging.renumbered(covered) if leave_out else None
+            estimate[:, columns] = self._one_pattern(samples, values, targets, skip)
+        estimate = estimate[:, 0] if self._one_field else estimate
+        return estimate, np.full_like(estimate, np.nan)
+
+    def _one_pattern(
+        self, samples: FloatArray, values: FloatArray, targets: FloatArray, skip: IntArray | None
+    ) -> FloatArray:
+        chosen = kriging.by_rule(self, samples, targets, skip)
+        estimate = np.full((len(targets), values.shape[1]), np.nan)
+        count = chosen.count
+        for m in np.unique(count[count > 0]):
+            same = np.flatnonzero(count == m)
+            for start in range(0, len(same), CHUNK):
+                rows = same[start : start + CHUNK]
+                index = chosen.index[rows, :m]
+                estimate[rows] = self._combine(
+                    _Near(samples[index], values[index], chosen.distance_m[rows, :m], targets[rows])
+                )
+        return estimate
+
+    def _combine(self, near: _Near) -> FloatArray:
+        """Estimate (t, fields)."""
+        raise NotImplementedError
+
+
+@dataclass(eq=False)
+class IndexInterpolation(_Local):
+    """The paper's baselines: spline or makima over the position index of the M samples within the radius.
+
+    Parameters
+    ----------
+    kind : {"spline", "makima"}
+        The interpolant.
+    grid : Grid
+        Gives each sample and target its index; all must lie on distinct cells.
+    neighbours, radius_m, selection, seed
+        As in :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`.
+    """
+
+    kind: Literal["spline", "makima"]
+    grid: Grid
+
+    def _combine(self, near: _Near) -> FloatArray:
+        curve: Callable[..., FloatArray] = {"spline": spline, "makima": makima}[self.kind]
+        index, at = self.grid.index_of(near.points_m), self.grid.index_of(near.targets_m)
+        if (index < 0).any() or (at < 0).any():
+            raise UsageError("a point outside the grid has no position index", expected="points on the grid")
+        return curve(index, near.values, at)
+
+
+class InverseDistance(_Local):
+    """Mean weighted by the inverse square of distance (Shepard 1968, doi:10.1145/800186.810616); exact at samples."""
+
+    def _combine(self, near: _Near) -> FloatArray:
+        at = near.distance_m < kriging.TIE_M
+        # relative to the nearest, so that nothing overflows
+        ratio = near.distance_m[:, :1] / np.where(at, 1.0, near.distance_m)
+        weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**2)
+        weight /= weight.sum(axis=1, keepdims=True)
+        # relative to one sample, so that equal values stay equal
+        first = near.values[:, :1]
+        return np.asarray(first[:, 0] + (weight[:, :, None] * (near.values - first)).sum(axis=1))
+
+
+class ServingTowerMean:
+    """Mean of all samples in the area of the target's serving tower.
+
+    Parameters
+    ----------
+    towers_m : (towers, 2+)
+        East, north [m].
+    """
+
+    def __init__(self, towers_m: ArrayLike) -> None:
+        self.towers_m = towers_m
+
+    def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
+        """Sum the samples (n, dims) with values (n,) or (n, fields) by tower; NaN does not count."""
+        fields = unmasked(values)
+        self._one_field = fields.ndim == 1
+        self.values_ = fields[:, None] if self._one_field else fields
+        self.tower_ = serving_tower(points_m, self.towers_m)
+        finite = np.isfinite(self.values_)
+        towers = len(np.asarray(self.towers_m))
+        self.total_ = np.zeros((towers, self.values_.shape[1]))
+        self.count_ = np.zeros_like(self.total_)
+        # not +=, which adds once where an index repeats
+        np.add.at(self.total_, self.tower_, np.where(finite, self.values_, 0.0))
+        np.add.at(self.count_, self.tower_, finite)
+        return self
+
+    def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Mean of each target's tower, NaN for a tower without samples, and NaN for the variance."""
+        tower = serving_tower(targets_m, self.towers_m)
+        return self._mean(self.total_[tower], self.count_[tower])
+
+    def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
+        """The same without the sample itself."""
+        finite = np.isfinite(self.values_)
+        total = self.total_[self.tower_] - np.where(finite, self.values_, 0.0)
+        return self._mean(total, self.count_[self.tower_] - finite)
+
+    def _mean(self, total: FloatArray, count: FloatArray) -> tuple[FloatArray, FloatArray]:
+        mean = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+        mean = mean[:, 0] if self._one_field else mean
+        return mean, np.full_like(mean, np.nan)
 
 
 class Predictor(Protocol):
@@ -121,3 +434,96 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
         if not test.all():
             estimate[test], _ = model.fit(points[~test], flat[~test]).predict(points[test])
     return score(data, estimate.reshape(data.shape))
+
+
+# The paper's nine altitudes of interpolation begin here; its 3 m are for blockage alone.
+LOWEST_M = 30.0
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """The paper's section VII-C on maps: correlation, curve, and leave-one-out errors of each interpolator.
+
+    Parameters
+    ----------
+    correlation : BinnedCorrelation
+        Of the positions' vectors.
+    fit : BiExponential
+        The curve through it.
+    scores : mapping of str to Score
+        "Kriging", "makima", "spline" (the paper's), "nearest", "inverse distance", "serving-tower mean"; arrays of
+        shape (altitudes, K).
+    """
+
+    correlation: variogram.BinnedCorrelation
+    fit: variogram.BiExponential
+    scores: Mapping[str, Score]
+
+
+def rank_fields(
+    result: MapResult, out_of_coverage: Literal["missing", "zero"] = "missing"
+) -> tuple[tuple[float, ...], FloatArray]:
+    """Altitudes and joint ranks (n, altitudes, K) to interpolate, from 30 m on: the paper leaves 3 m out.
+
+    ``out_of_coverage``: a rank of 0 becomes NaN (no sample), or stays the number 0.
+
+    Source: arXiv 2502.10324 eq. 7; arXiv 2502.10324 eq. 8.
+    """
+    rows = [i for i, height in enumerate(result.rank_altitudes_m) if height >= LOWEST_M]
+    rank = np.moveaxis(result.ranks()[rows], -1, 0).astype(np.float64)
+    heights = tuple(result.rank_altitudes_m[i] for i in rows)
+    return heights, np.where(rank > 0, rank, np.nan) if out_of_coverage == "missing" else rank
+
+
+def interpolation_study(
+    grid: Grid,
+    values: FloatArray,
+    towers_m: FloatArray,
+    *,
+    neighbours: int = 20,
+    radius_m: float = 150.0,
+    selection: Literal["nearest", "random"] = "nearest",
+    seed: int = 0,
+) -> Study:
+    """Correlation and leave-one-out interpolation of maps.
+
+    Parameters
+    ----------
+    grid : Grid
+        Positions.
+    values : (n, altitudes, K)
+        Rank or RSS; NaN out of coverage. For RSS the last axis may hold towers.
+    towers_m : (towers, 2+)
+        For the serving-tower mean.
+    neighbours, radius_m, selection, seed
+        M, r0 and the choice of samples, the same for every local interpolator.
+
+    Returns
+    -------
+    Study
+        The correlation and its fit, scores of every interpolator.
+    """
+    points = grid.points_m
+    # bins as wide as the grid's step, as the paper's are: narrower ones would be empty
+    correlation = variogram.vector_correlation(points, values, width_m=grid.spacing_m)
+    fit = _curve(correlation)
+    rule: dict[str, Any] = {"neighbours": neighbours, "radius_m": radius_m, "selection": selection, "seed": seed}
+    models: dict[str, Predictor] = {
+        "Kriging": OrdinaryKriging(fit, **rule),
+        "makima": IndexInterpolation("makima", grid, **rule),
+        "spline": IndexInterpolation("spline", grid, **rule),
+        # of one sample the weight is 1 at any distance
+        "nearest": InverseDistance(neighbours=1, radius_m=radius_m),
+        "inverse distance": InverseDistance(neighbours=neighbours, radius_m=radius_m),
+        "serving-tower mean": ServingTowerMean(towers_m),
+    }
+    scores = {name: leave_one_out(model, points, values) for name, model in models.items()}
+    return Study(correlation, fit, scores)
+
+
+def _curve(correlation: variogram.BinnedCorrelation) -> variogram.BiExponential:
+    if np.isfinite(correlation.correlation[1:]).any():
+        return variogram.fit_biexponential(correlation.distance_m, correlation.correlation)
+    # Kriging needs some curve, and says that it is not one of these data
+    reason = "no two positions have varying rank vectors: the paper's curve stands in"
+    return replace(variogram.PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)

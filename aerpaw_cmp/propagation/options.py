@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray
-from .geometry.paths import PathSet
+from .geometry import PathSet
 
 Engine = Literal["image", "sionna"]
 # Values of ``rt.diffraction``; their searches stand in :data:`aerpaw_cmp.propagation.edges.DIFFRACTION`.
@@ -32,7 +32,7 @@ class Search:
         Largest number of reflections, 0 to 3.
     samples : int or "auto"
         ``sionna`` only: rays per tower; "auto" raises the number until two pilots find the same paths
-        (:func:`aerpaw_cmp.propagation.engine.engines.enough_samples`).
+        (:func:`aerpaw_cmp.propagation.engines.enough_samples`).
     batch : int
         ``sionna`` only: poses per call.
     further : tuple of callable

@@ -10,14 +10,11 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
 from ..site.materials import material
-from ..site.mesh_scenes.mitsuba import TriangleScene
-from ..site.meshes import building_mesh
-from ..site.scenes import added
+from ..site.mitsuba import TriangleScene
+from ..site.scenes import added, building_mesh
 from ..site.site import Site
-from .geometry.arrays import Link, Poses
-from .geometry.faces import inside_solids, site_faces
-from .geometry.paths import Faces, Links, Surfaces
-from .native import compiled
+from . import compiled
+from .geometry import Faces, Link, Links, Poses, Surfaces, inside_solids, site_faces
 
 
 @dataclass(frozen=True, slots=True)

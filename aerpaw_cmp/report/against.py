@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 
 from ..common.units import FloatArray
-from ..compare.gains.spread import NO_SPREAD, LostLock, StatedSpread, inside_shares
-from ..compare.judge.entries import LevelSeries, level_scores
-from ..compare.judge.verdicts import Verdict, stated_errors
-from ..compare.ranks.forecast import ForecastScore
+from ..compare.gains import NO_SPREAD, LostLock, StatedSpread, inside_shares
+from ..compare.level import LevelSeries, level_scores
+from ..compare.receiver import ForecastScore
+from ..compare.verdict import Verdict, stated_errors
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

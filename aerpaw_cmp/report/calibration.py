@@ -13,9 +13,8 @@ from markupsafe import Markup
 
 from ..common.jsonable import json_object, named
 from ..common.units import FloatArray
-from ..compare.judge.verdicts import Verdict, antenna_or_place, by_flight
-from ..compare.learning.calibration import BASELINES, Score, mean_rmse
-from ..compare.learning.learning_curve import CurvePoint, with_one_more
+from ..compare.calibration import BASELINES, CurvePoint, Score, mean_rmse, with_one_more
+from ..compare.verdict import Verdict, antenna_or_place, by_flight
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Positions, Table, write_page
 from .flight_words import said_of
 from .page import Made, about
@@ -74,7 +73,7 @@ class CalibrationData(Made):
 
 ONE_FLIGHT = "Nothing is scored: one flight alone. Next: add a second flight."
 
-# Learned antennas against the best baseline, by :func:`~aerpaw_cmp.compare.judge.verdicts.by_flight`.
+# Learned antennas against the best baseline, by :func:`~aerpaw_cmp.compare.verdict.by_flight`.
 HELPS: dict[str, tuple[str, str]] = {
     "better": (
         "The learned antennas are significantly better ({effect:+.1f} dB, 95 %: {low:+.1f} to {high:+.1f} dB).",
@@ -94,7 +93,7 @@ HELPS: dict[str, tuple[str, str]] = {
     ),
 }
 
-# Body frame against frames that do not turn, by :func:`~aerpaw_cmp.compare.judge.verdicts.antenna_or_place`.
+# Body frame against frames that do not turn, by :func:`~aerpaw_cmp.compare.verdict.antenna_or_place`.
 FRAMES: dict[str, tuple[str, str]] = {
     "antenna": (
         "What was learned turns with the UAV, as an antenna does: {where} the error is {size:.1f} dB larger "

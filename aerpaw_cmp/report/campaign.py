@@ -13,16 +13,13 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from ..common.cells import guarded
-from ..common.counting import counted
 from ..common.jsonable import fields_of, json_safe, named
+from ..common.text import counted, guarded
 from ..common.units import FloatArray, IntArray
-from ..compare.flight_verdict import pooled_db
-from ..compare.judge.steps import NodeOffset, Step
-from ..compare.judge.verdicts import Verdict, campaign_verdict
-from ..compare.level.rss import LEARNED_HERE
+from ..compare.level import LEARNED_HERE
 from ..compare.offset import Moments, difference_moments
-from ..compare.statistics.intervals import Interval
+from ..compare.statistics import Interval
+from ..compare.verdict import NodeOffset, Step, Verdict, campaign_verdict, pooled_db
 from ..site.site import Site
 from .canvas import FigureSpec, Picture, beyond, colour_bar, draw_tower, frame_around, plan_axes, subplots
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Table, bold, estimate, settings_card
@@ -340,7 +337,7 @@ class CampaignData(Made):
 # Warnings of flights that stand one by one.
 FEW = 8
 
-# Sentence and next step by :func:`~aerpaw_cmp.compare.judge.verdicts.campaign_verdict`.
+# Sentence and next step by :func:`~aerpaw_cmp.compare.verdict.campaign_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "outlying error": (
         "Flight {where} stands out: its RMSE is {effect:.1f} times (95 %: {low:.1f} to {high:.1f}) that of the others.",

@@ -13,7 +13,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ..compare.statistics.intervals import Interval
+from ..compare.statistics import Interval
 from .canvas import Picture
 from .page import json_text, rendered, write_file
 from .texts import flat, interval, number, percent, short

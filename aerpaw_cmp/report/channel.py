@@ -13,17 +13,16 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from ..common.cells import guarded
 from ..common.cf import Dataset, GrowingNetcdf, file_attributes
+from ..common.content import KEY
 from ..common.jsonable import named
-from ..common.provenance import KEY
 from ..common.stages import Stages
+from ..common.text import guarded
 from ..common.units import AnyArray, FloatArray
 from ..common.versions import tool_version
-from ..propagation.drivers.parts import added_up
-from ..propagation.geometry.arrays import Poses
-from ..propagation.path_table import PathTable, frequency_responses, impulse_responses
-from ..propagation.replay import Replay
+from ..propagation.drivers import added_up
+from ..propagation.geometry import Poses
+from ..propagation.replay import PathTable, Replay, frequency_responses, impulse_responses
 
 _LINK, _PORTS = ("pose", "tower"), ("rx", "tx")
 _PATH = ("path", *_LINK)

@@ -14,9 +14,8 @@ import numpy as np
 
 from ..common.kml import CLASS_COLOURS
 from ..common.units import AnyArray
-from ..compare.judge.ladder import LadderRow, ModelCost, costs, distinct
-from ..compare.level.detection import DetectionScore
-from ..compare.level.serving import ServingComparison
+from ..compare.ladder import LadderRow, ModelCost, costs, distinct
+from ..compare.level import DetectionScore, ServingComparison
 from ..compare.result import RankResult
 from ..logs.records import has_wall_clock
 from .canvas import placed, seconds_since

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ..common.cells import guarded
+from ..common.content import KEY, union
 from ..common.jsonable import fields_of, json_safe, named
-from ..common.provenance import KEY, union
+from ..common.text import guarded
 from ..common.units import FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult, EngineResult, RankResult, RssResult
-from ..compare.statistics.intervals import Interval
+from ..compare.statistics import Interval
 from ..logs.records import has_wall_clock
 from .flight_data import RANKS, ReportData
 from .flight_words import audit_summary, cautions, offset_sentences, paragraph

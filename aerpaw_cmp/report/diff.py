@@ -10,11 +10,11 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ..common.counting import counted
 from ..common.jsonable import fields_of, json_object
+from ..common.text import counted
 from ..common.units import Printed
-from ..compare.judge.report_difference import LevelDifference, Overlap, RankDifference
-from ..compare.statistics.intervals import PairedDifference
+from ..compare.statistics import PairedDifference
+from ..compare.verdict import LevelDifference, Overlap, RankDifference
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Table, bold
 from .flight_words import count
 from .page import json_text, write_file

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.jsonable import named
 from ..common.units import BoolArray, IntArray, spread_out
-from ..compare.level.rss import PART_DB, RssComparison
+from ..compare.level import PART_DB, RssComparison
 from ..compare.offset import STEP_DB
 from ..compare.result import ModelLevel, RankResult, RssResult
 from ..logs.records import has_wall_clock

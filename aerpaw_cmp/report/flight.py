@@ -11,12 +11,11 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ..common.counting import counted
 from ..common.stages import Stages
+from ..common.text import counted
 from ..common.units import AnyArray
-from ..compare.judge.ladder import LadderRow, distinct
-from ..compare.level.field_difference import FieldAudit
-from ..compare.level.rss import PART_DB, ErrorSpan
+from ..compare.ladder import LadderRow, distinct
+from ..compare.level import PART_DB, ErrorSpan, FieldAudit
 from ..compare.result import AuditResult, RankResult, RssResult
 from ..logs.records import has_wall_clock
 from . import flight_figures as figures

@@ -14,12 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..common.counting import counted
 from ..common.jsonable import named
+from ..common.text import counted
 from ..common.units import AnyArray, FloatArray, IntArray
 from ..common.versions import utc_now, versions
 from ..compare.result import APPLIED, NOT_APPLIED, ClockResult, FlightResult, RankResult, RssResult
-from ..flight.gains.memory import antennas_used
+from ..flight.gains import antennas_used
 from ..logs.records import RejectedLine
 from ..site.site import Site
 

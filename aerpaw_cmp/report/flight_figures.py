@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..common.counting import counted
 from ..common.kml import CLASS_COLOURS
+from ..common.text import counted
 from ..common.units import FloatArray, spread_out
 from ..compare.rank import RankFit
 from ..compare.result import PairResult, RankResult, RssResult

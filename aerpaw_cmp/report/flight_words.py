@@ -10,17 +10,14 @@ from typing import Any
 
 import numpy as np
 
-from ..common.counting import counted
+from ..common.text import counted
 from ..common.units import AnyArray, Printed
-from ..compare.flight_verdict import baseline_errors, is_dead, is_one_place, lock_lost, pooled_db, scored
-from ..compare.judge.ladder import LadderRow, costs
-from ..compare.judge.verdicts import Verdict
-from ..compare.level.detection import DetectionScore
-from ..compare.level.rss import ErrorSpan
-from ..compare.ranks.forecast import ForecastScore
+from ..compare.ladder import LadderRow, costs
+from ..compare.level import DetectionScore, ErrorSpan
+from ..compare.receiver import ForecastScore
 from ..compare.result import BASELINE_TITLE, AuditResult, FlightVerdict, RankResult, RssResult
-from ..compare.statistics.intervals import Interval, paired_verdict
-from ..compare.statistics.memory import FEWEST
+from ..compare.statistics import FEWEST, Interval, paired_verdict
+from ..compare.verdict import Verdict, baseline_errors, is_dead, is_one_place, lock_lost, pooled_db, scored
 from .flight_data import ReportData
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..common.units import FloatArray
-from ..compare.learning.locate import Regions
+from ..compare.locate import Regions
 from ..site.site import Site
 from .cards import HEAD, SHARE, Card, Page, Positions, Table, write_page
 from .places import Places, payload

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
-from ..common.counting import counted
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import json_object, json_safe, named
 from ..common.kml import CLASS_COLOURS
+from ..common.text import counted
 from ..common.units import FloatArray, IntArray, spread_out
-from ..compare.judge.verdicts import Coverage, coverage_verdict
-from ..compare.statistics.intervals import Interval
+from ..compare.statistics import Interval
+from ..compare.verdict import Coverage, coverage_verdict
 from ..maps.grid import PAPER_SPACING_M
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
@@ -214,7 +214,7 @@ class MapsData(Made):
 
 LEAST = "Least coverage: {percent:.1f} % of the positions at {where}"
 
-# Sentence and next step by :func:`~aerpaw_cmp.compare.judge.verdicts.coverage_verdict`.
+# Sentence and next step by :func:`~aerpaw_cmp.compare.verdict.coverage_verdict`.
 CAUSES: dict[str, tuple[str, str]] = {
     "none": (LEAST + ".", "`aerpaw-cmp plan` for a flight that measures it"),
     "trees": (LEAST + "; trees take most of the rest.", "fly higher, or {thinner}"),

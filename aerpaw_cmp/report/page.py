@@ -18,8 +18,8 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ..common.counting import counted
 from ..common.stages import Progress, logged
+from ..common.text import counted
 from ..common.versions import commit, utc_now, versions
 from .canvas import FigureSpec, Picture, render
 from .texts import coded

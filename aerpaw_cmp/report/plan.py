@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..common.cells import guarded
 from ..common.jsonable import json_object, named
+from ..common.text import guarded
 from ..common.units import FloatArray
 from ..site.site import Site
 from .cards import HEAD, TEXT, Card, Page, Positions, Table, write_page

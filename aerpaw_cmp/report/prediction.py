@@ -12,16 +12,16 @@ import pandas as pd
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
-from ..common.cells import guarded
 from ..common.cf import Dataset, file_attributes, netcdf_bytes
 from ..common.errors import UsageError
 from ..common.jsonable import json_object, named
+from ..common.text import guarded
 from ..common.units import FloatArray
-from ..compare.judge.verdicts import Verdict, stated_errors
-from ..compare.learning.correction import OFF, Correction, crps_difference
-from ..compare.ranks.forecast import ForecastScore
-from ..compare.statistics.intervals import mean_interval, paired_difference
-from ..site.antenna.learned import Entry, LearnedSeries
+from ..compare.calibration import OFF, Correction, crps_difference
+from ..compare.receiver import ForecastScore
+from ..compare.statistics import mean_interval, paired_difference
+from ..compare.verdict import Verdict, stated_errors
+from ..site.learned import Entry, LearnedSeries
 from ..site.site import Site
 from .against import AgainstSeries
 from .cards import HEAD, SHARE, TEXT, Card, Page, Positions, Table, bold, paragraph, write_page
@@ -71,7 +71,7 @@ FIELD = {
 }
 
 HELD_OUT = "90 % intervals hold {inside:.0f} % of the held-out samples."
-# Stated standard deviations on what was left out, by :func:`~aerpaw_cmp.compare.judge.verdicts.stated_errors`.
+# Stated standard deviations on what was left out, by :func:`~aerpaw_cmp.compare.verdict.stated_errors`.
 STATED: dict[str, tuple[str, str]] = {
     "none": (HELD_OUT, ""),
     "no interval": ("", ""),
@@ -276,7 +276,7 @@ def after_flight(scores: Mapping[str, Mapping[str, float]], stated: Sequence[Ver
     scores : mapping of str to mapping
         By tower and channel.
     stated : sequence of Verdict
-        Of each, by :func:`~aerpaw_cmp.compare.judge.verdicts.stated_errors`.
+        Of each, by :func:`~aerpaw_cmp.compare.verdict.stated_errors`.
 
     Returns
     -------

@@ -12,12 +12,11 @@ from dataclasses import dataclass, field, fields, replace
 import numpy as np
 from shapely.geometry import Point, Polygon
 
-from ..common.counting import counted
 from ..common.geodesy import SiteFrame
-from ..common.htmltable import html_table
+from ..common.text import counted, html_table
 from ..common.units import FloatArray
-from .mesh_scenes.mitsuba import TriangleScene
-from .relief.dem import Dem
+from .mitsuba import TriangleScene
+from .relief import Dem
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,15 +1,17 @@
 """site.yaml to a :class:`~aerpaw_cmp.site.site.Site`, and the packaged sites.
 
 docs/site.md shows every key. Polygons are ``polygon_m`` (east, north) or ``polygon_deg`` (latitude, longitude).
+
+Files that a site is made of: the site.yaml and what it names. No output may replace one; a report names each.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args
@@ -19,28 +21,18 @@ import shapely
 from pydantic import AfterValidator, Field, model_validator
 from shapely.geometry import Point, Polygon
 
-from ..common.counting import counted
-from ..common.errors import UsageError
+from ..common.errors import AerpawCmpError, UsageError
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import named
+from ..common.text import counted
 from ..common.units import FloatArray
-from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines, nearest
+from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines, named_files, nearest
 from .materials import material
-from .mesh_scenes.mitsuba import TriangleScene
-from .relief.dem import Dem, read_dem
-from .relief.surface import Surface, surface_through
+from .mitsuba import TriangleScene
+from .relief import Dem, Surface, read_dem, surface_through
 from .scenes import placed_scene, without_traps
 from .site import Building, Forest, Geofence, Site, Tower, Trees
-from .trees import (
-    CrownDiameter,
-    TreeHeight,
-    TreeSizes,
-    TrunkDiameter,
-    join_trees,
-    place_trees,
-    trees_at,
-    wanted_trees,
-)
+from .trees import CrownDiameter, TreeHeight, TreeSizes, TrunkDiameter, join_trees, place_trees, trees_at, wanted_trees
 
 # Sites that come with the package, by name.
 PACKAGED = ("lake_wheeler",)
@@ -747,3 +739,33 @@ def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: 
             cause = "latitude and longitude are swapped"
         raise UsageError(f"'{name}' reaches {away / 1000:.0f} km from the site's origin", cause=cause)
     return list(zip(east.tolist(), north.tolist(), strict=True))
+
+
+def inputs_of_site(site: str | Path, folder: Path = Path()) -> list[Path]:
+    """The site file, as it is named in a folder, and what it names; none where it is wrong, which its reader says."""
+    with suppress(AerpawCmpError, OSError):
+        return [place for _, _, place in site_files(str(site), folder)]
+    return []
+
+
+def site_files(name: str, folder: Path) -> Iterator[tuple[str, str, Path]]:
+    """Name, role and place of the site file, as it is named in a folder, and of what it names."""
+    path = folder / name
+    if not path.is_file():
+        _site_model(name, 0, 0)
+        packaged = f"{packaged_name(name)}.yaml"
+        with resources.as_file(resources.files(__package__) / "data" / packaged) as file:
+            yield f"aerpaw_cmp/site/data/{packaged}", "site file (packaged)", file
+        return
+    yield name, "site file", path
+    status = path.stat()
+    model = _site_model(path, status.st_size, status.st_mtime_ns)
+    for key, text, place in named_files(model.model_dump(), [path.parent]):
+        yield text, f"site: {key}", place
+
+
+# by size and time, too: a site that is edited between two tasks is read again
+@lru_cache(maxsize=16)
+def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> SiteModel:
+    """A site file as checked; a campaign asks for the same one with every task."""
+    return site_model(site)

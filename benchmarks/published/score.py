@@ -15,9 +15,9 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.files import read_input
 from aerpaw_cmp.common.jsonable import fields_of
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.judge.entries import LevelSeries, level_scores
-from aerpaw_cmp.compare.ranks.forecast import constant_forecast, score_forecast
-from aerpaw_cmp.compare.statistics.intervals import bootstrap_means
+from aerpaw_cmp.compare.level import LevelSeries, level_scores
+from aerpaw_cmp.compare.receiver import constant_forecast, score_forecast
+from aerpaw_cmp.compare.statistics import bootstrap_means
 
 from .tasks import KEY, RANKS, SERIES, Bench
 

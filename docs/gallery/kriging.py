@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import aerpaw_cmp as ac
-from aerpaw_cmp.propagation.geometry.arrays import single_element
+from aerpaw_cmp.propagation.geometry import single_element
 
 site = ac.load_site("lake_wheeler")
 link = ac.Link(3.4e9, {"LW1": single_element()}, single_element())

@@ -6,7 +6,7 @@ Gain of the packaged patterns against elevation: what `link.*.pattern` may name.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole, Isotropic
+from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic
 
 elevation_deg = np.linspace(-90.0, 90.0, 361)
 theta = np.radians(90.0 - elevation_deg)

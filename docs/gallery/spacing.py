@@ -8,7 +8,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 
 import aerpaw_cmp as ac
-from aerpaw_cmp.propagation.geometry.arrays import linear_array
+from aerpaw_cmp.propagation.geometry import linear_array
 
 carrier_hz = 3.4e9
 wavelength_m = 299_792_458.0 / carrier_hz

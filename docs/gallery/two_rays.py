@@ -10,7 +10,7 @@ import numpy as np
 
 import aerpaw_cmp as ac
 from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
-from aerpaw_cmp.propagation.geometry.arrays import single_element
+from aerpaw_cmp.propagation.geometry import single_element
 
 carrier_hz = 3.4e9
 site = ac.load_site("lake_wheeler")

@@ -11,14 +11,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.geodesy import rough_m
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 from . import _pose, _stamps
 
@@ -121,7 +120,7 @@ def result(
     radio : Series
         ``RSSI``, ``RemRSSI``, ``Noise`` and ``RemNoise`` of the telemetry radio, in its steps.
     """
-    zero_ns, offset = _time.origin_ns(options, needed_by=reader), flights[0].utc_minus_clock_s
+    zero_ns, offset = _text.origin_ns(options, needed_by=reader), flights[0].utc_minus_clock_s
     if offset is not None:
         zero_ns = round(offset * 1e6) * 1000  # autopilots count microseconds
     series = [*(flight.position for flight in flights), radio]
@@ -134,7 +133,7 @@ def result(
     rows = _rows.Rows(
         reader=reader, options=options, lines=lines, row=number[timed], at=np.arange(int(timed.sum())),
         time=(np.round(time_s[timed] * 1e6).astype(np.int64) * 1000 + (zero_ns or 0)).astype("datetime64[ns]"),
-        flag=_lines.flags(int(timed.sum())), blank=lines - int(timed.sum()) - len(rejected), rejected=rejected,
+        flag=_text.flags(int(timed.sum())), blank=lines - int(timed.sum()) - len(rejected), rejected=rejected,
         relative=zero_ns is None,
     )  # fmt: skip
     if not len(rows):

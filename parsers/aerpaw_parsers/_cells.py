@@ -10,11 +10,11 @@ from typing import NamedTuple, cast
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.counting import counted
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.records import Attribute, Stream
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 # RSRP beyond these is a sentinel (2147483647, 0) or a mistake.
@@ -157,8 +157,8 @@ def _stream(rows: _rows.Rows, table: pd.DataFrame, cell: str, about: Mapping[str
         rows.warnings.append(f"{cell}: {ends.sum()} levels of {_END_DBM:g} dBm, and none near above: out of coverage")
     if about["quantity"] == "RSRP" and (table["rssi_dbm"] < level).sum() > max(2, len(level) // 2):
         rows.warnings.append(f"{cell}: RSSI lies below RSRP, which cannot be: are the columns exchanged?")
-    _lines.add_flag(flag, outside, "out_of_coverage")
-    _lines.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
+    _text.add_flag(flag, outside, "out_of_coverage")
+    _text.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
     level[outside] = np.nan
     values: dict[str, AnyArray] = {"rss_db": level, "serving": table["served"].to_numpy()}
     for name in QUALITIES:

@@ -16,8 +16,8 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Attribute
-from aerpaw_cmp.logs.text import rows as _rows
 
 from . import _sheet
 

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray, IntArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 _MOST_LINES = 5000
@@ -43,7 +43,7 @@ class Objects:
     closed: bool = False
 
 
-def objects(lines: _lines.Lines) -> Objects:
+def objects(lines: _text.Lines) -> Objects:
     """The objects of a file, one per line or each over several (as programs print them for people).
 
     A file that is one JSON array of them is read, too, on one line or with brackets alone on a line; commas at the end
@@ -90,7 +90,7 @@ def _loaded(text: bytes) -> tuple[Any, bool]:
         return None, False
 
 
-def _several(lines: _lines.Lines, first: int) -> tuple[Any, int]:
+def _several(lines: _text.Lines, first: int) -> tuple[Any, int]:
     """Object that begins on one line and ends on a later one, and that line; None where there is none."""
     end = lines.ends[min(first + _MOST_LINES, len(lines) - 1)]
     text = _bare(lines.data[lines.starts[first] : end]).decode("utf-8", "replace")

@@ -7,11 +7,11 @@ from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
-from aerpaw_cmp.common.counting import counted
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import ReadOptions, dictionary
 
 from . import _sheet
@@ -77,7 +77,7 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
 
 
 def of_readings(
-    lines: _lines.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine],
+    lines: _text.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine],
     options: ReadOptions, *, reader: str,
 ) -> ReadResult:  # fmt: skip
     """Return the telemetry ``vehicle`` of readings with a time and a position; see :func:`._sheet.of_readings`."""

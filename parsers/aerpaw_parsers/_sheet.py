@@ -18,14 +18,13 @@ from functools import cached_property
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.limits import NEAR_DEG
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import ReadOptions, dictionary
 
 from . import _stamps
@@ -168,7 +167,7 @@ class Sheet:
         Quantities, by the column, of columns whose names say none: what the user says.
     """
 
-    lines: _lines.Lines
+    lines: _text.Lines
     names: list[str]
     row: IntArray
     cells: list[list[str]]
@@ -384,7 +383,7 @@ def read(data: bytes, is_header: _IsHeader) -> Sheet | None:
     header = _header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
     if header is None:
         return None
-    sheet = cut(_lines.split(data), *header)
+    sheet = cut(_text.split(data), *header)
     _split_places(sheet)
     return sheet
 
@@ -413,7 +412,7 @@ def _split_places(sheet: Sheet) -> None:
 
 
 def of_readings(
-    lines: _lines.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine]
+    lines: _text.Lines, readings: Sequence[tuple[int, Mapping[str, str]]], rejected: list[RejectedLine]
 ) -> Sheet:
     """Return the table of readings that no separator divides; lines that are neither read nor rejected are comments.
 
@@ -433,7 +432,7 @@ def of_readings(
     )  # fmt: skip
 
 
-def cut(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> Sheet:
+def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     """The table below a header; lines above it, headers again and words at the end are comments, torn rows rejected.
 
     Parameters
@@ -468,7 +467,7 @@ _MOST_LINES = 40
 
 
 def _joined(
-    lines: _lines.Lines, rows: list[tuple[int, list[str]]], separator: str, width: int, comments: list[int]
+    lines: _text.Lines, rows: list[tuple[int, list[str]]], separator: str, width: int, comments: list[int]
 ) -> list[tuple[int, list[str]]]:
     """Rows whose quoted cells have line breaks, on their first lines; their further lines are added to the comments.
 
@@ -575,7 +574,7 @@ class _Table:
             cells[j] = f"{text.strip()} {unit}" if unit and text.strip() else text
         return cells
 
-    def sheet(self, lines: _lines.Lines, last_line: int) -> Sheet:
+    def sheet(self, lines: _text.Lines, last_line: int) -> Sheet:
         """The table; rows shorter than their header are read where that is a habit of the program."""
         # the last line may be cut short in every file
         inner, full = [i for i, _ in self._short if i != last_line], bool(self._row)
@@ -757,7 +756,7 @@ def _times(sheet: Sheet, column: int, options: ReadOptions, *, mapped: bool) -> 
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
         texts = [f"{date} {time}".strip() for date, time in pairs]
     name, unit = dictionary.plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", sheet.names[column])), sheet.unit(column)
-    count = next((short for short, c in _time.COUNTS.items() if c.said.search(unit) or c.said.search(name)), None)
+    count = next((short for short, c in _text.COUNTS.items() if c.said.search(unit) or c.said.search(name)), None)
     # the sign for micro is no letter of a plain name: 'Time [\u00b5s]' is 'time s' there
     if unit in ("\u00b5s", "\u03bcs") or (unit and count is None):
         count = "us" if unit in ("\u00b5s", "\u03bcs") else "s"
@@ -944,7 +943,7 @@ def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
 
 def nothing(data: bytes, reader: str, reason: str) -> ReadResult:
     """The account of a file without such a table: every line rejected."""
-    lines = _lines.split(data)
+    lines = _text.split(data)
     filled = np.flatnonzero(~lines.blank)
     rejected = tuple(lines.reject_all(filled, reason))
     blank = len(lines) - len(filled)

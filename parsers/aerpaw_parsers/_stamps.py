@@ -17,9 +17,8 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
 
 _NAMED_ZONE = r"Z|[A-Z][A-Za-z]+/[A-Z][\w/]+|[A-Z]{2,5}(?![A-Za-z])|(?:UTC|GMT)? ?[+-]\d{1,2}(?::?\d\d)?"
 # Java writes the place behind the offset: 10:00-04:00[America/New_York], 14:00Z[UTC].
@@ -63,7 +62,7 @@ _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?")
 _ROUNDED = re.compile(r"\d(?:[.,]\d{0,8})?[eE]\+?0?(?:9|1\d)")
 # What a spreadsheet shows of a time: minutes, seconds, tenths; the hour is lost.
 _MINUTES = re.compile(r"\d{1,2}:\d\d[.,]\d")
-_COMMON = re.compile((_time.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
+_COMMON = re.compile((_text.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 # Dates with hyphens or none, and Nemo's year, month, day: its summary of ``24Feb09`` says ``2024 Feb 09``.
 _IN_NAME = (
@@ -256,13 +255,13 @@ class _Zones:
         if word in _WITH_SUMMER or "/" in word:
             here = _at(_WITH_SUMMER.get(word, word), moment)
             return "" if here is None else _shown(here[0])
-        if word not in _time.WINTER:
+        if word not in _text.WINTER:
             raise UsageError(
                 f"the times are of a zone that is not known: {word}",
                 expected="UTC, an offset such as -04:00, or an abbreviation such as EDT",
                 cause="mend the name in the file, or its offset",
             )
-        candidates = _time.WINTER[word]
+        candidates = _text.WINTER[word]
         hours, zone = candidates[0]
         here = _at(zone, moment)
         if len(candidates) == 1 and (here is None or here[0] == hours):
@@ -312,7 +311,7 @@ def header_zone(name: str, brackets: str) -> str:
     if {word.lower() for word in words} & {"utc", "gps", "gmt", "zulu", *SCALES_S}:
         return "UTC"
     last = words[-1].upper() if len(words[-1]) > 2 else ""  # 'time_edt'
-    return next((word for word in (*words, last) if word in {*_HOURS, *_time.WINTER, *_WITH_SUMMER}), "")
+    return next((word for word in (*words, last) if word in {*_HOURS, *_text.WINTER, *_WITH_SUMMER}), "")
 
 
 def beside(text: str) -> str:
@@ -327,7 +326,7 @@ def beside(text: str) -> str:
     """
     number = re.fullmatch(r"[+-]?\d{1,5}(?:\.\d{1,2})?", text)
     if number is None or re.fullmatch(r"[+-]\d{4}", text):
-        word = text.upper() if text.upper() in {*_HOURS, *_time.WINTER, *_WITH_SUMMER} else text  # 'home' is none
+        word = text.upper() if text.upper() in {*_HOURS, *_text.WINTER, *_WITH_SUMMER} else text  # 'home' is none
         return word if re.fullmatch(_NAMED_ZONE, word) and ("/" not in word or _at(word, datetime.min)) else ""
     hours = float(text)
     # no zone is further than 14 h from UTC: larger numbers are minutes (840) or seconds
@@ -361,7 +360,7 @@ def read(
     Returns
     -------
     clock : str
-        As :func:`aerpaw_cmp.logs.text.rows.times` takes it.
+        As :func:`aerpaw_cmp.logs.rows.times` takes it.
     cells : array, shape (n,)
         Bytes or floats for it.
     warnings : list of str
@@ -396,7 +395,7 @@ def read(
         text.encode() if _COMMON.fullmatch(text) and (not zone or text[-6] in "+-" or text[-1] == "Z")
         else _written(text, order, zones) for text in shown
     ]  # fmt: skip
-    return "wall", _lines.cells(cells), warnings
+    return "wall", _text.cells(cells), warnings
 
 
 _COUNTED = re.compile(r"(.*\d:\d\d:\d\d:)(\d{1,9})(?!\d)(.*)")
@@ -456,7 +455,7 @@ def _numbers(
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
         # 0.9e9 s is July 1998: a clock that shows less counts from another origin
-        if middle >= 0.9 * scale and (unit is None or scale >= _time.COUNTS[unit].least_epoch):
+        if middle >= 0.9 * scale and (unit is None or scale >= _text.COUNTS[unit].least_epoch):
             if gps and middle < 1.58 * scale:  # as an epoch of 1970 before 2020, as one of 1980 before 2030
                 value, warnings = value + (GPS_S - LEAP_S) * scale / 1e9, [_GPS_COUNT]
             else:

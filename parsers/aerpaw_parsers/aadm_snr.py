@@ -5,13 +5,12 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _lines
+from aerpaw_cmp.logs import text as _time
 from aerpaw_cmp.logs.records import Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
-from aerpaw_cmp.logs.text import textlog as _text
 
-_HEADER = re.compile(_text.BOM + rb"time((?:,snr_[A-Za-z0-9]{1,12}){1,16})\s*", re.IGNORECASE)
+_HEADER = re.compile(_rows.BOM + rb"time((?:,snr_[A-Za-z0-9]{1,12}){1,16})\s*", re.IGNORECASE)
 
 
 def _row(data: bytes) -> re.Pattern[bytes]:
@@ -33,7 +32,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
             yield _rows.snr(rows, tower, rows.number(f"t{i}"))
 
 
-READER = _text.reader(
+READER = _rows.reader(
     "aadm_snr", "SNR of several towers, CSV (AADM)", kinds=("rss",), sample="time,snr_lw1,snr_lw2", header=_HEADER,
     row=_row, streams=_streams,
     otherwise="the number of fields, the time or a number does not fit the header (torn line?)",

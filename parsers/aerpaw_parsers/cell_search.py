@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import re
 
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 from . import _cells, _stamps
 
@@ -34,8 +34,8 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """A level series per cell; UsageError if no time zone is given."""
-    lines = _lines.split(data)
-    row, groups = _lines.match(lines, _ROW)
+    lines = _text.split(data)
+    row, groups = _text.match(lines, _ROW)
     texts = [(group[7] or group[0]).decode("ascii", "replace") for group in groups]
     clock, time, warnings = _stamps.read(texts, options)
     rows = _rows.built(

@@ -12,11 +12,10 @@ from collections.abc import Iterator
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray, IntArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _lines
+from aerpaw_cmp.logs import text as _time
 from aerpaw_cmp.logs.records import Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
-from aerpaw_cmp.logs.text import textlog as _text
 
 _STAMP = rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] "
 _VALUE = re.compile(_STAMP + rb"(?P<tower>\d{1,2}):(?P<snr>" + _lines.NUMBER + rb"|nan|-?inf)[ \t]*\r?$", re.MULTILINE)
@@ -36,7 +35,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
         yield _rows.snr(rows, f"LW{number}", level, tower == number)
 
 
-READER = _text.reader(
+READER = _rows.reader(
     "controller_log", "AADM controller console: SNR of each tower", kinds=("rss",),
     sample="[2025-01-01 12:00:07.000002] 1:-1.250000",
     mark=re.compile(rb"^\[[^\n]{0,80}\[(?:Controller-->UAV|UAV-->Controller)\]", re.MULTILINE), row=_VALUE,

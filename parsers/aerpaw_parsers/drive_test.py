@@ -15,11 +15,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.counting import counted
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import BoolArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
-from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _cells, _identity, _pose, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri

@@ -18,15 +18,14 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.matfile import MAGIC, MAGIC_73, names_of, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _pose
@@ -47,7 +46,7 @@ _NAMES = {*_TELEMETRY, *_LEVELS, *_TEXTS, *_EPOCHS, "mSpeed"}
 _SURE = {*_LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
 # Raw positions of the LTE flights, which stand in front of their levels; the interpolated ones are read.
 _GPS = re.compile(r"GPS[xyz]")
-_TEXT = re.compile(_time.TIME)
+_TEXT = re.compile(_text.TIME)
 
 
 def sniff(head: bytes) -> bool:
@@ -80,7 +79,7 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
             text = np.array([str(cell).strip() for cell in table[name]], dtype=np.str_)
             column = np.char.encode(text, "ascii", "replace")
             right = np.array([_TEXT.fullmatch(cell) is not None for cell in column.tolist()], dtype=bool)
-            wall, valid, _, _ = _time.parse_texts(column)
+            wall, valid, _, _ = _text.parse_texts(column)
             valid = valid & right
         else:
             epoch = _numeric(table[name], name)
@@ -104,24 +103,24 @@ _COUNTED = "row number"
 
 def _instants(
     table: dict[str, AnyArray], wall: AnyArray, clock: str, options: ReadOptions
-) -> tuple[_time.Instants, list[str]]:
+) -> tuple[_text.Instants, list[str]]:
     """UTC of each row: text and epoch both hold local wall clock unless ``clock: utc`` says otherwise."""
     warnings: list[str] = []
     none = np.zeros(len(wall), dtype=bool)
     if clock == _COUNTED:
-        origin = _time.origin_ns(options, needed_by="flight_mat")
+        origin = _text.origin_ns(options, needed_by="flight_mat")
         text = "the file has no clock: its rows are counted at the rate of the raw flight"
         warnings.append(text if origin is not None else text + ", from 1970-01-01T00:00")
-        return _time.Instants((wall + (origin or 0)).astype("datetime64[ns]"), none, none.copy()), warnings
+        return _text.Instants((wall + (origin or 0)).astype("datetime64[ns]"), none, none.copy()), warnings
     if clock == _UTC and options.clock not in ("local", "local_as_utc"):
-        return _time.Instants(wall.astype("datetime64[ns]"), none, none.copy()), warnings
+        return _text.Instants(wall.astype("datetime64[ns]"), none, none.copy()), warnings
     if clock == _EPOCHS[0] and options.clock is None:
         warnings.append("timestamp_power is read as local wall clock stored as UTC, as AERPAW's authors write it")
     elif clock == _TEXTS[0] and _EPOCHS[0] in table:
         shift_s = np.round(_numeric(table[_EPOCHS[0]], _EPOCHS[0]) - wall / 1e9)
         if len(shift_s) and np.abs(shift_s).max() > 1:
             warnings.append(f"timestamp_power and its text differ by {shift_s[0]:.0f} s (true UTC?): the text was used")
-    return _time.wall_to_utc(wall, options, needed_by="flight_mat"), warnings
+    return _text.wall_to_utc(wall, options, needed_by="flight_mat"), warnings
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -143,7 +142,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     timed = {name: column[keep] for name, column in table.items()}
     instants, warnings = _instants(timed, wall[keep], clock, options)
     rows = _rows.Rows(
-        reader="flight_mat", options=options, lines=count, row=keep, time=instants.time, flag=_lines.flags(len(keep)),
+        reader="flight_mat", options=options, lines=count, row=keep, time=instants.time, flag=_text.flags(len(keep)),
         rejected=[RejectedLine(int(i) + 1, "the row has no time", "") for i in np.flatnonzero(~valid)],
         warnings=[*warnings, *instants.warnings], relative=clock == _COUNTED and options.time_origin is None,
     )  # fmt: skip
@@ -179,7 +178,7 @@ def _track(rows: _rows.Rows, table: dict[str, AnyArray], clock: str) -> Stream |
     place = [name for name in ("latitude_deg", "longitude_deg", "altitude_m") if name in values]
     for i, name in enumerate(place):
         lost |= ~(np.abs(values[name]) < 900) if i < 2 else ~np.isfinite(values[name])
-    _lines.add_flag(flag, lost, "no_fix")
+    _text.add_flag(flag, lost, "no_fix")
     values |= {name: np.where(lost, np.nan, values[name]) for name in place}
     return rows.stream("telemetry", "vehicle", values, flag=flag, source=clock)
 

@@ -12,13 +12,13 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, Stream
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _identity, _pose, _sheet
@@ -123,7 +123,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If ``kind``, ``columns``, ``ri_base`` or ``timezone`` is missing or names what is not there.
     """
-    lines = _lines.split(data)
+    lines = _text.split(data)
     if lines.blank.all():
         return ReadResult("generic_csv", (), len(lines), 0, len(lines))
     first = int(np.argmin(lines.blank))
@@ -157,7 +157,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return rows.result(streams)
 
 
-def _tables(lines: _lines.Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
+def _tables(lines: _text.Lines, first: int) -> Iterator[tuple[int, str, list[str]]]:
     """Lines that may be the header, from the first on: place, separator and names."""
     for i in range(first, min(first + _sheet.TITLES, len(lines))):
         line = lines.raw(i).removeprefix(b"\xef\xbb\xbf")
@@ -176,7 +176,7 @@ def _stream(
         rows.warnings += [f"{coarse}: is it the right column?"] if coarse else []
     about = _lifted(rows, sheet, values, where)
     odd = np.any([_odd(sheet, where[key]) for key in _VALUE[kind]], axis=0)
-    _lines.add_flag(flag, odd, "no_number")
+    _text.add_flag(flag, odd, "no_number")
     if odd.any():
         lines = counted(int(odd.sum()), "row is", "rows are")
         first = int(rows.row[odd][0]) + 1
@@ -184,7 +184,7 @@ def _stream(
     if kind == "rss":
         level, meaning = values["rss_db"], sheet.meanings[where["rss_db"]]
         silent = ~(level > options.floor_db) | ((unit == "dBm") & (level == 0))
-        _lines.add_flag(flag, silent & ~odd, "out_of_coverage")
+        _text.add_flag(flag, silent & ~odd, "out_of_coverage")
         values["rss_db"] = np.where(silent, np.nan, level)
         quantity = meaning.quantity.name if meaning is not None and meaning.quantity.can_be[0] < 0 else None
         about = {"unit": unit or "dB re full scale", "quantity": quantity, **about}
@@ -192,15 +192,15 @@ def _stream(
         base, ri = int(options.ri_base == "one"), values["ri_raw"]
         good = (ri >= base) & (ri <= 7 + base) & (ri == np.round(ri))
         none = np.isnan(ri) | ((ri == 0) & (base == 1))
-        _lines.add_flag(flag, none & ~odd, "no_csi")
-        _lines.add_flag(flag, ~good & ~none, "ri_out_of_range")
+        _text.add_flag(flag, none & ~odd, "no_csi")
+        _text.add_flag(flag, ~good & ~none, "ri_out_of_range")
         values["rank"] = np.where(good, ri + 1 - base, np.nan)
         about = {"ri_base": options.ri_base, **about}
     else:
         latitude, longitude, altitude = (values[key] for key in _pose.PLACE)
         # -999 is what loggers write without a fix, here within rounding
         lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
-        _lines.add_flag(flag, lost, "no_fix")
+        _text.add_flag(flag, lost, "no_fix")
         values |= {key: np.where(lost, np.nan, values[key]) for key in _pose.PLACE}
         for key in {"fix", "satellites"} & set(values):
             values[key] = np.where(np.isnan(values[key]), -1, values[key]).clip(-1, 255).astype(np.int64)
@@ -225,7 +225,7 @@ def _track(rows: _rows.Rows, sheet: _sheet.Sheet, where: dict[str, int], device:
         return None
     values: dict[str, AnyArray] = {name: sheet.numbers(where[name]) for name in names}
     about = _lifted(rows, sheet, values, where)
-    flag = _lines.flags(len(rows))
+    flag = _text.flags(len(rows))
     name = f"vehicle_{device}" if device else "vehicle"
     return rows.stream("telemetry", name, values, flag=flag, source="mapped columns", about=about)
 

@@ -11,9 +11,9 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common import kml
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_cmp.logs.text import lines as _lines
 
 from . import _sheet, drive_test
 
@@ -30,7 +30,7 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Cells, KPIs and the track of the phone; UsageError if no time zone is given."""
-    lines = _lines.split(data)
+    lines = _text.split(data)
     begin = [match.start() for match in _PLACEMARK.finditer(data)]
     row = lines.number_at(begin)
     texts = [data[first:last] for first, last in zip(begin, [*begin[1:], len(data)][: len(begin)], strict=True)]

@@ -14,15 +14,15 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import IntArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _json, _pose, _stamps
 
-_N = rb"(" + _lines.NUMBER + rb")"
+_N = rb"(" + _text.NUMBER + rb")"
 _TAG = rb"(?:\w{1,20}:)?(?:trkpt|wpt|rtept)"  # also of a named space, as programs that use an XML library write it
 _POINT = re.compile(rb"<" + _TAG + rb"\b([^<>]{0,200})>(.{0,2000}?)(?:</" + _TAG + rb">)", re.DOTALL)
 _ATTRIBUTE = re.compile(rb"\b(lat|lon)\s?=\s?[\"']\s?" + _N + rb"\s?[\"']")
@@ -56,7 +56,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     InputError
         If no point has a time.
     """
-    lines, known = _lines.split(data), _points(data)
+    lines, known = _text.split(data), _points(data)
     points = [(at, values) for at, values in known if {b"lat", b"lon", b"time"} <= set(values)]
     if known and not points:
         raise InputError("a GPX track without times", expected="<time> in its points", cause="a route or a drawn track")
@@ -65,7 +65,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     texts = [values[b"time"].decode("ascii", "replace") for values in placed]
     clock, time, warnings = _stamps.read(texts, options, zone="UTC")  # as GPX defines it
     names = (b"lat", b"lon", b"ele")
-    column = {name.decode(): _lines.cells([values.get(name, b"") for values in placed]) for name in names}
+    column = {name.decode(): _text.cells([values.get(name, b"") for values in placed]) for name in names}
     rows = _rows.built(
         lines, row, {"time": time, **column}, options, reader="gpx", reason=lambda _line: None, clock=clock,
         extra=_torn(lines, data, row), closed=True,
@@ -95,7 +95,7 @@ def _stream(rows: _rows.Rows, name: str) -> Stream | None:
     return rows.stream("telemetry", name, values, where=~lost, source="GPX", about=about)
 
 
-def _torn(lines: _lines.Lines, data: bytes, row: object) -> list[RejectedLine]:
+def _torn(lines: _text.Lines, data: bytes, row: object) -> list[RejectedLine]:
     """Lines on which a point begins that is not whole."""
     tracked = b"<trkpt" in data
     starts = (start.start() for start in _START.finditer(data) if b"trkpt" in start[0] or not tracked)

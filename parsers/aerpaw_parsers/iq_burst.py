@@ -12,12 +12,11 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.matfile import MAGIC, names_of, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, ReadResult
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 _NAME = re.compile(r"(\d{6,12})(?:\.0)?_(\d{4,10})(?:\.0)?_(\d{4})_(\d\d)_(\d\d)_(\d\d)_(\d\d)_(\d\d)_?(\d{3,6})?")
 
@@ -49,14 +48,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         )
     year, month, day, hour, minute, second, part = named.groups()[2:]
     text = f"{year}-{month}-{day} {hour}:{minute}:{second}.{part or '0'}".encode()
-    instants, valid = _time.texts_to_utc(np.array([text]), options, needed_by="iq_burst")
+    instants, valid = _text.texts_to_utc(np.array([text]), options, needed_by="iq_burst")
     if not valid[0]:
         raise InputError("the date in the burst's name is none of the calendar", expected="YYYY_mm_dd_HH_MM_SS_mmm")
     with np.errstate(all="ignore"):  # damaged samples may be any number
         power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
     rows = _rows.Rows(
         reader="iq_burst", options=options, lines=1, row=np.zeros(1, dtype=np.int64), time=instants.time,
-        flag=_lines.flags(1), warnings=list(instants.warnings),
+        flag=_text.flags(1), warnings=list(instants.warnings),
     )  # fmt: skip
     instants.flag(rows.flag)
     streams = []

@@ -12,10 +12,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _lines
 from aerpaw_cmp.logs.records import Stream
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
-from aerpaw_cmp.logs.text import textlog as _text
 
 from . import _cells
 
@@ -58,7 +57,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     yield track
 
 
-READER = _text.reader(
+READER = _rows.reader(
     "nemo_csv", "Keysight Nemo NR rank and level, CSV with relative times", kinds=("rank", "rss", "kpi", "telemetry"),
     sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0", header=_HEADER,
     row=_ROW, streams=_streams, fields=9, otherwise="a field is no number", clock="relative_ms",

@@ -12,17 +12,17 @@ import numpy as np
 
 from aerpaw_cmp.common import kml
 from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.logs.jumps import FASTEST_MPS
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
+from aerpaw_cmp.logs.limits import FASTEST_MPS
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 from aerpaw_cmp.readers import dictionary
 
 from . import _cells, _pose
 from .nemo_csv import pdsch_rank
 
-_N = rb"(" + _lines.NUMBER + rb"|nan)"
+_N = rb"(" + _text.NUMBER + rb"|nan)"
 _GAP = rb"[^\n]{0,60}?"
 _NAME = rb" ?([A-Za-z][A-Za-z0-9 /_.-]{1,40}(?:\([^()=\n]{1,30}\))?) = "
 _RECORD = re.compile(
@@ -53,12 +53,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If ``time_origin`` is no time, or is local and no time zone is given.
     """
-    lines = _lines.split(data)
+    lines = _text.split(data)
     reports = list(_RECORD.finditer(data))
     row = lines.number_at(item.start() for item in reports)
     names = ("time", "what", "value", "unit", *_POSITION)
-    column = dict(zip(names, _lines.columns([item.groups(b"") for item in reports], 7), strict=True))
-    in_seconds = _in_seconds(*(_lines.numbers(column[name]) for name in ("time", *_POSITION[:2])))
+    column = dict(zip(names, _text.columns([item.groups(b"") for item in reports], 7), strict=True))
+    in_seconds = _in_seconds(*(_text.numbers(column[name]) for name in ("time", *_POSITION[:2])))
     rows = _rows.built(
         lines, row, column, options, reader="nemo_kml", reason=_reason,
         clock="relative_s" if in_seconds else "relative_ms",

@@ -17,11 +17,10 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, IntArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 _CSI = re.compile(rb"\bUE (?P<rnti>[0-9a-f]{4}):? [^\n]{0,120}?\bCQI (?P<cqi>\d{1,2}),? RI (?P<ri>\d{1,2}),? PMI")
 _LEVEL = re.compile(
@@ -33,7 +32,7 @@ _UE = re.compile(
     rb"SINR = (?P<sinr>-?\d{1,3}) dB, CQI = (?P<cqi>\d{1,2})"
 )
 _UE_LEVEL = re.compile(rb"\[UE \d{1,2}\] RSRP = (?P<rsrp>-?\d{1,3}) dBm")
-_STAMP = re.compile(rb"^\[?(" + _time.TIME + _time.ZONE + rb")\]?[ :]")
+_STAMP = re.compile(rb"^\[?(" + _text.TIME + _text.ZONE + rb")\]?[ :]")
 _SECONDS = re.compile(rb"^(?:\x1b\[[0-9;]{0,8}m)?(\d{1,10}\.\d{3,9}) ")
 _FRAME = re.compile(rb"Frame\.Slot \d")
 _FRAMES_S = 1.28
@@ -48,7 +47,7 @@ def sniff(head: bytes) -> bool:
     ) is not None  # fmt: skip
 
 
-def _rows_of(lines: _lines.Lines) -> tuple[IntArray, list[dict[str, bytes]], str, AnyArray]:
+def _rows_of(lines: _text.Lines) -> tuple[IntArray, list[dict[str, bytes]], str, AnyArray]:
     """Lines with a quantity, their values, the clock, and the times."""
     row, quantities, stamps = [], [], []
     stamp, seconds, frame = b"", b"", -1
@@ -76,7 +75,7 @@ def _rows_of(lines: _lines.Lines) -> tuple[IntArray, list[dict[str, bytes]], str
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``oai`` and RSRP; UsageError if stamps have no zone and none is given."""
-    lines = _lines.split(data)
+    lines = _text.split(data)
     row, quantities, clock, time = _rows_of(lines)
     rows = _rows.built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)
     timed = [quantities[i] for i in rows.at.tolist()]

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 from . import _cells, _json, _pose
 
@@ -70,8 +70,8 @@ def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
 
 def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
     """Cells of the text of 2023: ``CELL_LOG_START,<ms of UTC>,...``, a block per cell."""
-    lines = _lines.split(data)
-    row, groups = _lines.match(lines, _TEXT)
+    lines = _text.split(data)
+    row, groups = _text.match(lines, _TEXT)
     cells = [_text_cells(lines.raw(i)) for i in row.tolist()]
     odd = [lines.reject(i, "a block of other fields (quantities switched off in the app?)")
              for i, block in zip(row.tolist(), cells, strict=True) if block is None]  # fmt: skip
@@ -144,7 +144,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         return _read_text(data, options)
     if data[:4096].lstrip().startswith(b"GPS_LOG_START,"):
         return _read_location(data, options)
-    lines = _lines.split(data)
+    lines = _text.split(data)
     parsed = _json.objects(lines)
     entries = parsed.values
     time = _json.column(entries, "companion_abs_time", "abs_time")

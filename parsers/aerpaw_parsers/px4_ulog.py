@@ -16,7 +16,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from aerpaw_cmp.common.counting import counted
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine

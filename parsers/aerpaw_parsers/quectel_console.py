@@ -11,15 +11,14 @@ import re
 
 import numpy as np
 
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 from . import _cells
 
-_STAMP = re.compile(rb"^(" + _time.TIME + rb")")
+_STAMP = re.compile(rb"^(" + _text.TIME + rb")")
 _ROW = re.compile(rb'\|\s*\d+\s*\|\s*"?\+?Q(ENG|NWCFG): ?"([A-Za-z0-9_-]+)"?"?\s*\|(.*)\|\s*$')
 _HEADER = re.compile(rb"^\|[ \t]*\|[ \t]*(LTE|NR5G-NSA|NR5G-SA|servingcell)[ \t]*\|(.*)\|[ \t\r]*$")
 _CSI = ("lte_csi", "nr5g_csi")
@@ -37,7 +36,7 @@ def _number(cell: bytes) -> float:
     return np.nan if value in (-32768, -3276, 65535) else value
 
 
-def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, float]]], list[RejectedLine]]:
+def _tables(lines: _text.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, float]]], list[RejectedLine]]:
     """Line, time, title and named values of each row that holds a level or a CSI."""
     time = b""
     names: dict[bytes, list[str]] = {}
@@ -66,10 +65,10 @@ def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Cells by PCI, and rank where CSI tables stand; UsageError if no time zone is given."""
-    lines = _lines.split(data)
+    lines = _text.split(data)
     entries, rejected = _tables(lines)
     row = np.array([item[0] for item in entries], dtype=np.int64)
-    time = _lines.cells([item[1] for item in entries])
+    time = _text.cells([item[1] for item in entries])
     talk, column = lambda _line: None, {"time": time}
     rows = _rows.built(lines, row, column, options, reader="quectel_console", reason=talk, extra=rejected)
     timed = [entries[i] for i in rows.at.tolist()]

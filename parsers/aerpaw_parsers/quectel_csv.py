@@ -30,16 +30,15 @@ from collections.abc import Iterator
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, ReadResult, Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 _C = rb"[^,\n]{0,80}"
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
 # The logger's CSV, or a console whose lines carry a stamp (ts, a terminal program).
-_T = rb"^\[?(" + _time.TIME + _time.ZONE + rb")(?:,|\]?[ \t]{1,4})"
+_T = rb"^\[?(" + _text.TIME + _text.ZONE + rb")(?:,|\]?[ \t]{1,4})"
 
 
 def _token(command: bytes, word: bytes) -> bytes:
@@ -91,7 +90,7 @@ _FORMS = (
       for rat, form in _CSI_ALONE.items()),
 )  # fmt: skip
 _ANY = re.compile(_T + rb'"?\+(?:QNWCFG|QENG|QENDC)')
-_TALK = re.compile(_T + rb'(?!"?\+(?:QNWCFG|QENG|QENDC))|^\[?' + _time.TIME + rb"\]?[ \t]*\r?$")
+_TALK = re.compile(_T + rb'(?!"?\+(?:QNWCFG|QENG|QENDC))|^\[?' + _text.TIME + rb"\]?[ \t]*\r?$")
 # 3GPP TS 38.133 table 10.1.6.1-1: reported SS-RSRP lies between -156 and -31 dBm.
 _RSRP_RANGE = (-156.0, -31.0)
 # 3GPP TS 38.133 table 10.1.16.1-1: reported SS-SINR lies between -23 and 40 dB.
@@ -100,7 +99,7 @@ _SINR_RANGE = (-23.0, 40.0)
 
 def sniff(head: bytes) -> bool:
     """Check whether most of the first lines, a bare OK aside, are AT answers behind a time."""
-    lines = [line for line in _lines.first_lines(head) if line != b"OK" and not _TALK.match(line)]
+    lines = [line for line in _text.first_lines(head) if line != b"OK" and not _TALK.match(line)]
     return bool(lines) and 2 * sum(_ANY.match(line) is not None for line in lines) > len(lines)
 
 
@@ -111,7 +110,7 @@ def _reason(line: bytes) -> str | None:
         return "NUL bytes in the line (the file system was not synced when power went)"
     if line.startswith(b"[") and _TALK.match(line):
         return None  # commands and other answers of a console
-    if not re.match(rb"\[?" + _time.TIME, line):
+    if not re.match(rb"\[?" + _text.TIME, line):
         return "no time stamp in front (torn or stray modem line)"
     if b"neighbourcell" in line:
         return "neighbour-cell row: not read"
@@ -122,14 +121,14 @@ def _reason(line: bytes) -> str | None:
     return "not a row of the logger's CSVs, or one with another number of columns"
 
 
-def _table(lines: _lines.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
+def _table(lines: _text.Lines) -> tuple[IntArray, dict[str, AnyArray]]:
     """Lines of all kinds of row, and their columns of text; ``form`` is the kind, an index into ``_FORMS``."""
     # a search of a whole log of CSI would find nothing, slowly
     serving = b"servingcell" in lines.data or lines.data.startswith(b"[")
     tables: list[tuple[IntArray, dict[str, AnyArray]]] = []
     for i, (pattern, names) in enumerate(_FORMS if serving else _FORMS[:1]):
-        row, groups = _lines.match(lines, pattern)
-        column = dict(zip(names.split(), _lines.columns(groups, pattern.groups), strict=True))
+        row, groups = _text.match(lines, pattern)
+        column = dict(zip(names.split(), _text.columns(groups, pattern.groups), strict=True))
         tables.append((row, {**column, "form": np.full(len(row), float(i))}))
     row = np.concatenate([row for row, _ in tables])
     order = np.argsort(row, kind="stable")
@@ -165,13 +164,13 @@ def _levels(rows: _rows.Rows, rat: str, where: BoolArray) -> Iterator[Stream | N
     rsrp, pci, arfcn = (rows.number(f"{rat}_{name}") for name in ("rsrp", "pci", "arfcn"))
     flag = rows.flag.copy()
     good = (rsrp >= _RSRP_RANGE[0]) & (rsrp <= _RSRP_RANGE[1])
-    _lines.add_flag(flag, ~good, "out_of_coverage")
+    _text.add_flag(flag, ~good, "out_of_coverage")
     values = {"rss_db": np.where(good, rsrp, np.nan)}
     if rat == "nr":
         sinr = rows.number("nr_sinr")
         fits = (sinr >= _SINR_RANGE[0]) & (sinr <= _SINR_RANGE[1])
         # tenths of a decibel on 2020 firmware look like this: never divided silently
-        _lines.add_flag(flag, good & ~fits & ~np.isnan(sinr), "sinr_out_of_range")
+        _text.add_flag(flag, good & ~fits & ~np.isnan(sinr), "sinr_out_of_range")
         values["sinr_db"] = np.where(fits, sinr, np.nan)
     named = where & (pci >= 0) & (pci <= _MOST_PCI)
     # infinity sorts behind every carrier and is none
@@ -204,7 +203,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If no time zone is given.
     """
-    lines = _lines.split(data)
+    lines = _text.split(data)
     row, table = _table(lines)
     rows = _rows.built(lines, row, table, options, reader="quectel_csv", reason=_reason)
     form = rows.columns["form"]

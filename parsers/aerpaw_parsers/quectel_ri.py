@@ -11,11 +11,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _lines
+from aerpaw_cmp.logs import text as _time
 from aerpaw_cmp.logs.records import Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
-from aerpaw_cmp.logs.text import textlog as _text
 
 _CELL = rb', ?"?(?P<%s>' + _lines.NUMBER + rb'|nan|NaN|)"?'
 _ROW = re.compile(
@@ -34,13 +33,13 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     yield rows.stream("rank", name, values, channel=name, ri_base="one", source="CSI report")
 
 
-READER = _text.reader(
+READER = _rows.reader(
     "quectel_ri",
     "published Quectel NR rank table (six columns)",
     kinds=("rank",),
     sample="8,2025-01-01 12:00:07.250,-78.6960001,35.7280001,30.1,2",
     header=re.compile(
-        _text.BOM + rb'(?i:"?ID"?, ?"?Time and date"?, ?"?Longitude"?, ?"?Latitude"?, ?"?Altitude"?, ?"?NR RI"?)\s*'
+        _rows.BOM + rb'(?i:"?ID"?, ?"?Time and date"?, ?"?Longitude"?, ?"?Latitude"?, ?"?Altitude"?, ?"?NR RI"?)\s*'
     ),
     row=_ROW,
     streams=_streams,

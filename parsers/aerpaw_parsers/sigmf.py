@@ -23,10 +23,10 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 from . import _json, _pose, _stamps
 
@@ -89,7 +89,7 @@ def _rows_of(texts: list[str], options: ReadOptions) -> _rows.Rows:
     clock, cells, warnings = _stamps.read(texts, options)
     relative, instants, valid = _rows.times(cells, options, clock=clock, reader="sigmf")
     keep = np.flatnonzero(valid)
-    flag = _lines.flags(len(texts))
+    flag = _text.flags(len(texts))
     instants.flag(flag)
     return _rows.Rows(
         reader="sigmf", options=options, lines=len(texts), row=keep, at=keep, time=instants.time[keep], flag=flag[keep],

@@ -17,14 +17,12 @@ from itertools import dropwhile
 
 import numpy as np
 
-from aerpaw_cmp.common.counting import counted
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs.files.chunks import Column, Sections, WholeLogError
+from aerpaw_cmp.logs import text as _text
+from aerpaw_cmp.logs.files import Column, Sections, WholeLogError
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import KEPT_REJECTED, ReadResult, Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import make_frames as _frames
 
 from . import _identity
 
@@ -32,15 +30,15 @@ _STAMP = 28  # "[" + 26 characters of time + "]"
 _VALUE = 16  # od -f: right-aligned in sixteen columns
 _WIDTHS = range(7, 13)  # octal digits of the offset; seven until 2 MiB of samples, ten from 128 MiB on
 _MOST_REPEATS = 5_000_000  # two days at 30 samples a second: a damaged offset claims more
-_HEAD = rb"^\[(" + _time.TIME + rb")\] "
-_ODD = re.compile(_HEAD + rb"+([0-7]{7,12}) +(" + _lines.NUMBER + rb"|-?nan|-?inf)[ \t]*$")
+_HEAD = rb"^\[(" + _text.TIME + rb")\] "
+_ODD = re.compile(_HEAD + rb"+([0-7]{7,12}) +(" + _text.NUMBER + rb"|-?nan|-?inf)[ \t]*$")
 _STAR = re.compile(_HEAD + rb"+\*[ \t]*$")
 _FOOT = re.compile(_HEAD + rb"+([0-7]{7,12})[ \t]*$")
 
 
 def sniff(head: bytes) -> bool:
     """Check whether most of the first lines are od lines, with at least one sample."""
-    lines = _lines.first_lines(head)
+    lines = _text.first_lines(head)
     samples = sum(_ODD.match(line) is not None for line in lines)
     stars = sum(_STAR.match(line) is not None for line in lines)
     return samples > 0 and 2 * (samples + stars) > len(lines)
@@ -104,7 +102,7 @@ def _decimals(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
     return np.where(plain, np.where(negative, -whole, whole) / _POWERS[places], 0.0), plain
 
 
-def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
+def _fixed_layout(lines: _text.Lines) -> tuple[_Samples, IntArray]:
     """Samples of all lines that have exactly the layout of ``ts`` and ``od``, without a Python loop over lines.
 
     Second, such lines whose offset is no octal number.
@@ -116,8 +114,8 @@ def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
         if not len(rows):
             continue
         cells = lines.fixed(rows, _STAMP + 1 + width + _VALUE)
-        wall, valid = _time.parse_digits(cells[:, 1 : _STAMP - 1], 6)
-        offset, worst = _time.integers(cells[:, _STAMP + 1 : _STAMP + 1 + width], 8)
+        wall, valid = _text.parse_digits(cells[:, 1 : _STAMP - 1], 6)
+        offset, worst = _text.integers(cells[:, _STAMP + 1 : _STAMP + 1 + width], 8)
         value, plain = _decimals(cells[:, _STAMP + 1 + width :])
         valid &= plain & (cells[:, 0] == 91) & (cells[:, _STAMP - 1] == 93) & (cells[:, _STAMP] == 32)
         valid &= cells[:, _STAMP + 1 + width] == 32
@@ -143,7 +141,7 @@ class _Piece:
     torn: int = -1
 
 
-def _piece(lines: _lines.Lines, rejects: _lines.Rejects) -> _Piece:
+def _piece(lines: _text.Lines, rejects: _text.Rejects) -> _Piece:
     """Samples of od's layout at once, the few other lines one by one."""
     fixed, wrong = _fixed_layout(lines)
     rejects.add(lines, wrong, "the offset is no octal number: not written by od")
@@ -176,7 +174,7 @@ def _collect(rows: list[tuple[int, bytes, bytes, float]]) -> tuple[_Samples, lis
     if not rows:
         return _Samples.none(), []
     line = np.array([row[0] for row in rows], dtype=np.int64)
-    wall, valid, _, _ = _time.parse_texts(np.array([row[1] for row in rows]))
+    wall, valid, _, _ = _text.parse_texts(np.array([row[1] for row in rows]))
     offset = np.array([-1 if row[2] == b"-1" else int(row[2], 8) for row in rows], dtype=np.int64)
     value = np.array([row[3] for row in rows])
     return _Samples(line, wall, offset, value).take(valid), line[~valid].tolist()
@@ -264,7 +262,7 @@ def read_sections(pieces: Iterable[bytes], options: ReadOptions, most: float = n
     WholeLogError
         If sections cannot settle what all samples together can.
     """
-    rejects, tally, notes = _lines.Rejects(), Counter[str](), list[str]()
+    rejects, tally, notes = _text.Rejects(), Counter[str](), list[str]()
     for section in _sections(pieces, rejects, most):
         repeats, used, bad = _expand(section.samples, section.marks)
         tally["repeated"] += len(repeats.line)
@@ -288,13 +286,13 @@ def read_sections(pieces: Iterable[bytes], options: ReadOptions, most: float = n
     )  # fmt: skip
 
 
-def _sections(pieces: Iterable[bytes], rejects: _lines.Rejects, most: float) -> Iterator[_Piece]:
+def _sections(pieces: Iterable[bytes], rejects: _text.Rejects, most: float) -> Iterator[_Piece]:
     """Sections that end with a sample: its offset, time and value are all that the next one needs of it."""
     marks, texts = _Samples.none(), dict[int, str]()
     known, before, blank, unterminated = 0, 0, 0, False
     columns = [Column(kind) for kind in _COLUMNS.values()]
     for data in pieces:
-        lines = _lines.split(data)
+        lines = _text.split(data)
         rejects.before = before
         piece = _piece(lines, rejects)
         for part in (piece.samples, piece.marks):
@@ -335,23 +333,23 @@ def _stream(
     missing = int((jump[lost] // 4 - 1).sum())
     tally.update(lost=int(lost.sum()), missing=missing, back=int((jump < 0).sum()))
     samples.offset = jump = _NONE
-    instants = _time.wall_to_utc(samples.wall, options, needed_by="sounder_log")
+    instants = _text.wall_to_utc(samples.wall, options, needed_by="sounder_log")
     notes += instants.warnings
     samples.wall = _NONE
-    flag = _lines.flags(len(samples.line))
+    flag = _text.flags(len(samples.line))
     instants.flag(flag)
-    _lines.add_flag(flag, repeated, "repeated")
+    _text.add_flag(flag, repeated, "repeated")
     silent = ~(samples.value > options.floor_db)
     samples.value[silent] = np.nan
-    _lines.add_flag(flag, silent, "out_of_coverage")
-    _lines.add_flag(flag, lost, "samples_lost_before")
+    _text.add_flag(flag, silent, "out_of_coverage")
+    _text.add_flag(flag, lost, "samples_lost_before")
     if section.torn >= 0:
-        _lines.add_flag(flag, samples.line == section.torn, _lines.UNTERMINATED)
+        _text.add_flag(flag, samples.line == section.torn, _text.UNTERMINATED)
     samples.line += 1
-    frame = _frames.frame("rss", instants.time, samples.line, flag, {"rss_db": samples.value}, own=True)
-    tally["time_back"] += _frames.steps_back(frame)
+    frame = _text.frame("rss", instants.time, samples.line, flag, {"rss_db": samples.value}, own=True)
+    tally["time_back"] += _text.steps_back(frame)
     name, ratio = _name(options)
-    attributes = _frames.attributes(
+    attributes = _text.attributes(
         options, channel=name, unit=options.unit or ("dB" if ratio else "dB re full scale"),
         quantity="SNR" if name.lower() == "snr" else None, repeated_samples=tally["repeated"],
     )  # fmt: skip
@@ -376,7 +374,7 @@ def _warnings(tally: Counter[str], of_times: list[str], options: ReadOptions) ->
     if tally["back"]:
         yield f"offsets step back at {counted(tally['back'], 'place')}: several runs in one file?"
     yield from of_times
-    yield from _frames.back_in_time(tally["time_back"])
+    yield from _text.back_in_time(tally["time_back"])
     if tally["accepted"] and options.channel is None and not _NAMED.search(options.file_name.lower()):
         yield (
             "power, quality and SNR logs have one layout: read as power, as the file name does not say; name another "

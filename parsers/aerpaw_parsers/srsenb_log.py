@@ -17,10 +17,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _time
 from aerpaw_cmp.logs.records import Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import rows as _rows
-from aerpaw_cmp.logs.text import textlog as _text
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(
@@ -47,7 +46,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     yield from _rows.of_ues(rows, "rank", rows.options.channel or "srsenb", values, flag=rows.flag, about=about)
 
 
-READER = _text.reader(
+READER = _rows.reader(
     "srsenb_log", "srsENB console: rank indicator (0 = no report)", kinds=("rank",),
     sample="[2025-01-01 12:00:07.000000] lte   46   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k",
     mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:rat +(?:pci +)?)?rnti +cqi +ri +mcs", re.MULTILINE), row=_ROW,

@@ -17,16 +17,15 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 from . import _json, _stamps
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
-_STAMP = rb"^\[?(?P<time>" + _time.TIME + _time.ZONE + rb")\]?"
+_STAMP = rb"^\[?(?P<time>" + _text.TIME + _text.ZONE + rb")\]?"
 _ROW = re.compile(
     _STAMP
     + rb" *(?P<pci>\d{1,4}) +(?P<rnti>(?:0x)?[0-9a-fA-F]{1,6})(?: +\|)?" + _N % b"cqi" + _N % b"ri" + _N % b"mcs"
@@ -48,7 +47,7 @@ _TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +(?:0x)?[0-9a
 def sniff(head: bytes) -> bool:
     """Check whether it is the console with its title line, or the log with scheduler metrics."""
     known = b" rnti " in head or b"[METRICS" in head
-    return known and not head.startswith(_lines.MARKUP) and any(mark.search(head) for mark in (_TITLE, _SCHEDULER))
+    return known and not head.startswith(_text.MARKUP) and any(mark.search(head) for mark in (_TITLE, _SCHEDULER))
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -85,7 +84,7 @@ def _ues(report: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE and report."""
-    lines = _lines.split(data)
+    lines = _text.split(data)
     reports = _json.objects(lines)
     row, entries = reports.row, reports.values
     with_ue = [i for i, entry in enumerate(entries) if any(True for _ in _ues(entry))]

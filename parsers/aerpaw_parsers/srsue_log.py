@@ -14,10 +14,9 @@ from dataclasses import replace
 
 import numpy as np
 
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _time
 from aerpaw_cmp.logs.records import Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import rows as _rows
-from aerpaw_cmp.logs.text import textlog as _text
 
 from . import _cells
 
@@ -46,7 +45,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     yield rows.stream("kpi", "cfo", {"value": cfo}, quantity="CFO", unit="Hz")
 
 
-READER = _text.reader(
+READER = _rows.reader(
     "srsue_log",
     "srsUE console: RSRP, path loss, CFO",
     kinds=("rss", "kpi"),

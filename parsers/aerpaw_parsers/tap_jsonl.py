@@ -27,10 +27,10 @@ import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray
-from aerpaw_cmp.logs.files.checksums import SCHEMA, decode_record
+from aerpaw_cmp.logs import text
+from aerpaw_cmp.logs.files import SCHEMA, decode_record
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
-from aerpaw_cmp.logs.text import make_frames
 
 from . import _json
 
@@ -183,7 +183,7 @@ def _joined(name: str, pieces: list[Columns]) -> pd.DataFrame | None:
         return None
     values = {name: np.concatenate([piece[name] for piece in some]) for name in some[0]}
     time, line, flag = (values.pop(name) for name in ("time", "line", "flag"))
-    return make_frames.frame("rss" if _SERIES[name][1] else "rank", time, line, flag, values, own=True)
+    return text.frame("rss" if _SERIES[name][1] else "rank", time, line, flag, values, own=True)
 
 
 def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:

@@ -11,11 +11,10 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _lines
+from aerpaw_cmp.logs import text as _time
 from aerpaw_cmp.logs.records import Stream
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
-from aerpaw_cmp.logs.text import textlog as _text
 
 _N = _lines.NUMBER
 _PLACE = rb'\{"lat": ?(?P<lat>%s), ?"lon": ?(?P<lon>%s), ?"alt": ?(?P<alt>%s)\}' % (_N, _N, _N)
@@ -35,7 +34,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
         yield rows.stream("kpi", name, {"value": rows.number(name)}, quantity=f"mean {name}", unit=unit)
 
 
-READER = _text.reader(
+READER = _rows.reader(
     "vehicle_log", "flight script's console: measured positions", kinds=("telemetry", "kpi"),
     sample='[2025-01-01 12:00:07.250000] Current location is {"lat": 35.7280002, "lon": -78.6960001, "alt": 30.1}',
     mark=_ROW, row=_ROW, torn=re.compile(rb"^\[[^\]\n]{19,40}\] Filtered data \(avg\)"), streams=_streams,

@@ -20,22 +20,21 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.common.counting import counted
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_cmp.logs.text import clocks as _time
-from aerpaw_cmp.logs.text import lines as _lines
-from aerpaw_cmp.logs.text import rows as _rows
 
 _NUMBERS = (
     "index", "longitude", "latitude", "altitude", "pitch", "yaw", "roll", "north", "east", "down", "volt", "fix",
     "satellites",
 )  # fmt: skip
-_CELL = rb'"?(?P<%s>' + _lines.NUMBER + rb'|nan|NaN|None)"?'
+_CELL = rb'"?(?P<%s>' + _text.NUMBER + rb'|nan|NaN|None)"?'
 _TRIPLE = rb'"?[(\[]' + b", ?".join([_CELL] * 3) + rb'[)\]]"?'
-_CHARGE = rb'"?(?:' + _lines.NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge: a row without them is one
-_VOLT = rb'"?(?P<volt>' + _lines.NUMBER + rb'|nan|NaN|None|)"?'
+_CHARGE = rb'"?(?:' + _text.NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge: a row without them is one
+_VOLT = rb'"?(?P<volt>' + _text.NUMBER + rb'|nan|NaN|None|)"?'
 _SEP = rb", ?"
 _BODY = (
     _SEP.join((_TRIPLE % (b"pitch", b"yaw", b"roll"), _TRIPLE % (b"north", b"east", b"down"), _VOLT)),  # 10 fields
@@ -47,7 +46,7 @@ _FIELDS = _SEP.join(
         rb'^ ?"?(?P<index>\d{1,12})"?',
         *(_CELL % name for name in (b"longitude", b"latitude", b"altitude")),
         rb"(?:" + rb"|".join(_BODY) + rb")",
-        rb'"?(?P<time>' + _time.TIME + _time.ZONE + rb')"?',
+        rb'"?(?P<time>' + _text.TIME + _text.ZONE + rb')"?',
         rb'"?(?P<fix>-?\d{1,3})"?',
         rb'"?(?P<satellites>-?\d{1,3})"?',
     )
@@ -63,7 +62,7 @@ _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while t
 
 def sniff(head: bytes) -> bool:
     """Check whether most of the first lines are telemetry rows."""
-    return _lines.mostly(head, _ROW) or _lines.mostly(head, _LONGER)
+    return _text.mostly(head, _ROW) or _text.mostly(head, _LONGER)
 
 
 _TITLE = re.compile(rb"(?i)(?:\xef\xbb\xbf)?\s*[\"']?(?:num|number|line_?num|index|id|no\.?)[\"']?\s*,.*lon.*")
@@ -77,7 +76,7 @@ def _reason(line: bytes) -> str | None:
     fields = len(re.sub(rb"\([^()]*\)", b"", line).split(b","))
     if fields not in (8, 9, 10, 11):
         return f"{fields} fields where 8, 9, 10 or 11 were expected (torn line?)"
-    if not re.search(_time.TIME, line):
+    if not re.search(_text.TIME, line):
         return "no time stamp (torn line?)"
     return "a field is not of the form that vehicleOut has there"
 
@@ -90,7 +89,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If the times carry no offset and no time zone is given.
     """
-    pattern = _EITHER if _lines.mostly(data, _LONGER) and not _lines.mostly(data, _ROW) else _ROW
+    pattern = _EITHER if _text.mostly(data, _LONGER) and not _text.mostly(data, _ROW) else _ROW
     rows = _rows.matched(data, pattern, options, reader="vehicle_out", reason=_reason)
     number = {name: _numbers(rows, name) for name in _NUMBERS}
     for name in ("pitch_11", "yaw_11", "roll_11", "volt_11", "volt_9"):  # they stand elsewhere in other layouts

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.common.cells import guarded, unguarded
+from aerpaw_cmp.common.text import guarded, unguarded
 
 
 @pytest.mark.parametrize("name", ["=cmd|' /C calc'!A0", "+1", "-2+3", "@SUM(A1)", "\tx", "'mine"])

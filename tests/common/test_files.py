@@ -66,14 +66,14 @@ def test_what_a_killed_run_left_is_removed_after_an_hour(tmp_path: Path) -> None
 # Functions that read a whole file, by their place in the package, with what they want beside its path.
 READERS_OF_WHOLE_FILES: dict[str, dict[str, Any]] = {
     "flight.settings.load_flight": {},
-    "site.imports.mapfiles.read_map_file": {},
-    "site.mesh_scenes.mitsuba._root": {},
-    "site.mesh_scenes.meshfiles.read_mesh": {},
-    "site.antenna.antennas.read_pattern_text": {},
-    "site.relief.dem.read_dem": {"frame": SiteFrame(35.7, -78.7), "crs": "EPSG:4326"},
-    "site.antenna.sphere_pattern.read_sphere_csv": {},
-    "site.antenna.antennas.read_gain_grid": {"variable": "rad_pat"},
-    "jobs.learning.calibrate_rank.read_receiver": {},
+    "site.mapfiles.read_map_file": {},
+    "site.mitsuba._root": {},
+    "site.mitsuba.read_mesh": {},
+    "site.antennas.read_pattern_text": {},
+    "site.relief.read_dem": {"frame": SiteFrame(35.7, -78.7), "crs": "EPSG:4326"},
+    "site.learned.read_sphere_csv": {},
+    "site.antennas.read_gain_grid": {"variable": "rad_pat"},
+    "jobs.calibrate_rank.read_receiver": {},
     "jobs.diff_reports.read_metrics": {"named": Path()},
 }
 

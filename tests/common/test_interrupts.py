@@ -12,7 +12,7 @@ from aerpaw_cmp.common import interrupts, outputs
 from aerpaw_cmp.common.errors import InputError, add_note
 from aerpaw_cmp.common.outputs import OutputFile, OutputFolder
 from aerpaw_cmp.common.stages import Stages
-from aerpaw_cmp.live.stop import Stop
+from aerpaw_cmp.live.ports import Stop
 
 
 @pytest.fixture(autouse=True)

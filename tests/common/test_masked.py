@@ -10,13 +10,10 @@ import pytest
 
 import aerpaw_cmp as ac
 from aerpaw_cmp.common.units import finite_mean, unmasked
-from aerpaw_cmp.compare import rank
-from aerpaw_cmp.compare.judge import season
-from aerpaw_cmp.compare.level import rss
-from aerpaw_cmp.compare.statistics import intervals as statistics
+from aerpaw_cmp.compare import level, rank, statistics, verdict
 from aerpaw_cmp.maps import variogram
-from aerpaw_cmp.maps.biexponential import fit_biexponential
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
+from aerpaw_cmp.maps.variogram import fit_biexponential
+from aerpaw_cmp.propagation.geometry import Link, Poses, single_element
 
 ROOM = Path(ac.__file__).parent
 CHANCE = np.random.default_rng(5)
@@ -52,11 +49,11 @@ CASES: dict[str, tuple[Callable[[Any], Any], Any]] = {
     "rank": (lambda h: ac.channel_rank(h, 10.0), H),
     "histogram": (rank.histogram, RANKS),
     "agreement": (lambda r: (rank.agreement(r, RANKS), rank.cohen_kappa(RANKS, r)), np.roll(RANKS, 1)),
-    "comparison": (lambda z: rss.compare_rss(TIMES, z, LEVELS), LEVELS + CHANCE.normal(size=40)),
+    "comparison": (lambda z: level.compare_rss(TIMES, z, LEVELS), LEVELS + CHANCE.normal(size=40)),
     "curve": (lambda y: fit_biexponential(1.0 + TIMES, y), fall_off(1.0 + TIMES)),
     "variogram": (lambda z: variogram.Variogram().fit(PLACES, z)(TIMES), LEVELS),
     "correlation": (lambda z: statistics.correlation(z, TIMES), LEVELS),
-    "mean of flights": (season.mean_of_flights, LEVELS),
+    "mean of flights": (verdict.mean_of_flights, LEVELS),
     "mean": (finite_mean, LEVELS),
     "places": (traced, np.column_stack([PLACES, np.full(40, 30.0)])),
 }  # fmt: skip

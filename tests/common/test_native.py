@@ -21,7 +21,7 @@ from aerpaw_cmp.common.errors import AerpawCmpError, InputError
 from aerpaw_cmp.logs import matfile
 from aerpaw_cmp.logs.flight_file import read_flight
 from aerpaw_cmp.logs.matfile import read_arrays
-from aerpaw_cmp.site.relief.dem import read_dem
+from aerpaw_cmp.site.relief import read_dem
 
 SECRET = b"PRIVATE-KEY-" + bytes(range(65, 91)) * 8 + b"-END"
 HEAD = b"MATLAB 7.3 MAT-file".ljust(508) + b"\0\2IM"

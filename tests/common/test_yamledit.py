@@ -4,7 +4,7 @@ import pytest
 import yaml
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.common.yamledit import edited
+from aerpaw_cmp.common.yamlfile import edited
 
 TEXT = """\
 # head

@@ -5,11 +5,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term
-from aerpaw_cmp.compare.gains.spread import StatedSpread, fading_of, inside_shares
-from aerpaw_cmp.compare.judge.ladder import log_distance_level_db
-from aerpaw_cmp.compare.learning import calibration
-from aerpaw_cmp.compare.learning.calibration import (
+from aerpaw_cmp.compare import calibration
+from aerpaw_cmp.compare.calibration import (
     Observed,
     Parts,
     Recipe,
@@ -18,9 +15,10 @@ from aerpaw_cmp.compare.learning.calibration import (
     groups_of,
     spread_flights,
 )
-from aerpaw_cmp.compare.level.detection import floored_fit
-from aerpaw_cmp.compare.level.rss import local_mean_db
-from aerpaw_cmp.propagation.geometry.arrays import rotation_from_yaw_pitch_roll
+from aerpaw_cmp.compare.gains import GainModel, LinkSamples, StatedSpread, Term, fading_of, inside_shares
+from aerpaw_cmp.compare.ladder import log_distance_level_db
+from aerpaw_cmp.compare.level import floored_fit, local_mean_db
+from aerpaw_cmp.propagation.geometry import rotation_from_yaw_pitch_roll
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
 RECIPE = Recipe(MODEL)

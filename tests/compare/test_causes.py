@@ -9,10 +9,10 @@ import pytest
 from scipy.optimize import lsq_linear, minimize_scalar
 from scipy.stats import multivariate_normal
 
-from aerpaw_cmp.compare.judge import causes
-from aerpaw_cmp.compare.judge.causes import LevelEvidence, Trial, flight_cause, gains_by_direction
+from aerpaw_cmp.compare import causes
+from aerpaw_cmp.compare.causes import LevelEvidence, Trial, flight_cause, gains_by_direction
 from aerpaw_cmp.compare.result import APPLIED, ESTIMATED, ClockResult
-from aerpaw_cmp.jobs.reporting.likely_cause import heights_meant, is_simulated
+from aerpaw_cmp.jobs.likely_cause import heights_meant, is_simulated
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 from benchmarks.planted_causes import NONE, TROUBLES, situation
 from tests.parsers import autopilots

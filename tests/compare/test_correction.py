@@ -10,11 +10,11 @@ from scipy.stats import norm, t
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.gains.direction_gain import LinkSamples
-from aerpaw_cmp.compare.judge.entries import crps_normal
-from aerpaw_cmp.compare.learning import correction
-from aerpaw_cmp.compare.learning.correction import OFF, Base, Channel, by_degree, choose, fixed_base
-from aerpaw_cmp.compare.learning.field_gp import PARTS, FieldFit, FieldModel, Rows
+from aerpaw_cmp.compare import calibration
+from aerpaw_cmp.compare.calibration import OFF, Base, Channel, by_degree, choose, fixed_base
+from aerpaw_cmp.compare.field_gp import PARTS, FieldFit, FieldModel, Rows
+from aerpaw_cmp.compare.gains import LinkSamples
+from aerpaw_cmp.compare.level import crps_normal
 
 
 def samples(name: str, residual: FloatArray, place: FloatArray, channel: str = "A") -> LinkSamples:
@@ -41,23 +41,23 @@ def gain(series: LinkSamples) -> FloatArray:
     return np.asarray(0.02 * series.position_m[:, 0])
 
 
-FEW = {OFF: correction._STARTS[OFF], "field": FieldModel(place_sd_db=2.5, length_m=50.0, height_m=40.0, turn=math.inf)}
+FEW = {OFF: calibration._STARTS[OFF], "field": FieldModel(place_sd_db=2.5, length_m=50.0, height_m=40.0, turn=math.inf)}
 
 
 @pytest.fixture(autouse=True)
 def few_titles(monkeypatch: pytest.MonkeyPatch) -> None:
     """Two in place of five, whose scales are as given: a fit of the nuisances takes seconds."""
-    monkeypatch.setattr(correction, "_STARTS", FEW)
-    monkeypatch.setattr(correction, "fit_field", lambda *given: given[1])
+    monkeypatch.setattr(calibration, "_STARTS", FEW)
+    monkeypatch.setattr(calibration, "fit_field", lambda *given: given[1])
 
 
 def test_blocks_spread_by_their_means() -> None:
     place = np.array([[10.0, 10, 5], [290, 290, 5], [310, 10, 5], [-10, 10, 5], [-20, 10, 5]])
     rows = Rows.of(samples("a", np.zeros(5), place), 0)
     channel = Channel(rows=rows, left_db=np.array([1.0, 3.0, 5.0, -2.0, -4.0]), base_sd_db=np.zeros(5))
-    assert correction.between_blocks_db(channel) == pytest.approx(np.std([2.0, 5.0, -3.0], ddof=1))
+    assert calibration.between_blocks_db(channel) == pytest.approx(np.std([2.0, 5.0, -3.0], ddof=1))
     single = Channel(rows=rows.part(slice(0, 2)), left_db=channel.left_db[:2], base_sd_db=np.zeros(2))
-    assert correction.between_blocks_db(single) == 0.0
+    assert calibration.between_blocks_db(single) == 0.0
 
 
 def by_hand(series: Sequence[LinkSamples], base: Base, model: FieldModel) -> tuple[FloatArray, FloatArray]:
@@ -187,7 +187,7 @@ def test_of_many_flights_three_groups_of_six_are_scored_and_scales_are_learned_o
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fits: list[int] = []
-    monkeypatch.setattr(correction, "fit_field", lambda *given: fits.append(1) or given[1])
+    monkeypatch.setattr(calibration, "fit_field", lambda *given: fits.append(1) or given[1])
     for count, scored, learned in ((6, 6, 7), (7, 4, 2), (12, 6, 2)):
         fits.clear()
         choice = choose([flight(str(k), k) for k in range(count)], {"made": fixed_base(gain)})

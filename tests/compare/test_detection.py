@@ -5,7 +5,7 @@ import pytest
 from scipy.special import expit
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.compare.level.detection import (
+from aerpaw_cmp.compare.level import (
     BASE_S,
     DetectionForecast,
     aligned_quality,
@@ -13,7 +13,7 @@ from aerpaw_cmp.compare.level.detection import (
     learn_detection,
     score_detection,
 )
-from aerpaw_cmp.compare.ranks.receiver import out_of_group
+from aerpaw_cmp.compare.receiver import out_of_group
 
 FLOOR = -15.0
 

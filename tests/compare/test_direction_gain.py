@@ -7,10 +7,9 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.compare.gains import direction_gain
-from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term, chosen_fit, fit_gain
-from aerpaw_cmp.compare.gains.mount import fit_mounts
-from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
+from aerpaw_cmp.compare import gains as direction_gain
+from aerpaw_cmp.compare.gains import GainModel, LinkSamples, Term, chosen_fit, fit_gain, fit_mounts
+from aerpaw_cmp.propagation.geometry import rotation_from_aircraft, rotation_from_yaw_pitch_roll
 
 RNG = np.random.default_rng(5)
 TERMS = (Term("body", "all", 0.5, 2.5), Term("mast", "antenna", 0.4, 3.0))

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.compare.learning import field_gp
-from aerpaw_cmp.compare.learning.field_gp import PARTS, FieldFit, FieldModel, Rows, fit_field
+from aerpaw_cmp.compare import field_gp
+from aerpaw_cmp.compare.field_gp import PARTS, FieldFit, FieldModel, Rows, fit_field
 
 STILL = FieldModel(
     place_sd_db=3.0, length_m=40.0, height_m=20.0, turn=math.inf, offset_sd_db=0.0, drift_sd_db=0.0, noise_sd_db=1e-4

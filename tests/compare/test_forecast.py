@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.rank import one_hot
-from aerpaw_cmp.compare.ranks.forecast import brier_losses, constant_forecast, log_losses, score_forecast
-from aerpaw_cmp.compare.statistics.intervals import autocorrelation, bootstrap_means, interval
+from aerpaw_cmp.compare.receiver import brier_losses, constant_forecast, log_losses, score_forecast
+from aerpaw_cmp.compare.statistics import autocorrelation, bootstrap_means, interval
 
 
 def ranks(n=400, seed=1):

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.judge.ladder import (
+from aerpaw_cmp.compare.ladder import (
     LadderRow,
     Rung,
     climb,

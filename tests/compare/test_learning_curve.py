@@ -5,9 +5,8 @@ import itertools
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.gains.direction_gain import GainModel, Term
-from aerpaw_cmp.compare.learning.calibration import Observed, Recipe, learn
-from aerpaw_cmp.compare.learning.learning_curve import CurvePoint, learning_curve, with_one_more
+from aerpaw_cmp.compare.calibration import CurvePoint, Observed, Recipe, learn, learning_curve, with_one_more
+from aerpaw_cmp.compare.gains import GainModel, Term
 from tests.compare.test_direction_gain import GAINS, planted
 
 RECIPE = Recipe(GainModel((Term("body", "all", 0.5, 2.5), Term("mast", "antenna", 0.4, 3.0))))

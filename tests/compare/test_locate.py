@@ -10,8 +10,8 @@ from scipy.stats import multivariate_normal, norm
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.learning import locate as locating
-from aerpaw_cmp.compare.learning.locate import LevelTrack, fit_places, level_track, locate
+from aerpaw_cmp.compare import locate as locating
+from aerpaw_cmp.compare.locate import LevelTrack, fit_places, level_track, locate
 
 
 def _lawnmower(n: int) -> tuple[FloatArray, FloatArray]:

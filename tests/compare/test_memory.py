@@ -8,16 +8,8 @@ from scipy.optimize import brentq
 from scipy.signal import lfilter
 from scipy.stats import multivariate_normal
 
-from aerpaw_cmp.compare.statistics import memory
-from aerpaw_cmp.compare.statistics.memory import (
-    RATES,
-    TERMS,
-    WHITE_SHARES,
-    cosine_terms,
-    likelihoods,
-    mean_draws,
-    memories,
-)
+from aerpaw_cmp.compare import statistics
+from aerpaw_cmp.compare.statistics import RATES, TERMS, WHITE_SHARES, cosine_terms, likelihoods, mean_draws, memories
 
 POINTS = 2000
 
@@ -33,20 +25,20 @@ def integrated(rate: float, terms: int, law: Callable[[np.ndarray], np.ndarray] 
 
 @pytest.mark.parametrize("rate", [0.3, 4.0, 40.0])
 def test_the_covariance_of_cosine_terms_is_the_double_integral(rate: float) -> None:
-    np.testing.assert_allclose(memory._exponential(rate, 6), integrated(rate, 6), atol=2e-4 / rate)
+    np.testing.assert_allclose(statistics._exponential(rate, 6), integrated(rate, 6), atol=2e-4 / rate)
 
 
 @pytest.mark.parametrize("rate", [0.3, 4.0, 40.0])
 def test_the_covariance_of_a_smooth_memory_is_that_of_matern_three_halves(rate: float) -> None:
     expected = integrated(rate, 6, lambda lag: (1.0 + rate * lag) * np.exp(-rate * lag))
-    np.testing.assert_allclose(memory._smooth(rate, 6), expected, atol=2e-4 / rate)
+    np.testing.assert_allclose(statistics._smooth(rate, 6), expected, atol=2e-4 / rate)
 
 
 @pytest.mark.parametrize(("share", "rate"), [(0, 0), (0, 9), (1, 4), (2, 17)])
 def test_a_memory_whitens_its_terms_and_foretells_the_mean(share: int, rate: int) -> None:
     """Rates run fastest; half the rate times the covariance has the power 1 of an endless sequence at its low end."""
     white, known, at = WHITE_SHARES[share], memories(6), share * len(RATES) + rate
-    covariance = (1.0 - white) * 0.5 * RATES[rate] * memory._exponential(RATES[rate], 6) + white * np.eye(7)
+    covariance = (1.0 - white) * 0.5 * RATES[rate] * statistics._exponential(RATES[rate], 6) + white * np.eye(7)
     inner, cross = covariance[1:, 1:], covariance[0, 1:]
     whiten = known.whiten[at]
     np.testing.assert_allclose(whiten @ inner @ whiten.T, np.eye(6), atol=1e-9)
@@ -72,8 +64,10 @@ def test_the_likelihood_is_that_of_a_normal_with_its_scale_integrated_out() -> N
 
 
 @pytest.mark.parametrize("kind", ["mean", "power", "ratio"])
-def test_before_any_sample_every_memory_is_possible_and_none_stands_out_from_its_neighbours(kind: memory.Kind) -> None:
-    drawn = memory.weights(kind)
+def test_before_any_sample_every_memory_is_possible_and_none_stands_out_from_its_neighbours(
+    kind: statistics.Kind,
+) -> None:
+    drawn = statistics.weights(kind)
     assert drawn.sum() == pytest.approx(1.0)
     assert len(drawn) == len(memories().power)
     assert drawn.min() > 1e-8 * drawn.max()
@@ -98,7 +92,7 @@ def test_white_noise_has_as_many_degrees_of_freedom_as_samples() -> None:
 
 
 def test_draws_are_spread_as_their_distributions() -> None:
-    uniform, chi_squared, *normal = memory._random(7)
+    uniform, chi_squared, *normal = statistics._random(7)
     assert (uniform.mean(), uniform.var()) == pytest.approx((1 / 2, 1 / 12), rel=0.01)
     assert (chi_squared.mean(), chi_squared.var()) == pytest.approx((7.0, 14.0), rel=0.03)
     for unit in normal:
@@ -110,7 +104,7 @@ def test_draws_are_spread_as_their_distributions() -> None:
 @pytest.mark.parametrize("by", [0.7, 1.0, 1.5])
 def test_a_stretch_moves_the_ends_of_an_interval_and_leaves_every_draw_in_its_place(by: float) -> None:
     drawn = np.random.default_rng(4).normal(size=4096) ** 3
-    stretched, tail = memory._stretched(drawn, by), 1.0 / (1.0 + 39.0**by)  # the odds of 2.5 %, to that power
+    stretched, tail = statistics._stretched(drawn, by), 1.0 / (1.0 + 39.0**by)  # the odds of 2.5 %, to that power
     np.testing.assert_allclose(
         np.quantile(stretched, [0.025, 0.975]), np.quantile(drawn, [tail, 1.0 - tail]), rtol=0.02
     )
@@ -122,7 +116,7 @@ def test_the_ends_of_any_interval_lie_between_the_outer_thousandth_and_tenth_of_
     for keep in (0.0, 0.5, 0.9, 0.99, 1.0):
         for seed in (n, 22):  # of 60 steps, the second walk would lie outside by its shares
             values = lfilter([1.0], [1.0, -keep], np.random.default_rng(seed).normal(size=n))
-            stretches = [memory._picked(cosine_terms(values).slow, kind)[2] for kind in ("mean", "power")]
+            stretches = [statistics._picked(cosine_terms(values).slow, kind)[2] for kind in ("mean", "power")]
             assert 0.001 < 1.0 / (1.0 + 39.0 ** max(stretches)) <= 1.0 / (1.0 + 39.0 ** min(stretches)) < 0.1
 
 
@@ -136,14 +130,14 @@ def innovations_excess(values: np.ndarray) -> float:
 
 def test_draws_follow_unit_and_zero_and_do_not_know_the_direction_of_time() -> None:
     values = np.cumsum(np.random.default_rng(3).normal(size=120))
-    mean, power = mean_draws(values), memory.power_draws(values)
+    mean, power = mean_draws(values), statistics.power_draws(values)
     np.testing.assert_allclose(mean_draws(7.0 + 3.0 * values), 3.0 * mean, rtol=1e-9, atol=1e-9)
     np.testing.assert_allclose(np.sort(mean_draws(-values)), np.sort(-mean), rtol=1e-9, atol=1e-9)
-    np.testing.assert_allclose(memory.power_draws(5.0 + 3.0 * values), 9.0 * power, rtol=1e-9)
+    np.testing.assert_allclose(statistics.power_draws(5.0 + 3.0 * values), 9.0 * power, rtol=1e-9)
     np.testing.assert_allclose(mean_draws(values[::-1]), mean, rtol=1e-6, atol=1e-9)
-    np.testing.assert_allclose(memory.power_draws(values[::-1]), power, rtol=1e-6)
+    np.testing.assert_allclose(statistics.power_draws(values[::-1]), power, rtol=1e-6)
     assert not mean_draws(np.full(30, 2.0)).any()
-    assert not memory.power_draws(np.full(30, 2.0)).any()
+    assert not statistics.power_draws(np.full(30, 2.0)).any()
 
 
 @pytest.mark.parametrize(("share", "widened"), [(0.99, False), (1.01, True)])
@@ -159,13 +153,13 @@ def test_only_tails_beyond_chance_widen_the_power(share: float, widened: bool, m
         return innovations_excess(sequence(large)) - share * np.sqrt(6.0 / 399)
 
     values = sequence(brentq(beyond, 1.0, 8.0))
-    usual, drawn = memory.power_draws(values), memory._random(TERMS)
-    monkeypatch.setattr(memory, "_random", lambda _: (*drawn[:2], 0.0 * drawn[2], drawn[3]))
-    assert np.array_equal(memory.power_draws(values), usual) != widened
+    usual, drawn = statistics.power_draws(values), statistics._random(TERMS)
+    monkeypatch.setattr(statistics, "_random", lambda _: (*drawn[:2], 0.0 * drawn[2], drawn[3]))
+    assert np.array_equal(statistics.power_draws(values), usual) != widened
 
 
 @pytest.mark.parametrize("samples", [20, 80])
 def test_the_likeliest_memory_is_about_that_of_the_sequence(samples: int) -> None:
     rng, keep = np.random.default_rng(samples), np.exp(-1.0 / samples)
-    shares = [memory.memory_share(lfilter([1.0], [1.0, -keep], rng.normal(size=2000))) for _ in range(20)]
+    shares = [statistics.memory_share(lfilter([1.0], [1.0, -keep], rng.normal(size=2000))) for _ in range(20)]
     assert np.median(shares) * 2000 == pytest.approx(samples, rel=0.6)

@@ -6,9 +6,8 @@ import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.stats import spearmanr
 
-from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term, fit_gain
-from aerpaw_cmp.compare.learning.field_gp import FieldModel
-from aerpaw_cmp.compare.learning.next_flight import Known, rms_db
+from aerpaw_cmp.compare.field_gp import FieldModel, Known, rms_db
+from aerpaw_cmp.compare.gains import GainModel, LinkSamples, Term, fit_gain
 from tests.compare.test_direction_gain import drawn
 
 TERMS = (Term("body", "all", 0.6, 2.5), Term("mast", "antenna", 0.5, 3.0))

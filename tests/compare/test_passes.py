@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.statistics.intervals import correlation
-from aerpaw_cmp.compare.statistics.passes import Pass, PassTable
+from aerpaw_cmp.compare.statistics import Pass, PassTable, correlation
 
 RADIUS_M, WITHIN_DEG, CELL_M = 3.0, 20.0, 20.0
 FLIGHTS, LINKS, SAMPLES = 7, 3, 160

@@ -26,13 +26,7 @@ from aerpaw_cmp.compare.rank import (
     total_variation,
     wasserstein,
 )
-from aerpaw_cmp.compare.statistics.inertia import certain_rank
-from aerpaw_cmp.compare.statistics.intervals import (
-    NO_INTERVAL,
-    SEED,
-    autocorrelation,
-)
-from aerpaw_cmp.compare.statistics.passes import Visit
+from aerpaw_cmp.compare.statistics import NO_INTERVAL, SEED, Visit, autocorrelation, certain_rank
 
 NAN = float("nan")
 

@@ -5,15 +5,15 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.jsonable import json_safe
+from aerpaw_cmp.compare import receiver as receiving
 from aerpaw_cmp.compare.rank import cohen_kappa
-from aerpaw_cmp.compare.ranks import receiver as receiving
-from aerpaw_cmp.compare.ranks.forecast import log_losses
-from aerpaw_cmp.compare.ranks.receiver import (
+from aerpaw_cmp.compare.receiver import (
     Receiver,
     choose_features,
     decide,
     decision_weights,
     fit_mixture,
+    log_losses,
     mixture_loss,
     out_of_group,
     sector_groups,

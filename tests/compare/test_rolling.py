@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.judge.entries import crps_normal
-from aerpaw_cmp.compare.learning.rolling import KEEP, NONE, RouteAhead
+from aerpaw_cmp.compare.field_gp import KEEP, NONE, RouteAhead
+from aerpaw_cmp.compare.level import crps_normal
 
 
 def route():

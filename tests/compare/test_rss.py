@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.jsonable import json_safe
-from aerpaw_cmp.compare.level.rss import (
+from aerpaw_cmp.compare.level import (
     averaged_fits,
     channel_difference,
     compare_rss,
@@ -17,7 +17,7 @@ from aerpaw_cmp.compare.level.rss import (
     outliers,
     seconds,
 )
-from aerpaw_cmp.compare.statistics.intervals import error_intervals
+from aerpaw_cmp.compare.statistics import error_intervals
 
 NAN = float("nan")
 
@@ -161,7 +161,7 @@ def test_fading_averages_out_on_the_same_footing():
 
 
 def test_link_geometry_in_the_antenna_frames():
-    from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
+    from aerpaw_cmp.propagation.geometry import rotation_from_aircraft, rotation_from_yaw_pitch_roll
 
     tower = np.array([10.0, -5.0, 10.0])
     rng = np.random.default_rng(9)

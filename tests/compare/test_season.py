@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from aerpaw_cmp.compare.judge.season import error_at_offset, left_out_offsets, mean_of_flights, verdict_of
 from aerpaw_cmp.compare.offset import grid_offset
-from aerpaw_cmp.compare.statistics.intervals import autocorrelation
+from aerpaw_cmp.compare.statistics import autocorrelation
+from aerpaw_cmp.compare.verdict import error_at_offset, left_out_offsets, mean_of_flights, verdict_of
 
 
 def test_offset_of_the_others_is_the_search_over_their_samples():

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerpaw_cmp.compare.level.serving import at_times, compare_serving
+from aerpaw_cmp.compare.level import at_times, compare_serving
 
 
 def test_a_perfect_prediction_hits_always_and_an_exchanged_one_never() -> None:

@@ -6,8 +6,16 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from aerpaw_cmp.compare.gains.direction_gain import LinkSamples
-from aerpaw_cmp.compare.gains.spread import NO_SPREAD, SHARES, LostLock, Spread, StatedSpread, fading_of, inside_shares
+from aerpaw_cmp.compare.gains import (
+    NO_SPREAD,
+    SHARES,
+    LinkSamples,
+    LostLock,
+    Spread,
+    StatedSpread,
+    fading_of,
+    inside_shares,
+)
 
 N = 60_000
 

@@ -7,9 +7,10 @@ import pytest
 from scipy.signal import lfilter
 from scipy.stats import t as student
 
-from aerpaw_cmp.compare.statistics import intervals as statistics
-from aerpaw_cmp.compare.statistics.intervals import (
+from aerpaw_cmp.compare import statistics
+from aerpaw_cmp.compare.statistics import (
     Autocorrelation,
+    Visit,
     autocorrelation,
     autocovariance,
     bootstrap_means,
@@ -17,9 +18,9 @@ from aerpaw_cmp.compare.statistics.intervals import (
     error_intervals,
     interval,
     paired_difference,
+    same_places,
     share_interval,
 )
-from aerpaw_cmp.compare.statistics.passes import Visit, same_places
 
 
 def shadowing(rng, n, samples, sigma):

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from aerpaw_cmp.compare.judge.steps import NightOffsets, NodeOffset, _Stretch, node_offsets, stepped
+from aerpaw_cmp.compare.verdict import NightOffsets, NodeOffset, _Stretch, node_offsets, stepped
 
 NIGHTS, FIRST = 100, 30
 RADIOS = [f"LW{tower}:{channel}" for tower in range(1, 6) for channel in (0, 1)]

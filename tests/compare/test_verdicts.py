@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from scipy.stats import ttest_ind
 
-from aerpaw_cmp.compare.judge import verdicts
-from aerpaw_cmp.compare.judge.verdicts import (
+from aerpaw_cmp.compare import verdict as verdicts
+from aerpaw_cmp.compare.verdict import (
     Coverage,
     Verdict,
     antenna_or_place,

@@ -13,8 +13,7 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.site.antenna.learned import folder_of, read_learned, read_table
-from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv
+from aerpaw_cmp.site.learned import folder_of, read_learned, read_sphere_csv, read_table
 from tests.real_logs import REAL
 
 HERE = Path(__file__).parent / "learned"

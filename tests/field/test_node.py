@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.learning.locate import NodeEstimate, locate
-from aerpaw_cmp.flight.drafting import node
-from aerpaw_cmp.flight.drafting.node import ListedPlace, Placer, listed_places
-from aerpaw_cmp.flight.rows.lock import LOCK_FLOOR_DB
+from aerpaw_cmp.compare.locate import NodeEstimate, locate
+from aerpaw_cmp.flight.drafting import proposals
+from aerpaw_cmp.flight.drafting.proposals import ListedPlace, Placer, listed_places
+from aerpaw_cmp.flight.rows import LOCK_FLOOR_DB
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.site.siteyaml import load_site
@@ -19,7 +19,7 @@ FLIGHTS = ("sounder/*_288_loc_1.mat", "afar/*_300_loc_1.mat", "afar/*_300_loc_2.
 
 def test_the_rover_is_found_within_its_region(monkeypatch: pytest.MonkeyPatch) -> None:
     estimates: list[NodeEstimate] = []
-    monkeypatch.setattr(node, "locate", lambda *track: estimates.append(locate(*track)) or estimates[-1])
+    monkeypatch.setattr(proposals, "locate", lambda *track: estimates.append(locate(*track)) or estimates[-1])
     site = load_site("lake_wheeler")
     listed = listed_places([REAL / "sounder"])
     assert [place.line for place in listed[:3]] == [1, 2, 3]

@@ -7,7 +7,7 @@ import pytest
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.replay import replay_flight
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting.audit_flight import expectations
+from aerpaw_cmp.jobs.audit_flight import expectations
 from tests.raw_checks import raw_checked
 from tests.real_logs import REAL
 

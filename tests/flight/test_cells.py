@@ -12,8 +12,8 @@ from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
-from aerpaw_cmp.jobs.reporting.compare_flight import serving_of
-from aerpaw_cmp.jobs.reporting.flight_run import run_flight
+from aerpaw_cmp.jobs.compare_flight import serving_of
+from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.report import flight as html

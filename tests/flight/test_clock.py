@@ -8,7 +8,7 @@ import pytest
 from scipy.stats import multivariate_normal
 
 from aerpaw_cmp.flight import replay as flight_replay
-from aerpaw_cmp.flight.pose.clock import (
+from aerpaw_cmp.flight.clock import (
     CANNOT_TELL,
     EVIDENCE_NAT,
     OK,

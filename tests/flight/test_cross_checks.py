@@ -8,8 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.flight.drafting.node import Placer
-from aerpaw_cmp.flight.pose.cross_checks import _lowest_m, questions
+from aerpaw_cmp.flight.cross_checks import _lowest_m, questions
+from aerpaw_cmp.flight.drafting.proposals import Placer
 from aerpaw_cmp.logs.ingest import IngestedFile
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
 from aerpaw_cmp.site.siteyaml import load_site

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from aerpaw_cmp.flight.drafting import dry_run
+from aerpaw_cmp.flight.drafting import draft
 
 TRACK = SimpleNamespace(pose_at=np.asarray, why_not=lambda _: "most are after telemetry")
 
@@ -23,7 +23,7 @@ TRACK = SimpleNamespace(pose_at=np.asarray, why_not=lambda _: "most are after te
     ],
 )
 def test_a_loss_has_its_first_reason(counts: tuple[int, int, int], track: object, words: str) -> None:
-    reason = dry_run._loss(SimpleNamespace(track=track), np.zeros(3), counts)  # type: ignore[arg-type]
+    reason = draft._loss(SimpleNamespace(track=track), np.zeros(3), counts)  # type: ignore[arg-type]
     assert reason.startswith(words)
     assert bool(reason) == bool(words)
 
@@ -32,5 +32,5 @@ def test_values_positions_and_heights_are_counted_one_after_the_other() -> None:
     value = np.array([1.0, np.nan, 2.0, 3.0, 4.0])
     known = np.array([True, True, False, True, True])
     place = np.column_stack([np.zeros((5, 2)), [50.0, 50.0, 50.0, 20.0, 30.0]])
-    assert dry_run._counts(place, known, value, 30.0) == (4, 3, 2)
-    assert dry_run._counts(place, known, value, None) == (4, 3, 3)
+    assert draft._counts(place, known, value, 30.0) == (4, 3, 2)
+    assert draft._counts(place, known, value, None) == (4, 3, 3)

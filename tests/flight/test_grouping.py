@@ -7,10 +7,10 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight.clock import origin_of
+from aerpaw_cmp.flight.cross_checks import flights
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, drafts
-from aerpaw_cmp.flight.pose.grouping import flights
-from aerpaw_cmp.flight.pose.time_origin import origin_of
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
@@ -168,16 +168,16 @@ def test_no_origin_for_another_track_or_a_hover() -> None:
 
 
 def test_radios_meet_a_flight_up_to_the_slack_before_and_after() -> None:
-    from aerpaw_cmp.flight.pose import grouping
+    from aerpaw_cmp.flight import cross_checks
 
     begin, end = np.datetime64("2025-03-02T15:00:00", "ns"), np.datetime64("2025-03-02T15:05:00", "ns")
-    flight, second = grouping.Flight(files=[], span=(begin, end)), np.timedelta64(1, "s")
-    slack, long = grouping.SLACK, 10 * grouping.SLACK + (end - begin)
-    assert grouping._meet(flight, (end + slack - second, end + long), None)
-    assert not grouping._meet(flight, (end + slack + second, end + long), None)
-    assert grouping._meet(flight, (begin - long, begin - slack + second), None)
-    assert not grouping._meet(flight, (begin - long, begin - slack - second), None)
-    assert not grouping._meet(grouping.Flight(files=[]), (begin, end), None)
+    flight, second = cross_checks.Flight(files=[], span=(begin, end)), np.timedelta64(1, "s")
+    slack, long = cross_checks.SLACK, 10 * cross_checks.SLACK + (end - begin)
+    assert cross_checks._meet(flight, (end + slack - second, end + long), None)
+    assert not cross_checks._meet(flight, (end + slack + second, end + long), None)
+    assert cross_checks._meet(flight, (begin - long, begin - slack + second), None)
+    assert not cross_checks._meet(flight, (begin - long, begin - slack - second), None)
+    assert not cross_checks._meet(cross_checks.Flight(files=[]), (begin, end), None)
 
 
 def test_no_origin_for_a_lap_of_a_route_that_is_flown_again() -> None:

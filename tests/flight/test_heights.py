@@ -8,8 +8,8 @@ import pytest
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError, UsageError
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
-from aerpaw_cmp.flight.pose.heights import height_in_name
 from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.track import height_in_name
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 

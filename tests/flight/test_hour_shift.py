@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.flight.pose.hour_shift import clock_trap
+from aerpaw_cmp.flight.clock import clock_trap
 
 HOUR = 3600.0
 

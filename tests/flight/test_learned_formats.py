@@ -12,13 +12,19 @@ from scipy.io import savemat
 from scipy.signal import lfilter
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.compare.gains.direction_gain import ANTENNA_TERMS, link_directions, term_kernel
-from aerpaw_cmp.flight.gains.learned_gain import sphere_angles
+from aerpaw_cmp.compare.gains import ANTENNA_TERMS, link_directions, term_kernel
+from aerpaw_cmp.flight.gains import sphere_angles
 from aerpaw_cmp.logs.writers import format_power_log
-from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
-from aerpaw_cmp.site.antenna.known_directions import KnownDirections
-from aerpaw_cmp.site.antenna.learned import folder_of, remember
-from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, sphere_csv, sphere_grid, unit_mean_gain
+from aerpaw_cmp.propagation.geometry import rotation_from_aircraft
+from aerpaw_cmp.site.learned import (
+    KnownDirections,
+    SpherePattern,
+    folder_of,
+    remember,
+    sphere_csv,
+    sphere_grid,
+    unit_mean_gain,
+)
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.learned_entries import learned_entry, learned_series
 

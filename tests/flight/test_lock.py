@@ -5,8 +5,8 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.units import FloatArray
-from aerpaw_cmp.compare.level.detection import BASE_S
-from aerpaw_cmp.flight.rows.lock import lock_of, may_lose_lock
+from aerpaw_cmp.compare.level import BASE_S
+from aerpaw_cmp.flight.rows import lock_of, may_lose_lock
 from aerpaw_cmp.logs.records import Stream
 
 

@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.flight import marks
+from aerpaw_cmp.flight import training
 from aerpaw_cmp.flight.data import FlightData, load_data
-from aerpaw_cmp.flight.marks import among, mark_of
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.flight.training import series_mark
+from aerpaw_cmp.flight.training import among, mark_of, series_mark
 from tests.real_logs import REAL
 
 Readings = tuple[np.ndarray, np.ndarray]
@@ -99,7 +98,7 @@ def test_runs_of_a_quantised_level_are_shared_by_copies_only() -> None:
     """Whole dB repeat by chance: none of 20 pairs of flights may share three runs of 64."""
     t = np.arange(0.0, 1200.0, 0.25)
     levels = [np.round(-90 + np.random.default_rng(i).normal(0, 0.8, len(t))) for i in range(6)]
-    runs = [marks._parts(mark(t, level))[2] for level in levels]
+    runs = [training._parts(mark(t, level))[2] for level in levels]
     assert all(len(one) == 64 for one in runs)
     assert max(len(runs[i] & runs[j]) for i in range(6) for j in range(i)) == 0
 

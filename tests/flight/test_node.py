@@ -10,16 +10,16 @@ import pytest
 
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.compare.learning.locate import LevelModel, LevelTrack, NodeEstimate, Regions, level_track
-from aerpaw_cmp.flight.drafting import node
+from aerpaw_cmp.compare.locate import LevelModel, LevelTrack, NodeEstimate, Regions, level_track
+from aerpaw_cmp.flight.drafting import proposals as node
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, draft
-from aerpaw_cmp.flight.drafting.node import listed_places
-from aerpaw_cmp.flight.gains.learned_gain import sphere_angles
+from aerpaw_cmp.flight.drafting.proposals import listed_places
+from aerpaw_cmp.flight.gains import sphere_angles
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.logs.ingest import IngestedFile, ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Stream
-from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, sphere_grid, unit_mean_gain
+from aerpaw_cmp.site.learned import SpherePattern, sphere_grid, unit_mean_gain
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")

@@ -7,8 +7,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.flight.overrides import overridden
-from aerpaw_cmp.flight.settings import FlightFile, LinksSettings, load_flight
+from aerpaw_cmp.flight.settings import FlightFile, LinksSettings, load_flight, overridden
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
 

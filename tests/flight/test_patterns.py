@@ -7,7 +7,7 @@ import pytest
 import shapely
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.flight.pose.patterns import (
+from aerpaw_cmp.flight.routes import (
     NOSES,
     Pattern,
     Waypoint,
@@ -17,11 +17,12 @@ from aerpaw_cmp.flight.pose.patterns import (
     flown,
     lawnmower,
     path_within,
+    plan_text,
     route_of,
+    waypoints_csv,
     waypoints_of,
     with_turns,
 )
-from aerpaw_cmp.flight.pose.route_files import plan_text, waypoints_csv
 from aerpaw_cmp.logs.route import read_areas, read_route
 from aerpaw_cmp.site.siteyaml import load_site
 

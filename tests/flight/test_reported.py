@@ -9,9 +9,9 @@ import pytest
 
 import aerpaw_cmp
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight.cross_checks import doubts, questions
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.drafting.draft import DraftOptions, _entry, draft
-from aerpaw_cmp.flight.pose.cross_checks import doubts, questions
 from aerpaw_cmp.flight.replay import estimate_clocks
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.logs.ingest import ingest

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
-from aerpaw_cmp.flight.gains.memory import load_with_learned
+from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import ArraySettings, FlightFile
 
 POINT = {"east_m": 0, "north_m": 0, "height_m": 5}

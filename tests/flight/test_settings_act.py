@@ -17,10 +17,10 @@ from pydantic import BaseModel
 from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.common.yamlfile import _models_in
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.gains.memory import load_with_learned
+from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.replay import replay_flight
 from aerpaw_cmp.flight.settings import FlightFile
-from aerpaw_cmp.jobs.reporting.compare_flight import compare_flight
+from aerpaw_cmp.jobs.compare_flight import compare_flight
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 RANK_LINK = {

@@ -6,9 +6,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.flight.pose import track as tracks
-from aerpaw_cmp.flight.pose.track import Track, good_positions, velocities_mps
-from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
+from aerpaw_cmp.flight import track as tracks
+from aerpaw_cmp.flight.track import Track, good_positions, velocities_mps
+from aerpaw_cmp.propagation.geometry import rotation_from_aircraft
 
 FRAME = SiteFrame(35.7275, -78.6960)
 

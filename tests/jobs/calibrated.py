@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Any
 
-from aerpaw_cmp.jobs.learning.calibrate import Calibration, calibrate, load_calibration, read_flights
+from aerpaw_cmp.jobs.calibrate import Calibration, calibrate, load_calibration, read_flights
 from tests.simulated import planned, simulate, write_yaml
 
 ROUTES = {

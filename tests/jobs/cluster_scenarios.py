@@ -19,8 +19,8 @@ from distributed.security import Security
 from worker_tasks import collected, dies  # beside this script
 
 from aerpaw_cmp.common.errors import AerpawCmpError
-from aerpaw_cmp.jobs.tasks import workers
-from aerpaw_cmp.jobs.tasks.workers import check_workers, open_workers
+from aerpaw_cmp.jobs import tasks
+from aerpaw_cmp.jobs.tasks import check_workers, open_workers
 
 SECURITY = Security.temporary()
 # as a user's configuration names them, there by files
@@ -69,9 +69,9 @@ def on_a_cluster(folder: Path) -> dict[str, Any]:
             "unseen": message(lambda: check_workers(crew._client, [folder / "nowhere"])),
             "plain": message(lambda: open_workers(1, plain).__enter__()),
         }
-        real, workers.code_digest = workers.code_digest, lambda: "another"
+        real, tasks.code_digest = tasks.code_digest, lambda: "another"
         out["other"] = message(lambda: check_workers(crew._client, []))
-        workers.code_digest = real
+        tasks.code_digest = real
         out["killed"] = collected(crew, dies, [(i, str(folder)) for i in range(8)])
         # Dask cannot close a cluster while it starts a worker anew ("can only join a started process")
         crew._client.wait_for_workers(2, timeout=60)
@@ -111,7 +111,7 @@ def gone() -> str:
 
 
 def none_there() -> str:
-    workers.CONNECT_S = 0.5
+    tasks.CONNECT_S = 0.5
 
     def open_one() -> None:
         with open_workers(1, f"tls://127.0.0.1:{_port()}"):

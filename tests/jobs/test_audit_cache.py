@@ -8,12 +8,12 @@ import shapely
 
 from aerpaw_cmp.common import versions
 from aerpaw_cmp.common.files import cache_folder
-from aerpaw_cmp.compare.level.field_difference import FieldAudit
+from aerpaw_cmp.compare.level import FieldAudit
 from aerpaw_cmp.compare.result import AuditResult
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.replay import replay_flight
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting import audit_flight
+from aerpaw_cmp.jobs import audit_flight
 from aerpaw_cmp.report.flight_words import audit_summary
 from aerpaw_cmp.site.site import Building
 from tests.simulated import write_yaml

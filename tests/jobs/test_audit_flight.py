@@ -11,12 +11,12 @@ import pytest
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight import replay as replays
+from aerpaw_cmp.flight import track
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.pose import track as tracks
 from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings, LinksSettings, RtSettings, load_flight
-from aerpaw_cmp.jobs.reporting import audit_flight
-from aerpaw_cmp.propagation.geometry.arrays import Poses
-from aerpaw_cmp.propagation.native.llvm import INSTALL_AGAIN
+from aerpaw_cmp.jobs import audit_flight
+from aerpaw_cmp.propagation.geometry import Poses
+from aerpaw_cmp.propagation.llvm import INSTALL_AGAIN
 from tests.jobs.test_audit_raw import write_flight
 
 FRAME = SiteFrame(35.7275, -78.696)
@@ -34,7 +34,7 @@ def flight(attitude="logged", roll=8.0, pitch=-5.0):
     stream = SimpleNamespace(kind="telemetry", frame=frame)
     files = (SimpleNamespace(result=SimpleNamespace(streams=(stream,))),)
     settings = SimpleNamespace(rt=RtSettings(attitude=attitude))
-    return SimpleNamespace(settings=settings, track=tracks.Track(frame, FRAME), files=files)
+    return SimpleNamespace(settings=settings, track=track.Track(frame, FRAME), files=files)
 
 
 @pytest.mark.parametrize("mode", ["logged", "level"])
@@ -48,9 +48,9 @@ def test_attitude_turned_a_second_time(mode):
 @pytest.mark.parametrize(
     ("mode", "where", "name", "sign"),
     [
-        ("logged", tracks, "rotation_from_aircraft", (-1, 1, 1)),
-        ("logged", tracks, "rotation_from_aircraft", (1, -1, 1)),
-        ("logged", tracks, "rotation_from_aircraft", (1, 1, -1)),
+        ("logged", track, "rotation_from_aircraft", (-1, 1, 1)),
+        ("logged", track, "rotation_from_aircraft", (1, -1, 1)),
+        ("logged", track, "rotation_from_aircraft", (1, 1, -1)),
         ("level", replays, "rotation_from_aircraft", (1, 1, -1)),
     ],
 )
@@ -61,7 +61,7 @@ def test_wrong_sign_of_an_angle_is_seen(monkeypatch, mode, where, name, sign):
 
 
 def test_array_that_turns_although_the_attitude_is_ignored_is_seen():
-    turned = SimpleNamespace(poses=Poses(np.zeros((1, 3)), tracks.rotation_from_aircraft([1.0], [0.0], [90.0])))
+    turned = SimpleNamespace(poses=Poses(np.zeros((1, 3)), track.rotation_from_aircraft([1.0], [0.0], [90.0])))
     assert audit_flight.attitude_checked(flight("ignored"), [turned]).failures
 
 

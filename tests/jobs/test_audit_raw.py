@@ -11,9 +11,9 @@ from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.replay import replay_flight
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting.audit_flight import expectations
+from aerpaw_cmp.jobs.audit_flight import expectations
 from aerpaw_cmp.propagation.check.reference import Pattern
-from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv, sphere_csv, sphere_grid, unit_mean_gain
+from aerpaw_cmp.site.learned import read_sphere_csv, sphere_csv, sphere_grid, unit_mean_gain
 from tests.raw_checks import Account, raw_checked
 
 ORIGIN = (35.7275, -78.696)

@@ -9,10 +9,10 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.compare.learning.calibration import BASELINES, SPLITS, mean_rmse
-from aerpaw_cmp.jobs.learning.calibrate import load_calibration, observe, read_flights, recipe_of
-from aerpaw_cmp.site.antenna.antennas import TR38901
-from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv
+from aerpaw_cmp.compare.calibration import BASELINES, SPLITS, mean_rmse
+from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights, recipe_of
+from aerpaw_cmp.site.antennas import TR38901
+from aerpaw_cmp.site.learned import read_sphere_csv
 from tests.jobs.calibrated import YAW_DEG, calibrated, past_sector_antenna, settings
 from tests.json_page import unlisted
 from tests.real_logs import REAL
@@ -160,8 +160,8 @@ def test_one_flight_is_learned_and_not_scored(folder: Path) -> None:
 @pytest.mark.field
 def test_dataset12_each_way(tmp_path: Path) -> None:
     """Everything but the offset learned on the other flight: 3.53 dB here; free space 6.37."""
-    from aerpaw_cmp.compare.learning import calibration
-    from aerpaw_cmp.jobs.learning.calibrate import load_calibration, observe, read_flights
+    from aerpaw_cmp.compare import calibration
+    from aerpaw_cmp.jobs.calibrate import load_calibration, observe, read_flights
 
     flights = [str(Path(__file__).parents[1] / "field" / f"dataset12_{h}m.yaml") for h in (40, 70)]
     grid = {"model": "gain_grid", "file": "antennas/rad_pat.mat"}

@@ -9,14 +9,14 @@ import pytest
 from scipy.special import expit
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
-from aerpaw_cmp.compare.gains.direction_gain import GainModel, LinkSamples, Term
-from aerpaw_cmp.compare.learning.calibration import Learned, Observed, Recipe, flight_left_out, learn
-from aerpaw_cmp.compare.level.detection import DetectionForecast, learn_detection
-from aerpaw_cmp.flight.drafting.remembered import lock_elsewhere
-from aerpaw_cmp.flight.rows.lock import LOCK_FLOOR_DB
-from aerpaw_cmp.jobs.learning import calibrate_lock as locking
-from aerpaw_cmp.jobs.learning.calibrate_lock import learned_locks, lock_words
-from aerpaw_cmp.site.antenna.learned import LearnedLock, read_learned, remember
+from aerpaw_cmp.compare.calibration import Learned, Observed, Recipe, flight_left_out, learn
+from aerpaw_cmp.compare.gains import GainModel, LinkSamples, Term
+from aerpaw_cmp.compare.level import DetectionForecast, learn_detection
+from aerpaw_cmp.flight.drafting.proposals import lock_elsewhere
+from aerpaw_cmp.flight.rows import LOCK_FLOOR_DB
+from aerpaw_cmp.jobs import calibrate
+from aerpaw_cmp.jobs.calibrate import learned_locks, lock_words
+from aerpaw_cmp.site.learned import LearnedLock, read_learned, remember
 from tests.learned_entries import learned_entry, learned_series
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
@@ -80,10 +80,10 @@ def test_a_forecast_that_is_scored_knows_nothing_of_the_flight(monkeypatch: pyte
         calls.append([float(level.mean()) for level, _ in flights])
         return learn_detection(flights)
 
-    monkeypatch.setattr(locking, "learn", learn_from)
-    monkeypatch.setattr(locking, "learn_detection", levels)
+    monkeypatch.setattr(calibrate, "learn", learn_from)
+    monkeypatch.setattr(calibrate, "learn_detection", levels)
     observed = [flight(name, seed) for seed, name in enumerate("abc")]
-    for pair, learned in locking._without_pairs(observed, RECIPE).items():
+    for pair, learned in calibrate._without_pairs(observed, RECIPE).items():
         assert set(learned.mounts) == set("abc") - set(pair)
         taught.append(set(pair))
     assert len(taught) == 6

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.jobs.learning.calibrate_rank import (
+from aerpaw_cmp.jobs.calibrate_rank import (
     FittedReceiver,
     RankCalibration,
     RankGrid,
@@ -17,8 +17,8 @@ from aerpaw_cmp.jobs.learning.calibrate_rank import (
     features_of,
     read_receiver,
 )
-from aerpaw_cmp.propagation.drivers import geometries
-from aerpaw_cmp.propagation.geometry.arrays import (
+from aerpaw_cmp.propagation import drivers
+from aerpaw_cmp.propagation.geometry import (
     Link,
     Poses,
     rotation_from_aircraft,
@@ -122,12 +122,12 @@ def test_another_file_is_one_message(text: str, tmp_path: Path) -> None:
 
 def test_channels_of_a_mount_are_evaluated_once_in_whatever_order(monkeypatch):
     flown, slants = flight(0), [(45.0, -45.0, -45.0, 45.0), (0.0, 90.0, 0.0, 90.0)]
-    every = geometries.every_geometry([(0.0, 0.0, 0.0), (30.0, 0.0, 90.0)], [slants[0]], slants, [0.0, 0.5])
+    every = drivers.every_geometry([(0.0, 0.0, 0.0), (30.0, 0.0, 90.0)], [slants[0]], slants, [0.0, 0.5])
     mixed = [every[i] for i in (0, 6, 3, 5, 1, 7)]
     alone = np.concatenate([features_of([g], flown) for g in mixed])
     calls = []
-    columns = geometries.geometry
-    monkeypatch.setattr(geometries, "geometry", lambda *a: calls.append(1) or columns(*a))
+    columns = drivers.geometry
+    monkeypatch.setattr(drivers, "geometry", lambda *a: calls.append(1) or columns(*a))
     np.testing.assert_allclose(features_of(mixed, flown), alone, rtol=1e-12)
     assert len(calls) == 4  # two mounts, direct and off the ground
     features_of([g for g in mixed if g.ground == 0.0], flown)

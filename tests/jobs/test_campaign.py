@@ -11,10 +11,19 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.jobs.campaigns.campaign import load_campaign, pool_offsets, repeats, run, transfer_ranks
-from aerpaw_cmp.jobs.campaigns.campaign_tasks import Outcome, Task, digest_of, fitted_to
-from aerpaw_cmp.jobs.tasks.options import RunOptions
-from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore
+from aerpaw_cmp.jobs.campaign import (
+    Outcome,
+    Task,
+    digest_of,
+    fitted_to,
+    load_campaign,
+    pool_offsets,
+    repeats,
+    run,
+    transfer_ranks,
+)
+from aerpaw_cmp.jobs.options import RunOptions
+from aerpaw_cmp.jobs.tasks import OutcomeStore
 from aerpaw_cmp.report.campaign import RankRow
 from tests.jobs.campaign_rows import rss_row
 from tests.json_page import unlisted

@@ -18,7 +18,7 @@ from aerpaw_cmp.common.cf import GrowingNetcdf
 from aerpaw_cmp.common.units import SPEED_OF_LIGHT_MPS
 from aerpaw_cmp.jobs import channel
 from aerpaw_cmp.jobs.channel import ChannelOptions, run_channel
-from aerpaw_cmp.jobs.tasks.options import RunOptions
+from aerpaw_cmp.jobs.options import RunOptions
 from tests.json_page import listed
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"

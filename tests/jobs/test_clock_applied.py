@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.result import ESTIMATED, FlightResult
-from aerpaw_cmp.flight.pose.clock import ClockEstimate
+from aerpaw_cmp.flight.clock import ClockEstimate
 from aerpaw_cmp.flight.replay import _clock_of, telemetry_time
 from aerpaw_cmp.report.columns import clock_metrics
 from aerpaw_cmp.report.flight_data import clock_warnings

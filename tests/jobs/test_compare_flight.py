@@ -14,21 +14,20 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import noise_floor_dbm
-from aerpaw_cmp.compare.gains.spread import NO_SPREAD, StatedSpread
-from aerpaw_cmp.compare.judge.causes import Cause
+from aerpaw_cmp.compare.causes import Cause
+from aerpaw_cmp.compare.gains import NO_SPREAD, StatedSpread
 from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import FlightData, load_data
+from aerpaw_cmp.flight.gains import foliage_notes
 from aerpaw_cmp.flight.replay import replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting import compare_flight as compared
-from aerpaw_cmp.jobs.reporting import likely_cause
-from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series, compare_rss_series, pairs_of
-from aerpaw_cmp.jobs.reporting.flight_run import run_flight
-from aerpaw_cmp.jobs.reporting.foliage_notes import foliage_notes
-from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft
+from aerpaw_cmp.jobs import compare_flight, likely_cause
+from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series, pairs_of
+from aerpaw_cmp.jobs.flight_run import run_flight
+from aerpaw_cmp.propagation.geometry import rotation_from_aircraft
 from aerpaw_cmp.report.flight_data import rank_warnings, rss_warnings, track_of
 from aerpaw_cmp.report.flight_words import instants
-from aerpaw_cmp.site.antenna.learned import Errors
+from aerpaw_cmp.site.learned import Errors
 from tests.simulated import write_yaml
 from tests.tables import LW1, ORIGIN, POSITIONS, eastwards, rank_log, rss_log, write_csv
 
@@ -461,14 +460,14 @@ def test_an_expectation_that_the_flight_refutes_is_withdrawn(
 ) -> None:
     """Flights left out had 3.5 dB, 7.7 with the floor: one whose interval begins above has another fault."""
     errors = Errors(series=2, rmse_db=3.5, rmse_4s_db=2.8, free_space_rmse_db=6.1, inside_90=0.9)
-    monkeypatch.setattr(compared, "errors_elsewhere", lambda *_: errors)
+    monkeypatch.setattr(compare_flight, "errors_elsewhere", lambda *_: errors)
     data = SimpleNamespace(settings=SimpleNamespace(antennas={}), folder=Path())
     lock = SimpleNamespace(floor_rmse_db=7.7, free_space_floor_rmse_db=9.9)
-    monkeypatch.setattr(compared, "lock_elsewhere", lambda *_: lock)
+    monkeypatch.setattr(compare_flight, "lock_elsewhere", lambda *_: lock)
     locks = floor_low_db is not None
     floored = SimpleNamespace(rmse_ci95_db=(floor_low_db, 12.0)) if locks else None
     case = SimpleNamespace(data=data, series=SimpleNamespace(locked=np.ones(3) if locks else None))
-    known = compared._elsewhere(case, SimpleNamespace(rmse_ci95_db=(low_db, 9.0)), floored)
+    known = compare_flight._elsewhere(case, SimpleNamespace(rmse_ci95_db=(low_db, 9.0)), floored)
     assert (known is not None and known["rmse_db"] == 3.5) == expected
 
 
@@ -485,7 +484,7 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
         lost_per_db=0.5,
         lost_sd_db=8.0,
     )
-    monkeypatch.setattr(compared, "lock_elsewhere", lambda *_: lock)
+    monkeypatch.setattr(compare_flight, "lock_elsewhere", lambda *_: lock)
     case = SimpleNamespace(
         series=SimpleNamespace(locked=np.array([1.0, 1.0, 0.0]), link=SimpleNamespace(transmit_power_dbm=40.0)),
         data=SimpleNamespace(settings=SimpleNamespace(antennas={}), folder=Path()),
@@ -493,7 +492,7 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
     )
     score = SimpleNamespace(residual_db=np.array([2.0, 4.0, -9.0]), offset_db=-5.0)
     stated = StatedSpread(gain_sd_db=np.ones(3), spread=NO_SPREAD)
-    parts = compared._with_lock(case, score, stated).lock
+    parts = compare_flight._with_lock(case, score, stated).lock
     # path gains 10, 0 and -10 dB from -100; in lock it measured -43 and -51, 1 dB below what others did at these gains
     assert parts.locked_db == pytest.approx([3.0 - 1.0, 3.0 + 1.0, 3.0 + 3.0])
     assert parts.probability == pytest.approx(1.0 / (1.0 + np.exp([-0.9, 0.1, 1.1])))
@@ -502,4 +501,4 @@ def test_the_band_of_a_receiver_that_loses_its_lock_has_two_parts(monkeypatch: p
     )
     assert (parts.locked_sd_db, parts.lost_sd_db) == (7.0, 8.0)
     case.series.locked = None
-    assert compared._with_lock(case, score, stated) is stated
+    assert compare_flight._with_lock(case, score, stated) is stated

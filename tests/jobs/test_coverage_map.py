@@ -15,17 +15,15 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.jobs.mapping import coverage_map as mapping
-from aerpaw_cmp.jobs.mapping.paper_table import paper_rows
-from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.job import RATIO_LIMIT_DB, rank_of_singular_values
-from aerpaw_cmp.maps.link_budget import PAPER_BUDGET, LinkBudget
+from aerpaw_cmp.jobs import coverage_map
+from aerpaw_cmp.jobs.paper_table import paper_rows
+from aerpaw_cmp.maps.grid import PAPER_BUDGET, RATIO_LIMIT_DB, Grid, LinkBudget, rank_of_singular_values
 from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL
 from aerpaw_cmp.propagation.field.foliage import CrownIndex, Opaque, foliage_loss_db
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, linear_array, single_element
+from aerpaw_cmp.propagation.geometry import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.site.relief.dem import Dem
+from aerpaw_cmp.site.relief import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 from aerpaw_cmp.site.trees import join_trees
 from tests.jobs.sent_by_pickle import SentByPickle
@@ -57,19 +55,19 @@ def site():
 
 def settings(**change):
     some = {"spacing_m": 50.0, "rss_altitudes_m": (30.0,), "rank_altitudes_m": (3.0, 30.0, 60.0)}
-    return mapping.MapSettings(**{**some, **change})
+    return coverage_map.MapSettings(**{**some, **change})
 
 
 def test_every_mode_is_what_a_replay_with_its_loss_says(site):
     chosen = settings()
-    channels = mapping.SiteChannels(site, chosen)
+    channels = coverage_map.SiteChannels(site, chosen)
     position = Grid.over_area(site.area_m, 50.0).positions_m(6.0)
     poses = Poses(position, np.broadcast_to(np.eye(3), (len(position), 3, 3)))
     line = linear_array(4, wavelength_m(CARRIER_HZ) / 2, 0.0)
     crowns = CrownIndex(site.trees)
     maps = {}
-    for mode in mapping.FOLIAGE:
-        model = mapping.foliage_model(mode, CARRIER_HZ)
+    for mode in coverage_map.FOLIAGE:
+        model = coverage_map.foliage_model(mode, CARRIER_HZ)
 
         def loss(paths, source, target, model=model):
             return foliage_loss_db(source[paths.tower], paths.vertices_m, target[paths.pose], crowns, model)
@@ -96,7 +94,7 @@ def test_a_broadside_beam_gains_the_number_of_elements():
     # free space far away: 4 elements in phase, each with a quarter of the power, give 4 times the power broadside
     # (east of a line along north) and next to nothing along the line
     site = Site("air", SiteFrame(35.7, -78.7), {"A": tower("A", 0.0, 0.0)})
-    channels = mapping.SiteChannels(site, settings(max_depth=0, foliage=("none",)))
+    channels = coverage_map.SiteChannels(site, settings(max_depth=0, foliage=("none",)))
     places = np.array([[3000.0, 0.0, 10.0], [0.0, 3000.0, 10.0]])
     channels_there = channels.of("none")(places, ("A",))
     gain = channels_there.rss_mimo_dbm[:, 0] - channels_there.rss_siso_dbm[:, 0]
@@ -108,15 +106,15 @@ def test_a_broadside_beam_gains_the_number_of_elements():
 
 
 def test_modes_share_one_search_and_nothing_is_kept(site):
-    outcome = mapping.make_maps(site, settings(), Stages())
-    alone = mapping.make_maps(site, settings(foliage=("opaque",)), Stages())
+    outcome = coverage_map.make_maps(site, settings(), Stages())
+    alone = coverage_map.make_maps(site, settings(foliage=("opaque",)), Stages())
     assert outcome.paths == alone.paths > 0
     np.testing.assert_array_equal(outcome.maps["opaque"].rank, alone.maps["opaque"].rank)
     np.testing.assert_array_equal(outcome.maps["opaque"].rss_mimo_dbm, alone.maps["opaque"].rss_mimo_dbm)
     assert list(dict(outcome.ordered())) == ["opaque", "attenuating", "none"]
-    channels = mapping.SiteChannels(site, settings())
+    channels = coverage_map.SiteChannels(site, settings())
     position = np.array([[20.0, 20.0, 30.0]])
-    for mode in mapping.FOLIAGE:
+    for mode in coverage_map.FOLIAGE:
         channels.of(mode)(position, ("A", "B"))
     assert not channels._ready
 
@@ -130,10 +128,10 @@ def test_heights_are_above_the_ground_of_the_elevation_model():
     line_of_sight = settings(max_depth=0, foliage=("none",))
     there = np.array([[500.0, 40.0, 30.0]])
     raised = there + np.array([0.0, 0.0, 5.0])  # 1 % over 500 m
-    sloping = mapping.SiteChannels(hilly, line_of_sight).of("none")(there, ("A",))
-    expected = mapping.SiteChannels(flat, line_of_sight).of("none")(raised, ("A",))
+    sloping = coverage_map.SiteChannels(hilly, line_of_sight).of("none")(there, ("A",))
+    expected = coverage_map.SiteChannels(flat, line_of_sight).of("none")(raised, ("A",))
     assert sloping.rss_siso_dbm[0, 0] == pytest.approx(expected.rss_siso_dbm[0, 0], abs=1e-9)
-    level = mapping.SiteChannels(flat, line_of_sight).of("none")(there, ("A",))
+    level = coverage_map.SiteChannels(flat, line_of_sight).of("none")(there, ("A",))
     assert abs(sloping.rss_siso_dbm[0, 0] - level.rss_siso_dbm[0, 0]) > 1e-4
 
 
@@ -149,7 +147,7 @@ def test_heights_are_above_the_ground_of_the_elevation_model():
 )
 def test_settings_that_make_no_map_are_refused(change, said):
     with pytest.raises(UsageError, match=said):
-        mapping.MapSettings(**change)
+        coverage_map.MapSettings(**change)
 
 
 # --- the command ---------------------------------------------------------------------------------------------------
@@ -264,10 +262,10 @@ def test_a_missing_library_costs_its_own_file_alone(site, tmp_path, monkeypatch)
     import sys
 
     chosen = settings(spacing_m=250.0, rank_altitudes_m=(30.0,), ks=(10.0,), foliage=("none",), study=False)
-    outcome = mapping.make_maps(site, chosen, Stages())
+    outcome = coverage_map.make_maps(site, chosen, Stages())
     monkeypatch.setitem(sys.modules, "netCDF4", None)
     messages = []
-    mapping.export_maps(outcome, tmp_path, lambda text, *_: messages.append(text))
+    coverage_map.export_maps(outcome, tmp_path, lambda text, *_: messages.append(text))
     assert {path.name for path in tmp_path.iterdir()} == {"layers.csv", "maps.kmz"}
     assert any("netCDF4" in text and "aerpaw-cmp[geo]" in text for text in messages)
 
@@ -290,7 +288,7 @@ def test_wrong_wishes_are_one_message(words, said, tmp_path):
 def test_the_notes_say_where_p833_is_continued():
     def notes(**change):
         bare = types.SimpleNamespace(trees=())
-        return " ".join(mapping._notes(types.SimpleNamespace(settings=settings(**change), site=bare, tiles={})))
+        return " ".join(coverage_map._notes(types.SimpleNamespace(settings=settings(**change), site=bare, tiles={})))
 
     assert "Trees at 3.4 GHz: an extrapolation of ITU-R P.833" in notes(foliage=("opaque", "attenuating"))
     assert "extrapolation" not in notes(foliage=("opaque", "none"))
@@ -302,8 +300,8 @@ def test_workers_evaluate_the_tiles_to_the_same_digit() -> None:
     from aerpaw_cmp.site.siteyaml import load_site
 
     some, crew = settings(spacing_m=300.0, rank_altitudes_m=(30.0,), foliage=("none", "opaque")), SentByPickle()
-    alone = mapping.make_maps(load_site("lake_wheeler"), some, Stages())
-    shared = mapping.make_maps(load_site("lake_wheeler"), some, Stages(), workers=crew, name="lake_wheeler")
+    alone = coverage_map.make_maps(load_site("lake_wheeler"), some, Stages())
+    shared = coverage_map.make_maps(load_site("lake_wheeler"), some, Stages(), workers=crew, name="lake_wheeler")
     assert len(crew.sizes) > 1
     assert max(crew.sizes) < 3000
     assert shared.paths == alone.paths
@@ -342,17 +340,17 @@ def test_coverage_is_the_share_of_levels_at_the_threshold(site, tmp_path):
     open_site = replace(site, buildings=(), trees=join_trees([]))
     budget = LinkBudget(tx_power_dbm=20.0, bandwidth_mhz=10.0, noise_figure_db=5.0, threshold_snr_db=30.0)
     chosen = settings(foliage=("none",), budget=budget, max_depth=0, study=False)
-    outcome = mapping.make_maps(open_site, chosen, Stages(lambda *_: None))
+    outcome = coverage_map.make_maps(open_site, chosen, Stages(lambda *_: None))
     level = outcome.shown.rss("siso", "A")[0]
     grid = outcome.shown.grid.positions_m(30.0)
     away = np.linalg.norm(grid - open_site.towers["A"].position_m, axis=1)
     reach_m = wavelength_m(CARRIER_HZ) / (4 * np.pi) * 10 ** ((20.0 - budget.level_dbm) / 20)
     np.testing.assert_array_equal(budget.covered(level) > 0, away <= reach_m)
-    record = mapping.maps_record(outcome, name="open", stages_s={}, paper=paper_rows(outcome))
+    record = coverage_map.maps_record(outcome, name="open", stages_s={}, paper=paper_rows(outcome))
     shares = {(m.tower, m.antennas): m.coverage for m in record.rss}
     assert 0.2 < shares["A", "SISO"] < 0.8
     assert shares["A", "SISO"] == pytest.approx(np.mean(away <= reach_m))
-    layers = {layer.name: layer for layer in mapping._budget_layers(outcome)}
+    layers = {layer.name: layer for layer in coverage_map._budget_layers(outcome)}
     assert set(layers) == {"margin_mimo_h030m_joint_none", "snr_mimo_h030m_joint_none"}
     apart = layers["snr_mimo_h030m_joint_none"].values - layers["margin_mimo_h030m_joint_none"].values
     np.testing.assert_allclose(apart, 30.0, atol=0.011)
@@ -365,7 +363,7 @@ def test_options_replace_the_link_budget_of_the_site(tmp_path):
         "towers: {A: {latitude_deg: 35.7, longitude_deg: -78.7}}\n"
         "coverage: {tx_power_dbm: 23, bandwidth_mhz: 10, noise_figure_db: 6, threshold_snr_db: 3}\n"
     )
-    assert mapping.link_budget(str(file), {}).sentence().startswith("Transmit power 23 dBm; noise floor -98.0 dBm")
-    changed = mapping.link_budget(str(file), {"threshold_dbm": -90.0, "tx_power_dbm": None})
+    assert coverage_map.link_budget(str(file), {}).sentence().startswith("Transmit power 23 dBm; noise floor -98.0 dBm")
+    changed = coverage_map.link_budget(str(file), {"threshold_dbm": -90.0, "tx_power_dbm": None})
     assert (changed.tx_power_dbm, changed.threshold_snr_db, changed.level_dbm) == (23, None, -90.0)
-    assert mapping.link_budget("lake_wheeler", {}) == PAPER_BUDGET
+    assert coverage_map.link_budget("lake_wheeler", {}) == PAPER_BUDGET

@@ -8,7 +8,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.jobs.reporting.explain import run_explain
+from aerpaw_cmp.jobs.explain import run_explain
 from tests.json_page import unlisted
 from tests.simulated import planned, simulate, write_yaml
 

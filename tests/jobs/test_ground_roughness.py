@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.flight.gains.losses import path_loss, roughness_loss
+from aerpaw_cmp.flight.gains import path_loss, roughness_loss
 from aerpaw_cmp.flight.replay import replay_poses
 from aerpaw_cmp.flight.settings import RtSettings, load_flight
-from aerpaw_cmp.jobs.learning.calibrate import GroundFit
-from aerpaw_cmp.jobs.reporting.ladder import Model, recommended_changes
+from aerpaw_cmp.jobs.calibrate import GroundFit
+from aerpaw_cmp.jobs.flight_run import Model, recommended_changes
 from aerpaw_cmp.propagation.check import reference
-from aerpaw_cmp.propagation.check.field_audit import Expected
+from aerpaw_cmp.propagation.check.audit import Expected
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.geometry import Link, Poses, single_element
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")

@@ -11,16 +11,14 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.yamledit import edited
-from aerpaw_cmp.compare.judge.causes import Cause
-from aerpaw_cmp.compare.statistics.intervals import paired_difference
+from aerpaw_cmp.common.yamlfile import edited
+from aerpaw_cmp.compare.causes import Cause
+from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.flight.data import load_data
-from aerpaw_cmp.flight.drafting.remembered import offered
+from aerpaw_cmp.flight.drafting.proposals import offered
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting.flight_run import next_step, run_flight, unrivalled
-from aerpaw_cmp.jobs.reporting.ladder import Model, _Climber, recommended_changes
-from aerpaw_cmp.site.antenna.learned import Errors, folder_of, remember
-from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv, unit_mean_gain
+from aerpaw_cmp.jobs.flight_run import Model, _Climber, next_step, recommended_changes, run_flight, unrivalled
+from aerpaw_cmp.site.learned import Errors, folder_of, remember, sphere_csv, unit_mean_gain
 from tests.learned_entries import learned_entry, learned_series, learned_tables
 from tests.simulated import planned, simulate, write_yaml
 from tests.tables import eastwards, rss_log

@@ -15,10 +15,10 @@ from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.flight.data import choose_site
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import plan_trajectory, telemetry_frame
-from aerpaw_cmp.jobs.live.live_twin import LiveTwin
-from aerpaw_cmp.live.follow import TelemetrySample
+from aerpaw_cmp.jobs.live_twin import LiveTwin
+from aerpaw_cmp.live.predict import TelemetrySample
 from aerpaw_cmp.logs.writers import format_vehicle_out
-from aerpaw_cmp.propagation.geometry.arrays import Poses
+from aerpaw_cmp.propagation.geometry import Poses
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from benchmarks.simulated_modem import FaultyModem

@@ -7,8 +7,8 @@ from urllib.request import Request, urlopen
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.jobs.live.live_tap import TOKEN, Shown, tap_modems
-from aerpaw_cmp.live.session import TapSettings
+from aerpaw_cmp.jobs.live_tap import TOKEN, Shown, tap_modems
+from aerpaw_cmp.live.ports import TapSettings
 from benchmarks.simulated_modem import Faults, FaultyModem, read_log
 
 

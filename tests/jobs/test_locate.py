@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.jobs.options import RunOptions
 from aerpaw_cmp.jobs.run import run_simulate
-from aerpaw_cmp.jobs.tasks.options import RunOptions
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.json_page import listed
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.flight import replay as replay_job
+from aerpaw_cmp.flight import track as track_room
 from aerpaw_cmp.flight.data import FlightData, load_data
-from aerpaw_cmp.flight.pose import track as track_room
 from aerpaw_cmp.flight.settings import load_flight
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.tasks.manifest import other_inputs
+from aerpaw_cmp.jobs.tasks import other_inputs
 
 SITE = Path(__file__).parents[2] / "aerpaw_cmp" / "site" / "data" / "lake_wheeler.yaml"
 

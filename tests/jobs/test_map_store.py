@@ -15,19 +15,17 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.stages import Stages
-from aerpaw_cmp.jobs.mapping import coverage_map as mapping
-from aerpaw_cmp.jobs.tasks.workers import InProcess, Lost
-from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.job import RATIO_LIMIT_DB
-from aerpaw_cmp.maps.store import LEDGER
-from aerpaw_cmp.maps.tiles import PLANES
+from aerpaw_cmp.jobs import coverage_map
+from aerpaw_cmp.jobs.tasks import InProcess, Lost
+from aerpaw_cmp.maps.grid import RATIO_LIMIT_DB, Grid
+from aerpaw_cmp.maps.store import LEDGER, PLANES
 from aerpaw_cmp.site.siteyaml import load_site
 
 zarr = pytest.importorskip("zarr", reason="zarr is not installed (extra 'geo', Python 3.11)")
 xarray = pytest.importorskip("xarray")
 
 SITE = "lake_wheeler"
-SETTINGS = mapping.MapSettings(
+SETTINGS = coverage_map.MapSettings(
     spacing_m=120.0, rss_altitudes_m=(30.0,), rank_altitudes_m=(3.0, 30.0), foliage=("none",), max_depth=1, study=False,
     tile_m=600.0,
 )  # fmt: skip
@@ -35,12 +33,12 @@ TILES = 8  # 9 x 17 positions in tiles of 5
 
 
 def make(store, settings=SETTINGS, **more):
-    return mapping.make_maps(load_site(SITE), settings, Stages(), name=SITE, store=store, **more)
+    return coverage_map.make_maps(load_site(SITE), settings, Stages(), name=SITE, store=store, **more)
 
 
 @pytest.fixture(scope="module")
 def in_one_piece():
-    return mapping.make_maps(load_site(SITE), replace(SETTINGS, tile_m=None), Stages(), name=SITE)
+    return coverage_map.make_maps(load_site(SITE), replace(SETTINGS, tile_m=None), Stages(), name=SITE)
 
 
 def assert_like(outcome, reference):
@@ -69,7 +67,7 @@ class Watched(InProcess):
 
 def test_a_store_holds_the_map_in_one_piece(tmp_path):
     both = replace(SETTINGS, foliage=("none", "opaque"))
-    in_one_piece = mapping.make_maps(load_site(SITE), replace(both, tile_m=None), Stages(), name=SITE)
+    in_one_piece = coverage_map.make_maps(load_site(SITE), replace(both, tile_m=None), Stages(), name=SITE)
     outcome = make(tmp_path / "map.zarr", both)
     assert_like(outcome, in_one_piece)
     assert outcome.tiles == {
@@ -87,14 +85,14 @@ def test_a_store_holds_the_map_in_one_piece(tmp_path):
 
 
 def test_every_so_many_positions_of_a_large_map_are_shown(tmp_path, in_one_piece, monkeypatch):
-    monkeypatch.setattr(mapping, "SHOWN_POSITIONS", 20)
+    monkeypatch.setattr(coverage_map, "SHOWN_POSITIONS", 20)
     outcome = make(tmp_path / "map.zarr")
     assert outcome.tiles["shown_every"] == 3
     shown = outcome.maps["none"]
     assert shown.grid.shape == (6, 3)
     every = in_one_piece.maps["none"].grid.raster(in_one_piece.maps["none"].rss_siso_dbm[0, 2])
     np.testing.assert_allclose(shown.grid.raster(shown.rss_siso_dbm[0, 2]), every[::3, ::3], atol=0.006)
-    assert "one in 3" in " ".join(mapping._notes(outcome))
+    assert "one in 3" in " ".join(coverage_map._notes(outcome))
 
 
 def test_many_receivers_are_tiles_by_themselves_and_few_are_not():
@@ -201,7 +199,7 @@ def test_a_damaged_tile_is_computed_again_and_said(kind, finished, tmp_path, in_
     shutil.copytree(finished, store)
     damage(store)
     crew, said = Watched(), []
-    outcome = mapping.make_maps(
+    outcome = coverage_map.make_maps(
         load_site(SITE), SETTINGS, Stages(lambda text, *_: said.append(text)), name=SITE, store=store, workers=crew
     )
     assert_like(outcome, in_one_piece)
@@ -315,7 +313,7 @@ def test_a_full_disk_leaves_no_store_that_was_not_begun(tmp_path):
 
 def test_a_full_disk_is_one_message_and_the_run_goes_on_later(tmp_path, in_one_piece):
     store, soft, hard = tmp_path / "map.zarr", *resource.getrlimit(resource.RLIMIT_FSIZE)
-    written, full = [], mapping.TileStore.write
+    written, full = [], coverage_map.TileStore.write
 
     def write(self, number, *more):
         resource.setrlimit(resource.RLIMIT_FSIZE, (60 if len(written) == 2 else soft, hard))
@@ -326,7 +324,7 @@ def test_a_full_disk_is_one_message_and_the_run_goes_on_later(tmp_path, in_one_p
         written.append(number)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(mapping.TileStore, "write", write)
+        patch.setattr(coverage_map.TileStore, "write", write)
         with pytest.raises(OutputError, match=r"map.zarr: cannot be written") as caught:
             make(store)
     assert caught.value.exit_code == 3

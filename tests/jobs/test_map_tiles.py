@@ -8,11 +8,11 @@ import shapely
 from shapely.geometry import box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.jobs.mapping import coverage_map as mapping
+from aerpaw_cmp.jobs import coverage_map
 from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.tiles import PLANES, Budget, Reach, Tiling
-from aerpaw_cmp.propagation.geometry.arrays import Link, single_element
-from aerpaw_cmp.propagation.trace import trace
+from aerpaw_cmp.maps.store import PLANES, Budget, Reach, Tiling
+from aerpaw_cmp.propagation.geometry import Link, single_element
+from aerpaw_cmp.propagation.replay import trace
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 
 FRAME = SiteFrame(35.7, -78.7)
@@ -43,16 +43,16 @@ def town(buildings=80, side_m=800.0, seed=1, trees=0):
 
 def settings(**change):
     some = {"spacing_m": 40.0, "rss_altitudes_m": (2.0,), "rank_altitudes_m": (2.0, 12.0), "foliage": ("none",)}
-    return mapping.MapSettings(**{**some, "max_depth": 1, "study": False, **change})
+    return coverage_map.MapSettings(**{**some, "max_depth": 1, "study": False, **change})
 
 
 def in_tiles(site, chosen, cells):
     """Maps by mode, and how many buildings each tile has."""
-    channels = mapping.SiteChannels(site, chosen)
+    channels = coverage_map.SiteChannels(site, chosen)
     tiling = Tiling(Grid.over_area(site.area_m, chosen.spacing_m), cells)
     done, buildings = [], []
     for number in range(len(tiling)):
-        done.append(channels.tile(mapping.TileOrder(site="", settings=chosen, cells=cells, number=number)))
+        done.append(channels.tile(coverage_map.TileOrder(site="", settings=chosen, cells=cells, number=number)))
         buildings.append(len(channels.site.buildings))
     maps = {mode: tiling.joined({n: tile.maps[mode] for n, tile in enumerate(done)}) for mode in chosen.foliage}
     return maps, buildings, sum(tile.paths for tile in done)
@@ -60,10 +60,10 @@ def in_tiles(site, chosen, cells):
 
 def in_one_piece(site, chosen):
     """The same with every tower and every building everywhere."""
-    channels = mapping.SiteChannels(site, chosen)
+    channels = coverage_map.SiteChannels(site, chosen)
     channels.reach.of = lambda _box: site
     grid = Grid.over_area(site.area_m, chosen.spacing_m)
-    done = channels.tile(mapping.TileOrder(site="", settings=chosen, cells=max(grid.shape), number=0))
+    done = channels.tile(coverage_map.TileOrder(site="", settings=chosen, cells=max(grid.shape), number=0))
     return dict(done.maps), done.paths
 
 
@@ -80,7 +80,7 @@ def assert_equal(maps, others):
     [
         {"max_depth": 0},
         {"max_depth": 1},
-        {"max_depth": 1, "foliage": mapping.FOLIAGE, "trees": 25},
+        {"max_depth": 1, "foliage": coverage_map.FOLIAGE, "trees": 25},
         {"max_depth": 2, "spacing_m": 50.0, "buildings": 12},
         {"max_depth": 2, "spacing_m": 100.0, "buildings": 90},
     ],
@@ -135,7 +135,7 @@ def test_a_tower_that_is_left_out_of_a_tile_reaches_no_position_of_it():
 def test_a_tile_without_towers_is_out_of_coverage_at_once(monkeypatch):
     site = town(5)
     away = replace(site, area_m=tuple(side + 2e5 for side in site.area_m))
-    monkeypatch.setattr(mapping, "replay", lambda *_: pytest.fail("nothing reaches there"))
+    monkeypatch.setattr(coverage_map, "replay", lambda *_: pytest.fail("nothing reaches there"))
     maps, counts, paths = in_tiles(away, settings(spacing_m=100.0), 4)
     assert (paths, set(counts)) == (0, {0})
     assert np.isnan(maps["none"].rss_siso_dbm).all()

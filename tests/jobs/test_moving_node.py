@@ -11,10 +11,10 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.flight.data import FlightData, load_data
 from aerpaw_cmp.flight.replay import FlightReplay, replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.reporting.audit_flight import standing
-from aerpaw_cmp.jobs.reporting.compare_flight import compare_rank_series, compare_rss_series
-from aerpaw_cmp.jobs.reporting.explain import run_explain
-from aerpaw_cmp.jobs.reporting.ladder import flight_ladder
+from aerpaw_cmp.jobs.audit_flight import standing
+from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series
+from aerpaw_cmp.jobs.explain import run_explain
+from aerpaw_cmp.jobs.flight_run import flight_ladder
 from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay

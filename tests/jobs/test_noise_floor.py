@@ -10,7 +10,7 @@ from aerpaw_cmp.common.units import noise_floor_dbm
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import LinkSettings, load_flight
 from aerpaw_cmp.propagation.field.baselines import free_space_dbm
-from aerpaw_cmp.propagation.geometry.arrays import Isotropic, Link, Poses, single_element
+from aerpaw_cmp.propagation.geometry import Isotropic, Link, Poses, single_element
 from aerpaw_cmp.propagation.options import Field, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site

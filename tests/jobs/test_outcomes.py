@@ -16,22 +16,10 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.files import seal
 from aerpaw_cmp.common.stages import logged
-from aerpaw_cmp.flight.overrides import overridden
-from aerpaw_cmp.flight.settings import FlightFile, load_flight
-from aerpaw_cmp.jobs import sample
-from aerpaw_cmp.jobs.campaigns import campaign_tasks
-from aerpaw_cmp.jobs.campaigns.campaign_tasks import (
-    Order,
-    Outcome,
-    Task,
-    carry_out,
-    compute,
-    digest_of,
-    kept_outcomes,
-    planned_tasks,
-)
-from aerpaw_cmp.jobs.tasks.outcomes import OutcomeStore, task_inputs, task_key
-from aerpaw_cmp.jobs.tasks.workers import InProcess, Lost, Workers
+from aerpaw_cmp.flight.settings import FlightFile, load_flight, overridden
+from aerpaw_cmp.jobs import campaign, sample
+from aerpaw_cmp.jobs.campaign import Order, Outcome, Task, carry_out, compute, digest_of, kept_outcomes, planned_tasks
+from aerpaw_cmp.jobs.tasks import InProcess, Lost, OutcomeStore, Workers, task_inputs, task_key
 from aerpaw_cmp.report.campaign import Failure
 from tests.jobs.campaign_rows import rss_row
 
@@ -204,7 +192,7 @@ def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkey
             return Outcome(failure=Failure(flight="f3", setting="as written", message="no luck", traceback="line 1"))
         return outcome_of(float(task.flight[1:]))
 
-    monkeypatch.setattr(campaign_tasks, "run_task", compute_but_f3)
+    monkeypatch.setattr(campaign, "run_task", compute_but_f3)
     tasks = tasks_of(flight)
     first = run_tasks(tasks, InProcess(), keep=tmp_path)
     assert asked == ["f0", "f1", "f2", "f3"]
@@ -225,7 +213,7 @@ def test_a_new_name_or_place_in_the_list_computes_nothing(
 ) -> None:
     """A setting put before the first, a label that is another: the outcomes are those that were kept, renamed."""
     asked: list[str] = []
-    monkeypatch.setattr(campaign_tasks, "run_task", lambda task: asked.append(task.setting) or outcome_of(1.0))
+    monkeypatch.setattr(campaign, "run_task", lambda task: asked.append(task.setting) or outcome_of(1.0))
     run_tasks([Task(flight, "f", "a", {}, None, True)], InProcess(), keep=tmp_path)
     first = Task(flight, "g", "first", {"rss.advanced.lag_window_s": 3}, None, True)
     outcomes = run_tasks([first, Task(flight, "g", "b", {}, None, False)], InProcess(), keep=tmp_path)
@@ -245,20 +233,20 @@ def test_a_log_that_changes_is_read_again_by_a_worker_that_lives_on(flight: Path
     for name in flight.parent.iterdir():
         shutil.copy(name, tmp_path) if name.is_file() else shutil.copytree(name, tmp_path / name.name)
     task = Task(tmp_path / flight.name, "f", "a", {}, None)
-    before = campaign_tasks.flight_data(task)
+    before = campaign.flight_data(task)
     log = tmp_path / before.settings.logs[-1].path
     lines = log.read_bytes().splitlines(keepends=True)
     log.write_bytes(b"".join(lines[: len(lines) // 2]))
-    after = campaign_tasks.flight_data(task)
+    after = campaign.flight_data(task)
     assert len(after.files[-1].result.streams[0].frame) < len(before.files[-1].result.streams[0].frame)
 
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from aerpaw_cmp.jobs.campaigns import campaign_tasks
-from aerpaw_cmp.jobs.campaigns.campaign_tasks import compute, kept_outcomes
-from aerpaw_cmp.jobs.tasks.workers import InProcess
+from aerpaw_cmp.jobs import campaign as campaign_tasks
+from aerpaw_cmp.jobs.campaign import compute, kept_outcomes
+from aerpaw_cmp.jobs.tasks import InProcess
 from tests.jobs.campaign_rows import rss_row
 
 def compute_but_f2(task):
@@ -282,7 +270,7 @@ def test_after_sigkill_only_what_is_missing_is_computed(
     assert done.returncode == -signal.SIGKILL
     asked: list[str] = []
     monkeypatch.setattr(
-        campaign_tasks, "run_task", lambda task: asked.append(task.flight) or outcome_of(float(task.flight[1:]))
+        campaign, "run_task", lambda task: asked.append(task.flight) or outcome_of(float(task.flight[1:]))
     )
     outcomes = run_tasks(tasks_of(flight), InProcess(), keep=tmp_path)
     assert asked == ["f2", "f3"]
@@ -304,7 +292,7 @@ def test_a_fault_in_the_rows_of_a_flight_is_a_failure_of_that_flight(
 ) -> None:
     """It ended the whole campaign: only the replay stood where faults become messages."""
     nothing = SimpleNamespace(data=None, result=None)
-    monkeypatch.setattr(campaign_tasks, "run_flight", lambda *_, **__: nothing)
-    outcome = campaign_tasks.run_task(Task(flight, "f", "as written", {}, None))
+    monkeypatch.setattr(campaign, "run_flight", lambda *_, **__: nothing)
+    outcome = campaign.run_task(Task(flight, "f", "as written", {}, None))
     assert outcome.failure is not None
     assert "a fault of the program itself" in outcome.failure.message

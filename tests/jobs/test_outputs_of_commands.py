@@ -137,8 +137,8 @@ def test_a_bad_folder_is_told_before_the_computation(
 
     for name in (
         "flight.data.gather",
-        "jobs.campaigns.campaign.run",
-        "jobs.mapping.coverage_map.make_maps",
+        "jobs.campaign.run",
+        "jobs.coverage_map.make_maps",
         "report.site.plan",
     ):
         monkeypatch.setattr(f"aerpaw_cmp.{name}", never)

@@ -8,7 +8,7 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.propagation.edges import over_edges
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.geometry import Link, Poses, single_element
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.report.flight_data import FURTHER, SHORTEST, pose_paths

@@ -18,15 +18,13 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.jsonable import json_safe
 from aerpaw_cmp.flight.data import load_data
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.learning.calibrate import observe
-from aerpaw_cmp.jobs.learning.calibrate_rank import rank_samples
-from aerpaw_cmp.jobs.prediction import corrected_map, sources, where
-from aerpaw_cmp.jobs.prediction import predict as job
-from aerpaw_cmp.jobs.prediction.against import score_against
-from aerpaw_cmp.jobs.prediction.sources import named_flights
-from aerpaw_cmp.jobs.prediction.where import TargetOptions, Targets, find_targets
-from aerpaw_cmp.propagation.geometry.arrays import Link, rotation_from_aircraft, single_element
-from aerpaw_cmp.propagation.trace import trace
+from aerpaw_cmp.jobs import predict, sources
+from aerpaw_cmp.jobs.calibrate import observe
+from aerpaw_cmp.jobs.calibrate_rank import rank_samples
+from aerpaw_cmp.jobs.predict import score_against
+from aerpaw_cmp.jobs.sources import TargetOptions, Targets, find_targets, named_flights
+from aerpaw_cmp.propagation.geometry import Link, rotation_from_aircraft, single_element
+from aerpaw_cmp.propagation.replay import trace
 from aerpaw_cmp.report.prediction import prediction_metrics, write_prediction
 from aerpaw_cmp.report.texts import coded
 from aerpaw_cmp.site.siteyaml import load_site
@@ -57,7 +55,7 @@ def small(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def prediction(small):
-    return job.predict(small / "points.csv", named_flights([small / "a.yaml", small / "b.yaml"]))
+    return predict.predict(small / "points.csv", named_flights([small / "a.yaml", small / "b.yaml"]))
 
 
 def rows(prediction, point):
@@ -133,9 +131,9 @@ def test_no_flight_that_shares_a_tower_is_one_message(small):
     text = (small / "a.yaml").read_text().replace("node: LW1", "node: LW4").replace("node: LW2", "node: LW5")
     other.write_text(text)
     with pytest.raises(UsageError, match="asks for LW4, LW5"):
-        job.predict(other, named_flights([small / "a.yaml"]))
+        predict.predict(other, named_flights([small / "a.yaml"]))
     with pytest.raises(UsageError, match="the site is not named"):
-        job.predict(small / "points.csv", [])
+        predict.predict(small / "points.csv", [])
 
 
 def test_a_file_without_positions_is_refused(tmp_path):
@@ -145,7 +143,7 @@ def test_a_file_without_positions_is_refused(tmp_path):
 
 
 def test_a_table_of_points_is_refused_before_all_of_it_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr(where, "MOST_POINTS", 100)
+    monkeypatch.setattr(sources, "MOST_POINTS", 100)
     (tmp_path / "p.csv").write_text("east_m,north_m,height_m\n" + "1,2,30\n" * 1000)
     read, rows = pd.read_csv, []
 
@@ -219,11 +217,11 @@ def test_a_neighbour_stands_for_the_rank_of_a_point(monkeypatch: pytest.MonkeyPa
     targets = Targets(
         kind="points", name="", position_m=place, yaw_deg=np.full(count, 90.0), time_s=np.arange(float(count))
     )
-    receivers = job._receivers([], "lake_wheeler", site)
+    receivers = predict._receivers([], "lake_wheeler", site)
     ranks = []
     for most in (count, count // 13):
-        monkeypatch.setattr(job, "MOST_RANKED", most)
-        ((_, rows, p),) = job._ranks(targets, receivers, site, lambda *_: None)
+        monkeypatch.setattr(predict, "MOST_RANKED", most)
+        ((_, rows, p),) = predict._ranks(targets, receivers, site, lambda *_: None)
         assert rows.tolist() == list(range(count))
         ranks.append(p)
     assert 0.0 < np.abs(ranks[0] - ranks[1]).max() < 0.1
@@ -236,14 +234,14 @@ def test_headings_are_ranked_alike_one_at_a_time(monkeypatch: pytest.MonkeyPatch
     targets = Targets(
         kind="points", name="", position_m=place, yaw_deg=np.full(count, np.nan), time_s=np.arange(float(count))
     )
-    receivers, ranks, steps = job._receivers([], "lake_wheeler", site), [], []
-    for most in (count * job.HEADINGS, count):  # the second leaves no room for all headings at once
-        monkeypatch.setattr(job, "MOST_RANKED", most)
+    receivers, ranks, steps = predict._receivers([], "lake_wheeler", site), [], []
+    for most in (count * predict.HEADINGS, count):  # the second leaves no room for all headings at once
+        monkeypatch.setattr(predict, "MOST_RANKED", most)
         said: list[str] = []
-        ((_, _, p),) = job._ranks(targets, receivers, site, lambda text, *_, said=said: said.append(text))
+        ((_, _, p),) = predict._ranks(targets, receivers, site, lambda text, *_, said=said: said.append(text))
         ranks.append(p)
         steps.append(len(said))
-    assert steps == [1, job.HEADINGS]
+    assert steps == [1, predict.HEADINGS]
     np.testing.assert_allclose(*ranks, atol=1e-9)
 
 
@@ -257,7 +255,7 @@ def test_predicted_ranks_are_scored_where_they_were_flown(said, levels):
     p = np.full((len(right), 4), 0.1)
     p[np.arange(len(right)), right - 1] = 0.7
     said_ranks = pd.DataFrame({**place, "yaw_deg": np.nan, "tower": ranked.tower, "channel": "rank",
-                               **dict(zip(job.RANKS, p.T, strict=True))})  # fmt: skip
+                               **dict(zip(predict.RANKS, p.T, strict=True))})  # fmt: skip
     table = pd.read_csv(folder / "prediction.csv")
     pd.concat([table if levels else table[:0], said_ranks]).to_csv(folder / "prediction.csv", index=False)
     against = score_against(data, folder)
@@ -343,12 +341,12 @@ def test_a_flown_route_leans_where_the_settings_take_its_attitude(tmp_path, atti
 def test_corrected_levels_are_brought_to_the_raw_replay_by_the_planted_offset(prediction):
     targets = dataclasses.replace(prediction.targets, heights_m=(30.0,))
     on_grid = dataclasses.replace(prediction, targets=targets)
-    (levels,) = corrected_map._levels(on_grid, prediction.sources["LW1.USRP1"], len(targets))
+    (levels,) = predict._map_levels(on_grid, prediction.sources["LW1.USRP1"], len(targets))
     level = rows_of(prediction, "LW1", "USRP1")["level_db"].to_numpy()
     np.testing.assert_allclose((levels.corrected_dbm - level)[[0, 2, 3]], 12.3, atol=0.7)
     raw = trace("lake_wheeler", Link(3.3e9, {"LW1": single_element()}, single_element()), [[-300.0, 150.0, 30.0]])
     assert levels.raw_dbm[0] == pytest.approx(raw.rss_dbm[0, 0], abs=1e-6)
-    maps = corrected_map.CorrectedMaps(levels=(levels,), ranks={}, prediction=prediction.page)
+    maps = predict.CorrectedMaps(levels=(levels,), ranks={}, prediction=prediction.page)
     assert [layer.name for layer in maps.layers()] == [
         f"rss_{kind}_h030m_LW1_USRP1" for kind in ("raw", "corrected", "sd")
     ]

@@ -9,12 +9,11 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.compare.gains.spread import Spread
-from aerpaw_cmp.jobs.prediction import predict as job
-from aerpaw_cmp.jobs.prediction.corrected_map import corrected_maps
-from aerpaw_cmp.jobs.prediction.sources import Memory, named_flights
-from aerpaw_cmp.jobs.prediction.where import TargetOptions
-from aerpaw_cmp.site.antenna.learned import (
+from aerpaw_cmp.compare.gains import Spread
+from aerpaw_cmp.jobs import predict
+from aerpaw_cmp.jobs.predict import corrected_maps
+from aerpaw_cmp.jobs.sources import Memory, TargetOptions, named_flights
+from aerpaw_cmp.site.learned import (
     Entry,
     Errors,
     LearnedLevel,
@@ -23,8 +22,8 @@ from aerpaw_cmp.site.antenna.learned import (
     folder_of,
     read_learned,
     remember,
+    sphere_csv,
 )
-from aerpaw_cmp.site.antenna.sphere_pattern import sphere_csv
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.jobs.calibrated import OFFSET_DB, past_sector_antenna
 from tests.learned_entries import learned_entry, learned_series, learned_tables
@@ -72,7 +71,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_levels_are_free_space_and_the_remembered_gains(site: Path) -> None:
-    said = job.predict(site.parent / "p.csv", [], TargetOptions(site=str(site)))
+    said = predict.predict(site.parent / "p.csv", [], TargetOptions(site=str(site)))
     levels = said.table[said.table["channel"] == "A"][:3]
     assert list(said.table["flag"]) == ["", "", "outside_flown", "outside_flown"]  # behind the tower, and off the site
     free = 30.0 - 20 * np.log10(4 * np.pi * 300.0 * 3.3e9 / 299_792_458.0)
@@ -100,7 +99,7 @@ def test_a_receiver_that_loses_its_lock_is_forecast_in_two_parts(site: Path, tmp
     place = copied(tmp_path)
     remember(place, "planted", entry(LEVEL, lock), learned_tables("A", t=table(4.0, (1, 1)), u=table(2.0, (1, 1))))
     points = site.parent / "p.csv"
-    plain, said = (job.predict(points, [], TargetOptions(site=str(at))) for at in (site, place))
+    plain, said = (predict.predict(points, [], TargetOptions(site=str(at))) for at in (site, place))
     levels, before = (x.table[x.table["channel"] == "A"] for x in (said, plain))
     random, n = np.random.default_rng(3), 200_000
     assert len(levels) == 4
@@ -133,8 +132,8 @@ def test_a_receiver_that_loses_its_lock_is_forecast_in_two_parts(site: Path, tmp
 def test_an_unknown_heading_adds_the_spread_of_the_gain_over_headings(site: Path) -> None:
     points = pd.read_csv(site.parent / "p.csv").assign(yaw_deg=np.nan)
     points.to_csv(site.parent / "open.csv", index=False)
-    said = job.predict(site.parent / "open.csv", [], TargetOptions(site=str(site)))
-    known = job.predict(site.parent / "p.csv", [], TargetOptions(site=str(site)))
+    said = predict.predict(site.parent / "open.csv", [], TargetOptions(site=str(site)))
+    known = predict.predict(site.parent / "p.csv", [], TargetOptions(site=str(site)))
     any_heading, one_heading = (x.table[x.table["channel"] == "A"].iloc[0] for x in (said, known))
     # eight headings: the cosine has mean 0 and variance 1/2
     assert any_heading["level_db"] - one_heading["level_db"] == pytest.approx(2.0, abs=0.02)
@@ -145,15 +144,15 @@ def test_maps_are_corrected_by_the_memory_alone(site: Path) -> None:
     maps = corrected_maps(str(site), 300.0, ((40.0,), (60.0,)), [])
     assert [(item.link, item.height_m) for item in maps.levels] == [("LW1 A", 40.0)]
     assert maps.ranks == {}  # this memory has no receiver
-    said = job.predict(site, [], TargetOptions(heights_m=(40.0,), spacing_m=300.0))
+    said = predict.predict(site, [], TargetOptions(heights_m=(40.0,), spacing_m=300.0))
     np.testing.assert_allclose(maps.levels[0].corrected_dbm, said.table["level_db"] + 7.0, atol=1e-3)
 
 
 def test_a_site_without_learned_levels_is_predicted_by_the_prior_and_says_so(tmp_path: Path) -> None:
     place = copied(tmp_path)
-    assert job.predict(place, []).page.chosen["base"] == "prior"
+    assert predict.predict(place, []).page.chosen["base"] == "prior"
     remember(place, "old", entry(None), learned_tables("A", t=table(4.0, (1, 1)), u=table(2.0, (1, 1))))
-    page = job.predict(place, []).page
+    page = predict.predict(place, []).page
     assert page.chosen["base"] == "prior"
     assert any("have no level" in text for text in page.warnings)
 
@@ -187,7 +186,7 @@ def test_a_flight_is_predicted_before_it_from_the_memory_alone(flown: Path) -> N
 
 
 def test_remembered_antennas_stand_beside_other_bases_but_not_on_their_own_flights(flown: Path) -> None:
-    known = {name: job.predict(flown / "aside.yaml", named_flights([flown / f"{name}.yaml"]),
+    known = {name: predict.predict(flown / "aside.yaml", named_flights([flown / f"{name}.yaml"]),
                                TargetOptions(site=str(flown / "mine.yaml"))) for name in ("aside", "first")}  # fmt: skip
     bases = {name: {row["base"] for row in said.page.candidates} for name, said in known.items()}
     assert "antennas that the site remembers" in bases["aside"]

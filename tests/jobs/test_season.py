@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.jobs.campaigns.season import find_reports, rank_settings, soundings, with_season
+from aerpaw_cmp.jobs.campaign import find_reports, rank_settings, soundings, with_season
 from benchmarks import fabricated
 
 ROOT = Path(__file__).parents[2]

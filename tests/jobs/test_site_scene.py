@@ -10,11 +10,11 @@ pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.jobs.mapping.site_scene import SceneOptions, is_scene, run_scene_import, run_site_export
-from aerpaw_cmp.propagation.field.stands import stand_depth_m
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
+from aerpaw_cmp.jobs.site_scene import SceneOptions, is_scene, run_scene_import, run_site_export
+from aerpaw_cmp.propagation.field.foliage import stand_depth_m
+from aerpaw_cmp.propagation.geometry import Link, Poses, single_element
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
+from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.scenes import without_traps
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.scene_files import box

@@ -15,23 +15,17 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common import provenance
-from aerpaw_cmp.common.provenance import trained_on
+from aerpaw_cmp.common import content as provenance
+from aerpaw_cmp.common.content import trained_on
 from aerpaw_cmp.flight.data import FlightData, load_data
-from aerpaw_cmp.flight.gains.memory import load_with_learned
+from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.training import counted_once, flight_logs, marks_of
+from aerpaw_cmp.jobs.calibrate import CalibrationFile
+from aerpaw_cmp.jobs.calibrate_rank import FittedReceiver, RankCalibration, RankSamples, rank_samples, read_receiver
+from aerpaw_cmp.jobs.calibration_files import Calibrated, write_files
 from aerpaw_cmp.jobs.diff_reports import run_diff
-from aerpaw_cmp.jobs.learning.calibrate import CalibrationFile
-from aerpaw_cmp.jobs.learning.calibrate_rank import (
-    FittedReceiver,
-    RankCalibration,
-    RankSamples,
-    rank_samples,
-    read_receiver,
-)
-from aerpaw_cmp.jobs.learning.calibration_files import Calibrated, write_files
-from aerpaw_cmp.site.antenna.learned import folder_of
+from aerpaw_cmp.site.learned import folder_of
 from tests.jobs.calibrated import calibrated, past_sector_antenna, settings
 from tests.real_logs import REAL
 from tests.simulated import write_yaml

@@ -13,8 +13,8 @@ from typing import Any
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.jobs.tasks import workers
-from aerpaw_cmp.jobs.tasks.workers import open_workers
+from aerpaw_cmp.jobs import tasks
+from aerpaw_cmp.jobs.tasks import open_workers
 from tests.jobs.worker_tasks import collected, dies, listening
 
 
@@ -41,7 +41,7 @@ def test_workers_of_a_cluster_give_what_one_process_gives(seen: dict[str, Any]) 
 
 def test_a_killed_worker_costs_its_task_one_more_try(seen: dict[str, Any], tmp_path: Path) -> None:
     """The task that kills every time is lost alone; its neighbours, and the one that killed once, are there."""
-    crew = workers.Processes(2)
+    crew = tasks.Processes(2)
     here = collected(crew, dies, [(i, str(tmp_path)) for i in range(8)])
     for killed in (seen["cluster"]["killed"], here):
         assert "worker process ended" in killed[5]
@@ -53,7 +53,7 @@ def test_an_interrupt_ends_no_process_of_the_caller() -> None:
     own.start()
     try:
         with pytest.raises(KeyboardInterrupt):
-            workers.Processes(2).run(time.sleep, [0.0, 60.0], interrupted)
+            tasks.Processes(2).run(time.sleep, [0.0, 60.0], interrupted)
         assert own.is_alive()
         assert multiprocessing.active_children() == [own]
     finally:
@@ -71,7 +71,7 @@ def test_workers_run_no_module_that_lies_in_the_working_folder(tmp_path: Path) -
     for name in ("multiprocessing", "pickle", "numpy", "signal"):
         (logs / f"{name}.py").write_text(f"open('ran_{name}', 'w').close()")
     script.write_text(
-        "import os\nfrom aerpaw_cmp.jobs.tasks.workers import Processes\n"
+        "import os\nfrom aerpaw_cmp.jobs.tasks import Processes\n"
         "if __name__ == '__main__':\n"
         "    Processes(2).run(os.path.abspath, ['a', 'b'], lambda number, place: print(number, place))\n"
     )
@@ -112,7 +112,7 @@ def test_workers_end_with_their_parent_and_leave_nothing(tmp_path: Path) -> None
     """SIGKILL in the middle of a task: no process and no temporary folder stays."""
     script = (
         "import sys, time; sys.path[:0] = sys.argv[2:]\n"
-        "from aerpaw_cmp.jobs.tasks.workers import open_workers\n"
+        "from aerpaw_cmp.jobs.tasks import open_workers\n"
         "from tests.jobs.worker_tasks import sleeps\n"
         "if __name__ == '__main__':\n"
         "    with open_workers(2) as crew: crew.run(sleeps, [sys.argv[1]] * 2, print)\n"
@@ -173,10 +173,10 @@ class Later:
 
 def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatch) -> None:
     """A season waited for half an hour without a word for workers that had given up while the machine was busy."""
-    monkeypatch.setattr(workers, "NO_WORKER_S", 0.1)
-    monkeypatch.setattr(workers, "COUNT_EVERY_S", 0.05)
+    monkeypatch.setattr(tasks, "NO_WORKER_S", 0.1)
+    monkeypatch.setattr(tasks, "COUNT_EVERY_S", 0.05)
     messages: list[str] = []
-    crew = workers.Cluster(NoWorkers(messages), lambda text, _share=None: messages.append(text))
+    crew = tasks.Cluster(NoWorkers(messages), lambda text, _share=None: messages.append(text))
     results: dict[int, Any] = {}
     crew.run(abs, [-2, 3], results.__setitem__)
     assert results == {0: 2, 1: 3}
@@ -194,4 +194,4 @@ def test_a_scheduler_that_goes_away_as_it_is_asked_is_one_message() -> None:
             raise OSError("Stream is closed")
 
     with pytest.raises(InputError, match="went away"):
-        _ = workers.Cluster(Gone()).count
+        _ = tasks.Cluster(Gone()).count

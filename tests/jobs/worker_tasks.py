@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from aerpaw_cmp.jobs.tasks.workers import Lost
+from aerpaw_cmp.jobs.tasks import Lost
 
 
 def dies(item: tuple[int, str]) -> int:

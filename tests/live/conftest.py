@@ -9,7 +9,7 @@ import time
 import pytest
 
 from aerpaw_cmp.live.feed import Feed
-from aerpaw_cmp.live.serial.modem import QUERIES
+from aerpaw_cmp.live.modem import QUERIES
 from aerpaw_cmp.live.tap import Stop, Tap, TapSettings
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
 from benchmarks.simulated_modem import BadLine, FaultyModem, read_log

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.live.serial.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
-from aerpaw_cmp.live.session import TapSettings
+from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, TapSettings, find_candidates, find_port, holders
 from benchmarks.simulated_modem import Faults, FaultyModem
 from benchmarks.tap_common import run_tap
 from tests.live.terminals import held, until
@@ -74,7 +73,7 @@ def test_not_a_serial_port(tmp_path, content):
 def opened_by_nobody(node):
     """What a user without rights is told who opens a port."""
     code = (
-        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.serial.ports import SerialPort\n"
+        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
         "from aerpaw_cmp.common.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"
         "try:\n SerialPort.open(Path(sys.argv[1]))\nexcept InputError as error:\n print(error); sys.exit(error.exit_code)"
     )
@@ -103,7 +102,7 @@ def test_the_port_vanishes_during_open(monkeypatch):
     master, slave = pty.openpty()
     path = Path(os.ttyname(slave))
     os.close(slave)
-    from aerpaw_cmp.live.serial import ports
+    from aerpaw_cmp.live import ports
 
     real = ports.make_raw
     monkeypatch.setattr(ports, "make_raw", lambda fd, baud: (os.close(master), real(fd, baud)))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.live.serial.framing import Framer, Late, Unsolicited, unglue
+from aerpaw_cmp.live.modem import Framer, Late, Unsolicited, unglue
 
 CSI = ('AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',))
 QENG = ('AT+QENG="servingcell"', ("+QENG:",))

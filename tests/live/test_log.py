@@ -14,9 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.live.record import log as log_module
-from aerpaw_cmp.live.record.log import Clock, LogSettings, LogWriter, SegmentLog
-from aerpaw_cmp.logs.files.checksums import SCHEMA, decode_record, encode_record
+from aerpaw_cmp.live import log as log_module
+from aerpaw_cmp.live.log import Clock, LogSettings, LogWriter, SegmentLog
+from aerpaw_cmp.logs.files import SCHEMA, decode_record, encode_record
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER, decode_line
 from benchmarks.simulated_modem import read_log
@@ -105,7 +105,7 @@ def test_a_line_that_is_no_record_is_told_with_its_reason(body, reason):
 FULL_DISK = """
 import resource, signal, sys
 from pathlib import Path
-from aerpaw_cmp.live.record.log import LogSettings, SegmentLog
+from aerpaw_cmp.live.log import LogSettings, SegmentLog
 signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # then a write beyond the limit is short, or fails with EFBIG
 said = []
 log = SegmentLog(Path(sys.argv[1]), lambda: {"kind": "header", "schema": "aerpaw-cmp-tap/1"},
@@ -298,7 +298,7 @@ def test_a_folder_of_another_user(tmp_path):
     folder = tmp_path / "theirs"
     folder.mkdir(mode=0o755)
     code = (
-        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.record.log import SegmentLog\n"
+        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.log import SegmentLog\n"
         "os.setuid(65534)\nSegmentLog(Path(sys.argv[1]), dict).open()"
     )
     for part in (tmp_path, *tmp_path.parents):

@@ -5,7 +5,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.live.serial.modem import QUERIES, Redactor, csi_write, decode, encode
+from aerpaw_cmp.live.modem import QUERIES, Redactor, csi_write, decode, encode
 from tests.real_logs import REAL
 
 SA = '+QENG: "servingcell","NOCONN","NR5G-SA","TDD",999,99,0002A4001,77,1F,633984,78,12,-80,-11,25,1,-'

@@ -7,10 +7,9 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.live.follow import TelemetryFollower, predict_along
-from aerpaw_cmp.live.predict import Prediction
-from aerpaw_cmp.live.serial import simulator
-from aerpaw_cmp.live.serial.simulator import ranks_of
+from aerpaw_cmp.live import simulator
+from aerpaw_cmp.live.predict import Prediction, TelemetryFollower, predict_along
+from aerpaw_cmp.live.simulator import ranks_of
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.logs.records import ReadResult, Stream

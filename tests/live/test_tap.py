@@ -12,10 +12,10 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.live.log import Clock, LogSettings
+from aerpaw_cmp.live.modem import OTHER_QUERIES
+from aerpaw_cmp.live.ports import Schedule
 from aerpaw_cmp.live.predict import Prediction
-from aerpaw_cmp.live.record.log import Clock, LogSettings
-from aerpaw_cmp.live.schedule import Schedule
-from aerpaw_cmp.live.serial.modem import OTHER_QUERIES
 from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER

@@ -16,8 +16,8 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.feed import CHUNK, MEASURED, STALE_S, Feed, Rows
+from aerpaw_cmp.live.ports import TapStatus
 from aerpaw_cmp.live.predict import RunningInterval
-from aerpaw_cmp.live.session import TapStatus
 from aerpaw_cmp.live.web import Address, Limits, WebServer
 from benchmarks.tap_common import damaged
 from tests.live.terminals import until

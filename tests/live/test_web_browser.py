@@ -13,7 +13,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.live.feed import Feed
-from aerpaw_cmp.live.session import TapStatus
+from aerpaw_cmp.live.ports import TapStatus
 from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
 from aerpaw_cmp.report.live import LiveMap, live_page
 from tests.report.browsing import (

@@ -12,7 +12,7 @@ import pytest
 import scipy.io
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs.files import archives
+from aerpaw_cmp.logs import files as archives
 from aerpaw_cmp.logs.flight_file import write_flight
 from aerpaw_cmp.logs.ingest import ingest
 from tests.parsers.samples import FILES, IQ_NAME, NO_LOGS, OPTIONS, iq_mat

@@ -10,8 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.jobs.run import run_ingest
-from aerpaw_cmp.logs import limits
-from aerpaw_cmp.logs.files import chunks
+from aerpaw_cmp.logs import files, limits
 from aerpaw_cmp.logs.ingest import IngestedFile, ingest, summary
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import KEPT_REJECTED
@@ -34,7 +33,7 @@ def test_pieces_of_any_size_are_one_piece(
     pieces = [bytes(log[a:b]) for a, b in pairwise(ends)]
     read = by_name(reader).read_pieces
     assert read is not None
-    assert_same_result(read(chunks.whole_lines(pieces), OPTIONS), by_name(reader).read(bytes(log), OPTIONS))
+    assert_same_result(read(files.whole_lines(pieces), OPTIONS), by_name(reader).read(bytes(log), OPTIONS))
 
 
 @given(
@@ -48,11 +47,11 @@ def test_sections_sum_up_to_the_whole_log(step: int, damage: list[tuple[float, b
     for at, new in damage:
         log[int(at * len(log)) : int(at * len(log)) + 2] = new
     reader, data, lines = by_name("sounder_log"), bytes(log), bytes(log).splitlines(keepends=True)
-    pieces = chunks.whole_lines(b"".join(lines[first : first + step]) for first in range(0, len(lines), step))
+    pieces = files.whole_lines(b"".join(lines[first : first + step]) for first in range(0, len(lines), step))
     assert reader.read_sections is not None
     try:
-        result = chunks.spans(reader.read_sections(pieces, OPTIONS, most))
-    except chunks.WholeLogError:
+        result = files.spans(reader.read_sections(pieces, OPTIONS, most))
+    except files.WholeLogError:
         assert damage  # what only the whole log can settle: such a log is read again
         return
     whole = limits.check(reader.read(data, OPTIONS))
@@ -75,7 +74,7 @@ def test_only_the_span_of_a_large_log_is_held(
     (tmp_path / "x_power_log.txt").write_bytes(sounder_log(2000) + last)
     options = ReadOptions(timezone=OPTIONS.timezone)
     whole = ingest(tmp_path, options=options)
-    monkeypatch.setattr(chunks, "SECTION", 99)
+    monkeypatch.setattr(files, "SECTION", 99)
     monkeypatch.setattr("aerpaw_cmp.logs.ingest._LARGE_BYTES", 99)
     some = ingest(tmp_path, options=replace(options, only_spans=True))
     assert summary(some) == summary(whole) == run_ingest([tmp_path], timezone=options.timezone)
@@ -86,7 +85,7 @@ def test_a_file_is_read_in_pieces(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     data = b"\xef\xbb\xbf" + sounder_log(2000)
     (tmp_path / "x_power_log.txt").write_bytes(data)
     (at_once,) = ingest(tmp_path, options=OPTIONS)
-    monkeypatch.setattr(chunks, "PIECE_BYTES", 999)
+    monkeypatch.setattr(files, "PIECE_BYTES", 999)
     (file,) = ingest(tmp_path, options=OPTIONS)
     assert_same_result(file.result, at_once.result)
     assert file.sha256 == hashlib.sha256(data).hexdigest()

@@ -5,7 +5,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.logs import limits
-from aerpaw_cmp.logs.jumps import jumps_of, stale_of
+from aerpaw_cmp.logs.limits import jumps_of, stale_of
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
 
 DEGREE_M = 111_200.0

@@ -4,7 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.flight.rows.scored import unscored
+from aerpaw_cmp.flight.rows import unscored
 from aerpaw_cmp.logs.limits import UNSCORED, check
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream

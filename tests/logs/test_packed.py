@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError
-from aerpaw_cmp.logs.files import packed
+from aerpaw_cmp.logs import files
 from aerpaw_cmp.logs.ingest import ingest, sniffers_of
 from aerpaw_cmp.logs.readers import ReadOptions
 from tests.frames import assert_same_result
@@ -35,7 +35,7 @@ def in_streams(pack: Pack, data: bytes) -> bytes:
 def test_a_packed_log_is_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pack: Pack, piece: int) -> None:
     (tmp_path / "a_power_log.txt").write_bytes(LOG)
     (plain,) = ingest(tmp_path, options=OPTIONS)
-    monkeypatch.setattr(packed, "_PIECE", piece)
+    monkeypatch.setattr(files, "_PIECE", piece)
     for i, content in enumerate((pack(LOG), in_streams(pack, LOG))):
         place = tmp_path / f"b{i}_power_log.txt.packed"
         place.write_bytes(content)
@@ -82,6 +82,6 @@ def test_what_is_cut_damaged_or_a_bomb_is_one_message(tmp_path: Path, pack: Pack
 
 
 def test_words_that_begin_as_a_packed_file_does_are_text() -> None:
-    assert packed.form(b"BZh, a word\n") is None
-    assert packed.form(bz2.compress(b"a")) == "bzip2"
-    assert packed.form(lzma.compress(b"a")) == "xz"
+    assert files.packed_form(b"BZh, a word\n") is None
+    assert files.packed_form(bz2.compress(b"a")) == "bzip2"
+    assert files.packed_form(lzma.compress(b"a")) == "xz"

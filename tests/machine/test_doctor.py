@@ -9,7 +9,7 @@ import pytest
 
 from aerpaw_cmp.common.files import cache_folder, clear_cache
 from aerpaw_cmp.machine import doctor
-from aerpaw_cmp.propagation.native import llvm
+from aerpaw_cmp.propagation import llvm
 
 
 def test_every_unwell_check_has_a_remedy_and_the_whole_is_json(monkeypatch: pytest.MonkeyPatch) -> None:

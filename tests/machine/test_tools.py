@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from aerpaw_cmp.propagation.native import llvm
+from aerpaw_cmp.propagation import llvm
 from tests.conftest import skips
 from tools import setup_browser, setup_llvm
 

@@ -6,8 +6,8 @@ from scipy.stats import norm
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.maps import evaluate
+from aerpaw_cmp.maps.evaluate import IndexInterpolation, InverseDistance, ServingTowerMean
 from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.interpolate import IndexInterpolation, InverseDistance, ServingTowerMean
 from aerpaw_cmp.maps.kriging import OrdinaryKriging
 
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.interpolate import Akima1DInterpolator, CubicSpline
 
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.maps.evaluate import IndexInterpolation, InverseDistance, ServingTowerMean, makima, spline
 from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.interpolate import IndexInterpolation, InverseDistance, ServingTowerMean, makima, spline
 
 RNG = np.random.default_rng(5)
 

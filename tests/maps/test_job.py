@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.maps.grid import Grid
-from aerpaw_cmp.maps.job import (
+from aerpaw_cmp.maps.evaluate import interpolation_study, rank_fields
+from aerpaw_cmp.maps.grid import (
     PAPER_RANK_ALTITUDES_M,
     Evaluation,
+    Grid,
     foliage_difference,
     layers_of,
     map_job,
     rank_of_singular_values,
 )
-from aerpaw_cmp.maps.study import interpolation_study, rank_fields
 
 GRID = Grid.over_area((-300.0, 300.0, -300.0, 300.0))
 TOWERS = {"A": np.array([-200.0, 0.0, 10.0]), "B": np.array([200.0, 50.0, 10.0])}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.maps.link_budget import PAPER_BUDGET, LinkBudget
+from aerpaw_cmp.maps.grid import PAPER_BUDGET, LinkBudget
 
 BOLTZMANN, ROOM_K = 1.380649e-23, 290.0
 

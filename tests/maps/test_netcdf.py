@@ -8,9 +8,8 @@ import pytest
 from aerpaw_cmp.common.cf import file_attributes, netcdf_bytes
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.maps import netcdf
-from aerpaw_cmp.maps.grid import Grid, Layer, class_names, serving_tower, voronoi_borders
-from aerpaw_cmp.maps.job import MapResult
+from aerpaw_cmp.maps import export
+from aerpaw_cmp.maps.grid import Grid, Layer, MapResult, class_names, serving_tower, voronoi_borders
 
 FRAME = SiteFrame(35.7275, -78.6960)
 AREA = (-90.0, 90.0, -60.0, 90.0)
@@ -57,7 +56,7 @@ def write(path):
     )
     level = Layer("rss_sd_h030m_LW1", np.arange(len(GRID)) / 4.0, "dB", "Standard deviation")
     rank = Layer("rank_learned_h030m_LW1", np.arange(len(GRID)) % 5, "1", "Rank", class_names(4))
-    path.write_bytes(netcdf_bytes(netcdf.maps_dataset(MAPS, FRAME, about, [level, rank])))
+    path.write_bytes(netcdf_bytes(export.maps_dataset(MAPS, FRAME, about, [level, rank])))
     return path
 
 

@@ -6,7 +6,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.maps import biexponential, variogram
+from aerpaw_cmp.maps import variogram
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.variogram import (
     PAPER_BIEXPONENTIAL,
@@ -236,7 +236,7 @@ def test_bounded_amplitudes_equal_a_quadratic_programme(seed, level):
 
     rng = np.random.default_rng(seed)
     basis, target = rng.uniform(0, 1, (9, 2)), rng.normal(level, 1, 9)
-    amplitudes = biexponential._candidate_amplitudes(basis, target)
+    amplitudes = variogram._candidate_amplitudes(basis, target)
     cost = ((amplitudes @ basis.T - target) ** 2).sum(axis=-1)
     assert (amplitudes >= -1e-12).all()
     assert (amplitudes.sum(axis=-1) <= 1 + 1e-12).all()

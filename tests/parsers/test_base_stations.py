@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_parsers import _json
 from tests.parsers import samples
 
@@ -125,7 +125,7 @@ def test_an_export_of_the_tap_keeps_its_queries_apart() -> None:
 def test_objects_over_several_lines_are_read_behind_any_number_of_damaged_ones():
     damaged = b'{"timestamp": 1740927600.25, "cells": ~}\n'
     good = json.dumps({"timestamp": 1740927601.25, "ue_list": []}, indent=2).encode() + b"\n"
-    lines = _lines.split(40 * damaged + good)
+    lines = _text.split(40 * damaged + good)
     parsed = _json.objects(lines)
     assert [entry["timestamp"] for entry in parsed.values] == [1740927601.25]
     assert len(parsed.rejected) == 40

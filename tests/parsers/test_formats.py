@@ -7,8 +7,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.common.counting import counted
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.text import counted
 from aerpaw_cmp.logs.readers import ReadOptions, by_name, identify
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from tests.parsers import samples

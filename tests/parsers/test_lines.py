@@ -5,17 +5,17 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.logs.text import lines as _lines
+from aerpaw_cmp.logs import text as _text
 
 
 @pytest.mark.parametrize("space", [b" ", b"\t", b"\x0b", b"\x0c", b"\r \r", b" \t \x0b"])
 def test_a_line_of_any_white_space_is_blank(space: bytes) -> None:
-    lines = _lines.split(b"a\n" + space + b"\n" + space + b"b\n\n" + space)
+    lines = _text.split(b"a\n" + space + b"\n" + space + b"b\n\n" + space)
     assert lines.blank.tolist() == [False, True, False, True, True]
 
 
 def test_lines_of_equal_length_and_others_between() -> None:
-    lines = _lines.split(b"abc\ndef\nlonger\nghi\n\njkl")
+    lines = _text.split(b"abc\ndef\nlonger\nghi\n\njkl")
     assert [bytes(row) for row in lines.fixed(np.array([0, 1]), 3)] == [b"abc", b"def"]
     assert [bytes(row) for row in lines.fixed(np.array([0, 1, 3, 5]), 3)] == [b"abc", b"def", b"ghi", b"jkl"]
     assert [bytes(row) for row in lines.fixed(np.array([0, 1, 3]), 3)] == [b"abc", b"def", b"ghi"]
@@ -38,33 +38,33 @@ def test_lines_of_equal_length_and_others_between() -> None:
     ],
 )
 def test_sniffers_judge_by_whole_lines(head: bytes, lines: list[bytes]) -> None:
-    assert _lines.first_lines(head) == lines
+    assert _text.first_lines(head) == lines
 
 
 def test_sniffers_judge_by_forty_lines() -> None:
-    assert len(_lines.first_lines(b"a\n" * 100)) == 40
+    assert len(_text.first_lines(b"a\n" * 100)) == 40
 
 
 @pytest.mark.parametrize(
     ("head", "most"), [(b"1\n2\na\n", True), (b"1\na\n", False), (b"a\n1\n2\n", True), (b"", False)]
 )
 def test_most_of_the_first_lines_are_more_than_half(head: bytes, most: bool) -> None:
-    assert _lines.mostly(head, re.compile(rb"\d")) is most
-    assert _lines.mostly(b"title\n" + head, re.compile(rb"\d"), skip=1) is most
+    assert _text.mostly(head, re.compile(rb"\d")) is most
+    assert _text.mostly(b"title\n" + head, re.compile(rb"\d"), skip=1) is most
 
 
 def test_numbers_of_cells_and_of_none() -> None:
-    assert _lines.numbers(np.zeros(0, dtype="S5")).tolist() == []
-    np.testing.assert_array_equal(_lines.numbers(np.array([b"", b"1e3", b"-2.5"])), [np.nan, 1000, -2.5])
+    assert _text.numbers(np.zeros(0, dtype="S5")).tolist() == []
+    np.testing.assert_array_equal(_text.numbers(np.array([b"", b"1e3", b"-2.5"])), [np.nan, 1000, -2.5])
 
 
 @pytest.mark.parametrize(("data", "unterminated"), [(b"", False), (b"a", True), (b"a\n", False), (b"a\r", True)])
 def test_whether_the_last_line_has_its_end(data: bytes, unterminated: bool) -> None:
-    assert _lines.split(data).unterminated is unterminated
+    assert _text.split(data).unterminated is unterminated
 
 
 def test_rejected_lines_are_kept_to_a_length_and_numbered_from_one() -> None:
-    lines = _lines.split(b"a\n" + b"\xff" + b"x" * 4000 + b"\n")
+    lines = _text.split(b"a\n" + b"\xff" + b"x" * 4000 + b"\n")
     (rejected,) = lines.reject_all(np.array([1]), "why")
     assert (rejected.number, rejected.reason) == (2, "why")
-    assert rejected.text == "\ufffd" + "x" * (_lines.TEXT_LIMIT - 1)
+    assert rejected.text == "\ufffd" + "x" * (_text.TEXT_LIMIT - 1)

@@ -161,7 +161,7 @@ def test_names_that_only_look_like_one(name: str) -> None:
 )  # fmt: skip
 def test_every_form_of_one_time(text: str) -> None:
     clock, cells, _ = _stamps.read([text, text.replace("02.03", "22.03")] if "02.03." in text else [text], PLAIN)
-    from aerpaw_cmp.logs.text import rows as _rows
+    from aerpaw_cmp.logs import rows as _rows
 
     _, instants, valid = _rows.times(cells, PLAIN, clock=clock, reader="x")
     assert valid[0]

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
-from aerpaw_cmp.logs.text import rows as _rows
 
 OPTIONS = ReadOptions(timezone="America/New_York")
 PATTERN = re.compile(rb"^(?P<time>[\d.]+) (?P<value>\S+)$", re.MULTILINE)

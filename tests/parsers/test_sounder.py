@@ -6,8 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_cmp.logs.text import lines as _lines
 from aerpaw_parsers import sounder_log
 from tests.parsers.samples import OPTIONS
 
@@ -42,12 +42,12 @@ LONG = [line(n, f"1{0:0{n}o} {-20.5:15.4f}") for n in range(9, 12)]  # 33 millio
 
 
 def test_lines_of_od_are_read_at_once() -> None:
-    layout, _ = sounder_log._fixed_layout(_lines.split("".join(GOOD).encode()))
+    layout, _ = sounder_log._fixed_layout(_text.split("".join(GOOD).encode()))
     assert layout.line.tolist() == [0, 1, 2]
     assert layout.offset.tolist() == [0o17, 0o7777777, 0o10000000]
     assert layout.value.tolist() == [-20.5, 3.25, -788.5956]
     assert np.diff(layout.wall).tolist() == [10**9, 10**9]
-    assert sounder_log._fixed_layout(_lines.split("".join(LONG).encode()))[0].offset.tolist() == [8**9, 8**10, 8**11]
+    assert sounder_log._fixed_layout(_text.split("".join(LONG).encode()))[0].offset.tolist() == [8**9, 8**10, 8**11]
 
 
 @pytest.mark.parametrize("row", [0, 2], ids=["seven digits", "eight digits"])
@@ -61,7 +61,7 @@ def test_lines_with_one_sign_changed_are_left_to_the_strict_way(row: int, place:
     if row == 2 and place == 36:
         place += 1  # the space behind the offset
     bad = good[:place] + sign + good[place + 1 :]
-    assert len(sounder_log._fixed_layout(_lines.split(bad.encode()))[0].line) == 0
+    assert len(sounder_log._fixed_layout(_text.split(bad.encode()))[0].line) == 0
     result = read(*GOOD, bad)
     assert (result.accepted, len(result.rejected)) == (3, 1)
 
@@ -119,8 +119,8 @@ def test_a_run_has_as_many_samples_as_its_offsets_say_at_even_times() -> None:
 
 
 def test_offsets_of_a_run_go_on_from_the_sample_before() -> None:
-    lines = _lines.split("".join((sample(0, 8), star(1), sample(4, 24))).encode())
-    piece = sounder_log._piece(lines, _lines.Rejects())
+    lines = _text.split("".join((sample(0, 8), star(1), sample(4, 24))).encode())
+    piece = sounder_log._piece(lines, _text.Rejects())
     repeats, used, bad = sounder_log._expand(piece.samples, piece.marks)
     assert (repeats.offset.tolist(), used.tolist(), bad) == ([12, 16, 20], [1], [])
 
@@ -197,7 +197,7 @@ def test_a_last_line_without_its_end_counts_where_it_has_its_whole_width(value: 
     assert result.accepted == 1 + counts
     assert [reject.number for reject in result.rejected] == ([] if counts else [2])
     if counts:
-        assert result.streams[0].frame["flag"].tolist() == ["", _lines.UNTERMINATED]
+        assert result.streams[0].frame["flag"].tolist() == ["", _text.UNTERMINATED]
 
 
 def test_a_level_at_the_floor_is_out_of_coverage_and_one_above_is_not() -> None:

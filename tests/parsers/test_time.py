@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.logs import text as _text
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.text import clocks as _time
 
 NEW_YORK = "America/New_York"
 
@@ -21,7 +21,7 @@ def wall(*texts: str) -> np.ndarray:
 
 
 def utc_of(*texts: str, zone: str = NEW_YORK) -> list[str]:
-    made = _time.local_to_utc(wall(*texts), zone, needed_by="a test")
+    made = _text.local_to_utc(wall(*texts), zone, needed_by="a test")
     return [str(time)[:19] for time in made.time.astype("datetime64[s]")]
 
 
@@ -29,7 +29,7 @@ def utc_of(*texts: str, zone: str = NEW_YORK) -> list[str]:
     st.datetimes(datetime(1971, 1, 1), datetime(2037, 1, 1)), st.sampled_from([NEW_YORK, "Australia/Lord_Howe", "UTC"])
 )
 def test_agrees_with_datetime(moment: datetime, zone: str) -> None:
-    made = _time.local_to_utc(wall(moment.isoformat()), zone, needed_by="a test")
+    made = _text.local_to_utc(wall(moment.isoformat()), zone, needed_by="a test")
     expected = moment.replace(tzinfo=ZoneInfo(zone)).astimezone(timezone.utc).replace(tzinfo=None)
     assert pd.Timestamp(made.time[0]) == pd.Timestamp(expected)
 
@@ -39,7 +39,7 @@ def test_round_trip_through_the_zone(seconds: list[int]) -> None:
     """Any instant, written as local time and read again, is itself unless its hour came twice."""
     utc = np.sort(np.array(seconds, dtype=np.int64)) + 10**9
     local = pd.DatetimeIndex(utc * 10**9, tz="UTC").tz_convert(NEW_YORK).tz_localize(None).to_numpy()
-    made = _time.local_to_utc(local.astype("datetime64[ns]").astype(np.int64), NEW_YORK, needed_by="a test")
+    made = _text.local_to_utc(local.astype("datetime64[ns]").astype(np.int64), NEW_YORK, needed_by="a test")
     sure = ~made.ambiguous
     assert not made.nonexistent.any()
     assert np.array_equal(made.time.astype(np.int64)[sure], utc[sure] * 10**9)
@@ -54,7 +54,7 @@ def test_the_hour_that_comes_twice() -> None:
     assert utc_of(*texts) == [
         "2024-11-03T04:59:00", "2024-11-03T05:30:00", "2024-11-03T05:59:00", "2024-11-03T06:01:00", "2024-11-03T07:00:00",
     ]  # fmt: skip
-    made = _time.local_to_utc(wall(*texts), NEW_YORK, needed_by="a test")
+    made = _text.local_to_utc(wall(*texts), NEW_YORK, needed_by="a test")
     assert made.ambiguous.tolist() == [False, True, True, True, False]
     assert "twice" in made.warnings[0]
     column = np.full(5, "", dtype=object)
@@ -64,7 +64,7 @@ def test_the_hour_that_comes_twice() -> None:
 
 
 def test_the_hour_that_never_was() -> None:
-    made = _time.local_to_utc(wall("2024-03-10T02:30:00", "2024-03-10T03:00:00"), NEW_YORK, needed_by="a test")
+    made = _text.local_to_utc(wall("2024-03-10T02:30:00", "2024-03-10T03:00:00"), NEW_YORK, needed_by="a test")
     assert made.nonexistent.tolist() == [True, False]
     assert "skipped" in made.warnings[0]
 
@@ -72,14 +72,14 @@ def test_the_hour_that_never_was() -> None:
 @pytest.mark.parametrize("name", [None, "", "America/New_Yrok", "../etc/passwd", "/etc/passwd"])
 def test_no_or_wrong_zone(name: str | None) -> None:
     with pytest.raises(UsageError, match="timezone:"):
-        _time.local_to_utc(wall("2024-07-02T11:00:00"), name, needed_by="a test")
+        _text.local_to_utc(wall("2024-07-02T11:00:00"), name, needed_by="a test")
 
 
 def test_a_winter_time_in_summer_is_refused_with_what_may_be_meant() -> None:
     """EST is -5 h all year in the zone database; who flies in July and writes it means New York, or does not."""
     with pytest.raises(UsageError, match=r"New_York \(clocks are turned\) or Etc/GMT\+5"):
-        _time.local_to_utc(wall("2024-07-02T11:00:00"), "EST", needed_by="a test")
-    winter = _time.local_to_utc(wall("2024-01-02T11:00:00"), "EST", needed_by="a test")
+        _text.local_to_utc(wall("2024-07-02T11:00:00"), "EST", needed_by="a test")
+    winter = _text.local_to_utc(wall("2024-01-02T11:00:00"), "EST", needed_by="a test")
     assert winter.time[0] == np.datetime64("2024-01-02T16:00:00")
 
 
@@ -87,20 +87,20 @@ def test_a_winter_time_in_summer_is_refused_with_what_may_be_meant() -> None:
 def test_digits(moment: datetime, fraction: int) -> None:
     text = moment.strftime("%Y-%m-%d %H:%M:%S.%f").zfill(26)
     text = text[: 20 + fraction] if fraction else text[:19]
-    made, valid = _time.parse_digits(np.frombuffer(text.encode(), dtype=np.uint8)[None, :], fraction)
+    made, valid = _text.parse_digits(np.frombuffer(text.encode(), dtype=np.uint8)[None, :], fraction)
     assert valid[0]
     assert made[0] == pd.Timestamp(text).as_unit("ns").value
 
 
 @pytest.mark.parametrize("text", ["2025-02-29", "2100-02-29", "2025-04-31", "2025-13-01", "2025-00-10", "2025-01-00", "0000-01-01", "9999-01-01"])  # fmt: skip
 def test_days_that_are_none(text: str) -> None:
-    _, valid = _time.parse_digits(np.frombuffer(f"{text} 10:00:00".encode(), dtype=np.uint8)[None, :], 0)
+    _, valid = _text.parse_digits(np.frombuffer(f"{text} 10:00:00".encode(), dtype=np.uint8)[None, :], 0)
     assert not valid[0]
 
 
 @pytest.mark.parametrize("text", ["24:00:00", "10:60:00", "10:00:60", "1a:00:00", "10-00:00", "10:00 00"])
 def test_times_of_day_that_are_none(text: str) -> None:
-    _, valid = _time.parse_digits(np.frombuffer(f"2025-03-02 {text}".encode(), dtype=np.uint8)[None, :], 0)
+    _, valid = _text.parse_digits(np.frombuffer(f"2025-03-02 {text}".encode(), dtype=np.uint8)[None, :], 0)
     assert not valid[0]
 
 
@@ -116,7 +116,7 @@ def test_times_of_day_that_are_none(text: str) -> None:
 )
 def test_offsets_in_the_text(text: bytes, expected: str) -> None:
     options = ReadOptions(timezone=NEW_YORK)
-    made, valid = _time.texts_to_utc(np.array([text, b"2025-07-02 10:00:00.25"]), options, needed_by="a test")
+    made, valid = _text.texts_to_utc(np.array([text, b"2025-07-02 10:00:00.25"]), options, needed_by="a test")
     assert valid.all()
     assert made.time[0] == np.datetime64(expected, "ns")
     assert made.time[1] == np.datetime64("2025-07-02T14:00:00.25", "ns")
@@ -132,7 +132,7 @@ def test_times_that_come_back_are_read_like_times_alone(steps: list[int], fracti
     seconds = [int(start) + step for step in (*steps, *steps[::-1], steps[0])]
     texts = [datetime.fromtimestamp(s, timezone.utc).strftime("%Y-%m-%d %H:%M:%S") for s in seconds]
     rows = [(text + (".250" if fraction else "")).encode() for text in texts]
-    wall, valid = _time.parse_digits(np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(len(rows), -1), fraction)
+    wall, valid = _text.parse_digits(np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(len(rows), -1), fraction)
     assert valid.all()
     assert wall.tolist() == [s * 10**9 + (250_000_000 if fraction else 0) for s in seconds]
 
@@ -143,9 +143,9 @@ def test_offsets_in_times_of_any_layout_are_taken_row_by_row() -> None:
         b"2025-03-02T10:00:00Z", b"2025-03-02 10:00:00.5+02:00", b"2025-03-02T10:00:00.123456-0500",
         b"2025-03-02T10:00:00.25+05:30", b"2025-03-02 10:00:00-00:30", b"2025-03-02T10:00:00.000000001+00:00",
     ]  # fmt: skip
-    instants, valid = _time.texts_to_utc(np.array(texts), ReadOptions(), needed_by="here")
+    instants, valid = _text.texts_to_utc(np.array(texts), ReadOptions(), needed_by="here")
     assert valid.all()
     expected = ["10:00:00", "08:00:00.5", "15:00:00.123456", "04:30:00.25", "10:30:00", "10:00:00.000000001"]
     assert instants.time.tolist() == [np.datetime64(f"2025-03-02T{text}", "ns").astype(int) for text in expected]
     with pytest.raises(UsageError, match="zone"):
-        _time.texts_to_utc(np.array([*texts, b"2025-03-02T10:00:00.75"]), ReadOptions(), needed_by="here")
+        _text.texts_to_utc(np.array([*texts, b"2025-03-02T10:00:00.75"]), ReadOptions(), needed_by="here")

@@ -15,7 +15,7 @@ import pandas as pd
 import pytest
 import yaml
 
-from aerpaw_cmp.logs.files.chunks import whole_lines
+from aerpaw_cmp.logs.files import whole_lines
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 from tests.frames import assert_same_result

@@ -8,7 +8,7 @@ from shapely import affinity
 from shapely.geometry import LineString, box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.geometry import Link, Poses, single_element
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 CARRIER_HZ = 3.4e9

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
+from aerpaw_cmp.site.mitsuba import TriangleScene
 
 CLEARANCE_M = 2e-3
 

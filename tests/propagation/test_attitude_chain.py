@@ -10,15 +10,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.flight.pose.track import Track
 from aerpaw_cmp.flight.settings import ArraySettings, LinkSettings
-from aerpaw_cmp.propagation.geometry.arrays import (
-    Array,
-    Link,
-    Poses,
-    rotation_from_aircraft,
-    single_element,
-)
+from aerpaw_cmp.flight.track import Track
+from aerpaw_cmp.propagation.geometry import Array, Link, Poses, rotation_from_aircraft, single_element
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 

@@ -7,30 +7,31 @@ import numpy as np
 import pytest
 from shapely import Point
 
-from aerpaw_cmp.compare.level.field_difference import FieldAudit
+from aerpaw_cmp.compare.level import FieldAudit
 from aerpaw_cmp.propagation.check import audit as audit_module
-from aerpaw_cmp.propagation.check.audit import Second, _spread
-from aerpaw_cmp.propagation.check.field_audit import (
+from aerpaw_cmp.propagation.check.audit import (
     Expected,
+    Second,
     _another_rank,
     _lacking,
     _level_error,
     _link_error,
     _paths_against_sionna,
     _probe,
+    _spread,
     against_sionna,
     impossible,
     spread_over_paths,
 )
 from aerpaw_cmp.propagation.field.sum import channel_matrices
-from aerpaw_cmp.propagation.geometry.arrays import (
+from aerpaw_cmp.propagation.geometry import (
     Isotropic,
     Link,
     Poses,
+    path_lengths,
     rotation_from_yaw_pitch_roll,
     single_element,
 )
-from aerpaw_cmp.propagation.geometry.paths import path_lengths
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene

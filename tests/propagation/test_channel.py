@@ -12,7 +12,7 @@ from aerpaw_cmp.propagation.field import sum as field_module
 from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
 from aerpaw_cmp.propagation.field.fresnel import reflection_coefficients
 from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
-from aerpaw_cmp.propagation.geometry.arrays import (
+from aerpaw_cmp.propagation.geometry import (
     Array,
     Isotropic,
     rotation_from_aircraft,
@@ -304,7 +304,7 @@ def test_mean_pair_power_of_tiny_and_huge_channels(scale):
 
 
 def test_towers_need_equal_arrays(scenes):
-    from aerpaw_cmp.propagation.geometry.arrays import Link
+    from aerpaw_cmp.propagation.geometry import Link
 
     site = scenes.site(towers=((0.0, 0.0, 10.0), (9.0, 0.0, 10.0)))
     link = Link(3.4e9, {"LW1": single_element(), "LW2": tower_comparison_array()}, single_element())

@@ -21,20 +21,24 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs.bench import random_scene
+from aerpaw_cmp.propagation import compiled, engines
 from aerpaw_cmp.propagation import replay as replay_module
-from aerpaw_cmp.propagation.engine import engines
 from aerpaw_cmp.propagation.field import sum as field_sum
-from aerpaw_cmp.propagation.geometry.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
-from aerpaw_cmp.propagation.geometry.faces import site_faces
-from aerpaw_cmp.propagation.geometry.paths import Links
-from aerpaw_cmp.propagation.native import compiled
+from aerpaw_cmp.propagation.geometry import (
+    Array,
+    Links,
+    Poses,
+    site_faces,
+    tower_comparison_array,
+    uav_comparison_array,
+)
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.search import beams as prisms
 from aerpaw_cmp.propagation.search import mirror as image
-from aerpaw_cmp.propagation.search import prisms
-from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
+from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.materials import stated_name
-from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
+from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building
 
 needs_numba = pytest.mark.skipif(
@@ -397,7 +401,7 @@ def test_a_fault_planted_in_a_file_that_a_kernel_takes_in_reaches_compiled_code(
 
 @needs_numba
 def test_every_file_that_kernels_take_in_names_the_folder_of_compiled_code():
-    from aerpaw_cmp.propagation.native.compiled import ROOM, SOURCES
+    from aerpaw_cmp.propagation.compiled import ROOM, SOURCES
 
     known = {(ROOM / name).resolve() for name in SOURCES}
     holders = {path for path in ROOM.rglob("*.py") if "\n@kernel\n" in path.read_text(encoding="utf-8")}
@@ -426,12 +430,12 @@ def refuse(*args, **kwargs):
     raise OSError(30, "Read-only file system")
 tempfile.TemporaryFile = refuse  # how a folder for compiled code is tried
 import numpy as np
-from aerpaw_cmp.propagation.search import boxtree
+from aerpaw_cmp.propagation.search import merging as boxtree
 from aerpaw_cmp.propagation.search import beams as growth
 from aerpaw_cmp.propagation.search import merging
-from aerpaw_cmp.propagation.search import prisms
+from aerpaw_cmp.propagation.search import beams as prisms
 from aerpaw_cmp.propagation.field import kernels
-from aerpaw_cmp.propagation.native.numba_options import FOLDER
+from aerpaw_cmp.propagation.numba_options import FOLDER
 height = growth._height(np.array([[0.0, 0.0, 1.0]]), np.array([2.0]), 0, np.array([5.0, 5.0, 7.0]))
 print(json.dumps([FOLDER, height]))
 """
@@ -537,7 +541,7 @@ class _Ends:
 
 @pytest.mark.parametrize("kind", DAMAGED)
 def test_a_damaged_entry_of_compiled_code_is_compiled_again(kind, tmp_path, monkeypatch):
-    numba_options = pytest.importorskip("aerpaw_cmp.propagation.native.numba_options")
+    numba_options = pytest.importorskip("aerpaw_cmp.propagation.numba_options")
     monkeypatch.setattr(numba_options, "FOLDER", tmp_path)
 
     def run():

@@ -14,13 +14,11 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.jobs.bench import random_scene
 from aerpaw_cmp.propagation.check.explain import further_path_lines
 from aerpaw_cmp.propagation.edges import EdgePaths, Edges, diffracted, wedge_axes
-from aerpaw_cmp.propagation.geometry.arrays import Array, Link, Poses, single_element
-from aerpaw_cmp.propagation.geometry.faces import site_faces
+from aerpaw_cmp.propagation.geometry import Array, Link, Poses, single_element, site_faces
 from aerpaw_cmp.propagation.options import Search
-from aerpaw_cmp.propagation.replay import Replay, replay
+from aerpaw_cmp.propagation.replay import Replay, replay, trace
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.trace import trace
-from aerpaw_cmp.site.mesh_scenes.mitsuba import TriangleScene
+from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 HZ = 3.4e9

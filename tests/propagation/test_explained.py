@@ -8,15 +8,13 @@ from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.check import reference
+from aerpaw_cmp.propagation.check.audit import Expected
 from aerpaw_cmp.propagation.check.explain import explain_paths, further_path_lines, power_sum_dbm, simple_paths, why_not
-from aerpaw_cmp.propagation.check.field_audit import Expected
-from aerpaw_cmp.propagation.geometry.arrays import single_element
-from aerpaw_cmp.propagation.geometry.faces import site_faces
-from aerpaw_cmp.propagation.geometry.paths import Links
+from aerpaw_cmp.propagation.geometry import Links, single_element, site_faces
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search.mirror import find_paths
-from aerpaw_cmp.site.antenna.antennas import HalfWaveDipole
+from aerpaw_cmp.site.antennas import HalfWaveDipole
 from aerpaw_cmp.site.site import Building
 
 

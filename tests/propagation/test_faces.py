@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.propagation.geometry.faces import corners, inside, inside_solids, site_faces, triangles
+from aerpaw_cmp.propagation.geometry import corners, inside, inside_solids, site_faces, triangles
 from aerpaw_cmp.site.site import Building
 
 COURT = box(0, 0, 20, 20).difference(box(5, 5, 15, 15))

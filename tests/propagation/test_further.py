@@ -8,14 +8,12 @@ import pytest
 
 from aerpaw_cmp.common.units import FloatArray, IntArray, wavelength_m
 from aerpaw_cmp.flight.replay import part_of
+from aerpaw_cmp.propagation.check.audit import Expected, against_reference
 from aerpaw_cmp.propagation.check.explain import further_path_lines
-from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
-from aerpaw_cmp.propagation.drivers.moving import replay_moving
-from aerpaw_cmp.propagation.drivers.parts import replay_in_parts
+from aerpaw_cmp.propagation.drivers import replay_in_parts, replay_moving
 from aerpaw_cmp.propagation.edges import over_edges
 from aerpaw_cmp.propagation.field.sum import Fields, Further
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses
-from aerpaw_cmp.propagation.geometry.paths import Faces, PathSet, sources_of
+from aerpaw_cmp.propagation.geometry import Faces, Link, PathSet, Poses, sources_of
 from aerpaw_cmp.propagation.options import Field, Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.propagation.drivers.geometries import basis_fields, every_geometry, singular_values_of, slanted
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.drivers import basis_fields, every_geometry, singular_values_of, slanted
+from aerpaw_cmp.propagation.geometry import Link, Poses, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Site, Tower
@@ -42,7 +42,7 @@ def test_equal_to_the_replay_with_those_arrays():
     for geometry, sigma in zip(some("coherent", 1.0), singular_values, strict=True):
         turned = uav_comparison_array(wavelength, geometry.uav_yaw_deg, geometry.uav_roll_deg, geometry.uav_slant_deg)
         if geometry.uav_pitch_deg:
-            from aerpaw_cmp.propagation.geometry.arrays import rotation_from_yaw_pitch_roll
+            from aerpaw_cmp.propagation.geometry import rotation_from_yaw_pitch_roll
 
             turn = np.radians([geometry.uav_yaw_deg, geometry.uav_pitch_deg, geometry.uav_roll_deg])
             turned = dataclasses.replace(turned, mount=rotation_from_yaw_pitch_roll(*turn))
@@ -58,7 +58,7 @@ def test_power_sum_is_the_mean_over_the_phases_of_the_ground_ray():
     centre = np.array([0.0, 0.0, HEIGHT_M])
     (geometry, *_) = some("power_sum", 0.7)
     (sigma, *_) = singular_values_of([geometry], tower, centre, uav, at, CARRIER_HZ)
-    from aerpaw_cmp.propagation.geometry.arrays import rotation_from_yaw_pitch_roll
+    from aerpaw_cmp.propagation.geometry import rotation_from_yaw_pitch_roll
 
     turn = rotation_from_yaw_pitch_roll(*np.radians([geometry.uav_yaw_deg, 0.0, geometry.uav_roll_deg]))
     los, ground = basis_fields(tower, centre, dataclasses.replace(uav, mount=turn), at, CARRIER_HZ)

@@ -9,17 +9,18 @@ from shapely.geometry import box
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.jobs.mapping.site_scene import export_scene
+from aerpaw_cmp.jobs.site_scene import export_scene
 from aerpaw_cmp.propagation.check.explain import why_not
-from aerpaw_cmp.propagation.geometry.paths import Links
+from aerpaw_cmp.propagation.geometry import Links
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.search import beams, prisms
+from aerpaw_cmp.propagation.search import beams
+from aerpaw_cmp.propagation.search import beams as prisms
 from aerpaw_cmp.propagation.search import mirror as image
 from aerpaw_cmp.propagation.search.beams import grow_paths, reflection_points
 from aerpaw_cmp.propagation.search.merging import merged
-from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
+from aerpaw_cmp.site.mitsuba import read_scene
 from aerpaw_cmp.site.scenes import placed_scene
 from aerpaw_cmp.site.site import Building
 from tests.propagation import open_surfaces as enumerate_

@@ -11,12 +11,7 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import CheckError, UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.jobs.bench import random_scene, speed_against_error
-from aerpaw_cmp.propagation.geometry.arrays import (
-    tower_comparison_array,
-    uav_comparison_array,
-)
-from aerpaw_cmp.propagation.geometry.faces import site_faces
-from aerpaw_cmp.propagation.geometry.paths import Links
+from aerpaw_cmp.propagation.geometry import Links, site_faces, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.search import sionna
 from aerpaw_cmp.site.site import Building

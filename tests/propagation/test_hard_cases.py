@@ -9,7 +9,7 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.propagation.geometry.arrays import (
+from aerpaw_cmp.propagation.geometry import (
     Array,
     Isotropic,
     rotation_from_yaw_pitch_roll,

@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.propagation.geometry.faces import inside_solids, site_faces
-from aerpaw_cmp.propagation.geometry.paths import Links
+from aerpaw_cmp.propagation.geometry import Links, inside_solids, site_faces
 from aerpaw_cmp.propagation.search.mirror import Mirrors, find_paths, images_of, planes_of
 from aerpaw_cmp.site.site import Building
 
@@ -113,7 +112,7 @@ def test_chunks_do_not_change_the_paths(scenes, monkeypatch):
 @settings(max_examples=40, deadline=None)
 @given(st.floats(20, 3000), st.floats(0, 2 * np.pi), st.floats(0.5, 120.0), st.floats(0.5, 40.0))
 def test_empty_field_has_line_of_sight_and_one_ground_reflection(distance, bearing, high, low):
-    from aerpaw_cmp.propagation.geometry.paths import Faces, Links
+    from aerpaw_cmp.propagation.geometry import Faces, Links
 
     ground = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), ("medium_dry_ground",), ("ground",))
     source = np.array([[0.0, 0.0, low]])

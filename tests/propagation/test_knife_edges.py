@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.propagation.field.stands import Profile, deygout_db, knife_edge_db
+from aerpaw_cmp.propagation.field.foliage import Profile, deygout_db, knife_edge_db
 
 
 def grazed(*shares: float) -> tuple[np.ndarray, np.ndarray]:

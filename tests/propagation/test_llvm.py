@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.common.errors import CheckError
-from aerpaw_cmp.propagation.native import llvm
+from aerpaw_cmp.propagation import llvm
 from tools import setup_llvm as setup
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.propagation.drivers import moving
-from aerpaw_cmp.propagation.drivers.moving import replay_moving, site_with_tower_at
+from aerpaw_cmp.propagation import drivers
+from aerpaw_cmp.propagation.drivers import replay_moving, site_with_tower_at
 from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
 from aerpaw_cmp.propagation.field.sum import channel_matrices
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, linear_array, single_element
+from aerpaw_cmp.propagation.geometry import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site
@@ -50,7 +50,7 @@ def test_every_pose_is_traced_from_its_own_place_whatever_the_blocks(monkeypatch
         assert replayed.rss_dbm[i, 0] == pytest.approx(alone.rss_dbm[0, 0], abs=1e-9, nan_ok=True)
         assert (replayed.paths.pose == i).sum() == len(alone.paths)
     for most in (1, 7):
-        monkeypatch.setattr(moving, "PLACES_AT_ONCE", most)
+        monkeypatch.setattr(drivers, "PLACES_AT_ONCE", most)
         np.testing.assert_allclose(replay_moving(SITE, LINK, poses(), rover()).h, replayed.h, rtol=1e-9)
     again = channel_matrices(replayed.paths, replayed.faces, rover()[:, None], poses(), LINK)
     np.testing.assert_allclose(again.h, replayed.h, rtol=1e-12)

@@ -9,19 +9,12 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import SPEED_OF_LIGHT_MPS, wavelength_m
 from aerpaw_cmp.flight.replay import part_of
-from aerpaw_cmp.propagation.drivers.moving import replay_moving
-from aerpaw_cmp.propagation.drivers.parts import replay_in_parts
+from aerpaw_cmp.propagation.drivers import replay_in_parts, replay_moving
 from aerpaw_cmp.propagation.edges import over_edges
 from aerpaw_cmp.propagation.field.sum import mean_pair_power
-from aerpaw_cmp.propagation.geometry.arrays import (
-    Poses,
-    rotation_from_aircraft,
-    tower_comparison_array,
-    uav_comparison_array,
-)
+from aerpaw_cmp.propagation.geometry import Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.options import Field, Run, Search
-from aerpaw_cmp.propagation.path_table import subcarriers_hz
-from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.replay import replay, subcarriers_hz
 from aerpaw_cmp.site.site import Building
 
 BARN = Building("barn", box(40, -20, 60, 25), 9.0)

@@ -7,7 +7,7 @@ import pytest
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.propagation.geometry.arrays import tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.geometry import tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Site, Tower

@@ -8,10 +8,11 @@ import pytest
 import shapely
 
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation.check import field_audit, reference
+from aerpaw_cmp.propagation.check import audit as field_audit
+from aerpaw_cmp.propagation.check import reference
 from aerpaw_cmp.propagation.field import dyads, sum
 from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
-from aerpaw_cmp.propagation.geometry.arrays import (
+from aerpaw_cmp.propagation.geometry import (
     Array,
     linear_array,
     rotation_from_aircraft,
@@ -21,8 +22,8 @@ from aerpaw_cmp.propagation.geometry.arrays import (
 )
 from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.propagation.search import occlusion as solids
-from aerpaw_cmp.site.antenna.antennas import TR38901, HalfWaveDipole
+from aerpaw_cmp.propagation.search import mirror as solids
+from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.materials import MATERIALS, material
 from aerpaw_cmp.site.site import Building, Trees
 
@@ -340,7 +341,7 @@ def test_boxes_of_faces_lose_no_path_that_a_trial_of_all_sequences_has(case):
 
 
 def test_audit_of_several_replays_adds_up():
-    from aerpaw_cmp.compare.level.field_difference import FieldAudit
+    from aerpaw_cmp.compare.level import FieldAudit
 
     first = FieldAudit(paths=3, power_rms_db=1.0, power_max_db=2.0, failures=("a",))
     second = FieldAudit(paths=1, power_rms_db=3.0, power_max_db=1.0, failures=("a", "b"))

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.units import spread_out
-from aerpaw_cmp.propagation.engine.engines import FIRST, MOST, enough_samples
-from aerpaw_cmp.propagation.geometry.paths import Faces, PathSet
+from aerpaw_cmp.propagation.engines import FIRST, MOST, enough_samples
+from aerpaw_cmp.propagation.geometry import Faces, PathSet
 
 FACES = Faces(np.eye(3), np.zeros(3), ("concrete",) * 3, ("a", "b", "c"))
 

@@ -8,11 +8,11 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation.check import field_audit
+from aerpaw_cmp.propagation.check import audit as field_audit
 from aerpaw_cmp.propagation.check.audit import Second, audit
 from aerpaw_cmp.propagation.field import dyads
 from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
-from aerpaw_cmp.propagation.geometry.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.geometry import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene

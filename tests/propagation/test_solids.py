@@ -3,11 +3,9 @@ import pytest
 import shapely
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.propagation.geometry.faces import inside_solids, site_faces
-from aerpaw_cmp.propagation.geometry.paths import Links
+from aerpaw_cmp.propagation.geometry import Links, inside_solids, site_faces
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.propagation.search.mirror import find_paths
-from aerpaw_cmp.propagation.search.occlusion import Occlusion, convex_pieces
+from aerpaw_cmp.propagation.search.mirror import Occlusion, convex_pieces, find_paths
 from aerpaw_cmp.site.site import Building
 from tests.propagation import exact
 

@@ -10,14 +10,22 @@ from scipy.special import fresnel
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.flight.gains.losses import path_loss, sight_shares
+from aerpaw_cmp.flight.gains import path_loss, sight_shares
 from aerpaw_cmp.flight.settings import RtSettings
-from aerpaw_cmp.propagation.field.foliage import P833, FoliageModel, NoFoliage, Opaque, foliage_model
-from aerpaw_cmp.propagation.field.stands import TRUNKS, over_stands, stand_loss_db
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.field.foliage import (
+    P833,
+    TRUNKS,
+    FoliageModel,
+    NoFoliage,
+    Opaque,
+    foliage_model,
+    over_stands,
+    stand_loss_db,
+)
+from aerpaw_cmp.propagation.geometry import Link, Poses, single_element
 from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.site.relief.dem import Dem
+from aerpaw_cmp.site.relief import Dem
 from aerpaw_cmp.site.site import Building, Forest, Site, Tower
 from aerpaw_cmp.site.siteyaml import load_site
 

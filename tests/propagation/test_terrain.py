@@ -11,14 +11,13 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation.check.field_audit import Expected, against_reference
-from aerpaw_cmp.propagation.drivers.parts import replay_in_parts
-from aerpaw_cmp.propagation.geometry.arrays import Link, Poses, single_element
-from aerpaw_cmp.propagation.geometry.paths import path_lengths
+from aerpaw_cmp.propagation.check.audit import Expected, against_reference
+from aerpaw_cmp.propagation.drivers import replay_in_parts
+from aerpaw_cmp.propagation.geometry import Link, Poses, path_lengths, single_element
 from aerpaw_cmp.propagation.options import Field, Run, Search
 from aerpaw_cmp.propagation.replay import Replay, replay
 from aerpaw_cmp.propagation.search.terrain import _stationary, _zone_m, specular_points
-from aerpaw_cmp.site.relief.dem import Dem
+from aerpaw_cmp.site.relief import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 FRAME = SiteFrame(35.7, -78.7)

@@ -7,16 +7,15 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.propagation import engines
 from aerpaw_cmp.propagation.check.audit import Second, audit
+from aerpaw_cmp.propagation.compiled import State
 from aerpaw_cmp.propagation.edges import over_edges
-from aerpaw_cmp.propagation.engine import engines
-from aerpaw_cmp.propagation.engine.engines import PathCache
-from aerpaw_cmp.propagation.geometry.arrays import Link, single_element
-from aerpaw_cmp.propagation.native.compiled import State
+from aerpaw_cmp.propagation.engines import PathCache
+from aerpaw_cmp.propagation.geometry import Link, single_element
 from aerpaw_cmp.propagation.options import Run, Search
-from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.replay import replay, trace
 from aerpaw_cmp.propagation.scene import Scene, within_reach
-from aerpaw_cmp.propagation.trace import trace
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ import pytest
 from scipy.special import fresnel, jv
 
 from aerpaw_cmp.common.units import ComplexArray, FloatArray
+from aerpaw_cmp.propagation.edges import transition, wedge
 from aerpaw_cmp.propagation.field.fresnel import coefficients
-from aerpaw_cmp.propagation.field.wedge import transition, wedge
 
 WAVELENGTH = 299792458.0 / 3.4e9
 K = 2.0 * np.pi / WAVELENGTH

@@ -8,9 +8,9 @@ import pytest
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.compare.flight_verdict import flight_verdict
-from aerpaw_cmp.compare.level.rss import ChannelDifference
+from aerpaw_cmp.compare.level import ChannelDifference
 from aerpaw_cmp.compare.result import AuditResult, EngineResult, PairResult, RankResult, RssResult
+from aerpaw_cmp.compare.verdict import flight_verdict
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report.flight_data import InputFile, ReportData, Track, Waypoint
 from aerpaw_cmp.report.maps import Correlation, MapError, MapLayer, MapsData, PaperRow, RankMap, RssMap, at_height

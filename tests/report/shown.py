@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.compare.judge.ladder import LadderRow
-from aerpaw_cmp.compare.judge.report_difference import Overlap, level_difference
-from aerpaw_cmp.compare.learning.calibration import Score
-from aerpaw_cmp.compare.statistics.intervals import pooled_difference
+from aerpaw_cmp.compare.calibration import Score
+from aerpaw_cmp.compare.ladder import LadderRow
+from aerpaw_cmp.compare.statistics import pooled_difference
+from aerpaw_cmp.compare.verdict import Overlap, level_difference
 from aerpaw_cmp.report import calibration as calibration_html
 from aerpaw_cmp.report import campaign as campaign_html
 from aerpaw_cmp.report import diff as diff_html

@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.compare.judge.steps import NodeOffset, Step
+from aerpaw_cmp.compare.verdict import NodeOffset, Step
 from aerpaw_cmp.report import campaign as campaign_figures
 from aerpaw_cmp.report import campaign as campaign_html
 from aerpaw_cmp.report import campaign as campaign_words
@@ -60,7 +60,7 @@ def test_every_date_of_a_step_is_named_with_the_latest_first(data):
 def test_hostile_names_stay_text(data):
     bad = '</script><img src=x onerror="alert(1)">'
     row = dataclasses.replace(data.rss[0], flight=bad, setting=bad, tower=bad, channel=bad)
-    from aerpaw_cmp.jobs.campaigns.season import with_season
+    from aerpaw_cmp.jobs.campaign import with_season
 
     hostile = with_season(
         dataclasses.replace(data, rss=(row,), flights=(bad,), settings={bad: {bad: bad}}, failures=()),

@@ -6,9 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.judge.ladder import LadderRow
-from aerpaw_cmp.compare.level.detection import DetectionScore
-from aerpaw_cmp.compare.level.serving import compare_serving
+from aerpaw_cmp.compare.ladder import LadderRow
+from aerpaw_cmp.compare.level import DetectionScore, compare_serving
 from aerpaw_cmp.report import flight as html
 from aerpaw_cmp.report.against import Against, AgainstSeries
 from aerpaw_cmp.report.charts import charts_of, shown_confusion

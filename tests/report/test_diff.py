@@ -10,7 +10,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.outputs import OutputFolder
-from aerpaw_cmp.compare.statistics.intervals import pooled_difference
+from aerpaw_cmp.compare.statistics import pooled_difference
 from aerpaw_cmp.jobs.diff_reports import run_diff
 from aerpaw_cmp.report.diff import diff_page, verdict
 from aerpaw_cmp.report.flight import write_report

@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.compare.gains.spread import NO_SPREAD, StatedSpread
+from aerpaw_cmp.compare.gains import NO_SPREAD, StatedSpread
 from aerpaw_cmp.report import columns as export
 from aerpaw_cmp.report import exports as formats
 from aerpaw_cmp.report import exports as kmz

@@ -6,20 +6,19 @@ import itertools
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.flight_verdict import (
+from aerpaw_cmp.compare.causes import MOST_CAUSE_WORDS, Cause
+from aerpaw_cmp.compare.ladder import LadderRow
+from aerpaw_cmp.compare.level import DetectionScore, FieldAudit, floored_fit
+from aerpaw_cmp.compare.receiver import score_forecast
+from aerpaw_cmp.compare.result import FlightVerdict
+from aerpaw_cmp.compare.statistics import paired_difference
+from aerpaw_cmp.compare.verdict import (
     baseline_errors,
     flight_verdict,
     pooled_db,
     with_corrected_verdicts,
     without_copies,
 )
-from aerpaw_cmp.compare.judge.causes import MOST_CAUSE_WORDS, Cause
-from aerpaw_cmp.compare.judge.ladder import LadderRow
-from aerpaw_cmp.compare.level.detection import DetectionScore, floored_fit
-from aerpaw_cmp.compare.level.field_difference import FieldAudit
-from aerpaw_cmp.compare.ranks.forecast import score_forecast
-from aerpaw_cmp.compare.result import FlightVerdict
-from aerpaw_cmp.compare.statistics.intervals import paired_difference
 from aerpaw_cmp.report.columns import metrics
 from aerpaw_cmp.report.diff import DIFFERENCE
 from aerpaw_cmp.report.flight_words import (

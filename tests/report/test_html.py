@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.compare.rank import CommonestRank, RankRepeat
 from aerpaw_cmp.compare.result import ESTIMATED, ClockResult
-from aerpaw_cmp.compare.statistics.intervals import paired_difference
+from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report import flight as html
 from aerpaw_cmp.report import flight_data as build

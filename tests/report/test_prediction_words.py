@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.judge.verdicts import Verdict
-from aerpaw_cmp.compare.learning.correction import OFF, Correction
-from aerpaw_cmp.compare.learning.field_gp import FieldModel
+from aerpaw_cmp.compare.calibration import OFF, Correction
+from aerpaw_cmp.compare.field_gp import FieldModel
+from aerpaw_cmp.compare.verdict import Verdict
 from aerpaw_cmp.report.flight_words import MOST_WORDS
 from aerpaw_cmp.report.prediction import FIELD, FLOWN, after_flight, cautions, first_words
 

@@ -8,9 +8,9 @@ import scipy.io
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.site.antenna.antennas import TR38901
-from aerpaw_cmp.site.antenna.pattern_files import read_cut_files, read_pattern_file
-from aerpaw_cmp.site.antenna.sphere_pattern import read_sphere_csv
+from aerpaw_cmp.site.antennas import TR38901
+from aerpaw_cmp.site.learned import read_sphere_csv
+from aerpaw_cmp.site.pattern_files import read_cut_files, read_pattern_file
 
 FULL = np.arange(-180.0, 180.0, 2.0)
 HALF = np.arange(-90.0, 91.0, 2.0)

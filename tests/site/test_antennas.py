@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError, UsageError
-from aerpaw_cmp.site.antenna.antennas import (
+from aerpaw_cmp.site.antennas import (
     TR38901,
     HalfWaveDipole,
     Isotropic,
@@ -17,7 +17,7 @@ from aerpaw_cmp.site.antenna.antennas import (
     read_gain_grid,
     read_pattern_text,
 )
-from aerpaw_cmp.site.antenna.pattern_files import read_pattern_file
+from aerpaw_cmp.site.pattern_files import read_pattern_file
 from tests.real_logs import REAL
 
 MOMENT = np.array([0.8 + 0.1j, -0.3 + 0.5j, 0.6 - 0.2j])

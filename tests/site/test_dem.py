@@ -7,7 +7,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.site.relief.dem import EARTH_RADIUS_M, Dem, read_dem
+from aerpaw_cmp.site.relief import EARTH_RADIUS_M, Dem, read_dem
 from aerpaw_cmp.site.site import Site, Tower
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -87,7 +87,7 @@ def test_batches_agree_with_single_links(monkeypatch: pytest.MonkeyPatch) -> Non
     target = np.column_stack([random.uniform(-900, 900, (200, 2)) * [1, 0.5], random.uniform(-11, 5, 200)])
     together = dem.clear(source, target)
     assert 20 < together.sum() < 180
-    monkeypatch.setattr("aerpaw_cmp.site.relief.dem._SAMPLES_AT_ONCE", 1)
+    monkeypatch.setattr("aerpaw_cmp.site.relief._SAMPLES_AT_ONCE", 1)
     np.testing.assert_array_equal(dem.clear(source, target), together)
 
 
@@ -205,7 +205,7 @@ def test_geotiff_equals_the_ascii_grid(tmp_path: Path) -> None:
 
 
 def test_imported_site_keeps_its_elevation_model(tmp_path: Path) -> None:
-    from aerpaw_cmp.site.imports.footprints import import_site, site_yaml
+    from aerpaw_cmp.site.footprints import import_site, site_yaml
 
     (tmp_path / "base").mkdir()
     asc(tmp_path / "base" / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10)

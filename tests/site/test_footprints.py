@@ -10,8 +10,8 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.site.imports import footprints
-from aerpaw_cmp.site.imports.footprints import Footprints, import_footprints, import_site, site_yaml
+from aerpaw_cmp.site import footprints
+from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.siteyaml import build_site, load_site
 from tests.geojson import collection, feature, polygon
 from tests.real_logs import REAL

@@ -16,23 +16,24 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.common.outputs import file_digest
-from aerpaw_cmp.flight.drafting.remembered import every_antenna, searching_airframe, taught
-from aerpaw_cmp.flight.gains.memory import load_with_learned
-from aerpaw_cmp.flight.marks import mark_of
+from aerpaw_cmp.flight.drafting.proposals import every_antenna, searching_airframe, taught
+from aerpaw_cmp.flight.gains import load_with_learned
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.site.antenna import learned as memory
-from aerpaw_cmp.site.antenna.learned import (
+from aerpaw_cmp.flight.training import mark_of
+from aerpaw_cmp.site import learned as memory
+from aerpaw_cmp.site.learned import (
     Entry,
     LearnedLock,
     LearnedReceiver,
+    SpherePattern,
     carry_memory,
     files_of,
     find_named,
     folder_of,
     read_learned,
     remember,
+    sphere_csv,
 )
-from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern, sphere_csv
 from tests.learned_entries import learned_entry, learned_series, learned_tables
 
 CARRIER_HZ = 3.3e9
@@ -335,7 +336,7 @@ def test_a_table_that_no_calibration_wrote_is_neither_replaced_nor_removed(folde
 
 def test_two_processes_store_all_of_their_entries(tmp_path: Path) -> None:
     script = (
-        "import sys; from pathlib import Path; from aerpaw_cmp.site.antenna.learned import Entry, remember;"
+        "import sys; from pathlib import Path; from aerpaw_cmp.site.learned import Entry, remember;"
         "site, who, entry = sys.argv[1:]; input();"
         "[remember(Path(site), name, Entry.model_validate_json(entry.replace('A.', f'{name}.')),"
         " {f'{name}.{end}.csv.gz': b'table' for end in 'tu'}) for name in (f'{who}{i}' for i in range(20))]"

@@ -12,12 +12,11 @@ import pytest
 import shapely
 
 from aerpaw_cmp.common import kml as kml_module
-from aerpaw_cmp.common import xmlfiles
+from aerpaw_cmp.common import kml as xmlfiles
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.site.imports import mapfiles
-from aerpaw_cmp.site.imports.footprints import Footprints, import_footprints, import_site, site_yaml
-from aerpaw_cmp.site.imports.mapfiles import MAX_TAGS, read_map_file
-from aerpaw_cmp.site.imports.outlines import OSM_CREDIT
+from aerpaw_cmp.site import mapfiles
+from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
+from aerpaw_cmp.site.mapfiles import MAX_TAGS, OSM_CREDIT, read_map_file
 from aerpaw_cmp.site.siteyaml import build_site, load_site
 from tests.geojson import collection, feature, polygon
 from tests.site.osm import FRAME, Osm, Ring, lonlat
@@ -410,14 +409,14 @@ def test_too_many_tags_are_refused_before_any_is_an_object(tmp_path: Path) -> No
 def test_tags_in_themselves_are_walked_through_once(tmp_path: Path, tag: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Twenty thousand of them took minutes: each level was searched to the bottom again."""
     asked = [0]
-    plain = xmlfiles.plain
+    plain = xmlfiles.plain_tag
 
     def counted(name: str) -> str:
         asked[0] += 1
         return plain(name)
 
     for module in (mapfiles, kml_module, xmlfiles):
-        monkeypatch.setattr(module, "plain", counted)
+        monkeypatch.setattr(module, "plain_tag", counted)
     path = tmp_path / "m.kml"
     path.write_bytes(
         b"<kml><Placemark>" + f"<{tag}>".encode() * 20_000 + f"</{tag}>".encode() * 20_000 + b"</Placemark></kml>"

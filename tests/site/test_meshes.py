@@ -10,8 +10,8 @@ import pytest
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.jobs.mapping.site_scene import export_scene
-from aerpaw_cmp.site.meshes import WALL_DEPTH_M, building_mesh, site_meshes
+from aerpaw_cmp.jobs.site_scene import export_scene
+from aerpaw_cmp.site.scenes import WALL_DEPTH_M, building_mesh, site_meshes
 from aerpaw_cmp.site.site import Building
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -81,7 +81,7 @@ def test_export_is_well_formed(tmp_path: Path) -> None:
 def test_sionna_opens_the_scene(tmp_path: Path) -> None:
     path = export_scene(load_site("lake_wheeler"), tmp_path)[0]
     script = (
-        "from aerpaw_cmp.propagation.native.llvm import let_sionna_load; let_sionna_load()\n"
+        "from aerpaw_cmp.propagation.llvm import let_sionna_load; let_sionna_load()\n"
         "import sys, mitsuba as mi; mi.set_variant('llvm_ad_mono_polarized')\n"
         "from sionna.rt import load_scene\n"
         "scene = load_scene(sys.argv[1]); scene.frequency = 3.4e9\n"

@@ -5,8 +5,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError, UsageError
 from aerpaw_cmp.site.materials import material
-from aerpaw_cmp.site.mesh_scenes.meshfiles import read_ply
-from aerpaw_cmp.site.mesh_scenes.mitsuba import read_scene
+from aerpaw_cmp.site.mitsuba import read_ply, read_scene
 from aerpaw_cmp.site.scenes import ground_share, placed_scene, with_ground
 from tests.scene_files import box
 

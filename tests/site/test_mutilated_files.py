@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import AerpawCmpError, InputError
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.site.antenna.antennas import read_gain_grid, read_pattern_text
-from aerpaw_cmp.site.imports.footprints import import_footprints
+from aerpaw_cmp.site.antennas import read_gain_grid, read_pattern_text
+from aerpaw_cmp.site.footprints import import_footprints
 
 FRAME = SiteFrame(35.7275, -78.696)
 GEOJSON = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "id": 7, "properties": {"building": "yes",

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.flight.gains.learned_gain import learned_gain, pair_db
-from aerpaw_cmp.propagation.geometry.arrays import Array, Link, Poses, rotation_from_aircraft, single_element
-from aerpaw_cmp.site.antenna.pair_gain import PairGain, read_pair
-from aerpaw_cmp.site.antenna.sphere_pattern import SpherePattern
+from aerpaw_cmp.flight.gains import learned_gain, pair_db
+from aerpaw_cmp.propagation.geometry import Array, Link, Poses, rotation_from_aircraft, single_element
+from aerpaw_cmp.site.learned import PairGain, SpherePattern, read_pair
 
 RNG = np.random.default_rng(3)
 SHA = {"one": "a" * 64, "other": "b" * 64}

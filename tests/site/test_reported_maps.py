@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.site.imports.footprints import Footprints, import_footprints, import_site, site_yaml
+from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, site_yaml
 from aerpaw_cmp.site.siteyaml import build_site
 from tests.geojson import collection, feature, polygon
 from tests.site.osm import FRAME, Osm, lonlat, square

@@ -7,7 +7,7 @@ import pytest
 from shapely.geometry import Point
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.site.imports.footprints import import_site, site_yaml
+from aerpaw_cmp.site.footprints import import_site, site_yaml
 from aerpaw_cmp.site.siteyaml import load_site
 
 LATITUDE, LONGITUDE = -33.86, 151.2

@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.site.antenna.antennas import HalfWaveDipole
-from aerpaw_cmp.site.antenna.pattern_files import read_pattern_file
-from aerpaw_cmp.site.antenna.sphere_pattern import (
+from aerpaw_cmp.site.antennas import HalfWaveDipole
+from aerpaw_cmp.site.learned import (
     SpherePattern,
     planning_cuts,
     read_sphere_csv,
@@ -14,6 +13,7 @@ from aerpaw_cmp.site.antenna.sphere_pattern import (
     sphere_grid,
     unit_mean_gain,
 )
+from aerpaw_cmp.site.pattern_files import read_pattern_file
 
 
 def smooth():

@@ -7,7 +7,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
-from aerpaw_cmp.site.relief.surface import surface_through
+from aerpaw_cmp.site.relief import surface_through
 from aerpaw_cmp.site.siteyaml import known_grounds, load_site
 
 FRAME = SiteFrame(35.7275, -78.696)

@@ -8,8 +8,8 @@ from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
-from ...common.counting import counted
-from ...jobs.tasks.options import RunOptions
+from ...common.text import counted
+from ...jobs.options import RunOptions
 from ..app import DryRun, Export, Force, LogsRoot, command, output
 from ..shown import answered, number, print_files, records, say, show, table, warn_all
 
@@ -110,7 +110,7 @@ def _print_cards(verdict: Mapping[str, Any]) -> None:
 
 def _nothing_compared(metrics: Mapping[str, Any]) -> int:
     """1 where no channel and no rank has samples enough to compare, which is said; 0 else."""
-    from ...compare.statistics.memory import FEWEST
+    from ...compare.statistics import FEWEST
 
     channels = [m for channels in metrics["rss"].values() for m in channels.values()]
     # a channel left out because its antenna was learned on this log is no failure
@@ -156,7 +156,7 @@ def _print_forecasts(rank: Mapping[str, Any]) -> None:
 
 def _print_report_summary(outcome: Any) -> None:
     from ...compare.result import BASELINE_TITLE
-    from ...compare.statistics.memory import FEWEST
+    from ...compare.statistics import FEWEST
 
     links = [
         {
@@ -232,7 +232,7 @@ def calibrate(
     outcome = run.run_calibrate(flights[0], options, further=flights[1:], into_site=into_site, score=score or ())
     if answered(outcome.metrics):
         return
-    from ...compare.learning.calibration import BASELINES
+    from ...compare.calibration import BASELINES
 
     m = outcome.metrics
     rows = []

@@ -9,8 +9,8 @@ from typing import Annotated, Any
 from typer import Argument, Option
 from typer.core import TyperCommand
 
-from ...common.counting import counted
 from ...common.errors import UsageError, one_line
+from ...common.text import counted
 from ..app import command, output
 from ..shown import answered, print_files, say, show
 
@@ -67,8 +67,8 @@ def tap(
 
     if telemetry is not None and flight is None:
         raise UsageError("--telemetry without --flight", expected="--flight FILE, whose telemetry it is")
-    from ...jobs.live.live_tap import Shown, tap_modems
-    from ...live.session import TapSettings
+    from ...jobs.live_tap import Shown, tap_modems
+    from ...live.ports import TapSettings
 
     shown = Shown(web=web, flight=flight, telemetry=telemetry, say=say)
     settings = TapSettings(
@@ -111,7 +111,7 @@ class StatusLine:
 
     def __call__(self, name: str, now: Any) -> None:
         """Show the status of the modem of this name; no name where there is only one."""
-        from ...live.session import format_status
+        from ...live.ports import format_status
 
         head = f"{name}: " if name else ""
         if now.message:
@@ -160,13 +160,13 @@ def modem_sim(
 ) -> int:
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
     _needs_posix("modem-sim")
-    from ...live.serial.simulator import FlightModem, ModemSimulator, run_modem_sim
+    from ...live.simulator import FlightModem, ModemSimulator, run_modem_sim
 
     if (flight is None) != (telemetry is None):
         raise UsageError("--flight or --telemetry stands alone", expected="both: the flight to fly, and its new log")
     flown = None
     if flight is not None and telemetry is not None:
-        from ...jobs.live.live_twin import FlownAgain
+        from ...jobs.live_twin import FlownAgain
 
         flown = FlownAgain(flight, telemetry)
     modem = FlightModem() if flown is None else FlightModem(flown.rank, rsrp=flown.rsrp)

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 from typer import Option
 
 from ...common import files as cached
-from ...common.counting import counted
+from ...common.text import counted
 from ..app import command
 from ..shown import answered, records, say, show
 

@@ -8,8 +8,8 @@ from typing import Annotated, Any
 
 from typer import Argument, Option
 
-from ...common.counting import counted
-from ...jobs.tasks.options import RunOptions
+from ...common.text import counted
+from ...jobs.options import RunOptions
 from ..app import DryRun, Flights, Force, LogsRoot, command, output
 from ..shown import answered, print_files, records, say, show, warn_all
 
@@ -54,8 +54,8 @@ def predict(
     force: Force = False,
 ) -> None:
     """Predict level and rank with error bars where nobody has flown yet."""
-    from ...jobs.prediction.predict import run_predict
-    from ...jobs.prediction.where import TargetOptions
+    from ...jobs.predict import run_predict
+    from ...jobs.sources import TargetOptions
 
     outcome = run_predict(
         where,
@@ -126,8 +126,8 @@ def plan(
     force: Force = False,
 ) -> None:
     """Rank candidate flights by the standard deviation that they would leave."""
-    from ...jobs.prediction.next_flight import PlanOptions, run_plan
-    from ...jobs.prediction.where import TargetOptions
+    from ...jobs.next_flight import PlanOptions, run_plan
+    from ...jobs.sources import TargetOptions
 
     options = PlanOptions(
         minutes=minutes,

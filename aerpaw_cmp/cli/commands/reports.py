@@ -8,9 +8,9 @@ from typing import Annotated, Any, Literal
 
 from typer import Argument, Option
 
-from ...common.counting import counted
 from ...common.errors import one_line
-from ...jobs.tasks.options import RunOptions
+from ...common.text import counted
+from ...jobs.options import RunOptions
 from ..app import DryRun, Force, LogsRoot, Scheduler, Workers, command, output
 from ..shown import answered, number, records, say, show, table
 
@@ -33,7 +33,7 @@ def explain(
     logs_root: LogsRoot = None,
 ) -> None:
     """List every path of a link at an instant, term by term."""
-    from ...jobs.reporting.explain import run_explain
+    from ...jobs.explain import run_explain
 
     explanation = run_explain(
         flight, time=time, tower=tower, channel=channel, engine=engine, logs_root=logs_root, progress=say

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 from typer import Argument, Option
 
 from ...common.errors import UsageError
-from ...jobs.tasks.options import RunOptions
+from ...jobs.options import RunOptions
 from ..app import DryRun, Flights, Force, LogsRoot, Scheduler, Workers, antenna_app, command, output, site_app
 from ..shown import answered, print_files, say, show, table, warn_all
 
@@ -54,8 +54,7 @@ def site_import(
     force: Force = False,
 ) -> None:
     """Import footprints, or a scene."""
-    from ...jobs import run
-    from ...jobs.mapping import site_scene
+    from ...jobs import run, site_scene
 
     scene = len(files) == 1 and site_scene.is_scene(files[0])
     of_scenes = {"--origin": origin, "--material": material, "--turn": turn}
@@ -91,7 +90,7 @@ def site_export(
     force: Force = False,
 ) -> None:
     """Write a site for Sionna."""
-    from ...jobs.mapping.site_scene import run_site_export
+    from ...jobs.site_scene import run_site_export
 
     files = run_site_export(site, out, force=force).files
     print_files(files if say.as_json else files[:1])
@@ -116,7 +115,7 @@ def site_show(
 
     shown = run.run_site_show(site, RunOptions(out=out, force=force))
     if not say.as_json:
-        from ...site.antenna.learned import memory_lines
+        from ...site.learned import memory_lines
 
         for line in memory_lines(site):
             say(line)
@@ -147,7 +146,7 @@ def antenna_export(
     force: Force = False,
 ) -> None:
     """Write a pattern for another program."""
-    from ...jobs.antenna import run_antenna_export
+    from ...jobs.site_scene import run_antenna_export
 
     outcome = run_antenna_export(file, out, elevation=elevation, variable=variable, carrier_hz=carrier, force=force)
     print_files(outcome.files)
@@ -211,7 +210,7 @@ def map_(
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
     from ...jobs import run
-    from ...jobs.mapping.coverage_map import link_budget, map_settings, site_carrier_hz
+    from ...jobs.coverage_map import link_budget, map_settings, site_carrier_hz
 
     modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
     fields: dict[str, Any] = {

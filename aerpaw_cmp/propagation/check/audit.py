@@ -1,30 +1,604 @@
-"""One engine checked against the other on a spread of links, and its fields against two references."""
+"""One engine checked against the other on a spread of links, and its fields against two references.
+
+The field of a replay checked by two others: Sionna's own coefficients, and a second implementation.
+
+1. *Sionna* traces the audited links once more and gives, for each path, its own complex coefficient with one element at
+   each array centre, in both slants, from its own materials, patterns and rotations. Float32: entries within
+   ``_ENTRY_TOLERANCE`` of the strongest, phase within ``_PHASE_TOLERANCE_RAD`` on paths shorter than
+   ``_PHASE_RANGE_M``.
+2. :mod:`aerpaw_cmp.propagation.check.reference` computes a few links of each replay from the settings: its paths, H of
+   every element pair with foliage, RSS and rank. Both are float64: the difference is rounding.
+"""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...common.units import ComplexArray, FloatArray, IntArray, spread_out
-from ...compare.level.field_difference import FieldAudit
+from ...common.content import content_digest
+from ...common.text import counted
+from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray, spread_out
+from ...compare.level import FieldAudit
 from ...site.site import Site
-from ..geometry.arrays import Link, Poses
-from ..geometry.paths import joined
+from ..field.foliage import over_stands
+from ..field.sum import channel_matrices
+from ..geometry import Array, Faces, Isotropic, Link, Links, PathSet, Poses, joined, legs
 from ..options import Engine, Field, Run, Search
 from ..replay import Replay
 from ..replay import replay as run_replay
+from ..scene import Scene
 from ..search.mirror import plane_keys, planes_of
-from .field_audit import (
-    REFERENCE_LINKS,
-    Expected,
-    against_reference,
-    against_sionna,
-    impossible,
-    spread_over_paths,
-)
+from ..search.terrain import TERRAIN
+from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
+
+if TYPE_CHECKING:
+    from ..search.sionna import Coefficients
+
+
+# Of the strongest of a path's four entries: float32 leaves some 5e-4 of rotations, patterns and Fresnel coefficients.
+_ENTRY_TOLERANCE = 3e-3
+
+# Sionna's reflection points are barycentric on triangles that reach so far: float32 has 24 bits for a coordinate.
+_FLOAT32_ULP = 2.0**-22
+
+# Float32 moves a reflection point off its plane by 1e-4 m at most within ``_PHASE_RANGE_M``: 7e-3 rad at 3.4 GHz.
+_PHASE_TOLERANCE_RAD = 0.01
+
+_PHASE_RANGE_M = 300.0
+
+# Coherent RSS of a link of near paths [dB].
+_LINK_TOLERANCE_DB = 0.1
+
+# Of H against the second implementation, relative to the root of the links' mean path power; both are float64.
+_EXACT_TOLERANCE = 1e-6
+
+# A path that a move of an edge by this much makes or breaks may differ in float32.
+_SIONNA_MARGIN_M = 2e-3
+
+# Links per replay for the second implementation.
+# Of some 0.1 s each: the second implementation takes one element pair after the other.
+REFERENCE_LINKS = 8
+
+# Patterns of this package that Sionna has too, under the same names.
+_SIONNA_PATTERNS = ("iso", "hw_dipole", "tr38901")
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """Settings of a flight, for the second implementation."""
+
+    link: ExpectedLink
+    loss: ExpectedLoss = field(default_factory=ExpectedLoss)
+
+    @classmethod
+    def of(cls, link: Link, loss: ExpectedLoss | None = None) -> Expected:
+        """From a link itself: layout, slants and mounts are then taken as they are."""
+        towers = {name: expected_array(array) for name, array in link.tower_arrays.items()}
+        uav = expected_array(link.uav_array)
+        settings = (link.carrier_hz, link.transmit_power_dbm, link.uav_transmits)
+        known = ExpectedLink(*settings, towers, uav, link.noise_floor_dbm)
+        return cls(known, loss or ExpectedLoss())
+
+
+def expected_array(array: Array) -> ExpectedArray:
+    """An array's own numbers."""
+    # one pattern stands for all elements
+    patterns = array.patterns * len(array) if len(array.patterns) == 1 else array.patterns
+    return ExpectedArray(
+        tuple((float(x), float(y), float(z)) for x, y, z in array.positions_m),
+        tuple(float(x) for x in np.degrees(array.slant_rad)),
+        tuple(scalar_pattern(pattern) for pattern in patterns),
+        matrix_of(array.mount),
+    )
+
+
+def scalar_pattern(pattern: Any) -> Any:
+    """One direction of a pattern of this package."""
+
+    def of(theta: float, phi: float) -> tuple[complex, complex]:
+        e_theta, e_phi = pattern.field(np.array(theta), np.array(phi))
+        return complex(e_theta), complex(e_phi)
+
+    return of
+
+
+# ---------------------------------------------------------------- the second implementation
+
+
+def against_reference(
+    site: Site,
+    poses: Poses,
+    replay: Replay,
+    chosen: IntArray,
+    expected: Expected,
+    *,
+    ks: Sequence[float],
+    max_depth: int,
+) -> FieldAudit:
+    """A few links of a replay computed a second time.
+
+    Parameters
+    ----------
+    site, poses, replay
+        Of the replay.
+    chosen : (links,) int
+        Poses; each tower of the replay is taken at each.
+    expected : Expected
+    ks : sequence of float
+    max_depth : int
+
+    Returns
+    -------
+    FieldAudit
+    """
+    total, beyond = FieldAudit(reference_links=len(chosen) * len(replay.towers)), _over_terrain(replay)
+    in_woods = np.zeros(len(replay.paths), dtype=np.bool_)
+    if expected.loss.model != "none":
+        places = np.array([site.towers[name].position_m for name in replay.towers])
+        source, target = places[replay.paths.tower], poses.position_m[replay.paths.pose]
+        in_woods = over_stands(site, source, replay.paths.vertices_m, target)
+    for number, name in enumerate(replay.towers):
+        reference = Reference(site, name, expected.link, expected.loss)
+        for row in chosen:
+            mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
+            stands = in_woods[mine].any()
+            # it knows level ground and no medium: saying so is better than a false failure
+            if beyond[mine].any() or stands:
+                total += FieldAudit(not_covered=(_STANDS if stands else _ON_TERRAIN,))
+                continue
+            link = _OneLink(reference=reference, replay=replay, poses=poses, row=int(row), tower=number, mine=mine)
+            total += link.paths_checked(max_depth, site.dem is None)
+            try:
+                total += link.field_checked(ks)
+            # a material outside its own table of P.2040
+            except LookupError as error:
+                total += FieldAudit(not_covered=(f"the material {error.args[0]} at this carrier",))
+    return total
+
+
+def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expected: Expected) -> FieldAudit:
+    """Paths ``rows`` of a replay, which the other engine lacks, that cannot exist.
+
+    Parameters
+    ----------
+    site : Site
+    poses : Poses
+    replay : Replay
+    rows : (m,) int
+        Paths of the replay.
+    expected : Expected
+        Arrays and loss as the settings say, read a second time.
+
+    Returns
+    -------
+    FieldAudit
+        ``phantom_paths`` and their failures; all else empty.
+    """
+    count, beyond = 0, _over_terrain(replay)
+    for row in rows[~beyond[rows]]:
+        tower = int(replay.paths.tower[row])
+        reference = Reference(site, replay.towers[tower], expected.link, expected.loss)
+        sequence = _mirrors_of(reference, replay.faces, replay.paths, row)
+        east, north, up = poses.position_m[replay.paths.pose[row]].tolist()
+        if sequence is None or reference.verdict(sequence, (east, north, up)) is False:
+            count += 1
+    failures = (f"{counted(count, 'path')} that cannot exist",) if count else ()
+    return FieldAudit(phantom_paths=count, failures=failures)
+
+
+_STANDS = "paths at forests that are a medium"
+_ON_TERRAIN = "reflections off shaped ground"
+
+
+def _over_terrain(replay: Replay) -> BoolArray:
+    """Paths (paths,) off ground that is no level plane."""
+    shaped = np.append(replay.faces.solid == TERRAIN, False)
+    return np.asarray(shaped[replay.paths.faces].any(axis=1))
+
+
+@dataclass(frozen=True, slots=True)
+class _OneLink:
+    reference: Reference
+    replay: Replay
+    poses: Poses
+    row: int
+    tower: int
+    mine: IntArray
+
+    @property
+    def target(self) -> tuple[float, float, float]:
+        east, north, up = self.poses.position_m[self.row].tolist()
+        return east, north, up
+
+    @property
+    def name(self) -> str:
+        return f"{self.replay.towers[self.tower]}, pose {self.row}"
+
+    def sequence(self, path: int) -> tuple[Mirror, ...] | None:
+        """The mirrors of a path of the replay, looked up in the site; None where the site has no such face."""
+        return _mirrors_of(self.reference, self.replay.faces, self.replay.paths, path)
+
+    def paths_checked(self, max_depth: int, complete: bool) -> FieldAudit:
+        """Paths that cannot exist, and paths that are not there."""
+        failures: list[str] = []
+        keys = set()
+        phantom = doubtful = missing = 0
+        ground = self.reference.site.towers[self.replay.towers[self.tower]].ground_m
+        gap = math.dist(self.target, self.reference.source)
+        # a pose is beyond reach where it is so from every tower, not from this one alone
+        nearest = min(math.dist(self.target, tower.position_m) for tower in self.reference.site.towers.values())
+        # buried, in the near field, or beyond reach: the replay must have no path there
+        nowhere = self.target[2] < min(ground, 0.0) or gap < 0.01 or nearest > 1e5
+        for path in self.mine:
+            sequence = self.sequence(path)
+            keys.add(None if sequence is None else _key(sequence))
+            verdict = False if sequence is None or nowhere else self.reference.verdict(sequence, self.target)
+            phantom += verdict is False
+            doubtful += verdict is None
+        if phantom:
+            failures.append(f"{self.name}: {counted(phantom, 'path')} that cannot exist")
+        if complete and not nowhere:
+            # None: too many sequences to try; what is there is still judged
+            for sequence in self.reference.sequences(self.target, max_depth) or ():
+                # only what exists beyond doubt can be missing
+                if self.reference.verdict(sequence, self.target) and (key := _key(sequence)) not in keys:
+                    missing += 1
+                    keys.add(key)
+            if missing:
+                failures.append(f"{self.name}: {counted(missing, 'path is', 'paths are')} missing")
+        return FieldAudit(missing_paths=missing, phantom_paths=phantom, doubtful=doubtful, failures=tuple(failures))
+
+    def field_checked(self, ks: Sequence[float]) -> FieldAudit:
+        """H, RSS and rank from the replay's own list of paths."""
+        paths, replay = [], self.replay
+        if replay.further:  # the second implementation knows straight ways and mirrors
+            return FieldAudit(not_covered=tuple(f"paths {some.kind}" for some in replay.further))
+        for path in self.mine:
+            sequence = self.sequence(path)
+            if sequence is None:
+                return FieldAudit(doubtful=1)  # a failure already
+            loss = self.reference.loss_db(sequence, self.target)
+            if loss is None:
+                return FieldAudit(doubtful=1)
+            paths.append((sequence, loss))
+        h, power = self.reference.matrix(paths, self.target, matrix_of(self.poses.rotation[self.row]))
+        return self._against(h.T if self.reference.link.uav_transmits else h, power, ks, len(paths))
+
+    def _against(self, h: ComplexArray, power: float, ks: Sequence[float], paths: int) -> FieldAudit:
+        """H, RSS and rank of the replay against those of so many paths with their sum of powers."""
+        link, ours, failures = self.reference.link, self.replay.h[self.row, self.tower], []
+        over = _decibel(float((np.abs(h) ** 2).mean())) + link.transmit_power_dbm - link.noise_floor_dbm
+        # so near to the floor that rounding decides whether there is a channel
+        if abs(over) < 1e-3:
+            return FieldAudit(doubtful=1)
+        if over < 0:  # below the receiver's floor: no channel
+            h = np.zeros_like(h)
+        if ours.shape != h.shape:
+            return FieldAudit(failures=(f"{self.name}: H is {ours.shape}, expected {h.shape}",))
+        # of the powers, not of H: in a fade H is small, and its error is not
+        size = math.sqrt(power) or 1e-30
+        under = _decibel(power) + link.transmit_power_dbm < link.noise_floor_dbm
+        error = float(np.abs(ours - h).max()) / size
+        if not error <= _EXACT_TOLERANCE:
+            failures.append(f"{self.name}: H differs by {error:.2g} of its size")
+        worst, level_of_h = 0.0, float((np.abs(h) ** 2).mean())
+        for level, value in ((self.replay.rss_dbm, level_of_h), (self.replay.rss_power_dbm, 0.0 if under else power)):
+            # both levels: the coherent one from H, the other from the powers
+            off = _level_error(float(level[self.row, self.tower]), value, link.transmit_power_dbm, size)
+            if off > 1e-3:
+                failures.append(f"{self.name}: RSS differs by {off:.2g} dB")
+            worst = max(worst, off)
+        differs = _another_rank(ours, h, ks)
+        if differs:
+            failures.append(f"{self.name}: another rank")
+        return FieldAudit(
+            reference_paths=paths, h_max_error=error, rss_max_error_db=worst, rank_differs=int(differs),
+            failures=tuple(failures),
+        )  # fmt: skip
+
+
+def _another_rank(ours: ComplexArray, expected: ComplexArray, ks: Sequence[float]) -> bool:
+    """Check whether a rank differs for a K at which no singular value lies near the threshold."""
+    from ...compare.rank import channel_rank
+
+    sigma = np.linalg.svd(expected, compute_uv=False)
+    if not sigma[0] > 0:
+        return any(int(channel_rank(ours, k)) for k in ks)
+    # a singular value at the threshold counts or not by its last digit
+    clear = [k for k in ks if not (np.abs(sigma * k / sigma[0] - 1.0) < 1e-4).any()]
+    return any(int(channel_rank(ours, k)) != int((sigma > sigma[0] / k).sum()) for k in clear)
+
+
+def _decibel(power: float) -> float:
+    return 10 * math.log10(power) if power > 0 else -math.inf
+
+
+def _level_error(level_dbm: float, power: float, transmit_dbm: float, size: float) -> float:
+    """Difference of a level [dB] beyond what rounding does in a fade; infinite where only one of the two is covered."""
+    if power <= (1e-9 * size) ** 2:  # nothing, or a fade deeper than 180 dB
+        return 0.0 if not math.isfinite(level_dbm) or power > 0 else math.inf
+    if not math.isfinite(level_dbm):
+        return math.inf
+    off = abs(level_dbm - transmit_dbm - 10 * math.log10(power))
+    rounding = 20 / math.log(10) * _EXACT_TOLERANCE * size / math.sqrt(power)
+    return max(0.0, off - rounding)
+
+
+def _mirror_of(reference: Reference, faces: Faces, face: int, vertex: FloatArray) -> Mirror | None:
+    normal, offset = faces.normal[face], float(faces.offset_m[face])
+    solid = int(faces.solid[face])
+    point = tuple(vertex.tolist())
+    # by plane and building, not by number: numbers are the replay's own
+    same = [
+        m
+        for m in reference.mirrors
+        if m.solid == solid
+        and abs(m.offset_m - offset) < 1e-6
+        and max(abs(a - b) for a, b in zip(m.normal, normal.tolist(), strict=True)) < 1e-9
+    ]
+    return max(same, key=lambda m: m.margin(point)) if same else None
+
+
+def _mirrors_of(reference: Reference, faces: Faces, paths: PathSet, row: int) -> tuple[Mirror, ...] | None:
+    """The mirrors of a path, looked up in the site; None where the site has no such face."""
+    met = zip(paths.faces[row].tolist(), paths.vertices_m[row], strict=True)
+    mirrors = [_mirror_of(reference, faces, face, vertex) for face, vertex in met if face >= 0]
+    known = tuple(mirror for mirror in mirrors if mirror is not None)
+    return known if len(known) == len(mirrors) else None
+
+
+def _key(sequence: Sequence[Mirror]) -> tuple[tuple[float, ...], ...]:
+    """Planes of a sequence: coplanar faces are one mirror."""
+    return tuple(tuple(round(x, 6) + 0.0 for x in (*m.normal, m.offset_m)) for m in sequence)
+
+
+def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
+    """Poses of ``chosen`` that together meet as many faces as possible."""
+    if len(chosen) <= count:
+        return chosen
+    kinds: dict[int, set[tuple[int, ...]]] = {int(row): set() for row in chosen}
+    for pose, tower, faces in zip(
+        replay.paths.pose.tolist(), replay.paths.tower.tolist(), replay.paths.faces.tolist(), strict=True
+    ):
+        if pose in kinds:
+            kinds[pose].add((tower, *faces))
+    picked: list[int] = []
+    met: set[tuple[int, ...]] = set()
+    candidates = list(kinds)
+    # greedily, the pose that meets most faces not yet met; exact covers are not needed
+    while len(picked) < count:
+        best = max(candidates, key=lambda row: (len(kinds[row] - met), len(kinds[row])))
+        picked.append(best)
+        met |= kinds[best]
+        candidates.remove(best)
+    return np.array(sorted(picked), dtype=np.int64)
+
+
+# ---------------------------------------------------------------- Sionna's own coefficients
+
+
+def against_sionna(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    replay: Replay,
+    chosen: IntArray,
+    expected: Expected,
+    search: Search,
+    known: dict[str, Any] | None = None,
+) -> FieldAudit:
+    """Each path's power, phase and polarisation against what Sionna itself computes.
+
+    Parameters
+    ----------
+    site : Site
+    link : Link
+    poses : Poses
+    replay : Replay
+    chosen : (m,) int
+        Poses that are asked.
+    expected : Expected
+        Arrays and loss as the settings say, read a second time.
+    search : Search
+        Depth, rays and batch of Sionna's search.
+    known : dict, optional
+        What Sionna answered before, by what it was asked.
+
+    Returns
+    -------
+    FieldAudit
+        Counts and largest errors over the paths that both have.
+    """
+    few = poses[chosen]
+    scene = Scene.of(site, link, few)
+    probe, covered = _probe(link)
+    turns = (
+        np.array([expected.link.towers[name].mount for name in link.tower_arrays]),
+        few.rotation @ np.array(expected.link.uav.mount),
+    )
+    theirs = _own(scene, scene.links_to(few), probe, turns, search, {} if known is None else known)
+    place = np.full(int(max(len(poses), 1)), -1, dtype=np.int64)
+    place[chosen] = np.arange(len(chosen))
+    rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~_over_terrain(replay))
+    ours = replace(replay.paths.select(rows), pose=place[replay.paths.pose[rows]])
+    mine, matches = _matched(ours, replay.faces, theirs.paths, scene.faces)
+    own = replace(
+        theirs, paths=theirs.paths.select(matches), gain=theirs.gain[matches], length_m=theirs.length_m[matches]
+    )
+    total = _paths_against_sionna(ours.select(mine), replay, scene, few, probe, own, chosen)
+    if site.dem is None and site.scene is None:
+        lacking = np.setdiff1d(np.arange(len(theirs.paths)), matches)
+        total += _lacking(site, replay, theirs.paths, scene.faces, lacking, few, expected)
+    return replace(total, not_covered=covered)
+
+
+def _own(
+    scene: Scene, links: Links, probe: Link, turns: tuple[FloatArray, FloatArray], search: Search, known: dict[str, Any]
+) -> Coefficients:
+    """Sionna's own coefficients in the slants of a probe; it is asked once for upright and level elements."""
+    from ..search.sionna import Rays, own_coefficients
+
+    arrays, cross = list(probe.tower_arrays.items()), np.array([0.0, np.pi / 2])
+    # the slant of an element is a rotation, so two crossed elements answer for every slant
+    upright = replace(
+        probe,
+        tower_arrays={name: replace(array, slant_rad=cross) for name, array in arrays},
+        uav_array=replace(probe.uav_array, slant_rad=cross),
+    )
+    patterns = [array.patterns[0].name for array in (*probe.tower_arrays.values(), probe.uav_array)]
+    key = content_digest(scene.faces, scene.surfaces, links, patterns, probe.carrier_hz, turns, search.rays)
+    if key not in known:
+        rays = Rays(**search.rays)
+        known[key] = own_coefficients(scene.faces, links, upright, turns, rays, surfaces=scene.surfaces)
+    slants = np.stack([array.slant_parts for _, array in arrays])[known[key].paths.tower]
+    gain = np.einsum("pab,au,pbv->puv", known[key].gain, probe.uav_array.slant_parts, slants)
+    return replace(known[key], gain=gain)  # type: ignore[no-any-return]
+
+
+def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
+    """The link with two crossed elements in each array's centre, with the pattern and slant of its first element."""
+    unasked: list[str] = []
+
+    def centre(array: Array) -> Array:
+        first = array.patterns[0]
+        if first.name not in _SIONNA_PATTERNS:
+            unasked.append(f"the antenna pattern '{first.name}' (Sionna is asked with isotropic elements)")
+            first = Isotropic()
+        # two crossed elements hold all of the polarisation
+        slants = array.slant_rad[0] + np.array([0.0, np.pi / 2])
+        return Array(np.zeros((2, 3)), slants, (first,), array.mount)
+
+    towers = {name: centre(array) for name, array in link.tower_arrays.items()}
+    return replace(link, tower_arrays=towers, uav_array=centre(link.uav_array), uav_transmits=False), tuple(
+        dict.fromkeys(unasked)
+    )
+
+
+def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Faces) -> tuple[IntArray, IntArray]:
+    """Indices of the paths that both have."""
+    from ..geometry import joined
+
+    plane = planes_of(joined(our_faces, their_faces))
+    known = {key: index for index, key in enumerate(plane_keys(theirs, plane[len(our_faces) :]))}
+    pairs = [(i, known[key]) for i, key in enumerate(plane_keys(ours, plane[: len(our_faces)])) if key in known]
+    rows = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    return rows[:, 0], rows[:, 1]
+
+
+def _paths_against_sionna(
+    ours: PathSet, replay: Replay, scene: Scene, few: Poses, probe: Link, theirs: Coefficients, chosen: IntArray
+) -> FieldAudit:
+    """Paths, row by row those of Sionna ``theirs``; ``chosen`` (poses,) numbers the poses in the replay."""
+    count = len(ours)
+    if not count:
+        return FieldAudit()
+    # each path alone: a pose of its own
+    # H of a pose with one path is that path's coefficient
+    alone = replace(ours, pose=np.arange(count))
+    spots = few[ours.pose]
+    h = channel_matrices(alone, replay.faces, scene.sources_m, spots, probe).h[np.arange(count), ours.tower]
+    turn = (h * theirs.gain.conj()).sum(axis=(1, 2))
+    # a coefficient of zero has no phase
+    turn = np.where(turn == 0.0, 1.0, turn)
+    phase, near = np.abs(np.angle(turn)), theirs.length_m < _PHASE_RANGE_M
+    # float32 has no digits for a weak entry: all count as shares of the path's strongest
+    strongest = np.abs(theirs.gain).max(axis=(1, 2))
+    # phases are compared apart: over 1 km float32 has lost them
+    aligned = h * (turn.conj() / np.abs(turn))[:, None, None]
+    share = np.abs(aligned - theirs.gain).max(axis=(1, 2)) / np.where(strongest > 0.0, strongest, 1.0)
+    power = 20.0 * np.log10(1.0 + share)
+    allowed = _ENTRY_TOLERANCE + _turned_by_float32(ours, replay.faces, scene, spots, probe, theirs)
+    rss = _link_error(ours, h, theirs.gain, near, len(few), len(replay.towers))
+    failures = []
+    for error, bad, unit in (
+        # not share > allowed: so NaN is a failure, too
+        (power, ~(share <= allowed), "dB"),
+        (phase, near & ~(phase <= _PHASE_TOLERANCE_RAD), "rad"),
+    ):
+        if bad.any():
+            worst = int(np.argmax(np.where(bad, error, -1.0)))
+            faces = ", ".join(replay.faces.label[face] for face in ours.faces[worst] if face >= 0)
+            failures.append(
+                f"{counted(int(bad.sum()), 'path')} unlike Sionna's own by up to {error[worst]:.3g} {unit}: worst "
+                f"{replay.towers[ours.tower[worst]]}, pose {chosen[ours.pose[worst]]}, {faces or 'line of sight'}"
+            )
+    if rss > _LINK_TOLERANCE_DB:
+        failures.append(f"the RSS of a link differs from Sionna's own paths by {rss:.3g} dB")
+    return FieldAudit(
+        paths=count,
+        power_max_db=float(np.nanmax(power)),
+        power_rms_db=float(np.sqrt(np.nanmean(power**2))),
+        phases=int(near.sum()),
+        phase_max_rad=float(np.nanmax(phase[near], initial=0.0)),
+        phase_rms_rad=float(np.sqrt((phase[near] ** 2).mean())) if near.any() else 0.0,
+        link_rss_max_db=rss,
+        failures=tuple(failures),
+    )
+
+
+def _turned_by_float32(
+    ours: PathSet, faces: Faces, scene: Scene, spots: Poses, probe: Link, theirs: Coefficients
+) -> FloatArray:
+    """Angles (paths,) [rad] by which the rounding of Sionna's reflection points turns polarisations.
+
+    A point that lies nearly above an end, seen along a face's normal or the axis of a device, turns the plane of
+    incidence, or the basis of the pattern, by its shift over that small distance. Shifts beyond float32 excuse nothing.
+    """
+    mounts = np.stack([array.mount for array in probe.tower_arrays.values()])
+    ends = scene.sources_m[ours.tower], spots.position_m
+    # as search.sionna builds its ground: coordinates so large round a reflection point
+    reach = 4.0 * max(float(np.abs(np.concatenate(ends)).max()), 100.0)  # that of the ground's triangles
+    shift = np.nan_to_num(np.abs(theirs.paths.vertices_m - ours.vertices_m)).max(axis=(1, 2), initial=0.0)
+    axes = [mounts[ours.tower][:, :, 2], (spots.rotation @ probe.uav_array.mount)[:, :, 2]]
+    both = (list(legs(ends[0], vertices, ends[1])) for vertices in (ours.vertices_m, theirs.paths.vertices_m))
+    total = np.zeros(len(ours))
+    for step, ((start, end), (moved_start, moved_end)) in enumerate(zip(*both, strict=True)):
+        normals = [faces.normal[ours.faces[:, k]] for k in (step - 1, step) if 0 <= k < ours.faces.shape[1]]
+        for axis in (*normals, *axes):
+            planes = [np.cross(axis, way) for way in (end - start, moved_end - moved_start)]
+            sizes = [np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12) for plane in planes]
+            total += np.linalg.norm(planes[0] / sizes[0] - planes[1] / sizes[1], axis=1)
+    return np.where(shift <= _FLOAT32_ULP * reach, total, 0.0)
+
+
+def _link_error(
+    paths: PathSet, h: ComplexArray, reference: ComplexArray, near: BoolArray, poses: int, towers: int
+) -> float:
+    """Largest difference of the coherent power of links near by that are not in a fade [dB]."""
+    link = paths.pose * towers + paths.tower
+    sums = []
+    for value in (h, reference):
+        total = np.zeros((poses * towers, *value.shape[1:]), dtype=np.complex128)
+        np.add.at(total, link, value)
+        sums.append((np.abs(total) ** 2).mean(axis=(1, 2)))
+    alone = np.bincount(link, weights=(np.abs(h) ** 2).mean(axis=(1, 2)), minlength=poses * towers)
+    all_near = np.bincount(link, weights=~near, minlength=poses * towers) == 0
+    # in a fade of 20 dB an error of 0.01 rad is a tenth of the field that is left
+    good = all_near & (sums[1] > 0.01 * alone) & (alone > 0)
+    return float(np.abs(10 * np.log10(sums[0][good] / sums[1][good])).max(initial=0.0))
+
+
+def _lacking(
+    site: Site, replay: Replay, theirs: PathSet, faces: Faces, rows: IntArray, few: Poses, expected: Expected
+) -> FieldAudit:
+    """Paths that only Sionna has: missing where they exist beyond doubt, else its float32 edge."""
+    missing = doubtful = 0
+    references = [Reference(site, name, expected.link, expected.loss) for name in replay.towers]
+    for row in rows:
+        reference = references[int(theirs.tower[row])]
+        sequence = _mirrors_of(reference, faces, theirs, row)
+        east, north, up = few.position_m[theirs.pose[row]].tolist()
+        # with a wider margin: what 2 mm decide may differ in float32
+        exists = None if sequence is None else reference.verdict(sequence, (east, north, up), _SIONNA_MARGIN_M)
+        missing += exists is True
+        doubtful += exists is not True
+    failures = (f"{counted(missing, 'path of Sionna is', 'paths of Sionna are')} missing",) if missing else ()
+    return FieldAudit(missing_paths=missing, doubtful=doubtful, failures=failures)
+
 
 # Rays of the solve that gives Sionna's own coefficients: which paths there are is asked before, with all of them.
 _FIELD_SAMPLES = 100_000
@@ -100,7 +674,7 @@ class Second:
     links : int or None
         About this many pose-tower pairs, poses evenly spread over the flight; None checks all.
     expected : Expected, optional
-        What the settings say. With it fields are checked too (:mod:`aerpaw_cmp.propagation.check.field_audit`).
+        What the settings say. With it fields are checked too (:mod:`aerpaw_cmp.propagation.check.audit`).
     ks : sequence of float
         Singular-value ratios of the rank comparison.
     reference_links : int

@@ -27,11 +27,9 @@ from ...common.units import (
 from ..field.fresnel import FaceMaterials, reflection_coefficients
 from ..field.geometry import Elements, geometry
 from ..field.sum import amplitudes, pattern_ends
-from ..geometry.arrays import Link, Poses
-from ..geometry.paths import Faces, PathSet, Surfaces
+from ..geometry import Faces, Link, PathSet, Poses, Surfaces
 from ..replay import Replay
-from ..search.mirror import images_of, scene_tolerance_m, trace_back
-from ..search.occlusion import Occlusion
+from ..search.mirror import Occlusion, images_of, scene_tolerance_m, trace_back
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

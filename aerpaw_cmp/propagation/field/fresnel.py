@@ -14,7 +14,7 @@ import numpy as np
 
 from ...common.units import ComplexArray, FloatArray
 from ...site.materials import material
-from ..geometry.paths import Faces
+from ..geometry import Faces
 from .dyads import larger, select, sine_cosine
 
 

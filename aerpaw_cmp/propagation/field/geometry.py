@@ -7,9 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...common.units import AnyArray, FloatArray, IntArray
-from ...site.antenna.antennas import Isotropic
-from ..geometry.arrays import Array, Link, Pattern, Poses
-from ..geometry.paths import Faces, PathSet, sources_of
+from ...site.antennas import Isotropic
+from ..geometry import Array, Faces, Link, PathSet, Pattern, Poses, sources_of
 from . import dyads
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba.extending import overload
 
 from ...common.units import FloatArray
-from ..native.numba_options import kernel, law
+from ..numba_options import kernel, law
 from . import dyads, fresnel
 from .geometry import Elements, Ends, Geometry
 

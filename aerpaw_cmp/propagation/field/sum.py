@@ -22,9 +22,8 @@ import numpy as np
 
 from ...common.errors import UsageError
 from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
-from ..geometry.arrays import Array, Link, Poses
-from ..geometry.paths import Faces, PathSet, Rows
-from ..native import compiled
+from .. import compiled
+from ..geometry import Array, Faces, Link, PathSet, Poses, Rows
 from . import dyads
 from .fresnel import FaceMaterials, coefficients
 from .geometry import Elements, Ends, Geometry, directions, geometry, parts_of, pattern_fields, plain, rows_of
@@ -148,7 +147,7 @@ def channel_matrices(
         Further loss of each path, such as foliage.
     work : int, optional
         Element pairs of all links of the job that this call is a part of; decides whether compiled code is worth
-        loading (:mod:`aerpaw_cmp.propagation.native.compiled`).
+        loading (:mod:`aerpaw_cmp.propagation.compiled`).
 
     Returns
     -------

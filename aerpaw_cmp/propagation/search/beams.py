@@ -7,6 +7,12 @@ reflection points, whether each lies in its face, whether a triangle cuts a segm
 shadow of one convex face are left out. All cuts are conservative, so the paths are the same with each of them off.
 
 Pairs are streamed: memory does not grow with their number.
+
+Thousands of prisms: candidates by compiled beams, decided by the exact rules of the image engine.
+
+The beams of :mod:`aerpaw_cmp.propagation.search.beams` are cut with tolerances a thousand times wider than those that
+decide, and a candidate is given up only where a segment runs through the middle of a wall or roof. What is left, hardly
+more than the paths, is decided as in :mod:`aerpaw_cmp.propagation.search.mirror`, so both have the same paths.
 """
 
 from __future__ import annotations
@@ -19,13 +25,12 @@ import numpy as np
 
 from ...common.errors import UsageError
 from ...common.units import BoolArray, FloatArray, IntArray
-from ..geometry.paths import BoxTree, Links, PathSet, Surfaces
-from ..native import compiled
-from ..native.numba_options import kernel, part
+from .. import compiled
+from ..geometry import BoxTree, Faces, Links, PathSet, Surfaces, corners, triangles
+from ..numba_options import kernel, part
 from ..options import Progress, Run
-from .boxtree import DEEPEST, box_missed, box_outside, box_tree, next_leaf, within_planes
-from .merging import WINDOW
-from .mirror import merge, searched_links
+from .merging import DEEPEST, WINDOW, box_missed, box_outside, box_tree, next_leaf, within_planes
+from .mirror import Occlusion, images_of, merge, planes_of, scene_tolerance_m, searched_links, trace_back
 
 # Closer to a plane than this [m] is on it.
 SIDE_M = 1e-6
@@ -105,7 +110,7 @@ def grow_paths(
         False follows first faces that one convex face hides wholly, too.
     solids : bool
         The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
-        all. What is found are candidates for :mod:`aerpaw_cmp.propagation.search.prisms`, coincident ones among them.
+        all. What is found are candidates for :mod:`aerpaw_cmp.propagation.search.beams`, coincident ones among them.
 
     Returns
     -------
@@ -831,3 +836,82 @@ def try_out() -> None:
     free = _direct(_Solids(tree, triangle, tree), np.zeros(3), np.array([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]), rules)
     if free.tolist() != [False, True]:
         raise RuntimeError(f"compiled code sees {free.tolist()} where one of two points is hidden")
+
+
+# The ground is searched to this many times the largest coordinate: no reflection point lies further out.
+REACH = 10.0
+
+# Boxes of faces are this much larger [m].
+OVERLAP_M = 1e-3
+
+
+def find_paths(
+    faces: Faces,
+    links: Links,
+    run: Run = Run(),
+    *,
+    max_depth: int = 2,
+    extent_m: FloatArray | None = None,
+) -> PathSet:
+    """As :func:`aerpaw_cmp.propagation.search.mirror.find_paths`, for scenes with too many sequences for it.
+
+    Parameters
+    ----------
+    faces, links, max_depth, extent_m
+        As there.
+    run : Run
+
+    Returns
+    -------
+    PathSet
+        Sorted by pose, tower, depth, faces.
+    """
+    sources_m, targets_m = links.sources_m, links.targets_m
+    tolerance_m = scene_tolerance_m(faces, sources_m, targets_m if extent_m is None else extent_m)
+    # candidates: too many rather than too few
+    paths = grow_paths(solid_surfaces(faces, sources_m, targets_m), links, run, max_depth=max_depth, solids=True)
+    hiding = Occlusion(faces, tolerance_m)
+    pieces = []
+    # of one depth at once: tracing back takes sequences of one length
+    for depth in range(max_depth + 1):
+        some = paths.select(paths.depth == depth)
+        source, target = sources_m[some.tower], targets_m[some.pose]
+        sequence = some.faces[:, :depth]
+        vertices, good = trace_back(faces, sequence, images_of(faces, sequence, source), target, tolerance_m)
+        rows = np.flatnonzero(good)
+        rows = rows[~hiding.any_segment(source[rows], vertices[rows], target[rows])]
+        some.vertices_m[:, :depth] = vertices
+        pieces.append(some.select(rows))
+    return merge(pieces, max_depth, faces)
+
+
+def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -> Surfaces:
+    """Faces of solids as the compiled search takes them; the ground, which hides nothing, is no obstacle."""
+    known = targets_m[np.isfinite(targets_m).all(axis=1)]
+    finite = [np.abs(x[np.isfinite(x)]).max(initial=0.0) for x in (faces.lower, faces.upper, faces.offset_m)]
+    reach = REACH * float(max(1.0, *finite, *(np.abs(p).max(initial=0.0) for p in (known, sources_m))))
+    vertices, triangle, owner = triangles(faces, reach)
+    points = vertices[triangle]
+    # a bounding quadrilateral, which for a roof with corners cut is larger than the roof: a cut may keep more
+    outline = corners(faces, reach)
+    axes = np.stack([faces.along[owner], faces.across[owner]], axis=1)
+    flat = np.einsum("tki,tai->tka", points, axes)
+    hides = faces.solid[owner] >= 0
+    lower, upper = outline.min(axis=1) - OVERLAP_M, outline.max(axis=1) + OVERLAP_M
+    obstacles = np.ascontiguousarray(points[hides])
+    if not len(obstacles):
+        obstacles = np.full((1, 3, 3), 1e9)  # nothing hides: one needle far below everything
+    return Surfaces(
+        faces=faces,
+        corners_m=obstacles,
+        face=owner,
+        first=np.searchsorted(owner, np.arange(len(faces) + 1)),
+        flat_m=np.ascontiguousarray(flat),
+        window_m=np.ascontiguousarray(outline[:, np.minimum(np.arange(WINDOW), 3)]),
+        # the ground hides nothing, and what has a polygon does not fill its outline
+        convex=(faces.solid >= 0) & np.array([polygon is None for polygon in faces.polygon], dtype=np.bool_),
+        plane=planes_of(faces),
+        tree=box_tree(obstacles.min(axis=1), obstacles.max(axis=1)),
+        face_tree=box_tree(lower, upper),
+        merge_m=OVERLAP_M,
+    )

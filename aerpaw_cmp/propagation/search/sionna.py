@@ -35,10 +35,8 @@ from ...common.errors import CheckError, UsageError
 from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ...common.versions import version
 from ...site.materials import material
-from ..geometry.arrays import Link
-from ..geometry.faces import inside, triangles
-from ..geometry.paths import Faces, Links, PathSet, Surfaces, path_lengths
-from ..native.llvm import INSTALL_AGAIN, SionnaMissingError, let_sionna_load, prepare_llvm
+from ..geometry import Faces, Link, Links, PathSet, Surfaces, inside, path_lengths, triangles
+from ..llvm import INSTALL_AGAIN, SionnaMissingError, let_sionna_load, prepare_llvm
 from ..options import Progress
 from .mirror import (
     MINIMUM_LENGTH_M,

@@ -16,10 +16,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...common.units import BoolArray, FloatArray, IntArray
-from ...site.relief.dem import Dem
-from ..geometry.paths import Faces, Links, PathSet, joined, legs
-from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, images_of, searched_links, trace_back
-from .occlusion import Occlusion
+from ...site.relief import Dem
+from ..geometry import Faces, Links, PathSet, joined, legs
+from .mirror import MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, Occlusion, images_of, searched_links, trace_back
 
 # ``solid`` of the tangent planes of the terrain; that of a tower's level ground is -1.
 TERRAIN = -2

@@ -239,7 +239,7 @@ const common = (() => {
   // a menu that saves a chart: drawn again by ``draw`` as SVG, as a picture, or the rows of its numbers
   function downloads(canvas, name, rows, draw) {
     const save = (kind, blob) => { const a = document.createElement("a"); a.href = URL.createObjectURL(blob); a.download = `${name}.${kind}`; a.click(); URL.revokeObjectURL(a.href); };
-    // texts as aerpaw_cmp.common.cells guards them: a spreadsheet must not take a name for a formula
+    // texts as aerpaw_cmp.common.text guards them: a spreadsheet must not take a name for a formula
     const guarded = v => typeof v === "string" ? v.replace(/(^|;)(?=[=+\-@\t\r'])/g, "$1'") : v;
     const quoted = v => /[",\n]/.test(v) ? `"${String(v).replaceAll('"', '""')}"` : v;
     const cell = v => v === null || Number.isNaN(v) ? "" : quoted(guarded(v));

@@ -1,0 +1,127 @@
+"""Small texts: the commands and their help, counts in words, cells of CSV files, HTML tables.
+
+The commands and their one-line help, for ``--help`` without loading anything and for the command line itself.
+
+Numbers of things in words.
+
+Text cells of CSV files: names come from strangers' logs, and a spreadsheet runs what begins with = + - or @.
+
+A small HTML table: what a notebook shows of a record.
+"""
+
+from __future__ import annotations
+
+import html
+import re
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+COMMANDS: dict[str, str] = {
+    "ingest": "Read logs of any known format, account for every line, write a flight file.",
+    "formats": "List the log formats that can be read, with a sample line of each.",
+    "report": "Replay a flight, calibrate, compare with the measurement, write the report.",
+    "campaign": "Many flights and settings: pooled offsets, held-out flights, repeatability.",
+    "explain": "Every path of a link at an instant: faces, angles, each loss, the sum.",
+    "diff": "Differences between two reports of a flight: settings, inputs, numbers with intervals.",
+    "calibrate": "Learn antennas from several flights; score them on what was left out.",
+    "tap": "Log the rank indicator live from the modem's serial port.",
+    "modem-sim": "A pseudo-terminal that behaves like the modem, to try the tap without hardware.",
+    "predict": "Level and rank with error bars on a route, a grid or points, before a flight.",
+    "plan": "Which flight next: candidate routes by the standard deviation they would leave.",
+    "locate": "Where an unknown transmitter or receiver on the ground stands, by levels of a flight.",
+    "channel": "The channel along a flight or a route as files: paths, H, Doppler, levels.",
+    "map": "Coverage and rank maps of a site, Kriging of rank and its baselines.",
+    "simulate": "Write the logs of a planned flight in the real formats, with their truth.",
+    "sample": "Copy the sample flight, logs and flight.yaml, into a folder of your own.",
+    "site": "Make a site of maps or of a Mitsuba scene (import), look at it (show), export it.",
+    "antenna": "An antenna pattern in the formats of other programs (export).",
+    "bench": "Speed against error of the replay on this machine.",
+    "doctor": "Is this machine ready? LLVM, Sionna RT, memory, serial ports, with remedies.",
+}
+
+
+def counted(number: int, noun: str, plural: str = "") -> str:
+    """A number with its noun, thousands set apart as in the tables; the plural has an s unless it is given.
+
+    Examples
+    --------
+    >>> counted(1, "task"), counted(0, "task"), len(counted(6608, "task").split())
+    ('1 task', '0 tasks', 3)
+    >>> counted(1, "row is", "rows are"), counted(2, "row is", "rows are")
+    ('1 row is', '2 rows are')
+    """
+    # a narrow blank at which no line breaks: a comma is the decimal sign of many readers
+    return f"{number:,} {noun if number == 1 else plural or noun + 's'}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+# also behind a semicolon: where that parts cells, what follows begins a cell
+# and an apostrophe of the log itself: unguarded() would take it for one of ours
+_BEGINNING = re.compile(r"(^|;)(?=[=+\-@\t\r'])")
+_GUARDED = re.compile(r"(^|;)'")
+# within a comment a separator begins a cell, too; numbers stay as they are, since some comments hold tables of them
+_IN_COMMENT = re.compile(r"([,;\t]\s*)(?=[=@]|[+\-](?![\d.]|inf|nan))")
+
+
+def guarded(table: Any) -> Any:
+    """A data frame whose texts no spreadsheet takes for formulas: an apostrophe stands before those that it would.
+
+    Numbers stay numbers. :func:`unguarded` gives the texts back.
+    """
+    guarded_columns = {}
+    for name in table.columns:
+        if table[name].dtype.kind == "O" or str(table[name].dtype).startswith("str"):
+            # by distinct word: a million rows hold a few names
+            words = [word for word in table[name].unique() if isinstance(word, str) and _BEGINNING.search(word)]
+            if words:
+                texts = table[name].astype(object)
+                guarded_columns[name] = texts.replace({word: guarded_text(word) for word in words})
+    # the table of the caller stays as it is: numbers are read from it afterwards
+    return table.assign(**guarded_columns) if guarded_columns else table
+
+
+def guarded_text(word: str) -> str:
+    """A cell that no spreadsheet takes for a formula.
+
+    Examples
+    --------
+    >>> guarded_text("=1+1"), guarded_text("LW1;=1+1"), guarded_text("LW1")
+    ("'=1+1", "LW1;'=1+1", 'LW1')
+    """
+    return _BEGINNING.sub(r"\1'", word)
+
+
+def guarded_comment(line: str) -> str:
+    """Return a comment line of a table whose parts between separators are not formulas.
+
+    Examples
+    --------
+    >>> guarded_comment("# learned: f1, =1+1"), guarded_comment("# pair: 1.5,-0.3")
+    ("# learned: f1, '=1+1", '# pair: 1.5,-0.3')
+    """
+    return _IN_COMMENT.sub(r"\1'", line)
+
+
+def unguarded(word: str) -> str:
+    """The text of a cell that :func:`guarded` wrote.
+
+    Examples
+    --------
+    >>> unguarded("'=1+1"), unguarded("LW1")
+    ('=1+1', 'LW1')
+    """
+    return _GUARDED.sub(r"\1", word)
+
+
+def html_table(titles: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
+    """A table with a head; every text is escaped.
+
+    Examples
+    --------
+    >>> html_table(["tower"], [["LW1"]])
+    '<table><thead><tr><th>tower</th></tr></thead><tbody><tr><td>LW1</td></tr></tbody></table>'
+    """
+    head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    # a caption comes first in a table: HTML allows it nowhere else
+    name = f"<caption>{html.escape(caption)}</caption>" if caption else ""
+    return f"<table>{name}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

@@ -1,0 +1,1022 @@
+"""Antenna gain learned from flights, and its generalization to flights, heights and directions left out.
+
+Error on flights left out against the number of flights that were learned from, and for one more.
+
+Choice of a prediction and its correction, by flights (or blocks) left out inside those that are known.
+
+A *base* predicts levels above free space: nothing at all (a constant level), free space, a replay, learned antennas. A
+*correction* is the residual field (:mod:`.field_gp`) of a base. Both are chosen by the CRPS of what is left out, and
+the correction stays off unless a 95 % interval shows that it lowers the CRPS.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..common.geodesy import azimuth_rad, elevation_rad
+from ..common.units import BoolArray, FloatArray, IntArray, spread_out, wrap_degrees
+from .field_gp import NEW_FLIGHT, PARTS, FieldFit, FieldModel, Part, Rows, fit_field
+from .gains import (
+    GainFit,
+    GainModel,
+    GainOf,
+    LinkSamples,
+    MountFit,
+    Spread,
+    StatedSpread,
+    chosen_fit,
+    fading_of,
+    fit_gain,
+    fit_mounts,
+    inside_shares,
+    turned,
+)
+from .ladder import log_distance_level_db
+from .level import crps_normal, floored_fit, local_mean_db
+from .result import BASELINE_TITLE
+from .statistics import mean_interval
+
+SECTORS = 6
+# Directions this near a left-out sector are not learned from either.
+_GUARD_DEG = 10.0
+
+STRETCHES = 8
+GUARD_S = 20.0
+_CRUISE_M = 5.0
+_LEAST_SAMPLES = 50
+
+# Fields of :class:`Score` that a learned model is held against, with their titles.
+BASELINES = {f"{name}_rmse_db": BASELINE_TITLE[name] for name in ("free_space", "log_distance", "constant")}
+
+SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_left_out", "route_left_out")
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """Samples with what a score needs besides: level of free space (n,) [dB], heading of the nose (n,) [deg].
+
+    ``tower_m`` (n, 3): places of a tower that moves [m]. ``start``: the instant of ``time_s`` 0 (UTC), where known.
+    ``locked`` (n,): 1 where the receiver was in lock, 0 where it had lost it, NaN unknown. ``sent_dbm``: transmit power
+    of ``free_space_db``.
+    """
+
+    samples: LinkSamples
+    free_space_db: FloatArray
+    heading_deg: FloatArray
+    tower_m: FloatArray | None = None
+    start: np.datetime64 | None = None
+    locked: FloatArray | None = None
+    sent_dbm: float = 0.0
+
+    def part(self, keep: BoolArray | IntArray) -> Observed:
+        """Some of the samples."""
+        return dataclasses.replace(
+            self,
+            samples=self.samples.part(keep),
+            free_space_db=self.free_space_db[keep],
+            heading_deg=self.heading_deg[keep],
+            tower_m=None if self.tower_m is None else self.tower_m[keep],
+            locked=None if self.locked is None else self.locked[keep],
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """Definition of the quantities to be learned.
+
+    Parameters
+    ----------
+    model : GainModel
+        Terms and where their strengths start.
+    patterns : mapping of str to callable
+        Gain of measured patterns in the device frame: ``uav`` and antennas (``tower.channel``); may be empty.
+    """
+
+    model: GainModel
+    patterns: Mapping[str, GainOf] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True)
+class Mounted:
+    """Measured patterns by name, and the mounts that were fitted of those that a flight used."""
+
+    patterns: Mapping[str, GainOf]
+    mounts: Mapping[str, MountFit]
+
+    def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
+        """Gain (n,) of a measured pattern as mounted, towards directions (n, 3) of body or mast; 0 without one."""
+        pattern = self.patterns.get(name)
+        if pattern is None:
+            return np.zeros(len(direction))
+        mount = self.mounts.get(name)
+        return pattern(direction if mount is None else direction @ turned(mount.azimuth_deg))
+
+    def patterns_db(self, samples: LinkSamples) -> FloatArray:
+        """Gain (n,) of the measured patterns of both ends."""
+        return self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
+
+
+@dataclass(frozen=True, slots=True)
+class Learned(Mounted):
+    """The outcome of :func:`learn`."""
+
+    fit: GainFit
+    fading: Mapping[str, tuple[float, float]]
+    """Of each antenna: :func:`~aerpaw_cmp.compare.gains.fading_of` the flights that were learned from."""
+
+    @property
+    def model(self) -> GainModel:
+        """Terms and strengths of the fit."""
+        return self.fit.model
+
+    def spread(self, antenna: str) -> Spread:
+        """Spread of a level at an antenna besides the standard deviation of the gain."""
+        model = self.model
+        sd_db, kurtosis = self.fading.get(antenna, (0.0, 0.0))
+        return Spread(
+            own_sd_db=model.own_sd_db,
+            noise_sd_db=model.noise_sd_db,
+            fading_sd_db=sd_db,
+            fading_kurtosis=kurtosis,
+            bin_s=model.bin_s,
+        )
+
+    def predict(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        """Gain of both ends and its standard deviation (n,) [dB], about a mean that the offset takes."""
+        gain, sd = self.fit.predict(samples)
+        return self.patterns_db(samples) + gain, sd
+
+    def mean_error(self, samples: LinkSamples) -> float:
+        """Mean of measured minus :meth:`mean` [dB]; NaN without a sample that has both."""
+        error = samples.residual_db - self.mean(samples)
+        return float(np.nanmean(error)) if np.isfinite(error).any() else math.nan
+
+    def mean(self, samples: LinkSamples) -> FloatArray:
+        """The gain of :meth:`predict` alone, along a flight in the order of time."""
+        return self.patterns_db(samples) + _mean_along(self.fit, samples)
+
+
+# A UAV hardly turns within this time [s].
+_FINE_S = 0.5
+
+
+def _mean_along(fit: GainFit, samples: LinkSamples) -> FloatArray:
+    """Gain (n,) along a flight [dB]: at means over :data:`_FINE_S`, and linear between them."""
+    at = dataclasses.replace(samples, residual_db=np.zeros(len(samples))).binned(_FINE_S)
+    if not len(at):
+        return np.full(len(samples), np.nan)
+    # linear between half seconds: each mean costs a row of kernels
+    gain = np.interp(samples.time_s, at.time_s, fit.mean(at))
+    return np.where(np.isfinite(samples.at_uav).all(axis=1), gain, np.nan)
+
+
+def learn(series: Sequence[LinkSamples], recipe: Recipe, model: GainModel | None = None) -> Learned:
+    """Mounts, then the gain over direction on top of the patterns.
+
+    Parameters
+    ----------
+    series : sequence of LinkSamples
+        Residuals against free space of the flights to learn from, and no other.
+    recipe : Recipe
+    model : GainModel, optional
+        Strengths that were chosen on the same flights; chosen anew without.
+    """
+    names = ["uav", *dict.fromkeys(s.antenna for s in series)]
+    patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
+    mounted = Mounted(recipe.patterns, fit_mounts(series, patterns) if patterns else {})
+    residuals = [dataclasses.replace(s, residual_db=s.residual_db - mounted.patterns_db(s)) for s in series]
+    fit = chosen_fit(residuals, recipe.model) if model is None else fit_gain(residuals, model)
+    if any(s.floor_db is not None for s in series):  # once more; another time changes nothing on flights left out
+        fit = fit_gain([_at_floor(s, mounted.patterns_db(s), fit) for s in series], fit.model)
+    antennas = dict.fromkeys(s.antenna for s in series)
+    fading = {name: fading_of([s for s in series if s.antenna == name], fit.model.bin_s) for name in antennas}
+    return Learned(recipe.patterns, mounted.mounts, fit, fading)
+
+
+def _at_floor(samples: LinkSamples, known_db: FloatArray, fit: GainFit) -> LinkSamples:
+    """Residual minus ``known_db``; below the floor, the value that the fit expects, no higher than the floor."""
+    residual = samples.residual_db - known_db
+    if samples.floor_db is None:
+        return dataclasses.replace(samples, residual_db=residual)
+    floor, gain = samples.floor_db - known_db, _mean_along(fit, samples)
+    offset_db = floored_fit(residual - floor, gain - floor, 0.0).offset_db
+    unseen = np.minimum(gain - offset_db, floor)
+    return dataclasses.replace(samples, residual_db=np.where(residual < floor, unseen, residual))
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Error of one flight and channel that had no part in the fit, after one offset [dB].
+
+    ``rmse_4s_db``: both sides averaged in power over 4 s. ``inside_50``, ``inside_90``, ``inside_95``: share of
+    samples (some hundred of them) inside the interval that is to hold so many per cent. ``offset_db``: measured
+    minus predicted, mean. ``rmse_shared_offset_db``: with the mean offset of the flights that were learned from in
+    place of the flight's own. ``constant_rmse_db``, ``log_distance_rmse_db``: of a constant, and of a line over log
+    distance whose slope at each of eight places comes from the other places of the flight. Where a part of a flight is
+    scored, the offset of every model (and the slope of the line) comes from outside that part.
+    """
+
+    flight: str
+    tower: str
+    channel: str
+    rmse_db: float
+    rmse_4s_db: float
+    free_space_rmse_db: float
+    constant_rmse_db: float
+    log_distance_rmse_db: float
+    n: int
+    offset_db: float = math.nan
+    inside_50: float = math.nan
+    inside_90: float = math.nan
+    inside_95: float = math.nan
+    rmse_shared_offset_db: float = math.nan
+
+
+def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None) -> Score | None:
+    """Score of a prediction; None with fewer than 50 samples to score.
+
+    Parameters
+    ----------
+    observed : Observed
+    gain_db : (n,)
+        Predicted level above free space [dB]; NaN is not scored.
+    simple : Simple, optional
+        Baselines whose offset in each scored part, like that of ``gain_db``, comes from samples outside the part, so
+        that they are compared like for like. Without, they have one offset for the whole flight.
+
+    Returns
+    -------
+    Score or None
+    """
+    s = observed.samples
+    free = np.zeros(len(s)) if simple is None else simple.free_db
+    finite = np.isfinite(s.residual_db - gain_db) & np.isfinite(free)
+    if finite.sum() < _LEAST_SAMPLES:
+        return None
+    time, level, error = s.time_s[finite], observed.free_space_db[finite], (s.residual_db - gain_db)[finite]
+    measured = s.residual_db[finite] + level
+    if simple is None:
+        constant = np.zeros(len(error))
+        line = log_distance_level_db(measured, 10.0 ** (-level / 20.0), s.position_m[finite])
+    else:
+        constant, line = simple.constant_db[finite], simple.line_db[finite]
+    means = local_mean_db(time, measured, 4.0) - local_mean_db(time, gain_db[finite] + level, 4.0)
+    return Score(
+        flight=s.flight,
+        tower=s.tower,
+        channel=s.channel,
+        rmse_db=float(error.std()),
+        rmse_4s_db=float(means.std()),
+        free_space_rmse_db=float((s.residual_db - free)[finite].std()),
+        constant_rmse_db=float((measured - constant).std()),
+        log_distance_rmse_db=float((measured - line).std()),
+        n=int(finite.sum()),
+        offset_db=float(error.mean()),
+    )
+
+
+# Of a line over log distance: times free space.
+STEEPEST = 3.0
+
+
+@dataclass(frozen=True, slots=True)
+class Simple:
+    """Models without antennas, each (n,): free space above its level, a constant and a line over log distance [dB]."""
+
+    free_db: FloatArray
+    constant_db: FloatArray
+    line_db: FloatArray
+
+    def predict(self, o: Observed, inside: BoolArray, outside: BoolArray) -> None:
+        """Fill in the samples of a part, every number of it from samples outside."""
+        measured = o.samples.residual_db + o.free_space_db
+        known = outside & np.isfinite(measured)
+        free, level = o.free_space_db[known], measured[known]
+        spread = float(((free - free.mean()) ** 2).sum())
+        slope = float(((free - free.mean()) * (level - level.mean())).sum()) / spread if spread else 0.0
+        # 0 to 60 dB per decade: seen from one height only, a line may point anywhere else
+        slope = min(max(slope, 0.0), STEEPEST)
+        self.free_db[inside] = o.samples.residual_db[known].mean()
+        self.constant_db[inside] = level.mean()
+        self.line_db[inside] = level.mean() + slope * (o.free_space_db[inside] - free.mean())
+
+
+def mean_rmse(scores: Sequence[Score], name: str = "rmse_db") -> float:
+    """Mean over flights and channels [dB]; NaN without any."""
+    return float(np.mean([getattr(s, name) for s in scores])) if scores else math.nan
+
+
+def flights_of(observed: Sequence[Observed]) -> list[str]:
+    """Names in order."""
+    return list(dict.fromkeys(o.samples.flight for o in observed))
+
+
+# Flights are left out one by one, or, where they are more, in this many groups: none is predicted by itself.
+MOST_GROUPS = 6
+
+
+def groups_of(flights: Sequence[str]) -> list[list[str]]:
+    """Flights that are left out together: each alone, or spread over :data:`MOST_GROUPS` groups."""
+    count = min(len(flights), MOST_GROUPS)
+    # every so many: flights of one day are learned from and predicted
+    return [list(flights[i::count]) for i in range(count)]
+
+
+def flight_left_out(
+    observed: Sequence[Observed], recipe: Recipe, without: dict[str, Learned] | None = None
+) -> tuple[Score, ...]:
+    """Each flight predicted from others (:func:`groups_of`); ``kept`` receives what was learned without each flight."""
+    scores: list[Score | None] = []
+    for group in groups_of(flights_of(observed)):
+        train = [o.samples for o in observed if o.samples.flight not in group]
+        learned = learn(train, recipe)
+        if without is not None:
+            without |= dict.fromkeys(group, learned)
+        unseen = [o for o in observed if o.samples.flight in group]
+        if without is None:
+            known = {s.antenna for s in train if np.isfinite(s.residual_db).any()}
+            scores += [score(o, learned.mean(o.samples)) for o in unseen if o.samples.antenna in known]
+        else:
+            scores += _scored_with(unseen, learned, _offsets(train, learned))
+    return tuple(s for s in scores if s is not None)
+
+
+def score_with(learned: Learned, unseen: Sequence[Observed], train: Sequence[Observed]) -> tuple[Score, ...]:
+    """Scores of flights that were not learned from, at antennas that were."""
+    return tuple(_scored_with(unseen, learned, _offsets([o.samples for o in train], learned)))
+
+
+def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]:
+    """Mean over flights of measured minus predicted, per antenna [dB]."""
+    each: dict[str, list[float]] = {}
+    for samples in train:
+        each.setdefault(samples.antenna, []).append(learned.mean_error(samples))
+    return {antenna: float(np.nanmean(values)) for antenna, values in each.items() if np.isfinite(values).any()}
+
+
+# Samples of a series at which standard deviations are checked: each costs a thousand times what its mean does.
+_SPREAD_SAMPLES = 400
+
+
+def _scored_with(unseen: Sequence[Observed], learned: Learned, offsets: Mapping[str, float]) -> Iterator[Score]:
+    """Scores at antennas that have an offset, with their own and with that of the other flights."""
+    for o in unseen:
+        if o.samples.antenna not in offsets:
+            continue
+        gain = learned.mean(o.samples)
+        fitted = score(o, gain)
+        if fitted is None:
+            continue
+        # evenly over the flight: neighbours have the same standard deviation
+        some = spread_out(len(gain), _SPREAD_SAMPLES)
+        stated = StatedSpread(
+            gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
+        )
+        error = o.samples.residual_db - gain - fitted.offset_db
+        fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
+        # the mean square about another offset is the variance and the square of their difference
+        shared = math.hypot(fitted.rmse_db, fitted.offset_db - offsets[o.samples.antenna])
+        yield dataclasses.replace(fitted, rmse_shared_offset_db=shared)
+
+
+# Of more flights, this many are scored part by part, evenly over their order.
+_MOST_SCORED = 6
+
+
+def spread_flights(flights: Sequence[str]) -> list[str]:
+    """The flights, or :data:`_MOST_SCORED` of them, the first and the last among them."""
+    return [flights[i] for i in spread_out(len(flights), _MOST_SCORED)]
+
+
+# ``parts(scored, other)``: per part the samples (n,) of the scored series in it, and those (m,) of another series that
+# may be learned from.
+Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
+
+
+def parts_left_out(
+    observed: Sequence[Observed],
+    recipe: Recipe,
+    without: Mapping[str, Learned],
+    parts: Parts,
+    *,
+    own_rest: bool,
+) -> tuple[Score, ...]:
+    """Each flight predicted part by part, from other flights without what is like the part.
+
+    ``own_rest``: the rest of the flight is learned from, too. The offset of a part comes from the flight's samples
+    outside it, so that nothing of the part is fitted.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+        Of all flights.
+    recipe : Recipe
+    without : mapping of str to Learned
+        What was learned without each flight: its strengths are used again.
+    parts : callable
+        :func:`altitude_parts`, :func:`heading_parts`, :func:`sector_parts` or :func:`route_parts`.
+    own_rest : bool
+        Learn from the rest of the flight, too.
+
+    Returns
+    -------
+    tuple of Score
+        One per series, over all its parts; series of which no part could be predicted are left out.
+    """
+    flights = spread_flights(flights_of(observed))
+    of = {flight: [o for o in observed if o.samples.flight == flight] for flight in flights}
+    stitched = {flight: [np.full(len(o.samples), np.nan) for o in of[flight]] for flight in flights}
+    simple = {flight: [Simple(*np.full((3, len(o.samples)), np.nan)) for o in of[flight]] for flight in flights}
+    # one part after the other: what the flights learn from is much the same, and kept
+    for k in range(max(len(parts(mine[0], mine[0])) for mine in of.values())):
+        for flight, mine in of.items():
+            sources = list(observed) if own_rest else [o for o in observed if o.samples.flight != flight]
+            train = [o.part(parts(mine[0], o)[k][1]).samples for o in sources]
+            train = [s for s in train if np.isfinite(s.residual_db).sum() >= _LEAST_SAMPLES]
+            if not train or not any(parts(o, o)[k][0].any() for o in mine):
+                continue
+            try:
+                learned = learn(train, recipe, without[flight].model)
+            except InputError:
+                continue
+            known = {s.antenna for s in train}
+            for o, predicted, baselines in zip(mine, stitched[flight], simple[flight], strict=True):
+                inside, outside = parts(o, o)[k]
+                if o.samples.antenna not in known or not inside.any():
+                    continue
+                gain = learned.mean(o.samples)
+                error = (o.samples.residual_db - gain)[outside]
+                if np.isfinite(error).sum() >= _LEAST_SAMPLES:
+                    predicted[inside] = gain[inside] + np.nanmean(error)
+                    baselines.predict(o, inside, outside)
+    out = [
+        score(o, predicted, simple=baselines)
+        for flight in flights
+        for o, predicted, baselines in zip(of[flight], stitched[flight], simple[flight], strict=True)
+    ]
+    return tuple(s for s in out if s is not None)
+
+
+def altitude_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
+    """The commonest height of the scored flight, and all other heights."""
+    height, cruise = scored.samples.position_m[:, 2], cruise_height_m(scored)
+    mine = np.abs(height - cruise) < _CRUISE_M
+    return [(mine, np.abs(source.samples.position_m[:, 2] - cruise) >= _CRUISE_M)]
+
+
+def cruise_height_m(observed: Observed) -> float:
+    """Return the commonest height of a flight, to a metre [m]."""
+    heights, count = np.unique(np.round(observed.samples.position_m[:, 2]), return_counts=True)
+    return float(heights[count.argmax()])
+
+
+def sector_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
+    """Sectors of azimuth at the tower, with a guard."""
+
+    def azimuth(o: Observed) -> FloatArray:
+        return np.degrees(azimuth_rad(o.samples.at_tower))
+
+    return _angular(azimuth(scored), azimuth(source), SECTORS, _GUARD_DEG)
+
+
+def heading_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
+    """Eighths of the compass for the nose, with a guard."""
+    return _angular(scored.heading_deg, source.heading_deg, 8, _GUARD_DEG)
+
+
+def _angular(mine: FloatArray, sources: FloatArray, count: int, guard_deg: float) -> list[tuple[BoolArray, BoolArray]]:
+    half = 180.0 / count
+    out = []
+    for k in range(count):
+        centre = 2.0 * half * (k + 0.5)
+        near = np.abs(wrap_degrees(mine - centre)) <= half
+        far = np.abs(wrap_degrees(sources - centre)) > half + guard_deg
+        out.append((near, far))
+    return out
+
+
+def route_parts(scored: Observed, source: Observed) -> list[tuple[BoolArray, BoolArray]]:
+    """Stretches of the scored flight in time, with a guard; other flights count whole."""
+    time = scored.samples.time_s
+    # a little longer: the last sample lies in the last stretch
+    edges = np.linspace(time.min(), time.max() + 1e-6, STRETCHES + 1)
+    out = []
+    for low, high in itertools.pairwise(edges):
+        mine = (time >= low) & (time < high)
+        if source.samples.flight == scored.samples.flight:
+            source_time = source.samples.time_s
+            outside = (source_time < low - GUARD_S) | (source_time >= high + GUARD_S)
+        else:
+            outside = np.ones(len(source.samples), np.bool_)
+        out.append((mine, outside))
+    return out
+
+
+def world_frame(observed: Sequence[Observed]) -> list[Observed]:
+    """Control: the UAV's term in the world's axes, where no antenna of it is fixed."""
+    return [_with_uav(o, -o.samples.at_tower) for o in observed]
+
+
+def wrong_way(observed: Sequence[Observed]) -> list[Observed]:
+    """Control: headings taken with the wrong sign."""
+    out = []
+    for o in observed:
+        body = o.samples.at_uav
+        # the azimuth in the body is bearing less heading: this is bearing plus heading
+        turned = 2.0 * azimuth_rad(-o.samples.at_tower) - azimuth_rad(body)
+        across = np.hypot(body[:, 0], body[:, 1])
+        out.append(_with_uav(o, np.stack([across * np.cos(turned), across * np.sin(turned), body[:, 2]], axis=1)))
+    return out
+
+
+def _with_uav(o: Observed, at_uav: FloatArray) -> Observed:
+    return dataclasses.replace(o, samples=dataclasses.replace(o.samples, at_uav=at_uav))
+
+
+# Of each number of flights; where there are more subsets, those of neighbouring flights are taken.
+_MOST_FITS = 6
+
+# Numbers of flights that are tried.
+_MOST_SIZES = 6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CurvePoint:
+    """Mean error over the same series [dB], each predicted by every subset of other flights of one size.
+
+    Parameters
+    ----------
+    flights : int
+        That were learned from.
+    rmse_db, rmse_4s_db : float
+        As logged and over 4 s, after one offset.
+    fits : int
+        Subsets.
+    series : int
+        Flights and channels that the mean is over.
+    """
+
+    flights: int
+    rmse_db: float
+    rmse_4s_db: float
+    fits: int
+    series: int
+
+
+def learning_curve(observed: Sequence[Observed], recipe: Recipe) -> tuple[CurvePoint, ...]:
+    """Error against number of flights, by subsets of the named ones; nothing with fewer than three flights.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+        Of all flights.
+    recipe : Recipe
+        Its strengths are chosen within each subset.
+
+    Returns
+    -------
+    tuple of CurvePoint
+        By number of flights, the largest being all but the one that is predicted.
+    """
+    flights = flights_of(observed)
+    if len(flights) < 3:
+        return ()
+    sizes = np.unique(np.linspace(1, len(flights) - 1, min(len(flights) - 1, _MOST_SIZES)).round().astype(int))
+    errors: dict[int, dict[tuple[str, str], list[tuple[float, float]]]] = {}
+    fits: dict[int, int] = {}
+    for size in map(int, sizes):
+        subsets = _subsets(flights, size)
+        fits[size], errors[size] = len(subsets), {}
+        for subset in subsets:
+            learned = learn([o.samples for o in observed if o.samples.flight in subset], recipe)
+            known = {o.samples.antenna for o in observed if o.samples.flight in subset}
+            targets = [o for o in observed if o.samples.flight not in subset and o.samples.antenna in known]
+            for scored in filter(None, (score(o, learned.mean(o.samples)) for o in targets)):
+                key = scored.flight, f"{scored.tower}.{scored.channel}"
+                errors[size].setdefault(key, []).append((scored.rmse_db, scored.rmse_4s_db))
+    # the same series at every number: else a curve may fall because a hard flight left it
+    common = set.intersection(*(set(each) for each in errors.values()))
+    if not common:
+        return ()
+    points = []
+    for size, each in errors.items():
+        rmse, rmse_4s = np.mean([np.mean(each[key], axis=0) for key in sorted(common)], axis=0)
+        points.append(
+            CurvePoint(
+                flights=size, rmse_db=float(rmse), rmse_4s_db=float(rmse_4s), fits=fits[size], series=len(common)
+            )
+        )
+    return tuple(points)
+
+
+def _subsets(flights: Sequence[str], size: int) -> list[set[str]]:
+    """All subsets of a size, or runs of neighbours round the list, evenly begun."""
+    if math.comb(len(flights), size) <= _MOST_FITS:
+        return [set(subset) for subset in itertools.combinations(flights, size)]
+    twice = [*flights, *flights]
+    begins = np.unique(np.linspace(0, len(flights), min(len(flights), _MOST_FITS), endpoint=False).round().astype(int))
+    return [set(twice[begin : begin + size]) for begin in begins]
+
+
+def with_one_more(points: Sequence[CurvePoint], name: str = "rmse_db") -> float:
+    """Error to expect with one flight more than the largest subset and the one predicted [dB]; NaN with one point.
+
+    Notes
+    -----
+    The square of the error is fitted as ``a + b / flights`` with b >= 0; ``b / flights`` is what averages out. The last
+    three sizes count: with the first flights an error may fall slowly, until they share directions.
+
+    Examples
+    --------
+    >>> points = [CurvePoint(flights=n, rmse_db=(9 + 7 / n) ** 0.5, rmse_4s_db=3.0, fits=1, series=1) for n in (1, 2)]
+    >>> round(with_one_more(points) ** 2, 6) == round(9 + 7 / 3, 6)
+    True
+    """
+    if len(points) < 2:
+        return math.nan
+    x = np.array([1.0 / p.flights for p in points[-3:]])
+    square = np.array([getattr(p, name) ** 2 for p in points[-3:]])
+    slope = max(float(np.polyfit(x, square, 1)[0]), 0.0)
+    last = points[-1].flights
+    return math.sqrt(max(float(square[-1]) - slope * (1.0 / last - 1.0 / (last + 1)), 0.0))
+
+
+# Level above free space (n,) and its standard deviation (n,) [dB] of samples whose residual is not used.
+Predictor = Callable[[LinkSamples], tuple[FloatArray, FloatArray]]
+
+# Learns from samples whose residual is measured minus free space.
+Base = Callable[[Sequence[LinkSamples]], Predictor]
+
+_HeldOut = tuple[FloatArray, FloatArray]
+
+# Residuals are means over this time [s].
+BIN_S = 4.0
+
+# Side of the blocks of a single flight that are left out.
+BLOCK_M = 300.0
+
+# Of more flights than :data:`~.calibration.MOST_GROUPS`, so many groups are left out in turn, and the strengths of a
+# residual field that are learned without the first serve for all: one flight among many hardly moves them.
+_SCORED_GROUPS = 3
+
+OFF = "no correction"
+
+_NUISANCE = ("drift_sd_db", "drift_s", "noise_sd_db")
+
+# Scales of the place part that are tried; drift and noise always come from the likelihood. Between few flights the
+# likelihood alone confuses place with direction and height: measured, free lengths lost 0.3 dB on flights left out.
+_STARTS: dict[str, FieldModel | None] = {
+    OFF: FieldModel(place_sd_db=1e-3, turn=math.inf, drift_s=8.0),
+    "field of 2 dB, 30 m": FieldModel(place_sd_db=2.0, length_m=30.0, height_m=20.0, turn=0.35, drift_s=8.0),
+    "field of 2.5 dB, 50 m": FieldModel(place_sd_db=2.5, length_m=50.0, height_m=40.0, turn=0.35, drift_s=8.0),
+    "field of 1.5 dB, 50 m": FieldModel(place_sd_db=1.5, length_m=50.0, height_m=40.0, turn=math.inf, drift_s=8.0),
+    "field by likelihood": None,
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Channel:
+    """Binned rows of one tower and channel over all flights, and what a base leaves there (n,) [dB]."""
+
+    rows: Rows
+    left_db: FloatArray
+    base_sd_db: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Correction:
+    """Chosen base and residual field, conditioned on all that is known.
+
+    Parameters
+    ----------
+    base : str
+    predictor : callable
+        Of the base, learned from all flights.
+    title : str
+        Of the residual field, or :data:`OFF`.
+    model : FieldModel
+    channels : mapping of str to Channel
+        By antenna (``tower.channel``).
+    flights : tuple of str
+        Their places are the codes of :class:`Rows`.
+    crps_db : mapping of (base, title) to float
+        Of what was left out.
+    rmse_db : mapping of (base, title) to float
+    held_out : mapping of (base, title) to ((n,), (n,))
+        Errors on what was left out, in one order for all, and the standard deviations stated for them; NaN: no error.
+    sd_factor : float
+        On all standard deviations: makes the errors of what was left out as large as stated. Each candidate of
+        ``held_out`` has its own.
+    """
+
+    base: str
+    predictor: Predictor
+    title: str
+    model: FieldModel
+    channels: Mapping[str, Channel]
+    flights: tuple[str, ...]
+    crps_db: Mapping[tuple[str, str], float]
+    rmse_db: Mapping[tuple[str, str], float]
+    held_out: Mapping[tuple[str, str], _HeldOut] = field(default_factory=dict)
+    sd_factor: float = 1.0
+    fits: dict[str, FieldFit] = field(default_factory=dict, repr=False, compare=False)
+    """Solved fields by antenna."""
+
+    @property
+    def on(self) -> bool:
+        """True if a residual field is added."""
+        return self.title != OFF
+
+    def predict(
+        self, samples: LinkSamples, flight: str | None = None, *, own_mean: bool = False
+    ) -> tuple[FloatArray, FloatArray]:
+        """Level above free space (n,) and its standard deviation (n,) as a mean over :data:`BIN_S` [dB].
+
+        The standard deviation holds base, field, drift and noise, and the offset between flights unless the samples
+        count about their ``own_mean``.
+        """
+        return self.over_headings([samples], flight, own_mean=own_mean)
+
+    def over_headings(
+        self, each: Sequence[LinkSamples], flight: str | None = None, *, own_mean: bool = False, all_targets: int = 0
+    ) -> tuple[FloatArray, FloatArray]:
+        """As :meth:`predict`, of an aircraft whose heading is not known: each of some counts alike.
+
+        Parameters
+        ----------
+        each : sequence of LinkSamples
+            The same samples, as seen with each heading.
+        flight : str, optional
+        own_mean : bool
+        all_targets : int
+            Targets of the whole run, where these are a part: all parts are then solved alike.
+
+        Returns
+        -------
+        level_db, sd_db : (n,)
+            What a field of directions says of the heading counts as not known.
+        """
+        samples = each[0]
+        channel = self.channels.get(samples.antenna)
+        if channel is None:
+            raise InputError(f"no flight has {samples.antenna}", expected="one of " + ", ".join(self.channels))
+        gains, gain_sds = (np.stack(part) for part in zip(*map(self.predictor, each), strict=True))
+        targets = Rows.of(samples, self.flights.index(flight) if flight in self.flights else NEW_FLIGHT)
+        if len(each) > 1:
+            targets = dataclasses.replace(targets, direction=np.stack([s.at_uav for s in each], axis=1))
+        if not self.on and flight not in self.flights and len(targets):
+            # without a field one target with a position stands for all
+            targets = targets.part(np.array([np.isfinite(targets.position_m).all(axis=1).argmax()]))
+        # solved once for each antenna: maps ask tile by tile
+        fit = self.fits.setdefault(samples.antenna, FieldFit(self.model, channel.rows, channel.left_db))
+        exact = fit.fits(max(len(targets), all_targets))
+        mean, sd = fit.predict(targets, exact=exact)
+        if own_mean:
+            # about its own mean a flight's offset is no error
+            _, sd = fit.predict(targets, ("place", "drift"), exact=exact)
+        variance = sd**2 + (gain_sds**2).mean(axis=0) + gains.var(axis=0) + self.model.noise_sd_db**2
+        return gains.mean(axis=0) + mean, self.sd_factor * np.sqrt(variance)
+
+
+def between_blocks_db(channel: Channel) -> float:
+    """Standard deviation of what a base leaves, between blocks of :data:`BLOCK_M` [dB]; 0 for a single block."""
+    cell = np.floor(channel.rows.position_m[:, :2] / BLOCK_M).astype(np.int64)
+    member = np.unique(cell, axis=0, return_inverse=True)[1].ravel()
+    # equal blocks: a hover counts no more than a pass
+    means = np.bincount(member, weights=channel.left_db) / np.bincount(member)
+    return float(np.std(means, ddof=1)) if len(means) > 1 else 0.0
+
+
+def _channels(series: Sequence[LinkSamples], predictor: Predictor, flights: Sequence[str]) -> dict[str, Channel]:
+    """Residuals of a base, by antenna."""
+    parts: dict[str, list[Channel]] = {}
+    for samples in series:
+        binned = samples.binned(BIN_S)
+        gain, sd = predictor(binned)
+        finite = np.isfinite(gain)
+        channel = Channel(
+            rows=Rows.of(binned, flights.index(samples.flight)).part(finite),
+            left_db=(binned.residual_db - gain)[finite],
+            base_sd_db=sd[finite],
+        )
+        if finite.any():
+            parts.setdefault(samples.antenna, []).append(channel)
+    return {
+        antenna: Channel(
+            rows=Rows.joined([p.rows for p in each]),
+            left_db=np.concatenate([p.left_db for p in each]),
+            base_sd_db=np.concatenate([p.base_sd_db for p in each]),
+        )
+        for antenna, each in parts.items()
+    }
+
+
+def _model(title: str, channels: Mapping[str, Channel]) -> FieldModel:
+    known = [(c.rows, c.left_db) for c in channels.values()]
+    start = _STARTS[title]
+    return fit_field(known) if start is None else fit_field(known, start, _NUISANCE)
+
+
+@dataclass(frozen=True, slots=True)
+class _Fold:
+    """Samples of one part that is left out, and those that it is predicted from."""
+
+    known: list[LinkSamples]
+    left_out: list[LinkSamples]
+
+
+def _folds(series: Sequence[LinkSamples]) -> list[_Fold]:
+    """Each flight left out (or three of six groups); of a single flight, blocks of :data:`BLOCK_M`."""
+    names = list(dict.fromkeys(s.flight for s in series))
+    if len(names) > 1:
+        return [
+            _Fold([s for s in series if s.flight not in group], [s for s in series if s.flight in group])
+            for group in groups_of(names)[: None if len(names) <= MOST_GROUPS else _SCORED_GROUPS]
+        ]
+    cells = [np.floor(s.position_m[:, :2] / BLOCK_M).astype(np.int64) for s in series]
+    every, count = np.unique(np.concatenate(cells), axis=0, return_counts=True)
+    out = []
+    for cell in every[np.argsort(-count)[:6]]:
+        inside: list[IntArray] = [np.flatnonzero((c == cell).all(axis=1)) for c in cells]
+        outside = [np.setdiff1d(np.arange(len(s)), rows) for s, rows in zip(series, inside, strict=True)]
+        out.append(_Fold([s.part(r) for s, r in zip(series, outside, strict=True) if len(r)],
+                         [s.part(r) for s, r in zip(series, inside, strict=True) if len(r)]))  # fmt: skip
+    return out
+
+
+def _score_fold(
+    fold: _Fold, base: Base, models: dict[str, FieldModel | None], tallies: Mapping[str, list[_HeldOut]], *, keep: bool
+) -> None:
+    """Add the errors of every residual field of a base; new flights count about their own mean.
+
+    Parameters
+    ----------
+    fold : _Fold
+    base : callable
+    models : dict of str to FieldModel or None
+        By title; None: its strengths are learned here.
+    tallies : mapping of str to list
+        Receives the errors.
+    keep : bool
+        Put what is learned into ``models``.
+
+    Returns
+    -------
+    None
+    """
+    flights = list(dict.fromkeys(s.flight for s in fold.known))
+    predictor = base(fold.known)
+    channels = _channels(fold.known, predictor, flights)
+    targets = [s for s in fold.left_out if np.isfinite(s.residual_db).any()]
+    new_flight = bool(targets) and targets[0].flight not in flights
+    binned = [s.binned(BIN_S) for s in targets]
+    known = [predictor(s) if s.antenna in channels else None for s in binned]
+    for title, known_model in models.items():
+        model = known_model or _model(title, channels)
+        if keep:
+            models[title] = model
+        parts: tuple[Part, ...] = ("place", "drift") if new_flight else PARTS
+        for samples, gains in zip(binned, known, strict=True):
+            if gains is None:
+                tallies[title].append((np.full(len(samples), np.nan), np.ones(len(samples))))
+                continue
+            channel, (gain, gain_sd) = channels[samples.antenna], gains
+            code = NEW_FLIGHT if new_flight else flights.index(samples.flight)
+            mean, sd = FieldFit(model, channel.rows, channel.left_db).predict(Rows.of(samples, code), parts)
+            error = samples.residual_db - gain - mean
+            if new_flight and np.isfinite(error).any():
+                error = error - np.nanmean(error)
+            tallies[title].append((error, np.sqrt(sd**2 + gain_sd**2 + model.noise_sd_db**2)))
+
+
+# Titles of residual fields without free lengths, which remember places.
+STATED_FIELDS = tuple(title for title, start in _STARTS.items() if start is not None)
+
+
+def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Sequence[str] = ()) -> Correction:
+    """The base and the residual field with the lowest CRPS on what is left out, learned from all that is known.
+
+    Parameters
+    ----------
+    series : sequence of LinkSamples
+        Measured minus free space of every flight, tower and channel that is known.
+    bases : mapping of str to callable
+        In order of preference where scores are equal.
+    titles : sequence of str
+        Of the residual fields that are tried, :data:`OFF` among them; all by default.
+
+    Returns
+    -------
+    Correction
+
+    Raises
+    ------
+    InputError
+        No sample has a level and a pose.
+    """
+    series = [s for s in series if np.isfinite(s.residual_db).any()]
+    if not series:
+        raise InputError("no sample has a level and a pose", expected="RSS with positions")
+    folds, titles = _folds(series), titles or tuple(_STARTS)
+    tallies: dict[tuple[str, str], list[_HeldOut]] = {(base, title): [] for base in bases for title in titles}
+    for name, base in bases.items():
+        models: dict[str, FieldModel | None] = dict.fromkeys(titles)
+        for fold in folds:
+            if fold.known and fold.left_out:
+                many = len({s.flight for s in series}) > MOST_GROUPS
+                _score_fold(fold, base, models, {t: tallies[name, t] for t in titles}, keep=many)
+    joined = {key: _joined(parts) for key, parts in tallies.items() if parts}
+    # scaled before they are scored: CRPS then compares errors, not how badly spreads are stated
+    factors = {key: _sd_factor(*errors) for key, errors in joined.items()}
+    held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
+    crps = dict.fromkeys(tallies, math.inf) | {key: _mean(crps_normal(*errors)) for key, errors in held_out.items()}
+    sure = [key for key in held_out if key[1] == OFF or mean_interval(crps_difference(held_out, key))[1] < 0.0]
+    # to a thousandth of a decibel, then in the order in which they are preferred
+    best = min(sure or crps, key=lambda key: (round(crps[key], 3), list(tallies).index(key)))
+    flights = tuple(dict.fromkeys(s.flight for s in series))
+    predictor = bases[best[0]](series)
+    channels = _channels(series, predictor, flights)
+    return Correction(
+        base=best[0],
+        predictor=predictor,
+        title=best[1],
+        model=_model(best[1], channels),
+        channels=channels,
+        flights=flights,
+        crps_db=crps,
+        rmse_db=dict.fromkeys(tallies, math.nan)
+        | {key: math.sqrt(_mean(np.square(error))) for key, (error, _) in held_out.items()},
+        held_out=held_out,
+        sd_factor=factors.get(best, 1.0),
+    )
+
+
+def crps_difference(held_out: Mapping[tuple[str, str], _HeldOut], key: tuple[str, str]) -> FloatArray:
+    """CRPS of a base with a residual field minus that of the base alone, where both have an error [dB]."""
+    difference = crps_normal(*held_out[key]) - crps_normal(*held_out[key[0], OFF])
+    return np.asarray(difference[np.isfinite(difference)])
+
+
+def _sd_factor(error: FloatArray, sd: FloatArray) -> float:
+    """Ratio of seen to stated errors, between 0.8 and 1.6; 1 without an error."""
+    ratio = _mean(np.square(error / sd))
+    return min(max(math.sqrt(ratio), 0.8), 1.6) if math.isfinite(ratio) else 1.0
+
+
+def _joined(parts: Sequence[_HeldOut]) -> _HeldOut:
+    error, sd = (np.concatenate(columns) for columns in zip(*parts, strict=True))
+    return error, sd
+
+
+def _mean(values: FloatArray) -> float:
+    """Mean of the finite values; infinite without any."""
+    good = values[np.isfinite(values)]
+    return float(good.mean()) if len(good) else math.inf
+
+
+def fixed_base(gain: Callable[[LinkSamples], FloatArray]) -> Base:
+    """A base that learns nothing: its level above free space is known to it."""
+
+    def learn(_: Sequence[LinkSamples]) -> Predictor:
+        return lambda samples: (gain(samples), np.zeros(len(samples)))
+
+    return learn
+
+
+# Of more samples at a time, a model of directions is evaluated once per degree of direction.
+MOST_DIRECTIONS = 5_000
+
+
+def by_degree(predictor: Predictor) -> Predictor:
+    """A model of directions that takes many samples a degree at a time (gains have lengths of 11 degrees and more).
+
+    What a degree has is kept: later parts of a run, and other headings, ask for much the same directions.
+    """
+    known: dict[str, tuple[IntArray, FloatArray]] = {}
+
+    def predict(samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        if len(samples) <= MOST_DIRECTIONS:
+            return predictor(samples)
+        cells = np.zeros(len(samples), dtype=np.int64)
+        for ray in (samples.at_tower, samples.at_uav):
+            for angle in (azimuth_rad(ray), elevation_rad(ray)):
+                # one integer for both directions, to a degree
+                cells = 361 * cells + np.round(np.degrees(angle)).astype(np.int64) + 180
+        degrees, first, member = np.unique(cells, return_index=True, return_inverse=True)
+        keys, values = known.get(samples.antenna, (np.zeros(0, dtype=np.int64), np.zeros((2, 0))))
+        new = ~np.isin(degrees, keys)
+        if new.any():
+            keys, values = np.append(keys, degrees[new]), np.hstack([values, predictor(samples.part(first[new]))])
+            order = np.argsort(keys)
+            keys, values = known[samples.antenna] = keys[order], values[:, order]
+        gain, sd = values[:, np.searchsorted(keys, degrees)[member.ravel()]]
+        return gain, sd
+
+    return predict

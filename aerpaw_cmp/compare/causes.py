@@ -1,0 +1,1003 @@
+"""Likely cause of a level error: the one trouble of a log, its settings or its site that explains it, by likelihood.
+
+Each trouble changes the predicted level in its own way: by decibels that are known, by columns with free coefficients,
+or by samples that the receiver clipped, whose level is their own mean and which fade less. The offset is fitted beside
+it, and the residual counts as noise of two memories: slow fading is no trouble. Explanations are single troubles
+and two at a time, the second judged by what the first leaves. Each has the marginal likelihood that it gains over all
+channels: coefficients, angles, heights, places and instants are averaged over what they may be, so that a form with
+many free numbers pays for them. A trouble is named where the explanations with it are so much likelier than all without
+it, and where some of the RMSE goes with it. The paired test of two models would ask for a flight much longer than a
+trouble lasts: a trouble of a minute has one sign in each of few stretches.
+
+A new trouble is a function that yields its :class:`Trial`, and an entry of :data:`CANDIDATES`.
+
+References: MacKay, Neural Computation 4 (1992) 415, doi 10.1162/neco.1992.4.3.415, on marginal likelihoods; Granger and
+Morris, J. R. Stat. Soc. A 139 (1976) 246, doi 10.2307/2345178, on sums of autoregressive sequences.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+from functools import cache
+from itertools import combinations, combinations_with_replacement
+from typing import Protocol
+
+import numpy as np
+
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, Printed
+from .statistics import Interval
+
+# Samples are averaged over so long [s], over longer where a flight has more than so many seconds.
+BIN_S, _MOST_BINS = 1.0, 2000
+# And as long as the UAV stays so near [m] and turns no further [deg]: fading that stands still is one number, not many.
+# A slow orbit of 1.5 m/s loses no second.
+_NEAR_M, _NEAR_DEG = 1.0, 5.0
+_FEWEST_BINS, _ENOUGH_BINS = 24, 100
+# A trouble is in one flight of ten; named where the odds for it are five to one.
+_SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
+# Of sentence and next step of a cause: a page begins with sixty in all.
+MOST_CAUSE_WORDS = 28
+# A trouble that takes less than this share off the RMSE is no cause of the error, unless it gains so much a channel:
+# a floor where the flight fades leaves the error of all that is above it.
+_LEAST_SHARE, _CERTAIN = 0.1, 30.0
+# The sentence states the error without a cause and with it: they must differ in print, however certain the cause.
+_SHOWN_DB = 0.1
+# Learned antennas miss some decibels of each flight by themselves: less is no trouble of this one.
+_OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
+# Half of the 95 % point of chi-squared with one degree of freedom.
+_NEAR = 1.92
+_EPOCH = np.datetime64(0, "s")
+_Estimate = tuple[float, float, float]
+_NOTHING: _Estimate = (math.nan, math.nan, math.nan)
+
+
+class JudgedClock(Protocol):
+    """The radio clock as :class:`~..result.ClockResult` has it."""
+
+    @property
+    def radio_minus_telemetry_s(self) -> float:
+        """Lag [s]; positive: the radio shows later times."""
+
+    @property
+    def ci95_s(self) -> Interval:
+        """Interval of the lag [s]."""
+
+    @property
+    def shifted(self) -> bool:
+        """True of a clock that is wrong and was not corrected."""
+
+    @property
+    def in_words(self) -> str:
+        """The lag with its interval."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelEvidence:
+    """Evidence from which a cause is told: one channel of a flight.
+
+    Parameters
+    ----------
+    time_s : (n,)
+        In order.
+    measured_db, predicted_db : (n,)
+        Before any offset; NaN where there is none.
+    place_m : (n, 3)
+        Of the UAV.
+    uav_azimuth_deg, uav_elevation_deg : (n,)
+        Direction of the tower in the frame of the UAV's antenna.
+    tower_azimuth_deg : (n,)
+        Direction of the UAV seen from the tower, clockwise from north.
+    name, unit : str
+        Of the channel, and of its measured level.
+    start : datetime64
+        Instant at which ``time_s`` is 0.
+    antenna : {"isotropic", "measured", "learned"}
+        Of the UAV.
+    turned_db, raised_db : mapping of float to (n,)
+        Change of the predicted level where the heading is greater by so many degrees, and where the UAV flies higher by
+        so many metres; ``turned_db`` is empty for antennas without a pattern.
+    attitude_db : mapping of str to (n,)
+        Change of the predicted level with other values of ``rt.attitude``.
+    misread_db : mapping of str to (n,)
+        Change of the predicted level where the telemetry means something else, by that in words.
+    other_towers_db : mapping of str to (n,)
+        Predicted level of each other tower of the site.
+    locked, serving : (n,), optional
+        1 in lock or served by this cell, 0 not, NaN unknown, where the log says so.
+    clock : JudgedClock, optional
+        The radio clock as it was judged.
+    """
+
+    time_s: FloatArray
+    measured_db: FloatArray
+    predicted_db: FloatArray
+    place_m: FloatArray
+    uav_azimuth_deg: FloatArray
+    uav_elevation_deg: FloatArray
+    tower_azimuth_deg: FloatArray
+    name: str = ""
+    unit: str = "dBm"
+    start: np.datetime64 = _EPOCH
+    antenna: str = "measured"
+    turned_db: Mapping[float, FloatArray] = field(default_factory=dict)
+    raised_db: Mapping[float, FloatArray] = field(default_factory=dict)
+    attitude_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    misread_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    other_towers_db: Mapping[str, FloatArray] = field(default_factory=dict)
+    locked: FloatArray | None = None
+    serving: FloatArray | None = None
+    clock: JudgedClock | None = None
+    floored: bool = False
+    """True where the settings leave out what lies at the floor: of the lowest links those that fade upwards remain."""
+    least: BoolArray | None = None
+    """Samples at the least level of the log, where it has that again and again, exactly or within its noise."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cause:
+    """A named cause.
+
+    Parameters
+    ----------
+    name : str
+    sentence : str
+        Where it is, with its numbers, and the error with and without it.
+    next_step : str
+        A clause.
+    estimate, ci95 : float, (low, high)
+        Its number (lag [s], angle [deg], height [m], loss, floor or step [dB]; NaN else) and the interval of that.
+    channels : sequence of str
+        That show it.
+    rmse_db, rmse_with_db : float
+        Of these channels without and with it, as means over a second [dB].
+    gain : float
+        Log odds of the explanations with it to all without it.
+    """
+
+    name: str
+    sentence: str
+    next_step: str
+    estimate: float = math.nan
+    ci95: Interval = (math.nan, math.nan)
+    channels: tuple[str, ...] = ()
+    rmse_db: float = math.nan
+    rmse_with_db: float = math.nan
+    gain: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """A trouble with its numbers: what it changes, what choosing them costs, and what is said of it.
+
+    ``change_db`` (n,) is added to the predicted level; ``columns`` (n, k) have free coefficients, unit normals before
+    the flight; ``clipped`` (n,) are samples whose level is not that of the link; ``fading`` (n,) is the share of the
+    link's fading that is shown. ``cost`` is the log likelihood that goes where the numbers are averaged over all that
+    they may be.
+    """
+
+    name: str
+    cost: float
+    sentence: str
+    next_step: str
+    change_db: FloatArray | None = None
+    columns: FloatArray | None = None
+    clipped: BoolArray | None = None
+    fading: FloatArray | None = None
+    estimate: _Estimate = _NOTHING
+
+
+@dataclass(frozen=True, slots=True)
+class _Memories:
+    """Noise of two memories: of :data:`_SLOW`, :data:`_FAST` and :data:`_SLOW_SHARE` the numbers of a row each."""
+
+    slow: int
+    fast: int
+    share: int
+
+    @property
+    def near(self) -> list[_Memories]:
+        """Itself, and the neighbours of each of its numbers."""
+        places, sizes = (self.slow, self.fast, self.share), (len(_SLOW), len(_FAST), len(_SLOW_SHARE))
+        steps = [(0, 0), *((i, step) for i in range(3) for step in (-1, 1))]
+        moved = [tuple(p + step * (k == i) for k, p in enumerate(places)) for i, step in steps]
+        return [_Memories(*m) for m in moved if all(0 <= p < size for p, size in zip(m, sizes, strict=True))]
+
+    @property
+    def log_prior(self) -> float:
+        """Log normal in the slow memory, where that is longer than usual: else fading of minutes hides any trouble."""
+        times = -1.0 / math.log(_SLOW[self.slow]) / _FADES_S
+        return -0.5 * (math.log(max(times, 1.0)) / _FADES_FACTOR) ** 2 if _SLOW_SHARE[self.share] else 0.0
+
+
+_SLOW = (0.8, 0.87, 0.92, 0.95, 0.97, 0.985, 0.995)
+_FAST = (0.0, 0.3, 0.5, 0.7, 0.8)
+_SLOW_SHARE = (0.0, 0.1, 0.2, 0.35, 0.5, 0.65, 0.8, 1.0)
+# Shadows of open land are alike over some 37 m (3GPP TR 38.901, table 7.5-6), which 5 m/s fly in 7 s; three times as
+# long is one standard deviation.
+_FADES_S, _FADES_FACTOR = 7.0, math.log(3.0)
+_START = _Memories(4, 2, 3)
+# Where climbs may begin: in the middle, and without any memory.
+_STARTS = (_START, _Memories(0, 0, 0))
+
+
+@dataclass(frozen=True, slots=True)
+class _Fit:
+    """Log likelihood and residual of a prediction with its best offset, and the noise under which it is so."""
+
+    log_likelihood: float
+    residual_db: FloatArray
+    memories: _Memories
+
+
+@dataclass(frozen=True, slots=True)
+class _Model:
+    """Some troubles on one channel: the log likelihood that they gain together beyond their cost."""
+
+    evidence: LevelEvidence
+    trials: tuple[Trial, ...]
+    residual_db: FloatArray
+    gain: float
+    memories: _Memories
+
+
+_Models = Mapping[frozenset[str], _Model]
+_SOUND: frozenset[str] = frozenset()
+
+
+def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
+    """The trouble that explains the error of a flight; None where none is identified.
+
+    Parameters
+    ----------
+    channels : sequence of LevelEvidence
+
+    Returns
+    -------
+    Cause or None
+    """
+    tables = [_models(binned) for evidence in channels if (binned := _binned(evidence)) is not None]
+    names = sorted({name for table in tables for names in table for name in names})
+    odds: dict[frozenset[str], float] = {}
+    for some in (_SOUND, *({name} for name in names), *map(set, combinations(names, 2))):
+        models = [_best(table, some) for table in tables]
+        used = frozenset().union(*map(_names, models))
+        odds[used] = sum(model.gain for model in models) - _SELDOM * len(used)
+    best, lead = max(odds, key=lambda some: odds[some]), {}
+    for name in best:
+        with_it, without = ([odds[some] for some in odds if (name in some) == side] for side in (True, False))
+        lead[name] = float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without))
+    least, named = _MARGIN + math.log(max(len(channels), 1)), {}
+    for name in (trouble for trouble in best - {_UNNAMED} if lead[trouble] >= least):
+        shown = [table for table in tables if name in _names(_best(table, best))]
+        # the clearest channel gives the words
+        shown.sort(key=lambda table: -_best(table, {name}).gain)
+        # also alone it must bring levels and prediction together, not only their changes from second to second
+        alone = _share_of_error(shown, _SOUND, {name})
+        share = min(alone, _share_of_error(shown, best - {name}, best))
+        certain, least_share = lead[name] >= _CERTAIN * len(channels), _LEAST_SHARE
+        if name in _OF_ANTENNA and any(table[_SOUND].evidence.antenna == "learned" for table in shown):
+            certain, least_share = False, _LEARNED_SHARE
+        fall_db = (1.0 - alone) * _rmse_db([table[_SOUND] for table in shown])
+        alone_models = [table[frozenset([name])] for table in shown]
+        # a log of noise alone likes another antenna better, too: it must leave less than a constant level does
+        if name == _CATCH_ALL and any(m.residual_db.std() >= m.evidence.measured_db.std() for m in alone_models):
+            continue
+        # a floor that the settings leave out explains why the low links that are left look too strong, and is known
+        known = name == "floor" and shown[0][_SOUND].evidence.floored
+        if not known and fall_db >= _SHOWN_DB and (share <= 1.0 - least_share or certain):
+            named[name] = shown
+    if not named:
+        return None
+    # a gain over directions takes the place of much else: it is named where nothing else can be
+    name = min(named, key=lambda name: (name == _CATCH_ALL, -sum(_best(table, {name}).gain for table in tables)))
+    return _named(name, named[name], lead[name])
+
+
+def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
+    """Check that a gain over directions, which antennas learn, takes off a channel an error that a page shows."""
+    for evidence in filter(None, map(_binned, channels)):
+        sound, (antenna,) = _fitted(evidence), _pattern(evidence)
+        learned = _fitted(evidence, antenna, at=sound.memories)
+        left_db = float(learned.residual_db.std())
+        fall_db = min(float(sound.residual_db.std()), float(evidence.measured_db.std())) - left_db
+        if learned.log_likelihood > sound.log_likelihood + _SELDOM and fall_db >= _SHOWN_DB:
+            return True
+    return False
+
+
+def _names(model: _Model) -> frozenset[str]:
+    return frozenset(trial.name for trial in model.trials)
+
+
+def _best(table: _Models, troubles: Set[str]) -> _Model:
+    """The best model of a channel by some troubles or fewer."""
+    return max((model for names, model in table.items() if names <= troubles), key=lambda model: model.gain)
+
+
+# Troubles of a channel that are tried two at a time, and of those the ones without which all are looked for again.
+_MOST_TRIED, _MOST_FIRST = 6, 2
+
+
+def _models(e: LevelEvidence) -> _Models:
+    """The likeliest numbers of each trouble, and each two of the best of them: the second judged without the first."""
+    sound = _fitted(e)
+
+    def model(*trials: Trial, at: _Memories = sound.memories, climb: bool = True) -> _Model:
+        fit = _fitted(e, *trials, at=at, climb=climb)
+        cost = sum(trial.cost for trial in trials)
+        gain = fit.log_likelihood - sound.log_likelihood - cost
+        return _Model(e, trials, fit.residual_db, gain, fit.memories)
+
+    def best_of(sets: Iterable[tuple[Trial, ...]], at: _Memories) -> list[_Model]:
+        """The likeliest of each set of names under some noise, the best of them under their own."""
+        best: dict[frozenset[str], _Model] = {}
+        for trials in sets:
+            tried = model(*trials, at=at, climb=False)
+            names = _names(tried)
+            if len(names) == len(trials) and (names not in best or tried.gain > best[names].gain):
+                best[names] = tried
+        likely = sorted(best.values(), key=lambda m: -m.gain)[:_MOST_TRIED]
+        return [model(*m.trials, at=at) for m in likely]
+
+    alone = best_of(((trial,) for trial in _candidates(e)), sound.memories)
+    # the best first: pairs are made of it with each other
+    alone.sort(key=lambda m: -m.gain)
+    models, likely = [model(climb=False), *alone], [m for m in alone[:_MOST_FIRST] if m.gain > 0.0]
+    pairs = [pair for pair in combinations(alone, 2) if pair[0].gain > 0.0]
+    models += [model(first.trials[0], second.trials[0], at=first.memories) for first, second in pairs]
+    for first in likely:
+        rest = _without(e, first)
+        further = best_of(((first.trials[0], second) for second in _candidates(rest)), first.memories)
+        models += [*further, *(model(m.trials[1], climb=False) for m in further)]
+    return {_names(m): m for m in sorted(models, key=lambda m: m.gain)}
+
+
+def _candidates(e: LevelEvidence) -> Iterator[Trial]:
+    return (trial for candidate in CANDIDATES for trial in candidate(e))
+
+
+def _without(e: LevelEvidence, first: _Model) -> LevelEvidence:
+    """Evidence whose prediction knows a trouble already."""
+    predicted = e.measured_db - first.residual_db
+    moved = predicted - e.predicted_db
+    others = {name: level + moved for name, level in e.other_towers_db.items()}
+    return dataclasses.replace(e, predicted_db=predicted, other_towers_db=others)
+
+
+def _share_of_error(shown: Sequence[_Models], before: Set[str], after: Set[str]) -> float:
+    """RMSE with further troubles over that before."""
+    rmse, known = (_rmse_db([_best(table, troubles) for table in shown]) for troubles in (after, before))
+    return rmse / known if known else 1.0
+
+
+def _rmse_db(models: Sequence[_Model]) -> float:
+    return float(np.concatenate([model.residual_db - model.residual_db.mean() for model in models]).std())
+
+
+def _named(name: str, shown: Sequence[_Models], gain: float) -> Cause:
+    """The trouble in words, those of the channel that shows it best."""
+    trial = shown[0][frozenset([name])].trials[0]
+    # a channel with other numbers, such as those of another clock, would belie the sentence
+    shown = [table for table in shown if table[frozenset([name])].trials[0].sentence == trial.sentence]
+    alone = [table[frozenset([name])] for table in shown]
+    rmse, rmse_with = _rmse_db([table[_SOUND] for table in shown]), _rmse_db(alone)
+    channels = tuple(model.evidence.name for model in alone)
+    where = channels[0] if len(channels) == 1 else f"{len(channels)} channels"
+    value, low, high = trial.estimate
+    return Cause(
+        name=name,
+        sentence=f"Likely cause at {where}: {trial.sentence}; "
+        f"1-s RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
+        next_step=trial.next_step,
+        estimate=value,
+        ci95=(low, high),
+        channels=channels,
+        rmse_db=rmse,
+        rmse_with_db=rmse_with,
+        gain=gain,
+    )
+
+
+_ANGLES = ("uav_azimuth_deg", "tower_azimuth_deg")
+
+
+def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
+    """Means over :data:`BIN_S`, and over hovers, of the samples with both levels; None where they are too few."""
+    finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
+    if not finite.any():
+        return None
+    time, level = evidence.time_s[finite], evidence.measured_db[finite]
+    width = max(min(BIN_S, float(np.ptp(time)) / _ENOUGH_BINS), float(np.ptp(time)) / _MOST_BINS, 1e-3)
+    _, place = np.unique(np.floor(time / width), return_inverse=True)
+    place = _standing(evidence, finite, place)[place]
+    count = np.bincount(place).astype(np.float64)
+    if len(count) < _FEWEST_BINS:
+        return None
+
+    def mean(values: FloatArray) -> FloatArray:
+        return _mean(values[finite], place, count)
+
+    def binned(name: str, value: object) -> object:
+        if isinstance(value, Mapping):
+            return {key: mean(column) for key, column in value.items()}
+        if not isinstance(value, np.ndarray):
+            return value
+        if name not in _ANGLES:
+            # what the log does not say counts as in lock and served: a gap is no trouble
+            return mean(np.nan_to_num(value, nan=1.0) if name in ("locked", "serving") else value)
+        # the mean of 359 and 1 degrees is 0
+        turn = np.exp(1j * np.radians(value))
+        return np.degrees(np.angle(mean(turn.real) + 1j * mean(turn.imag)))
+
+    changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
+    at = level == level.min()
+    often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level))
+    changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
+    return LevelEvidence(**changed)  # type: ignore[arg-type]
+
+
+def _mean(values: FloatArray, place: IntArray, count: AnyArray) -> FloatArray:
+    """Means of values (n,) or (n, k) over the samples of each place, of which there are ``count``."""
+    if values.ndim == 1:
+        return np.asarray(np.bincount(place, values) / count)
+    return np.column_stack([_mean(column, place, count) for column in values.T])
+
+
+def _standing(e: LevelEvidence, finite: BoolArray, second: IntArray) -> IntArray:
+    """Number of the place of each second: seconds at which the UAV neither moves nor turns are one."""
+    azimuth, elevation = np.radians(e.uav_azimuth_deg[finite]), np.radians(e.uav_elevation_deg[finite])
+    flat = np.cos(elevation)
+    towards = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+    count = np.bincount(second)
+    at, towards = _mean(e.place_m[finite], second, count), _mean(towards, second, count)
+    number, begin = np.zeros(len(at), dtype=np.int64), 0
+    for i in range(1, len(at)):
+        turned = np.linalg.norm(towards[i] - towards[begin]) > np.radians(_NEAR_DEG)
+        moved = turned or np.linalg.norm(at[i] - at[begin]) > _NEAR_M
+        begin = i if moved else begin
+        number[i] = number[i - 1] + moved
+    return number
+
+
+# A receiver that clips writes one level in so many samples, and in so large a share of them.
+_AT_END, _SHARE_AT_END = 10, 0.01
+
+
+def _undetected(level_db: FloatArray) -> BoolArray | None:
+    """Samples (n,) about the densest level and below it, where links are lost into that at once: a detector's noise.
+
+    None where the level fades into it, as it does near a floor and where a UAV hovers.
+    """
+    ordered, step = np.sort(level_db), np.abs(np.diff(level_db))
+    within = np.searchsorted(ordered, ordered + 2.0 * _PILE_DB, "right") - np.arange(len(ordered))
+    low = ordered[within.argmax()]
+    under = level_db < low + 3.0 * _PILE_DB
+    dense = under & (level_db >= low)
+    inside, outside, between = dense[1:] & dense[:-1], ~(under[1:] | under[:-1]), under[1:] != under[:-1]
+    if inside.sum() < _LEAST_PILE * len(level_db) or min(outside.sum(), between.sum()) < _LEAST_BINS:
+        return None
+    fading_db = float(np.median(step[outside]))
+    at_once = np.median(step[between]) > _LOST * fading_db
+    return under if at_once and np.median(step[inside]) < _MOST_FADING * fading_db else None
+
+
+# A link is lost by so many times the steps that it fades by: 9 on a receiver with a noisy least level, elsewhere 3.
+_LOST = 5.0
+
+
+def _fitted(e: LevelEvidence, *trials: Trial, at: _Memories = _START, climb: bool = True) -> _Fit:
+    """Offset and coefficients with some troubles, under noise of the given memories, or the likeliest near them."""
+    target = e.measured_db - e.predicted_db
+    clipped = np.zeros(len(target), dtype=np.bool_)
+    columns, shown = [], np.ones(len(target))
+    for trial in trials:
+        target = target if trial.change_db is None else target - trial.change_db
+        clipped = clipped if trial.clipped is None else clipped | trial.clipped
+        columns += [] if trial.columns is None else [trial.columns]
+        shown = shown if trial.fading is None else shown * trial.fading
+    design = np.column_stack([np.full(len(target), _OFFSET_DB), *columns])
+    if clipped.all():
+        return _Fit(-math.inf, target - target.mean(), _START)
+    link = ~clipped
+    scale = shown[link]
+    fit = _remembering(target[link] / scale, design[link] / scale[:, None], at, climb)
+    likelihood, residual = fit.log_likelihood - float(np.log(scale).sum()), np.zeros(len(target))
+    residual[link] = fit.residual_db * scale
+    if clipped.any():  # what a receiver writes beyond its limit remembers nothing of the link
+        residual[clipped] = e.measured_db[clipped] - e.measured_db[clipped].mean()
+        # their mean and spread are two numbers (Schwarz)
+        spread = max(float(residual[clipped].std()), _LEAST_SPREAD_DB)
+        likelihood -= float(clipped.sum()) * (math.log(spread) + 0.5) + math.log(float(clipped.sum()))
+    return _Fit(likelihood, residual, fit.memories)
+
+
+_LEAST_SPREAD_DB = 0.2
+# Standard deviation of the offset of a log that nobody knows [dB].
+_OFFSET_DB = 100.0
+
+
+@cache
+def _whitening(memories: _Memories) -> tuple[tuple[float, float, float], float, float]:
+    """Coefficients of the filter, ahead (3,) and back, and the innovation's share of the standard deviation.
+
+    The sum of two first-order autoregressive sequences is an ARMA(2, 1) sequence (Granger and Morris).
+    """
+    slow, fast, share = _SLOW[memories.slow], _FAST[memories.fast], _SLOW_SHARE[memories.share]
+    shocks = share * (1.0 - slow**2), (1.0 - share) * (1.0 - fast**2)
+    power = shocks[0] * (1.0 + fast**2) + shocks[1] * (1.0 + slow**2)
+    neighbour = shocks[0] * fast + shocks[1] * slow
+    half = 0.5 * power / neighbour if neighbour > 1e-12 else math.inf
+    theta = half - math.sqrt(half**2 - 1.0) if math.isfinite(half) else 0.0
+    innovation = neighbour / theta if theta else power
+    return (1.0, -slow - fast, slow * fast), theta, math.sqrt(innovation)
+
+
+def _remembering(residual: FloatArray, design: FloatArray, at: _Memories, climb: bool) -> _Fit:
+    """Fit under noise of two memories: the given ones, or those climbed to from there or a start.
+
+    Coefficients of the design are unit normals: the likelihood is integrated over them, the residual is about their
+    means. The noise has its likeliest size; its memories have a prior.
+    """
+    from scipy.linalg.lapack import dtbtrs  # scipy.signal would load for 0.4 s
+
+    n, columns = len(residual), np.column_stack([residual, design])
+    # as if it had always been what it is at first; a column after the other, as LAPACK solves them
+    before = np.asfortranarray(columns[[0, 0, *range(n)]])
+
+    def fit(memories: _Memories) -> tuple[float, FloatArray]:
+        ahead, back, root = _whitening(memories)
+        moved = ahead[0] * before[2:] + ahead[1] * before[1:-1] + ahead[2] * before[:-2]
+        moved[0] /= 1.0 - back
+        white = dtbtrs(np.array([np.ones(n), np.full(n, -back)]), moved, uplo="L", overwrite_b=True)[0]
+        white[0] = root * columns[0]
+        gram = white.T @ white
+        power, axes = np.linalg.eigh(gram[1:, 1:])
+        power, along = np.maximum(power, 0.0), axes.T @ gram[1:, 0]
+        # directions of the coefficients that the samples do not tell
+        fixed = power > 1e-9 * power[-1]
+        left = max(float(gram[0, 0] - (along[fixed] ** 2 / power[fixed]).sum()), n * _LEAST_VARIANCE)
+        # each coefficient that the samples tell takes a degree of freedom
+        variance = left / max(n - float((power / (power + left / n)).sum()), 1.0)
+        mean = along / (power + variance)
+        square = float(gram[0, 0] - along @ mean) / variance
+        size = (n - len(power)) * math.log(variance) + float(np.log(variance + power).sum())
+        return -0.5 * (size + square) + math.log(root) + memories.log_prior, axes @ mean
+
+    tried = {memories: fit(memories) for memories in ({at, *_STARTS} if climb else {at})}
+    best, last = max(tried, key=lambda memories: tried[memories][0]), None if climb else at
+    while best != last:
+        last = best
+        tried |= {memories: fit(memories) for memories in last.near if memories not in tried}
+        best = max(tried, key=lambda memories: tried[memories][0])
+    likelihood, coefficients = tried[best]
+    return _Fit(likelihood, residual - design @ coefficients, best)
+
+
+_LEAST_VARIANCE = 1e-12
+
+
+# --- the troubles --------------------------------------------------------------------------------------------------
+
+
+def _clock(e: LevelEvidence) -> Iterator[Trial]:
+    """The lag that the judgement of the radio clock has; else the likeliest, for which there are no words."""
+    if e.clock is not None and e.clock.shifted:
+        lag = e.clock.radio_minus_telemetry_s
+        late = np.interp(e.time_s - lag, e.time_s, e.predicted_db)
+        yield Trial(
+            name="clock", cost=0.0, sentence=f"the radio clock is {e.clock.in_words}", next_step="`rss: {lag: apply}`",
+            change_db=late - e.predicted_db, estimate=(lag, *e.clock.ci95_s),
+        )  # fmt: skip
+        return
+    # a clock may be further off than was looked, or hidden by another trouble: what else fits is no cause then
+    levels = np.array([np.interp(e.time_s - lag, e.time_s, e.predicted_db) for lag in _LAGS_S])
+    nearer = _nearer(e, levels)
+    if not nearer.any():
+        return
+    left = (e.measured_db - levels)[:, 1:] - _SEARCHED_PHI[1] * (e.measured_db - levels)[:, :-1]
+    gain = np.where(nearer, -0.5 * left.shape[1] * np.log(left.var(axis=1) + _LEAST_VARIANCE), -np.inf)
+    cost, change_db = _concentration(gain, np.ones(len(gain))), levels[gain.argmax()] - e.predicted_db
+    yield Trial(name=_UNNAMED, cost=cost, sentence="", next_step="", change_db=change_db)
+
+
+def _nearer(e: LevelEvidence, level_db: FloatArray) -> BoolArray:
+    """Check which levels (..., n) take a share off the error: smoother ones may fade like the log, and be no nearer."""
+    error_db = (e.measured_db - e.predicted_db).std()
+    return np.asarray((e.measured_db - level_db).std(axis=-1) <= (1.0 - _LEAST_SHARE) * error_db)
+
+
+# A rival that is no trouble by itself, and lags of a clock that nobody judged.
+_UNNAMED, _LAGS_S = "", np.arange(-60.0, 61.0, 2.0)
+
+
+def _profiled(e: LevelEvidence, trials: Mapping[float, Trial], at: _Memories = _START) -> Trial:
+    """The best of some values, and the range of those that are nearly as likely, half way to the next that are not."""
+    likelihood = {value: _fitted(e, trial, at=at, climb=False).log_likelihood for value, trial in trials.items()}
+    best, tried = max(likelihood, key=lambda value: likelihood[value]), sorted(trials)
+    width = np.gradient(tried) if len(tried) > 1 else np.ones(1)
+    cost = trials[best].cost + _concentration(np.array([likelihood[value] for value in tried]), width)
+    near = [i for i, value in enumerate(tried) if likelihood[value] >= likelihood[best] - _NEAR]
+    low, high = max(near[0] - 1, 0), min(near[-1] + 1, len(tried) - 1)
+    ends = 0.5 * (tried[near[0]] + tried[low]), 0.5 * (tried[near[-1]] + tried[high])
+    return dataclasses.replace(trials[best], estimate=(best, *ends), cost=cost)
+
+
+def _concentration(log_likelihood: FloatArray, width: FloatArray) -> float:
+    """Log of the greatest likelihood over its mean, each value with its width."""
+    top = log_likelihood.max()
+    return -math.log(float(np.exp(log_likelihood - top) @ width / width.sum()))
+
+
+# Values between two that were given.
+_BETWEEN = np.linspace(-0.8, 0.8, 9)
+
+
+def _tuned(
+    e: LevelEvidence, changes_db: Mapping[float, FloatArray], trial: Callable[[float, FloatArray], Trial]
+) -> Trial:
+    """The best of some values and of those about it, whose changes of the level are interpolated; at 0 is none."""
+    # no change is known of 0: the curve goes through it
+    values = sorted({0.0, *changes_db})
+    likely = _profiled(e, {value: trial(value, change) for value, change in changes_db.items()})
+    best = likely.estimate[0]
+    table = np.stack([changes_db.get(value, np.zeros(len(e.time_s))) for value in values])
+    at = values.index(best)
+    between = np.interp(at + _BETWEEN, np.arange(len(values)), values)
+    curve = _spline(np.array(values), np.append(between, [*changes_db])) @ table
+    finer = {value: trial(value, change) for value, change in zip((*between.tolist(), *changes_db), curve, strict=True)}
+    finer.pop(0.0, None)
+    return _profiled(e, finer, _fitted(e, likely).memories)
+
+
+def _spline(knots: FloatArray, at: FloatArray) -> FloatArray:
+    """Weights (m, n) of values at n knots in their cubic spline at m places: scipy.interpolate would load for 0.1 s."""
+    n, share = len(knots), (np.append(knots, at)[:, None] - knots[0]) / np.ptp(knots)
+    # no term at the second knot and the last but one: with one cubic at each end no slope has to be known
+    terms = np.hstack([share ** np.arange(min(n, 4)), np.maximum(share - share[2 : n - 2, 0], 0.0) ** 3])
+    return np.asarray(np.linalg.solve(terms[:n].T, terms[n:].T).T)
+
+
+def _heading(e: LevelEvidence) -> Iterator[Trial]:
+    """An antenna turned about the vertical."""
+    # where the logged attitude is not used, an antenna has no heading that could be wrong
+    cost = _RARE if "logged" in e.attitude_db else 0.0
+
+    def turned(angle: float, change: FloatArray) -> Trial:
+        return Trial(
+            name="heading", cost=cost, change_db=change,
+            next_step="check the antenna's mount and the logged yaw",
+            sentence=f"the UAV antenna is turned clockwise by {angle:.0f} degrees",
+        )  # fmt: skip
+
+    if e.turned_db:
+        yield _tuned(e, e.turned_db, turned)
+
+
+def _attitude(e: LevelEvidence) -> Iterator[Trial]:
+    """An attitude that the settings do not use, or should not."""
+    for mode, change in e.attitude_db.items():
+        idle = mode != "ignored"  # a log that is not used has no free number
+        yield Trial(
+            name="attitude",
+            cost=0.0 if idle else _RARE,
+            sentence="the UAV's attitude is not used" if idle else "the logged attitude does not fit the level",
+            next_step=f"`rt: {{attitude: {mode}}}`",
+            change_db=change,
+        )
+
+
+def _height(e: LevelEvidence) -> Iterator[Trial]:
+    """Heights of another datum."""
+
+    def raised(rise: float, change: FloatArray) -> Trial:
+        return Trial(
+            name="height", cost=0.0, change_db=change,
+            sentence=f"the UAV flew about {abs(rise):.0f} m {'higher' if rise > 0 else 'lower'} than the log says",
+            next_step="check the telemetry's height datum",
+        )  # fmt: skip
+
+    if e.raised_db:
+        yield _tuned(e, e.raised_db, raised)
+
+
+def _misread(e: LevelEvidence) -> Iterator[Trial]:
+    """Telemetry with other units, signs or columns than its reader takes it for."""
+    for meaning, change in e.misread_db.items():
+        yield Trial(
+            name="telemetry", cost=math.log(len(e.misread_db)), sentence=meaning,
+            next_step="check the telemetry's columns and units", change_db=change,
+        )  # fmt: skip
+
+
+def _tower(e: LevelEvidence) -> Iterator[Trial]:
+    """The log of another tower."""
+    for name, level in e.other_towers_db.items():
+        yield Trial(
+            name="tower", cost=math.log(len(e.other_towers_db)), sentence=f"the log is that of {name}",
+            next_step=f"`node: {name}` in this `logs:` line", change_db=level - e.predicted_db,
+        )  # fmt: skip
+
+
+_CATCH_ALL = "pattern"
+
+# Functions of direction alone: they also take up what a wrong model leaves.
+OF_DIRECTION = frozenset({"blocked", _CATCH_ALL})
+
+_PATTERN = {
+    "isotropic": (
+        "the antenna pattern of the UAV",
+        "`aerpaw-cmp calibrate FLIGHT FLIGHT`",
+    ),
+    "measured": (
+        "the antenna file does not fit the UAV",
+        "check `antenna:`, else `aerpaw-cmp calibrate FLIGHT FLIGHT`",
+    ),
+    "learned": (
+        "the learned antennas do not fit this UAV",
+        "check which aircraft flew, else `aerpaw-cmp calibrate` with it",
+    ),
+}
+
+
+def _pattern(e: LevelEvidence) -> Iterator[Trial]:
+    """A smooth gain over the directions of the UAV's antenna, in place of the known one."""
+    azimuth, elevation = np.radians(e.uav_azimuth_deg), np.radians(e.uav_elevation_deg)
+    axes = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)
+    terms = [term for degree in (1, 2, 3) for term in combinations_with_replacement(axes, degree)]
+    columns = [_GAIN_DB * np.prod(term, axis=0) for term in terms]
+    if e.turned_db:  # no known pattern any more: the mean over all headings
+        columns.append(np.sum(list(e.turned_db.values()), axis=0) / (len(e.turned_db) + 1))
+    sentence, step = _PATTERN[e.antenna]
+    yield Trial(
+        name=_CATCH_ALL, cost=0.0, sentence=sentence, next_step=step, columns=np.column_stack(columns),
+    )  # fmt: skip
+
+
+# Standard deviations before the flight: of the terms of an antenna's gain, and of steps and losses [dB].
+_GAIN_DB, _STEP_DB, _LOSS_DB = 3.0, 8.0, 15.0
+# Log odds against what a log or its settings seldom have.
+_RARE = 3.0
+
+
+def _cell(e: LevelEvidence) -> Iterator[Trial]:
+    """A level that changes where another cell serves."""
+    if e.serving is not None and np.ptp(e.serving) > 0.5:
+        yield Trial(
+            name="cell", cost=0.0, sentence="the level steps where the phone changes its cell",
+            next_step="compare the cells apart", columns=_STEP_DB * e.serving[:, None],
+        )  # fmt: skip
+
+
+def _decibels(e: LevelEvidence) -> Iterator[Trial]:
+    """Decibels of an amplitude as if it were a power, or the reverse; none where any other slope is likelier."""
+    any_slope = Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=_SLOPE * e.predicted_db[:, None])
+    # what is left above a floor changes by fewer decibels than the link
+    least = math.inf if e.floored else _fitted(e, any_slope, climb=False).log_likelihood
+    for factor, words in ((0.5, "half"), (2.0, "twice")):
+        trial = Trial(
+            name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
+            sentence=f"the levels change by {words} the link's decibels",
+            next_step="check: 10 lg of power, 20 lg of amplitude",
+        )  # fmt: skip
+        if _nearer(e, factor * e.predicted_db) and _fitted(e, trial, climb=False).log_likelihood > least:
+            yield trial
+
+
+# Standard deviation of the slope of levels about their prediction, before the flight.
+_SLOPE = 0.5
+
+
+# --- troubles of the receiver ----------------------------------------------------------------------------------------
+
+
+def _flat(e: LevelEvidence) -> Iterator[Trial]:
+    """One level alone where the model predicts many: a dead input, or a flight below the floor or above the ceiling."""
+    if _is_flat(e):
+        yield Trial(
+            name="flat", cost=_RARE, next_step="check the receiver's input and gain", change_db=-e.predicted_db,
+            sentence=f"the level stays at {Printed(float(np.median(e.measured_db))):.0f} {e.unit} all along",
+        )  # fmt: skip
+
+
+# The middle 80 % of a flat level span less than this share of the predicted ones, as for the clock.
+_FLAT = 0.2
+
+
+def _is_flat(e: LevelEvidence) -> bool:
+    measured, predicted = (np.ptp(np.percentile(level, (10, 90))) for level in (e.measured_db, e.predicted_db))
+    return bool(measured < _FLAT * predicted)
+
+
+def _lock(e: LevelEvidence) -> Iterator[Trial]:
+    """Noise that the receiver writes without its lock, by the quality in the log."""
+    if e.locked is not None and (lost := e.locked < 0.5).any():
+        yield Trial(
+            name="lock", cost=0.0, clipped=lost,
+            sentence="the receiver had no lock in parts of the flight",  # the cautions count the samples
+            next_step="",  # the first sentence has the error with the floor already
+        )  # fmt: skip
+
+
+def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
+    """The least level, written again and again: nothing was detected there."""
+    if e.least is not None and e.least.any() and not e.least.all():
+        level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
+        # means of seconds spread less than samples do
+        top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
+        yield Trial(
+            name="no detection", cost=0.0, clipped=e.least, estimate=(level, level, level),
+            sentence=f"{share:.0f} % of the samples are at {Printed(level):.0f} {e.unit}: not detected",
+            next_step=f"`floor_db: {math.ceil(top * 100.0 + 1.0) / 100.0:.2f}` in this `logs:` line",
+        )  # fmt: skip
+
+
+def _floor(e: LevelEvidence) -> Iterator[Trial]:
+    """A receiver that shows no level below its floor; what it shows there spreads less."""
+    if e.least is None and not _is_flat(e):  # else the log itself says where nothing was detected
+        yield from _clipping(e, 1.0)
+
+
+def _saturation(e: LevelEvidence) -> Iterator[Trial]:
+    """A receiver that shows no level above its ceiling."""
+    drowned = e.unit == "dB" and bool(np.median(e.measured_db) < 0.0)  # a signal below the noise overloads nothing
+    if not drowned and not _is_flat(e):
+        yield from _clipping(e, -1.0)
+
+
+# Of samples beyond a limit: so many lie further [dB].
+_BEYOND_DB, _MOST_BEYOND = 2.0, 0.02
+_FAR_DB, _LEAST_FAR = 3.0, 0.1
+_LEAST_BINS = 5
+
+
+def _clipping(e: LevelEvidence, side: float) -> Iterator[Trial]:
+    """Limits below (``side`` 1) or above (-1) which a receiver shows no level: where it fades no more, and soft."""
+    pile = _pile(e, side)
+    if pile is not None:
+        limit = float(e.measured_db[pile].mean())
+        if (trial := _limited(e, limit, side)) is not None:
+            yield dataclasses.replace(trial, clipped=pile, estimate=(limit, limit, limit))
+    limits = np.quantile(e.measured_db, np.linspace(0.02, 0.7, 18) if side > 0 else np.linspace(0.98, 0.3, 18))
+    trials = {limit: trial for limit in limits.tolist() if (trial := _bent(e, limit, side)) is not None}
+    if trials:
+        yield _profiled(e, trials)
+
+
+# At a limit of the receiver: so near to the last levels [dB], so large a share of the samples, which fade so much less.
+_PILE_DB, _LEAST_PILE, _LEAST_CLIPPED, _MOST_FADING = 1.2, 0.1, 0.06, 0.35
+
+
+def _pile(e: LevelEvidence, side: float) -> BoolArray | None:
+    """Samples at the receiver's limit; None where those near the least or greatest level fade as all others do."""
+    end = float(np.quantile(e.measured_db, 0.01 if side > 0 else 0.99))
+    pile = side * (e.measured_db - end) < _PILE_DB
+    step = np.abs(np.diff(e.measured_db))
+    inside, outside = pile[1:] & pile[:-1], ~(pile[1:] | pile[:-1])
+    if inside.sum() < max(_LEAST_BINS, _LEAST_CLIPPED * len(pile)) or outside.sum() < _LEAST_BINS:
+        return None
+    return pile if np.median(step[inside]) < _MOST_FADING * np.median(step[outside]) else None
+
+
+def _limited(e: LevelEvidence, limit: float, side: float) -> Trial | None:
+    """A limit with its words; None where what is measured beyond it shows that nothing is clipped."""
+    if (side * (e.measured_db - limit) < -_BEYOND_DB).mean() > _MOST_BEYOND:
+        return None
+    name, words, step = _LIMITS[side]
+    sentence = words.format(level=f"{Printed(limit):.0f} {e.unit}")
+    next_step = step.format(typed=f"{limit + _OVER_FLOOR_DB:.0f}")
+    return Trial(name=name, cost=0.0, sentence=sentence, next_step=next_step)
+
+
+def _bent(e: LevelEvidence, limit: float, side: float) -> Trial | None:
+    """Levels to which the power of a limit adds, or which come no nearer than that to a ceiling."""
+    # the median: samples at the limit do not move it
+    offset = float(np.median(e.measured_db - e.predicted_db))
+    for _ in range(5):
+        level = e.predicted_db + offset
+        shown = limit + side * 10.0 * np.log10(1.0 + 10.0 ** (side * (level - limit) / 10.0))
+        offset += float(np.mean(e.measured_db - shown))
+    trial = _limited(e, limit, side)
+    # a prediction that fades too deep here and there meets no limit of the receiver
+    if trial is None or (side * (limit - level) > _FAR_DB).mean() < _LEAST_FAR:
+        return None
+    fading = 1.0 / (1.0 + 10.0 ** (side * (limit - level) / 10.0))
+    return dataclasses.replace(trial, change_db=shown - level, fading=fading.clip(_LEAST_FADING))
+
+
+_LEAST_FADING = 0.1
+# Half of a level so far above a floor is that floor [dB].
+_OVER_FLOOR_DB = 3.0
+
+
+_LIMITS = {
+    1.0: ("floor", "the receiver shows no level below {level}", "`floor_db: {typed}` in this `logs:` line"),
+    -1.0: ("saturation", "the receiver shows no level above {level}", "lower the gain; trust lower levels alone"),
+}
+
+
+# --- troubles of a part of the flight --------------------------------------------------------------------------------
+
+
+def _shift(residual: FloatArray, masks: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Shift by each mask (m, n), its standard error, and the log likelihood that it gains; offset fitted."""
+    # what the sample before does not foretell: slow fading then is no shift
+    y = residual[1:] - phi * residual[:-1]
+    x = masks[:, 1:] - phi * masks[:, :-1]
+    y, x = y - y.mean(), x - x.mean(axis=1, keepdims=True)
+    power = np.einsum("ij,ij->i", x, x)
+    shift = np.divide(x @ y, power, out=np.zeros(len(x)), where=power > 1e-9)
+    left = np.maximum(y @ y - shift**2 * power, 1e-12)
+    error = np.sqrt(np.divide(left, len(y) * power, out=np.zeros(len(x)), where=power > 1e-9))
+    return shift, error, -0.5 * len(y) * np.log(left / max(float(y @ y), 1e-12))
+
+
+_SEARCHED_PHI = (0.6, 0.93)
+_WIDTHS_DEG = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0)
+# Degrees over which the edge of a shadow fades: a Fresnel zone some hundred metres away.
+_EDGE_DEG = 4.0
+_MOST_STARTS = 600
+
+
+def _blocked(e: LevelEvidence) -> Iterator[Trial]:
+    """A loss in a sector of directions from the tower: searched by 5 degrees, then by one."""
+    residual = e.measured_db - e.predicted_db
+    coarse = [(middle, width) for width in _WIDTHS_DEG for middle in np.arange(0.0, 360.0, 5.0).tolist()]
+    shadows = _shadows(e, coarse)
+    for phi in _SEARCHED_PHI:
+        shift, _, gain = _shift(residual, shadows, phi)
+        inside = shadows.sum(axis=1)
+        possible = (inside >= _LEAST_BINS) & (shadows.shape[1] - inside >= _LEAST_BINS) & (shift < 0.0)
+        if not possible.any():
+            continue
+        gain = np.where(possible, gain, -np.inf)
+        cost, (middle, width) = _concentration(gain, np.ones(len(gain))), coarse[int(np.argmax(gain))]
+        around = [(middle + i, max(width + j, 2.0)) for i in range(-6, 7) for j in range(-8, 9)]
+        finer = _shadows(e, around)
+        shift, error, gain = _shift(residual, finer, phi)
+        at = int(np.argmax(np.where(shift < 0.0, gain, -np.inf)))
+        (middle, width), loss, reach = around[at], -float(shift[at]), 1.96 * float(error[at])
+        first = (middle - 0.5 * width) % 360.0
+        yield Trial(
+            name="blocked", cost=cost, columns=_LOSS_DB * finer[at][:, None],
+            estimate=(loss, loss - reach, loss + reach),
+            sentence=f"a loss of {loss:.0f} dB towards {first:.0f} to {(first + width) % 360:.0f} degrees",
+            next_step="add to the site what stands there",
+        )  # fmt: skip
+
+
+def _shadows(e: LevelEvidence, sectors: Sequence[tuple[float, float]]) -> FloatArray:
+    """Share (m, n) of the loss of each sector, by middle and width [deg], that each sample has."""
+    middle, width = (np.array(column)[:, None] for column in zip(*sectors, strict=True))
+    off = np.abs((e.tower_azimuth_deg - middle + 180.0) % 360.0 - 180.0)
+    return np.asarray(np.clip(0.5 + (0.5 * width - off) / _EDGE_DEG, 0.0, 1.0))
+
+
+def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
+    """A shift that lasts from an instant to the end."""
+    residual, n = e.measured_db - e.predicted_db, len(e.time_s)
+    starts = np.arange(_LEAST_BINS * 2, n - _LEAST_BINS * 2)
+    if not len(starts):
+        return
+    # every so many: a step is seen from the bins beside its own
+    starts = starts[:: 1 + len(starts) // _MOST_STARTS]
+    masks = (np.arange(n)[None, :] >= starts[:, None]).astype(np.float64)
+    for phi in _SEARCHED_PHI:
+        shift, error, gain = _shift(residual, masks, phi)
+        at = int(np.argmax(gain))
+        instant = (e.start + np.timedelta64(round(float(e.time_s[starts[at]])), "s")).astype("datetime64[s]")
+        step, reach = float(shift[at]), 1.96 * float(error[at])
+        yield Trial(
+            name="gain step", cost=_concentration(gain, np.ones(len(gain))), columns=_STEP_DB * masks[at][:, None],
+            estimate=(step, step - reach, step + reach),
+            sentence=f"the level steps by {Printed(step):+.1f} dB at {str(instant)[-8:]} UTC",
+            next_step="check the receiver's gain; compare both parts apart",
+        )  # fmt: skip
+
+
+CANDIDATES: tuple[Callable[[LevelEvidence], Iterator[Trial]], ...] = (
+    _clock, _heading, _attitude, _misread, _height, _tower, _pattern, _cell, _decibels,
+    _lock, _no_detection, _flat, _floor, _saturation, _blocked, _gain_step,
+)  # fmt: skip

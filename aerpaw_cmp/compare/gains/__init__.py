@@ -1,1 +1,0 @@
-"""Gains over direction and their spread; the mount of an antenna."""

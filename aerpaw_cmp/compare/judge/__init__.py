@@ -1,1 +1,0 @@
-"""Meaning of a flight's numbers: causes, entries, model ladder, season, verdicts."""

@@ -1,1 +1,0 @@
-"""Antennas, residual fields and the next flight learned from flights: pure functions of arrays."""

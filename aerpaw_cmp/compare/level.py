@@ -1,0 +1,1062 @@
+"""Levels against their prediction: RSS, detection, serving cells, scores.
+
+Measured against simulated received signal strength of one tower and channel.
+
+Every function takes arrays in time order, one entry per sample, NaN where there is none, and knows nothing of
+files, sites or engines.
+
+Scores of levels that were predicted: after a flight, and of entries of benchmarks/published.
+
+A level that a receiver detects or loses: the probability of either, and the level with a floor.
+
+Serving cell: the one that the prediction says is strongest, against the one that the phone was on.
+
+The numbers of an audit of fields, and how those of several replays add up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.special import ndtr, ndtri  # every report loads this module: scipy.stats would take it 0.4 s more
+
+from ..common.geodesy import azimuth_rad, bearing_deg, elevation_rad
+from ..common.jsonable import named
+from ..common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db, unmasked
+from .offset import SPAN_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, offset_grid
+from .receiver import brier_losses, log_losses, out_of_group
+from .statistics import NO_INTERVAL, ErrorIntervals, Interval, correlation, error_intervals, rmse_interval
+
+# Two channels of one receiver "part" where they differ by more than this [dB].
+PART_DB = 10.0
+# Over means of so long [s].
+_PART_S = 1.0
+
+
+def seconds(time: ArrayLike) -> FloatArray:
+    """Seconds since the first instant, from datetime64 or from seconds."""
+    array = np.asarray(time)
+    if array.dtype.kind == "M":
+        stamp = array.astype("datetime64[ns]")
+        known = stamp[~np.isnat(stamp)]
+        first = known.min() if len(known) else np.datetime64(0, "ns")
+        return np.asarray((stamp - first) / np.timedelta64(1, "s"), dtype=np.float64)
+    return np.asarray(array, dtype=np.float64)
+
+
+@dataclass(frozen=True, slots=True)
+class RssComparison:
+    """Comparison of a simulation with the measured level of one link.
+
+    Parameters
+    ----------
+    offset_db, rmse_db : float
+        Grid-search offset (added to the measurement) and what remains [dB].
+    n : int
+        Pairs that count.
+    n_out_of_coverage, n_measured_out, n_simulated_out : int
+        Samples at a known pose with no measured signal or no simulated path (either; each).
+    n_no_pose : int
+        Samples without a pose: they belong to no comparison.
+    at_edge : bool
+        The offset lies at the edge of the search span.
+    correlation : float
+        Pearson; NaN for constant series.
+    intervals : ErrorIntervals
+        95 % intervals and the residual's memory.
+    identifiable_db : (low, high)
+        Offsets within 0.1 dB of the least RMSE.
+    baselines : mapping of str to OffsetFit
+        Free space, two-ray and others, each with its own offset, over the same pairs.
+    baseline_intervals : mapping of str to (low, high)
+        95 % interval of each baseline's RMSE [dB].
+    lag_s : float
+        Applied clock lag [s]; NaN if none was estimated or applied.
+    fitted_on_scored : tuple of str
+        Names of the numbers that were fitted on the samples they are scored on.
+    residual_db : (samples,)
+        ``measured + offset - simulated``, NaN where no pair.
+    """
+
+    offset_db: float
+    rmse_db: float
+    n: int
+    n_out_of_coverage: int
+    n_measured_out: int
+    n_simulated_out: int
+    n_no_pose: int
+    at_edge: bool
+    correlation: float
+    intervals: ErrorIntervals
+    identifiable_db: Interval
+    baselines: Mapping[str, OffsetFit]
+    baseline_intervals: Mapping[str, Interval]
+    residual_db: FloatArray = field(repr=False)
+    lag_s: float = float("nan")
+    fitted_on_scored: tuple[str, ...] = ("offset_db",)
+
+    @property
+    def rmse_ci95_db(self) -> Interval:
+        """95 % interval of the RMSE [dB]."""
+        return self.intervals.rmse_db
+
+
+def compare_rss(
+    time_s: ArrayLike,
+    measured_db: ArrayLike,
+    simulated_db: ArrayLike,
+    *,
+    baselines: Mapping[str, ArrayLike] | None = None,
+    posed: ArrayLike | None = None,
+    span_db: tuple[float, float] = SPAN_DB,
+) -> RssComparison:
+    """Compare a measured with a simulated sequence of levels.
+
+    Parameters
+    ----------
+    time_s : array_like, (n,)
+        Instants: seconds or datetime64. Samples are put into this order; instants that are not numbers come last.
+    measured_db : array_like, (n,)
+        dBm or dB re full scale; NaN without a received signal.
+    simulated_db : array_like, (n,)
+        NaN where there is no path.
+    baselines : mapping of str to array_like, (n,), optional
+        Levels of simpler models at the same poses [dB].
+    posed : array_like of bool, (n,), optional
+        Whether the pose of the sample is known. A sample without a pose is not out of coverage.
+    span_db : (float, float)
+        Offset search.
+
+    Returns
+    -------
+    RssComparison
+    """
+    time, measured, simulated = seconds(time_s), _levels(measured_db), _levels(simulated_db)
+    has_pose = np.ones(len(time), dtype=bool) if posed is None else np.asarray(posed, dtype=bool)
+    use = has_pose & np.isfinite(measured) & np.isfinite(simulated)
+    order = np.flatnonzero(use)[np.argsort(time[use], kind="stable")]
+    m, s = measured[order], simulated[order]
+    fit = grid_offset(m, s, span_db=span_db)
+    offsets, curve = offset_curve(m, s, span_db=span_db)
+    simple = {name: _levels(levels)[order] for name, levels in (baselines or {}).items()}
+    fits = {name: grid_offset(m, level, span_db=span_db) for name, level in simple.items()}
+    return RssComparison(
+        **named(fit, "offset_db rmse_db n at_edge"),
+        n_out_of_coverage=int((has_pose & ~use).sum()),
+        n_measured_out=int((has_pose & ~np.isfinite(measured)).sum()),
+        n_simulated_out=int((has_pose & ~np.isfinite(simulated)).sum()),
+        n_no_pose=int((~has_pose).sum()),
+        correlation=correlation(m, s),
+        intervals=replace(error_intervals(m, s), rmse_db=_rmse_interval(m - s, fit)),
+        identifiable_db=identifiable_range(offsets, curve),
+        baselines=fits,
+        baseline_intervals={name: _rmse_interval(m - level, fits[name]) for name, level in simple.items()},
+        residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
+    )
+
+
+# Among the numbers that were fitted on the very samples they would be scored on.
+LEARNED_HERE = "antennas"
+
+
+def without_errors(score: RssComparison) -> RssComparison:
+    """A comparison on the flight that the antennas were learned from: offset, counts and baselines, no error."""
+    none = (float("nan"), float("nan"))
+    return replace(
+        score,
+        rmse_db=float("nan"),
+        correlation=float("nan"),
+        intervals=replace(score.intervals, rmse_db=none, correlation=none),
+        identifiable_db=none,
+        fitted_on_scored=(*score.fitted_on_scored, LEARNED_HERE),
+    )
+
+
+# Levels farther than this many interquartile ranges outside the quartiles are outlying: of a normal distribution one
+# in 10^9, and a deep fade of a real flight is not.
+_FENCE = 4.0
+
+# Least interquartile range that counts: a UAV that hovers has next to none.
+_NARROWEST_DB = 5.0
+
+
+def outliers(level_db: ArrayLike) -> BoolArray:
+    """Samples (n,) whose level lies far outside the flight's own distribution; they are flagged, not dropped.
+
+    Examples
+    --------
+    >>> outliers([-70.0, -72.0, -69.0, -71.0, -68.0, 99.0]).tolist()
+    [False, False, False, False, False, True]
+    """
+    level = _levels(level_db)
+    if not np.isfinite(level).any():
+        return np.zeros(len(level), np.bool_)
+    low, high = np.nanquantile(level, [0.25, 0.75])
+    reach = _FENCE * max(high - low, _NARROWEST_DB)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((level < low - reach) | (level > high + reach))
+
+
+def _levels(values: ArrayLike) -> FloatArray:
+    """Levels as floats; infinities (no power) become NaN."""
+    array = unmasked(values)
+    return np.where(np.isfinite(array), array, np.nan)
+
+
+def _rmse_interval(difference: FloatArray, fit: OffsetFit) -> Interval:
+    known = difference[np.isfinite(difference)]
+    return rmse_interval(known + fit.offset_db, fit.rmse_db)
+
+
+# --- both sides averaged over the same window ----------------------------------------------------------------------
+
+
+def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> FloatArray:
+    """Moving average of power over a centred window.
+
+    Parameters
+    ----------
+    time_s : array_like, (n,)
+        Instants [s] (or datetime64) in any order.
+    level_db : array_like, (n,)
+        Levels [dB]; NaN does not take part and stays NaN.
+    window_s : float
+        Full width [s]; 0 gives the levels back.
+
+    Notes
+    -----
+    Averages linear power, as a receiver that integrates longer would. Sums run over powers relative to the
+    strongest one, so a range of 100 dB within one window keeps its digits to 1e-6 dB.
+    """
+    time, level = seconds(time_s), _levels(level_db)
+    known = np.isfinite(level) & np.isfinite(time)
+    result = np.full(len(level), np.nan)
+    if not known.any():
+        return result
+    rows = np.flatnonzero(known)
+    rows = rows[np.argsort(time[rows], kind="stable")]
+    t, x = time[rows], level[rows]
+    top = x.max()
+    # relative to the strongest: levels re full scale of any gain stay in range
+    power = power_from_db(x - top)
+    first = np.searchsorted(t, t - 0.5 * window_s, side="left")
+    last = np.searchsorted(t, t + 0.5 * window_s, side="right")
+    result[rows] = db_from_power(_window_sums(power, first, last) / (last - first)) + top
+    return result
+
+
+def _window_sums(values: FloatArray, first: Any, last: Any) -> FloatArray:
+    """Sums of values[first:last] for windows that move forward.
+
+    A running sum would lose weak windows behind strong ones (1e-16 of the total), so sums restart: every window is
+    covered by two aligned pieces of length 2^j each of which was summed on its own (a sparse table), the rest by
+    one more level down; log2(n) passes.
+    """
+    total = np.zeros(len(first))
+    at, remaining = first.copy(), last - first
+    table = values
+    width = 1
+    tables = [table]
+    while width * 2 <= int(remaining.max(initial=1)):
+        table = table[: len(table) - width] + table[width:]
+        tables.append(table)
+        width *= 2
+    for j in range(len(tables) - 1, -1, -1):
+        take = (remaining >> j) & 1 == 1
+        total[take] += tables[j][at[take]]
+        at = at + np.where(take, 1 << j, 0)
+    return total
+
+
+def averaged_fits(
+    measured_db: ArrayLike,
+    simulations: Mapping[str, ArrayLike],
+    averages: Mapping[str, Callable[[FloatArray], FloatArray]],
+    *,
+    span_db: tuple[float, float] = SPAN_DB,
+) -> dict[str, dict[str, OffsetFit]]:
+    """Simulations against the measurement, both sides averaged alike.
+
+    Parameters
+    ----------
+    measured_db : array_like, (n,)
+        [dB]
+    simulations : mapping of str to array_like (n,)
+        Levels by name, such as "coherent", "power_sum" or "local_mean".
+    averages : mapping of str to callable
+        Means of levels (n,), NaN where either side has none, such as :func:`local_mean_db`.
+    span_db : (float, float)
+        Offset search.
+
+    Returns
+    -------
+    dict
+        ``result[simulation][average]``.
+    """
+    measured = _levels(measured_db)
+    result: dict[str, dict[str, OffsetFit]] = {}
+    for name, levels in simulations.items():
+        simulated = _levels(levels)
+        finite = np.isfinite(measured) & np.isfinite(simulated)
+        sides = [np.where(finite, side, np.nan) for side in (measured, simulated)]
+        result[name] = {
+            average: grid_offset(*(mean(side) for side in sides), span_db=span_db) for average, mean in averages.items()
+        }
+    return result
+
+
+# --- where the residual comes from ---------------------------------------------------------------------------------
+
+
+def link_geometry(
+    tower_m: ArrayLike,
+    position_m: FloatArray,
+    rotation: FloatArray | None = None,
+    *,
+    tower_mount: FloatArray | None = None,
+    uav_mount: FloatArray | None = None,
+) -> dict[str, FloatArray]:
+    """Variables that the residual may depend on, for every pose.
+
+    Parameters
+    ----------
+    tower_m : (3,), (1, 3) or (n, 3)
+        Array centre, east-north-up, of a tower that moves at every pose [m].
+    position_m : (n, 3)
+        UAV [m].
+    rotation : (n, 3, 3), optional
+        Aircraft body to east-north-up.
+    tower_mount, uav_mount : (3, 3), optional
+        Rotation of each array in its carrier (site axes; aircraft body); by default the identity.
+
+    Returns
+    -------
+    dict of str to ndarray (n,)
+        ``distance_m``, ``elevation_deg`` and ``azimuth_deg`` of the UAV from the tower (clockwise from north),
+        ``tower_azimuth_deg`` and ``tower_elevation_deg`` in the tower's array frame (azimuth from its boresight
+        towards its left), ``height_m``; with ``rotation`` also ``heading_deg``, ``uav_azimuth_deg`` and
+        ``uav_elevation_deg`` of the tower in the UAV's array frame.
+
+    Examples
+    --------
+    >>> found = link_geometry([0, 0, 10], np.array([[100.0, 0.0, 110.0]]))
+    >>> found["azimuth_deg"].round(6).tolist(), found["elevation_deg"].round(6).tolist()
+    ([90.0], [45.0])
+    """
+    place = np.asarray(position_m, dtype=np.float64)
+    ray = place - unmasked(tower_m)
+    columns = {
+        "distance_m": np.linalg.norm(ray, axis=1),
+        "elevation_deg": np.degrees(elevation_rad(ray)),
+        "azimuth_deg": bearing_deg(ray) % 360.0,
+        "height_m": place[:, 2],
+    }
+    in_array_frame = ray @ (np.eye(3) if tower_mount is None else tower_mount)
+    columns["tower_azimuth_deg"], columns["tower_elevation_deg"] = _direction_deg(in_array_frame)
+    if rotation is not None:
+        body = np.einsum("nji,nj->ni", rotation, -ray)
+        columns["uav_azimuth_deg"], columns["uav_elevation_deg"] = _direction_deg(
+            body @ (np.eye(3) if uav_mount is None else uav_mount)
+        )
+        columns["heading_deg"] = bearing_deg(rotation[:, :, 0]) % 360.0
+    return columns
+
+
+def _direction_deg(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Azimuth from x towards y and elevation above the x-y plane [deg]."""
+    return np.degrees(azimuth_rad(vector)), np.degrees(elevation_rad(vector))
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorSpan:
+    """A stretch of the flight where the error is large and of one sign.
+
+    Parameters
+    ----------
+    start_s, end_s : float
+        Seconds, as in the input (datetime64 input: since the first instant).
+    n : int
+        Samples.
+    mean_db : float
+        Mean residual; positive: measured stronger than simulated.
+    position_m : tuple of float
+        Mean east, north, up of the span [m]; empty if no positions were given.
+    geometry : mapping of str to float
+        Median of each context quantity in the span.
+    """
+
+    start_s: float
+    end_s: float
+    n: int
+    mean_db: float
+    position_m: tuple[float, ...]
+    geometry: Mapping[str, float] = field(default_factory=dict)
+
+
+def error_spans(
+    time_s: ArrayLike,
+    residual_db: ArrayLike,
+    *,
+    position_m: FloatArray | None = None,
+    context: Mapping[str, ArrayLike] | None = None,
+    window_s: float = 2.0,
+    threshold_db: float | None = None,
+    largest: int = 10,
+) -> list[ErrorSpan]:
+    """Stretches of largest error, worst first (mean error times the root of the duration).
+
+    Parameters
+    ----------
+    time_s, residual_db : array_like, (n,)
+        Instants and residual.
+    position_m : (n, 3), optional
+        East, north, up [m].
+    context : mapping of str to array_like (n,), optional
+        What the geometry was; known names: ``los`` (bool), ``foliage_m``, ``elevation_deg`` (from the tower),
+        ``height_m``, ``heading_deg``, ``coherent_minus_power_sum_db`` (how deep the simulation fades).
+    window_s : float
+        The residual is averaged over this window before it is judged [s].
+    threshold_db : float, optional
+        A span is where the average exceeds this; by default 1.5 times the RMSE.
+    largest : int
+        Spans that are given at most.
+
+    Returns
+    -------
+    list of ErrorSpan
+        Worst first.
+    """
+    time, residual = seconds(time_s), _levels(residual_db)
+    ok = np.flatnonzero(np.isfinite(residual) & np.isfinite(time))
+    ok = ok[np.argsort(time[ok], kind="stable")]
+    if not len(ok):
+        return []
+    t, r = time[ok], residual[ok]
+    first = np.searchsorted(t, t - 0.5 * window_s, side="left")
+    last = np.searchsorted(t, t + 0.5 * window_s, side="right")
+    smooth = _window_sums(r, first, last) / (last - first)
+    limit = 1.5 * float(np.sqrt(np.mean(r**2))) if threshold_db is None else threshold_db
+    sign = np.where(smooth > limit, 1, np.where(smooth < -limit, -1, 0))
+    # a gap longer than the window parts a stretch: nobody knows what was between
+    cut = (np.diff(sign) != 0) | (np.diff(t) > max(window_s, 1e-9))
+    bounds = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
+    where = {name: np.asarray(values)[ok] for name, values in (context or {}).items()}
+    place = None if position_m is None else np.asarray(position_m, dtype=np.float64)[ok]
+    spans = []
+    for a, b in pairwise(bounds):  # per span, not per sample
+        if sign[a] == 0:
+            continue
+        centre = () if place is None else tuple(float(v) for v in place[a:b].mean(axis=0))
+        spans.append(
+            ErrorSpan(
+                start_s=float(t[a]),
+                end_s=float(t[b - 1]),
+                n=int(b - a),
+                mean_db=float(r[a:b].mean()),
+                position_m=centre,
+                geometry={name: _typical(values[a:b]) for name, values in where.items()},
+            )
+        )
+    # a stretch of one sample has no duration, and still counts
+    spans.sort(key=lambda span: -abs(span.mean_db) * np.sqrt(span.end_s - span.start_s + 1e-3))
+    return spans[:largest]
+
+
+def _typical(values: Any) -> float:
+    """Median without NaN."""
+    known = np.asarray(values, dtype=np.float64)
+    known = known[np.isfinite(known)]
+    return float(np.median(known)) if len(known) else float("nan")
+
+
+@dataclass(frozen=True, slots=True)
+class ChannelDifference:
+    """Two channels of one receiver against each other.
+
+    Parameters
+    ----------
+    n : int
+        Samples that both have.
+    mean_db, std_db, correlation : float
+        Of first minus second.
+    spans : list of ErrorSpan
+        Where they part, with the geometry there.
+    """
+
+    n: int
+    mean_db: float = float("nan")
+    std_db: float = float("nan")
+    correlation: float = float("nan")
+    spans: list[ErrorSpan] = field(default_factory=list)
+
+
+def channel_difference(
+    time_s: ArrayLike,
+    first_db: ArrayLike,
+    second_db: ArrayLike,
+    *,
+    position_m: FloatArray | None = None,
+    context: Mapping[str, ArrayLike] | None = None,
+) -> ChannelDifference:
+    """Difference of two channels, and where they part by more than :data:`PART_DB` after their mean difference.
+
+    Parameters
+    ----------
+    time_s : array_like, (n,)
+        Instants: seconds or datetime64.
+    first_db, second_db : array_like, (n,)
+        Levels of the two channels at these instants [dB].
+    position_m : (n, 3), optional
+        For the places at which they part.
+    context : mapping of str to array_like (n,), optional
+        Geometry that may explain it, as in :func:`error_spans`.
+
+    Returns
+    -------
+    ChannelDifference
+        Mean and spread of first minus second [dB], their correlation, and the spans where they part; NaN without pairs.
+    """
+    first, second = _levels(first_db), _levels(second_db)
+    ok = np.isfinite(first) & np.isfinite(second)
+    if not ok.any():
+        return ChannelDifference(n=0)
+    difference = first - second
+    # the channels of a receiver have gains of their own
+    mean = float(difference[ok].mean())
+    residual = difference - mean
+    spans = error_spans(
+        time_s, residual, position_m=position_m, context=context, window_s=_PART_S, threshold_db=PART_DB
+    )
+    return ChannelDifference(
+        n=int(ok.sum()),
+        mean_db=mean,
+        std_db=float(residual[ok].std()),
+        correlation=correlation(first, second),
+        spans=spans,
+    )
+
+
+# Averaging window of the second error [s].
+WINDOW_S = 4.0
+
+# Nominal share of the interval whose coverage is told.
+COVERAGE = 0.9
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelSeries:
+    """Measured and predicted levels of one flight, tower and channel, in time order.
+
+    Parameters
+    ----------
+    name : str
+        ``flight tower.channel``.
+    time_s : (n,)
+    measured_db, level_db : (n,)
+        Measured and predicted median [dB].
+    sd_db : (n,), optional
+        Standard deviation of the prediction [dB]; without it nothing of a distribution is scored.
+    own_offset : bool
+        Score after the mean error of the series is removed.
+    """
+
+    name: str
+    time_s: FloatArray
+    measured_db: FloatArray
+    level_db: FloatArray
+    sd_db: FloatArray | None = None
+    own_offset: bool = True
+
+    @property
+    def bias_db(self) -> float:
+        """Mean of measured minus predicted [dB]."""
+        return float(np.mean(self.measured_db - self.level_db))
+
+    @property
+    def error_db(self) -> FloatArray:
+        """Measured minus predicted (n,), less the bias where the series has an offset of its own [dB]."""
+        error = self.measured_db - self.level_db
+        return np.asarray(error - error.mean() if self.own_offset else error)
+
+
+def crps_normal(error_db: FloatArray, sd_db: FloatArray) -> FloatArray:
+    """Continuous ranked probability score (n,) of normal forecasts [dB].
+
+    Source: Gneiting and Raftery (2007), doi:10.1198/016214506000001437, eq. 21.
+
+    Examples
+    --------
+    >>> crps_normal(np.array([0.0]), np.array([1.0])).round(4).tolist()
+    [0.2337]
+    """
+    z = error_db / sd_db
+    density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
+    return np.asarray(sd_db * (z * (2.0 * ndtr(z) - 1.0) + 2.0 * density - 1.0 / np.sqrt(np.pi)))
+
+
+def level_scores(series: Sequence[LevelSeries]) -> dict[str, float]:
+    """Scores of one task: the mean over its series, so that a long flight counts no more than a short one.
+
+    Parameters
+    ----------
+    series : sequence of LevelSeries
+        At least one.
+
+    Returns
+    -------
+    dict of str to float
+        ``rmse_db, rmse_4s_db, bias_db`` (mean size of the offsets), ``crps_db, log_score, coverage_90`` (NaN without
+        ``sd_db``), ``n``.
+    """
+    rows = [_series_scores(item) for item in series]
+    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key != "n"} | {
+        "n": float(sum(row["n"] for row in rows))
+    }
+
+
+def _series_scores(s: LevelSeries) -> dict[str, float]:
+    error = s.error_db
+    slow = local_mean_db(s.time_s, s.measured_db, WINDOW_S) - local_mean_db(s.time_s, s.level_db, WINDOW_S)
+    # the mean of local means is not that of the samples: it has an offset of its own
+    slow = slow - slow.mean() if s.own_offset else slow
+    scores = {
+        "rmse_db": float(np.sqrt(np.mean(error**2))),
+        "rmse_4s_db": float(np.sqrt(np.mean(slow**2))),
+        "bias_db": abs(s.bias_db),
+        "crps_db": np.nan,
+        "log_score": np.nan,
+        "coverage_90": np.nan,
+        "n": float(len(error)),
+    }
+    if s.sd_db is not None:
+        scores["crps_db"] = float(crps_normal(error, s.sd_db).mean())
+        scores["log_score"] = float(np.mean(0.5 * (error / s.sd_db) ** 2 + np.log(np.sqrt(2.0 * np.pi) * s.sd_db)))
+        scores["coverage_90"] = float(np.mean(np.abs(error) <= ndtri(0.5 + COVERAGE / 2) * s.sd_db))
+    return scores
+
+
+# Held-out segments of a flight, equally long.
+_SEGMENTS = 10
+
+_PENALTY = 1.0
+_SPAN_DB = 60.0
+# Samples of either kind that a score needs.
+_FEWEST = 50
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectionForecast:
+    """P(detected) of a predicted level, learned on flights: logistic in the level.
+
+    Parameters
+    ----------
+    level_db : float
+        Predicted level at which half of the samples are detected.
+    per_db : float
+        Slope of the log odds.
+    share : float
+        Of detected samples, mean over the flights: the forecast of who knows no level.
+    """
+
+    level_db: float
+    per_db: float
+    share: float
+
+    def probability(self, level_db: FloatArray) -> FloatArray:
+        """P(detected) (n,) at predicted levels (n,) [dB]."""
+        from scipy.special import expit
+
+        return np.asarray(expit(self.per_db * (level_db - self.level_db)))
+
+
+def learn_detection(flights: Sequence[tuple[FloatArray, BoolArray]]) -> DetectionForecast | None:
+    """P(detected) of predicted levels, each flight of the same weight; None where either outcome is rare.
+
+    Parameters
+    ----------
+    flights : sequence of ((n,), (n,))
+        Predicted levels [dB], finite, and which samples were detected.
+
+    Returns
+    -------
+    DetectionForecast or None
+        None, too, where the detected samples do not have the higher levels.
+    """
+    from scipy.optimize import minimize
+
+    flights = [flight for flight in flights if len(flight[0])]
+    detected = np.concatenate([np.zeros(0, dtype=np.bool_), *(locked for _, locked in flights)])
+    if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
+        return None
+    level = np.concatenate([each for each, _ in flights])
+    weight = np.concatenate([np.full(len(each), 1.0 / len(each)) for each, _ in flights])
+    centre, scale = float(level.mean()), max(float(level.std()), 1e-9)
+    unit = (level - centre) / scale
+
+    def loss(c: FloatArray) -> tuple[float, FloatArray]:
+        odds = c[0] + c[1] * unit
+        over = DetectionForecast(level_db=0.0, per_db=1.0, share=0.0).probability(odds) - detected
+        # a small ridge: where a level parts the outcomes exactly, no slope is steep enough
+        value = (weight * (np.logaddexp(0.0, odds) - detected * odds)).sum() + 1e-3 * c[1] ** 2
+        return float(value), np.array([(weight * over).sum(), (weight * over * unit).sum() + 2e-3 * c[1]])
+
+    constant, slope = minimize(loss, np.zeros(2), jac=True).x
+    if slope <= 0.0:
+        return None
+    share = float(np.mean([locked.mean() for _, locked in flights]))
+    return DetectionForecast(
+        level_db=centre - scale * float(constant / slope), per_db=float(slope) / scale, share=share
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DetectionScore:
+    """Score of a log whose receiver loses its lock, or ends at a floor.
+
+    Parameters
+    ----------
+    floor_db : float
+        Lower levels count as this one [unit of the measurement].
+    n, n_detected : int
+    brier, constant_brier, log_score, constant_log_score : float
+        Of P(detected) from the predicted level; constant: this flight's own share, the best that knows no level. Brier
+        counts one of the two outcomes: 0 to 1. Log score in nat.
+    learned_on : str
+        ``other flights``, or ``held-out segments``: each segment of this flight from the others.
+    offset_db, rmse_db : float
+        All samples, both sides no lower than the floor; the offset is added to the measurement.
+    rmse_ci95_db : (low, high)
+        Of ``rmse_db``, as other levels have it.
+    free_space_rmse_db : float
+        The same of free space.
+    detected_rmse_db : float
+        Of the detected samples alone, at that offset. They are selected by their level: never to be given alone.
+    reliability : tuple of (float, float, int)
+        Mean probability, share detected and samples, in fifths of the probability.
+    """
+
+    floor_db: float
+    n: int
+    n_detected: int
+    brier: float
+    constant_brier: float
+    log_score: float
+    constant_log_score: float
+    offset_db: float
+    rmse_db: float
+    free_space_rmse_db: float
+    detected_rmse_db: float
+    reliability: tuple[tuple[float, float, int], ...]
+    learned_on: str
+    rmse_ci95_db: Interval = NO_INTERVAL
+    locks: bool = False
+    """The log itself says when the receiver was in lock; else a sample without a level was not detected."""
+
+
+def score_detection(
+    time_s: FloatArray,
+    measured_db: FloatArray,
+    simulated_db: FloatArray,
+    detected: BoolArray,
+    *,
+    floor_db: float,
+    free_space_db: FloatArray,
+    forecast: DetectionForecast | None = None,
+) -> DetectionScore | None:
+    """Score of a log in two parts; None where either outcome is rare.
+
+    Parameters
+    ----------
+    time_s : (n,)
+    measured_db, simulated_db : (n,)
+        Measured NaN: below the floor. Samples without a simulated level take no part.
+    detected : (n,) bool
+    floor_db : float
+        Floor of the measurement.
+    free_space_db : (n,)
+        Level of free space, for comparison.
+    forecast : DetectionForecast, optional
+        Learned on other flights, of ``simulated_db``; without, each segment is forecast from the others.
+
+    Returns
+    -------
+    DetectionScore or None
+    """
+    finite = np.isfinite(simulated_db) & np.isfinite(time_s)
+    time, simulated, detected = time_s[finite], simulated_db[finite], detected[finite]
+    measured = np.maximum(np.nan_to_num(measured_db[finite], nan=floor_db), floor_db)
+    if min(int(detected.sum()), int((~detected).sum())) < _FEWEST:
+        return None
+    # as ranks 1 and 2: the regression of ranks serves here, too
+    outcome = detected.astype(np.int64) + 1
+    if forecast is None:
+        stated = _held_out(time, simulated, outcome)
+    else:
+        stated = np.stack([1.0 - (p := forecast.probability(simulated)), p], axis=1)
+    constant = np.tile([1.0 - detected.mean(), detected.mean()], (len(time), 1))
+    fit = floored_fit(measured, simulated, floor_db)
+    residual = measured - np.maximum(simulated - fit.offset_db, floor_db)
+    return DetectionScore(
+        floor_db=floor_db,
+        n=len(time),
+        n_detected=int(detected.sum()),
+        brier=float(brier_losses(stated, outcome).mean()) / 2.0,
+        constant_brier=float(brier_losses(constant, outcome).mean()) / 2.0,
+        log_score=float(log_losses(stated, outcome).mean()),
+        constant_log_score=float(log_losses(constant, outcome).mean()),
+        offset_db=fit.offset_db,
+        rmse_db=fit.rmse_db,
+        rmse_ci95_db=rmse_interval(residual[np.argsort(time, kind="stable")], fit.rmse_db),
+        free_space_rmse_db=floored_fit(measured, free_space_db[finite], floor_db).rmse_db,
+        detected_rmse_db=float(np.sqrt(np.mean(residual[detected] ** 2))),
+        reliability=_reliability(stated[:, 1], detected),
+        learned_on="held-out segments" if forecast is None else "other flights",
+    )
+
+
+def _held_out(time_s: FloatArray, level_db: FloatArray, outcome: IntArray) -> FloatArray:
+    """Probabilities (n, 2) of each segment by the level, learned in the others."""
+    segment = np.minimum((time_s - time_s.min()) / max(np.ptp(time_s), 1e-9) * _SEGMENTS, _SEGMENTS - 1).astype(
+        np.int64
+    )
+    stated = out_of_group(level_db[:, None], outcome, segment, _PENALTY)[:, :2]
+    # two outcomes of the four that a receiver of ranks knows
+    return np.asarray(stated / stated.sum(axis=1, keepdims=True))
+
+
+def floored_fit(measured_db: FloatArray, simulated_db: FloatArray, floor_db: float) -> OffsetFit:
+    """Offset of least RMSE where both sides count as no lower than the floor; pairs (n,) with a NaN do not count.
+
+    It is added to the measurement, and lies within 60 dB of the median above the floor.
+    """
+    finite = np.isfinite(measured_db) & np.isfinite(simulated_db)
+    order = np.flatnonzero(finite)[np.argsort(simulated_db[finite])]
+    measured, simulated = np.maximum(measured_db[order], floor_db), simulated_db[order]
+    above = measured > floor_db
+    middle = float(np.median((simulated - measured)[above])) if above.any() else 0.0
+    grid = offset_grid(span_db=(middle - _SPAN_DB, middle + _SPAN_DB))
+    # below the floor a prediction counts as the floor: the first k of the order, the others move with the offset
+    low = np.concatenate([[0.0], np.cumsum((measured - floor_db) ** 2)])
+    difference = simulated - measured
+    first, second = (np.concatenate([[0.0], np.cumsum(difference**power)]) for power in (1, 2))
+    k = np.searchsorted(simulated, grid + floor_db, side="right")
+    n = len(measured)
+    moved = (second[n] - second[k]) - 2.0 * grid * (first[n] - first[k]) + (n - k) * grid**2
+    # differences of large sums may fall a little below 0
+    mse = np.maximum(low[k] + moved, 0.0) / n
+    best = int(mse.argmin())
+    return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), n, best in (0, len(grid) - 1))
+
+
+def _reliability(stated: FloatArray, detected: BoolArray) -> tuple[tuple[float, float, int], ...]:
+    fifth = np.minimum((stated * 5.0).astype(np.int64), 4)
+    groups = [fifth == i for i in range(5)]
+    return tuple((float(stated[g].mean()), float(detected[g].mean()), int(g.sum())) for g in groups if g.any())
+
+
+# Between two values of AERPAW's sounder [s]: 4095 chips and the rest of its correlation.
+BASE_S = 0.032768
+
+# Correlation that the sounder's own time base must add before it is taken.
+_BETTER = 0.1
+
+
+def aligned_quality(time_s: FloatArray, power_db: FloatArray, quality_db: FloatArray) -> tuple[FloatArray, float]:
+    """Quality at the times of the power where a merged table paired them by row.
+
+    Rows were dropped from the power when it was merged with the telemetry, not from the quality: row i then holds the
+    quality of :data:`BASE_S` * i after the first.
+
+    Parameters
+    ----------
+    time_s, power_db, quality_db : (n,)
+        Of one table.
+
+    Returns
+    -------
+    (n,), float
+        Quality, NaN where none is left, and the largest shift [s]; 0 where the rows are paired in time.
+    """
+    base_s = np.arange(len(time_s)) * BASE_S + time_s[0]
+    moved = np.interp(time_s, base_s, quality_db, right=np.nan)
+    shift = float(np.abs(base_s - time_s).max())
+    finite = np.isfinite(moved) & np.isfinite(power_db) & np.isfinite(quality_db)
+    if shift < 2.0 or finite.sum() < _FEWEST:
+        return quality_db, 0.0
+    paired, based = (float(np.corrcoef(power_db[finite], q[finite])[0, 1]) for q in (quality_db, moved))
+    return (moved, shift) if based > paired + _BETTER else (quality_db, 0.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServingComparison:
+    """Serving cells, logged against predicted.
+
+    Parameters
+    ----------
+    cells : tuple of str
+    confusion : (cells, cells + 1) int
+        Samples by the cell that served (row) and the one predicted strongest (column); the last column counts samples
+        at which no cell is predicted at all.
+    n : int
+        Samples with a serving cell among ``cells``.
+    """
+
+    cells: tuple[str, ...]
+    confusion: IntArray
+    n: int
+
+    @property
+    def hit_share(self) -> float:
+        """Share of the samples whose serving cell is the one predicted strongest; NaN without samples."""
+        return float(np.trace(self.confusion) / self.n) if self.n else float("nan")
+
+    @property
+    def majority_share(self) -> float:
+        """Share that always naming the cell that served most would hit: what a prediction has to beat."""
+        return float(self.confusion.sum(axis=1).max() / self.n) if self.n else float("nan")
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        names = (*self.cells, "none")
+        return {
+            "cells": list(self.cells),
+            "n": self.n,
+            "hit_share": self.hit_share,
+            "majority_share": self.majority_share,
+            "confusion": {
+                cell: dict(zip(names, map(int, row), strict=True))
+                for cell, row in zip(self.cells, self.confusion, strict=True)
+            },
+        }
+
+
+def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence[str]) -> ServingComparison:
+    """Serving-cell hits and the confusion matrix.
+
+    Parameters
+    ----------
+    served : array_like, int, (n,)
+        Index of the serving cell; negative where it is not known or none of ``cells``: left out.
+    predicted_dbm : array_like, (n, cells)
+        NaN where no path is predicted. Of equal levels the first cell counts as strongest.
+    cells : sequence of str
+
+    Examples
+    --------
+    >>> compare_serving([0, 1, 1, -1], [[-70, -80], [-75, -71], [-60, -90], [-60, -90]], ["a", "b"]).confusion.tolist()
+    [[1, 0, 0], [1, 1, 0]]
+    """
+    # unknown is no cell: -1 would be the last one as an index
+    index = np.nan_to_num(unmasked(served), nan=-1.0).astype(np.int64)
+    level: FloatArray = unmasked(predicted_dbm)
+    known = index >= 0
+    filled = np.where(np.isnan(level), -np.inf, level)
+    strongest = np.where(np.isnan(level).all(axis=1), len(cells), filled.argmax(axis=1) if len(cells) else 0)
+    confusion = np.zeros((len(cells), len(cells) + 1), dtype=np.int64)
+    # add.at counts a pair as often as it comes; += would count it once
+    np.add.at(confusion, (index[known], strongest[known]), 1)
+    return ServingComparison(cells=tuple(cells), confusion=confusion, n=int(known.sum()))
+
+
+def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s: float) -> FloatArray:
+    """Values of one clock at the times of another: those of the nearest sample, NaN where none is near.
+
+    Parameters
+    ----------
+    time_s : array_like, (n,)
+        Times asked for [s].
+    of_s : array_like, (m,)
+        Times of the values, ascending [s].
+    values : array_like, (m,)
+    within_s : float
+        Farther samples do not count [s].
+
+    Returns
+    -------
+    (n,)
+        In the unit of ``values``.
+    """
+    instants, sampled_s = unmasked(time_s), unmasked(of_s)
+    column = unmasked(values)
+    if not len(sampled_s):
+        return np.full(len(instants), np.nan)
+    after = np.clip(np.searchsorted(sampled_s, instants), 0, len(sampled_s) - 1)
+    before = np.maximum(after - 1, 0)
+    near = np.where(np.abs(sampled_s[before] - instants) <= np.abs(sampled_s[after] - instants), before, after)
+    return np.where(np.abs(sampled_s[near] - instants) <= within_s, column[near], np.nan)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FieldAudit:
+    """Differences that the two references found.
+
+    Parameters
+    ----------
+    paths, power_max_db, power_rms_db, phase_max_rad, phase_rms_rad
+        Against Sionna's own coefficients: paths compared, worst and root-mean-square differences.
+    link_rss_max_db : float
+        Of the coherent RSS of links whose paths are all shorter than 300 m, against Sionna.
+    reference_links, reference_paths, h_max_error, rss_max_error_db, rank_differs
+        Against the second implementation: largest difference of H, relative; of RSS; links with another rank.
+    attitude_rows, attitude_max_rad
+        Logged attitudes turned into rotations a second time.
+    missing_paths, phantom_paths : int
+        Paths that a reference has and whose existence is beyond doubt; paths that cannot exist.
+    doubtful : int
+        Paths and links that were not judged, since a micrometre decides (float32: two millimetres).
+    failures : tuple of str
+        What is out of tolerance, in words.
+    not_covered : tuple of str
+    """
+
+    paths: int = 0
+    power_max_db: float = 0.0
+    power_rms_db: float = 0.0
+    phases: int = 0
+    phase_max_rad: float = 0.0
+    phase_rms_rad: float = 0.0
+    link_rss_max_db: float = 0.0
+    reference_links: int = 0
+    reference_paths: int = 0
+    h_max_error: float = 0.0
+    rss_max_error_db: float = 0.0
+    rank_differs: int = 0
+    attitude_rows: int = 0
+    attitude_max_rad: float = 0.0
+    missing_paths: int = 0
+    phantom_paths: int = 0
+    doubtful: int = 0
+    failures: tuple[str, ...] = ()
+    not_covered: tuple[str, ...] = ()
+
+    @property
+    def failed(self) -> int:
+        """Number of checks out of tolerance."""
+        return len(self.failures)
+
+    def __add__(self, other: FieldAudit) -> FieldAudit:
+        """Both together: counts add up, the worst stays."""
+        values: dict[str, Any] = {
+            name: _together(name, getattr(self, name), getattr(other, name)) for name in self.__slots__
+        }
+        values["power_rms_db"] = _rms(self.paths, self.power_rms_db, other.paths, other.power_rms_db)
+        values["phase_rms_rad"] = _rms(self.phases, self.phase_rms_rad, other.phases, other.phase_rms_rad)
+        return FieldAudit(**values)
+
+
+def _together(name: str, mine: Any, theirs: Any) -> Any:
+    """Texts once each, the larger of two errors, the sum of two counts."""
+    if isinstance(mine, tuple):
+        return tuple(dict.fromkeys((*mine, *theirs)))
+    worst = name.endswith(("_max_db", "_max_m", "_max_rad", "_max_error", "_max_error_db"))
+    return max(mine, theirs) if worst else mine + theirs
+
+
+def _rms(n: int, rms: float, m: int, other_rms: float) -> float:
+    return float(math.sqrt((n * rms**2 + m * other_rms**2) / max(n + m, 1)))

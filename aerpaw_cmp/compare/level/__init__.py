@@ -1,1 +1,0 @@
-"""Levels against their prediction: RSS, detection, serving cells."""

@@ -1,1 +1,0 @@
-"""Ranks that a receiver reports: forecast and receiver."""

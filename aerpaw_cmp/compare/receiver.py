@@ -1,0 +1,728 @@
+"""The rank that a receiver reports: its forecast, and its decision as learned from flights.
+
+Forecasts of rank: a probability for each rank, and what they are worth against the reports of a modem.
+
+A probability forecast is judged by a proper score (nobody gains by saying what he does not believe), the log score,
+beside that of a constant forecast, the histogram of the training flights. Kappa and agreement judge the one rank that
+a decision makes of the probabilities, beside what always saying the commonest rank agrees.
+
+Rank decision of a receiver, learned on flights: from singular values and level to a probability of each rank.
+
+A receiver picks the rank that promises most throughput at its noise, from a codebook and an estimate of the channel
+that no log holds. What can be learned is how often it says 1, 2, 3 or 4 where the modelled channel has certain ratios
+of singular values and a certain level: a multinomial logistic regression with a ridge penalty. Simpler rules stand
+beside it: one threshold per stream, and an ordered regression (one linear score, one cut between neighbouring ranks).
+
+Which antenna geometry the channel is modelled with is chosen by the log score on sectors of directions left out within
+the training flights (:func:`choose_features`), never on the flight that is scored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.errors import InputError
+from ..common.geodesy import azimuth_rad
+from ..common.text import counted
+from ..common.units import FloatArray, IntArray, unmasked
+from .rank import MAX_RANK, cohen_kappa, kappa_of_means, one_hot, total_variation, variation_of_means
+from .statistics import NO_INTERVAL, REPLICATES, Interval, autocorrelation, bootstrap_means, interval
+
+# What a rank counts in the log score that a forecast held impossible.
+_LEAST_PROBABILITY = 1e-6
+
+
+def log_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
+    """Logarithmic score of each sample [nat]: ``-ln p(reported rank)``; smaller is better.
+
+    Parameters
+    ----------
+    probability : (n, ranks)
+        Of rank 1 .. ranks; rows sum to one.
+    rank : (n,)
+        Reported.
+
+    Notes
+    -----
+    Good (1952), doi:10.1111/j.2517-6161.1952.tb00104.x. Probabilities below :data:`_LEAST_PROBABILITY` count as that.
+
+    Examples
+    --------
+    >>> log_losses(np.array([[0.5, 0.5]]), np.array([2])).round(4).tolist()
+    [0.6931]
+    """
+    return np.asarray(-np.log(np.maximum(probability[np.arange(len(rank)), rank - 1], _LEAST_PROBABILITY)))
+
+
+def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
+    """Brier score of each sample: ``sum_r (p_r - [r = rank])^2``, 0 to 2; smaller is better.
+
+    Notes
+    -----
+    Brier (1950), doi:10.1175/1520-0493(1950)078<0001:VOFEIT>2.0.CO;2.
+
+    Examples
+    --------
+    >>> brier_losses(np.array([[0.5, 0.5]]), np.array([2])).tolist()
+    [0.5]
+    """
+    return np.asarray(((probability - one_hot(rank, probability.shape[1])) ** 2).sum(axis=1))
+
+
+def constant_forecast(rank: ArrayLike, ranks: int = MAX_RANK) -> FloatArray:
+    """Histogram of training ranks (ranks,), each rank counted once more, so that none is impossible."""
+    values = unmasked(rank)
+    count = np.bincount(values[values >= 1].astype(np.int64), minlength=ranks + 1)[1:] + 1.0
+    return np.asarray(count / count.sum())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForecastScore:
+    """Score of a forecast on samples that had no part in its fit.
+
+    Parameters
+    ----------
+    n : int
+        Samples with a report and a forecast.
+    kappa, agreement : float
+        Of the decided rank.
+    majority_agreement : float
+        Agreement of always saying the commonest rank of these samples (known only afterwards).
+    log_score, constant_log_score : float
+        Mean of :func:`log_losses` [nat], of the forecast and of the constant one.
+    log_score_gain : float
+        Share by which the forecast is below the constant one.
+    log_score_difference_ci95 : (low, high)
+        Of forecast minus constant [nat], on the same samples.
+    total_variation_expected : float
+        Between the mean probabilities and the measured histogram.
+    kappa_ci95, log_score_ci95, total_variation_ci95 : (low, high)
+    """
+
+    n: int
+    kappa: float = np.nan
+    kappa_ci95: Interval = NO_INTERVAL
+    agreement: float = np.nan
+    majority_agreement: float = np.nan
+    log_score: float = np.nan
+    log_score_ci95: Interval = NO_INTERVAL
+    constant_log_score: float = np.nan
+    log_score_gain: float = np.nan
+    log_score_difference_ci95: Interval = NO_INTERVAL
+    total_variation_expected: float = np.nan
+    total_variation_ci95: Interval = NO_INTERVAL
+
+
+def score_forecast(
+    measured: ArrayLike,
+    probability: FloatArray,
+    decided: ArrayLike,
+    constant: FloatArray,
+    *,
+    replicates: int = REPLICATES,
+) -> ForecastScore:
+    """Score a forecast on samples in time order.
+
+    Parameters
+    ----------
+    measured : array_like, (n,)
+        Reported rank, NaN where none.
+    probability : (n, ranks)
+        NaN where there is no forecast.
+    decided : array_like, (n,)
+        The one rank said; 0 where there is no forecast.
+    constant : (ranks,)
+        The constant forecast, from the flights of the fit (:func:`constant_forecast`).
+    replicates : int
+        Block bootstrap.
+
+    Returns
+    -------
+    ForecastScore
+        All NaN where no sample has both.
+    """
+    ri, decision = unmasked(measured).ravel(), unmasked(decided).ravel()
+    counts = (ri >= 1) & (decision >= 1) & np.isfinite(probability).all(axis=1)
+    rank, choice, p = ri[counts].astype(np.int64), decision[counts].astype(np.int64), probability[counts]
+    if not len(rank):
+        return ForecastScore(n=0)
+    flat = np.broadcast_to(constant, p.shape)
+    reported, chosen = one_hot(rank), one_hot(choice)
+    log, log_constant = log_losses(p, rank), log_losses(flat, rank)
+    columns = np.column_stack([log, log - log_constant, p, rank == choice, reported, chosen]).astype(np.float64)
+    pair_columns = columns[:, -1 - 2 * MAX_RANK :]  # agreement and the two ranks, as kappa takes them
+    # one set of resamples serves all numbers: the longest memory is safe for each
+    memory = max((autocorrelation(c) for c in (pair_columns[:, 0], *columns[:, :2].T)), key=lambda m: m.block_length)
+    drawn = bootstrap_means(columns, memory.block_length, replicates=replicates)
+    drawn_p, drawn_pair = drawn[:, 2 : 2 + MAX_RANK], drawn[:, 2 + MAX_RANK :]
+    mean = columns.mean(axis=0)
+    expected, share = mean[2 : 2 + MAX_RANK], pair_columns.mean(axis=0)[1 : 1 + MAX_RANK]
+    kappa = cohen_kappa(rank, choice)
+    spread = total_variation(share, expected)
+    varied = variation_of_means(np.column_stack([drawn_pair[:, : 1 + MAX_RANK], drawn_p]))
+    return ForecastScore(
+        n=len(rank),
+        kappa=kappa,
+        kappa_ci95=interval(kappa, kappa_of_means(drawn_pair), memory, bounds=(-1.0, 1.0)),
+        agreement=float(np.mean(rank == choice)),
+        majority_agreement=float(share.max()),
+        log_score=float(mean[0]),
+        log_score_ci95=interval(float(mean[0]), drawn[:, 0], memory, bounds=(0.0, np.inf)),
+        constant_log_score=float(log_constant.mean()),
+        log_score_gain=float(1.0 - mean[0] / log_constant.mean()),
+        log_score_difference_ci95=interval(float(mean[1]), drawn[:, 1], memory),
+        total_variation_expected=spread,
+        total_variation_ci95=interval(spread, varied, memory, bounds=(0.0, 1.0)),
+    )
+
+
+# Ratios of singular values below this are as good as zero to any receiver.
+FLOOR_DB = -40.0
+
+# Ridge penalties to choose from, on coefficients of standardised features (log likelihood of the whole flight).
+_PENALTIES = (1.0, 3.0, 10.0, 30.0, 100.0)
+
+# Ridge penalty while geometries are chosen.
+_CHOICE_PENALTY = 10.0
+
+# Training samples below which nothing is fitted.
+FEWEST = 50
+
+# Numbers in one batch of regressions: bounds memory to some 100 MiB.
+_HELD = 1 << 22
+
+
+def stream_features(sigma: ArrayLike) -> FloatArray:
+    """Features that a receiver may decide by: ratios of singular values and level.
+
+    Parameters
+    ----------
+    sigma : array_like, (..., m)
+        Singular values, descending, absolute (not scaled per matrix).
+
+    Returns
+    -------
+    ndarray, (..., m)
+        ``20 log10 (sigma_i / sigma_1)`` [dB] for i = 2 .. m, not below :data:`FLOOR_DB`, then ``20 log10 sigma_1``
+        [dB]. NaN without a channel.
+
+    Examples
+    --------
+    >>> stream_features([1.0, 0.1, 0.0]).tolist()
+    [-20.0, -40.0, 0.0]
+    """
+    values = unmasked(sigma)
+    largest = values[..., :1]
+    alive = (largest > 0) & np.isfinite(largest)
+    safe = np.where(alive, largest, 1.0)
+    ratio = np.maximum(values[..., 1:] / safe, 10.0 ** (FLOOR_DB / 20.0))
+    features = 20.0 * np.log10(np.concatenate([np.where(alive, ratio, 1.0), safe], axis=-1))
+    return np.asarray(np.where(alive, features, np.nan))
+
+
+def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s: float) -> FloatArray:
+    """Mean of squared singular values over a while around each sample, some seconds later.
+
+    Parameters
+    ----------
+    power : (..., n, m)
+        Squares of singular values.
+    time_s : (n,)
+        Of the samples, in any order [s].
+    shift_s : float
+        Positive: the report belongs to a later position than the log says [s].
+    average_s : float
+        Length of the mean, centred; 0: the sample next in time.
+
+    Returns
+    -------
+    (..., n, m)
+        Where no sample lies in the interval (a gap, the end of the log), the sample next in time stands for the mean.
+
+    Notes
+    -----
+    A receiver decides by an estimate that is seconds old, the network grants what was reported before that, and the
+    positions of a handset lag as well: neither can be told from a log. Ripple of a modelled channel that is finer than
+    these seconds says nothing about a report.
+
+    Examples
+    --------
+    >>> time_means(np.array([[1.0], [2.0], [6.0]]), np.array([0.0, 1.0, 2.0]), 1.0, 2.0).ravel().tolist()
+    [3.0, 4.0, 6.0]
+    """
+    order = np.argsort(time_s, kind="stable")
+    time, centre = time_s[order], time_s + shift_s
+    # an instant at an end of the interval counts, whatever its rounding
+    low = np.searchsorted(time, centre - 0.5 * average_s - 1e-9)
+    high = np.searchsorted(time, centre + 0.5 * average_s + 1e-9, side="right")
+    after = np.searchsorted(time, centre).clip(0, len(time) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(time[before] - centre) < np.abs(time[after] - centre), before, after)
+    empty = high <= low
+    low, high = np.where(empty, nearest, low), np.where(empty, nearest + 1, high)
+    sums = np.zeros((*power.shape[:-2], len(time) + 1, power.shape[-1]))
+    np.cumsum(power[..., order, :], axis=-2, out=sums[..., 1:, :])
+    return np.asarray((sums[..., high, :] - sums[..., low, :]) / (high - low)[:, None])
+
+
+def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8) -> IntArray:
+    """Sector of directions from the tower of each sample (n,), with about equally many samples in each.
+
+    Sectors left out are directions that the fit never saw; neighbouring samples in time mostly share one.
+    """
+    # cut where the tower has seen nothing, so that the seam splits no sector
+    azimuth = azimuth_rad(position_m[:, :2] - np.asarray(tower_m)[:2])
+    order = np.sort(azimuth)
+    gap = np.diff(np.append(order, order[0] + 2.0 * np.pi))
+    turned = (azimuth - order[(np.argmax(gap) + 1) % len(order)]) % (2.0 * np.pi)
+    return np.asarray(
+        np.searchsorted(np.quantile(turned, np.arange(1, sectors) / sectors), turned, side="right"), dtype=np.int64
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Receiver:
+    """A fitted multinomial regression of rank.
+
+    Parameters
+    ----------
+    coefficient : (ranks, 1 + features)
+        Per rank: constant, then one per standardised feature.
+    mean, scale : (features,)
+        Of the training features.
+    decision_weight : (ranks,)
+        The decided rank is that of the largest probability times weight. All ones: the most probable rank. Others are
+        fitted for kappa on out-of-sector forecasts of the training flights (:func:`decision_weights`).
+    penalty : float
+        Ridge penalty.
+    constant : (ranks,)
+        Histogram of the training ranks: the constant forecast.
+    n : int
+        Training samples.
+    """
+
+    coefficient: FloatArray
+    mean: FloatArray
+    scale: FloatArray
+    decision_weight: FloatArray
+    penalty: float
+    constant: FloatArray
+    n: int
+
+    def probabilities(self, features: FloatArray) -> FloatArray:
+        """Probability (n, ranks) of each rank at features (n, features); NaN where a feature is NaN."""
+        return _softmax(_design((features - self.mean) / self.scale) @ self.coefficient.T)
+
+    def decide(self, probability: FloatArray) -> IntArray:
+        """One rank (n,) per row of probabilities; 0 where there is none."""
+        return decide(probability, self.decision_weight)
+
+    @classmethod
+    def from_dict(cls, numbers: Mapping[str, Any]) -> Receiver:
+        """From its fields as JSON has them.
+
+        Raises
+        ------
+        ValueError
+            If a part is missing or has another shape than the others.
+        """
+        names = ("coefficient", "mean", "scale", "decision_weight", "constant")
+        if missing := [name for name in (*names, "penalty", "n") if name not in numbers]:
+            raise ValueError(f"a receiver without {', '.join(missing)}")
+        arrays = {name: np.asarray(numbers[name], dtype=np.float64) for name in names}
+        ranks, width = arrays["coefficient"].shape
+        if arrays["mean"].shape != (width - 1,) or arrays["constant"].shape != (ranks,):
+            raise ValueError(f"coefficients of {ranks} ranks and {width - 1} features do not fit the other parts")
+        return cls(**arrays, penalty=float(numbers["penalty"]), n=int(numbers["n"]))
+
+
+def decide(probability: FloatArray, weight: FloatArray) -> IntArray:
+    """Rank (n,) of the largest ``probability * weight``; 0 where the probabilities are NaN."""
+    alive = np.asarray(np.isfinite(probability).all(axis=1))
+    best = np.argmax(np.where(alive[:, None], probability, 0.0) * weight, axis=1) + 1
+    return np.where(alive, best, 0).astype(np.int64)
+
+
+def _fitted(x: FloatArray, rank: IntArray, penalty: float) -> Receiver:
+    mean, scale = _standard(x)
+    return Receiver(
+        coefficient=_fit_multinomial((x - mean) / scale, rank, np.ones(len(rank)), penalty),
+        mean=mean,
+        scale=scale,
+        decision_weight=np.ones(MAX_RANK),
+        penalty=penalty,
+        constant=constant_forecast(rank),
+        n=len(rank),
+    )
+
+
+def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
+    """Features (geometries, n, features), ranks and groups of the samples that have a rank and all features."""
+    ri = unmasked(rank)
+    good = np.asarray((ri >= 1) & np.isfinite(features).all(axis=(0, 2)))
+    y = ri[good].astype(np.int64)
+    if len(y) < FEWEST or np.ptp(y) == 0:
+        what = f"{counted(len(y), 'sample')} with rank and channel" if len(y) < FEWEST else f"rank {y[0]} throughout"
+        raise InputError(what, expected=f"at least {FEWEST} samples of at least two ranks to fit a receiver")
+    if len(np.unique(groups[good])) < 2:
+        raise InputError("all training samples are in one sector", expected="samples in at least two sectors")
+    return features[:, good], y, groups[good]
+
+
+def _standard(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and scale per feature; a constant feature keeps scale 1 and says nothing."""
+    # over the samples: the axis before the last, whatever stands in front
+    scale = x.std(axis=-2)
+    return x.mean(axis=-2), np.asarray(np.where(scale > 1e-9, scale, 1.0))
+
+
+def _standardised(x: FloatArray) -> FloatArray:
+    mean, scale = _standard(x)
+    return (x - mean[..., None, :]) / scale[..., None, :]
+
+
+def _design(x: FloatArray) -> FloatArray:
+    return np.concatenate([np.ones((*x.shape[:-1], 1)), x], axis=-1)
+
+
+def _softmax(score: FloatArray) -> FloatArray:
+    # less the largest: exp would overflow
+    e = np.exp(score - _over_ranks(np.maximum, score)[..., None])
+    return np.asarray(e / _over_ranks(np.add, e)[..., None])
+
+
+def _over_ranks(operation: np.ufunc, values: FloatArray) -> FloatArray:
+    """``operation.reduce`` over the last axis, which has a few elements only: ten times as fast, the same bits."""
+    return np.asarray(reduce(operation, np.moveaxis(values, -1, 0)))
+
+
+def out_of_group(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float) -> FloatArray:
+    """Forecast (..., n, ranks) of each group by a regression on all the others.
+
+    Parameters
+    ----------
+    x : (..., n, features)
+        Leading axes are further sets of features of the same samples, fitted at once.
+    rank : (n,) int
+        1 to :data:`~aerpaw_cmp.compare.rank.MAX_RANK`.
+    groups : (n,) int
+        Each is left out once.
+    penalty : float
+        Of the squared coefficients (ridge).
+
+    Returns
+    -------
+    (..., n, ranks)
+        Probabilities; they sum to 1 over the last axis.
+    """
+    z = _standardised(x)
+    result = np.empty((*z.shape[:-1], MAX_RANK))
+    for group in np.unique(groups):
+        out = groups == group
+        weights = _fit_multinomial(z, rank, (~out).astype(np.float64), penalty)
+        result[..., out, :] = _softmax(_design(z[..., out, :]) @ np.swapaxes(weights, -1, -2))
+    return result
+
+
+def _fit_multinomial(
+    x: FloatArray, rank: IntArray, weight: FloatArray, penalty: float, *, steps: int = 30
+) -> FloatArray:
+    """Coefficients (..., ranks, 1 + features) of the largest penalised log likelihood, by damped Newton steps.
+
+    Parameters
+    ----------
+    x : (..., n, features)
+        Standardised.
+    weight : (n,)
+        Of each sample, 0 or 1.
+    penalty : float
+        ``penalty / 2`` times the squares of all slopes is added to minus the log likelihood, and a thousandth of it
+        for the constants, which fixes the common shift that probabilities do not see.
+
+    Notes
+    -----
+    Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., section 4.4.
+    """
+    design = _design(x)
+    lead, width = design.shape[:-2], design.shape[-1]
+    target = one_hot(rank) * weight[:, None]
+    ridge = np.full(width, penalty)
+    ridge[0] = 1e-3 * penalty
+    # half a report more: a rank that nobody reported starts at a finite constant
+    start = np.log((target.sum(axis=0) + 0.5) / (weight.sum() + 0.5 * MAX_RANK))
+    coefficient = np.zeros((*lead, MAX_RANK, width))
+    coefficient[..., 0] = start - start.mean()
+    transposed = np.swapaxes(design, -1, -2)
+
+    def objective(c: FloatArray) -> FloatArray:
+        score = design @ np.swapaxes(c, -1, -2)
+        top = _over_ranks(np.maximum, score)
+        normal = top + np.log(_over_ranks(np.add, np.exp(score - top[..., None])))
+        return np.asarray(
+            (weight * normal).sum(axis=-1)
+            - (target * score).sum(axis=(-1, -2))
+            + 0.5 * (ridge * c**2).sum(axis=(-1, -2))
+        )
+
+    value = objective(coefficient)
+    for _ in range(steps):
+        p = _softmax(design @ np.swapaxes(coefficient, -1, -2))
+        gradient = np.swapaxes(p * weight[:, None] - target, -1, -2) @ design + ridge * coefficient
+        hessian = _hessian(design, transposed, p, weight, ridge)
+        flat = gradient.reshape(*lead, MAX_RANK * width, 1)
+        # as a matrix of one column: NumPy 2 takes a stack of vectors for one matrix
+        step = np.linalg.solve(hessian, flat)[..., 0].reshape(coefficient.shape)
+        damping = np.ones((*lead, 1, 1))
+        for _halving in range(12):
+            trial = objective(coefficient - damping * step)
+            worse = trial > value + 1e-9
+            if not np.any(worse):
+                break
+            damping = np.where(worse[..., None, None], 0.5 * damping, damping)
+        coefficient = coefficient - damping * step
+        value = objective(coefficient)
+        if np.abs(damping * step).max() < 1e-7:
+            break
+    return coefficient
+
+
+def _hessian(
+    design: FloatArray, transposed: FloatArray, p: FloatArray, weight: FloatArray, ridge: FloatArray
+) -> FloatArray:
+    width = design.shape[-1]
+    result = np.zeros((*design.shape[:-2], MAX_RANK * width, MAX_RANK * width))
+    for a in range(MAX_RANK):
+        for b in range(a, MAX_RANK):
+            curvature = weight * p[..., a] * (float(a == b) - p[..., b])
+            block = transposed @ (design * curvature[..., None])
+            if a == b:
+                block = block + np.diag(ridge)
+            result[..., a * width : (a + 1) * width, b * width : (b + 1) * width] = block
+            result[..., b * width : (b + 1) * width, a * width : (a + 1) * width] = block
+    return result
+
+
+def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) -> FloatArray:
+    """Weights (ranks,) of the decision: those of largest kappa, if they earn it where they were not chosen; else ones.
+
+    Parameters
+    ----------
+    probability : (n, ranks)
+        Forecasts of groups left out.
+    rank : (n,) int
+    groups : (n,) int
+        Each is decided once with the weights that suit the others.
+    """
+    weighed, plain = np.zeros_like(rank), decide(probability, np.ones(MAX_RANK))
+    for group in np.unique(groups):
+        out = groups == group
+        if np.ptp(rank[~out]) > 0:
+            weighed[out] = decide(probability[out], _kappa_weights(probability[~out], rank[~out]))
+        else:
+            weighed[out] = plain[out]
+    if cohen_kappa(rank, weighed) > np.nan_to_num(cohen_kappa(rank, plain)):
+        return _kappa_weights(probability, rank)
+    return np.ones(MAX_RANK)
+
+
+def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
+    """Weights (ranks,) for the largest kappa: one for ranks below the commonest, one for those above.
+
+    Always the most probable rank says the commonest one too often: kappa pays for the rare ones. Two weights on a grid,
+    the nearest to none at equal kappa.
+    """
+    commonest = int(np.bincount(rank).argmax())
+    # those near none first: a further one must be better to be taken
+    exponents = sorted(np.arange(-3, 13) / 10.0, key=abs)
+    best, weights = -np.inf, np.ones(MAX_RANK)
+    ranks = np.arange(1, MAX_RANK + 1)
+    for below in exponents:
+        for above in exponents:
+            weight = np.exp(np.where(ranks < commonest, below, np.where(ranks > commonest, above, 0.0)))
+            kappa = cohen_kappa(rank, decide(probability, weight))
+            if np.isfinite(kappa) and kappa > best + 1e-9:
+                best, weights = kappa, weight
+    return weights
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReceiverMixture:
+    """Receivers of several geometries that the training flights cannot tell apart: the mean of their forecasts.
+
+    Parameters
+    ----------
+    members : tuple of Receiver
+        One per geometry, best first.
+    decision_weight : (ranks,)
+        As of a :class:`Receiver`, for the mean.
+    """
+
+    members: tuple[Receiver, ...]
+    decision_weight: FloatArray
+
+    def probabilities(self, features: FloatArray) -> FloatArray:
+        """Mean probability (n, ranks) at features (members, n, features)."""
+        return np.asarray(
+            np.mean([member.probabilities(x) for member, x in zip(self.members, features, strict=True)], axis=0)
+        )
+
+    def decide(self, probability: FloatArray) -> IntArray:
+        """One rank (n,) per row of probabilities; 0 where there is none."""
+        return decide(probability, self.decision_weight)
+
+
+def fit_mixture(
+    features: FloatArray, rank: ArrayLike, groups: IntArray, *, penalties: Sequence[float] = _PENALTIES
+) -> ReceiverMixture:
+    """Fit one receiver per geometry, with the penalty and the decision that suit the mean of their forecasts.
+
+    Parameters
+    ----------
+    features : (geometries, n, features)
+        Those of :attr:`FeatureChoice.tied`, say.
+    rank : array_like, (n,)
+        Reported rank; samples without (NaN, 0) or without features take no part.
+    groups : (n,) int
+        Each is left out once, e.g. :func:`sector_groups`.
+    penalties : sequence of float
+        To choose from, by the log loss on groups left out.
+
+    Returns
+    -------
+    ReceiverMixture
+        One receiver per geometry, in order, and their common decision.
+
+    Raises
+    ------
+    InputError
+        Fewer than :data:`FEWEST` samples, or one rank only: nothing to learn from.
+    """
+    x, y, group = _training(features, rank, groups)
+    means = [np.mean([out_of_group(item, y, group, penalty) for item in x], axis=0) for penalty in penalties]
+    best = int(np.argmin([log_losses(p, y).mean() for p in means]))
+    return ReceiverMixture(
+        members=tuple(_fitted(item, y, float(penalties[best])) for item in x),
+        decision_weight=decision_weights(means[best], y, group),
+    )
+
+
+# --- which geometry -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeatureChoice:
+    """Choice of the modelled channel that explains the training ranks best, and of those that do as well.
+
+    Parameters
+    ----------
+    best : int
+        Index of the candidate with the least log score on groups left out.
+    order : (tried,) int
+        Candidates that were cross-validated, best first.
+    log_score : (tried,)
+        On groups left out [nat], in that order.
+    tied : tuple of int
+        Candidates that the data cannot tell from the best: the 95 % interval of the difference of their log scores on
+        the same samples holds 0. The best comes first.
+    candidates : int
+        How many there were.
+    """
+
+    best: int
+    order: IntArray
+    log_score: FloatArray
+    tied: tuple[int, ...]
+    candidates: int
+
+
+def choose_features(
+    features: FloatArray,
+    rank: ArrayLike,
+    groups: IntArray,
+    *,
+    finalists: int = 60,
+    replicates: int = REPLICATES,
+) -> FeatureChoice:
+    """Choose between candidate geometries by groups left out within the training flights.
+
+    Parameters
+    ----------
+    features : (candidates, n, features)
+        Of every candidate at the same samples.
+    rank : array_like, (n,)
+    groups : (n,) int
+        Each is left out once.
+    finalists : int
+        Only those with the best likelihood on the training samples themselves are cross-validated: all candidates have
+        equally many coefficients, and a fit costs a tenth of a cross-validation.
+    replicates : int
+        Of the bootstrap that says which candidates are no worse than the best.
+
+    Returns
+    -------
+    FeatureChoice
+        The best candidate, those tied with it, and the finalists by their log score.
+
+    Raises
+    ------
+    InputError
+        As :func:`fit_mixture`.
+    """
+    x, y, group = _training(features, rank, groups)
+    step = max(1, _HELD // (x.shape[1] * (x.shape[2] + 1) * MAX_RANK))
+    rough = np.concatenate([_own_losses(x[i : i + step], y) for i in range(0, len(x), step)])
+    # stable, to nine digits: of candidates equal but for rounding (mounts half a turn apart) the first listed stays
+    final = np.argsort(np.round(rough, 9), kind="stable")[:finalists]
+    losses = np.concatenate([_left_out_losses(x[final[i : i + step]], y, group) for i in range(0, len(final), step)])
+    score = losses.mean(axis=1)
+    rows = np.argsort(np.round(score, 9), kind="stable")
+    tied = tuple(int(final[r]) for r in rows if _not_worse(losses[r] - losses[rows[0]], replicates))
+    return FeatureChoice(
+        best=int(final[rows[0]]), order=final[rows], log_score=score[rows], tied=tied, candidates=len(features)
+    )
+
+
+def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray) -> float:
+    """Log score of the mean forecast of several geometries on groups left out.
+
+    Parameters
+    ----------
+    features : (geometries, n, features)
+    rank, groups : (n,)
+        As :func:`fit_mixture`.
+
+    Returns
+    -------
+    float
+        [nat].
+    """
+    x, y, group = _training(features, rank, groups)
+    return float(log_losses(out_of_group(x, y, group, _CHOICE_PENALTY).mean(axis=0), y).mean())
+
+
+def _own_losses(x: FloatArray, rank: IntArray) -> FloatArray:
+    z = _standardised(x)
+    # a rough likelihood is enough to leave candidates out
+    weights = _fit_multinomial(z, rank, np.ones(len(rank)), _CHOICE_PENALTY, steps=6)
+    p = _softmax(_design(z) @ np.swapaxes(weights, -1, -2))
+    return np.array([log_losses(item, rank).mean() for item in p])
+
+
+def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray) -> FloatArray:
+    return np.stack([log_losses(item, rank) for item in out_of_group(x, rank, groups, _CHOICE_PENALTY)])
+
+
+def _not_worse(difference: FloatArray, replicates: int) -> bool:
+    if np.abs(difference).max() < 1e-9:  # the same channel by another name
+        return True
+    known = autocorrelation(difference)
+    mean = float(difference.mean())
+    drawn = bootstrap_means(difference[:, None], known.block_length, replicates=replicates)[:, 0]
+    low, _ = interval(mean, drawn, known)
+    return not low > 0.0

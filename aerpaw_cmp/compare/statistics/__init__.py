@@ -1,1 +1,0 @@
-"""Intervals, memory of a series, passes, inertia: pure functions of arrays."""

@@ -1,0 +1,467 @@
+"""Questions about logs: what names, files beside them, clocks or the ground contradict; what is assumed.
+
+Logs of several flights told apart by time and place.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta, tzinfo
+from datetime import timezone as zones
+from pathlib import Path, PurePosixPath
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..common.units import AnyArray
+from ..logs import files
+from ..logs.ingest import IngestedFile, read_bytes
+from ..logs.limits import PLACE, jumps_of
+from ..logs.records import Stream, has_wall_clock
+from ..site.site import Site
+from .clock import Origin, origin_of
+from .track import Track
+
+# Logs that end and begin within this are of one flight: radios are started before the take-off.
+SLACK = np.timedelta64(5, "m")
+# Tracks at one time, but some 5 km apart, are of two aircraft.
+APART_DEG = 0.05
+
+Span = tuple[np.datetime64, np.datetime64]
+
+
+@dataclass
+class Flight:
+    """Files of one flight, and when it was (None: nothing has a wall clock)."""
+
+    files: list[IngestedFile] = field(default_factory=list)
+    span: Span | None = None
+    place: tuple[float, float] | None = None
+    unsure: dict[str, str] = field(default_factory=dict)
+    """Questions about files that may be of another flight, by path."""
+
+    @property
+    def measured(self) -> list[Stream]:
+        """Streams that can be compared."""
+        return [stream for file in self.files for stream in file.result.streams if stream.kind in ("rss", "rank")]
+
+    @property
+    def complete(self) -> bool:
+        """True if it holds something to compare, and positions to compare it at."""
+        measured = self.measured
+        tracked = any(_tracks(file) for file in self.files)
+        return bool(measured) and (tracked or any("latitude_deg" in stream.frame for stream in measured))
+
+
+def flights(files: Sequence[IngestedFile]) -> list[Flight]:
+    """Flights in the order of time.
+
+    Telemetry begins a flight; a radio log belongs to the flight that it shares most time with. Logs with relative
+    times go to the flight on whose track their positions lie, else to that whose files lie in their folder; where
+    that says nothing, to the only flight, or to one of their own. Of several that hold both levels and positions, and
+    no clock beside them, each is a flight.
+
+    Parameters
+    ----------
+    files : sequence of IngestedFile
+    """
+    timed = [(file, span) for file in files if (span := _span_of(file)) is not None]
+    groups: list[Flight] = []
+    # tracks first, in the order of time: radio logs then find their flight
+    for file, span in sorted(timed, key=lambda entry: (not _tracks(entry[0]), entry[1][0])):
+        place = _place(file)
+        near = [flight for flight in groups if _meet(flight, span, place)]
+        flight = max(near, key=lambda group: _shared(group.span, span), default=None)
+        if flight is None:
+            flight = Flight(span=span, place=place)
+            groups.append(flight)
+        flight.files.append(file)
+        if _tracks(file) or not any(_tracks(member) for member in flight.files):
+            assert flight.span is not None
+            # a radio that was left on does not stretch a flight that has a track
+            flight.span = (min(flight.span[0], span[0]), max(flight.span[1], span[1]))
+            flight.place = flight.place or place
+    for file in files:
+        if _span_of(file) is None:
+            _home(file, groups).files.append(file)
+    for flight in groups:
+        tracks = [file for file in flight.files if _tracks(file)]
+        for file in flight.files if tracks else ():
+            if file.path not in flight.unsure and (text := _otherwise(file, tracks[0])):
+                flight.unsure[file.path] = text
+    return sorted(groups, key=lambda group: (group.span is None, (group.span or ())[:1]))
+
+
+# A number of a flight, and a date, in the name of a log or of its folder.
+_FLIGHT_NUMBER = re.compile(r"(?<![a-z])(flight|flt|sortie|mission)[ _.-]?0*(\d{1,3})(?!\d)", re.IGNORECASE)
+_DATE = re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)")
+
+
+def _otherwise(file: IngestedFile, track: IngestedFile) -> str:
+    """Return the question about a log whose name has another flight or date than the track's; empty if it has none."""
+    names = ["/".join(Path(item.path).parts[-2:]) for item in (file, track)]
+    first, second = ({(word.lower(), number) for word, number in _FLIGHT_NUMBER.findall(name)} for name in names)
+    if first and second and not first & second:
+        (shown, other) = (" ".join(min(found)) for found in (first, second))
+        return f"its name has {shown}, that of the track {other}: which flight?"
+    # a clock of its own says more than a name: an evening's flight has the next day in UTC
+    if _span_of(file) is not None:
+        return ""
+    dates = [{"-".join(parts) for parts in _DATE.findall(name)} for name in names]
+    flown = _span_of(track)
+    if flown is not None:
+        dates[1] |= {str(flown[0].astype("datetime64[D]") + day) for day in (-1, 0, 1)}
+    if dates[0] and dates[1] and not dates[0] & dates[1]:
+        return f"its name has {min(dates[0])}, the track is of {max(dates[1])}: which flight?"
+    return ""
+
+
+def _span_of(file: IngestedFile) -> Span | None:
+    """First and last time of a file's streams; None where it has no wall clock."""
+    spans = [span for stream in file.result.streams if (span := stream_span(stream)) is not None]
+    first = min((begin for begin, _ in spans), default=None)
+    return None if first is None or not has_wall_clock(first) else (first, max(end for _, end in spans))
+
+
+def stream_span(stream: Stream) -> Span | None:
+    """First and last time of a stream; None where it has none."""
+    time = stream.frame["time"].to_numpy("datetime64[ns]")
+    time = time[~np.isnat(time)]
+    return (time.min(), time.max()) if len(time) else None
+
+
+def meet(first: Span, second: Span) -> bool:
+    """Check whether two spans share an instant."""
+    return bool(first[0] <= second[1] and second[0] <= first[1])
+
+
+def _tracks(file: IngestedFile) -> list[Stream]:
+    return [stream for stream in file.result.streams if stream.kind == "telemetry"]
+
+
+def _place(file: IngestedFile) -> tuple[float, float] | None:
+    for stream in _tracks(file):
+        known = stream.frame[["latitude_deg", "longitude_deg"]].dropna()
+        if len(known):
+            return float(known["latitude_deg"].median()), float(known["longitude_deg"].median())
+    return None
+
+
+def _meet(flight: Flight, span: Span, place: tuple[float, float] | None) -> bool:
+    if flight.span is None or not meet((flight.span[0] - SLACK, flight.span[1] + SLACK), span):
+        return False
+    if place is None or flight.place is None:
+        return True
+    # the margin before and after is for radios: two tracks must share time
+    return meet(flight.span, span) and max(abs(place[0] - flight.place[0]), abs(place[1] - flight.place[1])) < APART_DEG
+
+
+def _shared(first: Span | None, second: Span) -> np.timedelta64:
+    """Time that two spans share; negative where they do not."""
+    assert first is not None
+    return min(first[1], second[1]) - max(first[0], second[0])
+
+
+def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
+    """Origin under which a log with positions lies on the track of a flight."""
+    track = next((track for member in flight.files for track in _tracks(member)), None)
+    # the fullest: a log of a hundred cells has the places of one receiver a hundred times
+    placed = [stream for stream in file.result.streams if "latitude_deg" in stream.frame]
+    fullest = max(placed, key=lambda stream: stream.frame["latitude_deg"].count(), default=None)
+    return None if track is None or fullest is None else origin_of(fullest, track)
+
+
+# Two tracks that a log lies on about as well: it may be of either flight.
+_ALIKE, _ALIKE_M = 2.0, 5.0
+
+
+def _called(flight: Flight) -> str:
+    if flight.span is None:
+        return f"of {Path(flight.files[0].path).name}"
+    return f"at {str(flight.span[0].astype('datetime64[m]')).replace('T', ' ')} UTC"
+
+
+def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
+    """The flight of a file without a wall clock; a new one is added to ``groups``."""
+    # what holds both levels and positions is a flight by itself: with another in its own time it shares none
+    alone = Flight([file]).complete
+    known = [flight for flight in groups if flight.span is not None] if alone else groups
+    by_track = [
+        (origin.distance_m, i) for i, flight in enumerate(known) if (origin := _origin(file, flight)) is not None
+    ]
+    if by_track:
+        # nearest track first
+        (near_m, best), *others = sorted(by_track)
+        rivals = [i for away_m, i in others if away_m < max(_ALIKE * near_m, _ALIKE_M)]
+        if rivals:
+            called = " and ".join(_called(known[i]) for i in rivals)
+            text = f"its positions lie on the track of the flight {called} too: which flight?"
+            known[best].unsure[file.path] = text
+        return known[best]
+    folder = Path(file.path).parent
+    near = [flight for flight in known if any(Path(member.path).parent == folder for member in flight.files)]
+    if len(near) != 1:
+        near = known if len(known) == 1 else []
+    if not near:
+        groups.append(Flight())
+        near = groups[-1:]
+    return near[0]
+
+
+_IN_NAME = re.compile(
+    r"(?<!\d)(20\d\d)[-_]?([01]\d)[-_]?([0-3]\d)(?:[T_ -]([0-2]\d)[-_:]?([0-5]\d)(?:[-_:]?([0-5]\d))?)?(?!\d)"
+)
+_NEMO_START = re.compile(r"^Measurement start;(\d{4} \w{3} \d\d \d\d:\d\d)", re.MULTILINE)
+
+# A name with a date alone may be local or UTC, and of the start or the end.
+_OF_THE_DAY = timedelta(hours=36)
+
+# A program is started before its radio is.
+_OF_THE_MINUTE = timedelta(minutes=15)
+
+# A track whose lowest height [m] is farther from 0 does not begin at its take-off.
+_GROUND_M = 5.0
+
+
+def questions(file: IngestedFile, streams: Sequence[Stream], timezone: str | None) -> list[str]:
+    """Questions of a draft about the streams of a log that it keeps, each with both values.
+
+    Parameters
+    ----------
+    file : IngestedFile
+    streams : sequence of Stream
+    timezone : str or None
+        Of clocks without a zone.
+    """
+    texts = []
+    start = _start(streams)
+    if start is not None:
+        zone = ZoneInfo(timezone) if timezone else None
+        starts = _name_starts(file.path)
+        # names of a flight file are those of the machine that made it
+        if not file.holder:  # else a path that the flight file names, of another machine
+            starts += _summary_starts(Path(file.path))
+        texts += [
+            f"{where} says {time:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is right?"
+            for where, time, form, slack in starts
+            if _apart(time, start, zone, exact=slack == _OF_THE_MINUTE) > slack
+        ]
+        if any(s.attributes.get("clock_from") == "assumed" for s in streams):
+            texts.append(f"the times are read as {_source(streams, 'clock') or 'local wall time'}: right?")
+    if any(s.attributes.get("height_from") == "assumed" for s in streams):
+        texts.append(f"the heights are read as {_source(streams, 'height') or 'above take-off'}: right?")
+    for stream in streams:
+        sentence = "" if (jumps := jumps_of(stream))[0].any() else jumps[1]
+        # a draft is checked by its lines that end in a question mark
+        texts += [f"{sentence.rstrip('?')}?"] if sentence else []
+        if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > _GROUND_M:
+            texts.append(f"the lowest height is {low:.0f} m, expected 0 m: does the track begin in the air?")
+    return list(dict.fromkeys(texts))
+
+
+# Nothing flown here goes higher; a lowest height above it is one of another datum [m].
+_TOO_HIGH_M = 150.0
+
+# Radios are started within this of the telemetry; a whole number of hours apart, a zone is wrong.
+_TOGETHER_S = 90.0
+
+_MANY_WITHOUT_POSE = 0.1
+
+
+def doubts(
+    track: Track, telemetry: Stream, series: Sequence[tuple[str, AnyArray]], undated: Sequence[str] = ()
+) -> tuple[str, ...]:
+    """Clauses on clocks and heights that the first words of a report repeat.
+
+    Parameters
+    ----------
+    track : Track
+    telemetry : Stream
+        That it was made from.
+    series : sequence of (str, (n,) datetime64)
+        Names and times of what is compared on the track.
+    undated : sequence of str
+        Logs with positions whose times the flight file dates, beside telemetry with a clock.
+
+    Returns
+    -------
+    tuple of str
+    """
+    apart: dict[int, list[str]] = {}
+    poseless: dict[str, float] = {}
+    for name, time in ((name, time) for name, time in series if len(time)):
+        late_s = float((time.min() - np.datetime64(track.start_ns, "ns")) / np.timedelta64(1, "s"))
+        hours = round(late_s / 3600.0)
+        if hours and abs(late_s - 3600.0 * hours) < _TOGETHER_S:
+            apart.setdefault(hours, []).append(name)
+        if (without := float(np.mean(~track.pose_at(time).valid))) > _MANY_WITHOUT_POSE:
+            poseless[name] = without
+    texts = [
+        f"{_listed(names)} begins {hours:+d} h from the telemetry, as with a wrong time zone"
+        for hours, names in apart.items()
+    ]
+    if poseless:
+        texts.append(f"{max(poseless.values()):.0%} of the samples of {_listed(list(poseless))} have no position")
+    if undated:
+        texts.append(f"{_listed(undated)} has no clock: by its positions it may be of another flight on this route")
+    low_m, assumed = _lowest_m(telemetry), telemetry.attributes.get("height_from") == "assumed"
+    if low_m is not None and (low_m > _TOO_HIGH_M or (assumed and abs(low_m) > _GROUND_M)):
+        texts.append(f"the lowest height above take-off is {low_m:.0f} m, probably above another datum")
+    return tuple(texts)
+
+
+# A flight has samples below this height above its take-off [m]; else its heights count from the sea.
+_FLOWN_M = 300.0
+
+# Heights that begin within this of the site's ground above the sea probably count from the sea [m].
+_NEAR_GROUND_M = 50.0
+
+# A UAV at rest: for this long it does not move by more than this [s, m], and then it climbs [m].
+_REST_S, _REST_M, _CLIMB_M = 5.0, 0.5, 5.0
+
+
+def check_heights(site: Site, path: str, telemetry: Stream) -> tuple[str, ...]:
+    """Check that the heights of a flight count from its take-off, and not from the sea.
+
+    Parameters
+    ----------
+    site : Site
+    path : str
+        Path of the log, for the message.
+    telemetry : Stream
+
+    Returns
+    -------
+    tuple of str
+        A clause for the first words of a report if the lowest height is about that of the site's ground above the sea.
+
+    Raises
+    ------
+    InputError
+        If no sample is below :data:`_FLOWN_M`, or if the UAV rests and takes off at about the height of the site's
+        ground above the sea.
+    """
+    low_m, sea_m = _lowest_m(telemetry), site.ground_above_sea_m
+    if low_m is None or "takeoff_from" in telemetry.attributes:
+        return ()
+    low_m += site.takeoff_ground_m
+    near = sea_m is not None and low_m > _GROUND_M and abs(low_m - sea_m) < _NEAR_GROUND_M
+    if low_m > _FLOWN_M or (near and _takes_off(telemetry)):
+        ground = "the ground of the take-off above the sea [m]" if sea_m is None else f"the ground is {sea_m:g} m up"
+        raise InputError(
+            f"the lowest height above take-off is {low_m:.0f} m",
+            expected=f"samples below {_FLOWN_M:.0f} m, or a log that begins on the ground",
+            cause="heights above sea level that are read as above take-off: "
+            f"write 'takeoff_ground_m: {-(low_m if sea_m is None else sea_m):.0f}' under 'origin:' of the site "
+            f"file (minus {ground}), or add the rows of the take-off to the log",
+            path=path,
+        )
+    if near:
+        return (
+            f"the lowest height above take-off is {low_m:.0f} m, about the ground of the site above the sea "
+            f"({sea_m:.0f} m): if the heights count from the sea, write 'takeoff_ground_m: {-(sea_m or 0.0):.0f}' "
+            "under 'origin:' of the site file",
+        )
+    return ()
+
+
+def _takes_off(telemetry: Stream) -> bool:
+    """Check whether a track begins with a UAV at rest that then climbs."""
+    frame = telemetry.frame.dropna(subset=["time", *PLACE])
+    if len(frame) < 2:
+        return False
+    latitude, longitude, height = (frame[name].to_numpy(np.float64) for name in PLACE)
+    seconds = (frame["time"].to_numpy() - frame["time"].to_numpy()[0]) / np.timedelta64(1, "s")
+    first = seconds <= _REST_S
+    moved = np.hypot(latitude - latitude[0], (longitude - longitude[0]) * np.cos(np.radians(latitude[0]))) * 111_000.0
+    still = np.maximum(moved, np.abs(height - height[0]))[first].max() <= _REST_M and first.sum() > 2
+    return bool(still and height.max() > height[0] + _CLIMB_M and height.min() > height[0] - _CLIMB_M)
+
+
+def _listed(names: Sequence[str]) -> str:
+    return names[0] if len(names) == 1 else f"{names[0]} (and {len(names) - 1} more)"
+
+
+def _start(streams: Sequence[Stream]) -> datetime | None:
+    """First time (UTC) of some streams; None without a wall clock."""
+    first = min((span[0] for stream in streams if (span := stream_span(stream)) is not None), default=None)
+    if first is None or not has_wall_clock(first):
+        return None
+    start: datetime = first.astype("datetime64[us]").item().replace(tzinfo=zones.utc)
+    return start
+
+
+def _name_starts(path: str) -> list[tuple[str, datetime, str, timedelta]]:
+    """Date, or date and time, in the name of a file."""
+    starts = []
+    for match in _IN_NAME.finditer(Path(path).name):
+        parts = [int(part) for part in match.groups() if part is not None]
+        try:
+            time = datetime(*parts, tzinfo=zones.utc)  # type: ignore[misc, arg-type]
+        except ValueError:
+            continue
+        form, slack = ("%Y-%m-%d %H:%M", _OF_THE_MINUTE) if len(parts) > 3 else ("%Y-%m-%d", _OF_THE_DAY)
+        starts.append(("the file's name", time, form, slack))
+    return starts
+
+
+def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
+    """Start of the measurement in a Nemo summary beside a log."""
+    starts = []
+    stem = path.name.split(".")[0]
+    for name, head in _tables_beside(path):
+        # a folder may hold the summaries of several measurements
+        if name.startswith(stem) and (match := _NEMO_START.search(head)) is not None:
+            time = datetime.strptime(match[1], "%Y %b %d %H:%M").replace(tzinfo=zones.utc)
+            starts.append((f"Measurement start in {name}", time, "%Y-%m-%d %H:%M", _OF_THE_MINUTE))
+    return starts
+
+
+def _tables_beside(path: Path) -> Iterator[tuple[str, str]]:
+    """Names and beginnings of the CSVs in a log's folder, or in the folder of the archive that holds it."""
+    if path.parent.is_dir():
+        for table in (table for table in sorted(path.parent.glob("*.csv")) if table != path and table.is_file()):
+            with table.open("rb") as stream:
+                yield table.name, stream.read(_HEAD_BYTES).decode("utf-8", "replace")
+        return
+    if (part := files.path_in_archive(path)) is not None:
+        place, inner = part
+        for name, member in files.archive_members(read_bytes(place)[0], place).items():
+            if name != inner and name.endswith(".csv") and PurePosixPath(name).parent == PurePosixPath(inner).parent:
+                yield PurePosixPath(name).name, member.read(_HEAD_BYTES).decode("utf-8", "replace")
+
+
+_HEAD_BYTES = 2000
+
+
+def _apart(time: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
+    """Least distance of a time from the start, read as UTC and as local; without a zone in any zone."""
+    if not exact:
+        # a date is its noon, give or take
+        return abs(start - time - timedelta(hours=12))
+    if zone is not None:
+        # that of the day: a zone has two in a year
+        offset = start.astimezone(zone).utcoffset() or timedelta(0)
+        return min(abs(start - time), abs(start + offset - time))
+    # every zone that there is, by half hours
+    return min(abs(start - time + timedelta(minutes=30 * half)) for half in range(-28, 29))
+
+
+def _source(streams: Sequence[Stream], what: str) -> str:
+    sources = [s.attributes.get(f"{what}_source") for s in streams if s.attributes.get(f"{what}_from") == "assumed"]
+    return next((str(source) for source in sources if source), "")
+
+
+def _lowest_m(stream: Stream) -> float | None:
+    height = stream.frame["altitude_m"].to_numpy(np.float64)
+    height = height[np.isfinite(height)]
+    if not len(height):
+        return None
+    # not the least: one row of a receiver without a fix may be far below
+    low = float(np.percentile(height, 1.0))
+    # a log may end in the air; a climb from its first row is no jump of a receiver that had no fix
+    begins = np.abs(np.diff(height[: len(height) // 100 + 2], prepend=0.0)).max() <= _GROUND_M
+    return min(low, float(height[0])) if begins else low

@@ -1,0 +1,686 @@
+"""Proposals for a draft: the tower or place that the levels fit, and learned antennas of the site.
+
+Tower, or place, that the levels of a log fit: proposals for a draft.
+
+Learned antennas of a site for a flight: those that the levels of the flight itself support.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from ...common.errors import InputError, UsageError
+from ...common.jsonable import named
+from ...common.units import FloatArray, spread_out
+from ...compare.gains import (
+    LEAST_ODDS,
+    MAST,
+    Evidence,
+    FlightEvidence,
+    KnownProcess,
+    LinkSamples,
+    Moments,
+    Spread,
+    link_directions,
+    table_moments,
+)
+from ...compare.locate import FEWEST, LevelModel, LevelTrack, fit_places, level_track, locate, place_odds
+from ...logs.records import Stream
+from ...propagation.field.baselines import free_space_dbm
+from ...site import learned
+from ...site.antennas import MeasuredPattern
+from ...site.learned import KnownDirections, SpherePattern, check_logs, read_known, read_pair, read_sphere_csv
+from ...site.site import Site
+from ..data import RATIOS, FlightData, RssSeries, quantity_of
+from ..gains import pair_and_sd_db, sphere_angles, spread_of, with_learned
+from ..replay import observed_series
+from ..rows import unscored
+from ..settings import FlightFile
+from ..track import Track
+from ..training import among, flight_logs, marks_of
+
+# Log odds from which on a tower stands: of real flights and thirds at LW1 18 of 20 give more, all more than -3, and six
+# rovers -11 and less; from which on a listed place does, which somebody wrote down: the rovers' give -3 and more.
+_TOWER_ODDS, _LISTED_ODDS = -0.5, -5.0
+
+# Log odds that antennas which flights taught must give more: thirds of LW1 flights give 8 to 57 in all where one or two
+# taught; of 165 places elsewhere 158 give less than the 5 at which a tower stands.
+_TAUGHT_MORE = 5.5
+
+# Log evidence by which another tower must explain the levels better before a named one is doubted.
+CONTRADICTED = 8.0
+
+# Bins of a level that say which of two vehicles carried the radio, and the model that they are judged by.
+_FEWEST_OF_VEHICLE = 8
+_NEAR_FREE_SPACE = LevelModel(slope=2.0, slope_sd=0.3, elevation_sd_db=2.0, shadow_sd_db=2.0, scatter_sd_db=1.5)
+
+# Places of a list, and towers, whose log odds differ by less are all named.
+_UNDECIDED = 3.0
+
+# Of the link that a draft proposes.
+CARRIER_HZ, POWER_DBM = 3.3e9, 40.0
+
+# Below it an airframe on the ground decides the level.
+_LOW_M = 5.0
+
+# A place of a list that is farther from the track is not of this flight.
+NEAR_M = 5000.0
+
+
+@dataclass(frozen=True, slots=True)
+class ListedPlace:
+    """A place of a position list: file name, line, latitude and longitude [deg]."""
+
+    file: str
+    line: int
+    latitude_deg: float
+    longitude_deg: float
+
+
+_PAIR = re.compile(r"\s*(-?\d{1,3}\.\d{3,})\s*[,;\s]\s*(-?\d{1,3}\.\d{3,})\s*")
+_MOST_BYTES = 20_000
+
+
+def listed_places(folders: Iterable[Path]) -> list[ListedPlace]:
+    """Places that position lists in some folders name: text files with ``position`` in the name, a pair a line."""
+    paths = [path for folder in sorted(set(folders)) for path in sorted(folder.glob("*[Pp]osition*"))]
+    places = []
+    for path in paths:
+        if path.suffix not in (".txt", ".csv", "") or not path.is_file() or path.stat().st_size > _MOST_BYTES:
+            continue
+        for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+            if (pair := _PAIR.fullmatch(line)) is not None:
+                places.append(ListedPlace(path.name, number, float(pair[1]), float(pair[2])))
+    return places
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """A proposal for ``node`` of a log.
+
+    Parameters
+    ----------
+    node : str
+    tower : mapping or None
+        Entry of ``towers`` in flight.yaml, where the site has no such tower.
+    question : str
+        About the proposal.
+    radius_m : float
+        Of 90 % confidence about an estimated place; 0 of a known one.
+    """
+
+    node: str
+    tower: Mapping[str, Any] | None
+    question: str
+    radius_m: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class Taught:
+    """Antennas of a tower and of an airframe that flights taught, and how levels scatter about them."""
+
+    tower: MeasuredPattern
+    uav: MeasuredPattern
+    model: LevelModel
+    moments: Moments | None = None
+    """Gain of both ends with its covariance, by which it must win against a gain of the flight's own."""
+
+
+@dataclass
+class Placer:
+    """Proposals for the logs of one flight."""
+
+    site: Site
+    telemetry: Stream
+    listed: Sequence[ListedPlace] = ()
+    nodes: dict[str, FloatArray] = field(default_factory=dict)
+    """Proposed so far: east and north."""
+
+    def __post_init__(self) -> None:
+        frame = self.telemetry.frame[~unscored(self.telemetry.frame)]
+        takeoff_m, ground = self.site.takeoff_ground_m, self.site.ground_under_m
+        self.track = Track(frame, self.site.frame, ground_m=takeoff_m, ground=ground)
+
+    @property
+    def at_site(self) -> bool:
+        """True if the flight was flown near a tower of the site."""
+        return any(self._near(tower.latitude_deg, tower.longitude_deg) for tower in self.site.towers.values())
+
+    def positions_m(self, count: int) -> FloatArray:
+        """About ``count`` positions (n, 3) of the flight [m], spread over it, above the ground."""
+        times = self.telemetry.frame["time"]
+        place = self.track.pose_at(times.iloc[spread_out(len(times), count)]).position_m
+        # in the air: on the ground everything is behind something
+        return place[place[:, 2] > self.track.ground_m + _LOW_M]
+
+    def levels(
+        self,
+        stream: Stream,
+        floor_db: float = -np.inf,
+        airframe: MeasuredPattern | None = None,
+        node: MeasuredPattern | None = None,
+    ) -> LevelTrack:
+        """Levels of a log where the UAV flew, with the gains of its airframe and of a node where they are known.
+
+        Parameters
+        ----------
+        stream : Stream
+        floor_db : float
+            Of the receiver; -inf where none is known.
+        airframe, node : MeasuredPattern, optional
+
+        Returns
+        -------
+        LevelTrack
+        """
+        frame = stream.frame[~unscored(stream.frame)]
+        poses = self.track.pose_at(frame["time"])
+        place = np.where((poses.position_m[:, 2] > self.track.ground_m + _LOW_M)[:, None], poses.position_m, np.nan)
+        time = frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
+        level = frame["rss_db"].to_numpy(np.float64)
+        below_floor = frame["flag"].astype(str).str.contains("out_of_coverage").to_numpy()
+        # out of coverage is knowledge: the level was below the floor there
+        level = np.where(np.isnan(level) & below_floor & np.isfinite(floor_db), floor_db, level)
+        track = level_track(time, place, level, floor_db=floor_db)
+        if not len(track.time_s):
+            return track
+        track = replace(track, rotation=self.track.pose_at((track.time_s * 1e9).astype("datetime64[ns]")).rotation)
+        return track if airframe is None else replace(track, airframe_db=self._gain_db(track, airframe, node))
+
+    def propose(
+        self, track: LevelTrack, taught: Mapping[str, Sequence[Taught]] = MappingProxyType({})
+    ) -> Placement | None:
+        """Tower, listed place or estimated place that the levels fit; None where they are too few.
+
+        Parameters
+        ----------
+        track : LevelTrack
+        taught : mapping of str to sequence of Taught
+            Gains of towers and airframe that other flights taught, by tower; none for those of its own log.
+        """
+        if len(track.level_db) < FEWEST:
+            return None
+        towers = list(self.site.towers.values())
+        listed = [place for place in self.listed if self._near(place.latitude_deg, place.longitude_deg)]
+        at = [np.asarray(tower.position_m) for tower in towers] + [self._local(place) for place in listed]
+        odds = place_odds(track, np.array(at))
+        odds_tower, odds_listed = odds[: len(towers)].copy(), odds[len(towers) :]
+        # the search takes longer than all else: only where a tower's antennas or a place of its own need it
+        estimate = locate(track) if any(taught.values()) or odds_tower.max() < _TOWER_ODDS else None
+        known = np.full(len(towers), -np.inf)
+        for i, tower in enumerate(towers):
+            gains = taught.get(tower.name, ()) if estimate is not None else ()
+            if gains := [each for each in gains if self._supports(track, tower.name, each)]:
+                taught_odds = max(self._taught_odds(track, tower.name, each) for each in gains) - np.log(len(gains))
+                # as odds against any place, like those of the search
+                taught_odds -= estimate.anywhere + _TAUGHT_MORE
+                known[i] = taught_odds if taught_odds >= _TOWER_ODDS else -np.inf
+                odds_tower[i] = max(odds_tower[i], taught_odds)
+        if len(listed) and odds_listed.max() >= max(_LISTED_ODDS, odds_tower.max()):
+            # a list of rover places holds neighbours some metres apart: all likely lines are named
+            order = np.argsort(-odds_listed)
+            place, least = listed[order[0]], odds_listed[order[0]] - _UNDECIDED
+            undecided = [listed[i] for i in order[1:] if odds_listed[i] > least]
+            also = "".join(f" or line {tie.line}" for tie in undecided)
+            about = f"line {place.line} of {place.file}{also}: is the node there?"
+            return self._node(self._local(place), place.latitude_deg, place.longitude_deg, 1.5, about)
+        best = int(odds_tower.argmax())
+        if odds_tower[best] >= _TOWER_ODDS:
+            how = "with the antennas that flights taught" if odds_tower[best] > odds[best] else "as well as any place"
+            near = [i for i in np.argsort(-odds_tower) if odds_tower[i] > odds_tower[best] - _UNDECIDED]
+            alike = [towers[i].name for i in near]
+            # a part of a flight that circles no tower fits several: that with learned antennas is the likeliest
+            name = towers[max(near, key=lambda i: (known[i], towers[i].name in taught))].name
+            asked = "is it this tower?" if len(alike) == 1 else f"is it {name}?"
+            return Placement(name, None, f"the levels fit {' or '.join(alike)} {how}: {asked}")
+        assert estimate is not None  # no tower stands
+        latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
+        apart = [float(np.hypot(*(np.asarray(t.position_m) - estimate.place_m)[:2])) for t in towers]
+        near = [t.name for t, d in zip(towers, apart, strict=True) if d <= estimate.radius90_m]
+        decided = f"the levels decide for no tower ({', '.join(near)} possible)" if near else "no tower fits the levels"
+        about = (
+            f"{decided}. They fit this place best, 90 % within {estimate.radius90_m:.0f} m, "
+            f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where did the node stand?"
+        )
+        place = estimate.place_m
+        node = self._node(place, float(latitude[0]), float(longitude[0]), float(place[2]), about)
+        return replace(node, radius_m=estimate.radius90_m)
+
+    def _supports(self, track: LevelTrack, tower: str, gains: Taught) -> bool:
+        """Check whether levels support the learned antennas of a tower against a gain of their own."""
+        if gains.moments is None or track.rotation is None:
+            return True
+        place = self.site.towers[tower].position_m
+        at_uav, at_tower = link_directions(place, track.position_m, track.rotation)
+        free = free_space_dbm(place[None, :], track.position_m, CARRIER_HZ, POWER_DBM)[:, 0]
+        level = np.where(track.below, np.nan, track.level_db)
+        samples = LinkSamples("", tower, "", track.time_s, track.position_m, at_uav, at_tower, level - free)
+        odds = FlightEvidence([samples]).of_link(0, gains.moments)
+        return odds.over_own >= LEAST_ODDS and odds.over_turned > 0.0
+
+    def _taught_odds(self, track: LevelTrack, tower: str, gains: Taught) -> float:
+        """Log evidence of a tower with the antennas at both ends that flights taught."""
+        place, gain_db = self.site.towers[tower].position_m[None, :], self._gain_db(track, gains.uav, gains.tower)
+        return float(fit_places(replace(track, airframe_db=gain_db), place, gains.model).evidence[0])
+
+    def _gain_db(
+        self, track: LevelTrack, airframe: MeasuredPattern, node: MeasuredPattern | None = None
+    ) -> Callable[[FloatArray], FloatArray]:
+        """Gain of an airframe, and of a node, at each level of a track towards unit vectors (m, n, 3)."""
+
+        def gain_db(towards: FloatArray) -> FloatArray:
+            assert track.rotation is not None
+            uav_db = airframe.gain_dbi(*sphere_angles(np.einsum("nji,mnj->mni", track.rotation, towards)))
+            return uav_db if node is None else uav_db + node.gain_dbi(*sphere_angles(-towards))
+
+        return gain_db
+
+    def evidence(self, stream: Stream) -> float:
+        """Log evidence a bin of levels along this track at the best tower; -inf where they are too few."""
+        track = self.levels(stream)
+        if len(track.level_db) < _FEWEST_OF_VEHICLE:
+            return -np.inf
+        towers = [tower.position_m for tower in self.site.towers.values()]
+        return float(fit_places(track, towers, _NEAR_FREE_SPACE).evidence.max()) / len(track.level_db)
+
+    def contradiction(self, track: LevelTrack, node: str) -> str | None:
+        """Tower that the levels fit far better than the one that is named; None where none does."""
+        if node not in self.site.towers or len(track.level_db) < FEWEST:
+            return None
+        names = list(self.site.towers)
+        evidence = fit_places(track, [self.site.towers[name].position_m for name in names]).evidence
+        best = int(evidence.argmax())
+        return names[best] if evidence[best] > evidence[names.index(node)] + CONTRADICTED else None
+
+    def offset_db(self, track: LevelTrack, node: str) -> float | None:
+        """Median of free space over the draft's link minus the level [dB]; None for an unknown node."""
+        place = self.nodes.get(node)
+        if node in self.site.towers:
+            place = self.site.towers[node].position_m
+        if place is None or not len(track.level_db):
+            return None
+        free = free_space_dbm(place[None, :], track.position_m, CARRIER_HZ, POWER_DBM)[:, 0]
+        return float(np.median(free - track.level_db))
+
+    def _node(self, place: FloatArray, latitude: float, longitude: float, height: float, about: str) -> Placement:
+        # two channels of one rover are placed some metres apart
+        same = [name for name, placed in self.nodes.items() if np.hypot(*(placed[:2] - place[:2])) < 100.0]
+        name = same[0] if same else "NODE" + (str(len(self.nodes) + 1) if self.nodes else "")
+        tower = {"latitude_deg": round(latitude, 7), "longitude_deg": round(longitude, 7), "antenna_height_m": height}
+        if same:
+            return Placement(name, None, "")
+        self.nodes[name] = place
+        return Placement(name, tower, about)
+
+    def _local(self, place: ListedPlace) -> FloatArray:
+        east, north = self.site.frame.to_local(np.array([place.latitude_deg]), np.array([place.longitude_deg]))
+        return np.array([east[0], north[0], 1.5])
+
+    def _near(self, latitude_deg: float, longitude_deg: float) -> bool:
+        if not len(self.track):
+            return False
+        start = self.track.pose_at(np.array([self.track.start_ns], dtype="datetime64[ns]")).position_m[0]
+        # a list may hold angles that are none
+        with np.errstate(invalid="ignore"):
+            east, north = self.site.frame.to_local(np.array([latitude_deg]), np.array([longitude_deg]))
+        return bool(np.hypot(east[0] - start[0], north[0] - start[1]) < NEAR_M)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Remembered:
+    """Learned antennas of one tower and channel of a site."""
+
+    name: str
+    """Of the entry."""
+    entry: learned.Entry
+    series: learned.LearnedSeries
+    tower: SpherePattern
+    uav: SpherePattern
+    known: KnownDirections
+
+    @property
+    def level(self) -> learned.LearnedLevel:
+        """Level of the log; only of series that have it."""
+        assert self.series.level is not None
+        return self.series.level
+
+    @property
+    def spread(self) -> Spread:
+        """Error model of a level besides the standard deviation of the gains."""
+        return spread_of(self.series.spread)
+
+    @property
+    def prior_variance_db2(self) -> float:
+        """Variance of the gains of both ends in directions that nobody has flown."""
+        return self.tower.largest_sd_db**2 + self.uav.largest_sd_db**2
+
+    @cached_property
+    def airframe(self) -> KnownProcess:
+        """Gain of the UAV with its covariance."""
+        return KnownProcess(
+            gain_db=lambda at: self.uav.gain_dbi(*sphere_angles(at)),
+            sd_db=lambda at: self.uav.gain_sd_db(*sphere_angles(at)),
+            directions=self.known.directions,
+            covariance_db2=self.known.covariance_db2,
+        )
+
+    def gain_db(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        """Gain of both ends (n,) and its standard deviation (n,) [dB]."""
+        ends = {"uav": (self.uav, samples.at_uav), "tower": (self.tower, samples.at_tower)}
+        pair_db, sd_db = pair_and_sd_db(ends)
+        return pair_db + sum(pattern.gain_dbi(*sphere_angles(direction)) for pattern, direction in ends.values()), sd_db
+
+    def moments(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        """Return mean (n,) and covariance (n, n) of the gain of both ends [dB, dB^2]."""
+        angles = sphere_angles(samples.at_tower)
+        uav_db, covariance = self.airframe.moments(samples.at_uav)
+        covariance += table_moments(MAST, self.tower.gain_sd_db(*angles), samples.at_tower)
+        both = np.concatenate([samples.at_uav, samples.at_tower], axis=1)
+        pair_db = 0.0 if self.tower.pair is None else self.tower.pair.at(both, np.zeros(len(both)))[0]
+        return uav_db + self.tower.gain_dbi(*angles) + pair_db, covariance
+
+
+def every_antenna(site: str | Path) -> list[Remembered]:
+    """Return the learned antennas of a site, of all entries, the latest entry last.
+
+    Raises
+    ------
+    UsageError, InputError
+        Learned models that are damaged, or a table that is not as it was written.
+    """
+    folder, out = learned.folder_of(site), []
+    for name, entry in sorted(learned.read_learned(site).entries.items(), key=lambda item: item[1].made):
+        named = learned.Named(entry=entry, part="", folder=folder)
+        for series in entry.series:
+            files = (series.tower_file, series.uav_file)
+            tower, uav = (read_sphere_csv(folder / file, named.written(file)) for file in files)
+            check_logs((*tower.trained_on, *uav.trained_on), named, folder / series.tower_file)
+            if (pair := series.pair) is not None:
+                place, written = folder / pair.file, named.written(pair.file)
+                tower.pair = read_pair(place, pair.length, pair.prior_sd_db, written)
+            known = read_known(folder / series.known_file, named.written(series.known_file))
+            out.append(Remembered(name=name, entry=entry, series=series, tower=tower, uav=uav, known=known))
+    return out
+
+
+def remembered(site: str | Path) -> dict[str, Remembered]:
+    """Return the learned antennas of the towers of a site by ``tower.channel``, the latest made of each.
+
+    Raises
+    ------
+    UsageError, InputError
+        As :func:`every_antenna`.
+    """
+    return {f"{known.series.tower}.{known.series.channel}": known for known in every_antenna(site)}
+
+
+# Exponent of the distance beside antennas that were learned under free space.
+_TAUGHT_SLOPE_SD = 0.2
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Proposal:
+    """Learned antennas and receiver for a draft, by name, each with a sentence on what to expect."""
+
+    antennas: Mapping[str, str] = field(default_factory=dict)
+    antennas_about: str = ""
+    """Source and odds of the antennas; if none fits, the odds of the best one."""
+    carrier_hz: float | None = None
+    receiver: str | None = None
+    receiver_about: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Nodes:
+    """Nodes of a draft that are no towers of the site and whose place is well known, and the towers of the site."""
+
+    placed: frozenset[str] = frozenset()
+    fixed: Sequence[str] = ()
+
+
+def propose(
+    data: FlightData, place: str | Path, site: str, nodes: Nodes = Nodes(), *, carrier_known: bool = False
+) -> Proposal:
+    """Return the learned antennas that the levels of a flight support, and the rank receiver of its tower.
+
+    Antennas of both ends are compared with the levels of each series; if none fits, the airframes alone with all
+    series together. The antenna of a node that other flights placed is compared at any node that is well placed.
+
+    Parameters
+    ----------
+    data : FlightData
+        Without learned antennas.
+    place : str or Path
+        The site, as :func:`.read_learned` takes it.
+    site : str
+        Its name in the names of the antennas.
+    nodes : Nodes
+    carrier_known : bool
+        The carriers of ``data`` are those of the experiment, and antennas of other bands do not fit.
+
+    Returns
+    -------
+    Proposal
+
+    Raises
+    ------
+    UsageError, InputError
+        As :func:`every_antenna`.
+    """
+    ranked = {(s.tower, quantity_of(data, s)) for s in data.rank}
+    entries = learned.read_learned(place).entries
+    fitted = (n for n, entry in entries.items() if any((r.tower, r.quantity) in ranked for r in entry.receivers))
+    receiver = next(fitted, None)
+    ranks = Proposal(
+        receiver=f"{site}/{receiver}" if receiver else None,
+        receiver_about=entries[receiver].about() if receiver else "",
+    )
+    if data.track is None or not data.rss or not entries:
+        return ranks
+    found = _antennas_for(data, every_antenna(place), site, nodes, carrier_known=carrier_known)
+    return replace(found, **named(ranks, "receiver receiver_about"))
+
+
+def _antennas_for(
+    data: FlightData, known: Sequence[Remembered], site: str, nodes: Nodes, *, carrier_known: bool
+) -> Proposal:
+    """Return the antennas of the entry with the largest odds, or of the airframe with the largest odds."""
+    # a ratio to the noise counts if there is no level
+    levels = [s for s in data.rss if s.channel.lower() not in RATIOS] or list(data.rss)
+    evidence = FlightEvidence([observed_series(data, series)[0].samples for series in levels])
+    chosen: dict[str, dict[str, tuple[Remembered, Evidence]]] = {}
+    for number, series in enumerate(levels):
+        for item in known:
+            band = learned.BAND if carrier_known else math.inf
+            if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
+                continue
+            named_odds = _named_odds(data, series, item)
+            odds, best = evidence.of_link(number, item.moments).with_prior(named_odds), chosen.setdefault(item.name, {})
+            key = f"{series.tower}.{series.channel}"
+            if odds.over_own >= LEAST_ODDS and odds.over_turned > 0.0:
+                best[key] = max(best.get(key, (item, odds)), (item, odds), key=lambda pair: pair[1].over_own)
+    entry = max(chosen, key=lambda name: sum(e.over_own for _, e in chosen[name].values()), default="")
+    if fits := chosen.get(entry):
+        first = next(iter(fits.values()))[0]
+        names = {key: f"{site}/{entry}_{k.series.tower}.{k.series.channel}" for key, (k, _) in fits.items()}
+        return Proposal(
+            antennas=names | {"uav": f"{site}/{entry}_uav"},
+            antennas_about=f"{first.entry.about()}; {_odds(_pooled([odds for _, odds in fits.values()]))}",
+            carrier_hz=first.series.carrier_hz,
+        )
+    return _airframe_for(data, known, site, evidence, band=learned.AIRFRAME_BAND if carrier_known else math.inf)
+
+
+def _airframe_for(
+    data: FlightData, known: Sequence[Remembered], site: str, evidence: FlightEvidence, *, band: float
+) -> Proposal:
+    """Return the airframe alone that the levels support; without an antenna, the odds of the best one."""
+    own, marks = set(flight_logs(data)), marks_of([data])
+    tried: dict[str, tuple[Remembered, Evidence]] = {}
+    for item in known:
+        # a receiver that loses its lock, and flights that do not predict each other, say nothing about other flights
+        silent = item.series.lock is not None or not item.series.shares_airframe
+        same_log = own & set(item.entry.trained_on) or any(among(mark, item.uav.marks) for mark in marks)
+        near = all(_in_band(item, series, band) for series in data.rss)
+        if not silent and not same_log and near and item.series.uav_file not in tried:
+            tried[item.series.uav_file] = item, evidence.of_airframe(item.airframe)
+    if not tried:
+        return Proposal()
+    best, odds = max(tried.values(), key=lambda pair: min(pair[1].over_own, pair[1].over_turned))
+    if not odds.fits:
+        text = f"none of the learned airframes fits these levels; the best one, {best.name}: {_odds(odds)}"
+        return Proposal(antennas_about=text)
+    return Proposal(
+        antennas={"uav": f"{site}/{best.name}_uav"},
+        antennas_about=f"the airframe alone, {best.entry.about()}, there with its tower antenna; {_odds(odds)}",
+        carrier_hz=None if math.isfinite(band) else best.series.carrier_hz,
+    )
+
+
+# Log odds of antennas of both ends before any level: with the names of its tower and channel, or of its receiver; and
+# with levels in another unit, which are those of another receiver. Levels of field flights decide by 13 and more.
+_SAME_NAME, _OTHER_UNIT = 4.0, -3.0
+
+
+def _named_odds(data: FlightData, series: RssSeries, item: Remembered) -> float:
+    """Return the log odds that names give to the learned antennas of both ends."""
+    learned_series = item.series
+    receiver = data.settings.logs[int(series.log[0])].receiver if len(series.log) else ""
+    if receiver and learned_series.receiver:
+        return _SAME_NAME if receiver == learned_series.receiver else -math.inf
+    same = (series.tower, series.channel) == (learned_series.tower, learned_series.channel)
+    other = learned_series.level is not None and learned_series.level.unit != series.unit
+    return (_SAME_NAME if same else 0.0) + (_OTHER_UNIT if other else 0.0)
+
+
+def _in_band(item: Remembered, series: RssSeries, band: float) -> bool:
+    return abs(series.link.carrier_hz / item.series.carrier_hz - 1.0) <= band
+
+
+def _pooled(each: Sequence[Evidence]) -> Evidence:
+    """Return the evidence of several series together."""
+    own, turned = (sum(getattr(e, key) for e in each) for key in ("over_own", "over_turned"))
+    return Evidence(over_own=own, over_turned=turned)
+
+
+# Larger odds are not told from certainty.
+_MOST_ODDS = 1000.0
+
+
+def _odds(odds: Evidence) -> str:
+    """Return the odds of antennas as words.
+
+    Examples
+    --------
+    >>> _odds(Evidence(over_own=4.0, over_turned=20.0))
+    'odds 55:1 against a gain of its own, more than 1000:1 against rotated copies'
+    """
+
+    def ratio(nat: float) -> str:
+        if nat > math.log(_MOST_ODDS):
+            return f"more than {_MOST_ODDS:.0f}:1"
+        return f"{math.exp(nat):.0f}:1" if nat > 0.0 else f"1:{math.exp(min(-nat, 20.0)):.0f}"
+
+    turned = "" if math.isinf(odds.over_turned) else f", {ratio(odds.over_turned)} against rotated copies"
+    return f"odds {ratio(odds.over_own)} against a gain of its own{turned}"
+
+
+def searching_airframe(site: str | Path, towers: Collection[str], log: tuple[str, str]) -> SpherePattern | None:
+    """Return the airframe that was learned with nodes at many places, for the search of a node; None if none fits.
+
+    Only for levels of the channel sounder: such an airframe was learned with a receiver that loses its lock.
+
+    Parameters
+    ----------
+    site : str or Path
+        As :func:`.read_learned` takes it.
+    towers : collection of str
+        Of the site: what was learned with one of them says little about a search.
+    log : (SHA-256, mark)
+        Of the log, which must not have been learned from.
+    """
+    nodes = (ends for tower, each in taught(site, log, loses_lock=True).items() if tower not in towers for ends in each)
+    return next((ends.uav for ends in nodes if isinstance(ends.uav, SpherePattern)), None)
+
+
+def taught(site: str | Path, log: tuple[str, str], *, loses_lock: bool) -> dict[str, list[Taught]]:
+    """Return the learned antennas of both ends by tower; none if the learned models are damaged.
+
+    Parameters
+    ----------
+    site : str or Path
+    log : (SHA-256, mark)
+        A tower whose antennas were learned from this log has an empty list.
+    loses_lock : bool
+        Those of receivers that lose their lock, or all others.
+    """
+    from ...compare.locate import LevelModel  # a draft's alone, and a report loads this module
+
+    out: dict[str, list[Taught]] = {}
+    with suppress(InputError, UsageError):
+        for known in every_antenna(site):
+            if (known.series.lock is not None) != loses_lock:
+                continue
+            each = out.setdefault(known.series.tower, [])
+            if log[0] in known.entry.trained_on or among(log[1], known.uav.marks):
+                continue
+            model = LevelModel(
+                slope=2.0,
+                slope_sd=_TAUGHT_SLOPE_SD,
+                elevation_sd_db=known.spread.own_sd_db,
+                shadow_sd_db=float(np.hypot(known.spread.own_sd_db, known.series.sd_db)),
+                scatter_sd_db=known.spread.noise_sd_db,
+            )
+            each.append(Taught(tower=known.tower, uav=known.uav, model=model, moments=known.moments))
+        return out
+    return {}
+
+
+def offered(data: FlightData) -> FlightFile | None:
+    """Return the settings of a flight with the learned antennas that its levels support; None if none fits."""
+    site = data.settings.site.file
+    own = frozenset(data.settings.towers)  # as the rovers of other flights were: placed by their own flight
+    nodes = Nodes(placed=own, fixed=[name for name in data.site.towers if name not in own])
+    try:
+        known = propose(data, data.site_place, str(Path(site).with_suffix("")), nodes, carrier_known=True)
+    except (InputError, UsageError):
+        return None
+    if not known.antennas:
+        return None
+    settings = with_learned(data.settings.model_copy(update={"antennas": dict(known.antennas)}), data.folder)
+    return settings if settings.link != data.settings.link else None
+
+
+def errors_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> learned.Errors | None:
+    """Return the errors on held-out flights of the learned antennas of a tower and channel; None without such."""
+    name = antennas.get(f"{series.tower}.{series.channel}")
+    if name is None or "uav" not in antennas:
+        return None
+    try:
+        return learned.find_named(name, folder).entry.errors
+    except (InputError, UsageError):
+        return None
+
+
+def lock_elsewhere(antennas: Mapping[str, str], folder: Path) -> learned.LearnedLock | None:
+    """Return P(lock) of the receiver that the airframe of a flight was learned with; None if it never loses lock."""
+    try:
+        named = learned.find_named(antennas["uav"], folder)
+    except (KeyError, InputError, UsageError):
+        return None
+    return next((s.lock for s in named.entry.series if s.lock is not None), None)
+
+
+def _same_place(s: learned.LearnedSeries, tower: str, nodes: Nodes) -> bool:
+    """Check whether an antenna hangs at a tower, or at a node that other flights carried to their places."""
+    return s.tower == tower or (tower in nodes.placed and s.tower not in nodes.fixed)

@@ -1,0 +1,471 @@
+"""Gains and losses that a flight file names or that are stored beside a site.
+
+Learned antenna data of a link besides the patterns that the replay takes: both ends at once, error bars.
+
+Losses of a path of a flight besides its own field: foliage, reflections, rough ground.
+
+The antennas and the receiver that flight.yaml names from the memory of a site: found there, checked, made files.
+
+Reading flight.yaml opens no table; a job that replays or lists its inputs takes this stage after it.
+
+Notes that must be given on foliage models: how far they are stretched or assumed.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import InputError, UsageError
+from ..common.geodesy import azimuth_rad, elevation_rad
+from ..common.units import FloatArray, wavelength_m
+from ..compare.gains import NO_SPREAD, Spread, link_directions
+from ..propagation.field.foliage import (
+    LEAFLESS_FACTOR,
+    P833,
+    P833_TABLE,
+    crown_index,
+    foliage_depth_m,
+    foliage_loss_db,
+    foliage_model,
+    stand_depth_m,
+    stand_loss_db,
+)
+from ..propagation.geometry import Link, PathSet, Pattern, Poses, single_element
+from ..propagation.options import Loss, Run, Search
+from ..propagation.replay import replay
+from ..site.learned import LearnedSpread, Named, SpherePattern, UnknownName, find_named, learned_antenna, receiver_file
+from ..site.site import Site
+from .settings import (
+    AntennaSettings,
+    ArraySettings,
+    Caution,
+    FlightFile,
+    LinkSettings,
+    Overrides,
+    RtSettings,
+    joined,
+    load_flight,
+    overridden,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedGain:
+    """Along the direct line, at the poses of a replay.
+
+    Parameters
+    ----------
+    pair_db : (poses,)
+        Gain towards both ends at once, to be added to the level [dB]; zero where the files hold none.
+    sd_db : (poses,)
+        Standard deviation of all learned gain together [dB].
+    spread : Spread
+        Error model of the level besides ``sd_db``: that of the tower's antenna, else of the UAV's.
+    """
+
+    pair_db: FloatArray
+    sd_db: FloatArray
+    spread: Spread
+
+
+def learned_gain(link: Link, poses: Poses, source_m: FloatArray) -> LearnedGain | None:
+    """The learned gain of a link to one tower; None where neither end is learned.
+
+    Parameters
+    ----------
+    link : Link
+        With one tower.
+    poses : Poses
+    source_m : (1, 3) or (poses, 3)
+        Centre of the tower's array [m].
+
+    Returns
+    -------
+    LearnedGain or None
+    """
+    towards = dict(zip(("uav", "tower"), link_directions(source_m, poses.position_m, poses.rotation), strict=True))
+    (tower_array,) = link.tower_arrays.values()
+    ends: dict[str, tuple[SpherePattern, FloatArray]] = {}
+    for end, array in (("uav", link.uav_array), ("tower", tower_array)):
+        pattern = array.patterns[0]
+        if isinstance(pattern, SpherePattern):
+            ends[end] = pattern, np.asarray(towards[end] @ array.mount)
+    if not ends:
+        return None
+    pair_db, sd_db = pair_and_sd_db(ends)
+    stated = (pattern.spread for pattern, _ in reversed(ends.values()) if pattern.spread is not None)
+    return LearnedGain(pair_db=pair_db, sd_db=sd_db, spread=spread_of(next(stated, None)))
+
+
+def spread_of(stated: LearnedSpread | None) -> Spread:
+    """Return the error model that a learned antenna states; that of the gain alone if it states none."""
+    return NO_SPREAD if stated is None else Spread(**stated.model_dump())
+
+
+def pair_and_sd_db(ends: Mapping[str, tuple[SpherePattern, FloatArray]]) -> tuple[FloatArray, FloatArray]:
+    """Gain towards both ends at once (n,) and standard deviation (n,) of all learned gain together [dB].
+
+    ``ends``: pattern and directions (n, 3) in its frame, of ``uav`` and ``tower``, or one of them.
+    """
+    square = sum(pattern.gain_sd_db(*sphere_angles(direction)) ** 2 for pattern, direction in ends.values())
+    sd_db = np.sqrt(square)
+    if len(ends) == 2:
+        (uav, at_uav), (tower, at_tower) = ends["uav"], ends["tower"]
+        # a pair's gain is what these two leave together: it means nothing beside another table
+        if tower.pair is not None and uav.trained_on == tower.trained_on:  # of one and the same calibration
+            return tower.pair.at(np.concatenate([at_uav, at_tower], axis=1), sd_db)
+    return np.zeros(len(sd_db)), sd_db
+
+
+def sphere_angles(direction: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Zenith angle and azimuth (...,) [rad] of directions (..., 3)."""
+    return 0.5 * np.pi - elevation_rad(direction), azimuth_rad(direction)
+
+
+def mean_gain_db(patterns: Sequence[Pattern], theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
+    """Mean gain (n,) of the elements of an array towards directions of its frame [dBi]; no lower than -60."""
+    fields = [pattern.field(theta_rad, phi_rad) for pattern in patterns]
+    power = sum(np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2 for e_theta, e_phi in fields)
+    # a null is -60 dB: no model of a pattern is that sure
+    return np.asarray(10.0 * np.log10(np.maximum(power / len(patterns), 1e-6)))
+
+
+def pair_db(link: Link, poses: Poses, source_m: FloatArray) -> FloatArray | float:
+    """Gain (poses,) towards both ends at once, to be added to the level [dB]; 0 where none is learned."""
+    gain = learned_gain(link, poses, source_m)
+    return 0.0 if gain is None else gain.pair_db
+
+
+def path_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
+    """Loss per path besides the field's own: foliage and reflections, a function of paths and their ends.
+
+    Parameters
+    ----------
+    site : Site
+        Its trees and stands, and how high its ground lies.
+    rt : RtSettings
+        ``foliage``, ``foliage_model``, ``gamma_db_per_m``, ``maximum_loss_db``, ``leaves``, ``reflection_loss_db``,
+        ``ground_roughness_m``.
+    carrier_hz : float
+
+    Returns
+    -------
+    callable or None
+        ``loss(paths, sources_m (towers, 3), targets_m (poses, 3)) -> (paths,)`` [dB], infinite where nothing gets
+        through; None where no path loses anything.
+
+    Raises
+    ------
+    UsageError
+        ``rt.ground_roughness_m`` with a scene of triangles.
+    """
+    through = _foliage_loss(site, rt, carrier_hz)
+    per_reflection, rough = rt.reflection_loss_db, roughness_loss(site, rt, carrier_hz)
+    if per_reflection == 0.0 and rough is None:
+        return through
+
+    def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
+        trees_db = 0.0 if through is None else through(paths, sources_m, targets_m)
+        ground_db = 0.0 if rough is None else rough(paths, sources_m, targets_m)
+        return np.asarray(trees_db + ground_db + per_reflection * paths.depth, dtype=np.float64)
+
+    return loss
+
+
+# Lines of sight are the same at any carrier.
+_ANY_HZ = 3.4e9
+
+# A reflection this near to a ground plane of the site is one off the ground.
+_ON_GROUND_M = 1e-6
+
+
+# The same over an elevation model, whose specular points are found by iteration.
+_NEAR_TERRAIN_M = 0.01
+
+
+def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
+    """Loss [dB] of ground reflections by ``rt.ground_roughness_m``; None where the ground is smooth.
+
+    Parameters
+    ----------
+    site : Site
+        Its ground: planes of the origin and of its towers, and its elevation model.
+    rt : RtSettings
+    carrier_hz : float
+
+    Returns
+    -------
+    callable or None
+        As :func:`path_loss` gives it.
+
+    Raises
+    ------
+    UsageError
+        A site that is a scene of triangles.
+
+    Notes
+    -----
+    Each reflection off the ground falls by ``exp(-2 (k sigma sin(grazing))^2)``, the grazing angle that of the array
+    centres (:func:`aerpaw_cmp.propagation.field.baselines.specular_factor`, here as a loss, which does not underflow);
+    what leaves the specular direction is not followed.
+    """
+    sigma = rt.ground_roughness_m
+    if sigma == 0.0:
+        return None
+    if site.scene is not None:
+        raise UsageError(
+            "rt.ground_roughness_m on a site that is a scene of triangles",
+            expected="a site with a ground plane, or reflection_loss_db",
+            cause="no face of the scene is known to be its ground",
+        )
+    # the planes of tower_ground: offsets stand beside the origin's
+    heights = np.array(sorted({0.0, *(tower.ground_m for tower in site.towers.values())}))
+    wavelength = wavelength_m(carrier_hz)
+
+    def loss(paths: PathSet, sources_m: FloatArray, _targets_m: FloatArray) -> FloatArray:
+        total, ray_start = np.zeros(len(paths)), sources_m[paths.tower]
+        for step in range(paths.vertices_m.shape[1]):
+            corner = paths.vertices_m[:, step]
+            on = np.abs(corner[:, 2:] - heights).min(axis=1) < _ON_GROUND_M  # NaN where the path has no such corner
+            if site.dem is not None:
+                on |= np.abs(corner[:, 2] - site.dem.ground_m(corner[:, 0], corner[:, 1])) < _NEAR_TERRAIN_M
+            ray = corner[on] - ray_start[on]
+            sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), _ON_GROUND_M)
+            total[on] += 40.0 * np.log10(np.e) * (2.0 * np.pi / wavelength * sigma * sine) ** 2
+            ray_start = np.where(np.isfinite(corner), corner, ray_start)
+        return total
+
+    return loss
+
+
+def _foliage_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
+    if not site.wooded or rt.foliage == "none":
+        return None
+    site = site.under(rt.foliage)
+    model, evergreen = (
+        foliage_model(
+            rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
+            carrier_hz,
+            in_leaf=in_leaf,
+            gamma_db_per_m=rt.advanced.gamma_db_per_m,
+            maximum_db=rt.advanced.maximum_loss_db,
+        )
+        for in_leaf in (rt.leaves == "in", True)
+    )
+    index, wavelength = crown_index(site.trees), wavelength_m(carrier_hz)
+
+    def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
+        source, target = sources_m[paths.tower], targets_m[paths.pose]
+        # single trees and woods as media shade one behind the other: their losses add
+        trees_db = foliage_loss_db(source, paths.vertices_m, target, index, model)
+        return trees_db + stand_loss_db(site, source, paths.vertices_m, target, model, wavelength, evergreen)
+
+    return loss
+
+
+def sight_shares(site: Site, tower: str, poses_m: FloatArray) -> tuple[float, float]:
+    """Shares of the direct lines from a tower to poses (n, 3) [m] that woods shade, and that buildings hide."""
+    source = site.towers[tower].position_m
+    array = single_element()
+    poses = Poses(poses_m, np.broadcast_to(np.eye(3), (len(poses_m), 3, 3)))
+    # without a cache: a draft asks once
+    seen = replay(site, Link(_ANY_HZ, {tower: array}, array), poses, Search(max_depth=0), run=Run(cache_dir=""))
+    return float((direct_foliage_m(source, poses_m, site) > 0.0).mean()), float(1.0 - len(seen.paths) / len(poses_m))
+
+
+def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, site: Site) -> FloatArray:
+    """Length (n,) [m] in crowns and stands of the direct lines from a tower (3,), or (n, 3), to poses (n, 3) [m]."""
+    source = np.broadcast_to(tower_m, poses_m.shape)
+    in_crowns = foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, site.trees)
+    return in_crowns + stand_depth_m(site, source, poses_m)
+
+
+def load_with_learned(path: str | Path, learned: Path | None = None, overrides: Overrides | None = None) -> FlightFile:
+    """Return the settings of a flight.yaml with the learned antennas and receiver that it names, as files.
+
+    Parameters
+    ----------
+    path : str or Path
+    learned : Path, optional
+        calibrated.yaml whose settings take the place of those of the flight file, and of the antennas that it names.
+    overrides : mapping, optional
+        Dotted keys with other values: they come before the antennas, whose band must fit the carrier.
+    """
+    settings = with_learned(overridden(load_flight(path), overrides or {}), Path(path).parent)
+    return settings if learned is None else joined(settings, learned)
+
+
+def flight_of(path: Path) -> FlightFile | None:
+    """Return the settings of the flight file that a path names, or None for any other file."""
+    if path.suffix.lower() not in (".yaml", ".yml") or not path.is_file():
+        return None
+    text = path.read_text(encoding="utf-8", errors="replace")
+    return load_with_learned(path) if re.search(r"^flight\s*:", text, re.MULTILINE) else None
+
+
+@dataclass(slots=True)
+class _Ends:
+    """Links of a flight, to which learned antennas are added, and those that do not fit."""
+
+    rss: LinkSettings
+    channels: dict[str, LinkSettings]
+    cautions: list[Caution] = field(default_factory=list)
+    used: set[str] = field(default_factory=set)
+
+    def link(self, channel: str | None) -> LinkSettings:
+        """Return the link of a channel; that of ``link.rss`` for None and for a channel without an entry."""
+        return self.rss if channel is None else self.channels.get(channel, self.rss)
+
+    def use(self, key: str, channel: str | None, name: str, named: Named) -> None:
+        """Put a learned antenna at the end that a key names; a channel of None is the link of all other channels."""
+        tower, link = key.partition(".")[0], self.link(channel)
+        before = link.uav if key == "uav" else link.towers.get(tower, link.tower)
+        instead = "an isotropic antenna is used instead" if before == ArraySettings() else "that of 'link' is used"
+        try:
+            file, known = learned_antenna(named, "uav" if key == "uav" else "tower", link.carrier_hz)
+        except (InputError, UsageError) as error:
+            text = f"the learned antenna {name} is not used ({_reason(error)}); {instead}"
+            self.cautions.append(Caution(key=f"antennas.{key}", channel=channel, text=text))
+            return
+        if before != ArraySettings():
+            text = f"the learned antenna {name} replaces the array of 'link'"
+            self.cautions.append(Caution(key=f"antennas.{key}", channel=channel, text=text, used=True))
+        array = ArraySettings(antenna=AntennaSettings(model="sphere", file=str(file), learned=known))
+        end: dict[str, Any] = {"uav": array} if key == "uav" else {"towers": {**link.towers, tower: array}}
+        self.used.add(key)
+        if channel is None:
+            self.rss = link.model_copy(update=end)
+        else:
+            self.channels[channel] = link.model_copy(update=end)
+
+
+def with_learned(settings: FlightFile, folder: Path) -> FlightFile:
+    """Return the settings with the learned antennas and the receiver that they name, as files.
+
+    The airframe (``antennas.uav``) is the UAV's end of every channel. What does not fit (another band, a damaged
+    table) is not used: :attr:`.FlightFile.cautions` has the reasons, and the run continues.
+
+    Parameters
+    ----------
+    settings : FlightFile
+    folder : Path
+        Folder of the flight file, which may contain sites that are not packaged.
+
+    Raises
+    ------
+    UnknownName
+        A name that no learned model has, or one for another end.
+    UsageError
+        A key of ``antennas`` that is neither ``uav`` nor ``TOWER.CHANNEL``.
+    """
+    ends = _Ends(settings.link.rss, dict(settings.link.channels))
+    # the airframe last: it belongs to every channel, also to those that antennas of towers bring
+    for key, name in sorted(settings.antennas.items(), key=lambda item: item[0] == "uav"):
+        tower, _, channel = key.partition(".")
+        if key != "uav" and not (tower and channel):
+            raise UsageError(f"unknown key 'antennas.{key}'", expected="'uav' or 'TOWER.CHANNEL', such as LW1.USRP1")
+        named = _named(name, folder, "uav" if key == "uav" else "tower", f"antennas.{key}")
+        for each in (None, *list(ends.channels)) if key == "uav" else (channel,):
+            if isinstance(named, Caution):
+                ends.cautions.append(replace(named, channel=each))
+            else:
+                ends.use(key, each, name, named)
+    content: dict[str, Any] = {}
+    if ends.used:
+        link = {"rss": ends.rss, "channels": ends.channels} if ends.channels else {"rss": ends.rss}
+        content["link"] = settings.link.model_copy(update=link)
+    if settings.antennas:
+        content["antennas"] = {key: name for key, name in settings.antennas.items() if key in ends.used}
+    receiver = settings.rank.receiver
+    if receiver is not None and "/" in receiver and not (folder / receiver).is_file():
+        content["rank"] = settings.rank.model_copy(update={"receiver": _receiver(settings, receiver, folder, ends)})
+    lent = ends.channels.keys() - settings.link.channels.keys()
+    return settings.changed(content, cautions=ends.cautions, lent=lent) if content or ends.cautions else settings
+
+
+def antennas_used(series: Sequence[tuple[str, str, LinkSettings]]) -> tuple[str, ...]:
+    """Return a sentence per pair of antennas: its names, and the channels that are replayed with it if others are not.
+
+    Examples
+    --------
+    >>> antennas_used([("LW1", "A", LinkSettings(carrier_hz=3.3e9)), ("LW1", "B", LinkSettings(carrier_hz=3.3e9))])
+    ('Antennas: isotropic at the tower, isotropic at the UAV.',)
+    """
+    pairs: dict[str, list[str]] = {}
+    for tower, channel, link in series:
+        ends = (_antenna_name(array.antenna) for array in (link.towers.get(tower, link.tower), link.uav))
+        pairs.setdefault("{} at the tower, {} at the UAV".format(*ends), []).append(f"{tower} {channel}")
+    if len(pairs) == 1:
+        return (f"Antennas: {next(iter(pairs))}.",)
+    return tuple(f"Antennas of {', '.join(names)}: {what}." for what, names in pairs.items())
+
+
+def _antenna_name(antenna: AntennaSettings) -> str:
+    if antenna.file is None:
+        return {"iso": "isotropic"}.get(antenna.model, antenna.model)
+    return Path(antenna.file).name.removesuffix(".gz").removesuffix(".csv")
+
+
+def _named(name: str, folder: Path, end: str, key: str) -> Named | Caution:
+    """Return the entry of a name, or the reason why the learned models cannot be read."""
+    try:
+        return find_named(name, folder, end)
+    except UnknownName as error:
+        raise UnknownName(f"{key}: {error.found}", expected=error.expected, cause=error.cause) from None
+    except (InputError, UsageError) as error:
+        return Caution(key=key, channel=None, text=f"{name} is not used ({_reason(error)})")
+
+
+def _receiver(settings: FlightFile, name: str, folder: Path, ends: _Ends) -> str | None:
+    """Return the file of a rank receiver; None, with the reason in ``ends``, if it does not fit."""
+    if Path(name).suffix == ".json":  # a file that is missing: reading it reports that
+        return name
+    named = _named(name, folder, "receiver", "rank.receiver")
+    if not isinstance(named, Caution):
+        try:
+            return str(receiver_file(named, settings.link.rank.carrier_hz))
+        except (InputError, UsageError) as error:
+            named = Caution(key="rank.receiver", channel="rank", text=f"{name} is not used ({_reason(error)})")
+    ends.cautions.append(named)
+    return None
+
+
+def _reason(error: InputError | UsageError) -> str:
+    """Return what was found, in which file, and what was expected instead."""
+    where = f" in {Path(error.path).name}" if error.path else ""
+    return f"{error.found}{where}; expected: {error.expected}"
+
+
+def foliage_notes(wooded: bool, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
+    """Notes a report must give on its foliage models, if the site has trees: how far they are stretched or assumed."""
+    if not wooded or rt.foliage != "attenuating":
+        return ()
+    notes = []
+    if rt.foliage_model == "p833" and (rt.advanced.gamma_db_per_m is None or rt.advanced.maximum_loss_db is None):
+        notes += [note for carrier in sorted(carriers_hz) if (note := p833_note(carrier))]
+    if rt.leaves == "out":
+        what = "gamma" if rt.foliage_model == "p833" else "the loss"
+        notes.append(
+            f"Trees out of leaf: {what} in leaf divided by {1 / LEAFLESS_FACTOR:g}. That is an assumption of this "
+            "tool: ITU-R P.833 gives about 20 % near 1 GHz, and no number at this carrier."
+        )
+    return tuple(notes)
+
+
+def p833_note(carrier_hz: float) -> str | None:
+    """That P.833's table is continued beyond its end, or None within it."""
+    low, high = P833_TABLE[0][0], P833_TABLE[-1][0]
+    if low <= carrier_hz / 1e6 <= high:
+        return None
+    model = P833.at(carrier_hz)
+    return (
+        f"Trees at {carrier_hz / 1e9:g} GHz: an extrapolation of ITU-R P.833, whose table of woodland covers {low:g} "
+        f"to {high:g} MHz. Continued it gives gamma = {model.gamma_db_per_m:.2f} dB/m and A_m = {model.maximum_db:.0f} "
+        "dB in leaf; other continuations give 0.45 to 0.7 dB/m at 3.4 GHz, so treat gamma as a sensitivity."
+    )

@@ -1,1 +1,0 @@
-"""Gains and losses that a flight file names or a site remembers."""

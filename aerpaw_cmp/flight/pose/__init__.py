@@ -1,1 +1,0 @@
-"""Place and time of the UAV: track, heights, clock, routes."""

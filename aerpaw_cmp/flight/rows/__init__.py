@@ -1,1 +1,0 @@
-"""Rows that count: positions that are scored, a sounder in lock."""

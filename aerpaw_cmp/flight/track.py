@@ -1,0 +1,696 @@
+"""Position and attitude of the UAV at any instant.
+
+Attitude is interpolated as rotation (slerp), never as angles. Telemetry gaps longer than a stated limit are not
+bridged; poses in them are invalid, with a reason. What a log does not say (attitude) is replaced by level flight
+along the course and flagged. Nothing is dropped silently: :class:`TrackAccount` counts every row left out.
+
+Heights of tracks: over the ground under them, and those of logs that write latitude and longitude alone.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import re
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.errors import UsageError
+from ..common.geodesy import SiteFrame, bearing_deg
+from ..common.units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray, IntArray
+from ..logs.ingest import IngestedFile
+from ..logs.records import Stream
+from ..propagation.geometry import rotation_from_aircraft
+from .settings import LogSettings
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+
+Ground = Callable[[FloatArray, FloatArray], FloatArray]
+"""Up of the ground [m] at easts and norths (n,)."""
+
+# Heights above take-off drift by this much in a flight [m]: real ones end at -3.9 m after landing.
+_DRIFT_M = 5.0
+
+
+def raised(up_m: FloatArray, ground_m: FloatArray, takeoff_m: float) -> tuple[FloatArray, BoolArray]:
+    """Heights of poses over the ground under them, and which poses lie below it.
+
+    A little below ground that is about as high as the take-off point is the drift of the height; all else below
+    ground cannot have been flown: the ground or the heights are wrong.
+
+    Parameters
+    ----------
+    up_m, ground_m : (n,)
+        Of the poses and of the ground under them [m].
+    takeoff_m : float
+        Up of the take-off point [m].
+
+    Returns
+    -------
+    (n,), (n,) bool
+
+    Examples
+    --------
+    >>> raised(np.array([-2.0, -20.0, 8.0]), np.zeros(3), 0.0)
+    (array([  0.5, -20. ,   8. ]), array([False,  True, False]))
+    """
+    drift = np.where(ground_m <= takeoff_m + _DRIFT_M, _DRIFT_M, 0.0)
+    buried = up_m < ground_m - drift
+    return np.where(buried, up_m, np.fmax(up_m, ground_m + MINIMUM_HEIGHT_M)), buried
+
+
+_IN_NAME = re.compile(r"(?<![A-Za-z0-9.])(\d{1,3}) ?(?:m|meters|metres)(?![A-Za-z0-9])")
+
+
+def lacks_height(stream: Stream) -> bool:
+    """Check whether a stream has positions and no altitude in any row."""
+    frame = stream.frame
+    if "latitude_deg" not in frame or not frame["latitude_deg"].notna().any():
+        return False
+    return "altitude_m" not in frame or not bool(frame["altitude_m"].notna().any())
+
+
+def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
+    """A log whose positions without altitude are all at the ``height_m`` that the flight file gives.
+
+    Parameters
+    ----------
+    log : LogSettings
+    file : IngestedFile
+        What was read of it.
+
+    Returns
+    -------
+    IngestedFile
+        The same where no height is given.
+
+    Raises
+    ------
+    UsageError
+        If a height is given and every stream with positions has altitudes of its own.
+    """
+    if log.height_m is None:
+        return file
+    streams = [
+        replace(s, frame=s.frame.assign(altitude_m=float(log.height_m))) if lacks_height(s) else s
+        for s in file.result.streams
+    ]
+    if all(after is before for after, before in zip(streams, file.result.streams, strict=True)):
+        raise UsageError(
+            f"{log.path}: 'height_m' acts on nothing",
+            expected="a log with positions and no altitude",
+            cause="the log has altitudes of its own, or no positions",
+        )
+    note = f"no altitude in the log: {log.height_m:g} m above take-off in all of it, as height_m says"
+    # the reader asked for what is answered here
+    warnings = [text for text in file.result.warnings if not text.startswith("no column is known as a height")]
+    return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, note)))
+
+
+def height_in_name(path: str) -> float | None:
+    """The height [m] that the name of a log's file tells, if it tells one alone.
+
+    Examples
+    --------
+    >>> height_in_name("urban/60m.csv"), height_in_name("run2_120m_5G.csv"), height_in_name("phone.csv")
+    (60.0, 120.0, None)
+    """
+    # as a set: 'flight_60m_60m' tells one height, '40m_to_60m' none
+    heights = {float(text) for text in _IN_NAME.findall(Path(path).stem.replace("_", " "))}
+    return heights.pop() if len(heights) == 1 else None
+
+
+# Telemetry gaps longer than this are not bridged [s]; vehicleOut rows come every 1.0 s.
+_MAXIMUM_GAP_S = 3.0
+
+# Telemetry as sparse as this per fix is a straight line between fixes where nine of ten lie no farther apart [m]:
+# what a search at 2 m/s covers in 14 s. Of a faster flight its steady legs are: intervals of which one end or the other
+# lies this near the line between the fixes beside it (the field's own search: 7.7 m in nine of ten), and no turn does.
+_SPARSE_APART_M, _SPARSE_ERROR_M = 100.0, 10.0
+
+# An interval this many times the usual one of sparse telemetry is a gap.
+_SPARSE_GAP = 2.0
+
+# Below this ground speed the course says nothing about the heading [m/s].
+_COURSE_SPEED_MPS = 1.0
+
+# Instants whose poses are computed at once: bounds memory on flights of more than half an hour.
+AT_ONCE = 100_000
+
+# Positions this long before and after give a velocity that is not logged [s].
+_COURSE_SPAN_S = 2.0
+
+# Why a pose is not valid; index 0 is a valid pose.
+REASONS = (
+    "", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time", "no position of the tower",
+    "below the site's ground plane",
+)  # fmt: skip
+
+
+# What a log may mean by its attitude: the columns that hold roll, pitch and yaw, their signs, and degrees that
+# the yaw lacks. A yaw without a sign is the course.
+MISREAD = {
+    "the logged yaw has the wrong sign": ([0, 1, 2], [1.0, 1.0, -1.0], 0.0),
+    "the logged yaw counts from east, counter-clockwise": ([0, 1, 2], [1.0, 1.0, -1.0], 90.0),
+    "the nose follows the course, not the logged yaw": ([0, 1, 2], [0.0, 0.0, 0.0], 0.0),
+    "the logged pitch has the wrong sign": ([0, 1, 2], [1.0, -1.0, 1.0], 0.0),
+    "the logged roll has the wrong sign": ([0, 1, 2], [-1.0, 1.0, 1.0], 0.0),
+    "the columns of pitch and yaw are exchanged": ([0, 2, 1], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll and yaw are exchanged": ([2, 1, 0], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll and pitch are exchanged": ([1, 0, 2], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll, pitch and yaw are shifted by one": ([1, 2, 0], [1.0, 1.0, 1.0], 0.0),
+    "the columns of roll, pitch and yaw are shifted by two": ([2, 0, 1], [1.0, 1.0, 1.0], 0.0),
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TrackAccount:
+    """Account of what became of the telemetry rows.
+
+    Parameters
+    ----------
+    rows : int
+        Rows of the telemetry frame.
+    no_time, duplicate_time, backward_time, bad_position : int
+        Rows not used for position: no time stamp; the stamp of the row before; a stamp earlier than one before it
+        (or, where fewer rows are lost that way, later than one after it); NaN, -999 or impossible coordinates.
+    steps_sorted : int
+        Steps back in time of a shuffled file, whose rows were sorted: the path is shorter in order of time.
+    unknown_attitude : int
+        Used rows without attitude (NaN, or exactly 0, 0, 0: written by converters for "unknown").
+    heading_alone : int
+        Used rows with a heading and neither roll nor pitch.
+    below_ground : int
+        Used rows below the site's ground plane.
+    sparse_s : float
+        Usual interval of sparse telemetry whose fixes are joined by straight lines [s]; 0 of other telemetry.
+    sparse_error_m : (median, ninth of ten)
+        Error of those lines: half the distance of each fix from the line between its neighbours [m].
+    gaps : int
+        Intervals between used rows that are longer than the limit.
+    longest_gap_s : float
+        The longest interval [s].
+    hour_steps : int
+        Steps of whole hours between neighbouring rows of the file: a clock that changed to or from daylight saving.
+    """
+
+    rows: int
+    no_time: int
+    duplicate_time: int
+    backward_time: int
+    bad_position: int
+    unknown_attitude: int
+    gaps: int
+    longest_gap_s: float
+    hour_steps: int = 0
+    steps_sorted: int = 0
+    heading_alone: int = 0
+    below_ground: int = 0
+    sparse_s: float = 0.0
+    sparse_error_m: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Warnings for the user, one sentence each."""
+        reasons = (
+            (self.hour_steps, "step(s) of whole hours between telemetry rows: daylight-saving change or a reset clock"),
+            (self.steps_sorted, "step(s) back in time between telemetry rows: all rows were sorted by time"),
+            (self.backward_time, "telemetry row(s) out of time order were left out"),
+            (self.duplicate_time, "telemetry row(s) repeat the time stamp before them and were left out"),
+            (self.no_time, "telemetry row(s) without a time stamp were left out"),
+            (self.bad_position, "telemetry row(s) without a position (NaN, -999) were left out"),
+            (self.gaps, f"telemetry gap(s), the longest {self.longest_gap_s:.1f} s, were not bridged"),
+            (self.unknown_attitude, "telemetry row(s) without attitude: level flight along the course stands in"),
+            (self.heading_alone, "telemetry row(s) hold a heading alone: level flight along it stands in"),
+            (
+                self.below_ground,
+                "telemetry row(s) lie below the site's ground plane and are not compared: origin.takeoff_ground_m, or "
+                "an elevation model, says how high the ground is",
+            ),
+        )
+        usual_m, high_m = self.sparse_error_m
+        sparse = (
+            f"the telemetry has a fix every {self.sparse_s:.0f} s: positions between are a straight line, wrong by "
+            f"about {usual_m:.0f} m in the median and {high_m:.0f} m in one of ten"
+        )
+        return (*([sparse] if self.sparse_s else []), *(f"{count} {text}" for count, text in reasons if count))
+
+
+@dataclass(frozen=True, slots=True)
+class TrackPoses:
+    """Poses at asked instants.
+
+    Parameters
+    ----------
+    position_m : (n, 3)
+        East, north, up in the site frame [m]; NaN where not valid.
+    rotation : (n, 3, 3)
+        Aircraft body (forward-left-up) to east-north-up; NaN where not valid.
+    valid : (n,) bool
+        False before, after and inside gaps of the telemetry.
+    reason_code : (n,) int8
+        Which of :data:`REASONS` it is; 0 where valid.
+    attitude_known : (n,) bool
+        False where level flight along the course stands in for the attitude.
+    """
+
+    position_m: FloatArray
+    rotation: FloatArray
+    valid: BoolArray
+    reason_code: AnyArray
+    attitude_known: BoolArray
+
+    def __len__(self) -> int:
+        return len(self.valid)
+
+    def pick(self, rows: BoolArray) -> TrackPoses:
+        """The poses of some rows (n,) bool; the very same where these are all of them."""
+        if rows.all():
+            return self
+        return TrackPoses(**{field.name: getattr(self, field.name)[rows] for field in dataclasses.fields(self)})
+
+    def where(self, known: BoolArray) -> TrackPoses:
+        """The poses with those as not valid at which the tower, which moves too, is not known (n,)."""
+        if known.all():
+            return self
+        lost = self.valid & ~known
+        return dataclasses.replace(
+            self,
+            position_m=np.where(known[:, None], self.position_m, np.nan),
+            valid=self.valid & known,
+            reason_code=np.where(lost, REASONS.index("no position of the tower"), self.reason_code).astype(np.int8),
+        )
+
+    @property
+    def reason(self) -> AnyArray:
+        """Reason why a pose is not valid (n,), one of :data:`REASONS`; empty where it is."""
+        return np.asarray(REASONS)[self.reason_code]
+
+    @property
+    def heading_deg(self) -> FloatArray:
+        """Heading of the nose, clockwise from north, [0, 360) deg."""
+        return np.asarray(bearing_deg(self.rotation[:, :, 0]) % 360.0)
+
+
+def nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
+    """UTC instants as int64 ns since 1970; NaT becomes the smallest integer. Floats are epoch seconds."""
+    # to the nanosecond whatever pandas or NumPy had: their default units differ by version
+    array = np.asarray(times)
+    if array.dtype.kind == "M":
+        return np.asarray(array.astype("datetime64[ns]").astype(np.int64))
+    if array.dtype.kind == "O":
+        import pandas as pd
+
+        stamps = pd.DatetimeIndex(pd.to_datetime(array, utc=True)).tz_localize(None)
+        return np.asarray(stamps.to_numpy().astype("datetime64[ns]").astype(np.int64))
+    seconds = array.astype(np.float64)
+    good = np.isfinite(seconds)
+    stamp = np.round(np.where(good, seconds, 0.0) * 1e9).astype(np.int64)
+    return np.asarray(np.where(good, stamp, np.iinfo(np.int64).min))
+
+
+# What an instant that is not known becomes.
+NO_TIME = np.iinfo(np.int64).min
+
+# Instants nearer than this are one: epoch seconds as floats carry 0.2 microseconds [s].
+_SAME_S = 1e-6
+
+
+def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
+    """Rows of a strictly increasing clock, and how many are duplicates and backward.
+
+    A stamp is backward when an earlier row is later. One wild stamp in the future would then condemn all rows
+    after it, so the mirrored rule (a stamp later than a later row's is wrong) is used where it loses fewer rows.
+    """
+    if not len(stamp):
+        return np.zeros(0, dtype=bool), 0, 0
+    # the latest stamp before each row, and the earliest after it
+    before = np.concatenate([[NO_TIME], np.maximum.accumulate(stamp)[:-1]])
+    after = np.concatenate([np.minimum.accumulate(stamp[::-1])[::-1][1:], [np.iinfo(np.int64).max]])
+    onward, mirrored = stamp >= before, stamp <= after
+    # on a tie the plain rule: what came first is right
+    ordered = onward if onward.sum() >= mirrored.sum() else mirrored
+    keep = ordered.copy()
+    rows = np.flatnonzero(ordered)
+    repeated = np.concatenate([[False], np.diff(stamp[rows]) == 0])
+    keep[rows[repeated]] = False
+    return keep, int(repeated.sum()), int((~ordered).sum())
+
+
+def _order(stamp: AnyArray, position: FloatArray) -> tuple[IntArray, int]:
+    """Row order by time where stamps tell the truth and the file is shuffled, else as written; steps back so mended.
+
+    A clock that stepped leaves the rows in the order that was flown: sorting them would mix two parts of the flight,
+    and the path would grow. A file that was sorted by another column, or put together of parts, has the longer path.
+    """
+    steps, written = int((np.diff(stamp) < 0).sum()), np.arange(len(stamp))
+    if not steps:
+        return written, 0
+    order = np.argsort(stamp, kind="stable")
+
+    def length_m(path: FloatArray) -> float:
+        return float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
+
+    # of a file in reverse order the path is as long, but for rounding
+    shorter = length_m(position[order]) <= length_m(position) * (1 + 1e-9)
+    return (order, steps) if shorter else (written, 0)
+
+
+def _hour_steps(stamp: AnyArray) -> int:
+    """Steps between rows that are whole hours, forward or back, give or take five seconds."""
+    step = np.diff(stamp) * 1e-9
+    hours = np.round(step / 3600.0)
+    # clocks are turned by one hour, in Antarctica by two
+    return int(((hours != 0) & (np.abs(hours) <= 2) & (np.abs(step - 3600.0 * hours) < 5.0)).sum())
+
+
+def good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> BoolArray:
+    """Coordinates that can be: finite, in range, not (0, 0) and not the -999 that loggers write without a fix."""
+    finite = np.isfinite(latitude) & np.isfinite(longitude) & np.isfinite(altitude)
+    with np.errstate(invalid="ignore"):
+        possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0) & (altitude > -900.0)
+    return np.asarray(finite & possible & ~((latitude == 0.0) & (longitude == 0.0)))
+
+
+def positions_over_time(frame: pd.DataFrame) -> tuple[FloatArray, FloatArray]:
+    """Times (n,) [s since 1970], ascending, and latitude and longitude (n, 2) [deg] of the rows that have both."""
+    known = frame[["time", "latitude_deg", "longitude_deg"]].dropna().drop_duplicates("time").sort_values("time")
+    return nanoseconds(known["time"]) * 1e-9, known[["latitude_deg", "longitude_deg"]].to_numpy(np.float64)
+
+
+class Track:
+    """The flight path of one telemetry stream in a site frame.
+
+    Parameters
+    ----------
+    telemetry : pandas.DataFrame
+        Records of kind telemetry (see :mod:`aerpaw_cmp.logs.records`), file order.
+    frame : SiteFrame
+        The site's frame.
+    maximum_gap_s : float
+        Longer gaps are not bridged [s].
+    ground_m : float
+        Height of the take-off point above the site origin [m], added to ``altitude_m``.
+    ground : callable, optional
+        Up [m] of the site's ground at easts and norths; by default that of the take-off point.
+
+    Attributes
+    ----------
+    account : TrackAccount
+        What became of the rows.
+    start_ns, end_ns : int
+        First and last used instant [ns since 1970, UTC]; both 0 without a row.
+    """
+
+    def __init__(
+        self,
+        telemetry: pd.DataFrame,
+        frame: SiteFrame,
+        *,
+        maximum_gap_s: float = _MAXIMUM_GAP_S,
+        ground_m: float = 0.0,
+        ground: Ground | None = None,
+    ) -> None:
+        self.frame = frame
+        self.maximum_gap_s = maximum_gap_s
+        self.ground_m = ground_m
+        self._ground = ground or (lambda east, _: np.full(len(east), ground_m))
+        self._load(telemetry)
+
+    def _load(self, telemetry: pd.DataFrame) -> None:
+        def column(name: str) -> FloatArray:
+            return telemetry[name].to_numpy(dtype=np.float64)
+
+        stamp = nanoseconds(telemetry["time"])
+        latitude, longitude, altitude = column("latitude_deg"), column("longitude_deg"), column("altitude_m")
+        timed = stamp != NO_TIME
+        # only rows with both can be interpolated from; the others count in the account
+        placed = timed & good_positions(latitude, longitude, altitude)
+        rows = np.flatnonzero(placed)
+        east, north = self.frame.to_local(latitude[rows], longitude[rows])
+        position = np.column_stack([east, north, altitude[rows] + self.ground_m])
+        order, steps_sorted = _order(stamp[rows], position)
+        hour_steps = _hour_steps(stamp[rows[order]] if steps_sorted else stamp[timed])
+        forward, duplicates, backward = _forward_rows(stamp[rows[order]])
+        used = order[forward]
+        rows, position = rows[used], position[used]
+
+        self.start_ns = int(stamp[rows[0]]) if len(rows) else 0
+        self.end_ns = int(stamp[rows[-1]]) if len(rows) else 0
+        self._time_s = (stamp[rows] - self.start_ns) * 1e-9
+        self._position = position
+        velocity = [column("velocity_east_mps"), column("velocity_north_mps"), -column("velocity_down_mps")]
+        self._velocity = _velocities(self._time_s, self._position, np.column_stack(velocity)[rows])
+        self._course_deg = _courses(self._velocity)
+        self._attitude = np.column_stack([column("roll_deg"), column("pitch_deg"), column("yaw_deg")])[rows]
+        turn, yaw = self._attitude[:, :2], self._attitude[:, 2]
+        # all zero is no heading: converters write it for "unknown"
+        heading_alone = np.isfinite(yaw) & ~np.isfinite(turn).any(axis=1) & bool(np.nan_to_num(yaw).any())
+        turn[heading_alone] = 0.0
+        known = np.isfinite(self._attitude).all(axis=1) & (np.any(self._attitude != 0.0, axis=1) | heading_alone)
+        self._known = known
+        interval = np.diff(self._time_s)
+        sparse_s, self._turns, sparse_error_m = self._sparse(interval)
+        # last: what is sparse is judged by the limit that was asked for
+        self.maximum_gap_s = max(self.maximum_gap_s, _SPARSE_GAP * sparse_s)
+        self._gap = (interval > self.maximum_gap_s) | self._turns
+        self._asked = np.zeros(0, np.int64), self._pose_at(np.zeros(0, np.int64))
+        self.account = TrackAccount(
+            rows=len(stamp),
+            no_time=int((~timed).sum()),
+            duplicate_time=duplicates,
+            backward_time=backward,
+            bad_position=int((timed & ~placed).sum()),
+            unknown_attitude=int((~known).sum()),
+            gaps=int(self._gap.sum()),
+            longest_gap_s=float(interval.max()) if len(interval) else 0.0,
+            hour_steps=hour_steps,
+            steps_sorted=steps_sorted,
+            heading_alone=int(heading_alone.sum()),
+            below_ground=int(self._raised(position)[1].sum()),
+            sparse_s=sparse_s,
+            sparse_error_m=sparse_error_m,
+        )
+
+    def __len__(self) -> int:
+        return len(self._time_s)
+
+    def pose_at(self, times: ArrayLike | pd.Series) -> TrackPoses:
+        """Poses at instants.
+
+        Parameters
+        ----------
+        times : array_like, (n,)
+            datetime64 (UTC) or epoch seconds; any order.
+
+        Returns
+        -------
+        TrackPoses
+        """
+        instant = nanoseconds(times).ravel()
+        if len(instant) <= AT_ONCE:
+            if not np.array_equal(instant, self._asked[0]):  # channels of a log share their instants
+                poses = self._pose_at(instant)
+                for field in dataclasses.fields(poses):
+                    getattr(poses, field.name).flags.writeable = False  # the next who asks gets the same
+                self._asked = instant, poses
+            return self._asked[1]
+        parts = [self._pose_at(part) for part in np.array_split(instant, -(-len(instant) // AT_ONCE))]
+        names = [field.name for field in dataclasses.fields(TrackPoses)]
+        return TrackPoses(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+    def rotations_if(self, misread: str, times: ArrayLike | pd.Series) -> FloatArray:
+        """Rotations (n, 3, 3) at instants inside the track, were the logged angles as one of :data:`MISREAD` says."""
+        order, signs, east_deg = MISREAD[misread]
+        other = copy.copy(self)
+        other._attitude = self._attitude[:, order] * signs + [0.0, 0.0, east_deg]
+        if signs[2] == 0.0:
+            other._attitude[:, 2] = self._course_deg
+        return other._rotations((nanoseconds(times) - self.start_ns) * 1e-9)[0]
+
+    def why_not(self, pose: TrackPoses) -> str:
+        """Reason for most of the instants that have no pose."""
+        reason = REASONS[int(np.bincount(pose.reason_code[~pose.valid], minlength=len(REASONS)).argmax())]
+        if reason != "telemetry gap":
+            return f"most are {reason}" if reason else "there are no samples"
+        long = f"gaps above {self.maximum_gap_s:g} s (rt.advanced.maximum_gap_s)"
+        left = "turns between fixes" if self._turns.any() else long
+        return f"it has a fix every {np.median(np.diff(self._time_s)):.0f} s; {left} are not interpolated"
+
+    def _pose_at(self, instant: AnyArray) -> TrackPoses:
+        """Poses at instants (n,) [ns since 1970]."""
+        timed = instant != NO_TIME
+        # from the first row: a float64 of seconds since 1970 has but 0.2 microseconds
+        t = np.where(timed, instant - self.start_ns, 0) * 1e-9
+        code = self._codes(t)
+        code[~timed] = REASONS.index("no time")
+        valid = code == 0
+        n = len(t)
+        if len(self):
+            # an instant that rounding puts before the first row is at it
+            t = np.clip(t, self._time_s[0], self._time_s[-1])
+        position = np.full((n, 3), np.nan)
+        rotation = np.full((n, 3, 3), np.nan)
+        known = np.zeros(n, dtype=bool)
+        if valid.any():
+            position[valid] = interpolated(t[valid], self._time_s, self._position)
+            rotation[valid], known[valid] = self._rotations(t[valid])
+            position[valid, 2], buried = self._raised(position[valid])
+            code[np.flatnonzero(valid)[buried]] = REASONS.index("below the site's ground plane")
+            valid = code == 0
+            position[~valid], rotation[~valid], known[~valid] = np.nan, np.nan, False
+        return TrackPoses(
+            position_m=position,
+            rotation=rotation,
+            valid=valid,
+            reason_code=code.astype(np.int8),
+            attitude_known=known,
+        )
+
+    def _sparse(self, interval_s: FloatArray) -> tuple[float, BoolArray, tuple[float, float]]:
+        """Usual interval of telemetry that is sparse throughout, its turns, and the error of lines between fixes."""
+        usual_s = float(np.median(interval_s)) if len(interval_s) > 1 else 0.0
+        turns, step_m = np.zeros(len(interval_s), dtype=bool), np.linalg.norm(np.diff(self._position, axis=0), axis=1)
+        if usual_s <= self.maximum_gap_s:
+            return 0.0, turns, (0.0, 0.0)
+        part = (interval_s[:-1] / (interval_s[:-1] + interval_s[1:]))[:, None]
+        line = (1.0 - part) * self._position[:-2] + part * self._position[2:]
+        # half: a fix is twice as far from the line between its neighbours as places between fixes are from theirs
+        away_m = 0.5 * np.linalg.norm(line - self._position[1:-1], axis=1)
+        if np.quantile(step_m, 0.9) > _SPARSE_APART_M:
+            at_ends = np.append(np.inf, away_m), np.append(away_m, np.inf)
+            # the nearer end: a leg beside a turn is straight at its other end
+            nearer_m = np.minimum(*at_ends)
+            turns, away_m = nearer_m > _SPARSE_ERROR_M, nearer_m[nearer_m <= _SPARSE_ERROR_M]
+            if not len(away_m):
+                return 0.0, ~turns, (0.0, 0.0)
+            # chosen by the nearer of two ends, they look straighter than they are: the limit, not their own 90 %
+            return usual_s, turns, (float(np.median(away_m)), _SPARSE_ERROR_M)
+        return usual_s, turns, (float(np.median(away_m)), float(np.quantile(away_m, 0.9)))
+
+    def _raised(self, position: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Up of positions (n, 3), the lowest raised to just above the ground, and those that lie below it."""
+        return raised(position[:, 2], self._ground(position[:, 0], position[:, 1]), self.ground_m)
+
+    def _codes(self, t: FloatArray) -> AnyArray:
+        """Index into :data:`REASONS` for every instant."""
+        code = np.zeros(len(t), dtype=np.int64)
+        if not len(self):
+            code[:] = REASONS.index("no telemetry")
+            return code
+        code[_in_gap(t, self._time_s, self._gap)] = REASONS.index("telemetry gap")
+        code[t < self._time_s[0] - _SAME_S] = REASONS.index("before telemetry")
+        code[t > self._time_s[-1] + _SAME_S] = REASONS.index("after telemetry")
+        return code
+
+    def _rotations(self, t: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Rotation at every instant (n, 3, 3) and whether it comes from logged attitude."""
+        at = self._time_s[self._known]
+        near = np.zeros(len(t), dtype=bool)
+        if len(at):
+            # attitudes may end before positions do, and have gaps of their own
+            near = (t >= at[0]) & (t <= at[-1]) & ~_in_gap(t, at, np.diff(at) > self.maximum_gap_s)
+        if near.all() and len(t):
+            return _slerp(t, at, self._attitude[self._known]), near
+        course = rotation_from_aircraft(0.0 * t, 0.0 * t, self._course_at(t))
+        if near.any():
+            course[near] = _slerp(t[near], at, self._attitude[self._known])
+        return course, near
+
+    def _course_at(self, t: FloatArray) -> FloatArray:
+        """Course over ground [deg], interpolated as a direction."""
+        # by sine and cosine: between 350 and 10 degrees lies north
+        angle = np.radians(self._course_deg)
+        return bearing_deg(interpolated(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)])))
+
+
+def interpolated(t: FloatArray, at: FloatArray, values: FloatArray) -> FloatArray:
+    """Columns (rows, m) known at ``at`` (rows,), ascending, at t (n,): linear between rows, (n, m)."""
+    return np.column_stack([np.interp(t, at, values[:, i]) for i in range(values.shape[1])])
+
+
+def _in_gap(t: FloatArray, at: FloatArray, gap: BoolArray) -> BoolArray:
+    """Check whether an instant lies strictly inside an interval (rows - 1,) that is a gap."""
+    later = np.clip(np.searchsorted(at, t, side="left"), 0, len(at) - 1)
+    earlier = np.maximum(later - 1, 0)
+    # at a row itself the pose is known, whatever gap follows
+    exact = np.minimum(np.abs(at[later] - t), np.abs(at[earlier] - t)) <= _SAME_S
+    return np.asarray(np.append(gap, False)[earlier] & (later > earlier) & ~exact)
+
+
+def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArray:
+    """Rotations at t (n, 3, 3) from roll, pitch, yaw (rows, 3) at ``at``."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    # only the rows around t: a part of a long flight does not turn the whole
+    part = slice(max(int(np.searchsorted(at, t.min(), side="right")) - 1, 0), int(np.searchsorted(at, t.max())) + 1)
+    at, attitude_deg = at[part], attitude_deg[part]
+    matrices = rotation_from_aircraft(attitude_deg[:, 0], attitude_deg[:, 1], attitude_deg[:, 2])
+    if len(at) == 1:
+        return np.broadcast_to(matrices, (len(t), 3, 3))
+    return np.asarray(Slerp(at, Rotation.from_matrix(matrices))(t).as_matrix())
+
+
+def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> FloatArray:
+    """Logged velocities (east, north, up); where missing or never moving, differences of position over 4 s.
+
+    Over shorter times the differences are those of the position's noise: at 10 Hz a hover then has a speed.
+    """
+    if len(t) < 2:
+        return np.where(np.isfinite(logged), logged, 0.0)
+    derived = _differences_mps(t, position, _COURSE_SPAN_S)
+    missing = np.asarray(~np.isfinite(logged).all(axis=1))
+    if not np.any(logged[~missing]):  # converters write (0, 0, 0) for "unknown"
+        missing[:] = True
+    return np.where(missing[:, None], derived, logged)
+
+
+def velocities_mps(time_s: FloatArray, position_m: FloatArray, span_s: float = 1.0, gap_s: float = 3.0) -> FloatArray:
+    """Velocity (n, 3) by the central difference of positions over twice ``span_s``, linear between them.
+
+    Parameters
+    ----------
+    time_s : (n,)
+        Ascending.
+    position_m : (n, 3)
+    span_s : float
+        Before and after; at the ends and beside gaps one side alone.
+    gap_s : float
+        Longer steps are not bridged.
+
+    Returns
+    -------
+    (n, 3)
+        NaN where an instant has no neighbour.
+    """
+    velocity = np.full(position_m.shape, np.nan)
+    for part in np.split(np.arange(len(time_s)), np.flatnonzero(~(np.diff(time_s) <= gap_s)) + 1):
+        if len(part) >= 2 and (np.diff(time_s[part]) > 0.0).all():
+            velocity[part] = _differences_mps(time_s[part], position_m[part], span_s)
+    return velocity
+
+
+def _differences_mps(t: FloatArray, position_m: FloatArray, span_s: float) -> FloatArray:
+    """Velocity (n, 3) at ascending times by positions some seconds, or else a row, before and after."""
+    early, late = np.maximum(t - span_s, t[0]), np.minimum(t + span_s, t[-1])
+    # by at least one row on either side: sparse telemetry has none within the span
+    early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))
+    moved = interpolated(late, t, position_m) - interpolated(early, t, position_m)
+    return np.asarray(moved / (late - early)[:, None])
+
+
+def _courses(velocity: FloatArray) -> FloatArray:
+    """Course over ground [deg clockwise from north]; at rest the last one holds (before the first: the first)."""
+    course = bearing_deg(velocity)
+    moving = np.flatnonzero(np.hypot(velocity[:, 0], velocity[:, 1]) >= _COURSE_SPEED_MPS)
+    if not len(moving):
+        return np.zeros(len(velocity))
+    last = np.searchsorted(moving, np.arange(len(velocity)), side="right") - 1
+    return np.asarray(course[moving[np.maximum(last, 0)]])

@@ -1,0 +1,569 @@
+"""The ``calibrate`` job: antennas as they hang, learned from several flights, scored on what was left out.
+
+The lock's part of ``calibrate``: when a receiver is in lock, from the level that other flights predict.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+from pydantic import Field
+
+from ..common.content import union
+from ..common.errors import InputError, UsageError
+from ..common.stages import PlannedStage, Stages
+from ..common.text import counted
+from ..common.units import FloatArray
+from ..common.yamlfile import StrictModel, load_yaml
+from ..compare import calibration, gains
+from ..compare.calibration import (
+    BIN_S,
+    CurvePoint,
+    Learned,
+    Observed,
+    Recipe,
+    Score,
+    flights_of,
+    groups_of,
+    learn,
+    learning_curve,
+)
+from ..compare.gains import GainOf
+from ..compare.level import DetectionScore, learn_detection, score_detection
+from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
+from ..flight.gains import flight_of, load_with_learned, mean_gain_db, sphere_angles
+from ..flight.replay import observed_series
+from ..flight.rows import LOCK_FLOOR_DB
+from ..flight.settings import AntennaSettings, load_pattern
+from ..flight.training import counted_once, flight_logs, marks_of
+from ..propagation.field.baselines import two_ray_dbm
+from ..report.calibration import sentences
+from ..site.learned import LearnedLock, Source
+
+
+def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
+    """P(lock) by antenna, of levels that were predicted without the flight at hand, and its scores on flights left out.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+        Of all flights.
+    recipe : Recipe
+    fits : mapping of str to Learned
+        What was learned without each flight.
+
+    Returns
+    -------
+    dict of str to LearnedLock
+        Nothing for receivers that keep their lock, or with fewer than three flights: none could be scored.
+    """
+    able = [o for o in observed if o.locked is not None and np.isfinite(o.locked).any()]
+    if len(flights_of(able)) < 3:
+        return {}
+    pairs = _without_pairs(observed, recipe)
+    out = {}
+    for antenna in dict.fromkeys(o.samples.antenna for o in able):
+        lock = _learned([o for o in able if o.samples.antenna == antenna], fits, pairs)
+        if lock is not None:
+            out[antenna] = lock
+    return out
+
+
+def _without_pairs(observed: Sequence[Observed], recipe: Recipe) -> dict[tuple[str, str], Learned]:
+    """Gains learned without two flights: the levels of the one, in a forecast for the other, know of neither."""
+    out: dict[tuple[str, str], Learned] = {}
+    for one, other in combinations(groups_of(flights_of(observed)), 2):
+        learned = learn([o.samples for o in observed if o.samples.flight not in (*one, *other)], recipe)
+        out |= {pair: learned for a in one for b in other for pair in ((a, b), (b, a))}
+    return out
+
+
+class _Levels:
+    """Predicted path gain of one series and what was received [dB], where the lock is known."""
+
+    def __init__(self, o: Observed, learned: Learned) -> None:
+        assert o.locked is not None
+        level = o.free_space_db - o.sent_dbm + learned.mean(o.samples)
+        at = np.isfinite(level) & np.isfinite(o.locked)
+        self.time_s, self.level_db = o.samples.time_s[at], level[at]
+        self.free_db = o.free_space_db[at]
+        self.measured_db = o.samples.residual_db[at] + self.free_db
+        self.detected = o.locked[at] == 1.0
+
+
+def _learned(
+    series: Sequence[Observed], fits: Mapping[str, Learned], pairs: Mapping[tuple[str, str], Learned]
+) -> LearnedLock | None:
+    """From all flights, scored flight by flight by what the others teach."""
+    flights = [_Levels(o, fits[o.samples.flight]) for o in series]
+    every = learn_detection([(f.level_db, f.detected) for f in flights])
+    scores: list[DetectionScore] = []
+    for o, item in zip(series, flights, strict=True):
+        known = [(other, pairs.get((o.samples.flight, other.samples.flight))) for other in series]
+        others = [_Levels(other, learned) for other, learned in known if learned is not None]
+        from_others = learn_detection([(f.level_db, f.detected) for f in others])
+        score = None if from_others is None else score_detection(
+            item.time_s, item.measured_db, item.level_db, item.detected, floor_db=LOCK_FLOOR_DB,
+            free_space_db=item.free_db, forecast=from_others,
+        )  # fmt: skip
+        if score is not None:
+            scores.append(score)
+    if every is None or not scores:
+        return None
+
+    names = ("brier", "constant_brier", "log_score", "constant_log_score", "rmse_db", "free_space_rmse_db")
+    mean = {name: round(float(np.mean([getattr(score, name) for score in scores])), 4) for name in names}
+    return LearnedLock(
+        gain_db=round(every.level_db, 2),
+        per_db=round(every.per_db, 4),
+        share=round(every.share, 3),
+        **_two_parts(flights, every.level_db),
+        flights=len(scores),
+        floor_db=LOCK_FLOOR_DB,
+        floor_rmse_db=mean.pop("rmse_db"),
+        free_space_floor_rmse_db=mean.pop("free_space_rmse_db"),
+        **mean,
+    )
+
+
+# Of a receiver that always writes the same level without lock.
+_LEAST_SD_DB = 0.5
+
+# Width of the central 90 % of a normal distribution, over its standard deviation.
+_CENTRAL = 3.29
+
+
+def _two_parts(flights: Sequence[_Levels], gain_db: float) -> dict[str, float]:
+    """Lines of the level over path gain in lock and without, and the spread about each."""
+    numbers: dict[str, float] = {}
+    for name, in_lock in (("locked", True), ("lost", False)):
+        parts = [f.detected == in_lock for f in flights]
+        each = [(f.level_db[at] - gain_db, f.measured_db[at]) for f, at in zip(flights, parts, strict=True) if at.any()]
+        gain, level = (np.concatenate(values) for values in zip(*each, strict=True))
+        alike = np.concatenate([np.full(len(g), len(g) ** -0.5) for g, _ in each])  # each flight of the same weight
+        slope, middle = np.polyfit(gain, level, 1, w=alike)
+        # in lock fades are rare and deep: the spread of the central 90 %, or the band of 90 % holds more
+        central = np.mean([np.ptp(np.quantile(m - slope * g, (0.05, 0.95))) for g, m in each]) / _CENTRAL
+        sd = central if in_lock else (level - middle - slope * gain).std()
+        numbers |= {f"{name}_db": middle, f"{name}_per_db": slope, f"{name}_sd_db": max(sd, _LEAST_SD_DB)}
+    return {name: round(float(value), 3) for name, value in numbers.items()}
+
+
+def lock_words(lock: LearnedLock) -> str:
+    """Sentences on P(lock), and on the level with a floor, from flights left out."""
+    return (
+        f"The predicted level gives the probability of lock with a Brier score of {lock.brier:.3f} on flights left out "
+        f"(constant share of each flight: {lock.constant_brier:.3f}), log score {lock.log_score:.3f} "
+        f"({lock.constant_log_score:.3f}). Where levels below {lock.floor_db:g} dB re full scale count as "
+        f"{lock.floor_db:g}, the RMSE is {lock.floor_rmse_db:.1f} dB; free space: "
+        f"{lock.free_space_floor_rmse_db:.1f} dB."
+    )
+
+
+# Heights of roughness that are tried [m]; infinite is no ground ray.
+_ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
+
+
+class PatternsSettings(StrictModel):
+    """Measured patterns that the learned gain stands on; none: isotropic."""
+
+    uav: AntennaSettings | None = None
+    tower: AntennaSettings | None = None
+    towers: dict[str, AntennaSettings] = Field(default_factory=dict)
+    """By ``tower.channel``, where they differ."""
+
+
+class CalibrationFile(StrictModel):
+    """The whole calibration.yaml."""
+
+    calibration: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
+    flights: Annotated[list[str], Field(min_length=1)]
+    patterns: PatternsSettings = PatternsSettings()
+    source: Source = Source()
+    """Title, DOI and licence of the flights' data, and their airframe: kept beside what a site remembers."""
+    rank: bool = False
+    """Also learn how the receiver decides its rank."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundFit:
+    """Roughness of the ground: log likelihood against no ground ray, per height tried [m]; infinite: no such ray."""
+
+    roughness_m: tuple[float, ...]
+    log_likelihood: tuple[float, ...]
+
+    @property
+    def likely_m(self) -> tuple[float, float]:
+        """Heights within 2 of the best log likelihood (some 95 %)."""
+        # two standard deviations of a normal likelihood
+        least = max(self.log_likelihood) - 2.0
+        near = [r for r, v in zip(self.roughness_m, self.log_likelihood, strict=True) if v > least]
+        return min(near), max(near)
+
+    @property
+    def used_m(self) -> float | None:
+        """Height that a replay is to take: the most probable one, or None where no ground ray is as likely."""
+        return None if math.isinf(self.likely_m[1]) else self.roughness_m[int(np.argmax(self.log_likelihood))]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """All that a calibration found."""
+
+    settings: CalibrationFile
+    flights: tuple[FlightData, ...]
+    observed: tuple[Observed, ...]
+    learned: Learned
+    scores: Mapping[str, tuple[Score, ...]]
+    controls: Mapping[str, tuple[Score, ...]]
+    ground: GroundFit
+    curve: tuple[CurvePoint, ...]
+    locks: Mapping[str, LearnedLock]
+    """By antenna, of receivers that lose their lock."""
+    warnings: tuple[str, ...]
+    words: tuple[str, ...]
+
+    @property
+    def fit(self) -> gains.GainFit:
+        """The learned gain over direction: every ``fit.gain`` has one."""
+        return self.learned.fit
+
+    @property
+    def pair_term(self) -> gains.Term | None:
+        """The term of the gain towards both ends at once; None if none was learned."""
+        return next((term for term in self.fit.model.terms if term.frame == "pair"), None)
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the flights."""
+        return [data.settings.flight.name for data in self.flights]
+
+    def first_series(self, antenna: str) -> tuple[FlightData, RssSeries]:
+        """The first flight with an antenna, and its series there."""
+        return next((data, s) for data in self.flights for s in data.rss if f"{s.tower}.{s.channel}" == antenna)
+
+    @property
+    def trained_on(self) -> tuple[str, ...]:
+        """SHA-256 of every log that was learned from."""
+        return union(*map(flight_logs, self.flights))
+
+    @property
+    def marks(self) -> tuple[str, ...]:
+        """Marks of their series."""
+        return marks_of(self.flights)
+
+
+def load_calibration(path: Path, further: Sequence[Path] = ()) -> CalibrationFile:
+    """Read and check a calibration.yaml, or a flight file and ``further``; UsageError as of any settings file."""
+    if (flight := flight_of(path)) is None:
+        settings = load_yaml(path, CalibrationFile)
+    else:
+        settings = CalibrationFile(calibration=flight.flight.name, flights=[str(path.resolve())])
+    settings = settings.model_copy(update={"flights": [*settings.flights, *(str(f.resolve()) for f in further)]})
+    if len(set(settings.flights)) != len(settings.flights):
+        raise UsageError(
+            "a flight is named twice", expected="each flight once: its copy would be scored on itself", path=path
+        )
+    return settings
+
+
+def calibrate(
+    settings: CalibrationFile,
+    flights: Sequence[FlightData],
+    folder: Path,
+    logs_root: Path | None = None,
+    *,
+    stages: Stages | None = None,
+    score: Sequence[Path] = (),
+) -> Calibration:
+    """Learn from flights, score.
+
+    Parameters
+    ----------
+    settings : CalibrationFile
+    flights : sequence of FlightData
+        As :func:`read_flights` gives them.
+    folder, logs_root : Path
+        Against which patterns resolve, and logs of ``score`` in place of their flight file's folder.
+    stages : Stages, optional
+    score : sequence of Path
+        Further flight files, scored with all that was learned.
+
+    Returns
+    -------
+    Calibration
+        What was learned, its scores on flights left out, and the controls.
+
+    Raises
+    ------
+    UsageError
+        Settings that are wrong; flights that share no tower and channel.
+    InputError
+        Logs that cannot be read; flights without RSS.
+    """
+    stages = stages or Stages()
+    observed, warnings = observe(flights)
+    recipe = recipe_of(settings, observed, logs_root or folder)
+    with stages("read"):
+        further = [load_data(load_with_learned(path), path.parent, logs_root) for path in score]
+    series = [o.samples for o in observed]
+    rest = [("fit, ground, scores, curve", ", ".join(sorted({samples.antenna for samples in series})))]
+    rest += [("score", counted(len(score), "flight"))] if score else []
+    rest += [("rank", "of all flights")] if settings.rank else []
+    stages.checked(lambda: [PlannedStage(*row) for row in rest])
+    with stages("fit"):
+        learned = calibration.learn(series, recipe)
+    with stages("ground"):
+        ground = _fit_ground(flights, observed, learned)
+    fits: dict[str, Learned] = {}
+    with stages("scores"):
+        scores = _score_all(observed, recipe, stages, fits)
+        stages.progress("scores: controls")
+        controls = _controls_of(observed, recipe, scores["flight_left_out"])
+        locks = learned_locks(observed, recipe, fits)
+    with stages("curve"):
+        curve = learning_curve(observed, recipe)
+    warnings += _mount_warnings(learned)
+    if further:
+        with stages("score"):
+            further_scores, remarks = _score_further(further, flights, learned, observed)
+        scores, warnings = {**scores, "other_flights": further_scores}, list(dict.fromkeys([*warnings, *remarks]))
+    return Calibration(
+        settings=settings,
+        flights=tuple(flights),
+        observed=tuple(observed),
+        learned=learned,
+        scores=scores,
+        controls=controls,
+        ground=ground,
+        curve=curve,
+        locks=locks,
+        warnings=tuple(warnings),
+        words=(
+            *sentences(scores, controls, ground.likely_m, curve),
+            *map(lock_words, locks.values()),
+        ),
+    )
+
+
+def _score_further(
+    further: Sequence[FlightData],
+    flights: Sequence[FlightData],
+    learned: Learned,
+    observed: Sequence[Observed],
+) -> tuple[tuple[Score, ...], list[str]]:
+    """Scores of further flights with what was learned, and which of them were learned from."""
+    distinct, remarks = counted_once([*flights, *further])
+    fresh = [data for data in distinct if not any(data is item for item in flights)]
+    if not fresh:
+        return (), remarks
+    measured = [series for data in fresh for series in observe([data])[0]]
+    known = {o.samples.antenna for o in observed}
+    remarks += [
+        f"{o.samples.flight}: nothing was learned about {o.samples.antenna}"
+        for o in measured
+        if o.samples.antenna not in known
+    ]
+    return calibration.score_with(learned, [o for o in measured if o.samples.antenna in known], observed), remarks
+
+
+# --- flights -------------------------------------------------------------------------------------------------------
+
+
+def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None) -> tuple[list[FlightData], list[str]]:
+    """Every flight of the calibration, gathered, each log once, and what is to be said of copies."""
+    places = [folder / name for name in settings.flights]
+    out = [load_data(load_with_learned(path), path.parent, logs_root) for path in places]
+    names = [data.settings.flight.name for data in out]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"two flights are named {name!r}", expected="an own 'flight: {name: ...}' in each file")
+    return counted_once(out)
+
+
+def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
+    """Samples of every series against free space, and what is to be said of them."""
+    observed: list[Observed] = []
+    warnings: list[str] = []
+    carriers: dict[str, dict[str, float]] = {}
+    for data, series in [(flight, entry) for flight in flights for entry in flight.rss]:
+        level, remarks = _observed_level(data, series)
+        warnings += remarks
+        if level is not None:
+            carriers.setdefault(level.samples.antenna, {})[data.settings.flight.name] = series.link.carrier_hz
+            observed.append(level)
+    if not observed:
+        raise InputError("none of the flights has RSS at known poses", expected="RSS logs with telemetry")
+    for antenna, per_flight in carriers.items():
+        low, high = min(per_flight.values()), max(per_flight.values())
+        if high > 1.02 * low:
+            raise UsageError(
+                f"{antenna} was received at {low / 1e9:g} and {high / 1e9:g} GHz",
+                expected="one frequency per tower and channel: an antenna's gain is of its frequency",
+                cause="flights of different experiments, or a wrong link.rss.carrier_hz",
+            )
+    lonely = [a for a, per_flight in carriers.items() if len(per_flight) == 1]
+    if len(calibration.flights_of(observed)) > 1 and len(lonely) == len(carriers):
+        raise UsageError(
+            "the flights share no tower and channel: " + "; ".join(f"{a} in {next(iter(carriers[a]))}" for a in lonely),
+            expected="at least one tower and channel that two flights have",
+            cause="different 'node' or 'channel' beside the logs in the flight files",
+        )
+    if len(calibration.flights_of(observed)) < 2:
+        warnings.append("one flight alone: nothing can be left out, nothing here is scored, and mounts are unstable")
+    elif lonely:
+        warnings.append(f"only one flight has {', '.join(lonely)}: learned, but not scored")
+    return observed, warnings
+
+
+def _observed_level(data: FlightData, series: RssSeries) -> tuple[Observed | None, list[str]]:
+    """One series of levels at known poses; None for ratios and without any, and what is to be said of it."""
+    name, remarks = f"{data.settings.flight.name}: {series.tower} {series.channel}", []
+    if series.channel.lower() in RATIOS:
+        if series.channel.lower() != SNR or any(s.channel.lower() not in RATIOS for s in data.rss):
+            return None, [f"{data.settings.flight.name}: {series.channel} is a ratio, no level: left out"]
+        remarks.append(
+            f"{data.settings.flight.name}: {series.tower} {SNR} stands for a level: the noise is taken as constant"
+        )
+    observed, guessed, lost = observed_series(data, series)
+    if not np.isfinite(observed.samples.residual_db).any():
+        return None, [*remarks, f"{name} has no level at a known pose and is left out"]
+    if guessed > 0.01:
+        share = f"{100 * guessed:.0f} % of the attitudes at {series.tower} {series.channel} are unknown"
+        remarks.append(f"{data.settings.flight.name}: {share}: heading from the track, level flight")
+    if lost > 0.01:
+        remarks.append(f"{name}: {100 * lost:.0f} % of the levels have no position and are left out")
+    return observed, remarks
+
+
+# --- what is learned -----------------------------------------------------------------------------------------------
+
+
+def learned_antennas(train: Sequence[gains.LinkSamples]) -> Learned:
+    """Antennas of both ends from means over the bins of a correction, with the model's own strengths to start from."""
+    return calibration.learn(train, Recipe(gains.GainModel(bin_s=BIN_S)))
+
+
+def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
+    """Terms and patterns as calibration.yaml asks."""
+    patterns: dict[str, GainOf] = {}
+    if settings.patterns.uav is not None:
+        patterns["uav"] = gain_of(settings.patterns.uav, folder)
+    antennas = list(dict.fromkeys(o.samples.antenna for o in observed))
+    if unknown := sorted(settings.patterns.towers.keys() - set(antennas)):
+        raise UsageError(
+            f"patterns.towers.{unknown[0]}: the flights have no such tower and channel",
+            expected="one of " + ", ".join(antennas),
+        )
+    for antenna in antennas:
+        chosen = settings.patterns.towers.get(antenna, settings.patterns.tower)
+        if chosen is not None:
+            patterns[antenna] = gain_of(chosen, folder)
+    return Recipe(gains.GainModel(), patterns)
+
+
+def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
+    """Gain [dBi] of a pattern towards unit vectors (n, 3) of its device frame."""
+    pattern = load_pattern(settings, folder)
+    return lambda direction: mean_gain_db([pattern], *sphere_angles(direction))
+
+
+def _fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
+    """Likelihood of a coherent ground ray of each roughness, the gains integrated out."""
+    by_name = {data.settings.flight.name: data for data in flights}
+    by_series = {(o.samples.flight, o.samples.antenna): o for o in observed}
+
+    def columns(samples: gains.LinkSamples, bin_s: float) -> FloatArray:
+        data = by_name[samples.flight]
+        o = by_series[samples.flight, samples.antenna]
+        link = next(s.link for s in data.rss if f"{s.tower}.{s.channel}" == samples.antenna)
+        tower = data.site.towers[samples.tower]
+        place = tower.position_m[None, :] if o.tower_m is None else o.tower_m[:, None, :]
+        out = [samples.binned(bin_s).residual_db]
+        for sigma in _ROUGHNESS_M:
+            level = two_ray_dbm(
+                place,
+                samples.position_m,
+                link.carrier_hz,
+                link.transmit_power_dbm,
+                ground_material=data.site.ground_material,
+                ground_m=tower.ground_m,
+                roughness_m=sigma,
+            )[:, 0]
+            ripple = np.where(np.isfinite(samples.residual_db), level - o.free_space_db, np.nan)
+            out.append(dataclasses.replace(samples, residual_db=ripple).binned(bin_s).residual_db)
+        stacked = np.stack(out, axis=1)
+        return np.asarray(stacked - stacked.mean(axis=0))
+
+    series = [o.samples for o in observed]
+    unexplained = [dataclasses.replace(s, residual_db=s.residual_db - learned.patterns_db(s)) for s in series]
+    form = gains.column_forms(unexplained, learned.model, columns)
+    value = np.diag(form)[1:] - 2.0 * form[0, 1:]
+    likelihood = -0.5 * (value - value[-1])
+    return GroundFit(roughness_m=_ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
+
+
+# --- scores --------------------------------------------------------------------------------------------------------
+
+
+def _score_all(
+    observed: Sequence[Observed], recipe: Recipe, stages: Stages, fits: dict[str, Learned]
+) -> dict[str, tuple[Score, ...]]:
+    """Every split, on flights that had no part in the fit; fits of one are used by the next.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+    recipe : Recipe
+    stages : Stages
+    fits : dict of str to Learned
+        Receives what was learned without each flight.
+
+    Returns
+    -------
+    dict of str to tuple of Score
+    """
+    scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
+    if len(calibration.flights_of(observed)) < 2:
+        return scores
+    scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, fits)
+    for split, parts, own_rest in (
+        ("altitude_left_out", calibration.altitude_parts, False),
+        ("heading_left_out", calibration.heading_parts, False),
+        ("sector_left_out", calibration.sector_parts, False),
+        ("route_left_out", calibration.route_parts, True),
+    ):
+        stages.progress(f"scores: {split.replace('_', ' ')}")
+        scores[split] = calibration.parts_left_out(observed, recipe, fits, parts, own_rest=own_rest)
+    return scores
+
+
+def _controls_of(
+    observed: Sequence[Observed], recipe: Recipe, scores: tuple[Score, ...]
+) -> dict[str, tuple[Score, ...]]:
+    """Wrong frames of the UAV's gain beside its body's, each flight left out; ``scores`` are those of the recipe."""
+    if len(calibration.flights_of(observed)) < 2:
+        return {}
+    left_out, bare = calibration.flight_left_out, dataclasses.replace(recipe, patterns={})
+    return {
+        "world frame at the UAV": left_out(calibration.world_frame(observed), bare),
+        "heading turned the wrong way": left_out(calibration.wrong_way(observed), bare),
+        "body frame, no patterns": left_out(observed, bare) if recipe.patterns else scores,
+    }
+
+
+def _mount_warnings(learned: Learned) -> list[str]:
+    """A sentence for every mount that the data do not tell."""
+    return [
+        f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard deviation of "
+        f"{mount.azimuth_sd_deg:.0f} deg"
+        for name, mount in learned.mounts.items()
+        if not mount.identified
+    ]

@@ -1,0 +1,391 @@
+"""The receiver's part of ``calibrate``: how the modem decides its rank, learned on flights, scored on those left out.
+
+The ground is flat at height 0 and everything else is left out (line of sight and one ground ray): which way the ports
+look and how strong the ground is decide more about the rank than any wall at a rural site.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.content import KEY, MARKS, union
+from ..common.errors import InputError, UsageError, parsing
+from ..common.jsonable import json_safe
+from ..common.units import FloatArray, IntArray
+from ..compare import receiver
+from ..compare.level import seconds
+from ..compare.receiver import ForecastScore, constant_forecast, score_forecast
+from ..flight.data import FlightData, RankSeries
+from ..flight.replay import rank_poses
+from ..flight.training import among, logs_of, series_mark
+from ..propagation.drivers import Geometry, every_geometry, singular_values_of
+from ..propagation.geometry import Link, Poses
+from ..site.learned import read_table
+
+# First key of a receiver file.
+FORMAT = "aerpaw-cmp receiver 1"
+
+# Ways to slant the four ports of a modem: two diagonals, two upright and two lying, all alike.
+_SLANTS_DEG: tuple[tuple[float, ...], ...] = (
+    (45.0, -45.0, 45.0, -45.0), (45.0, -45.0, -45.0, 45.0), (45.0, 45.0, -45.0, -45.0),
+    (-45.0, 45.0, -45.0, 45.0), (-45.0, 45.0, 45.0, -45.0), (-45.0, -45.0, 45.0, 45.0),
+    (0.0, 90.0, 0.0, 90.0), (0.0, 90.0, 90.0, 0.0), (0.0, 0.0, 90.0, 90.0),
+    (90.0, 0.0, 90.0, 0.0), (90.0, 0.0, 0.0, 90.0), (90.0, 90.0, 0.0, 0.0),
+    (0.0, 0.0, 0.0, 0.0), (90.0, 90.0, 90.0, 90.0),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankGrid:
+    """Geometries and timings that are tried.
+
+    Parameters
+    ----------
+    yaw_step_deg : float
+        Between mounts of the modem's array.
+    uav_slant_deg : tuple of tuple of float
+        Slants of the modem's ports.
+    ground : tuple of float
+        Amplitude factors on the ground reflection.
+    members : int
+        Of the geometries that cannot be told apart, how many the forecast averages.
+    thin : int
+        Every n-th sample chooses the geometry; all fit.
+    shift_s, average_s : tuple of float
+        Seconds by which a report may belong to a later position than the log says, and over which the modelled channel
+        may be averaged.
+    """
+
+    yaw_step_deg: float = 30.0
+    uav_slant_deg: tuple[tuple[float, ...], ...] = _SLANTS_DEG
+    ground: tuple[float, ...] = (0.0, 0.2, 0.5, 1.0)
+    members: int = 20
+    thin: int = 4
+    shift_s: tuple[float, ...] = (0.0, 2.0, 4.0, 6.0)
+    average_s: tuple[float, ...] = (0.0, 8.0, 16.0, 24.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankSamples:
+    """Reports of one flight at one tower, at known positions: ``rank`` (n,), NaN without CSI; ``time_s`` (n,)."""
+
+    flight: str
+    tower: str
+    tower_m: FloatArray
+    poses: Poses
+    rank: FloatArray
+    link: Link
+    time_s: FloatArray
+    logs: tuple[str, ...] = ()
+    """SHA-256 of the logs that hold the reports."""
+    mark: str = ""
+    """Of these reports, whatever their log is."""
+
+    def part(self, rows: Any) -> RankSamples:
+        """Some of the samples."""
+        return dataclasses.replace(self, poses=self.poses[rows], rank=self.rank[rows], time_s=self.time_s[rows])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timing:
+    """Time relation of reports to the positions of a log: see :func:`~aerpaw_cmp.compare.receiver.time_means`."""
+
+    shift_s: float = 0.0
+    average_s: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FittedReceiver:
+    """A receiver at one tower: the geometries that cannot be told apart, best first, and their mean forecast."""
+
+    tower: str
+    geometries: tuple[Geometry, ...]
+    tied: int
+    flights: tuple[str, ...]
+    """Names of those that it was fitted on."""
+    trained_on: tuple[str, ...] = ()
+    """SHA-256 of their logs: no score there is worth anything."""
+    marks: tuple[str, ...] = ()
+    """Of their reports."""
+    mixture: receiver.ReceiverMixture
+    timing: Timing = Timing()
+
+    def knows(self, samples: RankSamples) -> bool:
+        """Check whether it was fitted on these reports, by their logs or readings."""
+        return not set(self.trained_on).isdisjoint(samples.logs) or among(samples.mark, self.marks)
+
+    def forecast(self, samples: RankSamples, turns_deg: Sequence[float] = (0.0,)) -> tuple[FloatArray, IntArray]:
+        """Probability (n, 4) of each rank, and the one that is said; the mean over turns of the UAV to the right."""
+        turned = [
+            dataclasses.replace(g, uav_yaw_deg=(g.uav_yaw_deg - turn) % 360.0)  # many turned mounts are the same
+            for turn in turns_deg
+            for g in self.geometries
+        ]
+        features = np.split(features_of(turned, samples, self.timing), len(turns_deg))
+        p = np.mean([self.mixture.probabilities(some) for some in features], axis=0)
+        return p, self.mixture.decide(p)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For the receiver file."""
+        return {
+            "geometries": [dataclasses.asdict(g) for g in self.geometries],
+            "tied": self.tied,
+            "flights": list(self.flights),
+            KEY: list(self.trained_on),
+            MARKS: list(self.marks),
+            "members": json_safe(self.mixture.members),
+            "decision_weight": self.mixture.decision_weight.tolist(),
+            "shift_s": self.timing.shift_s,
+            "average_s": self.timing.average_s,
+        }
+
+    @classmethod
+    def from_dict(cls, tower: str, content: Mapping[str, Any]) -> FittedReceiver:
+        """From :meth:`as_dict`."""
+        return cls(
+            tower=tower,
+            geometries=tuple(_geometry(g) for g in content["geometries"]),
+            tied=int(content["tied"]),
+            flights=tuple(str(name) for name in content["flights"]),
+            trained_on=tuple(str(digest) for digest in content[KEY]),
+            marks=tuple(str(mark) for mark in content[MARKS]),
+            mixture=receiver.ReceiverMixture(
+                members=tuple(receiver.Receiver.from_dict(m) for m in content["members"]),
+                decision_weight=np.asarray(content["decision_weight"], dtype=np.float64),
+            ),
+            timing=Timing(shift_s=float(content["shift_s"]), average_s=float(content["average_s"])),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankCalibration:
+    """Receivers by tower, fitted on all flights, and scores by split: (flight, tower, score)."""
+
+    receivers: Mapping[str, FittedReceiver]
+    scores: Mapping[str, tuple[tuple[str, str, ForecastScore], ...]]
+    warnings: tuple[str, ...]
+
+    def metrics(self) -> dict[str, list[dict[str, Any]]]:
+        """``rank`` of ``calibrate --json``."""
+        return {
+            split: [{"flight": flight, "tower": tower, **json_safe(score)} for flight, tower, score in rows]
+            for split, rows in self.scores.items()
+        }
+
+    def text(self) -> str:
+        """The receiver file."""
+        towers = {name: fitted.as_dict() for name, fitted in self.receivers.items()}
+        return json.dumps({"format": FORMAT, "towers": towers}, indent=1) + "\n"
+
+
+def read_receiver(path: Path) -> dict[str, FittedReceiver]:
+    """Receivers of a file that ``calibrate`` wrote, by tower.
+
+    Raises
+    ------
+    InputError
+        If it is no such file.
+    """
+    with parsing(path, f"a file of format {FORMAT!r}", "a file of another kind", any_shape=True):
+        content = json.loads(read_table(path, "a receiver file"))
+        if content["format"] != FORMAT:
+            raise ValueError(f"format {content['format']!r}")
+        return {tower: FittedReceiver.from_dict(tower, entry) for tower, entry in content["towers"].items()}
+
+
+def _geometry(values: Mapping[str, Any]) -> Geometry:
+    slants = {name: tuple(values[name]) for name in ("tower_slant_deg", "uav_slant_deg")}
+    return Geometry(**{**values, **slants})
+
+
+def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
+    """Reports above ``rank.minimum_height_m`` at known positions."""
+    poses, known, _ = rank_poses(data, series)
+    low = data.settings.rank.minimum_height_m
+    high = np.full(len(poses), True) if low is None else poses.position_m[:, 2] >= low
+    keep, link = np.flatnonzero(known)[high], data.link_of(series)
+    ports = {len(link.uav_array), len(link.tower_arrays[series.tower])}
+    if series.tower in data.nodes:
+        raise UsageError(
+            f"rank of {series.tower} in {data.settings.flight.name}, which moves",
+            expected="a tower that stands still: geometries of the modem are fitted as seen from one place",
+        )
+    if ports != {4}:
+        raise UsageError(
+            f"link.rank of {data.settings.flight.name} has arrays of {sorted(ports)} ports",
+            expected="four at both ends: the slants and ranks of a four-port modem are fitted",
+        )
+    return RankSamples(
+        flight=data.settings.flight.name,
+        tower=series.tower,
+        tower_m=np.asarray(data.site.towers[series.tower].position_m),
+        poses=poses[high],
+        rank=series.rank[keep],
+        link=link,
+        time_s=seconds(series.time[keep]),
+        logs=logs_of(data, series),
+        mark=series_mark(series),
+    )
+
+
+def _powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
+    """Squares (geometries, n, 4) of the singular values of the modelled channels."""
+    order = sorted(range(len(geometries)), key=lambda i: geometries[i].mount_deg)  # best first: mounts come again
+    singular = singular_values_of(
+        [geometries[i] for i in order], samples.link.tower_arrays[samples.tower], samples.tower_m,
+        samples.link.uav_array, samples.poses, samples.link.carrier_hz,
+    )  # fmt: skip
+    by_place = {i: sigma**2 for i, sigma in zip(order, singular, strict=True)}
+    return np.stack([by_place[i] for i in range(len(geometries))])
+
+
+def features_of(geometries: Sequence[Geometry], samples: RankSamples, timing: Timing | None = None) -> FloatArray:
+    """Features (geometries, n, 4) of the modelled channels."""
+    return _features(_powers_of(geometries, samples), samples, timing or Timing())
+
+
+def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatArray:
+    return receiver.stream_features(
+        np.sqrt(receiver.time_means(power, samples.time_s, timing.shift_s, timing.average_s))
+    )
+
+
+def candidates(grid: RankGrid, samples: RankSamples) -> tuple[Geometry, ...]:
+    """Geometries to try: upright and rolled by 90 deg (half a turn is the same), lying flat."""
+    half, full = (np.arange(0.0, end, grid.yaw_step_deg) for end in (180.0, 360.0))
+    mounts = [(float(y), 0.0, r) for r in (0.0, 90.0) for y in half] + [(float(y), 90.0, 0.0) for y in full]
+    tower = tuple(np.degrees(samples.link.tower_arrays[samples.tower].slant_rad).round(9).tolist())
+    return every_geometry(mounts, [tower], grid.uav_slant_deg, grid.ground)
+
+
+def samples_by_tower(flights: Sequence[FlightData]) -> dict[str, list[RankSamples]]:
+    """Reports of all flights; InputError without any, UsageError of :func:`rank_samples`."""
+    towers: dict[str, list[RankSamples]] = {}
+    for data in flights:
+        for series in data.rank:
+            towers.setdefault(series.tower, []).append(rank_samples(data, series))
+    if not towers:
+        raise InputError("none of the flights has rank", expected="rank logs", cause="'rank:' in calibration.yaml")
+    return towers
+
+
+def fit_rank(towers: Mapping[str, Sequence[RankSamples]]) -> RankCalibration:
+    """Fit a receiver per tower on all flights, and score it on each flight left out; InputError of too few reports."""
+    receivers, warnings = {}, []
+    scores: dict[str, list[tuple[str, str, ForecastScore]]] = {"flight_left_out": [], "sector_left_out": []}
+    for tower, samples in towers.items():
+        tried = Tried.of(samples)
+        receivers[tower] = tried.fit(range(len(samples)))
+        if len(samples) < 2:
+            warnings.append(f"rank at {tower}: one flight alone, no flight can be left out and nothing is scored")
+            continue
+        for held_out, test in enumerate(samples):
+            train = [i for i in range(len(samples)) if i != held_out]
+            fitted, constant = tried.fit(train), constant_forecast(np.concatenate([samples[i].rank for i in train]))
+            p, decided = fitted.forecast(test)
+            scores["flight_left_out"].append((test.flight, tower, score_forecast(test.rank, p, decided, constant)))
+            scores["sector_left_out"].append((test.flight, tower, _sectors(test, fitted, constant)))
+        timing = receivers[tower].timing
+        if timing.shift_s or timing.average_s:
+            warnings.append(
+                f"rank at {tower}: reports go best with positions {timing.shift_s:g} s later than logged and a channel "
+                f"averaged over {timing.average_s:g} s, as sectors left out within the flights say"
+            )
+        if receivers[tower].tied > 1:
+            warnings.append(
+                f"rank at {tower}: {receivers[tower].tied} geometries give the same score, among them "
+                + "; ".join(g.in_words() for g in receivers[tower].geometries[:3])
+            )
+    return RankCalibration(
+        receivers=receivers, scores={k: tuple(v) for k, v in scores.items()}, warnings=tuple(warnings)
+    )
+
+
+def _sectors(samples: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> ForecastScore:
+    """Each sector forecast from the others of the same flight, with the geometries of the other flights."""
+    good = samples.part(samples.rank >= 1)
+    groups = receiver.sector_groups(good.poses.position_m, good.tower_m)
+    penalty = fitted.mixture.members[0].penalty
+    forecast = receiver.out_of_group(
+        features_of(fitted.geometries[:1], good, fitted.timing)[0], good.rank.astype(np.int64), groups, penalty
+    )
+    return score_forecast(good.rank, forecast, forecast.argmax(axis=1) + 1, constant)
+
+
+@dataclass(frozen=True, slots=True)
+class Tried:
+    """All candidates at thinned samples of each flight, evaluated once: ``power`` (geometries, n, 4) per flight."""
+
+    grid: RankGrid
+    samples: Sequence[RankSamples]
+    geometries: tuple[Geometry, ...]
+    thinned: Sequence[RankSamples]
+    power: Sequence[FloatArray]
+
+    @classmethod
+    def of(cls, samples: Sequence[RankSamples], grid: RankGrid = RankGrid()) -> Tried:
+        """All candidates of a grid, for flights at one tower."""
+        geometries = candidates(grid, samples[0])
+        thinned = [sample.part(slice(None, None, grid.thin)) for sample in samples]
+        return cls(grid, samples, geometries, thinned, [_powers_of(geometries, item) for item in thinned])
+
+    def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
+        """Choose geometries and timing, and fit, on some of the flights.
+
+        The geometries are chosen without timing first; the best of them choose the timing, with which all geometries
+        are then compared again.
+        """
+        first = self.choose(flights, Timing())
+        timing = self.choose_timing(flights, first.order[: self.grid.members])
+        choice = first if timing.shift_s == timing.average_s == 0.0 else self.choose(flights, timing)
+        chosen = tuple(self.geometries[i] for i in choice.tied[: self.grid.members])
+        train = [self.samples[i] for i in flights]
+        mixture = receiver.fit_mixture(
+            np.concatenate([features_of(chosen, item, timing) for item in train], axis=1),
+            np.concatenate([item.rank for item in train]),
+            _groups(train),
+            penalties=(3.0, 10.0, 30.0),
+        )
+        return FittedReceiver(
+            tower=train[0].tower,
+            geometries=chosen,
+            tied=len(choice.tied),
+            flights=tuple(item.flight for item in train),
+            trained_on=union(*(item.logs for item in train)),
+            marks=tuple(item.mark for item in train if item.mark),
+            mixture=mixture,
+            timing=timing,
+        )
+
+    def choose(self, flights: Sequence[int] | range, timing: Timing) -> receiver.FeatureChoice:
+        """Compare all geometries on sectors left out within the flights."""
+        thinned = [self.thinned[i] for i in flights]
+        return receiver.choose_features(
+            self.features(flights, timing), np.concatenate([item.rank for item in thinned]), _groups(thinned)
+        )
+
+    def choose_timing(self, flights: Sequence[int] | range, which: IntArray) -> Timing:
+        """Least log score of the mean forecast of some geometries, on sectors left out within the flights."""
+        thinned = [self.thinned[i] for i in flights]
+        rank, groups = np.concatenate([item.rank for item in thinned]), _groups(thinned)
+        timings = [Timing(shift_s=s, average_s=mean_s) for s in self.grid.shift_s for mean_s in self.grid.average_s]
+        return min(timings, key=lambda t: receiver.mixture_loss(self.features(flights, t, which), rank, groups))
+
+    def features(
+        self, flights: Sequence[int] | range, timing: Timing, which: IntArray | slice = slice(None)
+    ) -> FloatArray:
+        """Features (geometries, n, 4) at the thinned samples of some flights."""
+        return np.concatenate([_features(self.power[i][which], self.thinned[i], timing) for i in flights], axis=1)
+
+
+def _groups(samples: Sequence[RankSamples]) -> IntArray:
+    """Sectors of directions; a sector is left out of all flights at once."""
+    position_m = np.concatenate([sample.poses.position_m for sample in samples])
+    return receiver.sector_groups(position_m, samples[0].tower_m)

@@ -1,0 +1,484 @@
+"""Antenna files, the settings that name them, and the page of a calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ..common.content import KEY, MARKS, union
+from ..common.gaussian import determining, gaussian_kernel
+from ..common.jsonable import named
+from ..common.units import spread_out
+from ..compare.calibration import cruise_height_m, mean_rmse, with_one_more
+from ..compare.gains import Frame, Spread, directed, student_factor
+from ..flight.data import FlightData, RssSeries, quantity_of
+from ..flight.training import flight_logs, marks_of
+from ..logs.records import has_wall_clock
+from ..report.calibration import AntennaMap, CalibrationData, calibration_metrics, write_calibration
+from ..report.page import write_file
+from ..report.texts import safe_name
+from ..site.learned import (
+    Entry,
+    Errors,
+    KnownDirections,
+    LearnedAntenna,
+    LearnedLevel,
+    LearnedLock,
+    LearnedPair,
+    LearnedReceiver,
+    LearnedSeries,
+    LearnedSpread,
+    PairGain,
+    SpherePattern,
+    planning_cuts,
+    sphere_csv,
+    sphere_grid,
+    unit_mean_gain,
+)
+from .calibrate import Calibration, CalibrationFile
+from .calibrate_rank import RankCalibration
+
+# First words of calibrated.yaml, by which an own earlier output is known.
+_MARK = "# aerpaw-cmp calibrate"
+
+# Share of the variance over both directions that the stored directions leave, and their largest number.
+_PAIR_SHARE, _MOST_PAIRS = 0.01, 400
+
+# The same for the directions at the UAV. Of 60, 100 and 200 the evidence for an airframe differs by at most 3 nat.
+_KNOWN_SHARE, _MOST_KNOWN = 0.002, 100
+
+
+def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
+    """Every antenna over the sphere, by ``(tower.channel, "uav" or "tower")``."""
+    theta, azimuth, vectors = sphere_grid()
+    flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
+    fit, out = calibration.fit, {}
+    for antenna in fit.antennas:
+        ends: tuple[tuple[str, Frame, str], ...] = (("uav", "body", "uav"), ("tower", "mast", antenna))
+        for end, frame, name in ends:
+            gain, sd = fit.gain(frame, antenna, flat)
+            raw = (gain + calibration.learned.pattern_db(name, flat)).reshape(shape)
+            gain_dbi = unit_mean_gain(raw)
+            out[antenna, end] = AntennaMap(
+                name=f"{antenna} {end}",
+                theta_deg=theta,
+                azimuth_deg=azimuth,
+                gain_dbi=gain_dbi,
+                sd_db=sd.reshape(shape),
+                level_db=float((raw - gain_dbi).flat[0]),
+                flown=fit.seen(frame, antenna),
+            )
+    return out
+
+
+def _antenna_files(
+    calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float
+) -> dict[str, str]:
+    """Content of each file by its name: the full sphere with standard deviation, and cuts for planning tools.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    maps : mapping of (antenna, end) to AntennaMap
+    carrier_hz : float
+
+    Returns
+    -------
+    dict of str to str
+    """
+    names = ", ".join(calibration.names)
+    notes = (
+        f"aerpaw-cmp calibrate: {calibration.settings.calibration}, from {names}",
+        "gain of the antenna as mounted: UAV in the body frame (x forward, y left, z up), tower in east-north-up",
+        "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
+    )
+    out: dict[str, str] = {}
+    for (antenna, end), gains in maps.items():
+        stem = safe_name(f"{antenna}.{end}")
+        out[f"{stem}.csv"] = sphere_csv(gains.gain_dbi, gains.sd_db, (*notes, *_provenance_notes(calibration)))
+        pair = _pair_gain(calibration, antenna) if end == "tower" else None
+        if pair is not None:
+            out[f"{safe_name(f'{antenna}.pair')}.csv"] = pair.table((*notes[:1], *_provenance_notes(calibration)))
+        pattern = SpherePattern(stem, gains.gain_dbi, gains.sd_db)
+        out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz, _provenance_notes(calibration))
+    return out
+
+
+def _provenance_notes(calibration: Calibration) -> Sequence[str]:
+    """Training logs of every channel: they share a fit."""
+    return f"{KEY}: {' '.join(calibration.trained_on)}", f"{MARKS}: {' '.join(calibration.marks)}"
+
+
+def _pair_gain(calibration: Calibration, antenna: str) -> PairGain | None:
+    """Return the gain towards both ends at once of an antenna; None if none was learned."""
+    fit = calibration.fit
+    if (term := calibration.pair_term) is None:
+        return None
+    flown, length = fit.seen("pair", antenna), term.length
+    at = flown[determining(flown, lambda a, b: gaussian_kernel(a, b, length), _PAIR_SHARE, _MOST_PAIRS)]
+    return PairGain(
+        directions=at,
+        gain_db=fit.gain("pair", antenna, at)[0],
+        sd_db=fit.predict(directed(antenna, at), ("body", "mast", "pair"))[1],
+        length=term.length,
+        prior_sd_db=term.sd_db,
+    )
+
+
+def _known_directions(calibration: Calibration, antenna: str) -> KnownDirections:
+    """Return the directions at the UAV that determine its gain, and the covariance there."""
+    from scipy.spatial.distance import cdist
+
+    fit = calibration.fit
+    flown = fit.seen("body", antenna)
+    # as far apart as rounding to a tenth of a degree keeps them
+    at = flown[determining(flown, lambda a, b: np.exp(-cdist(a, b)), _KNOWN_SHARE, _MOST_KNOWN)]
+    return KnownDirections(directions=at, covariance_db2=fit.covariance("body", antenna, at))
+
+
+def _listed(key: str, entries: Sequence[str]) -> list[str]:
+    """Lines of calibrated.yaml that name the training logs."""
+    comment = {KEY: "SHA-256 of the logs: nothing is scored on them", MARKS: "marks, by which copies are known"}[key]
+    return [f"# {comment}", f"{key}:", *(f"  - '{entry}'" for entry in entries)] if entries else []
+
+
+def _learned_antenna(
+    calibration: Calibration, antenna: str, end: str, files: Mapping[str, str], place: str, command: str
+) -> str:
+    """Return the value of ``antenna`` in calibrated.yaml: table, SHA-256 and error model of an antenna, on one line."""
+
+    def sha256(file: str) -> str:
+        return hashlib.sha256(files[file].encode()).hexdigest()
+
+    file, pair_file = (safe_name(f"{antenna}.{part}") + ".csv" for part in (end, "pair"))
+    pair, spread = calibration.pair_term if end == "tower" else None, calibration.learned.spread(antenna)
+    both = None if pair is None else LearnedPair(
+        file=f"{place}/{pair_file}", sha256=sha256(pair_file), length=pair.length, prior_sd_db=_rounded(pair.sd_db)
+    )  # fmt: skip
+    known = LearnedAntenna(sha256=sha256(file), command=command, pair=both, spread=rounded_spread(spread))
+    content = {"model": "sphere", "file": f"{place}/{file}", "learned": known.model_dump(exclude_none=True)}
+    return str(yaml.safe_dump(content, default_flow_style=True, sort_keys=False, width=10_000)).strip()
+
+
+def rounded_spread(spread: Spread) -> LearnedSpread:
+    """Return an error model with four digits, as it is written."""
+    return LearnedSpread(**{name: _rounded(value) for name, value in dataclasses.asdict(spread).items()})
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.4g}")
+
+
+def settings_text(calibration: Calibration, folder_name: str, files: Mapping[str, str], command: str) -> str:
+    """Return calibrated.yaml: the part of a flight.yaml that names the learned antennas.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    folder_name : str
+        Folder of the antenna files.
+    files : mapping of str to str
+        Content of the antenna files by name.
+    command : str
+        Command that makes them.
+    """
+    lines = [
+        f"{_MARK}: {calibration.settings.calibration}. Learned from {', '.join(calibration.names)}.",
+        *(f"# {text}" for text in calibration.words),
+        "# Put this into a flight.yaml; files resolve against its folder, or --logs-root.",
+        *_listed(KEY, calibration.trained_on),
+        "link:",
+        "  channels:",
+    ]
+    for antenna in calibration.fit.antennas:
+        channel, link = antenna.partition(".")[2], calibration.first_series(antenna)[1].link
+        ends = {e: _learned_antenna(calibration, antenna, e, files, folder_name, command) for e in ("tower", "uav")}
+        lines += [
+            f"    {channel}:" if channel.isidentifier() else f"    {channel!r}:",
+            f"      carrier_hz: {link.carrier_hz:.6g}",
+            f"      transmit_power_dbm: {link.transmit_power_dbm:g}",
+            f"      tower: {{antenna: {ends['tower']}}}",
+            f"      uav: {{antenna: {ends['uav']}}}",
+        ]
+    rough = calibration.ground.used_m
+    lines += [
+        "# the gains were learned beside line of sight alone",
+        "rt: {engine: image, max_depth: 0, attitude: logged}",
+    ] if rough is None else [
+        "# a ground ray of this roughness is likelier than none beside the learned gains",
+        f"rt: {{engine: image, max_depth: 1, attitude: logged, ground_roughness_m: {rough:g}}}",
+    ]  # fmt: skip
+    return "\n".join(lines) + "\n"
+
+
+def _record_of(
+    calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], text: str, stages_s: Mapping[str, float]
+) -> CalibrationData:
+    """All that the page shows.
+
+    Parameters
+    ----------
+    calibration : Calibration
+    maps : mapping of (antenna, end) to AntennaMap
+    text : str
+        The settings to copy into a flight file.
+    stages_s : mapping of str to float
+        Time of each stage [s].
+
+    Returns
+    -------
+    CalibrationData
+        As :func:`aerpaw_cmp.report.calibration.write_calibration` takes it.
+    """
+    mounts = {
+        name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}
+        | {"probability": dict(zip([f"{g:g}" for g in m.grid_deg], map(float, m.probability), strict=True))}
+        for name, m in calibration.learned.mounts.items()
+    }
+    heights = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in calibration.ground.roughness_m]
+    ground = {
+        "rows": list(zip(heights, calibration.ground.log_likelihood, strict=True)),
+        "likely_m": calibration.ground.likely_m,
+    }
+    return CalibrationData(
+        name=calibration.settings.calibration,
+        flights=calibration.names,
+        **named(calibration, "trained_on marks words warnings"),
+        scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
+        controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
+        mounts=mounts,
+        strengths={"model": dataclasses.asdict(calibration.learned.model)},
+        ground=ground,
+        curve=[dataclasses.asdict(point) for point in calibration.curve],
+        one_more_rmse_db=with_one_more(calibration.curve),
+        antennas=tuple(maps.values()),
+        settings_text=text,
+        stages_s=stages_s,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Calibrated:
+    """Results learned from the flights of a calibration, and what is to be said of their logs."""
+
+    settings: CalibrationFile
+    flights: tuple[FlightData, ...]
+    remarks: tuple[str, ...]
+    calibration: Calibration | None
+    ranked: RankCalibration | None
+    command: str
+
+
+def write_files(
+    calibrated: Calibrated, folder: Path, name: str, stages_s: Mapping[str, float]
+) -> tuple[dict[str, Any], str]:
+    """Fill the folder of a calibration; gives its metrics and the text of calibrated.yaml.
+
+    Parameters
+    ----------
+    calibrated : Calibrated
+    folder : Path
+        Exists, and is swapped for the old one by the caller.
+    name : str
+        Of the folder, as the settings name its files.
+    stages_s : mapping of str to float
+        Time of each stage [s].
+
+    Returns
+    -------
+    metrics : dict
+    text : str
+        calibrated.yaml.
+    """
+    calibration, ranked = calibrated.calibration, calibrated.ranked
+    rank, rank_warnings = (None, ()) if ranked is None else (ranked.metrics(), ranked.warnings)
+    logs, marks = union(*map(flight_logs, calibrated.flights)), marks_of(calibrated.flights)
+    if calibration is not None:
+        maps = _antenna_maps(calibration)
+        carrier = next(s.link.carrier_hz for data in calibrated.flights for s in data.rss)
+        files = _antenna_files(calibration, maps, carrier)
+        for file, content in files.items():
+            write_file(folder / file, content)
+        text = settings_text(calibration, name, files, calibrated.command)
+        record = dataclasses.replace(
+            _record_of(calibration, maps, text, stages_s),
+            rank=rank,
+            warnings=(*calibrated.remarks, *calibration.warnings, *rank_warnings),
+        )
+        write_calibration(record, folder)
+        metrics = calibration_metrics(record)
+    else:
+        text = "\n".join([f"{_MARK}: {calibrated.settings.calibration}", *_listed(KEY, logs)]) + "\n"
+        metrics = {
+            "scores": {}, "controls": {}, "words": [], "antennas": [], "calibration": calibrated.settings.calibration,
+            "rank": rank, "warnings": [*calibrated.remarks, *rank_warnings], "flights": calibrated.settings.flights,
+            KEY: list(logs), MARKS: list(marks),
+        }  # fmt: skip
+        (folder / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+    text += "".join(f"{line}\n" for line in _listed(MARKS, marks))
+    if ranked is not None:
+        (folder / "receiver.json").write_text(ranked.text(), encoding="utf-8")
+        text += f"rank:\n  receiver: {name}/receiver.json\n"
+    return metrics, text
+
+
+def site_entry(calibrated: Calibrated) -> tuple[Entry, dict[str, bytes]]:
+    """Return the entry of a calibration for a site, antennas and rank receivers, and its tables by name.
+
+    Parameters
+    ----------
+    calibrated : Calibrated
+
+    Returns
+    -------
+    entry : Entry
+    tables : dict of str to bytes
+    """
+    begins = [s.time.min() for data in calibrated.flights for _, s in data.series]
+    made = Entry(
+        command=calibrated.command,
+        made=datetime.now(timezone.utc).date().isoformat(),
+        flights=[data.settings.flight.name for data in calibrated.flights],
+        flown=sorted({str(begin.astype("datetime64[D]")) for begin in begins if has_wall_clock(begin)}),
+        trained_on=list(union(*map(flight_logs, calibrated.flights))),
+        source=calibrated.settings.source,
+    )
+    tables: dict[str, bytes] = {}
+    if calibrated.calibration is not None:
+        series, tables = _learned_series(calibrated.calibration)
+        ground_m = calibrated.calibration.ground.used_m
+        errors = _errors(calibrated.calibration)
+        made = made.model_copy(update={"errors": errors, "series": series, "ground_roughness_m": ground_m})
+    if calibrated.ranked is not None:
+        file = f"{safe_name(calibrated.settings.calibration)}.receiver.json.gz"
+        made = made.model_copy(update={"receivers": _learned_receivers(calibrated.flights, calibrated.ranked, file)})
+        tables = {**tables, file: calibrated.ranked.text().encode()}
+    return made, tables
+
+
+def _learned_series(calibration: Calibration) -> tuple[list[LearnedSeries], dict[str, bytes]]:
+    """Antennas of every tower and channel, and their tables by name."""
+    name, maps = calibration.settings.calibration, _antenna_maps(calibration)
+    tables: dict[str, bytes] = {}
+    series = []
+    for antenna in calibration.fit.antennas:
+        # the UAV has one antenna for all towers
+        shared = calibration.fit.antennas[0]
+        parts = {"tower": antenna, "pair": antenna, "uav": shared, "known": shared}
+        files = {part: f"{safe_name(f'{name}.{owner}.{part}')}.csv.gz" for part, owner in parts.items()}
+        notes = {p: (f"aerpaw-cmp calibrate: {name}, {antenna} {p}", *_provenance_notes(calibration)) for p in files}
+        # these two are never named alone, and fingerprints are most of a table
+        notes |= {part: notes[part][:2] for part in ("known", "pair")}
+        for end in ("tower", "uav"):
+            gains = maps[parts[end], end]
+            content = sphere_csv(gains.gain_dbi, gains.sd_db, notes[end], decimals=2)
+            tables.setdefault(files[end], content.encode())
+        if files["known"] not in tables:
+            tables[files["known"]] = _known_directions(calibration, antenna).table(notes["known"]).encode()
+        both = None
+        if (pair := _pair_gain(calibration, antenna)) is not None:
+            tables[files["pair"]] = pair.table(notes["pair"]).encode()
+            both = LearnedPair(file=files["pair"], length=pair.length, prior_sd_db=_rounded(pair.prior_sd_db))
+        samples = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
+        (data, first), ends = calibration.first_series(antenna), (maps[shared, "uav"], maps[antenna, "tower"])
+        sds = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), _SD_SAMPLES)))[1] for o in samples])
+        series.append(
+            LearnedSeries(
+                tower=samples[0].tower,
+                channel=samples[0].channel,
+                receiver=data.settings.logs[int(first.log[0])].receiver,
+                carrier_hz=first.link.carrier_hz,
+                tower_file=files["tower"],
+                uav_file=files["uav"],
+                known_file=files["known"],
+                pair=both,
+                spread=rounded_spread(calibration.learned.spread(antenna)),
+                sd_db=round(float(np.nanmean(sds)), 2),
+                lock=_at_unit_gain(calibration.locks.get(antenna), *ends),
+                level=_level(calibration, first, *ends),
+            )
+        )
+    return series, tables
+
+
+# Of a series: their standard deviations stand for its mean.
+_SD_SAMPLES = 200
+
+# Between flights, before any was seen: counts as two. A guess, fitted to no campaign: three of dataset 12, LTE, AFAR
+# and NR are likeliest at 1.0 (without AFAR) to 2.8 dB (without dataset 12), too far apart to learn it from the others.
+_OFFSET_SD_DB = 1.5
+
+
+def _level(calibration: Calibration, series: RssSeries, *ends: AntennaMap) -> LearnedLevel | None:
+    """Mean level of the flights above the antennas as written; its error is that of flights left out."""
+    mine = [o for o in calibration.observed if (o.samples.tower, o.samples.channel) == (series.tower, series.channel)]
+    if mine[0].samples.antenna in calibration.locks:  # without lock a level says nothing of the path
+        mine = [o.part(o.locked == 1.0) for o in mine if o.locked is not None]
+    sent = series.link.transmit_power_dbm
+    offsets = [calibration.learned.mean_error(o.samples) + o.sent_dbm - sent for o in mine]
+    squares = [
+        max(s.rmse_shared_offset_db**2 - s.rmse_db**2, 0.0)
+        for s in calibration.scores["flight_left_out"]
+        if (s.tower, s.channel) == (series.tower, series.channel)
+    ]
+    n = max(len(squares), 1)
+    # each was predicted by n - 1 others, and misses their mean by n / (n - 1) of what it misses the mean of all
+    variance_db2 = (2.0 * _OFFSET_SD_DB**2 + (1.0 - 1.0 / n) ** 2 * sum(squares)) / (n + 1.0)
+    return LearnedLevel(
+        offset_db=round(float(np.nanmean(offsets)) + sum(end.level_db for end in ends), 2),
+        sd_db=round(student_factor(n) * math.sqrt((1.0 + 1.0 / n) * variance_db2), 2),
+        transmit_power_dbm=sent,
+        unit=series.unit,
+    )
+
+
+def _at_unit_gain(lock: LearnedLock | None, *ends: AntennaMap) -> LearnedLock | None:
+    """P(lock) of levels that are predicted with the antennas as written."""
+    if lock is None:
+        return None
+    return lock.model_copy(update={"gain_db": round(lock.gain_db - sum(end.level_db for end in ends), 2)})
+
+
+def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, file: str) -> list[LearnedReceiver]:
+    """Receivers that were fitted on flights, with their scores on flights left out."""
+    receivers = []
+    for tower in ranked.receivers:
+        scores = [score for _, at, score in ranked.scores["flight_left_out"] if at == tower]
+        first = next((data, s) for data in flights for s in data.rank if s.tower == tower)
+        means = {
+            key: round(float(np.mean([getattr(item, key) for item in scores])), 3)
+            for key in ("kappa", "log_score", "constant_log_score")
+            if scores
+        }
+        link = first[0].settings.link.rank
+        receivers.append(
+            LearnedReceiver(tower=tower, quantity=quantity_of(*first), carrier_hz=link.carrier_hz, file=file, **means)
+        )
+    return receivers
+
+
+def _errors(calibration: Calibration) -> Errors | None:
+    scores = calibration.scores["flight_left_out"]
+    if not scores:
+        return None
+    parts = {name: calibration.scores[f"{split}_left_out"] for name, split in _PARTS.items()}
+    values = {
+        name: round(mean_rmse(scores, name), 3) for name in ("rmse_db", "rmse_4s_db", "free_space_rmse_db", "inside_90")
+    }
+    values |= {f"{name}_rmse_db": round(mean_rmse(some), 3) for name, some in parts.items() if some}
+    heights = sorted({float(cruise_height_m(o)) for o in calibration.observed})
+    return Errors(series=len(scores), heights_m=heights, **values)
+
+
+# Parts of a flight that no other flight has, by the prefix of their error.
+_PARTS = {"sector": "sector", "height": "altitude", "heading": "heading"}

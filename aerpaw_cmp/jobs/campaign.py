@@ -1,0 +1,928 @@
+"""Many flights and settings: run each, pool the offsets, compare flights at the same places.
+
+A campaign.yaml names flight files and, optionally, settings: labels with overrides of flight keys in dotted form
+(``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read is a row with its message.
+
+One flight under one setting: what a worker is given, does and gives back, what is kept and what is to do.
+
+Numbers of a season from the rows of a campaign: held-out errors, ranking, steps of offsets, residuals by place.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import platform
+import time
+import traceback
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Annotated, Any, Literal
+from urllib.parse import quote
+
+import numpy as np
+import pandas as pd
+from pydantic import Field
+
+from ..common.errors import AerpawCmpError, InputError, UsageError, one_line, parsing
+from ..common.files import LARGEST_TABLE, read_bounded
+from ..common.jsonable import named
+from ..common.stages import PlannedStage, Progress, Stages
+from ..common.text import counted
+from ..common.units import FloatArray, finite_mean
+from ..common.versions import versions
+from ..common.yamlfile import StrictModel, load_yaml
+from ..compare import offset, verdict
+from ..compare.offset import Pooling, pooled_moments
+from ..compare.result import FlightResult, RankResult, RssResult
+from ..compare.statistics import Pass, PassPair, PassTable, cell_means
+from ..compare.verdict import NightOffsets, NodeOffset, node_offsets, stepped
+from ..flight.data import FlightData, RankSeries, RssSeries, gather, read_logs
+from ..flight.gains import with_learned
+from ..flight.settings import FlightFile, Overrides, RssSettings, load_flight, overridden
+from ..flight.training import among, logs_of, series_mark
+from ..logs.ingest import ingest
+from ..logs.readers import ReadOptions
+from ..logs.records import has_wall_clock
+from ..report.campaign import (
+    CampaignData,
+    Failure,
+    PlaceMap,
+    PooledOffset,
+    RankRow,
+    RankTransfer,
+    Repeat,
+    RssRow,
+    Season,
+    SettingRank,
+)
+from .flight_run import run_flight
+from .options import DEFAULT, RunOptions
+from .tasks import Lost, OutcomeStore, Workers, open_workers, stamp, task_inputs, task_key
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One flight file under one setting."""
+
+    path: Path
+    flight: str
+    setting: str
+    overrides: Overrides
+    logs_root: Path | None
+    reference: bool = True
+    """Pairs of flights and the season are of this setting: places are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Rows of one task, or why there are none, and what it cost [s]."""
+
+    rss: tuple[RssRow, ...] = ()
+    rank: tuple[RankRow, ...] = ()
+    failure: Failure | None = None
+    seconds: float = 0.0
+
+
+def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Outcomes in the order of their tasks; a flight that holds the log of an earlier one is a failure that says so.
+
+    A log that comes twice, renamed, copied or packed, would be pooled twice and predicted from itself.
+    """
+    home: dict[str, str] = {}
+    marked: dict[str, str] = {}
+    counted = []
+    for task, outcome in zip(tasks, outcomes, strict=True):
+        rows: list[RssRow | RankRow] = [*outcome.rss, *outcome.rank]
+        again = sorted({log for row in rows for log in row.logs if home.setdefault(log, task.flight) != task.flight})
+        message = f"the same log as {home[again[0]]} (SHA-256 {again[0][:12]}...)" if again else ""
+        marks = {row.mark for row in rows if row.mark}
+        others = [mark for mark, name in marked.items() if name != task.flight and not message]
+        if copied := next((mark for mark in others if any(among(own, [mark]) for own in marks)), ""):
+            message = f"readings of {marked[copied]} in another log"
+        if message:
+            outcome = failed_task(task, f"it holds {message}: it is counted once")
+        else:
+            marked |= dict.fromkeys(marks, task.flight)
+        counted.append(outcome)
+    return counted
+
+
+@lru_cache(maxsize=512)
+def _flight_file(path: Path, _size: int, _mtime_ns: int) -> FlightFile:
+    return load_flight(path)
+
+
+def _settings(task: Task) -> FlightFile:
+    """Return the settings of a task; the learned antennas that they name must fit its overrides."""
+    written = overridden(_flight_file(task.path, *stamp(task.path)), task.overrides)
+    return with_learned(written, task.path.parent)
+
+
+@lru_cache(maxsize=2)
+def _logs(key: _Logs) -> Any:
+    """The logs of a flight: settings after settings reads them once."""
+    return read_logs(key.settings, key.folder, key.logs_root)
+
+
+@dataclass(frozen=True, slots=True)
+class _Logs:
+    """Inputs on which the reading of logs depends; settings that do not matter to it do not count in comparisons."""
+
+    folder: Path
+    logs_root: Path | None
+    text: str
+    stamps: tuple[tuple[int, int], ...]
+    settings: FlightFile = field(compare=False)
+
+
+def flight_data(task: Task) -> FlightData:
+    """Read and gather the flight of a task; errors as in :mod:`aerpaw_cmp.flight.data`."""
+    settings = _settings(task)
+    folder, root = task.path.parent, task.logs_root
+    text = "\n".join([str(settings.timezone), *(log.model_dump_json() for log in settings.logs)])
+    stamps = tuple(stamp((root or folder) / log.path) for log in settings.logs)
+    return gather(settings, folder, _logs(_Logs(folder, root, text, stamps, settings)), root)
+
+
+def run_task(task: Task) -> Outcome:
+    """Replay and compare one flight under one setting; whatever goes wrong becomes a message."""
+    try:
+        flight_run = run_flight(flight_data(task), audit=False)
+        return _rows_of(task, flight_run.data, flight_run.result)
+    except AerpawCmpError as error:
+        return failed_task(task, str(error), error)
+    except Exception as error:  # one flight's fault must not cost the others their numbers
+        return failed_task(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
+
+
+def _rows_of(task: Task, data: FlightData, result: FlightResult) -> Outcome:
+    """Outcome of a flight that was compared."""
+    return Outcome(
+        rss=tuple(
+            _rss_row(task, data.settings.rss, compared, _identity(data, series))
+            for compared, series in zip(result.rss, data.rss, strict=True)
+        ),
+        rank=tuple(
+            row
+            for compared, series in zip(result.rank, data.rank, strict=True)
+            for row in _rank_rows(task, compared, _identity(data, series))
+        ),
+    )
+
+
+def failed_task(task: Task, message: str, error: BaseException | None = None) -> Outcome:
+    """The outcome of a task without numbers; the traceback of an error goes into a file of its own."""
+    text = "" if error is None else "".join(traceback.format_exception(error))
+    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message, traceback=text))
+
+
+# --- as a worker does it --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """Order to a worker: paths and the digest of what the outcome depends on, as the first process sees it.
+
+    ``key`` is None where an input cannot be read, or nothing is kept.
+    """
+
+    task: Task
+    key: str | None = None
+
+
+def carry_out(order: Order) -> Outcome:
+    """Run a task; what runs in worker processes of every kind.
+
+    The key is computed anew here: a worker that sees another file or runs other code fails the task instead of
+    giving a wrong number under a right name.
+    """
+    task = order.task
+    try:
+        same = order.key is None or digest_of(task) == order.key
+    except (AerpawCmpError, OSError) as error:
+        return failed_task(task, f"an input can no longer be read: {error}", error)
+    if not same:
+        return failed_task(
+            task,
+            f"the worker on {platform.node()} sees other inputs, or runs another version of the program, than the "
+            f"process that planned the campaign (aerpaw-cmp {versions()['aerpaw-cmp']} there); expected the same "
+            "everywhere",
+        )
+    start = time.perf_counter()
+    outcome = run_task(task)
+    return dataclasses.replace(outcome, seconds=time.perf_counter() - start)
+
+
+def digest_of(task: Task) -> str:
+    """Digest of the settings and inputs on which the outcome of a task depends.
+
+    Raises
+    ------
+    AerpawCmpError, OSError
+        If an input cannot be read.
+    """
+    settings = _settings(task)
+    return task_key(settings, task_inputs(settings, task.path, task.logs_root))
+
+
+def fitted_to(task: Task, outcome: Outcome) -> Outcome:
+    """An outcome under the names of this campaign; series of samples stay for the first setting alone.
+
+    Of the others a row holds numbers: the memory of 4000 tasks is that of the flights.
+    """
+
+    def row(kept_row: RssRow) -> RssRow:
+        named = dataclasses.replace(kept_row, flight=task.flight, setting=task.setting)
+        if task.reference:
+            return named
+        none = np.zeros(0)
+        return dataclasses.replace(
+            named,
+            difference=kept_row.moments,
+            measured_db=none,
+            simulated_dbm=none,
+            position_m=np.zeros((0, 3)),
+            heading_deg=None,
+        )
+
+    failure = outcome.failure and dataclasses.replace(outcome.failure, flight=task.flight, setting=task.setting)
+    return dataclasses.replace(
+        outcome,
+        rss=tuple(map(row, outcome.rss)),
+        rank=tuple(dataclasses.replace(item, flight=task.flight, setting=task.setting) for item in outcome.rank),
+        failure=failure,
+    )
+
+
+# --- rows -----------------------------------------------------------------------------------------------------------
+
+
+def _identity(data: FlightData, series: RssSeries | RankSeries) -> dict[str, Any]:
+    """Fields of a row that say which log it is of, whatever the log is called or packed in."""
+    return {"logs": logs_of(data, series), "mark": series_mark(series)}
+
+
+def _rss_row(task: Task, rules: RssSettings, result: RssResult, identity: Mapping[str, Any]) -> RssRow:
+    score, clock = result.score, result.further.clock
+    # nothing is pooled or ranked from the flight that its antennas were learned from
+    measured_db = np.full_like(result.measured_db, np.nan) if result.further.trained_on else result.measured_db
+    return RssRow(
+        flight=task.flight,
+        setting=task.setting,
+        **named(result, "tower channel unit simulated_dbm position_m"),
+        **named(score, "offset_db rmse_db correlation n n_out_of_coverage rmse_ci95_db lag_s"),
+        at_search_edge=score.at_edge,
+        offset_ci95_db=score.intervals.offset_db,
+        correlation_ci95=score.intervals.correlation,
+        n_effective=score.intervals.autocorrelation.n_effective,
+        lag_verdict="" if clock is None else clock.verdict,
+        fitted=score.fitted_on_scored,
+        baselines={name: model.rmse_db for name, model in result.baselines.items()},
+        verdicts={
+            name: result.further.compared_with[name].verdict
+            for name in result.baselines
+            if name in result.further.compared_with
+        },
+        span_db=rules.span_db,
+        measured_db=measured_db,
+        start_ns=int(result.time[0].astype("datetime64[ns]").astype(np.int64)) if len(result.time) else 0,
+        heading_deg=result.geometry.get("heading_deg"),
+        difference=offset.difference_moments(measured_db, result.simulated_dbm),
+        **identity,
+    )
+
+
+def _rank_rows(task: Task, result: RankResult, identity: Mapping[str, Any]) -> list[RankRow]:
+    score = result.score
+    return [
+        RankRow(
+            flight=task.flight,
+            setting=task.setting,
+            tower=result.tower,
+            **named(score, "n best_k"),
+            best_k_ci95=score.curve.best_k_interval,
+            k=k,
+            n_out_of_coverage=fit.out_of_coverage,
+            **named(fit, "agreement agreement_ci95 kappa total_variation total_variation_ci95 wasserstein"),
+            commonest_agreement=result.further.commonest.agreement,
+            **identity,
+        )
+        for k, fit in score.simulated.items()
+    ]
+
+
+# --- what is kept, what is to do -------------------------------------------------------------------------------------
+
+
+def planned_tasks(tasks: Sequence[Task], kept: Mapping[int, Outcome], workers: int) -> list[PlannedStage]:
+    """Tasks of each setting, for a dry run; ``kept`` outcomes stand by the numbers of their tasks.
+
+    A task to do takes as long as the kept ones of its setting took on average, else as all of them; unknown where
+    none is kept. ``workers`` do so many side by side.
+    """
+    spent: dict[str, list[float]] = {}
+    for number, outcome in kept.items():
+        spent.setdefault(tasks[number].setting, []).append(outcome.seconds)
+    every = [seconds for some in spent.values() for seconds in some]
+    stages = []
+    for setting in dict.fromkeys(task.setting for task in tasks):
+        numbers = [number for number, task in enumerate(tasks) if task.setting == setting]
+        left, known = len({*numbers} - {*kept}), spent.get(setting, every)
+        seconds = left * sum(known) / len(known) / workers if known else None
+        work = f"{counted(len(numbers), 'task')}, {len(numbers) - left} kept"
+        stages.append(PlannedStage(f"flights, {setting}", work, seconds if left else 0.0))
+    return stages
+
+
+def kept_outcomes(
+    tasks: Sequence[Task], store: OutcomeStore | None, progress: Progress
+) -> tuple[dict[int, Outcome], dict[int, Order]]:
+    """Outcomes that are there, and what is to be computed, by number."""
+    outcomes: dict[int, Outcome] = {}
+    orders = {number: Order(task=task) for number, task in enumerate(tasks)}
+    if store is None:
+        return outcomes, orders
+    for number, task in enumerate(tasks):
+        with suppress(AerpawCmpError, OSError):  # such a task will say itself what is wrong
+            key = digest_of(task)
+            orders[number] = Order(task=task, key=key)
+            if isinstance(outcome := store.load(key), Outcome):
+                outcomes[number] = fitted_to(task, outcome)
+                del orders[number]
+    for text in store.warnings:
+        progress(text)
+    if len(outcomes):
+        progress(f"{len(outcomes)} of {counted(len(tasks), 'outcome')} kept from before in {store.folder}")
+    return outcomes, orders
+
+
+def compute(
+    orders: Mapping[int, Order],
+    workers: Workers,
+    outcomes: dict[int, Outcome],
+    store: OutcomeStore | None,
+    progress: Progress,
+) -> None:
+    """Let the workers do what is to do; each outcome is put into ``outcomes`` and kept as soon as it comes.
+
+    Parameters
+    ----------
+    orders : mapping of int to Order
+        What is to do, by the number of its task.
+    workers : Workers
+    outcomes : dict of int to Outcome
+        Gets the new ones.
+    store : OutcomeStore, optional
+        Keeps the new ones.
+    progress : Progress
+        Tasks done.
+    """
+    numbers, total, failed = list(orders), len(outcomes) + len(orders), 0
+
+    def take(place: int, result: Outcome | Lost) -> None:
+        nonlocal failed
+        order = orders[numbers[place]]
+        if isinstance(result, Lost):
+            result = failed_task(order.task, result.message)
+        if store is not None and order.key is not None and result.failure is None:
+            store.save(order.key, result)
+        outcomes[numbers[place]] = fitted_to(order.task, result)
+        failed += result.failure is not None
+        progress(f"flights\t{len(outcomes)} of {total} done, {failed} failed", len(outcomes) / total)
+
+    if orders:
+        workers.run(carry_out, [orders[number] for number in numbers], take)
+
+
+# Label of the only setting of a campaign that names none.
+_AS_WRITTEN = "as written"
+
+
+class CampaignFile(StrictModel):
+    """The whole campaign.yaml."""
+
+    campaign: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
+    title: str | None = None
+    flights: list[str] = Field(default_factory=list)
+    soundings: list[str] = Field(default_factory=list)
+    timezone: str | None = None  # of soundings with local times
+    settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
+
+
+def load_campaign(path: Path) -> CampaignFile:
+    """Read and check a campaign.yaml.
+
+    Raises
+    ------
+    UsageError
+        As :func:`aerpaw_cmp.common.yamlfile.load_yaml`.
+    """
+    campaign = load_yaml(path, CampaignFile)
+    if not campaign.flights + campaign.soundings:
+        raise UsageError("no flights and no soundings", expected="flights: [FLIGHT.yaml, ...]", path=path)
+    if campaign.timezone is not None and not campaign.soundings:
+        raise UsageError(
+            "'timezone' without 'soundings', whose times it is for",
+            expected="the time zone of a flight in its own flight.yaml",
+            path=path,
+        )
+    return campaign
+
+
+# --- all of it --------------------------------------------------------------------------------------------------------
+
+
+def run(
+    campaign: CampaignFile,
+    folder: Path,
+    options: RunOptions = DEFAULT,
+    *,
+    keep: Path | None = None,
+    stages: Stages | None = None,
+) -> CampaignData:
+    """All flights under all settings, and what can be said only of several flights.
+
+    Parameters
+    ----------
+    campaign : CampaignFile
+    folder : Path
+        Against which the paths of flight files resolve.
+    options : RunOptions
+    keep : Path, optional
+        Folder of outcomes, taken and added to.
+    stages : Stages, optional
+
+    Returns
+    -------
+    CampaignData
+        Rows of every flight and setting, pooled offsets, repeats; a flight that failed is among ``failures``.
+
+    Raises
+    ------
+    UsageError
+        Overrides that no flight file could have, two flights of one name.
+    """
+    stages, progress, logs_root = stages or Stages(), options.progress, options.logs_root
+    if options.scheduler is not None:  # workers may stand in another folder
+        folder, logs_root = folder.absolute(), None if logs_root is None else logs_root.absolute()
+    tasks, files, failures = campaign_tasks(campaign, folder, logs_root)
+    settings = campaign.settings or {_AS_WRITTEN: {}}
+    store = None if keep is None else OutcomeStore(keep, Outcome)
+    with stages("flights"):
+        outcomes, orders = kept_outcomes(tasks, store, progress)
+    unread = [PlannedStage(failure.flight, one_line(failure.message)) for failure in failures]
+    stages.checked(lambda: [*planned_tasks(tasks, outcomes, options.workers), *unread])
+    if store is not None:
+        store.check()
+    inputs = _inputs_of(files, logs_root)
+    with (
+        open_workers(options.workers, options.scheduler if orders else None, paths=inputs, progress=progress) as crew,
+        stages("flights"),
+    ):
+        compute(orders, crew, outcomes, store, progress)
+    results = counted_once(tasks, [outcomes[number] for number in range(len(tasks))])
+    rank = tuple(row for o in results for row in o.rank)
+    failures += [o.failure for o in results if o.failure is not None]
+    with stages("pool"):
+        rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
+        repeated = repeats([r for r in rows if r.setting == next(iter(settings))])
+    good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
+    return CampaignData(
+        name=campaign.campaign,
+        title=campaign.title or campaign.campaign,
+        calibration=campaign.calibration,
+        flights=tuple(dict.fromkeys([*files, *(f.flight for f in failures)])),
+        settings=settings,
+        rss=tuple(rows),
+        rank=rank,
+        rank_transfers=tuple(transfer_ranks(rank)),
+        failures=tuple(failures),
+        pooled=tuple(pooled),
+        repeats=tuple(repeated),
+        site=flight_data(good[0]).site if good else None,
+        synthetic=tuple(name for name, (_, f) in files.items() if f.flight.synthetic),
+        workers=options.workers,
+    )
+
+
+def campaign_tasks(
+    campaign: CampaignFile, folder: Path, logs_root: Path | None = None
+) -> tuple[list[Task], dict[str, tuple[Path, FlightFile]], list[Failure]]:
+    """Every setting on every flight, the flight files by name, and those that cannot be read.
+
+    Raises
+    ------
+    UsageError
+        Overrides that no flight file could have, two flights of one name.
+    """
+    settings = campaign.settings or {_AS_WRITTEN: {}}
+    files, failures = _flight_files(campaign, folder, settings)
+    tasks = [
+        Task(path, name, label, overrides, logs_root, reference=label == next(iter(settings)))
+        for name, (path, _) in files.items()
+        for label, overrides in settings.items()
+    ]
+    return tasks, files, failures
+
+
+def _inputs_of(files: Mapping[str, tuple[Path, FlightFile]], logs_root: Path | None) -> list[Path]:
+    """Flight files and logs that are there; what is missing here is a row of the result."""
+    paths = [path for path, _ in files.values()]
+    paths += [(logs_root or path.parent) / log.path for path, flight in files.values() for log in flight.logs]
+    return [path for path in paths if path.exists()]
+
+
+def _flight_files(
+    campaign: CampaignFile, folder: Path, settings: Mapping[str, Overrides]
+) -> tuple[dict[str, tuple[Path, FlightFile]], list[Failure]]:
+    """Flight files that can be read, by name, every override tried on them; and those that cannot."""
+    files: dict[str, tuple[Path, FlightFile]] = {}
+    failures = []
+    for entry in campaign.flights:
+        path = folder / entry
+        try:
+            flight = load_flight(path)
+            with_learned(flight, path.parent)
+        except (InputError, UsageError) as error:
+            failures.append(Failure(flight=Path(entry).stem, setting="every setting", message=str(error)))
+            continue
+        name = flight.flight.name
+        if name in files:
+            raise UsageError(f"two flights are named {name!r}: {files[name][0]} and {path}", expected="one name each")
+        files[name] = (path, flight)
+        for label, overrides in settings.items():
+            try:
+                overridden(flight, overrides)
+            except UsageError as error:
+                raise UsageError(
+                    f"settings.{label}: {error.found}", expected=error.expected, cause=error.cause
+                ) from None
+    return files, failures
+
+
+# --- what only several flights together can give: shared offsets, repeatability, K chosen on the others --------------
+
+
+def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], list[PooledOffset]]:
+    """Shared offsets of each setting, entered into the rows and listed by group."""
+    pooled_rows: list[RssRow] = []
+    groups: list[PooledOffset] = []
+    for setting in dict.fromkeys(row.setting for row in rows):
+        members = [row for row in rows if row.setting == setting]
+        span = (min(r.span_db[0] for r in members), max(r.span_db[1] for r in members))
+        fits = pooled_moments(
+            {row.key: row.moments for row in members},
+            per,
+            span_db=span,
+        )
+        pooled = [
+            dataclasses.replace(row, pooled_offset_db=fits[row.key].offset_db, pooled_rmse_db=fits[row.key].rmse_db)
+            for row in members
+        ]
+        pooled_rows += pooled
+        by_group: dict[str, list[RssRow]] = {}
+        for row in pooled:
+            by_group.setdefault(_group(row, per), []).append(row)
+        groups += [_pooled(setting, name, some, fits) for name, some in by_group.items()]
+    return pooled_rows, groups
+
+
+def _group(row: RssRow, per: Pooling) -> str:
+    joined = {"link": f"{row.flight} {row.link}", "all": "all"}
+    return joined[per] if per in joined else str(getattr(row, per))
+
+
+def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]) -> PooledOffset:
+    offsets_db = np.array([row.offset_db for row in rows])
+    offsets_db = offsets_db[np.isfinite(offsets_db)]
+    nan = float("nan")
+    return PooledOffset(
+        setting=setting,
+        group=name,
+        members=tuple(f"{row.flight} {row.link}" for row in rows),
+        offset_db=rows[0].pooled_offset_db,
+        spread_db=float(offsets_db.std(ddof=1)) if len(offsets_db) > 1 else nan,
+        range_db=(float(offsets_db.min()), float(offsets_db.max())) if len(offsets_db) else (nan, nan),
+        own_rmse_db=finite_mean([row.rmse_db for row in rows]),
+        pooled_rmse_db=finite_mean([row.pooled_rmse_db for row in rows]),
+        at_search_edge=any(fits[row.key].at_edge for row in rows),
+        units=tuple(dict.fromkeys(row.unit for row in rows)),
+    )
+
+
+def repeats(rows: Sequence[RssRow]) -> list[Repeat]:
+    """Every pair of flights that share a tower and channel, of the rows of one setting, in their order."""
+    passes = [
+        Pass(
+            **named(row, "flight position_m residual_db heading_deg"),
+            link=f"{row.tower}\n{row.channel}",
+            level_db=row.measured_db,
+        )
+        for row in rows
+    ]
+    rule = named(CampaignData, "radius_m heading_within_deg")
+    pairs = PassTable(passes, CampaignData.cell_m).pairs(**rule)
+    known = [int(np.isfinite(row.measured_db).sum()) for row in rows]
+    ordered = sorted(pairs, key=lambda pair: (pair.first, pair.second))
+    return [_repeat(pair, rows[pair.first], rows[pair.second], known[pair.first]) for pair in ordered]
+
+
+def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat:
+    same = "n rmse_db rmse_ci95_db offset_db residual_rmse_db place_rmse_db place_correlation cells height_difference_m"
+    return Repeat(
+        tower=first.tower,
+        channel=first.channel,
+        first=first.flight,
+        second=second.flight,
+        share=pair.n / max(known, 1),
+        single_db=pair.rmse_db / 2.0**0.5,
+        **named(pair, same),
+    )
+
+
+def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
+    """K chosen on the other flights, for every flight that has others with the same tower and K."""
+    out = []
+    for setting, tower in dict.fromkeys((row.setting, row.tower) for row in rows):
+        by: dict[str, dict[float, RankRow]] = {}
+        for row in rows:
+            if (row.setting, row.tower) == (setting, tower) and np.isfinite(row.total_variation):
+                by.setdefault(row.flight, {})[row.k] = row
+        for flight, fits in by.items():
+            other_flights = [at for name, at in by.items() if name != flight]
+            common = [k for k in fits if other_flights and all(k in at for at in other_flights)]
+            if not common:
+                continue
+            # K that all other flights have: a mean over fewer of them would compare unlike flights
+            chosen = min(common, key=lambda k: finite_mean([at[k].total_variation for at in other_flights]))
+            best = min(fits, key=lambda k: fits[k].total_variation)
+            out.append(
+                RankTransfer(
+                    setting=setting,
+                    flight=flight,
+                    tower=tower,
+                    chosen_on=tuple(name for name in by if name != flight),
+                    k=chosen,
+                    total_variation=fits[chosen].total_variation,
+                    kappa=fits[chosen].kappa,
+                    own_k=best,
+                    own_total_variation=fits[best].total_variation,
+                )
+            )
+    return out
+
+
+_QUANTILES = (0.1, 0.25, 0.5, 0.75, 0.9)
+
+
+def with_season(
+    data: CampaignData, reports: Mapping[str, str] | None = None, sounded: Sequence[NodeOffset] = ()
+) -> CampaignData:
+    """The campaign with held-out errors in its rows and what they say over the season.
+
+    Parameters
+    ----------
+    data : CampaignData
+    reports : mapping of str to str, optional
+        Address of the report of a flight, against the campaign's folder.
+    sounded : sequence of NodeOffset
+        Of soundings between towers (:func:`soundings`), in place of the offsets of the flights.
+    """
+    rows = _held_out_rows(data.rss)
+    data = dataclasses.replace(data, rss=tuple(rows))
+    if not rows:
+        return dataclasses.replace(data, season=Season(reports=dict(reports or {}), nodes=tuple(sounded)))
+    started = _started_of(rows)
+    order = sorted(data.flights, key=lambda name: (name not in started, started.get(name, 0)))
+    links = list(dict.fromkeys(row.link for row in rows))
+    ranking = rank_settings(rows, list(data.settings), order, "")
+    if len(links) > 1:
+        for link in links:
+            ranking += rank_settings([r for r in rows if r.link == link], list(data.settings), order, link)
+    return dataclasses.replace(
+        data,
+        season=Season(
+            held_out=any(np.isfinite(row.held_out_rmse_db) for row in rows),
+            started={name: _iso(ns) for name, ns in started.items()},
+            ranking=tuple(ranking),
+            nodes=tuple(sounded) or _flown(data.reference_rows, order, started),
+            places=_place_map(data.reference_rows, data.cell_m),
+            reports=dict(reports or {}),
+        ),
+    )
+
+
+def _started_of(rows: Iterable[RssRow]) -> dict[str, int]:
+    """First instant of each flight [ns after 1970-01-01]; none where its logs have relative times only."""
+    starts: dict[str, int] = {}
+    for row in rows:
+        if row.start_ns and has_wall_clock(np.datetime64(row.start_ns, "ns")):
+            starts[row.flight] = min(row.start_ns, starts.get(row.flight, row.start_ns))
+    return starts
+
+
+def _iso(ns: int) -> str:
+    return str(np.datetime64(ns, "ns").astype("datetime64[s]")) + "Z"
+
+
+# --- held-out errors --------------------------------------------------------------------------------------------------
+
+
+def _held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
+    """Rows with the offset from the other flights of their setting, tower and channel, and what it leaves."""
+    groups: dict[tuple[str, str, str, str], list[int]] = {}
+    for i, row in enumerate(rows):
+        groups.setdefault((row.setting, row.tower, row.channel, row.unit), []).append(i)
+    scored = list(rows)
+    for members in groups.values():
+        mine = [rows[i] for i in members]
+        mean = np.array([row.moments.mean_db for row in mine])
+        offset = verdict.left_out_offsets(
+            [row.n if np.isfinite(m) else 0 for row, m in zip(mine, mean, strict=True)],
+            mean,
+            span_db=(min(row.span_db[0] for row in mine), max(row.span_db[1] for row in mine)),
+        )
+        error = verdict.error_at_offset(offset, [row.rmse_db for row in mine], [row.offset_db for row in mine], mean)
+        for i, o, e in zip(members, offset, error, strict=True):
+            scored[i] = dataclasses.replace(rows[i], held_out_offset_db=float(o), held_out_rmse_db=float(e))
+    return scored
+
+
+def _error_of(row: RssRow) -> float:
+    """The error that settings are ranked by [dB]: held out, or own where there is no other flight."""
+    return row.held_out_rmse_db if np.isfinite(row.held_out_rmse_db) else row.rmse_db
+
+
+# --- settings ---------------------------------------------------------------------------------------------------------
+
+
+def rank_settings(
+    rows: Iterable[RssRow], settings: Sequence[str], flights: Sequence[str], link: str
+) -> list[SettingRank]:
+    """Settings by their mean error over flights, and their difference to the first on the same flights and links.
+
+    Parameters
+    ----------
+    rows : iterable of RssRow
+    settings : sequence of str
+        Labels; ties keep their order.
+    flights : sequence of str
+        Those that are compared.
+    link : str
+        What the rows are of, for the record.
+
+    Returns
+    -------
+    list of SettingRank
+        Least mean error first; settings without a finite error are left out.
+    """
+    table: dict[str, dict[str, dict[str, float]]] = {name: {} for name in settings}
+    for row in rows:
+        if np.isfinite(_error_of(row)):
+            table[row.setting].setdefault(row.flight, {})[row.link] = _error_of(row)
+    means = {name: np.array([np.mean(list(by.values())) for by in table[name].values()]) for name in settings}
+    known = sorted((name for name in settings if len(means[name])), key=lambda name: float(means[name].mean()))
+    choices = []
+    for name in known:
+        difference = verdict.mean_of_flights(_paired(table[name], table[known[0]], flights))
+        low, *middle, high = (float(v) for v in np.quantile(means[name], (0.0, *_QUANTILES, 1.0)))
+        choices.append(
+            SettingRank(
+                setting=name,
+                link=link,
+                n_flights=len(means[name]),
+                mean_db=float(means[name].mean()),
+                quantiles_db=(low, *middle, high),
+                difference_db=difference.mean,
+                difference_ci95_db=None if name == known[0] else (difference.low, difference.high),
+                n_paired=difference.n,
+                verdict="first" if name == known[0] else verdict.verdict_of(difference),
+            )
+        )
+    return choices
+
+
+def _paired(errors: Mapping[str, Any], base: Mapping[str, Any], flights: Sequence[str]) -> FloatArray:
+    """Mean difference on the links that both settings scored, per flight, in the order of the dates."""
+    differences = []
+    for flight in flights:
+        links = sorted(set(errors.get(flight, ())) & set(base.get(flight, ())))
+        if links:
+            differences.append(float(np.mean([errors[flight][link] - base[flight][link] for link in links])))
+    return np.array(differences)
+
+
+# --- steps of offsets -------------------------------------------------------------------------------------------------
+
+
+def _flown(rows: Sequence[RssRow], order: Sequence[str], started: Mapping[str, int]) -> tuple[NodeOffset, ...]:
+    """Offset of each tower and channel over the flights, less what all share on a flight, and its steps."""
+    known = {(row.flight, row.link): row.moments.mean_db for row in rows}
+    links = list(dict.fromkeys(row.link for row in rows))
+    offsets = np.array([[known.get((flight, link), np.nan) for link in links] for flight in order])
+    dates = [_iso(started[flight]) if flight in started else flight for flight in order]
+    nodes = node_offsets(offsets, [("", link) for link in links])
+    return tuple(stepped(name.removesuffix(" receives"), dates, values, len(nodes)) for name, values in nodes.items())
+
+
+def soundings(paths: Sequence[Path], timezone: str | None) -> tuple[NodeOffset, ...]:
+    """Offset of each radio of the towers, night by night (UTC), from soundings between them.
+
+    Parameters
+    ----------
+    paths : sequence of Path
+        Logs, their folders, or a flight file of ``ingest -o``. Streams that name transmitter and receiver count.
+    timezone : str, optional
+        Of logs with local times.
+
+    Raises
+    ------
+    InputError
+        No log names a link.
+    """
+    levels = []
+    for file in ingest(paths, options=ReadOptions(timezone=timezone)):
+        for stream in file.result.streams:
+            link = stream.attributes
+            if stream.kind == "rss" and link.get("unit") != "dB" and {"transmitter", "receiver"} <= link.keys():
+                night = stream.frame["time"].dt.strftime("%Y-%m-%d")
+                ends = {end: _radio(link, end) for end in ("transmitter", "receiver")}
+                by_night = stream.frame["rss_db"].groupby(night).median()
+                levels.append(pd.DataFrame({**ends, "band": link.get("frequency_hz", np.nan), "offset": -by_night}))
+    if not levels:
+        raise InputError("no log names transmitter and receiver", expected="soundings", path=paths[0])
+    table = pd.concat(levels).rename_axis("night").reset_index()
+    nights = sorted(table["night"].unique())
+    nodes: dict[str, NightOffsets] = {}
+    for band, part in table.groupby("band", dropna=False):
+        wide = part.pivot_table("offset", "night", ["transmitter", "receiver"], aggfunc="median").reindex(nights)
+        name = f"{band / 1e6:.0f} MHz, " if np.isfinite(band) else ""
+        nodes |= {name + node: values for node, values in node_offsets(wide.to_numpy(), list(wide.columns)).items()}
+    return tuple(stepped(node, nights, values, len(nodes)) for node, values in nodes.items())
+
+
+def _radio(link: Mapping[str, Any], end: str) -> str:
+    """Tower, serial number and channel of one end of a link, where the log has them."""
+    serial, channel = link.get(f"{end}_serial_number"), link.get(f"{end}_channel")
+    return str(link[end]) + (f" {serial}" if serial else "") + (f":{channel}" if channel else "")
+
+
+# --- places -----------------------------------------------------------------------------------------------------------
+
+
+def _place_map(rows: Sequence[RssRow], cell_m: float) -> PlaceMap | None:
+    """Mean residual of each cell of the plan over flights, towers and channels; None without a cell."""
+    residuals: dict[tuple[int, int], list[float]] = {}
+    for row in rows:
+        scored = np.isfinite(row.residual_db) & np.isfinite(row.position_m).all(axis=1)
+        cells, means, _ = cell_means(row.position_m, row.residual_db, scored, cell_m)
+        for (east, north), residual in zip(cells.tolist(), means, strict=True):
+            residuals.setdefault((east, north), []).append(residual)
+    if not residuals:
+        return None
+    return PlaceMap(cells=np.array(list(residuals)), mean_db=np.array([np.mean(v) for v in residuals.values()]))
+
+
+# --- reports of the flights -------------------------------------------------------------------------------------------
+
+
+def find_reports(flights: Iterable[str], folder: Path, places: Sequence[Path]) -> dict[str, str]:
+    """Relative addresses of the reports of flights that stand in one of the folders ``places``.
+
+    Parameters
+    ----------
+    flights : iterable of str
+    folder : Path
+        Of the campaign's page.
+    places : sequence of Path
+        Each may hold ``NAME/report.html``, as ``aerpaw-cmp report`` writes it.
+
+    Returns
+    -------
+    dict
+        A folder whose metrics.json is of another flight is no report of this one.
+    """
+    reports: dict[str, str] = {}
+    for name in flights:
+        for place in places:
+            page = place / name / "report.html"
+            if page.is_file() and _flight_of(page.with_name("metrics.json")) == name:
+                relative = Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix()
+                reports[name] = quote(relative)
+                break
+    return reports
+
+
+def _flight_of(path: Path) -> str | None:
+    try:
+        with parsing(path, any_shape=True):
+            name = json.loads(read_bounded(path, LARGEST_TABLE)).get("flight")
+    except InputError:
+        return None
+    return name if isinstance(name, str) else None

@@ -1,1 +1,0 @@
-"""Many flights: plan, tasks, fits over flights, seasons."""

@@ -1,0 +1,725 @@
+"""Compare each replayed series with its measurement: numbers, as :mod:`aerpaw_cmp.compare.result` lists them.
+
+A new number of a tower and channel is a field of ``RssFurther`` there and a function here, called in
+:func:`compare_rss_series`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
+from itertools import combinations
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..common.jsonable import named
+from ..common.stages import give_memory_back
+from ..common.units import BoolArray, FloatArray, IntArray, spread_out
+from ..compare import level as rss
+from ..compare import offset as offsets
+from ..compare import rank as ranks
+from ..compare import statistics
+from ..compare.gains import LostLock, StatedSpread, inside_shares
+from ..compare.ladder import log_distance_level_db
+from ..compare.level import (
+    DetectionForecast,
+    DetectionScore,
+    ServingComparison,
+    at_times,
+    compare_serving,
+    score_detection,
+)
+from ..compare.receiver import ForecastScore, score_forecast
+from ..compare.result import (
+    APPLIED,
+    Fit,
+    FlightResult,
+    ModelLevel,
+    PairResult,
+    RankFurther,
+    RankResult,
+    RssFurther,
+    RssResult,
+    SnrScore,
+)
+from ..compare.statistics import Visit, memory_share
+from ..compare.verdict import flight_verdict, with_corrected_verdicts
+from ..flight.data import FlightData, RankSeries, RssSeries
+from ..flight.drafting.proposals import errors_elsewhere, lock_elsewhere
+from ..flight.gains import direct_foliage_m
+from ..flight.replay import FlightReplay, Replayed, replay_poses
+from ..flight.rows import LOCK_FLOOR_DB
+from ..flight.settings import RssSettings, RtSettings
+from ..flight.training import learned_here
+from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
+from ..site.learned import LearnedLock
+from ..site.relief import Dem
+from ..site.site import Site
+from ..site.siteyaml import ground_surface, site_model
+from .likely_cause import cause_of
+
+if TYPE_CHECKING:
+    from .calibrate_rank import FittedReceiver
+
+
+# Both sides are averaged over these windows to see how much of the error is fading.
+_AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
+
+# Two passes of one place, first and second half of a flight, come this near.
+_PASSES_WITHIN_M = 3.0
+
+# Grounds that are drawn for the error bar of rank agreement, and poses that are replayed over each.
+_DRAWS, _POSES = 6, 300
+
+# A shorter stretch of large error is a fade.
+_SHORTEST_S = 5.0
+
+
+def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
+    """Every series against its replay, and every two channels of a tower against each other."""
+    results = []
+    for series, replayed in zip(data.rss, replays.rss, strict=True):
+        results.append(compare_rss_series(data, series, replayed))
+        give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
+    results = with_corrected_verdicts(results)
+    cause, step = cause_of(data, replays, results)
+    return FlightResult(
+        rss=tuple(results),
+        verdict=flight_verdict(results),
+        likely_cause=cause,
+        next_step=step,
+        rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
+        pairs=tuple(pairs_of(results)),
+        serving=serving_of(data.rss, results),
+    )
+
+
+# A prediction of another cell at most this long before or after stands for the moment: phones report once a second.
+_SERVING_WITHIN_S = 1.5
+
+
+def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> ServingComparison | None:
+    """Serving cells of the log against the strongest predicted; None where no log tells which cell serves.
+
+    Compared are the cells that the flight file gives to towers, at the moments when one of them served. Levels are as
+    simulated: cells of one network send alike, and an offset fitted per cell would hide which one is stronger.
+    """
+    cells = [(cell, result) for cell, result in zip(series, results, strict=True) if cell.serving is not None]
+    if len(cells) < 2 or not any(np.nansum(cell.serving) for cell, _ in cells if cell.serving is not None):
+        return None
+    start = min(cell.time.min() for cell, _ in cells if len(cell.time))
+    times, served = [], []
+    for i, (cell, _) in enumerate(cells):
+        assert cell.serving is not None
+        mine = (cell.time - start)[cell.serving == 1] / np.timedelta64(1, "s")
+        times.append(mine)
+        served.append(np.full(len(mine), i))
+    at = np.concatenate(times)
+    predicted = np.full((len(at), len(cells)), np.nan)
+    for j, (cell, result) in enumerate(cells):
+        order = np.argsort(cell.time, kind="stable")
+        seconds = ((cell.time - start) / np.timedelta64(1, "s"))[order]
+        predicted[:, j] = at_times(at, seconds, result.simulated_dbm[order], within_s=_SERVING_WITHIN_S)
+    return compare_serving(np.concatenate(served), predicted, [f"{cell.tower} {cell.channel}" for cell, _ in cells])
+
+
+# --- RSS -----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Levels:
+    """Measured and simulated levels (n,) [dB].
+
+    ``posed`` are the samples with a known pose above the lowest height; ``measured_db`` is NaN elsewhere.
+    """
+
+    measured_db: FloatArray
+    simulated_db: FloatArray
+    posed: BoolArray
+
+
+def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> Levels:
+    """Levels of a series that are compared, as ``rss`` of the flight file asks."""
+    measured = series.measured_db
+    posed = replayed.valid.copy()
+    if settings.minimum_height_m is not None:
+        posed[posed] = replayed.poses.position_m[:, 2] >= settings.minimum_height_m
+    level_dbm = replayed.level_dbm("power" if settings.field == "power" else "coherent")
+    return Levels(
+        measured_db=np.where(posed, measured, np.nan),
+        simulated_db=replayed.spread(level_dbm),
+        posed=posed,
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Case:
+    """One tower and channel with what every number of it is computed from.
+
+    ``simple`` are the baselines at the samples; ``trained`` names logs of this flight that its antennas were learned
+    from: then nothing is scored.
+    """
+
+    data: FlightData
+    series: RssSeries
+    replayed: Replayed
+    levels: Levels
+    position_m: FloatArray
+    geometry: Mapping[str, FloatArray]
+    simple: Mapping[str, FloatArray]
+    trained: tuple[str, ...]
+
+
+def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> RssResult:
+    """Offset, RMSE, correlation, intervals and baselines of one tower and channel."""
+    settings, case = data.settings.rss, _case(data, series, replayed)
+    levels, clock = case.levels, replayed.clock
+    score = rss.compare_rss(
+        series.time,
+        levels.measured_db,
+        levels.simulated_db,
+        baselines=case.simple,
+        posed=levels.posed,
+        span_db=settings.span_db,
+    )
+    if clock is not None:
+        also = ("lag_s",) if clock.result.applied == APPLIED else ()
+        lag_s = clock.result.radio_minus_telemetry_s
+        score = dataclasses.replace(score, lag_s=lag_s, fitted_on_scored=(*score.fitted_on_scored, *also))
+    direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
+    spans = _worst(case, score.residual_db, direct)
+    if case.trained:
+        score, spans = rss.without_errors(score), []
+    stated = _with_lock(case, score, stated_spread(replayed))
+    return RssResult(
+        **named(series, "tower channel unit time"),
+        **named(case, "position_m geometry"),
+        measured_db=levels.measured_db,
+        simulated_dbm=np.where(levels.posed, levels.simulated_db, np.nan),
+        posed=levels.posed,
+        tower_m=tower_places(replayed),
+        line_of_sight=direct,
+        score=score,
+        baselines=_baselines(case.simple, score),
+        spans=tuple(spans),
+        further=_further(case, score, stated),
+        stated=stated,
+    )
+
+
+def stated_spread(replayed: Replayed) -> StatedSpread | None:
+    """Error bars of the simulated level that learned antennas state, along the direct line; None where none does.
+
+    Where only one end is learned, or files hold no gain towards both ends at once, the gains of both ends count as
+    independent; they are learned from the same levels, so the true standard deviation is rather smaller.
+
+    Parameters
+    ----------
+    replayed : Replayed
+
+    Returns
+    -------
+    StatedSpread or None
+    """
+    gain = replayed.learned
+    if gain is None:
+        return None
+    return StatedSpread(gain_sd_db=replayed.spread(gain.sd_db), spread=gain.spread)
+
+
+def _with_lock(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> StatedSpread | None:
+    """Error bars in two parts, where other flights taught when the receiver loses its lock."""
+    series, error_db = case.series, score.residual_db
+    lock = None if stated is None else _lock(case)
+    locked = (series.locked == 1.0) & np.isfinite(error_db)
+    if stated is None or lock is None or not locked.any():
+        return stated
+    simulated_db = case.levels.simulated_db
+    above_db = simulated_db - series.link.transmit_power_dbm - lock.gain_db
+    expected_db = lock.locked_db + lock.locked_per_db * above_db + score.offset_db - simulated_db
+    # a flight that is stronger in lock than others at the same path gain loses its lock later, too
+    own_db = (error_db - expected_db)[locked].mean()
+    parts = LostLock(
+        probability=_forecast(series, lock).probability(simulated_db + own_db),
+        locked_db=expected_db + own_db,
+        lost_db=lock.lost_db + lock.lost_per_db * (above_db + own_db) + score.offset_db - simulated_db,
+        locked_sd_db=lock.locked_sd_db,
+        lost_sd_db=lock.lost_sd_db,
+    )
+    return dataclasses.replace(stated, lock=parts)
+
+
+def _lock(case: _Case) -> LearnedLock | None:
+    """Lock that other flights taught; None of a receiver that never loses it."""
+    if case.series.locked is None:
+        return None
+    return lock_elsewhere(case.data.settings.antennas, case.data.folder)
+
+
+def _forecast(series: RssSeries, lock: LearnedLock) -> DetectionForecast:
+    """P(lock) of the levels of a series."""
+    level_db = lock.gain_db + series.link.transmit_power_dbm
+    return DetectionForecast(level_db=level_db, per_db=lock.per_db, share=lock.share)
+
+
+def _case(data: FlightData, series: RssSeries, replayed: Replayed) -> _Case:
+    settings, trained = data.settings.rss, learned_here(data, series, replayed.link)
+    levels = levels_of(series, replayed, settings)
+    geometry = link_geometry(data.site, series.tower, replayed, data.settings.rt)
+    simple = {
+        name: replayed.spread(level) for name, level in _baseline_levels(data.site, series.tower, replayed).items()
+    }
+    position = replayed.spread(replayed.poses.position_m)
+    simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
+    return _Case(
+        data=data,
+        series=series,
+        replayed=replayed,
+        levels=levels,
+        position_m=position,
+        geometry=geometry,
+        simple=simple,
+        trained=trained,
+    )
+
+
+def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None) -> RssFurther:
+    """Counts, conditions and, where it may be scored, further views of the error.
+
+    Parameters
+    ----------
+    case : _Case
+    score : RssComparison
+    stated : StatedSpread, optional
+        Error bars that learned antennas state.
+
+    Returns
+    -------
+    RssFurther
+    """
+    settings, levels, series, replayed = case.data.settings.rss, case.levels, case.series, case.replayed
+    wild = rss.outliers(levels.measured_db)
+    detection = None if case.trained else _detection(case)
+    further = RssFurther(
+        **named(score, "n_measured_out n_simulated_out identifiable_db"),
+        block_length=score.intervals.autocorrelation.block_length,
+        n_too_low=int((replayed.valid & ~levels.posed).sum()),
+        n_no_pose=int((~replayed.valid).sum()),
+        n_outliers=int(wild.sum()),
+        rmse_without_outliers_db=_rmse_without(wild, settings, levels, score),
+        n_flagged=dict(series.flagged),
+        clock=None if replayed.clock is None else replayed.clock.result,
+        baseline_rmse_ci95_db=score.baseline_intervals,
+        compared_with={},
+        averaged={},
+        simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
+        error_bars=None if stated is None else _error_bars(stated, None if case.trained else score.residual_db),
+        elsewhere=_elsewhere(case, score, detection),
+        trained_on=case.trained or None,
+        rmse_bound=_bound(series, score),
+    )
+    if case.trained:
+        return further
+    return dataclasses.replace(
+        further,
+        compared_with=_paired(levels, case.simple),
+        averaged=_averaged(case),
+        detection=detection,
+        snr=_snr(series, levels),
+    )
+
+
+def _bound(series: RssSeries, score: rss.RssComparison) -> str | None:
+    """Reason of an interval of the RMSE that has no upper end."""
+    if not np.isposinf(score.rmse_ci95_db[1]):
+        return None
+    known = np.isfinite(score.residual_db)
+    order = np.argsort(series.time[known], kind="stable")
+    time = series.time[known]
+    length_s = (time.max() - time.min()) / np.timedelta64(1, "s")
+    return f"the flight is too short for its memory of {memory_share(score.residual_db[known][order]) * length_s:.0f} s"
+
+
+def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score: rss.RssComparison) -> float:
+    """RMSE after an own offset where some samples do not count."""
+    if not wild.any():
+        return score.rmse_db
+    inliers_db = np.where(wild, np.nan, levels.measured_db)
+    return offsets.grid_offset(inliers_db, levels.simulated_db, span_db=settings.span_db).rmse_db
+
+
+def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore | None) -> dict[str, float] | None:
+    """Error to expect on another flight, where the antennas of the site say it and this flight does not refute it."""
+    errors, lock = errors_elsewhere(case.data.settings.antennas, case.series, case.data.folder), _lock(case)
+    if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:
+        return None
+    if lock is not None and detection is not None and detection.rmse_ci95_db[0] > lock.floor_rmse_db:
+        return None
+    out = {} if errors is None else named(errors, "rmse_db free_space_rmse_db rmse_4s_db")
+    out |= {} if lock is None else named(lock, "floor_rmse_db free_space_floor_rmse_db")
+    return out or None
+
+
+def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[str, float]:
+    """Parts of the stated standard deviation [dB], and the shares of samples that its intervals hold, where scored."""
+    parts = {"gain_sd_db": float(np.nanmean(stated.gain_sd_db)), **dataclasses.asdict(stated.spread)}
+    if residual_db is None:
+        return parts
+    return parts | inside_shares(residual_db, stated) | {"crps_db": stated.crps_db(residual_db)}
+
+
+def _baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
+    """Free space and two-ray (isotropic) at the replayed poses (n,) [dBm]."""
+    place, link = site.towers[tower], replayed.link
+    source, target = replayed.source_m(site), replayed.poses.position_m
+    if replayed.tower_m is not None:  # a place per pose: (poses, towers, 3)
+        source = source[:, None, :]
+    ends = (source, target, link.carrier_hz, link.transmit_power_dbm)
+    two_ray = two_ray_dbm(*ends, ground_material=site.ground_material, ground_m=place.ground_m)
+    return {"free_space": free_space_dbm(*ends)[:, 0], "two_ray": two_ray[:, 0]}
+
+
+def _fitted_levels(
+    free_space_dbm: FloatArray, measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray
+) -> dict[str, FloatArray]:
+    """Baselines that know no physics, about the mean level of free space (n,) [dBm]: a constant, and log-distance."""
+    known = np.isfinite(measured_db) & np.isfinite(free_space_dbm)
+    mean = float(free_space_dbm[known].mean()) if known.any() else np.nan
+    line = log_distance_level_db(measured_db, distance_m, position_m)
+    return {"constant": np.where(np.isfinite(line), mean, np.nan), "log_distance": mean + line}
+
+
+def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> dict[str, ModelLevel]:
+    return {
+        name: ModelLevel(
+            level_dbm=level,
+            **named(score.baselines[name], "offset_db rmse_db"),
+            rmse_ci95_db=score.baseline_intervals[name],
+        )
+        for name, level in levels.items()
+    }
+
+
+def _paired(levels: Levels, models: Mapping[str, FloatArray]) -> dict[str, statistics.PairedDifference]:
+    """The replay against each other model on the samples that both have, each with its own offset."""
+    error_db = levels.measured_db - levels.simulated_db
+    return {name: statistics.paired_difference(error_db, levels.measured_db - level) for name, level in models.items()}
+
+
+def _averaged(case: _Case) -> dict[str, dict[str, Fit]]:
+    """Both sides averaged alike over windows of time, per simulation."""
+    replayed, span_db = case.replayed, case.data.settings.rss.span_db
+    simulations = {
+        "coherent": replayed.spread(replayed.level_dbm("coherent")),
+        "power_sum": replayed.spread(replayed.level_dbm("power")),
+    }
+    averages = {f"{w:g} s": partial(rss.local_mean_db, case.series.time, window_s=w) for w in _AVERAGING_WINDOWS_S}
+    fits = rss.averaged_fits(case.levels.measured_db, simulations, averages, span_db=span_db)
+    return {
+        name: {average: Fit(**named(fit, "offset_db rmse_db")) for average, fit in each.items()}
+        for name, each in fits.items()
+    }
+
+
+def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
+    """The replay's level over the receiver's noise against the logged ratio, without any offset."""
+    if series.noise_dbm is None:
+        return None
+    error_db = levels.measured_db - (levels.simulated_db - series.noise_dbm)
+    error_db = error_db[np.isfinite(error_db)]
+    if not len(error_db):
+        return None
+    return SnrScore(
+        noise_dbm=series.noise_dbm,
+        rmse_db=float(np.sqrt(np.mean(error_db**2))),
+        mean_error_db=float(error_db.mean()),
+        n=len(error_db),
+    )
+
+
+def _detection(case: _Case) -> DetectionScore | None:
+    """P(lock), or P(above the floor), and all samples with the floor; None for a level without either."""
+    series, levels, lock = case.series, case.levels, _lock(case)
+    if series.locked is not None:
+        known, detected, floor_db = np.isfinite(series.locked), series.locked == 1.0, LOCK_FLOOR_DB
+    else:
+        detected = np.isfinite(levels.measured_db)
+        known = np.ones(len(detected), dtype=np.bool_)
+        if not (levels.posed & ~detected).any() or not detected.any():
+            return None
+        floor_db = float(np.nanmin(levels.measured_db))
+    at = known & levels.posed
+    score = score_detection(
+        rss.seconds(series.time[at]),
+        levels.measured_db[at],
+        levels.simulated_db[at],
+        detected[at],
+        floor_db=floor_db,
+        free_space_db=case.simple["free_space"][at],
+        forecast=None if lock is None else _forecast(series, lock),
+    )
+    return None if score is None else dataclasses.replace(score, locks=series.locked is not None)
+
+
+def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
+    """Every two channels of a tower against each other, where they have instants in common."""
+    out = []
+    for channel, other_channel in combinations(results, 2):
+        if channel.tower != other_channel.tower:
+            continue
+        rows, other_rows = _same_instants(channel.time, other_channel.time)
+        if not len(rows):
+            continue
+        first, second = channel.calibrated_db[rows], other_channel.calibrated_db[other_rows]
+        position = channel.position_m[rows]
+        context = {"height_m": position[:, 2], "elevation_deg": channel.geometry["elevation_deg"][rows]}
+        if "heading_deg" in channel.geometry:
+            context["heading_deg"] = channel.geometry["heading_deg"][rows]
+        out.append(
+            PairResult(
+                tower=channel.tower,
+                first=channel.channel,
+                second=other_channel.channel,
+                time=channel.time[rows],
+                score=rss.channel_difference(channel.time[rows], first, second, position_m=position, context=context),
+            )
+        )
+    return out
+
+
+def _same_instants(first: Any, second: Any) -> tuple[IntArray, IntArray]:
+    """Samples of two series that were taken within half a sampling interval of each other."""
+    if len(first) == len(second) and (first == second).all():
+        return np.arange(len(first)), np.arange(len(second))
+    if len(first) < 2 or not len(second):
+        return np.arange(0), np.arange(0)
+    order = np.argsort(second, kind="stable")
+    ahead = np.clip(np.searchsorted(second[order], first), 0, len(second) - 1)
+    before = np.maximum(ahead - 1, 0)
+    nearer = np.abs(second[order[before]] - first) < np.abs(second[order[ahead]] - first)
+    nearest = order[np.where(nearer, before, ahead)]
+    limit = 0.5 * np.median(np.abs(np.diff(first)))
+    rows = np.flatnonzero(np.abs(second[nearest] - first) <= limit)
+    return rows, nearest[rows]
+
+
+def _has_direct(replayed: Replayed) -> BoolArray:
+    paths = replayed.replay.paths
+    direct = np.zeros(len(replayed.poses), dtype=np.bool_)
+    direct[paths.pose[paths.depth == 0]] = True
+    return direct
+
+
+def tower_places(replayed: Replayed) -> FloatArray | None:
+    """Place of a tower that moves at every sample (n, 3) [m]; None of one that stands."""
+    return None if replayed.tower_m is None else replayed.spread(replayed.tower_m)
+
+
+def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) -> dict[str, FloatArray]:
+    """Quantities that residuals are drawn against, at the samples of the series (n,), by name with unit.
+
+    Parameters
+    ----------
+    site : Site
+    tower : str
+    replayed : Replayed
+        Its poses, arrays and which samples have a pose.
+    rt : RtSettings
+        ``foliage`` says whether the depth of foliage counts.
+
+    Returns
+    -------
+    dict of str to (n,)
+        ``altitude_m``, ``distance_m``, ``elevation_deg``, ``azimuth_deg``, ``tower_elevation_deg``,
+        ``uav_azimuth_deg``, ``uav_elevation_deg``; ``heading_deg`` with a track, ``foliage_depth_m`` with trees.
+        NaN where no pose is known.
+    """
+    link = replayed.link
+    directions = rss.link_geometry(
+        replayed.source_m(site),
+        replayed.poses.position_m,
+        replayed.poses.rotation,
+        tower_mount=link.tower_arrays[tower].mount,
+        uav_mount=link.uav_array.mount,
+    )
+    directions["azimuth_deg"] = directions["tower_azimuth_deg"]  # residuals are drawn in the frame of the antenna
+    out = {"altitude_m": replayed.spread(replayed.poses.position_m[:, 2])}
+    for name in (
+        "distance_m", "elevation_deg", "azimuth_deg", "tower_elevation_deg", "uav_azimuth_deg", "uav_elevation_deg",
+    ):  # fmt: skip
+        out[name] = replayed.spread(directions[name])
+    if replayed.track is not None:
+        out["heading_deg"] = replayed.spread(replayed.track.heading_deg)
+    if site.wooded and rt.foliage != "none":
+        depth = direct_foliage_m(replayed.source_m(site), replayed.poses.position_m, site.under(rt.foliage))
+        out["foliage_depth_m"] = replayed.spread(depth)
+    return out
+
+
+def _worst(case: _Case, residual_db: FloatArray, line_of_sight: FloatArray) -> list[rss.ErrorSpan]:
+    """The spans of largest error, with place and geometry."""
+    geometry = case.geometry
+    context = {
+        "los": line_of_sight,
+        "elevation_deg": geometry["elevation_deg"],
+        "height_m": geometry["altitude_m"],
+    }
+    for ours, theirs in (("heading_deg", "heading_deg"), ("foliage_depth_m", "foliage_m")):
+        if ours in geometry:
+            context[theirs] = geometry[ours]
+    spans = rss.error_spans(
+        case.series.time, residual_db, position_m=case.position_m, context=context, largest=len(residual_db)
+    )
+    return [span for span in spans if span.end_s - span.start_s >= _SHORTEST_S][:6]
+
+
+# --- rank ----------------------------------------------------------------------------------------------------------
+
+
+def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed) -> RankResult:
+    """Measured against simulated rank for each K."""
+    settings = data.settings.rank
+    position = replayed.spread(replayed.poses.position_m)
+    keep = replayed.valid.copy()
+    if settings.minimum_height_m is not None:
+        with np.errstate(invalid="ignore"):
+            keep &= position[:, 2] >= settings.minimum_height_m
+    rows, poses = np.flatnonzero(keep), np.flatnonzero(keep[replayed.valid])
+    h = replayed.replay.h[poses, 0]
+    sinr_db = series.sinr_db[rows] if np.isfinite(series.sinr_db[rows]).any() else None
+    score = ranks.compare_rank(
+        series.rank[rows],
+        h,
+        settings.k,
+        time_s=(series.time[rows] - series.time[:1]) / np.timedelta64(1, "s") if len(rows) else None,
+        sinr_db=sinr_db,
+    )
+    sigma, towers = ranks.singular_values(h), tower_places(replayed)
+    probability, forecast, trained = _receiver_forecast(data, series)
+    heading = None if replayed.track is None else replayed.spread(replayed.track.heading_deg)[rows]
+    return RankResult(
+        tower=series.tower,
+        n_samples=len(series.rank),
+        time=series.time[rows],
+        position_m=position[rows],
+        tower_m=None if towers is None else towers[rows],
+        measured=series.rank[rows],
+        sinr_db=sinr_db,
+        sigma=sigma,
+        level_dbm=replayed.replay.rss_dbm[poses, 0],
+        rank={k: ranks.rank_from_singular_values(sigma, k) for k in score.simulated},
+        score=score,
+        further=RankFurther(
+            n_flagged=dict(series.flagged),
+            kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
+            commonest=ranks.commonest_rank(series.rank[rows]),
+            repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], heading),
+            receiver=forecast,
+            trained_on=trained or None,
+            agreement_sd_by_ground=_agreement_by_ground(data, replayed, series.rank[rows], poses, settings.k) or None,
+        ),
+        probability=probability,
+    )
+
+
+def fitted_receiver(data: FlightData, tower: str) -> FittedReceiver | None:
+    """Return the receiver of a tower that the flight file names; None if it names no file.
+
+    Raises
+    ------
+    InputError
+        A file that cannot be read, or that has no receiver of this tower.
+    """
+    named = data.settings.rank.receiver
+    if named is None:
+        return None
+    from .calibrate_rank import read_receiver  # few flights name one
+
+    receivers = read_receiver(data.folder / named)
+    if tower not in receivers:
+        raise InputError(
+            f"no receiver at {tower}",
+            expected="a receiver fitted at one of the flight's towers; it has " + ", ".join(receivers),
+            path=data.folder / named,
+        )
+    return receivers[tower]
+
+
+def _receiver_forecast(
+    data: FlightData, series: RankSeries
+) -> tuple[FloatArray | None, ForecastScore | None, tuple[str, ...]]:
+    """Probability (n, 4) of each rank by the receiver of the flight file, its score, and logs that it was fitted on."""
+    receiver = fitted_receiver(data, series.tower)
+    if receiver is None:
+        return None, None, ()
+    from .calibrate_rank import rank_samples  # few flights name a receiver
+
+    samples = rank_samples(data, series)
+    probability, decided = receiver.forecast(samples)
+    if receiver.knows(samples):  # nothing is scored where it was fitted
+        return probability, None, samples.logs
+    constant = receiver.mixture.members[0].constant
+    return probability, score_forecast(samples.rank, probability, decided, constant), ()
+
+
+def _repeated_rank(
+    time: Any, position_m: FloatArray, rank: FloatArray, heading_deg: FloatArray | None
+) -> dict[str, ranks.RankRepeat]:
+    """Agreement of the modem with itself where the second half of the flight passes places of the first."""
+    elapsed = rss.seconds(time)
+    with np.errstate(invalid="ignore"):
+        late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
+    headings: dict[str, FloatArray | None] = {} if heading_deg is None else {"same_heading": heading_deg}
+    repeats = {}
+    for name, turn in {**headings, "any_heading": None}.items():
+        early, again = (Visit(position_m[at], rank[at], None if turn is None else turn[at]) for at in (~late, late))
+        repeats[name] = ranks.repeat_rank(early, again, _PASSES_WITHIN_M)
+    return repeats
+
+
+def _agreement_by_ground(
+    data: FlightData, replayed: Replayed, measured: FloatArray, poses: IntArray, ks: Sequence[float]
+) -> dict[str, float]:
+    """Standard deviation of a tower's rank agreement, by K, over grounds drawn within the errors of known heights.
+
+    Parameters
+    ----------
+    data : FlightData
+    replayed : Replayed
+        Of the rank of one tower.
+    measured : (n,)
+        Reported rank, NaN where the modem gave none.
+    poses : (n,)
+        The replayed pose of each report.
+    ks : sequence of float
+
+    Returns
+    -------
+    dict of str to float
+        Empty for sites without ``ground_points``, scenes of triangles and towers that move.
+    """
+    model = site_model(data.site_place)
+    known = np.flatnonzero(np.isfinite(measured))
+    if not model.ground_points or data.site.scene is not None or replayed.tower_m is not None or not len(known):
+        return {}
+    known = known[spread_out(len(known), _POSES)]
+    some = replayed.poses[poses[known]]
+    agreed = []
+    # seeds 0, 1, ...: two reports of a flight draw the same grounds, and so state the same number
+    for ground in ground_surface(model, data.site.frame).dems(map(np.random.default_rng, range(_DRAWS))):
+        h = replay_poses(_on(data.site, ground), data.settings.rt, replayed.link, some).h[:, 0]
+        agreed.append([float((ranks.channel_rank(h, k) == measured[known]).mean()) for k in ks])
+    return {f"{k:g}": float(sd) for k, sd in zip(ks, np.std(agreed, axis=0, ddof=1), strict=True)}
+
+
+def _on(site: Site, ground: Dem) -> Site:
+    """The site with towers, buildings and trees on another ground."""
+    towers = {
+        name: dataclasses.replace(tower, ground_m=float(np.nan_to_num(ground.ground_m(tower.east_m, tower.north_m))))
+        for name, tower in site.towers.items()
+    }
+    return dataclasses.replace(site, dem=ground, towers=towers)

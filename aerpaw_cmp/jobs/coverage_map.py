@@ -1,0 +1,911 @@
+"""The map job: the replay engine plugged into :mod:`aerpaw_cmp.maps.grid`, foliage modes, study, record of the page.
+
+Paths depend neither on arrays nor on foliage. Each chunk of positions is searched
+once; one element and the arrays, and every foliage mode, are evaluated on the same paths, and a mode re-evaluates only
+the links that foliage touches.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sized
+from dataclasses import asdict, dataclass, field, replace
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.cf import file_attributes, netcdf_bytes
+from ..common.errors import InputError, UsageError, noting_interrupts
+from ..common.jsonable import named
+from ..common.outputs import file_digest
+from ..common.stages import PlannedStage, Progress, Stages, share_of
+from ..common.text import counted
+from ..common.units import (
+    THERMAL_NOISE_DBM_HZ,
+    ComplexArray,
+    FloatArray,
+    carrier_fault,
+    db_from_power,
+    finite_mean,
+    wavelength_m,
+)
+from ..compare.rank import singular_values
+from ..flight.gains import p833_note
+from ..maps import export
+from ..maps import grid as cells
+from ..maps import grid as job
+from ..maps.evaluate import (
+    LOWEST_M,
+    InverseDistance,
+    Predictor,
+    Score,
+    ServingTowerMean,
+    Study,
+    blocked,
+    interpolation_study,
+    rank_fields,
+)
+from ..maps.export import maps_dataset
+from ..maps.grid import PAPER_BUDGET, Grid, LinkBudget
+from ..maps.kriging import OrdinaryKriging
+from ..maps.store import Budget, Reach, TileStore, Tiling
+from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
+from ..propagation.field.foliage import crown_index, foliage_loss_db, foliage_model, stand_loss_db
+from ..propagation.field.sum import channel_matrices, rss_dbm
+from ..propagation.geometry import Link, PathSet, Poses, linear_array, single_element
+from ..propagation.options import Job, Run, Search
+from ..propagation.replay import Replay, replay
+from ..report import maps as page
+from ..report.flight_data import ReportData
+from ..report.prediction import outside_share
+from ..site.site import Site
+from ..site.siteyaml import inputs_of_site, load_site, site_model
+from .predict import CorrectedMaps
+from .tasks import InProcess, Lost, Workers, code_digest
+
+# Modes of the trees, from no loss to total loss; the paper's is the last.
+FOLIAGE = ("none", "attenuating", "opaque")
+
+RATIOS = ("spread", "condition")
+
+# Those of the paper.
+INTERPOLATORS = ("Kriging", "makima", "spline")
+
+# A map of more receivers (positions times heights) is written in tiles of so many positions a side (some 0.7 MB of
+# values per tower, height and foliage mode); so many positions of it are drawn and exported beside the store.
+_TILED_ABOVE, _TILE_CELLS, SHOWN_POSITIONS = 1_000_000, 128, 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class MapSettings:
+    """Settings of a map; the defaults are the paper's (arXiv 2502.10324, table II and section VII).
+
+    Parameters
+    ----------
+    foliage : tuple of str
+        Modes to map, of :data:`FOLIAGE`.
+    spacing_m : float
+        Between neighbouring positions.
+    rss_altitudes_m, rank_altitudes_m : tuple of float
+        Heights above ground.
+    ks : tuple of float
+        Singular-value ratios.
+    carrier_hz : float
+        Carrier frequency.
+    budget : LinkBudget
+        Transmit power, receiver noise and the threshold of coverage.
+    elements, element_spacing : int, float
+        Of the linear arrays at both ends, along north; spacing in wavelengths.
+    max_depth : int
+        Of the replay.
+    neighbours, radius_m : int, float
+        M and r0 of the interpolators; the radius grows with a spacing above the paper's, so that M are in reach.
+    block_m : float
+        Side of the blocks that are left out whole.
+    study : bool
+        Correlation, interpolation and their errors, too.
+    seed : int
+        Of random samples.
+    tile_m : float, optional
+        Side of the tiles of a map that is written tile by tile. Default: :data:`_TILE_CELLS` positions where there are
+        more than :data:`_TILED_ABOVE` receivers, else the map is made in one piece.
+    """
+
+    foliage: tuple[str, ...] = FOLIAGE
+    spacing_m: float = cells.PAPER_SPACING_M
+    rss_altitudes_m: tuple[float, ...] = job.PAPER_RSS_ALTITUDES_M
+    rank_altitudes_m: tuple[float, ...] = job.PAPER_RANK_ALTITUDES_M
+    ks: tuple[float, ...] = job.PAPER_KS
+    carrier_hz: float = 3.4e9
+    budget: LinkBudget = PAPER_BUDGET
+    elements: int = 4
+    element_spacing: float = 0.5
+    max_depth: int = 2
+    neighbours: int = 20
+    radius_m: float = 150.0
+    block_m: float = 300.0
+    study: bool = True
+    seed: int = 0
+    tile_m: float | None = None
+
+    def __post_init__(self) -> None:
+        unknown = [name for name in self.foliage if name not in FOLIAGE]
+        if unknown or not self.foliage:
+            raise UsageError(f"foliage {', '.join(unknown) or '(none given)'!r}", expected=", ".join(FOLIAGE))
+        heights = (*self.rss_altitudes_m, *self.rank_altitudes_m)
+        if not heights or any(not h > 0 for h in heights):
+            raise UsageError(f"heights {heights}", expected="heights above ground [m], above 0")
+        if not self.ks or any(not k > 1 for k in self.ks):
+            raise UsageError(f"K {self.ks}", expected="ratios of singular values, above 1")
+        if fault := carrier_fault(self.carrier_hz):
+            raise UsageError(fault, cause="--carrier-ghz in megahertz or hertz")
+        if self.tile_m is not None and not self.tile_m >= self.spacing_m > 0:
+            raise UsageError(f"tiles of {self.tile_m:g} m", expected=f"at least the spacing, {self.spacing_m:g} m")
+
+    def tile_cells(self, grid: Grid) -> int | None:
+        """Positions along a side of the tiles that are written one by one; None for a map in one piece."""
+        if self.tile_m is not None:
+            return max(1, round(self.tile_m / self.spacing_m))
+        receivers = len(grid) * len({*self.rss_altitudes_m, *self.rank_altitudes_m})
+        return _TILE_CELLS if receivers > _TILED_ABOVE else None
+
+    @property
+    def shown(self) -> str:
+        """The mode that the study and the paper's rows are about: the paper's, when mapped."""
+        return max(self.foliage, key=FOLIAGE.index)
+
+    @property
+    def reach_m(self) -> float:
+        """Radius of the interpolators."""
+        return self.radius_m * max(1.0, self.spacing_m / cells.PAPER_SPACING_M)
+
+
+# A coarse map in seconds: what ``--quick`` puts in place of the paper's settings.
+QUICK: dict[str, Any] = {"spacing_m": 120.0, "rss_altitudes_m": (30.0, 110.0), "rank_altitudes_m": (3.0, 30.0, 110.0)}
+
+
+def map_settings(fields: Mapping[str, Any], *, quick: bool = False) -> MapSettings:
+    """Return the settings of a map from the fields that were given; None leaves the default."""
+    stated = {name: value for name, value in fields.items() if value is not None}
+    return MapSettings(**({**QUICK, **stated} if quick else stated))
+
+
+def site_carrier_hz(site: str) -> float | None:
+    """Return the carrier of the key ``coverage`` of a site [Hz]; None if it names none."""
+    carrier_ghz = site_model(site).coverage.carrier_ghz
+    return None if carrier_ghz is None else carrier_ghz * 1e9
+
+
+def link_budget(site: str, options: Mapping[str, float | None]) -> LinkBudget:
+    """Return the link budget of the key ``coverage`` of a site, with command-line options in its place.
+
+    A threshold among the options replaces either threshold of the site.
+    """
+    stated = {name: value for name, value in options.items() if value is not None}
+    kept = site_model(site).coverage.model_dump(exclude_none=True, exclude={"carrier_ghz"})
+    if "threshold_dbm" in stated or "threshold_snr_db" in stated:
+        kept = {name: value for name, value in kept.items() if not name.startswith("threshold")}
+    return LinkBudget(**(kept | stated))
+
+
+# --- the engine ----------------------------------------------------------------------------------------------------
+
+
+class SiteChannels:
+    """The replay engine as :data:`~aerpaw_cmp.maps.grid.Evaluate`, one per foliage mode, on shared paths.
+
+    The first mode that asks for a chunk has all modes evaluated; the others are kept until asked for.
+    """
+
+    def __init__(self, site: Site, settings: MapSettings) -> None:
+        self.settings, self.names = settings, tuple(site.towers)
+        self.crowns = {mode: crown_index(site.under(mode).trees) for mode in settings.foliage}
+        budget = Budget(
+            carrier_hz=settings.carrier_hz,
+            transmit_power_dbm=settings.budget.tx_power_dbm,
+            gain_db=float(db_from_power(settings.elements)),
+            floor_dbm=THERMAL_NOISE_DBM_HZ,
+        )
+        self.reach = Reach(site, budget, max_depth=settings.max_depth)
+        self.paths = 0
+        self._ready: dict[tuple[str, bytes], job.Evaluation] = {}
+        self._take_site(site)
+
+    def _take_site(self, site: Site) -> None:
+        """Take the part of the site that reaches a tile."""
+        self.site = site
+        apart_m = self.settings.element_spacing * wavelength_m(self.settings.carrier_hz)
+        self.siso = self._link(single_element())
+        self.mimo = self._link(linear_array(self.settings.elements, apart_m, 0.0))
+        self.sources_m = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
+
+    def _link(self, array: Any) -> Link:
+        towers = dict.fromkeys(self.site.towers, array)
+        return Link(self.settings.carrier_hz, towers, array, self.settings.budget.tx_power_dbm, uav_transmits=False)
+
+    def of(self, mode: str) -> job.Evaluate:
+        """The evaluation of one foliage mode."""
+
+        def evaluate(position_m: FloatArray, towers: tuple[str, ...]) -> job.Evaluation:
+            if towers != self.names:
+                raise ValueError(f"towers {towers} are not those of the site")
+            chunk = position_m.tobytes()
+            if (mode, chunk) not in self._ready:
+                self._ready |= {(name, chunk): evaluated for name, evaluated in self._all_modes(position_m).items()}
+            return self._ready.pop((mode, chunk))
+
+        return evaluate
+
+    def try_at(self, position_m: FloatArray) -> None:
+        """Evaluate one position (3,) [m] in every mode, for the errors that it raises."""
+        self._all_modes(position_m[None])
+
+    def tile(self, order: TileOrder, progress: Callable[[float], None] | None = None) -> TileDone:
+        """Maps of one tile, with the towers and buildings that can reach it."""
+        s = self.settings
+        grid = Tiling(Grid.over_area(self.reach.site.area_m, s.spacing_m), order.cells).grid_of(order.number)
+        west, east, south, north = grid.area_m
+        heights = (*s.rss_altitudes_m, *s.rank_altitudes_m)
+        self._take_site(self.reach.of(np.array([[west, south, min(heights)], [east, north, max(heights)]])))
+        self.paths = 0
+        maps = self._maps(grid, progress)
+        return TileDone(maps=maps, paths=self.paths)
+
+    def _maps(self, grid: Grid, progress: Callable[[float], None] | None = None) -> dict[str, job.MapResult]:
+        s = self.settings
+        towers = {name: tower.position_m for name, tower in self.reach.site.towers.items()}
+        return {
+            mode: job.map_job(
+                grid, towers, self.of(mode), rss_altitudes_m=s.rss_altitudes_m, rank_altitudes_m=s.rank_altitudes_m,
+                ks=s.ks, progress=progress if mode == s.foliage[0] else None,
+            )
+            for mode in s.foliage
+        }  # fmt: skip
+
+    def empty(self, grid: Grid) -> dict[str, job.MapResult]:
+        """Maps by foliage mode without any coverage."""
+        self._take_site(replace(self.reach.site, towers={}))
+        return self._maps(grid)
+
+    def _all_modes(self, position_m: FloatArray) -> dict[str, job.Evaluation]:
+        s, n = self.settings, len(position_m)
+        if not self.site.towers:
+            none = np.empty((n, 0))
+            nothing = job.Evaluation(none, none, none, np.empty((n, 0, s.elements)))
+            return dict.fromkeys(s.foliage, self._for_all_towers(nothing))
+        poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (n, 3, 3)))
+        search = Search(max_depth=s.max_depth)
+        links = n * len(self.site.towers)
+        run = Run(job=Job(self.reach.extent_m, links, links))
+        replayed = replay(self.site, self.siso, poses, search, run=run)
+        self.paths += len(replayed.paths)
+        siso, mimo = replayed.h, channel_matrices(replayed.paths, replayed.faces, self.sources_m, poses, self.mimo).h
+        result = {}
+        for mode in s.foliage:
+            loss = self._loss_db(mode, replayed.paths, poses)
+            shaded_siso = self._shaded(siso, replayed, poses, self.siso, loss)
+            shaded_mimo = self._shaded(mimo, replayed, poses, self.mimo, loss)
+            level = self._rss_dbm(shaded_mimo)
+            covered = np.isfinite(level)
+            spread = np.where(covered, level_sd_db(shaded_mimo), np.nan)
+            sigma = np.where(covered[..., None], singular_values(shaded_mimo), 0.0)
+            result[mode] = self._for_all_towers(job.Evaluation(self._rss_dbm(shaded_siso), level, spread, sigma))
+        return result
+
+    def _for_all_towers(self, some: job.Evaluation) -> job.Evaluation:
+        """The evaluation of the towers that reach a tile, with the others out of coverage."""
+        if len(self.site.towers) == len(self.names):
+            return some
+        at = [self.names.index(name) for name in self.site.towers]
+
+        def placed(values: FloatArray) -> FloatArray:
+            every = np.full((len(values), len(self.names), *values.shape[2:]), np.nan)
+            every[:, at] = values
+            return every
+
+        siso, mimo, spread = (placed(level) for level in some.levels)
+        return job.Evaluation(siso, mimo, spread, placed(some.singular_values))
+
+    def _rss_dbm(self, h: ComplexArray) -> FloatArray:
+        return rss_dbm(_beam_power(h), self.settings.budget.tx_power_dbm)
+
+    def _above_ground(self, position_m: FloatArray) -> FloatArray:
+        if self.site.dem is None:
+            return position_m
+        ground = self.site.dem.ground_m(position_m[:, 0], position_m[:, 1])
+        return np.column_stack([position_m[:, :2], position_m[:, 2] + ground])
+
+    def _loss_db(self, mode: str, paths: PathSet, poses: Poses) -> FloatArray | None:
+        if mode == "none" or not self.site.wooded:
+            return None
+        model = foliage_model(mode, self.settings.carrier_hz)
+        source, target = self.sources_m[paths.tower], poses.position_m[paths.pose]
+        trees_db = foliage_loss_db(source, paths.vertices_m, target, self.crowns[mode], model)
+        wavelength = wavelength_m(self.settings.carrier_hz)
+        return trees_db + stand_loss_db(self.site.under(mode), source, paths.vertices_m, target, model, wavelength)
+
+    def _shaded(
+        self, clear: ComplexArray, replayed: Replay, poses: Poses, link: Link, loss_db: FloatArray | None
+    ) -> ComplexArray:
+        """Channel matrices with foliage: those of links without any loss stay as they are."""
+        if loss_db is None:
+            return clear
+        paths, h = replayed.paths, clear.copy()
+        touched = np.zeros(h.shape[:2], dtype=np.bool_)
+        touched[paths.pose[loss_db > 0], paths.tower[loss_db > 0]] = True
+        # a path of infinite loss is an obstacle, not a weak path
+        again = touched[paths.pose, paths.tower] & np.isfinite(loss_db)
+        some = channel_matrices(paths.select(again), replayed.faces, self.sources_m, poses, link, loss_db[again])
+        h[touched] = some.h[touched]
+        return np.asarray(h)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TileOrder:
+    """A tile of a map, for a worker: its number among tiles of so many positions a side."""
+
+    site: str
+    settings: MapSettings
+    cells: int
+    number: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TileDone:
+    """Answer of a worker: maps by foliage mode, and how many paths there were."""
+
+    maps: Mapping[str, job.MapResult]
+    paths: int
+
+
+def map_tile(order: TileOrder) -> TileDone:
+    """Evaluate a tile of a map."""
+    return _channels_of(order.site, order.settings).tile(order)
+
+
+@lru_cache(maxsize=1)
+def _channels_of(site: str, settings: MapSettings) -> SiteChannels:
+    """Channels of a site, which a worker keeps from tile to tile."""
+    return SiteChannels(load_site(site), settings)
+
+
+def _beam_power(h: ComplexArray) -> FloatArray:
+    """Received share of the transmit power of channels (..., n_rx, n_tx): equal feed in phase, mean over receivers."""
+    amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
+    return np.asarray((amplitude.real**2 + amplitude.imag**2).mean(axis=-1), dtype=np.float64)
+
+
+def level_sd_db(h: ComplexArray) -> FloatArray:
+    """Standard deviation of the level over the element pairs of channels (..., n_rx, n_tx) [dB]."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(db_from_power(h.real**2 + h.imag**2).std(axis=(-2, -1)))
+
+
+# --- the job -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True)
+class MapOutcome:
+    """Everything that one run found.
+
+    ``maps`` by foliage mode; of a map in tiles some positions, as ``tiles`` says. ``studies``: positions out of
+    coverage as no sample ("missing"), as rank 0 ("zero"), and as rank 0 with M random samples within the radius in
+    place of the M nearest ("random"). ``blocks``: errors of each interpolator with square blocks left out whole.
+    """
+
+    site: Site
+    settings: MapSettings
+    maps: dict[str, job.MapResult] = field(default_factory=dict)
+    studies: dict[str, Study] = field(default_factory=dict)
+    blocks: dict[str, Score] = field(default_factory=dict)
+    correlations: dict[str, BinnedCorrelation] = field(default_factory=dict)
+    paths: int = 0
+    tiles: dict[str, Any] = field(default_factory=dict)
+    corrected: CorrectedMaps | None = None
+    flights: tuple[ReportData, ...] = ()
+
+    @property
+    def shown(self) -> job.MapResult:
+        """The maps of the paper's mode."""
+        return self.maps[self.settings.shown]
+
+    def ordered(self) -> list[tuple[str, job.MapResult]]:
+        """Modes and maps, the paper's mode first."""
+        return sorted(self.maps.items(), key=lambda item: -FOLIAGE.index(item[0]))
+
+
+def make_maps(
+    site: Site,
+    settings: MapSettings,
+    stages: Stages,
+    *,
+    workers: Workers | None = None,
+    name: str = "",
+    store: Path | None = None,
+    force: bool = False,
+) -> MapOutcome:
+    """Evaluate the grid of a site in every foliage mode.
+
+    Parameters
+    ----------
+    site : Site
+    settings : MapSettings
+    stages : Stages
+    workers : Workers, optional
+        Share the pieces of the grid.
+    name : str
+        The site as workers load it.
+    store : Path, optional
+        Where a map in tiles is written; without it every map is made in one piece.
+    force : bool
+        Replace the store of another map.
+
+    Returns
+    -------
+    MapOutcome
+        Maps by foliage mode; no study yet.
+
+    Raises
+    ------
+    UsageError, InputError, OutputError
+        The store is not that of this map; tiles were lost; the disk does not take them.
+    """
+    outcome = MapOutcome(site, settings)
+    grid = Grid.over_area(site.area_m, settings.spacing_m)
+    crew = workers or InProcess()
+    share = share_of(stages.progress, "maps")
+    tile_cells = None if store is None else settings.tile_cells(grid)
+    # four tiles a worker: with one each all would wait for the slowest
+    shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))
+    tiling = Tiling(grid, tile_cells or (shared if crew.count > 1 else max(grid.shape)))
+    with stages("maps"):
+        channels = SiteChannels(site, settings)
+        evaluate = partial(channels.tile, progress=share if len(tiling) < 2 else None) if crew.count < 2 else map_tile
+        order = partial(TileOrder, site=name, settings=settings, cells=tiling.cells)
+        if store is not None and tile_cells:
+            book = TileStore(store, tiling, _job_of(name, settings), force=force)
+            _write_tiles(outcome, book, channels, partial(crew.run, evaluate), order, stages.progress)
+            return outcome
+        parts: dict[int, Mapping[str, job.MapResult]] = {}
+
+        def done(number: int, result: TileDone | Lost) -> None:
+            if isinstance(result, Lost):
+                raise InputError(f"a tile of the map: {result.message}")
+            parts[number] = result.maps
+            outcome.paths += result.paths
+            share(len(parts) / len(tiling))
+
+        crew.run(evaluate, [order(number=number) for number in range(len(tiling))], done)
+        for mode in settings.foliage:
+            outcome.maps[mode] = tiling.joined({number: maps[mode] for number, maps in parts.items()})
+    return outcome
+
+
+def _write_tiles(
+    outcome: MapOutcome,
+    store: TileStore,
+    channels: SiteChannels,
+    run: Callable[..., None],
+    order: Callable[..., TileOrder],
+    progress: Progress,
+) -> None:
+    """Compute the tiles that a store lacks, write each as it comes, and read some positions of all for the page."""
+    empty, tiling = channels.empty(store.tiling.grid_of(0)), store.tiling
+    missing = store.begin(empty, outcome.site.frame, _about_maps(outcome.site))
+    if store.damaged:
+        progress(f"{counted(store.damaged, 'finished tile')} with missing or changed chunks: computed again")
+    if len(missing) < len(tiling):
+        progress(f"{len(tiling) - len(missing)} of {counted(len(tiling), 'tile')} computed before")
+    lost: list[str] = []
+    written = itertools.count(len(tiling) - len(missing) + 1)
+
+    def done(number: int, result: TileDone | Lost) -> None:
+        if isinstance(result, Lost):
+            lost.append(result.message)
+            return
+        store.write(missing[number], result.maps, result.paths)
+        progress("maps", next(written) / len(tiling))
+
+    with noting_interrupts(f"{store.path} keeps the finished tiles: the same command goes on"):
+        run([order(number=number) for number in missing], done)
+    if lost:
+        raise InputError(
+            f"{len(lost)} of {counted(len(tiling), 'tile')} lost: {lost[0]}",
+            cause="too little memory; the finished tiles are kept, and the same command computes the others",
+        )
+    outcome.paths = int(store.paths().sum())
+    step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
+    outcome.maps |= store.read(empty, step)
+    # every n-th position has no neighbours at the distances that the study is about
+    outcome.settings = replace(outcome.settings, study=False)
+    outcome.tiles = {
+        "store": str(store.path), "tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step,
+    }  # fmt: skip
+
+
+def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
+    """All that the values of a map depend on: settings, content of the site's files, program."""
+    without = ("study", "neighbours", "radius_m", "block_m", "seed")
+    chosen = {key: str(value) for key, value in asdict(settings).items() if key not in without}
+    files = [file_digest(file)[:12] for file in inputs_of_site(site)]
+    return {"site": files, **chosen, "program": code_digest()[:12]}
+
+
+def map_stages(place: Site, settings: MapSettings, flights: Sized = ()) -> list[PlannedStage]:
+    """Return the stages of a map, for its dry run; one position is mapped, so that it refuses what the map would."""
+    grid = Grid.over_area(place.area_m, settings.spacing_m)
+    SiteChannels(place, settings).try_at(np.append(grid.points_m[0, :2], min(settings.rss_altitudes_m, default=30.0)))
+    heights, tile = {*settings.rss_altitudes_m, *settings.rank_altitudes_m}, settings.tile_cells(grid)
+    sides = {"position": len(grid), "height": len(heights), "tower": len(place.towers)}
+    work = f"{counted(math.prod(sides.values()), 'link')}: {', '.join(counted(n, name) for name, n in sides.items())}"
+    stages = {
+        "maps": work + (f", in tiles of {tile} x {tile} positions" if tile else ""),
+        "correct, compare": counted(len(flights), "flight") if flights else "",
+        "study": "correlation and interpolation" if settings.study and not tile else "",
+        "export, page": f"layers of {counted(len(settings.foliage), 'foliage mode')}",
+    }
+    return [PlannedStage(name, what) for name, what in stages.items() if what]
+
+
+def check_study(place: Site, settings: MapSettings) -> None:
+    """Refuse a study of fewer than two rank heights before any map is computed."""
+    studied = settings.study and not settings.tile_cells(Grid.over_area(place.area_m, settings.spacing_m))
+    heights = [height for height in settings.rank_altitudes_m if height >= LOWEST_M]
+    if studied and len(heights) < 2:
+        raise UsageError(
+            f"{counted(len(heights), 'rank height')} at or above {LOWEST_M:g} m",
+            expected="two or more for the study, or --no-study",
+        )
+
+
+def study_maps(outcome: MapOutcome, stages: Stages) -> None:
+    """Correlation, interpolation and its errors, on the maps of the paper's foliage mode."""
+    s, result = outcome.settings, outcome.shown
+    heights, rank = rank_fields(result)
+    local: dict[str, Any] = {"neighbours": s.neighbours, "radius_m": s.reach_m, "seed": s.seed}
+    with stages("leave one out"):
+        zeros, towers = rank_fields(result, "zero")[1], result.towers_m
+        outcome.studies["missing"] = interpolation_study(result.grid, rank, towers, **local)
+        outcome.studies["zero"] = interpolation_study(result.grid, zeros, towers, **local)
+        outcome.studies["random"] = interpolation_study(result.grid, zeros, towers, selection="random", **local)
+    with stages("correlation"):
+        points, width = result.grid.points_m, s.spacing_m
+        outcome.correlations = {
+            "horizontal": field_correlation(points, rank, width_m=width),
+            "vertical": vertical_correlation(heights, np.moveaxis(rank, 0, -1)),
+            "RSS": field_correlation(points, result.rss().T, width_m=width),
+        }
+    with stages("held-out tests"):
+        for name, model in _far_reaching(outcome).items():
+            outcome.blocks[name] = blocked(model, result.grid.points_m, rank, s.block_m)
+
+
+def _far_reaching(outcome: MapOutcome) -> dict[str, Predictor]:
+    """Interpolators that reach as far as they must where every sample is far."""
+    neighbours = outcome.settings.neighbours
+    return {
+        "Kriging": OrdinaryKriging(outcome.studies["missing"].fit, neighbours, outside="nearest"),
+        "nearest": InverseDistance(neighbours=1, radius_m=np.inf),
+        "inverse distance": InverseDistance(neighbours=neighbours, radius_m=np.inf),
+        "serving-tower mean": ServingTowerMean(outcome.shown.towers_m),
+    }
+
+
+# --- the page ------------------------------------------------------------------------------------------------------
+
+
+def maps_record(
+    outcome: MapOutcome,
+    *,
+    name: str,
+    stages_s: Mapping[str, float],
+    paper: Iterable[page.PaperRow] = (),
+) -> page.MapsData:
+    """The record that :func:`aerpaw_cmp.report.maps.write_maps` turns into files.
+
+    Parameters
+    ----------
+    outcome : MapOutcome
+    name : str
+        Of the maps.
+    stages_s : mapping of str to float
+        Seconds per stage.
+    paper : iterable of PaperRow
+        The table of what the paper states.
+
+    Returns
+    -------
+    MapsData
+    """
+    s, result, flown = outcome.settings, outcome.shown, outcome.corrected
+    rss = tuple(item for mode, maps in outcome.ordered() for item in _rss_maps(maps, mode, s.budget))
+    rank = tuple(item for mode, maps in outcome.ordered() for item in _rank_maps(maps, mode))
+    towers = result.tower_names if len(result.tower_names) > 1 else ()
+    by_tower = (item for mode, maps in outcome.ordered() for tower in towers for item in _rank_maps(maps, mode, tower))
+    return page.MapsData(
+        title=f"Coverage and rank maps, {outcome.site.name}",
+        name=name,
+        site=outcome.site,
+        east_m=result.grid.east_m,
+        north_m=result.grid.north_m,
+        borders_m=tuple(border.line_m for border in result.borders),
+        rss=rss,
+        corrected=() if flown is None else tuple(flown.rss_maps(result.grid)),
+        corrected_rank=tuple(_rank_versions(outcome)),
+        flights=outcome.flights,
+        flown_m=() if flown is None else tuple(line.T for line in flown.prediction.flown.values()),
+        outside_flown=0.0 if flown is None else outside_share(flown.prediction.table),
+        budget="" if s.budget == PAPER_BUDGET else f"{s.budget.sentence()} ",
+        corrected_words="" if flown is None else flown.prediction.verdict,
+        rank=rank,
+        rank_by_tower=tuple(by_tower),
+        layers=(
+            *_further_layers(outcome),
+            *(() if flown is None else flown.page_layers(result.grid)),
+            *_linked_layers(outcome),
+        ),
+        correlation=tuple(_correlation_panels(outcome)),
+        errors=tuple(_errors(outcome)),
+        paper=tuple(paper),
+        warnings=() if flown is None else tuple(flown.prediction.warnings),
+        notes=_notes(outcome),
+        settings=asdict(s),
+        stages_s=dict(stages_s),
+        metrics=_metrics(outcome),
+    )
+
+
+def _rss_maps(result: job.MapResult, mode: str, budget: LinkBudget) -> Iterator[page.RssMap]:
+    kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
+    for antennas in kinds:
+        for row, height in enumerate(result.rss_altitudes_m):
+            for tower in (*result.tower_names, None):
+                values = result.rss(antennas, tower)[row]
+                yield page.RssMap(
+                    tower=tower or page.JOINT,
+                    antennas=antennas.upper(),
+                    altitude_m=height,
+                    rss_dbm=result.grid.raster(values),
+                    coverage=float(budget.covered(values).mean()),
+                    foliage=mode,
+                )
+
+
+def _rank_maps(result: job.MapResult, mode: str, tower: str | None = None) -> Iterator[page.RankMap]:
+    """Rank to the serving tower, or to one."""
+    ranks, shares = result.ranks(tower), result.rank_shares(tower)
+    for (column, k), (row, height) in itertools.product(enumerate(result.ks), enumerate(result.rank_altitudes_m)):
+        yield page.RankMap(
+            k=k,
+            altitude_m=height,
+            rank=result.grid.raster(ranks[row, column]).astype(np.int64),
+            share=shares[row, column],
+            foliage=mode,
+            **({} if tower is None else {"tower": tower}),
+        )
+
+
+def _rank_versions(outcome: MapOutcome) -> Iterator[page.RankMap]:
+    """Traced and learned ranks of every tower whose receiver is learned."""
+    if outcome.corrected is not None:
+        for tower in dict.fromkeys(tower for tower, _ in outcome.corrected.ranks):
+            yield from _rank_maps(outcome.shown, outcome.settings.shown, tower)
+        yield from outcome.corrected.rank_maps(outcome.shown.grid)
+
+
+def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
+    """Layers of the linked map alone: how many towers cover a position, at what share of heights, which one serves."""
+    kinds: tuple[job.Antennas, ...] = ("mimo", "siso")
+    budget = outcome.settings.budget
+    for mode, result in outcome.ordered():
+        raster = result.grid.raster
+        for antennas in kinds:
+            axes = {"Antennas": antennas.upper(), "Foliage": mode}
+            each = budget.covered(result.rss_mimo_dbm if antennas == "mimo" else result.rss_siso_dbm)
+            for row, height in enumerate(result.rss_altitudes_m):
+                yield page.MapLayer(
+                    quantity="Towers in coverage", unit="towers", axes={**axes, **page.at_height(height)},
+                    values=raster(each[row].sum(axis=0)),
+                )  # fmt: skip
+            for tower in (None, *result.tower_names) if len(result.rss_altitudes_m) > 1 else ():
+                covered = budget.covered(result.rss(antennas, tower)).mean(axis=0)
+                yield page.MapLayer(
+                    quantity="Probability of coverage over heights", unit="%",
+                    axes={"Tower": tower or page.JOINT, **axes}, values=raster(100.0 * covered),
+                )  # fmt: skip
+    shown = outcome.shown
+    if len(shown.tower_names) > 1:
+        yield page.MapLayer(
+            quantity="Serving tower", unit="", axes={}, values=shown.grid.raster(shown.serving.astype(np.float64)),
+            classes=shown.tower_names,
+        )  # fmt: skip
+
+
+def _budget_layers(outcome: MapOutcome) -> Iterator[cells.Layer]:
+    """Yield the margin above the threshold and the SNR of the nearest tower, per foliage mode and height."""
+    budget = outcome.settings.budget
+    for mode, result in outcome.ordered():
+        for row, height in enumerate(result.rss_altitudes_m):
+            level, at = result.rss()[row], f"{job.in_name(height)}m_joint_{mode}"
+            where = f"{height:g} m, nearest tower, foliage {mode}"
+            if budget.level_dbm is not None:
+                margin = np.round(level - budget.level_dbm, 2)
+                yield cells.Layer(
+                    f"margin_mimo_h{at}", margin, "dB", f"Margin above {budget.level_dbm:.1f} dBm, {where}"
+                )
+            if budget.noise_dbm is not None:
+                yield cells.Layer(f"snr_mimo_h{at}", np.round(level - budget.noise_dbm, 2), "dB", f"SNR, {where}")
+
+
+def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
+    """Singular-value spread and condition number, then what foliage changes."""
+    result, s = outcome.shown, outcome.settings
+    raster = result.grid.raster
+    for layer in _budget_layers(outcome):
+        quantity, _, height = layer.title.partition(", ")
+        height, _, foliage = height.partition(", nearest tower, foliage ")
+        yield page.MapLayer(
+            quantity=quantity, unit="dB", axes={"Foliage": foliage, "Height": height}, values=raster(layer.values)
+        )
+    for name, values in (("Singular-value spread", result.spread_db), ("Condition number", result.condition_db)):
+        joint = values[..., result.serving, np.arange(len(result.grid))]
+        for row, height in enumerate(result.rank_altitudes_m):
+            shown = raster(np.minimum(joint[row], job.RATIO_LIMIT_DB))
+            yield page.MapLayer(
+                quantity=f"{name}, foliage {s.shown}", unit="dB", axes=page.at_height(height), values=shown
+            )
+    for mode, maps, change in _foliage_changes(outcome):
+        for row, height in enumerate(maps.rss_altitudes_m):
+            yield page.MapLayer(
+                quantity=f"RSS lost by foliage, {mode}", unit="dB", axes=page.at_height(height),
+                values=raster(change.rss_loss_db[row]), difference=True,
+            )  # fmt: skip
+        for column, k in enumerate(maps.ks if mode == s.shown else ()):
+            for row, height in enumerate(maps.rank_altitudes_m):
+                covered = maps.ranks()[row, column] > 0
+                yield page.MapLayer(
+                    quantity=f"Rank change by foliage, {mode}, K = {k:g}", unit="", axes=page.at_height(height),
+                    values=raster(np.where(covered, change.rank_change[row, column], np.nan)), difference=True,
+                )  # fmt: skip
+
+
+def _foliage_changes(outcome: MapOutcome) -> Iterator[tuple[str, job.MapResult, job.FoliageDifference]]:
+    """Effect of each foliage mode, where a map without foliage is there to compare with."""
+    if (clear := outcome.maps.get("none")) is not None:
+        yield from (
+            (mode, maps, job.foliage_difference(clear, maps)) for mode, maps in outcome.ordered() if mode != "none"
+        )
+
+
+def _correlation_panels(outcome: MapOutcome) -> Iterator[page.Correlation]:
+    if not outcome.studies:
+        return
+    distance = np.linspace(0.0, 500.0, 251)
+    for key, title in (("zero", "Rank vectors, Z as rank 0"), ("missing", "Rank vectors, Z left out")):
+        fit, words = outcome.studies[key].fit, f"bi-exponential, RMSE {outcome.studies[key].fit.rmse:.4f}"
+        modelled = {"fit_distance_m": distance, "fit": fit(distance), "fit_label": words}
+        yield _correlation(title, outcome.studies[key].correlation, **modelled)
+    titles = {"horizontal": "Rank, one height", "vertical": "Rank, across heights", "RSS": "RSS, one height"}
+    for key, binned in outcome.correlations.items():
+        yield _correlation(titles[key], binned)
+
+
+def _correlation(title: str, binned: BinnedCorrelation, **modelled: Any) -> page.Correlation:
+    excluded = binned.excluded_constant
+    return page.Correlation(title=title, **named(binned, "distance_m correlation"), excluded=excluded, **modelled)
+
+
+def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
+    if not outcome.studies:
+        return
+    heights, _ = rank_fields(outcome.shown)
+    chosen = outcome.studies["random"].scores
+    tables: dict[str, dict[str, Score]] = {
+        "leave one out": dict(outcome.studies["missing"].scores),
+        "leave one out, Z as rank 0": dict(outcome.studies["zero"].scores),
+        "leave one out, Z as rank 0, random samples": {name: chosen[name] for name in INTERPOLATORS if name in chosen},
+        f"blocks of {outcome.settings.block_m:g} m left out": outcome.blocks,
+    }
+    fields = list(itertools.product(enumerate(heights), enumerate(outcome.shown.ks)))
+    for evaluation, scores in tables.items():
+        for method, score in scores.items():
+            for (row, height), (column, k) in fields:
+                yield page.MapError(
+                    evaluation=evaluation, method=method, k=k, altitude_m=height,
+                    mae=float(score.mae[row, column]), n=int(score.n[row, column]),
+                )  # fmt: skip
+
+
+def _notes(outcome: MapOutcome) -> tuple[str, ...]:
+    """Notes on the loss in crowns where it is continued beyond its table, and on tiles."""
+    note = p833_note(outcome.settings.carrier_hz) if "attenuating" in outcome.settings.foliage else None
+    notes = [outcome.settings.budget.sentence(), *([] if note is None else [note])]
+    if outcome.tiles:
+        each, all_ = outcome.tiles["shown_every"], outcome.tiles["positions"]
+        notes.append(
+            f"The map of {counted(all_, 'position')} is in {Path(outcome.tiles['store']).name}. "
+            f"This page and the files beside it hold one in {each} along either axis."
+        )
+    return tuple(notes)
+
+
+def _metrics(outcome: MapOutcome) -> dict[str, Any]:
+    """Content of metrics.json beyond the tables of the page."""
+    result: dict[str, Any] = {
+        **named(outcome, "paths tiles"),
+        "settings": asdict(outcome.settings),
+    }
+    for key in ("zero", "missing"):
+        if key not in outcome.studies:
+            continue
+        study = outcome.studies[key]
+        result.setdefault("correlation", {})[f"z_{key}"] = {
+            **named(study.fit, "c1 c2 c3 c4 rmse degenerate message"),
+            **named(study.correlation, "positions excluded_constant"),
+        }
+    for mode, maps, change in _foliage_changes(outcome):
+        result.setdefault("foliage", {})[mode] = [
+            {"altitude_m": height, "mean_rss_loss_db": finite_mean(loss_db), "lost": float(lost.mean())}
+            for height, loss_db, lost in zip(maps.rss_altitudes_m, change.rss_loss_db, change.lost, strict=True)
+        ]
+    return result
+
+
+# --- files beside the page -----------------------------------------------------------------------------------------
+
+
+def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[Path]:
+    """layers.csv and maps.kmz; maps.nc where its libraries are installed.
+
+    ``progress`` is told where it is left out, and why.
+    """
+    site, grid = outcome.site, outcome.shown.grid
+    flown = [*_budget_layers(outcome), *([] if outcome.corrected is None else outcome.corrected.layers())]
+    joint, every = (_all_layers(outcome, towers_too=too) + flown for too in (False, True))
+    names = {layer.name for layer in joint}
+    every = [layer for layer in every if layer.name in names or not layer.name.startswith(RATIOS)]
+    shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
+    named = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
+    table = export.MapLayers(
+        grid=grid, frame=site.frame, layers=every, towers_m=named, borders=outcome.shown.borders, credit=site.credit
+    )
+    written = [
+        export.write_csv(folder / "layers.csv", table),
+        export.write_kmz(folder / "maps.kmz", replace(table, layers=shown), title=site.name),
+    ]
+    try:
+        maps = maps_dataset(dict(outcome.ordered()), site.frame, _about_maps(site), flown)
+        (folder / "maps.nc").write_bytes(netcdf_bytes(maps))
+        written.append(folder / "maps.nc")
+    except UsageError as missing:
+        progress(str(missing))
+    return written
+
+
+def _about_maps(site: Site) -> dict[str, str]:
+    """Attributes of maps.nc and of a store of tiles."""
+    about = file_attributes(
+        title=site.name,
+        source="ray tracing",
+        comment="A missing level has no path. A rank of 0 is a code: no path.",
+    )
+    return about | ({"acknowledgement": site.credit} if site.credit else {})
+
+
+def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
+    """Layers of all modes, with the mode in their names; the serving tower once."""
+    result: list[cells.Layer] = []
+    for mode, maps in outcome.ordered():
+        serving, *layers = job.layers_of(maps, towers_too=towers_too)
+        result += [] if result else [serving]
+        for layer in layers:
+            # a hundredth of a dB is more than the site's data hold, and a third of the bytes
+            values = layer.values if layer.classes else np.round(layer.values, 2)
+            if layer.name.startswith(RATIOS):
+                values = np.minimum(values, job.RATIO_LIMIT_DB)
+            title = f"{layer.title}, foliage {mode}"
+            result.append(replace(layer, name=f"{layer.name}_{mode}", title=title, values=values))
+    return result

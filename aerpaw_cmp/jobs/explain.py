@@ -1,0 +1,265 @@
+"""``aerpaw-cmp explain``: every path of one link at one instant."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.jsonable import fields_of, json_object
+from ..common.stages import Progress, logged
+from ..common.units import FloatArray
+from ..flight.data import FlightData, RankSeries, RssSeries, Times, load_data
+from ..flight.gains import load_with_learned, path_loss, roughness_loss
+from ..flight.replay import estimate_clocks, rank_poses, replay_poses, telemetry_time, valid_poses
+from ..flight.settings import RtSettings
+from ..propagation.check.explain import (
+    ExplainedPath,
+    explain_paths,
+    further_path_lines,
+    power_sum_dbm,
+    simple_paths,
+    why_not,
+)
+from ..propagation.drivers import site_with_tower_at
+from ..propagation.geometry import Link, Poses
+from ..propagation.options import Engine
+from ..propagation.replay import Replay
+from ..report.texts import iso_time
+from ..site.site import Site
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Explanation:
+    """One link at one instant.
+
+    Parameters
+    ----------
+    level_dbm : float
+        Coherent level of the replay, NaN out of coverage: ``simulated_dbm`` of rss.csv with ``rss.field: coherent``.
+    power_sum_dbm : float
+        Of the paths' powers.
+    absent : tuple of (str, str)
+        Line of sight or ground reflections that are not there, and why.
+    """
+
+    flight: str
+    tower: str
+    channel: str
+    time_utc: str
+    time_s: float
+    position_m: tuple[float, float, float]
+    transmit_power_dbm: float
+    carrier_hz: float
+    engine: str
+    paths: tuple[ExplainedPath, ...]
+    level_dbm: float
+    power_sum_dbm: float
+    measured_db: float | None
+    unit: str
+    absent: tuple[tuple[str, str], ...]
+    notes: tuple[str, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; what is not finite is None."""
+        absent = [{"path": path, "reason": reason} for path, reason in self.absent]
+        return json_object(**(fields_of(self) | {"paths": [path.as_dict() for path in self.paths], "absent": absent}))
+
+
+def run_explain(
+    flight: Path,
+    *,
+    time: str,
+    tower: str,
+    channel: str | None = None,
+    engine: Engine | None = None,
+    logs_root: Path | None = None,
+    progress: Progress = logged,
+) -> Explanation:
+    """Explain the link to a tower at the sample nearest to an instant.
+
+    Parameters
+    ----------
+    flight : Path
+    time : str
+        Seconds after the first sample of the tower, or ISO 8601; without an offset in the flight's time zone.
+    tower : str
+    channel : str, optional
+        Of the RSS logs; "rank" for the rank log. Default: the first series of the tower.
+    engine : {"image", "sionna"}, optional
+        Whose paths; default ``rt.engine``.
+    logs_root : Path, optional
+    progress : Progress
+
+    Returns
+    -------
+    Explanation
+        The paths of the link with their losses [dB], what is not there and why.
+
+    Raises
+    ------
+    UsageError
+        Unknown tower or channel, a time that is none or lies outside the logs, no pose there.
+    """
+    settings = load_with_learned(flight)
+    data = load_data(settings, flight.parent, logs_root)
+    series = _series(data, tower, channel)
+    at, seconds = _sample(series, time, settings.timezone)
+    link, pose, notes, instant = _pose(data, series, at, progress)
+    if tower in data.nodes:  # as it stood at that moment
+        place, known = data.tower_at(tower, instant)
+        _check_pose(known, series, at)
+        data = dataclasses.replace(data, site=site_with_tower_at(data.site, tower, place[0]))
+    rt = settings.rt.model_copy(update={"engine": "sionna"}) if engine == "sionna" else settings.rt
+    replayed = replay_poses(data.site, rt, link, pose, engine=engine or rt.engine, progress=progress)
+    source = data.site.towers[tower].position_m
+    if tower in data.nodes:
+        notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
+    paths = _paths(data.site, rt, replayed, link, pose, source)
+    if isinstance(series, RssSeries) and settings.rss.field != "coherent":
+        notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
+    notes += further_path_lines(replayed, np.asarray(source), pose, link)
+    measured = float(series.measured_db[at]) if isinstance(series, RssSeries) else None
+    return Explanation(
+        flight=settings.flight.name,
+        tower=tower,
+        channel=series.channel,
+        time_utc=str(iso_time(series.time[at])),
+        time_s=seconds,
+        position_m=tuple(float(x) for x in pose.position_m[0]),  # type: ignore[arg-type]
+        transmit_power_dbm=link.transmit_power_dbm,
+        carrier_hz=link.carrier_hz,
+        engine=replayed.engine,
+        paths=paths,
+        level_dbm=float(replayed.rss_dbm[0, 0]),
+        power_sum_dbm=power_sum_dbm(paths) if paths else float("nan"),
+        measured_db=measured,
+        unit=series.unit if isinstance(series, RssSeries) else "",
+        absent=tuple(_absent(replayed, source, pose.position_m[0])),
+        notes=(*data.cautions, *notes, *(f"left out: {what}" for what in replayed.left_out)),
+    )
+
+
+def _series(data: FlightData, tower: str, channel: str | None) -> RssSeries | RankSeries:
+    every = [series for _, series in data.series]
+    towers = list(dict.fromkeys(series.tower for series in every))
+    mine = {series.channel: series for series in reversed(every) if series.tower == tower}
+    if not mine:
+        at_site = tower in data.site.towers
+        raise UsageError(
+            f"no log of tower {tower!r}",
+            expected="one of " + ", ".join(towers),
+            cause="the site has it, the flight has not measured there" if at_site else "a typing error",
+        )
+    if channel is None:
+        return mine[list(mine)[-1]]
+    if channel not in mine:
+        raise UsageError(f"no channel {channel!r} at {tower}", expected="one of " + ", ".join(reversed(mine)))
+    return mine[channel]
+
+
+def _sample(series: RssSeries | RankSeries, time: str, zone: str | None) -> tuple[int, float]:
+    """Number of the sample nearest to an instant, and its seconds after the first."""
+    first, last = series.time.min(), series.time.max()
+    span = float((last - first) / np.timedelta64(1, "s"))
+    instant = _instant(time, first, zone)
+    step = span / max(len(series.time) - 1, 1)
+    after_s = float((instant - first) / np.timedelta64(1, "s"))
+    if not -max(step, 1.0) <= after_s <= span + max(step, 1.0):
+        raise UsageError(
+            f"--time {time} is {abs(after_s) if after_s < 0 else after_s - span:.1f} s "
+            f"{'before the first' if after_s < 0 else 'after the last'} sample of {series.tower}",
+            expected=f"0 to {span:.1f} s, or {iso_time(first)} to {iso_time(last)}",
+        )
+    at = int(np.argmin(np.abs(series.time - instant)))
+    return at, float((series.time[at] - first) / np.timedelta64(1, "s"))
+
+
+def _instant(text: str, first: Any, zone: str | None) -> Any:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = float("nan")
+    if np.isfinite(seconds) and abs(seconds) < 1e9:
+        return first + np.timedelta64(round(1e9 * seconds), "ns")
+    try:
+        parsed = datetime.fromisoformat(text.strip().replace("Z", "+00:00"))
+    except ValueError:
+        raise UsageError(
+            f"--time {text!r}",
+            expected="seconds after the tower's first sample (12.5), or a time such as 2025-06-01T14:00:05.5Z",
+        ) from None
+    if parsed.tzinfo is None:
+        parsed = parsed.replace(tzinfo=ZoneInfo(zone or "UTC"))
+    return np.datetime64(parsed.astimezone(timezone.utc).replace(tzinfo=None), "ns")
+
+
+def _pose(
+    data: FlightData, series: RssSeries | RankSeries, at: int, progress: Progress
+) -> tuple[Link, Poses, list[str], Times]:
+    """Link and pose of a sample, as the report replays it, and its instant (1,) on the telemetry's clock."""
+    rt, notes = data.settings.rt, []
+    if isinstance(series, RssSeries):
+        time = series.time
+        if data.settings.rss.lag == "apply" or isinstance(data.settings.rss.lag, float):
+            receiver = tuple(s for s in data.rss if s.tower == series.tower)  # it has a clock of its own
+            clocks = estimate_clocks(dataclasses.replace(data, rss=receiver), progress)
+            clock = clocks[[s is series for s in receiver].index(True)]
+            time = telemetry_time(time, clock)
+            if clock is not None and clock.applied_s[at]:
+                notes.append(f"{clock.applied_s[at]:.3f} s are taken off the radio's clock")
+        track = data.poses_at(time[at : at + 1])
+        _check_pose(track.valid, series, at)
+        return data.link_of(series), valid_poses(track, rt.attitude), notes, time[at : at + 1]
+    link = data.link_of(series)
+    poses, valid, _ = rank_poses(data, series)
+    _check_pose(valid[at : at + 1], series, at)
+    row = int(valid[:at].sum())
+    return link, poses[row : row + 1], notes, series.time[at : at + 1]
+
+
+def _check_pose(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
+    if not valid[0]:
+        raise UsageError(
+            f"no pose is known at {iso_time(series.time[at])}",
+            expected="a time with telemetry",
+            cause="the telemetry starts later, ends earlier or has a gap (rt.advanced.maximum_gap_s)",
+        )
+
+
+SMOOTH = {"reflection_loss_db": 0.0, "ground_roughness_m": 0.0}
+
+
+def _paths(
+    site: Site, rt: RtSettings, replayed: Replay, link: Link, pose: Poses, source: FloatArray
+) -> tuple[ExplainedPath, ...]:
+    """The paths with their terms, foliage and roughness apart."""
+    through = path_loss(site, rt.model_copy(update=SMOOTH), link.carrier_hz)
+    further = {}
+    if through is not None:
+        further["foliage"] = through(replayed.paths, source[None], pose.position_m)
+    if rt.reflection_loss_db:
+        further["rough surfaces"] = rt.reflection_loss_db * replayed.paths.depth.astype(np.float64)
+    rough = roughness_loss(site, rt, link.carrier_hz)
+    if rough is not None:
+        further["rough ground"] = rough(replayed.paths, source[None], pose.position_m)
+    if replayed.paths.terrain_db.any():
+        further["terrain"] = replayed.paths.terrain_db
+    return explain_paths(replayed.paths, replayed.faces, source, pose, link, further)
+
+
+def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterator[tuple[str, str]]:
+    traced = {tuple(row[row >= 0].tolist()) for row in replayed.paths.faces}
+    otherwise = "geometry allows it: stopped by the terrain, or the ground of another tower"
+    if replayed.engine == "sionna":  # its rays are drawn: too few of them miss paths
+        otherwise = f"nothing is in its way: not found with {replayed.samples} samples per tower"
+    for words, sequence in simple_paths(replayed):
+        if tuple(sequence.tolist()) not in traced:
+            yield words, why_not(replayed.faces, source, target, sequence, replayed.surfaces) or otherwise

@@ -1,0 +1,700 @@
+"""One flight from its data to its numbers: clocks, replay, comparison, audit. Every job on a flight starts here.
+
+A new stage (a ladder of models, the receiver's chain, a further audit) is a function of what stands before it, one
+field of :class:`FlightRun` or of :class:`~aerpaw_cmp.compare.result.FlightResult`, and two lines in :func:`run_flight`.
+
+The ladder of models of a flight: which antennas, attitude, ground, buildings and trees its measurement asks for.
+
+Stages come one after the other (antennas, woods, ground, buildings, relief); each adds variants to the best model so
+far, by the RMSE on held-out segments. Everything but the offset is fixed beforehand.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+
+from ..common.errors import UsageError
+from ..common.outputs import unsealed
+from ..common.stages import PlannedStage, Stages
+from ..common.text import counted
+from ..common.units import FloatArray
+from ..common.yamlfile import KeyPath, edited, parse_yaml
+from ..compare.causes import OF_DIRECTION, Cause
+from ..compare.ladder import Ladder, Rung, climb, series_rows
+from ..compare.result import BASELINE_TITLE, FlightResult
+from ..compare.statistics import pooled_difference
+from ..compare.verdict import is_one_place
+from ..flight.data import FlightData, RssSeries, choose_site
+from ..flight.drafting.proposals import errors_elsewhere, offered
+from ..flight.gains import pair_db, path_loss
+from ..flight.replay import FlightReplay, Replayed, attitude_rotation, replay_flight, try_replay
+from ..flight.settings import FlightFile, RssSettings
+from ..flight.training import learned_here
+from ..propagation.drivers import replay_moving
+from ..propagation.edges import diffracted
+from ..propagation.field.sum import fields_of, mean_pair_power, rss_dbm
+from ..propagation.geometry import Link, PathSet, Poses, single_element
+from ..propagation.options import Field, Run, Search
+from ..propagation.replay import Replay, replay
+from ..site.antennas import Isotropic
+from ..site.learned import SpherePattern
+from ..site.site import Site
+from ..site.siteyaml import known_grounds
+from .audit_flight import audit_replays
+from .compare_flight import Levels, compare_flight, fitted_receiver, levels_of
+
+# Loss of the weakened ground reflection: a smooth half-space reflects more than any field.
+_WEAK_GROUND_DB = 10.0
+
+# A smaller gain is none that a page could show [dB].
+_SHOWN_DB = 0.1
+
+# Per series; of longer ones every second, third, ... sample is taken.
+_MOST_SAMPLES = 4000
+
+AS_SET = "as set in flight.yaml"
+_FREE_SPACE = BASELINE_TITLE["free_space"]
+# Lines that replay nothing: what a model must beat to be worth its name.
+LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
+
+# Behind the name of a rung that would be scored where it was fitted.
+LEARNED_HERE = " (its antennas were learned on this flight, too: not scored)"
+
+Antennas = Literal["isotropic", "measured", "learned"]
+Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
+Trees = Literal["none", "p833", "weissberger", "opaque"]
+Relief = Literal["flat", "offsets", "surface"]
+
+# What the ladder calls the sums and losses of the ground reflection.
+_GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "rough": "rough", "power sum": "incoherent"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Model:
+    """One combination of what a replay may hold."""
+
+    antennas: Antennas = "isotropic"
+    attitude: Literal["ignored", "level", "logged"] = "ignored"
+    ground: Ground = "none"
+    buildings: bool = False
+    trees: Trees = "none"
+    media: bool = False
+    """The woods that attenuate are media, not single trees."""
+    relief: Relief = "flat"
+    """Ground at the towers and below the paths, in place of that of the flight file."""
+    diffraction: bool = False
+    """Paths over one edge of a building, with the ground on either side."""
+    roughness_m: float = 0.0
+    """Of ``ground: rough``: that of the flight file, where it has one."""
+
+    @property
+    def name(self) -> str:
+        """Content of the model in words."""
+        parts = {
+            "isotropic": [], "measured": ["antennas"], "learned": ["learned sphere"],
+        }[self.antennas]  # fmt: skip
+        parts += {"ignored": [], "level": ["heading"], "logged": ["attitude"]}[self.attitude]
+        if self.ground != "none":
+            parts.append(f"{_GROUND_WORDS[self.ground]} ground reflection")
+        parts += ["buildings"] if self.buildings else []
+        parts += ["diffraction"] if self.diffraction else []
+        if self.trees != "none":
+            woods = "woods as media" if self.media else "trees"
+            parts.append("opaque trees" if self.trees == "opaque" else f"{woods} ({self.trees})")
+        parts += [] if self.relief == "flat" else [f"relief ({self.relief})"]
+        return _FREE_SPACE if not parts else " + ".join(parts)
+
+    def settings(self, max_depth: int) -> dict[str, dict[str, Any]]:
+        """The keys of flight.yaml that make it, ``max_depth`` that of the flight file."""
+        depth = 0 if self.ground == "none" else max(max_depth, 1) if self.buildings else 1
+        rt: dict[str, Any] = {
+            "max_depth": depth,
+            "attitude": self.attitude,
+            "reflection_loss_db": _WEAK_GROUND_DB if self.ground == "weakened" else 0.0,
+            **({"ground_roughness_m": self.roughness_m} if self.ground == "rough" else {}),
+            "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
+        }
+        if self.diffraction:
+            rt["diffraction"] = "edges"
+        if self.trees in ("p833", "weissberger"):
+            rt["foliage_model"] = self.trees
+        return {
+            "rt": rt,
+            "rss": {"field": "power" if self.ground == "power sum" else "coherent"},
+            "site": {
+                "without_buildings": not self.buildings,
+                **({} if self.relief == "flat" else {"tower_ground": self.relief}),
+            },
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightLadder:
+    """The scored ladder; ``models`` are in the order of its rungs (None: the settings of the flight file)."""
+
+    ladder: Ladder
+    models: tuple[Model | None, ...]
+    names: tuple[tuple[str, str], ...]
+    offered: Mapping[str, str] = field(default_factory=dict)
+    """Names of learned antennas that the site offers and the flight file does not use."""
+
+    @property
+    def recommended(self) -> Model | None:
+        """The recommended model; None where it is that of the flight file, or none."""
+        chosen = self.ladder.recommended
+        return None if chosen is None else self.models[chosen]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Series:
+    """One series, thinned: ``rows`` (m,) of its samples, their poses, and which of its replayed poses they are."""
+
+    replayed: Replayed
+    levels: Levels
+    rows: Any
+    picked: Any
+    step: int
+    time_s: FloatArray
+
+
+def flight_ladder(data: FlightData, replays: FlightReplay) -> FlightLadder | None:
+    """Climb the ladder; None for a flight without RSS, or replayed by rays of another engine than the image method."""
+    if not data.rss or data.settings.rt.engine != "image":
+        return None
+    return _Climber(data, [_sampled(data.rss, i, r, data.settings.rss) for i, r in enumerate(replays.rss)]).climb()
+
+
+def _sampled(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: RssSettings) -> _Series:
+    levels = levels_of(rss[index], replayed, rules)
+    comparable = np.flatnonzero(levels.posed & np.isfinite(levels.measured_db))
+    step = max(1, -(-len(comparable) // _MOST_SAMPLES))
+    rows = comparable[::step]
+    pose_of = np.cumsum(replayed.valid) - 1
+    seconds = (rss[index].time - rss[0].time[:1]) / np.timedelta64(1, "s")
+    return _Series(replayed=replayed, levels=levels, rows=rows, picked=pose_of[rows], step=step, time_s=seconds[rows])
+
+
+class _Climber:
+    """Evaluates models on the series of a flight, each search of paths once."""
+
+    def __init__(self, data: FlightData, series: Sequence[_Series]) -> None:
+        self._data, self._series = data, series
+        self._measured = [s.levels.measured_db[s.rows] for s in series]
+        self._traced: dict[tuple[Any, ...], tuple[Replay, float]] = {}
+        self._lost: dict[tuple[int, Model], tuple[Replay, PathSet, list[FloatArray | None], float]] = {}
+        patterns = [p for s in series for a in _arrays(s.replayed.link) for p in a.patterns]
+        self._offer = offered(data) if all(p.name == "iso" for p in patterns) else None
+        links = [s.replayed.link for s in series]
+        if (offer := self._offer) is not None:
+            links = [offer.link.of(s.channel).build([s.tower], data.folder) for s in data.rss]
+        self._links = links
+        ways = [
+            (link.carrier_hz, self._sources(s, data.site).tobytes(), self._poses(s, "ignored").position_m.tobytes())
+            for link, s in zip(self._links, series, strict=True)
+        ]
+        self._like = [ways.index(way) for way in ways]  # by series, the first one with the same paths
+
+    def climb(self) -> FlightLadder:
+        """All stages."""
+        rungs = self._lines()
+        models: list[Model | None] = [None] * len(rungs)
+        best = Model()
+        # a wood takes more than a reflection, which is not seen before it is known
+        for stage in (self._antennas, self._trees, self._ground, self._buildings, self._edges, self._relief):
+            for model in stage(best):
+                if model not in models:
+                    models.append(model)
+                    rungs.append(self._rung(model))
+            scored = self._scored(rungs)
+            if scored.best_replay is not None:
+                best = models[scored.best_replay] or best
+        models.append(None)
+        rungs.append(self._as_set())
+        names = tuple((s.tower, s.channel) for s in self._data.rss)
+        climbed = FlightLadder(
+            ladder=self._scored(rungs),
+            models=tuple(models),
+            names=names,
+            offered={} if self._offer is None else self._offer.antennas,
+        )
+        return self._better_than_set(self._by_flights_left_out(climbed), climbed)
+
+    def _better_than_set(self, *climbed: FlightLadder) -> FlightLadder:
+        """The first whose recommended model is better than the flight as set, significantly; else the flight as set.
+
+        Nothing is recommended of a flight that taught its own antennas: as set it has no score.
+        """
+        better = (each for each in climbed if self._is_better(each.ladder))
+        ladder, last = climbed[-1].ladder, len(climbed[-1].ladder.rungs) - 1
+        if ladder.recommended is not None:
+            scored = math.isfinite(ladder.rmse_db[last])
+            ladder = dataclasses.replace(ladder, recommended=last if scored else None)
+        return next(better, dataclasses.replace(climbed[-1], ladder=ladder))
+
+    def _is_better(self, ladder: Ladder) -> bool:
+        """Check that a recommended model gains on the last rung, the flight as set, over all series at once.
+
+        And on the first, a constant level: at one place every model is its offset, and the flattest model gains.
+        """
+        if ladder.recommended is None:
+            return False
+        chosen = ladder.error_db[ladder.recommended]
+        # Both must hold, so neither level is corrected for there being two: whichever of the gains is none is taken for
+        # one by its own test in at most 2.5 %, hence both are (intersection-union, Berger 1982, doi 10.2307/1267823).
+        for other in (ladder.error_db[0], ladder.error_db[-1]):
+            columns = [(s.time_s, a, b) for s, a, b in zip(self._series, chosen, other, strict=True)]
+            pair = pooled_difference(columns, free_offset=False)
+            if pair.verdict != "better" or pair.difference_db > -_SHOWN_DB:
+                return False
+        return True
+
+    def _by_flights_left_out(self, climbed: FlightLadder) -> FlightLadder:
+        """The learned model, as it was calibrated, where flights left out say that it beats free space."""
+        antennas = (self._offer or self._data.settings).antennas
+        errors = [errors_elsewhere(antennas, series, self._data.folder) for series in self._data.rss]
+        known = [error for error in errors if error is not None]
+        if len(known) < len(errors) or not known:
+            return climbed
+        learned, free = (
+            float(np.sqrt(np.mean([getattr(e, key) ** 2 for e in known]))) for key in ("rmse_db", "free_space_rmse_db")
+        )
+        for attitude in ("logged", "level"):
+            model = Model(antennas="learned", attitude=attitude)
+            at = climbed.models.index(model) if model in climbed.models else None
+            if at is not None and np.isfinite(climbed.ladder.rmse_db[at]) and learned < free:
+                ladder = dataclasses.replace(climbed.ladder, recommended=at, elsewhere_db=(learned, free))
+                return dataclasses.replace(climbed, ladder=ladder)
+        return climbed
+
+    def _scored(self, rungs: Sequence[Rung]) -> Ladder:
+        return climb(
+            self._measured,
+            [s.time_s for s in self._series],
+            rungs,
+            [s.replayed.poses.position_m[s.picked] for s in self._series],
+        )
+
+    # the stages: what may be added to the best model so far
+
+    def _antennas(self, _best: Model) -> list[Model]:
+        patterns = [p for link in self._links for a in _arrays(link) for p in a.patterns]
+        models = [Model()]
+        if all(p.name == "iso" for p in patterns):
+            return models
+        kind: Antennas = "learned" if any(isinstance(p, SpherePattern) for p in patterns) else "measured"
+        models.append(Model(antennas=kind))
+        tracks = [s.replayed.track for s in self._series]
+        if all(t is not None for t in tracks):
+            known = np.concatenate([t.attitude_known for t in tracks if t is not None])
+            models.append(Model(antennas=kind, attitude="level"))
+            if known.any():
+                models.append(Model(antennas=kind, attitude="logged"))
+        return models
+
+    def _ground(self, best: Model) -> list[Model]:
+        kinds: tuple[Ground, ...] = ("power sum", "weakened", "coherent")
+        models = [dataclasses.replace(best, ground=kind) for kind in kinds]
+        rough = self._data.settings.rt.ground_roughness_m
+        return [*models, *([dataclasses.replace(best, ground="rough", roughness_m=rough)] if rough else [])]
+
+    def _buildings(self, best: Model) -> list[Model]:
+        if not self._data.site.buildings:
+            return []
+        return [dataclasses.replace(best, buildings=True)]
+
+    def _edges(self, best: Model) -> list[Model]:
+        # where the flight asks for them: they were the dearest rung, and the best on none of 28 real series
+        moving = any(s.replayed.tower_m is not None for s in self._series)
+        site, asked = self._data.site, self._data.settings.rt.diffraction != "none"
+        if not asked or not site.buildings or site.scene is not None or moving:
+            return []
+        return [dataclasses.replace(best, buildings=True, diffraction=True)]
+
+    def _trees(self, best: Model) -> list[Model]:
+        if not self._data.site.wooded:
+            return []
+        # without Weissberger: within 0.11 dB of P.833 on every real flight
+        kinds: tuple[Trees, ...] = ("p833", "opaque")
+        media = any(forest.height_m is not None for forest in self._data.site.forests)
+        return [dataclasses.replace(best, trees=kind, media=media and kind != "opaque") for kind in kinds]
+
+    def _relief(self, best: Model) -> list[Model]:
+        # without diffraction: over terrain it costs more than all rungs before, and edges of roofs are as they were
+        return [dataclasses.replace(best, relief=kind, diffraction=False) for kind in self._reliefs]
+
+    @cached_property
+    def _reliefs(self) -> dict[Relief, Site]:
+        """The site with other grounds that its file knows, where the flight has flat ground and no own node."""
+        data, flat = self._data, self._data.site
+        if flat.dem or flat.scene or data.settings.towers or any(t.ground_m for t in flat.towers.values()):
+            return {}
+        kinds = known_grounds(data.site_place)
+        chosen: dict[Relief, Site] = {}
+        for kind in ("offsets", "surface"):
+            if kind in kinds:
+                choice = data.settings.site.model_copy(update={"tower_ground": kind, "file": str(data.site_place)})
+                chosen[kind] = choose_site(choice, data.folder)
+        return chosen
+
+    def _site(self, relief: Relief) -> Site:
+        return self._data.site if relief == "flat" else self._reliefs[relief]
+
+    # levels
+
+    def _lines(self) -> list[Rung]:
+        zeros = tuple(np.zeros(len(s.rows)) for s in self._series)
+        ray_m = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s, self._data.site) for s in self._series)
+        # a pose in the place of the antenna has no logarithm
+        range_db = tuple(10.0 * np.log10(np.maximum(np.linalg.norm(a, axis=1), 0.1)) for a in ray_m)
+        return [
+            Rung(model=name, level_db=zeros, seconds=0.0, regressor_db=x)
+            for name, x in zip(LINES, (zeros, range_db), strict=True)
+        ]
+
+    def _as_set(self) -> Rung:
+        levels = tuple(s.levels.simulated_db[s.rows] for s in self._series)
+        seconds = self._of_flight([s.replayed.replay.seconds for s in self._series])
+        if self._learned_here and self._offer is None:
+            nothing = tuple(np.full(len(level), np.nan) for level in levels)
+            return Rung(model=AS_SET + LEARNED_HERE, level_db=nothing, seconds=seconds)
+        return Rung(model=AS_SET, level_db=levels, seconds=seconds)
+
+    def _of_flight(self, seconds: Sequence[float]) -> float:
+        """Seconds of a flight from those of its series: channels that share a replay cost it once."""
+        shared: dict[tuple[str, str], float] = {}
+        for series, cost_s in zip(self._data.rss, seconds, strict=True):
+            key = series.tower, series.settings_key
+            shared[key] = max(cost_s, shared.get(key, 0.0))
+        return sum(shared.values())
+
+    @cached_property
+    def _learned_here(self) -> bool:
+        """True if antennas or settings of the flight file were learned from a log of this very flight."""
+        pairs = zip(self._data.rss, self._links, strict=True)
+        return any(learned_here(self._data, series, link) for series, link in pairs)
+
+    def _rung(self, model: Model) -> Rung:
+        learned = model.antennas == "learned" or model.ground == "rough"
+        if learned and self._learned_here:
+            nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
+            return Rung(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
+        levels = [self._level(i, model) for i in range(len(self._series))]
+        return Rung(
+            model=model.name, level_db=tuple(f[0] for f in levels), seconds=self._of_flight([f[1] for f in levels])
+        )
+
+    def _level(self, index: int, model: Model) -> tuple[FloatArray, float]:
+        """Level (m,) [dBm] at the thinned samples of a series, and the seconds that the whole series would take."""
+        series, link, site = self._series[index], self._links[index], self._site(model.relief)
+        if model.antennas == "isotropic":
+            link = _isotropic_link(link)
+        traced, paths, losses_db, search_s = self._paths(index, model)
+        begin = time.perf_counter()
+        poses, sources = self._poses(series, model.attitude), self._sources(series, site)
+        fields = [
+            fields_of(some, traced.faces, traced.ends.sources_m, poses, link, loss_db)
+            for some, loss_db in zip((paths, *traced.further), losses_db, strict=True)
+        ]
+        if model.ground == "power sum":
+            power = sum(item.power for item in fields)
+        else:
+            power = mean_pair_power(np.asarray(sum(item.h for item in fields)))
+        level = rss_dbm(np.asarray(power), link.transmit_power_dbm)[:, 0] + pair_db(link, poses, sources)
+        return level, series.step * (search_s + time.perf_counter() - begin)
+
+    def _paths(self, index: int, model: Model) -> tuple[Replay, PathSet, list[FloatArray | None], float]:
+        """Replay with the paths of a model, those without an edge that it takes, losses [dB] of both, and seconds."""
+        # antennas and attitude change no path and no loss
+        key = self._like[index], dataclasses.replace(model, antennas="isotropic", attitude="ignored")
+        if key not in self._lost:
+            traced, search_s = self._traced_for(index, model)
+            begin = time.perf_counter()
+            rt, site = self._data.settings.rt, self._site(model.relief)
+            paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
+            changed = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
+            field, ends = Field(path_loss(site, changed, self._links[index].carrier_hz)), traced.ends
+            lines = [paths, *(some.lines() for some in traced.further)]
+            losses = [field.loss_db(some, ends.sources_m, ends.poses.position_m) for some in lines]
+            self._lost[key] = traced, paths, losses, search_s + time.perf_counter() - begin
+        return self._lost[key]
+
+    def _traced_for(self, index: int, model: Model) -> tuple[Replay, float]:
+        """Replay between single elements, and its seconds."""
+        direct = model.relief != "flat" and model.ground == "none"  # reflections off shaped ground are costly to find
+        key = self._like[index], model.buildings, model.diffraction, model.relief, direct
+        if key not in self._traced:
+            begin = time.perf_counter()
+            series, tower, site = self._series[index], self._data.rss[index].tower, self._site(model.relief)
+            site = site if model.buildings else dataclasses.replace(site, buildings=())
+            depth = max(self._data.settings.rt.max_depth, 1) if model.buildings else 1
+            search = Search(
+                max_depth=0 if direct else depth, further=diffracted("edges" if model.diffraction else "none")
+            )
+            link = Link(self._links[index].carrier_hz, {tower: single_element()}, single_element())
+            poses, sources = self._poses(series, "ignored"), self._sources(series, site)
+            if series.replayed.tower_m is not None:
+                replayed = replay_moving(site, link, poses, sources, search)
+            else:
+                replayed = replay(site, link, poses, search, run=Run(cache_dir=""))
+            self._traced[key] = replayed, time.perf_counter() - begin
+        return self._traced[key]
+
+    def _sources(self, series: _Series, site: Site) -> FloatArray:
+        """Place of the tower: (1, 3), or (m, 3) at the thinned samples where it moves."""
+        places = series.replayed.source_m(site)
+        return places if series.replayed.tower_m is None else places[series.picked]
+
+    def _poses(self, series: _Series, attitude: str) -> Poses:
+        poses, track = series.replayed.poses, series.replayed.track
+        turn = poses.rotation if track is None else attitude_rotation(track, attitude)
+        return Poses(poses.position_m[series.picked], np.ascontiguousarray(turn[series.picked]))
+
+
+def _arrays(link: Link) -> list[Any]:
+    return [*link.tower_arrays.values(), link.uav_array]
+
+
+def _isotropic_link(link: Link) -> Link:
+    """The link with isotropic elements."""
+
+    def other(array: Any) -> Any:
+        return dataclasses.replace(array, patterns=tuple(Isotropic() for _ in array.patterns))
+
+    towers = {name: other(array) for name, array in link.tower_arrays.items()}
+    return dataclasses.replace(link, tower_arrays=towers, uav_array=other(link.uav_array))
+
+
+def recommended_changes(
+    settings: FlightFile, stated: Mapping[str, Any], model: Model, offered: Mapping[str, str] | None = None
+) -> dict[KeyPath, Any]:
+    """Keys of a flight file that a model needs otherwise, by path; None for one that has to go.
+
+    Parameters
+    ----------
+    settings : FlightFile
+        As set, defaults included.
+    stated : mapping
+        Plain values of the keys that the file states.
+    model : Model
+        See :attr:`FlightLadder.recommended`.
+    offered : mapping of str to str, optional
+        Learned antennas of the site by name, which a learned model takes.
+
+    Returns
+    -------
+    dict
+    """
+    current = settings.model_dump(mode="json")
+    changes: dict[KeyPath, Any] = {
+        (section, key): value
+        for section, wanted in model.settings(settings.rt.max_depth).items()
+        for key, value in wanted.items()
+        if current[section].get(key) != value
+    }
+    rt = stated.get("rt") or {}
+    gone = {"ground_roughness_m": model.ground != "rough", "diffraction": not model.diffraction}
+    changes |= {("rt", key): None for key, unused in gone.items() if unused and key in rt}
+    if isinstance(stated.get("site"), str):
+        of_site = {key: changes.pop(("site", key)) for section, key in list(changes) if section == "site"}
+        if of_site:
+            changes["site",] = {"file": stated["site"], **of_site}
+    if offered and model.antennas == "learned":
+        changes["antennas",] = dict(offered)
+    if model.antennas == "isotropic":
+        changes |= {("antennas",): None} if "antennas" in stated else {}
+        link = stated.get("link") or {}
+        changes |= _isotropic({key: link[key] for key in ("rss", "channels") if key in link}, ("link",))
+    return changes
+
+
+def _isotropic(content: Mapping[str, Any], path: KeyPath) -> dict[KeyPath, Any]:
+    """Isotropic antennas in the place of all below some keys of a link."""
+    iso, changes = {"model": "iso"}, dict[KeyPath, Any]()
+    for key, value in content.items():
+        if key in ("antenna", "antennas"):
+            new = [iso for _ in value] if isinstance(value, list) else iso
+            changes |= {} if new == value else {(*path, key): new}
+        elif isinstance(value, Mapping):
+            changes |= _isotropic(value, (*path, key))
+    return changes
+
+
+def check_recommended(data: FlightData) -> None:
+    """Refuse to recommend a model for a flight without RSS, or with rays of another engine than the image method."""
+    if not data.rss or data.settings.rt.engine != "image":
+        raise _NOT_RECOMMENDED
+
+
+_NOT_RECOMMENDED = UsageError(
+    "no model can be recommended for this flight",
+    expected="RSS with known poses, replayed by the image engine (rt.engine: image)",
+)
+
+
+def recommended_text(settings: FlightFile, ladder: FlightLadder | None, flight: Path) -> tuple[str, str]:
+    """Return the flight file with the lines changed that the recommended model needs, and a sentence on them.
+
+    Raises
+    ------
+    UsageError
+        If no models were compared: no RSS, or rays of another engine than the image method.
+    """
+    if ladder is None or ladder.ladder.recommended is None:
+        raise _NOT_RECOMMENDED
+    # bytes: line ends stay as they are
+    text = unsealed(flight.read_bytes().decode("utf-8"))
+    if ladder.recommended is None:
+        return text, f"No model is significantly better than {flight.name}: the recommended file is a copy of it."
+    text = edited(text, recommended_changes(settings, yaml.safe_load(text), ladder.recommended, ladder.offered))
+    parse_yaml(text, FlightFile)  # a flight file that its own reader refuses is a fault of ours
+    return text, f"The recommended file has the settings of the model '{ladder.recommended.name}'."
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightRun:
+    """Record of what was computed of one flight.
+
+    Parameters
+    ----------
+    data : FlightData
+        As read: settings, site, logs, track, series.
+    replays : FlightReplay
+        Poses, paths, fields and clock of every series.
+    result : FlightResult
+        Numbers alone.
+    ladder : FlightLadder, optional
+        Which models the measurement asks for.
+    """
+
+    data: FlightData
+    replays: FlightReplay
+    result: FlightResult
+    ladder: FlightLadder | None = None
+
+
+def run_flight(
+    data: FlightData,
+    stages: Stages | None = None,
+    *,
+    replays: FlightReplay | None = None,
+    audit: bool = True,
+    anew: bool = False,
+    ladder: bool = False,
+) -> FlightRun:
+    """Clocks, replay, comparison, audit and ladder.
+
+    Parameters
+    ----------
+    data : FlightData
+    stages : Stages, optional
+        Times "clocks", "replay", "compare", "audit" and "ladder".
+    replays : FlightReplay, optional
+        Of this flight, where they were made before (:func:`~aerpaw_cmp.flight.replay.replay_flight`).
+    audit : bool
+        Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
+    anew : bool
+        Audit even what this machine audited before.
+    ladder : bool
+        Also score simpler and richer models of the RSS on stretches left out.
+
+    Returns
+    -------
+    FlightRun
+        Replays, numbers of the comparison, and the ladder where it was asked for.
+    """
+    stages = stages or Stages()
+    replays = replays or replay_flight(data, stages)
+    with stages("compare"):
+        result = compare_flight(data, replays)
+    if audit:
+        with stages("audit"):
+            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress, anew=anew))
+    climbed: FlightLadder | None = None
+    if ladder:
+        with stages("ladder"):
+            stages.progress("ladder of models")
+            climbed = flight_ladder(data, replays)
+            if climbed is not None:
+                rows = (series_rows(climbed.ladder, index, name) for index, name in enumerate(climbed.names))
+                result = dataclasses.replace(result, ladder=tuple(row for of_series in rows for row in of_series))
+    result = dataclasses.replace(result, likely_cause=unrivalled(result.likely_cause, climbed))
+    result = dataclasses.replace(result, next_step=next_step(data, result, climbed))
+    return FlightRun(data=data, replays=replays, result=result, ladder=climbed)
+
+
+def report_stages(data: FlightData, figures: str) -> list[PlannedStage]:
+    """Return the stages of a report of a flight that was read, for its dry run; ``figures`` as for the report.
+
+    One pose of every series is replayed and the receiver is read, so that a dry run refuses what the run would refuse.
+    """
+    try_replay(data)
+    for series in data.rank:
+        fitted_receiver(data, series.tower)
+    n_rss, n_rank = (sum(len(item.time) for item in series) for series in (data.rss, data.rank))
+    samples, rt = f"{counted(n_rss, 'RSS sample')}, {counted(n_rank, 'rank sample')}", data.settings.rt
+    audited = min(rt.audit_links, n_rss + n_rank)
+    drawn = 0 if figures == "none" else len(data.rss) + len(data.rank)
+    clocked = bool(n_rss) and data.settings.rss.lag in ("estimate", "apply")
+    stages = {
+        "clocks": counted(len({series.tower for series in data.rss}), "receiver") if clocked else "",
+        "replay": f"{samples}, engine {rt.engine}",
+        "compare": samples,
+        "audit": f"{counted(audited, 'link')} by the other engine" if audited else "",
+        "ladder": "simpler and richer models" if n_rss and rt.engine == "image" else "",
+        "report": f"page, figures of {counted(drawn, 'channel')}",
+    }
+    return [PlannedStage(name, work) for name, work in stages.items() if work]
+
+
+def unrivalled(cause: Cause | None, climbed: FlightLadder | None) -> Cause | None:
+    """The likely cause; None of a function of direction where the recommended model gains as much as it does."""
+    if cause is None or cause.name not in OF_DIRECTION or climbed is None or climbed.recommended is None:
+        return cause
+    at, rmse_db = climbed.ladder.recommended, climbed.ladder.rmse_db
+    assert at is not None
+    return None if rmse_db[-1] - rmse_db[at] >= cause.rmse_db - cause.rmse_with_db else cause
+
+
+def next_step(data: FlightData, result: FlightResult, climbed: FlightLadder | None) -> str | None:
+    """A wider search of the offset, the step against the likely cause, or a model that is better than the one as set.
+
+    Parameters
+    ----------
+    data : FlightData
+    result : FlightResult
+    climbed : FlightLadder, optional
+
+    Returns
+    -------
+    str or None
+        A clause; without any of these that of the comparison, and None for a training flight.
+    """
+    beyond = [panel for panel in result.rss if panel.score.at_edge]
+    if beyond:
+        # the offset is added to the measurement; ten further decibels, so that no edge is touched again
+        missing = [float(np.nanmedian(panel.simulated_dbm - panel.measured_db)) for panel in beyond]
+        low, high = data.settings.rss.span_db
+        ends = (
+            min(low, *(10 * math.floor(m / 10) - 10 for m in missing)),
+            max(high, *(10 * math.ceil(m / 10) + 10 for m in missing)),
+        )
+        return f"`rss: {{span_db: [{ends[0]:.0f}, {ends[1]:.0f}]}}`"
+    if any(panel.further.trained_on for panel in result.series):
+        return None
+    if result.likely_cause is not None:
+        return result.likely_cause.next_step or None
+    if is_one_place(result.rss):
+        return "a flight along a route"
+    if climbed is not None and climbed.recommended is not None:
+        return "`aerpaw-cmp report FLIGHT --recommend FILE` writes settings significantly better than these"
+    return result.next_step

@@ -1,1 +1,0 @@
-"""Calibration: antennas, ground, lock and rank receivers learned from flights."""

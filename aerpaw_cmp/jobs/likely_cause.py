@@ -1,0 +1,262 @@
+"""Evidence from which the likely cause of a flight's error is told, gathered from its replayed series."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import TypeVar
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..compare import level as rss
+from ..compare.causes import OF_DIRECTION, Cause, LevelEvidence, flight_cause, gains_by_direction
+from ..compare.gains import turned
+from ..compare.result import RssResult
+from ..compare.verdict import without_copies
+from ..flight.data import FlightData, RssSeries, Times
+from ..flight.gains import mean_gain_db
+from ..flight.replay import FlightReplay, Replayed, attitude_rotation, telemetry_time
+from ..flight.track import MISREAD
+from ..logs.limits import path_of
+from ..logs.records import Stream
+from ..propagation.field.baselines import free_space_dbm
+from ..site.antennas import Isotropic
+from ..site.learned import SpherePattern
+from ..site.site import Site
+
+_Key = TypeVar("_Key")
+_ANGLES_DEG = tuple(float(angle) for angle in range(10, 360, 10))
+_RISES_M = (-150.0, -100.0, -60.0, -40.0, -25.0, -15.0, 15.0, 25.0, 40.0, 60.0, 100.0, 150.0)
+
+
+def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResult]) -> tuple[Cause | None, str | None]:
+    """The likely cause of the error of a flight over its scored channels; towers that move have none.
+
+    Without a cause the second is a next step: a calibration, where directions of the UAV's antenna tell some of the
+    error.
+
+    Parameters
+    ----------
+    data : FlightData
+    replays : FlightReplay
+    results : sequence of RssResult
+        The compared series.
+
+    Returns
+    -------
+    Cause or None, str or None
+    """
+    telemetry = [stream for file in data.files for stream in file.result.streams if stream.kind == "telemetry"]
+    if any(map(is_simulated, telemetry)):
+        return SIMULATED, None
+    if meaning := next(filter(None, map(heights_meant, telemetry)), ""):
+        sentence = f"Likely cause: {meaning}, by the logged vertical speed."
+        return Cause(name="telemetry", sentence=sentence, next_step="check the telemetry's columns and units"), None
+    names = {result.name for result in without_copies(results)}  # a copy is replayed with antennas of another channel
+    evidence = [
+        _evidence(data, series, replayed, result)
+        for series, replayed, result in zip(data.rss, replays.rss, results, strict=True)
+        if replayed.tower_m is None and not result.training and result.name in names
+    ]
+    cause = flight_cause(evidence)
+    clocks = [(s.tower, r.clock.result) for s, r in zip(data.rss, replays.rss, strict=True) if r.clock is not None]
+    late = next((f"The radio clock at {tower} is {clock.in_words}." for tower, clock in clocks if clock.shifted), None)
+    # judged by itself: it is mended first, however little of the error it explains, and before what directions tell
+    if late is not None and (cause is None or cause.name in OF_DIRECTION):
+        return Cause(name="clock", sentence=late, next_step="`rss: {lag: apply}`"), None
+    # an antenna that the file names is missing: errors by direction are expected, and the first caution has the reason
+    if any(not c.used for c in data.settings.cautions) and (cause is None or cause.name in OF_DIRECTION):
+        return None, "see the first caution: a learned antenna that the flight file names is not used"
+    # learned antennas miss some decibels of any flight
+    if cause is not None or data.settings.antennas or not gains_by_direction(evidence):
+        return cause, None
+    return None, _CALIBRATE
+
+
+_CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site"
+
+
+def is_simulated(telemetry: Stream) -> bool:
+    """Check for the receiver and the battery of ArduPilot's simulator, which AERPAW's emulator runs.
+
+    Of fix 6, 10 satellites and the few voltages of its battery, two are in the log, and what else it has agrees.
+    """
+    rows = telemetry.frame
+    if len(rows) < _FEWEST_ROWS:
+        return False
+    signs = [bool((rows[name] == value).all()) for name, value in _RECEIVER.items() if (rows[name] >= 0).any()]
+    if "battery_v" in rows and len(rows) >= _FEWEST_VOLTAGES:
+        volts = rows["battery_v"].dropna().to_numpy()
+        # a log of tenths of a volt has few voltages of any battery
+        if len(volts) and (np.abs(volts * 10.0 - np.round(volts * 10.0)) > 1e-6).any():
+            commonest = np.sort(np.unique(volts, return_counts=True)[1])[-3:]
+            signs.append(bool(commonest.sum() >= _SHARE_OF_VOLTAGES * len(volts)))
+    return len(signs) > 1 and all(signs)
+
+
+_RECEIVER = {"fix": 6, "satellites": 10}
+# Rows of a table from which constant columns, and from which few voltages tell anything. The simulator's battery has
+# three for flying and standing (97 % of the rows of one flight), a real one another in each row (at most 5 %).
+_FEWEST_ROWS, _FEWEST_VOLTAGES, _SHARE_OF_VOLTAGES = 4, 15, 0.8
+
+SIMULATED = Cause(
+    name="emulator",
+    sentence="The log is a simulator's: receiver and battery (fix 6, 10 satellites, few voltages) are ArduPilot's.",
+    next_step="draw no conclusion on the site from this flight",
+)
+
+
+def heights_meant(telemetry: Stream) -> str:
+    """Unit of heights where logged speeds fit the track along the ground but not upwards, in words; else empty."""
+    rows, time_s, place_m = path_of(telemetry.frame)
+    speed_mps = telemetry.frame[list(_SPEED)].to_numpy(np.float64)[rows] * [1.0, 1.0, -1.0]
+    step_s, flown = np.diff(time_s)[:, None], np.diff(place_m, axis=0)
+    told = 0.5 * (speed_mps[1:] + speed_mps[:-1]) * step_s
+    near = np.isfinite(told).all(axis=1) & (step_s[:, 0] > 0.0) & (step_s[:, 0] < _LONG_STEP_S)
+    flown, told = flown[near], told[near]
+    if min(np.abs(told[:, :2]).sum(), np.abs(told[:, 2]).sum()) < _LEAST_PATH_M:
+        return ""
+    # speeds of another unit are so along the ground, too
+    along, upwards = ((flown[:, axes] * told[:, axes]).sum() / np.square(told[:, axes]).sum() for axes in (slice(2), 2))
+    alike = upwards * (flown[:, 2] @ told[:, 2]) > _ALIKE * (flown[:, 2] @ flown[:, 2])
+    fits = [meaning for meaning, to_m in _HEIGHTS.items() if alike and abs(upwards * to_m - along) < _AS_TOLD * along]
+    return fits[0] if fits else ""
+
+
+# The log of another unit, by what its heights have to be multiplied with.
+_FOOT_M = 0.3048
+_HEIGHTS = {"the logged heights are in feet": _FOOT_M, "the logged heights were divided by 3.28": 1.0 / _FOOT_M}
+# Four field logs climb at .90 to 1.00 of their speeds; rows further apart [s] tell no path between them.
+_AS_TOLD, _ALIKE, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
+_SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
+
+
+def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: RssResult) -> LevelEvidence:
+    link = _Direct(data.site, series.tower, replayed)
+    known_db = link.level_db
+    time_s = rss.seconds(series.time)
+    order = np.argsort(time_s, kind="stable")
+
+    def at_samples(values: FloatArray) -> FloatArray:
+        return replayed.spread(values)[order]
+
+    def changed(levels_db: Mapping[_Key, FloatArray]) -> dict[_Key, FloatArray]:
+        return {key: at_samples(level - known_db) for key, level in levels_db.items()}
+
+    directions = link.directions(link.place_m, replayed.poses.position_m, replayed.poses.rotation)
+    predicted = result.simulated_dbm[order]
+    patterns = replayed.link.uav_array.patterns
+    kinds = {"learned": any(isinstance(p, SpherePattern) for p in patterns) or replayed.learned is not None,
+             "isotropic": all(isinstance(p, Isotropic) for p in patterns), "measured": True}  # fmt: skip
+    return LevelEvidence(
+        name=result.name,
+        unit=series.unit,
+        start=series.time.min() if len(series.time) else np.datetime64(0, "s"),
+        antenna=next(name for name, holds in kinds.items() if holds),
+        time_s=time_s[order],
+        measured_db=result.measured_db[order],
+        predicted_db=predicted,
+        place_m=result.position_m[order],
+        uav_azimuth_deg=at_samples(directions["uav_azimuth_deg"]),
+        uav_elevation_deg=at_samples(directions["uav_elevation_deg"]),
+        tower_azimuth_deg=at_samples(directions["azimuth_deg"]),
+        turned_db=changed(link.turned_db()),
+        raised_db=changed(link.raised_db()),
+        attitude_db=changed(link.attitude_db(data.settings.rt.attitude)),
+        misread_db=changed(link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid])),
+        other_towers_db={name: predicted + change for name, change in changed(link.other_towers_db()).items()},
+        locked=None if series.locked is None else series.locked[order],
+        serving=None if series.serving is None else series.serving[order],
+        clock=None if replayed.clock is None else replayed.clock.result,
+        floored=any("floor_db" in data.settings.logs[log].model_fields_set for log in np.unique(series.log)),
+    )
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class _Direct:
+    """Level of the direct path of a series at its poses (m,) [dBm], and what it would be otherwise."""
+
+    site: Site
+    tower: str
+    replayed: Replayed
+
+    @property
+    def place_m(self) -> FloatArray:
+        return self.replayed.source_m(self.site)
+
+    @property
+    def level_db(self) -> FloatArray:
+        return self._level(self.place_m, self.replayed.poses.position_m, self.replayed.poses.rotation)
+
+    def turned_db(self) -> dict[float, FloatArray]:
+        """Levels where the heading is greater; none for isotropic antennas."""
+        if not self._has_pattern:
+            return {}
+        place_m, poses = self.place_m, self.replayed.poses
+        # a heading grows clockwise, the angle of a mount the other way
+        turns = {angle: turned(-angle) @ poses.rotation for angle in _ANGLES_DEG}
+        return {angle: self._level(place_m, poses.position_m, rotation) for angle, rotation in turns.items()}
+
+    def raised_db(self) -> dict[float, FloatArray]:
+        """Levels where the UAV is higher, no lower than the ground."""
+        poses, levels = self.replayed.poses, {}
+        for rise in _RISES_M:
+            place = poses.position_m + np.array([0.0, 0.0, rise])
+            if len(place) and place[:, 2].min() > -_BELOW_GROUND_M:
+                levels[rise] = self._level(self.place_m, place, poses.rotation)
+        return levels
+
+    def attitude_db(self, used: str) -> dict[str, FloatArray]:
+        """Levels with another use of the attitude that the log knows."""
+        track, poses = self.replayed.track, self.replayed.poses
+        if track is None or not self._has_pattern or not track.attitude_known.any():
+            return {}
+        return {
+            mode: self._level(self.place_m, poses.position_m, attitude_rotation(track, mode))
+            for mode in ("logged", "ignored")
+            if mode != used
+        }
+
+    def misread_db(self, data: FlightData, time: Times) -> dict[str, FloatArray]:
+        """Levels with telemetry that means something else, at the instants of the poses (m,)."""
+        poses, track, used = self.replayed.poses, self.replayed.track, data.settings.rt.attitude
+        if data.track is None or track is None:
+            return {}
+        ground_m, levels = data.track.ground_m, {}
+        for meaning, scale in _HEIGHTS.items():
+            place = np.column_stack([poses.position_m[:, :2], ground_m + scale * (poses.position_m[:, 2] - ground_m)])
+            levels[meaning] = self._level(self.place_m, place, poses.rotation)
+        if used != "ignored" and self._has_pattern and track.attitude_known.any():
+            for meaning in MISREAD:
+                other = dataclasses.replace(track, rotation=data.track.rotations_if(meaning, time))
+                levels[meaning] = self._level(self.place_m, poses.position_m, attitude_rotation(other, used))
+        return levels
+
+    def other_towers_db(self) -> dict[str, FloatArray]:
+        """Levels from each other tower of the site."""
+        poses = self.replayed.poses
+        return {
+            name: self._level(neighbour.position_m[None, :], poses.position_m, poses.rotation)
+            for name, neighbour in self.site.towers.items()
+            if name != self.tower
+        }
+
+    @property
+    def _has_pattern(self) -> bool:
+        return not all(isinstance(pattern, Isotropic) for pattern in self.replayed.link.uav_array.patterns)
+
+    def directions(self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> dict[str, FloatArray]:
+        """Directions between a place and the UAV."""
+        return rss.link_geometry(place_m, position_m, rotation, uav_mount=self.replayed.link.uav_array.mount)
+
+    def _level(self, place_m: FloatArray, position_m: FloatArray, rotation: FloatArray) -> FloatArray:
+        """Free space and the mean gain of the UAV's elements towards the tower [dB]."""
+        link, at = self.replayed.link, self.directions(place_m, position_m, rotation)
+        theta, phi = np.radians(90.0 - at["uav_elevation_deg"]), np.radians(at["uav_azimuth_deg"])
+        gain = mean_gain_db(link.uav_array.patterns, theta, phi)
+        return np.asarray(free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0] + gain)
+
+
+# A track under another datum may begin so far below the ground [m].
+_BELOW_GROUND_M = 20.0

@@ -1,1 +1,0 @@
-"""The tap beside a replay."""

@@ -1,0 +1,160 @@
+"""``tap`` as a job: one modem or several, with a page where it is wanted."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import shlex
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from ..common.text import counted
+from ..live.feed import Feed
+from ..live.ports import Stop, TapSettings, TapStatus, TapSummary
+from ..live.tap import Tap
+
+# Environment variable with the token of a page beyond the loopback: so that it outlives a restart of the tap.
+TOKEN = "AERPAW_CMP_WEB_TOKEN"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Shown:
+    """The page and the prediction that a tap shows.
+
+    Parameters
+    ----------
+    web : str, optional
+        HOST:PORT of the page; None: no page.
+    flight, telemetry : Path, optional
+        flight.yaml that predicts, and the growing telemetry log.
+    say : callable
+        Gets a line for the terminal.
+    """
+
+    web: str | None
+    flight: Path | None
+    telemetry: Path | None
+    say: Callable[[str], None]
+
+
+def tap_modems(
+    settings: TapSettings, ports: Sequence[str | None], shown: Shown, on_status: Callable[[str, TapStatus], None]
+) -> list[TapSummary]:
+    """Tap one modem or several until a signal or the set time ends it.
+
+    Parameters
+    ----------
+    settings : TapSettings
+        Of each; ``port`` and, of several, a folder in ``folder`` are set here.
+    ports : sequence of str or None
+        None: the first AT port of a Quectel modem.
+    shown : Shown
+    on_status : callable
+        Gets the name of the modem (empty where there is only one) and its status.
+
+    Returns
+    -------
+    list of TapSummary
+        In the order of the ports.
+
+    Raises
+    ------
+    InputError, UsageError
+        If a port, the folder or the page's address cannot be used, at the start.
+    """
+    names = _names([port or "modem" for port in ports])
+    twin = _twin(shown)
+    with contextlib.ExitStack() as stack:
+        feed = None
+        if shown.web is not None:
+            feed = Feed(names)
+            _serve(stack, feed, twin, shown, ", ".join(names))
+        stop = stack.enter_context(Stop())  # nothing is logged before, so nothing has to end in order
+        alone = len(ports) == 1
+        # one after another: each replays the route that is ahead
+        predictors = [None if twin is None else twin.predictor() for _ in ports]
+
+        def session(number: int) -> TapSummary:
+            folder = settings.folder if alone else settings.folder / names[number]
+            return Tap(
+                dataclasses.replace(settings, port=ports[number], folder=folder),
+                stop,
+                on_status=partial(on_status, "" if alone else names[number]),
+                watch=None if feed is None else partial(feed.put, number),
+                predict=predictors[number],
+            ).run()
+
+        summaries = [session(0)] if alone else _together(session, len(ports), stop)
+        if feed is not None:
+            feed.end(_ended(settings.folder, summaries, twin))
+    return summaries
+
+
+def _twin(shown: Shown) -> Any:
+    if shown.flight is None:
+        return None
+    from .live_twin import LiveTwin
+
+    return LiveTwin.of(shown.flight, shown.telemetry)
+
+
+def _serve(stack: contextlib.ExitStack, feed: Feed, twin: Any, shown: Shown, title: str) -> None:
+    """Build the page, serve it as long as the stack lasts, and say where."""
+    from ..live.web import Address, Page, WebServer
+    from ..report.live import live_page
+
+    address = Address.parse(shown.web or "")
+    background = None if twin is None else twin.map()
+    page = Page(*live_page(background, title if background is None else background.title))
+    server = stack.enter_context(WebServer(feed, page, address, token=os.environ.get(TOKEN)))
+    known = f"  (... is the value of {TOKEN})" if os.environ.get(TOKEN) else ""
+    shown.say("the page: " + "  ".join(server.urls) + known)
+
+
+def _together(session: Callable[[int], TapSummary], count: int, stop: Stop) -> list[TapSummary]:
+    """Run sessions at once, each in its thread; the first fault at a start ends all."""
+
+    def run(number: int) -> TapSummary:
+        try:
+            return session(number)
+        # whatever ends one session ends all
+        except BaseException:
+            stop("error")
+            raise
+
+    with ThreadPoolExecutor(count, "tap") as threads:
+        return list(threads.map(run, range(count)))
+
+
+def _names(paths: Sequence[str]) -> list[str]:
+    """Short names, each once."""
+    names = [Path(path).name or path for path in paths]
+    return [name if names.count(name) == 1 else f"{name}-{number}" for number, name in enumerate(names, 1)]
+
+
+def _ended(folder: Path, summaries: Sequence[TapSummary], twin: Any) -> dict[str, Any]:
+    records, gaps = sum(s.records for s in summaries), sum(s.gaps for s in summaries)
+    lost = sum(s.lost_records for s in summaries)
+    at = time.strftime("%H:%M:%S", time.gmtime())
+    counts = f"{counted(records, 'record')}, {counted(gaps, 'gap')}" + (
+        f", {counted(lost, 'record')} lost" if lost else ""
+    )
+    text = f"The tap ended at {at} UTC ({summaries[0].reason}): {counts}. The log is in {folder}."
+    return {"text": text, "commands": _report_commands(folder, twin)}
+
+
+def _report_commands(folder: Path, twin: Any) -> list[str]:
+    """Commands that make the report of a tapped flight."""
+    log = shlex.quote(str(folder))
+    telemetry = "VEHICLEOUT_LOG" if twin is None else shlex.quote(str(twin.telemetry))
+    zone = "ZONE" if twin is None else twin.settings.timezone
+    return [
+        f"aerpaw-cmp ingest {log} {telemetry} --timezone {zone} --draft flight.yaml",
+        "aerpaw-cmp report flight.yaml",
+    ]

@@ -1,0 +1,245 @@
+"""The flight beside the tap: the replay at the present pose, its map for the page, the same flight flown again."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import InputError, UsageError
+from ..common.units import MINIMUM_HEIGHT_M, FloatArray, spread_out
+from ..compare.field_gp import RouteAhead
+from ..compare.rank import channel_rank
+from ..flight.data import choose_site
+from ..flight.gains import load_with_learned
+from ..flight.replay import replay_poses
+from ..flight.settings import FlightFile, LogSettings
+from ..flight.simulate import planned_poses
+from ..live.predict import Predict, Prediction, TelemetryFollower, TelemetrySample, predict_along
+from ..live.simulator import ranks_of
+from ..logs.readers import by_name
+from ..logs.writers import format_vehicle_out
+from ..maps.grid import Grid
+from ..propagation.field.baselines import free_space_dbm
+from ..propagation.geometry import Link, Poses, rotation_from_aircraft
+from ..report.live import LiveMap
+from ..site.site import Site
+
+_MAP_HEIGHTS_M = (10.0, 30.0, 50.0, 70.0, 90.0, 110.0)
+# Cells on the longer side of the map behind the flight.
+_MAP_CELLS = 70
+_ROUTE_STEP_S = 2.0
+# Points of the rest of the route in one record.
+_ROUTE_SHOWN = 40
+_DEMO_OFFSET_DB = -38.0
+_DEMO_FADING_DB = 2.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LiveTwin:
+    """A flight file ready to predict: where each pose leads, and at which of its K."""
+
+    settings: FlightFile
+    site: Site
+    link: Link
+    telemetry: Path
+    k: float
+
+    @classmethod
+    def of(cls, flight: Path, telemetry: Path | None = None) -> LiveTwin:
+        """Twin of a flight file.
+
+        Parameters
+        ----------
+        flight : Path
+            flight.yaml; the link and the tower of its ``rank`` count, and the middle K.
+        telemetry : Path, optional
+            The growing log; without it, the first telemetry log of the flight file.
+        """
+        settings = load_with_learned(flight)
+        site = choose_site(settings.site, flight.parent)
+        link = settings.link.rank.build([settings.rank.tower], flight.parent)
+        k = sorted(settings.rank.k)[len(settings.rank.k) // 2]
+        return cls(
+            settings=settings,
+            site=site,
+            link=link,
+            telemetry=telemetry or flight.parent / _telemetry_log(settings).path,
+            k=k,
+        )
+
+    def predictor(self) -> Predict:
+        """``predict`` for one modem; it reads the telemetry log on its own."""
+        log = _telemetry_log(self.settings)
+        follower = TelemetryFollower(
+            self.telemetry,
+            options=log.options(self.settings.timezone),
+            reader=by_name(log.reader or "vehicle_out"),
+        )
+        return predict_along(follower, partial(self.at, ahead=self.route_ahead()))
+
+    def route_ahead(self) -> RouteAhead | None:
+        """Prediction of the planned route that learns in flight; None without a plan."""
+        plan = self.settings.flight.plan
+        if plan is None:
+            return None
+        _, place, yaw = planned_poses(plan, self.site.takeoff_ground_m, _ROUTE_STEP_S)
+        rotation = np.broadcast_to(np.eye(3), (len(place), 3, 3))
+        if self.settings.rt.attitude != "ignored":
+            rotation = rotation_from_aircraft(0.0 * yaw, 0.0 * yaw, yaw)
+        _, level = self._replayed(place, rotation)
+        return RouteAhead(place, {"replay": level, "free space": self._free_space(place)})
+
+    def _free_space(self, place_m: FloatArray) -> FloatArray:
+        tower = self.site.towers[self.settings.rank.tower].position_m
+        link = self.settings.link.rank
+        return np.asarray(free_space_dbm(tower[None, :], place_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
+
+    def at(self, sample: TelemetrySample, ahead: RouteAhead | None = None) -> Prediction:
+        """Prediction at a pose of the telemetry; with ``ahead``, it can learn what is measured there."""
+        if not np.isfinite([sample.latitude_deg, sample.longitude_deg, sample.altitude_m]).all():
+            return Prediction()
+        place, rotation = self._pose(sample)
+        rank, level = self._replayed(place[None], rotation[None])
+        east, north, up = map(float, place)
+        return Prediction(
+            rank=int(rank[0]) or None,
+            level_dbm=float(level[0]) if rank[0] else None,
+            east_m=east,
+            north_m=north,
+            up_m=up,
+            learn=None if ahead is None or not rank[0] else partial(self._learn, ahead, place, float(level[0])),
+        )
+
+    def _learn(
+        self, ahead: RouteAhead, place: FloatArray, level: float, utc_ns: int, rsrp_dbm: float
+    ) -> dict[str, Any] | None:
+        """The rest of the route for the log and the page, after a record; None between two bins."""
+        free = float(self._free_space(place[None])[0])
+        forecast = ahead.add(utc_ns / 1e9, place, rsrp_dbm, {"replay": level, "free space": free})
+        if forecast is None:
+            return None
+        low, high = forecast.interval_db
+        columns = np.column_stack([ahead.route_m[forecast.index, :2], forecast.level_db, low, high])
+        columns = columns[np.isfinite(columns).all(axis=1)]
+        if not len(columns):
+            return None
+        shown = columns[spread_out(len(columns), _ROUTE_SHOWN)].round(1)
+        median, least, most = columns[:, 2:].mean(axis=0).round(1).tolist()
+        return {"trend": forecast.trend, "level_dbm": median, "interval_dbm": [least, most], "points": shown.tolist()}
+
+    def map(self) -> LiveMap:
+        """Predicted rank and level over the site at several heights, the UAV level and heading north."""
+        east_min, east_max, north_min, north_max = self.site.area_m
+        spacing = max(20.0, max(east_max - east_min, north_max - north_min) / _MAP_CELLS)
+        grid = Grid.over_area(self.site.area_m, spacing)
+        places = np.concatenate([grid.positions_m(height) for height in _MAP_HEIGHTS_M])
+        level = rotation_from_aircraft(np.asarray(0.0), np.asarray(0.0), np.asarray(0.0))
+        rank, level_dbm = self._replayed(places, np.broadcast_to(level, (len(places), 3, 3)))
+        shape = (len(_MAP_HEIGHTS_M), len(grid.north_m), len(grid.east_m))
+        return LiveMap(
+            title=self.settings.flight.title or self.settings.flight.name,
+            site=self.site,
+            tower=self.settings.rank.tower,
+            k=self.k,
+            heights_m=_MAP_HEIGHTS_M,
+            east_m=grid.east_m,
+            north_m=grid.north_m,
+            rank=rank.reshape(shape),
+            level_dbm=level_dbm.reshape(shape),
+        )
+
+    def _pose(self, sample: TelemetrySample) -> tuple[FloatArray, FloatArray]:
+        east, north = self.site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
+        ground = float(self.site.ground_under_m(np.array([east]), np.array([north]))[0])
+        up = max(sample.altitude_m + self.site.takeoff_ground_m, ground + MINIMUM_HEIGHT_M)
+        place, attitude = np.array([float(east), float(north), up]), self.settings.rt.attitude
+        if attitude == "ignored" or not np.isfinite(sample.yaw_deg):
+            return place, np.eye(3)
+        roll, pitch = (0.0, 0.0) if attitude == "level" else (sample.roll_deg, sample.pitch_deg)
+        return place, rotation_from_aircraft(np.asarray(roll), np.asarray(pitch), np.asarray(sample.yaw_deg))
+
+    def _replayed(self, places_m: FloatArray, rotations: FloatArray) -> tuple[Any, FloatArray]:
+        """Rank (n,) at the twin's K and level (n,) [dBm]."""
+        replayed = replay_poses(self.site, self.settings.rt, self.link, Poses(places_m, rotations), engine="image")
+        return channel_rank(replayed.h[:, 0], self.k), replayed.rss_dbm[:, 0]
+
+
+def _telemetry_log(settings: FlightFile) -> LogSettings:
+    return next((entry for entry in settings.logs if entry.reader in (None, "vehicle_out")), settings.logs[0])
+
+
+class FlownAgain:
+    """The flight of a flight file, flown again from now on, for ``modem-sim``: rank, RSRP, and telemetry that grows.
+
+    Parameters
+    ----------
+    flight : Path
+        flight.yaml with a telemetry log and, for the ranks, a rank log.
+    telemetry : Path
+        New file for the telemetry.
+    """
+
+    def __init__(self, flight: Path, telemetry: Path) -> None:
+        twin = LiveTwin.of(flight)
+        settings, log = twin.settings, _telemetry_log(twin.settings)
+        data = (flight.parent / log.path).read_bytes()
+        streams = by_name(log.reader or "vehicle_out").read(data, log.options(settings.timezone)).streams
+        if not streams or not len(streams[0].frame):
+            raise InputError("no telemetry in it", expected="a flight with a vehicleOut log", path=flight)
+        self._frame, self._zone = streams[0].frame.sort_values("time"), settings.timezone or "UTC"
+        times = self._frame["time"].to_numpy().astype("datetime64[ns]").astype("int64")
+        self._seconds = (times - times[0]) / 1e9
+        self._lasts_s = float(self._seconds[-1]) + 1.0
+        self._level = self._levels(twin)
+        self.rank = self._rank_log(settings, flight.parent)
+        self._start_ns, self._written = time.time_ns(), 0
+        try:
+            self._file = telemetry.open("xb", buffering=0)
+        except FileExistsError:
+            raise UsageError("the file is there already", expected="a new name", path=telemetry) from None
+
+    def _levels(self, twin: LiveTwin) -> FloatArray:
+        """RSRP at each line of the telemetry: the replay, an offset, and a fading that remembers two lines."""
+        names = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
+        rows = self._frame[list(names)].to_numpy(dtype="float64")
+        poses = [twin._pose(TelemetrySample(0, *row)) for row in rows]
+        level = twin._replayed(np.stack([p for p, _ in poses]), np.stack([r for _, r in poses]))[1]
+        random = np.random.default_rng(7)
+        fading = np.zeros(len(level))
+        for i in range(1, len(fading)):
+            # 0.36 + 0.64 = 1: the variance stays that of one step
+            fading[i] = 0.6 * fading[i - 1] + 0.8 * _DEMO_FADING_DB * random.standard_normal()
+        # -140 dBm is the least RSRP that a modem can report
+        return np.asarray(np.nan_to_num(level + _DEMO_OFFSET_DB + fading, nan=-140.0))
+
+    @staticmethod
+    def _rank_log(settings: FlightFile, folder: Path) -> Callable[[float], int] | None:
+        """Ranks of the flight's first rank log; None: those of the built-in flight."""
+        for entry in settings.logs:
+            if (ranks := ranks_of(folder / entry.path, entry.options(settings.timezone))) is not None:
+                return ranks
+        return None
+
+    def rsrp(self, seconds: float) -> float:
+        """RSRP so long after the start [dBm]."""
+        return float(np.interp(seconds % self._lasts_s, self._seconds, self._level))
+
+    def __call__(self) -> None:
+        """Write the telemetry lines that are due."""
+        elapsed = (time.time_ns() - self._start_ns) / 1e9
+        while self._due() <= elapsed:
+            row = self._frame.iloc[[self._written % len(self._frame)]].copy()
+            row["time"] = np.datetime64(self._start_ns + int(self._due() * 1e9), "ns")
+            line = format_vehicle_out(row, self._zone).partition(b",")[2]  # one row is written: its number is ours
+            self._written += 1
+            self._file.write(b"%d," % self._written + line)
+
+    def _due(self) -> float:
+        rounds, line = divmod(self._written, len(self._frame))
+        return rounds * self._lasts_s + float(self._seconds[line])

@@ -1,1 +1,0 @@
-"""Coverage and rank maps of a site, and scenes of other programs."""

@@ -1,0 +1,474 @@
+"""The ``plan`` command: which flight to fly next, by the standard deviation that each candidate would leave."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import shapely
+
+from ..common.errors import InputError, UsageError
+from ..common.geodesy import bearing_deg
+from ..common.outputs import OutputFolder
+from ..common.stages import PlannedStage, Stages
+from ..common.text import counted
+from ..common.units import FloatArray
+from ..compare.calibration import choose
+from ..compare.field_gp import Known, rms_db
+from ..compare.gains import GainModel, LinkSamples
+from ..flight.routes import (
+    NOSES,
+    Pattern,
+    Route,
+    Waypoint,
+    allowed_area,
+    cut,
+    flown,
+    plan_text,
+    route_of,
+    waypoints_csv,
+)
+from ..flight.training import counted_once
+from ..logs.route import read_areas
+from ..report.plan import PlanPage, plan_metrics, write_plan
+from ..report.texts import safe_name
+from ..site.mapfiles import MAX_CROSSINGS, is_tangled
+from ..site.site import Site
+from .calibrate import learned_antennas, observe
+from .options import DEFAULT, JobOutcome, RunOptions
+from .predict import site_of
+from .sources import (
+    NamedFlight,
+    TargetOptions,
+    Targets,
+    files_of,
+    find_targets,
+    level_samples,
+    named_flights,
+    sources_of,
+    target_files,
+)
+
+# Target: all directions of the tower seen from the UAV, at all headings.
+_SPHERE = "sphere"
+
+_SPHERE_AWAY_M = 150.0
+# Per antenna, while candidates are ranked.
+_MOST_TARGETS = 600
+
+# At points of a target whose heading is open.
+HEADINGS = 4
+
+# Of one area: geofences are drawn by hand.
+_MOST_CORNERS = 10_000
+# A target that lies farther outside the geofence throughout, or a geofence outside the site, is refused.
+_FARTHEST_M = 1000.0
+
+# Of the battery, for what a longer flight buys.
+SHARES = (0.25, 0.5, 0.75, 1.0, 1.5)
+
+_ALLOWED_OUTSIDE_M = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlanOptions:
+    """Options of ``plan``.
+
+    Parameters
+    ----------
+    minutes, speed_mps : float
+        Battery and speed.
+    heights_m : tuple of float
+        Of the tool's own patterns, above take-off.
+    tower_distance_m : float
+        Least horizontal distance to towers.
+    fence : Path, optional
+        KML; the area of the site without.
+    avoid : tuple of Path
+        KMLs of no-fly areas.
+    routes : tuple of Path
+        Further candidates.
+    towers : tuple of str
+        Whose antennas count, where no flight names them.
+    target : TargetOptions
+        Heights, spacing and heading of a target that is a grid, and the site where no flight names it.
+    """
+
+    minutes: float = 15.0
+    speed_mps: float = 8.0
+    heights_m: tuple[float, ...] = (40.0,)
+    tower_distance_m: float = 30.0
+    fence: Path | None = None
+    avoid: tuple[Path, ...] = ()
+    routes: tuple[Path, ...] = ()
+    towers: tuple[str, ...] = ()
+    target: TargetOptions = field(default_factory=lambda: TargetOptions(spacing_m=60.0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """A flight to choose: route, pattern (None of a file), why it may not be flown; ranked: what it leaves [dB]."""
+
+    route: Route
+    pattern: Pattern | None = None
+    refused: str = ""
+    sd_db: float = math.nan
+
+    @property
+    def row(self) -> dict[str, Any]:
+        """For metrics.json."""
+        length = {"length_m": self.route.length_m, "minutes": self.route.duration_s / 60.0}
+        return {"name": self.route.name, "sd_db": self.sd_db, **length, "refused": self.refused}
+
+
+def _plan_flight(
+    target: str, flights: Sequence[NamedFlight], plan: PlanOptions, logs_root: Path | None, stages: Stages
+) -> PlanPage:
+    """Rank candidate flights by the standard deviation that they would leave over a target.
+
+    Parameters
+    ----------
+    target : str
+        ``sphere``, or what :func:`.sources.find_targets` takes.
+    flights : sequence of NamedFlight
+        That were flown; none: antennas are unknown.
+    plan : PlanOptions
+    logs_root : Path or None
+    stages : Stages
+
+    Returns
+    -------
+    PlanPage
+        Candidates best first, the files of the best, and the standard deviation over the target before and after it.
+
+    Raises
+    ------
+    UsageError, InputError
+        No candidate fits, a target far outside, a route that cannot be read.
+    """
+    with stages("read"):
+        datas, remarks = counted_once([flight.load(logs_root) for flight in flights])
+        observed = observe(datas)[0] if datas else []
+        site, _ = site_of(None if target == _SPHERE else Path(target), flights, datas, plan.target.site)
+        sources = sources_of(datas, observed) if datas else {}
+        ends = {a: (s.tower, s.channel) for a, s in sources.items()} or _open_ends(site, plan)
+        series = [o.samples for o in observed if o.samples.antenna in ends]
+        area = _area(site, plan)
+    with stages("candidates"):
+        candidates = [*_own_patterns(plan, area, site), *_file_routes(plan, area, site)]
+        if not candidates:
+            raise UsageError(
+                "no route fits: no pattern lies within the geofence",
+                expected="a larger area, or --route FILE",
+            )
+        if all(candidate.refused for candidate in candidates):
+            raise UsageError(
+                f"no route fits: {candidates[0].route.name} {candidates[0].refused}",
+                expected="a candidate within the geofence, the battery and the distance to towers",
+            )
+        points = None if target == _SPHERE else find_targets(Path(target), site, plan.target)
+        if points is not None:
+            remarks += points.remarks
+            _check_near("target", shapely.multipoints(points.position_m[points.known]), area, "that may be flown")
+        targets = _targets(points, site, ends)
+    work = f"{counted(len(candidates), 'candidate')}: {', '.join(candidate.route.name for candidate in candidates)}"
+    stages.checked(lambda: [PlannedStage("learn, rank, curve, map", work)])
+    with stages("learn"):
+        known = _flown_knowledge(series)
+    few_targets = {a: _thinned(s, _MOST_TARGETS) for a, s in targets.items()}
+
+    def leaves_db(route: Route) -> float:
+        return rms_db(known.sd_db(_samples(route, ends, site), few_targets))
+
+    with stages("rank"):
+        ranked = _ranked(candidates, leaves_db, stages)
+    with stages("curve"):
+        curve = _curve(ranked, leaves_db, site, area, plan)
+    with stages("map"):
+        shown = {a: _thinned(s, 6 * _MOST_TARGETS) for a, s in targets.items()}
+        before, after = known.sd_db([], shown), known.sd_db(_samples(ranked[0].route, ends, site), shown)
+    best, ways, speed = ranked[0], ranked[0].route.waypoints, plan.speed_mps
+    return PlanPage(
+        target=target,
+        sentence=_sentence(best, curve, rms_db(known.sd_db([], few_targets))),
+        antennas=tuple(ends),
+        flights=[data.settings.flight.name for data in datas],
+        candidates=[candidate.row for candidate in ranked],
+        curve=curve,
+        outline_m=np.array(area.exterior.coords),
+        holes_m=[np.array(ring.coords) for ring in area.interiors],
+        track_m=best.route.position_m,
+        place_m=next(iter(shown.values())).position_m,
+        before_db=_rms_of_antennas(before),
+        after_db=_rms_of_antennas(after),
+        seen_from_m=np.asarray(site.towers[next(iter(ends.values()))[0]].position_m) if points is None else None,
+        site=site,
+        files={
+            "route.plan": plan_text(ways, site.frame, speed),
+            "route.csv": waypoints_csv(ways, site.frame),
+        },
+        warnings=[*(f"{text}." for text in site.cautions(tower for tower, _ in ends.values())), *remarks],
+        stages_s=stages.seconds,
+    )
+
+
+def _sentence(best: Candidate, curve: Sequence[Mapping[str, float]], now_db: float) -> str:
+    """Opening text of the page."""
+    minutes = best.route.duration_s / 60.0
+    text = (
+        f"Fly {best.route.name}: {best.route.length_m / 1000.0:.1f} km, {minutes:.0f} min. It lowers the standard "
+        f"deviation over the target from {now_db:.1f} to {best.sd_db:.1f} dB."
+    )
+    for enough in [p for p in curve if p["minutes"] < 0.9 * minutes][-1:]:
+        text += f" A flight of {enough['minutes']:.0f} min leaves {enough['sd_db']:.1f} dB."
+    return text
+
+
+def _ranked(candidates: Sequence[Candidate], leaves_db: Callable[[Route], float], stages: Stages) -> list[Candidate]:
+    """Candidates by what they leave, those that may not be flown last."""
+    ranked = []
+    for number, candidate in enumerate(candidates):
+        stages.progress(f"rank {candidate.route.name}", number / len(candidates))
+        ranked.append(replace(candidate, sd_db=leaves_db(candidate.route)))
+    ranked.sort(key=lambda candidate: (bool(candidate.refused), candidate.sd_db))
+    return ranked
+
+
+def _open_ends(site: Site, plan: PlanOptions) -> dict[str, tuple[str, str]]:
+    """Antennas that nobody has measured: one per tower."""
+    towers = plan.towers or tuple(site.towers)
+    for name in towers:
+        if name not in site.towers:
+            raise UsageError(f"no tower {name!r}", expected="one of " + ", ".join(site.towers))
+    return {f"{name}.level": (name, "level") for name in towers}
+
+
+def _area(site: Site, plan: PlanOptions) -> Any:
+    """Area where a route may run."""
+    west, east, south, north = site.area_m
+    ground = shapely.box(west, south, east, north)
+    fence = ground if plan.fence is None else shapely.union_all(_polygons(plan.fence, site))
+    _check_near("geofence", fence, ground, f"of site {site.name}")
+    avoid = [polygon for path in plan.avoid for polygon in _polygons(path, site)]
+    towers = np.array([t.position_m for t in site.towers.values()]).reshape(-1, 3)
+    return allowed_area(fence, avoid, towers, plan.tower_distance_m)
+
+
+def _polygons(path: Path, site: Site) -> list[shapely.Polygon]:
+    out = []
+    for corners in read_areas(path):
+        latitude, longitude = np.array(corners).T
+        east, north = site.frame.to_local(latitude, longitude)
+        ring = shapely.Polygon(np.column_stack([east, north]))
+        if len(corners) > _MOST_CORNERS or is_tangled(ring):  # what follows is not bounded and hears no Ctrl-C
+            raise InputError(
+                f"an area of {len(corners)} corners that cannot be used",
+                expected=f"at most {_MOST_CORNERS} corners and {MAX_CROSSINGS} crossings of the outline with itself",
+                cause="a track or a drawing by hand: simplify it in the map program",
+                path=path,
+            )
+        out.append(ring.buffer(0))
+    if not any(item.area > 0 for item in out):
+        raise InputError("areas without an extent", expected="outlines of three corners or more", path=path)
+    return out
+
+
+def _own_patterns(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
+    """The tool's own patterns; those that leave the area on the way between legs are dropped."""
+    out = []
+    shapes = [("lawnmower", 0.0, False), ("lawnmower", 90.0, False), ("lawnmower", 0.0, True), ("cross", 0.0, False)]
+    for height, (shape, azimuth, turns), nose in product(plan.heights_m, shapes, NOSES):
+        # where the aircraft turns on its legs all headings are flown already, whichever the nose
+        if turns and nose != "along":
+            continue
+        pattern = Pattern(shape=shape, azimuth_deg=azimuth, height_m=height, nose=nose, turns=turns)  # type: ignore[arg-type]
+        try:
+            route = _raised(route_of(pattern, area, plan.speed_mps, 60.0 * plan.minutes), site)
+        except UsageError:
+            continue
+        if not _leaves_area(route, area):
+            out.append(Candidate(route=route, pattern=pattern))
+    return out
+
+
+def _file_routes(plan: PlanOptions, area: Any, site: Site) -> list[Candidate]:
+    """Routes of files, flown at the speed of the plan; why one may not be flown."""
+    out = []
+    for path in plan.routes:
+        targets = find_targets(path, site, TargetOptions(heights_m=plan.heights_m))
+        if targets.kind == "grid" or targets.known.sum() < 2:
+            raise InputError("no route", expected="a .plan, KML, CSV or log with two points or more", path=path)
+        place, yaw = targets.position_m[targets.known], targets.yaw_deg[targets.known]
+        steps = np.diff(place, axis=0)
+        yaw = np.where(np.isfinite(yaw), yaw, bearing_deg(np.vstack([steps, steps[-1:]])))  # else the nose goes ahead
+        ground = site.takeoff_ground_m
+        points = [
+            Waypoint(east_m=float(p[0]), north_m=float(p[1]), height_m=float(p[2]) - ground, yaw_deg=float(y))
+            for p, y in zip(place, yaw, strict=True)
+        ]
+        route = _raised(flown(path.name, _corners(points), plan.speed_mps), site)
+        refused = "leaves the allowed area" if _leaves_area(route, area) else ""
+        if route.duration_s > 60.0 * plan.minutes + 1.0:
+            refused = f"takes {route.duration_s / 60.0:.1f} min of {plan.minutes:g} min"
+        out.append(Candidate(route=route, refused=refused))
+    return out
+
+
+def _corners(points: Sequence[Waypoint]) -> list[Waypoint]:
+    """Waypoints without those that lie straight between their neighbours and keep the yaw."""
+    place = np.array([(w.east_m, w.north_m, w.height_m) for w in points])
+    corners = [points[0]]
+    for i in range(1, len(points) - 1):
+        before, after = place[i] - place[i - 1], place[i + 1] - place[i]
+        # the cosine of about one degree
+        straight = float(before @ after) > 0.9998 * float(np.linalg.norm(before) * np.linalg.norm(after))
+        if not straight or abs(points[i].yaw_deg - corners[-1].yaw_deg) > 2.0:
+            corners.append(points[i])
+    return [*corners, points[-1]]
+
+
+def _raised(route: Route, site: Site) -> Route:
+    """Heights above take-off to heights of the site."""
+    return replace(route, position_m=route.position_m + np.array([0.0, 0.0, site.takeoff_ground_m]))
+
+
+def _leaves_area(route: Route, area: Any) -> bool:
+    line = shapely.LineString(route.position_m[:, :2])
+    return not bool(shapely.covers(shapely.buffer(area, _ALLOWED_OUTSIDE_M + 3.0), line))
+
+
+def _targets(points: Targets | None, site: Site, ends: Mapping[str, tuple[str, str]]) -> dict[str, LinkSamples]:
+    """Target points (None: all directions) at every antenna, at all headings where the heading is open."""
+    out = {}
+    for antenna, end in ends.items():
+        tower = np.asarray(site.towers[end[0]].position_m)
+        if points is None:
+            direction = _even_directions(800)
+            direction = direction[(direction[:, 2] > 0.03) & (direction[:, 2] < 0.98)]
+            # turns by the golden angle spread headings as evenly as the directions
+            place, yaw = tower + _SPHERE_AWAY_M * direction, 137.508 * np.arange(len(direction)) % 360.0
+        else:
+            place, yaw = points.position_m[points.known], points.yaw_deg[points.known]
+            step = max(1, len(place) // (2 * _MOST_TARGETS))
+            place, yaw = place[::step], yaw[::step]
+            if np.isnan(yaw).any():
+                turns = np.arange(HEADINGS) * (360.0 / HEADINGS)
+                place, yaw = (
+                    np.repeat(place, HEADINGS, axis=0),
+                    np.where(np.isnan(np.repeat(yaw, HEADINGS)), np.tile(turns, len(yaw)), np.repeat(yaw, HEADINGS)),
+                )
+        out[antenna] = level_samples(end, tower, place, np.asarray(yaw, dtype=np.float64), np.zeros(len(yaw)))
+    return out
+
+
+def _check_near(what: str, place: Any, area: Any, which: str) -> None:
+    """UsageError where a shape lies farther than :data:`_FARTHEST_M` outside the area."""
+    distance_m = shapely.distance(area, place)
+    if distance_m > _FARTHEST_M:
+        raise UsageError(
+            f"the {what} lies {distance_m:.0f} m outside the area {which}",
+            expected=f"a {what} within {_FARTHEST_M:g} m of it",
+            cause="another site, or exchanged coordinates",
+        )
+
+
+def _samples(route: Route, ends: Mapping[str, tuple[str, str]], site: Site) -> list[LinkSamples]:
+    return [
+        level_samples(end, np.asarray(site.towers[end[0]].position_m), route.position_m, route.yaw_deg, route.time_s)
+        for end in ends.values()
+    ]
+
+
+def _even_directions(count: int) -> FloatArray:
+    """Unit vectors (count, 3) that share the sphere evenly (Fibonacci lattice)."""
+    k = np.arange(count) + 0.5
+    z = 1.0 - 2.0 * k / count
+    azimuth = np.pi * (1.0 + math.sqrt(5.0)) * k
+    across = np.sqrt(1.0 - z * z)
+    return np.asarray(np.stack([across * np.cos(azimuth), across * np.sin(azimuth), z], axis=-1), dtype=np.float64)
+
+
+def _flown_knowledge(series: Sequence[LinkSamples]) -> Known:
+    """Strengths and residual field by the flights that were flown; the model's own without any."""
+    model, residual_field = GainModel(), None
+    if series:
+        model = learned_antennas(series).model
+        correction = choose(series, {"learned": lambda train: learned_antennas(train).predict})
+        residual_field = correction.model if correction.on else None
+    return Known(series=series, model=model, field=residual_field)
+
+
+def _thinned(samples: LinkSamples, most: int) -> LinkSamples:
+    """Points spread over a target; the step shares no factor with the number of headings."""
+    step = max(1, math.ceil(len(samples) / most))
+    step += int(step > 1 and step % 2 == 0)
+    return samples.part(np.arange(0, len(samples), step))
+
+
+def _rms_of_antennas(sd_db: Mapping[str, FloatArray]) -> FloatArray:
+    return np.asarray(np.sqrt(np.mean([sd**2 for sd in sd_db.values()], axis=0)))
+
+
+# Candidates of which the best one counts at each length: a pattern of fewer legs may lie better.
+_CURVE_OF = 3
+
+
+def _curve(
+    ranked: Sequence[Candidate], leaves_db: Callable[[Route], float], site: Site, area: Any, plan: PlanOptions
+) -> list[dict[str, float]]:
+    """Standard deviations that shorter and longer flights of the best candidates leave; of files, shorter ones."""
+    out: list[dict[str, float]] = []
+    best = [r for r in ranked if not r.refused][:_CURVE_OF]
+    for share in SHARES:
+        tried = []
+        for route in filter(None, (_of_length(item, share, area, plan) for item in best)):
+            raised = _raised(route, site)
+            sd = leaves_db(raised)
+            tried.append({"minutes": raised.duration_s / 60.0, "length_m": raised.length_m, "sd_db": sd})
+        for point in sorted(tried, key=lambda point: point["sd_db"])[:1]:
+            least = min([point["sd_db"], *(p["sd_db"] for p in out)])  # a longer flight may hold the shorter one
+            out.append(point | {"sd_db": least})
+    return out
+
+
+def _of_length(candidate: Candidate, share: float, area: Any, plan: PlanOptions) -> Route | None:
+    """A candidate that takes this share of the battery; None of a file for more than it has."""
+    if candidate.pattern is not None:
+        return route_of(candidate.pattern, area, plan.speed_mps, 60.0 * share * plan.minutes)
+    full = flown(candidate.route.name, candidate.route.waypoints, plan.speed_mps)
+    return cut(full, share * full.duration_s, plan.speed_mps) if share <= 1.0 else None
+
+
+def run_plan(target: str, flights: Sequence[Path], plan: PlanOptions, options: RunOptions = DEFAULT) -> JobOutcome:
+    """Rank flights and write ``plan.html``, the chosen route, ``sd_map.csv`` and ``metrics.json``.
+
+    Parameters
+    ----------
+    target : str
+        As for :func:`.next_flight.plan_flight`.
+    flights : sequence of Path
+    plan : PlanOptions
+    options : RunOptions
+        ``out`` is ``reports/plan-TARGET`` by default.
+
+    Returns
+    -------
+    JobOutcome
+    """
+    inputs = target_files(Path(target), plan.target.site, options.logs_root)
+    inputs += [path for path in (plan.fence, *plan.avoid, *plan.routes) if path is not None]
+    known = named_flights(flights)
+    inputs += files_of(known, options.logs_root)
+    folder = options.out or Path("reports") / f"plan-{safe_name(Path(target).stem)}"
+    stages = options.stages("plan", inputs, folder)
+    with OutputFolder(folder, job="plan", inputs=inputs, force=options.force) as output:
+        record = _plan_flight(target, known, plan, options.logs_root, stages)
+        with output.filling() as place:
+            options.progress("page")
+            written = write_plan(record, place)
+        return JobOutcome(folder=folder, metrics=plan_metrics(record), files=output.placed(written))

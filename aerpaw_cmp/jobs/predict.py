@@ -1,0 +1,934 @@
+"""The ``predict`` job: level, its interval, probabilities and ranks where nobody has flown yet.
+
+A flight held against what was predicted before it: ``report flight.yaml --against prediction/``.
+
+Maps corrected by flights: raw replay, what ``predict`` says, its standard deviation, ranks of a learned receiver.
+
+Levels are those of the map, in dBm: the mean offset between the logs and the raw replay is taken off.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ..common.content import KEY, MARKS, union
+from ..common.errors import InputError, UsageError, parsing
+from ..common.files import LARGEST_TABLE, read_bounded
+from ..common.geodesy import bearing_deg
+from ..common.jsonable import named
+from ..common.outputs import OutputFolder
+from ..common.stages import PlannedStage, Progress, Stages
+from ..common.text import counted
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..compare.calibration import OFF, STATED_FIELDS, Base, Observed, by_degree, choose, fixed_base
+from ..compare.gains import BAND, LinkSamples, LostLock
+from ..compare.receiver import ForecastScore, score_forecast
+from ..flight.data import FlightData, site_place, unread
+from ..flight.drafting.proposals import remembered
+from ..flight.gains import flight_of
+from ..flight.settings import FlightFile, LinkSettings, LinksSettings
+from ..flight.training import among, common, counted_once, flight_logs, knows, learned_patterns, marks_of
+from ..maps.grid import Grid, Layer, class_names
+from ..propagation.geometry import Poses, rotation_from_aircraft
+from ..report import maps as page
+from ..report.against import Against, AgainstSeries
+from ..report.prediction import (
+    FLAGS,
+    TITLES,
+    PredictionPage,
+    against_words,
+    cautions,
+    first_words,
+    heading_words,
+    memory_cautions,
+    outside_share,
+    prediction_metrics,
+    prior_caution,
+    prior_words,
+    write_prediction,
+)
+from ..site.antennas import MeasuredPattern
+from ..site.learned import BAND as CARRIER_BAND
+from ..site.learned import folder_of, read_learned
+from ..site.site import Site
+from ..site.siteyaml import load_site, site_model
+from .calibrate import learned_antennas, observe
+from .calibrate_rank import FittedReceiver, RankSamples, rank_samples, read_receiver
+from .options import DEFAULT, JobOutcome, RunOptions
+from .sources import (
+    PRIOR_ANTENNA_DB,
+    PRIOR_FADING_DB,
+    PRIOR_OFFSET_DB,
+    PRIOR_SHADOWING_DB,
+    Flown,
+    Memory,
+    NamedFlight,
+    Prior,
+    Source,
+    TargetOptions,
+    Targets,
+    files_of,
+    find_targets,
+    is_settings,
+    memory_of,
+    named_flights,
+    outside,
+    sources_of,
+    target_files,
+    track_m,
+)
+
+# Directions of the nose that count alike where it is not known.
+HEADINGS = 8
+
+# Targets that are predicted together: bounds the memory.
+AT_ONCE = 50_000
+
+RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
+
+# Column of the probability of lock, where a receiver loses it.
+P_LOCK = "p_lock"
+
+_TILE_M = 100.0
+
+# Targets at which the channel matrices of a receiver are evaluated.
+MOST_RANKED = 50_000
+
+# Distance that counts as much as a turn of 60 degrees, where a target stands for its neighbours.
+_NOSE_M = 50.0
+
+_FLAG_CODES = {name: code for code, name in enumerate(["", *FLAGS])}
+
+# Receiver of each tower, the link that says its arrays, and the folder of their files.
+Receivers = Mapping[str, tuple[FittedReceiver, LinkSettings, Path]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """The record of a page, and what maps need besides."""
+
+    page: PredictionPage
+    targets: Targets
+    model: Flown | Memory | Prior
+    sources: Mapping[str, Source]
+
+    @property
+    def table(self) -> pd.DataFrame:
+        """Rows of prediction.csv: one per target, tower and channel, then one per target and receiver."""
+        return self.page.table
+
+    def _repr_html_(self) -> str:
+        """First words and the first points for notebooks."""
+        points = str(self.table.head(10).round(2).to_html(index=False, border=0))
+        return f"<p>{escape(self.page.verdict)}</p>{points}"
+
+
+def predict(
+    where: Path,
+    flights: Sequence[NamedFlight],
+    options: TargetOptions | None = None,
+    *,
+    logs_root: Path | None = None,
+    stages: Stages | None = None,
+) -> Prediction:
+    """Predict levels and ranks at the places that WHERE names.
+
+    Parameters
+    ----------
+    where : Path
+        See :func:`.sources.find_targets`.
+    flights : sequence of NamedFlight
+        Flights to learn from. Without any, the levels learned for the site are used; if there are none, ray tracing
+        with a wide prior.
+    options : TargetOptions, optional
+    logs_root : Path, optional
+        Where logs resolve.
+    stages : Stages, optional
+
+    Returns
+    -------
+    Prediction
+
+    Raises
+    ------
+    UsageError, InputError
+        No source that shares a tower and band, no place to predict.
+    """
+    stages, options = stages or Stages(), options or TargetOptions()
+    with stages("read"):
+        known, remarks = counted_once([flight.load(logs_root) for flight in flights])
+        site, place = site_of(where, flights, known, options.site)
+        unflown = None if known else _unflown(where, place, site, options)
+        if unflown is not None:
+            asked = _nodes_of(where)
+            every = unflown.sources()
+            if isinstance(unflown, Prior) and options.carrier_hz is None and (learned := remembered(place)):
+                remarks.append(f"Not used: the antennas learned for {', '.join(learned)} have no level.")
+            sources = {name: s for name, s in every.items() if s.tower in asked} or every
+        else:
+            observed, warnings = observe(known)
+            sources = sources_of(known, observed)
+            remarks += [text for text in warnings if "scored" not in text]
+        _check_shared(where, sources, site, "the flights heard" if known else "the site remembers")
+        targets = find_targets(where, site, options, logs_root)
+    work = f"{counted(len(targets.position_m), 'point')}: {', '.join(sources)}"
+    stages.checked(lambda: [PlannedStage("choose, predict", work)])
+    with stages("choose"):
+        model = unflown or _best_model(targets, sources, known, place, remarks)
+    with stages("predict"):
+        receivers = _receivers(known, place, site)
+        table = _table(targets, site, (sources, model, receivers), stages.progress)
+    about = _model_fields(model, known, [receiver for receiver, _, _ in receivers.values()], table)
+    cautioned = [f"{text}." for text in site.cautions(source.tower for source in sources.values())]
+    page = PredictionPage(
+        **named(targets, "name kind heights_m"),
+        site=site,
+        table=table,
+        units={f"{s.tower} {s.channel}": s.unit for s in sources.values()},
+        shape=None if targets.grid is None else targets.grid.shape,
+        flown={f"{s.flight} {s.antenna}": track_m(s).T for source in sources.values() for s in source.samples},
+        stages_s=stages.seconds,
+        **about | {"warnings": (*cautioned, *about["warnings"], *remarks, *targets.remarks)},
+    )
+    return Prediction(page=page, targets=targets, model=model, sources=sources)
+
+
+def _model_fields(
+    model: Flown | Memory | Prior, known: Sequence[FlightData], receivers: Sequence[FittedReceiver], table: pd.DataFrame
+) -> dict[str, Any]:
+    """Fields of the page that tell of the model and what it learned from."""
+    guess = outside_share(table)
+    expected = (
+        float(np.sqrt((table["slow_sd_db"] ** 2).mean())),
+        float((table["q95_db"] - table["q05_db"]).mean()) / 2.0,
+        heading_words(table["yaw_deg"].to_numpy(np.float64)),
+        float(table[P_LOCK].mean()) if P_LOCK in table else None,
+    )
+    if isinstance(model, Prior):
+        return {
+            "verdict": first_words(
+                None, 0.0, *expected, origin=prior_words(model.link.carrier_hz, model.link.transmit_power_dbm)
+            ),
+            "warnings": [prior_caution(PRIOR_OFFSET_DB, PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, PRIOR_FADING_DB)],
+            "flights": [],
+            KEY: (),
+            MARKS: (),
+            "candidates": [],
+            "model": {},
+            "chosen": {"title": TITLES["prior"], "base": "prior", "corrected": False, "field": OFF},
+        }
+    logs, marks = ([getattr(receiver, key) for receiver in receivers] for key in (KEY, MARKS))
+    if isinstance(model, Memory):
+        entries = {antenna.entry.command: antenna.entry for antenna in model.known.values()}.values()
+        return {
+            "verdict": first_words(None, guess, *expected),
+            "warnings": memory_cautions([(m.entry, m.series) for m in model.known.values()], guess),
+            "flights": [name for entry in entries for name in entry.flights],
+            KEY: union(*(entry.trained_on for entry in entries), *logs),
+            MARKS: union(*(end.marks for m in model.known.values() for end in (m.tower, m.uav)), *marks),
+            "candidates": [],
+            "model": {},
+            "chosen": {"title": TITLES["memory"], "base": "memory", "corrected": False, "field": OFF},
+        }
+    correction = model.correction
+    key = correction.base, correction.title
+    return {
+        "verdict": first_words(correction, guess, *expected),
+        "warnings": cautions(correction, guess),
+        "flights": [data.settings.flight.name for data in known],
+        KEY: union(*map(flight_logs, known), *logs, *model.trained_on),
+        MARKS: union(marks_of(known), *marks, *model.marks),
+        "candidates": [
+            {"base": TITLES[base], "field": name, "rmse_db": correction.rmse_db[base, name], "crps_db": crps}
+            for (base, name), crps in sorted(correction.crps_db.items(), key=lambda item: item[1])
+        ],
+        "model": asdict(correction.model),
+        "chosen": {
+            "title": f"{TITLES[correction.base]}, {correction.title}",
+            "base": correction.base,
+            "corrected": correction.on,
+            "field": correction.title,
+            "sd_factor": correction.sd_factor,
+            "rmse_db": correction.rmse_db[key],
+            "crps_db": correction.crps_db[key],
+            "left_out": "flights" if len(correction.flights) > 1 else "300 m blocks",
+        },
+    }
+
+
+# --- sources -------------------------------------------------------------------------------------------------------
+
+
+def site_of(
+    where: Path | None, flights: Sequence[NamedFlight], known: Sequence[FlightData], named: str | None = None
+) -> tuple[Site, str | Path]:
+    """Site of a prediction or plan: by name, WHERE where it is a site, that of the flights, that of WHERE.
+
+    Parameters
+    ----------
+    where : Path or None
+    flights : sequence of NamedFlight
+    known : sequence of FlightData
+        Their data; all must share the frame of the site.
+    named : str, optional
+        ``--site``.
+
+    Returns
+    -------
+    site : Site
+    place : str or Path
+        As :func:`~aerpaw_cmp.site.siteyaml.load_site` takes it.
+
+    Raises
+    ------
+    UsageError, InputError
+        No site, two sites, no such file.
+    """
+    if where is not None and where.suffix and not where.exists():
+        raise InputError("no such file", expected="a site, a route, points or a flight.yaml", path=where)
+    planned = None if where is None else flight_of(where)
+    place: str | Path | None = named
+    if place is None and where is not None and planned is None and (is_settings(where) or not where.exists()):
+        place = where if where.is_file() else str(where)
+    if place is not None:
+        site = load_site(place)
+    elif known:
+        site, place = known[0].site, site_place(flights[0].settings.site.file, flights[0].path.parent)
+    elif where is not None and planned is not None:
+        asked = unread(planned, where.parent)
+        site, place = asked.site, asked.site_place
+    else:
+        raise UsageError("the site is not named", expected="--site SITE, or --with a flight")
+    for data in known:
+        east, north = site.frame.to_local(np.array([data.site.frame.latitude_deg]), [data.site.frame.longitude_deg])
+        if np.hypot(east[0], north[0]) > 1.0:
+            raise UsageError(
+                f"flight {data.settings.flight.name} has site {data.site.name!r}, the prediction {site.name!r}",
+                expected="flights of one site",
+            )
+    return site, place
+
+
+def _unflown(where: Path, place: str | Path, site: Site, options: TargetOptions) -> Memory | Prior:
+    """Return the model of a site without named flights: what was learned for it, else ray tracing with a prior.
+
+    A carrier or a power that the user names asks for the prior: learned levels belong to their own.
+    """
+    memory = memory_of(place, site) if options.carrier_hz is None and options.tx_power_dbm is None else None
+    if memory is not None:
+        return memory
+    stated, flight = site_model(place).coverage, flight_of(where)
+    link = LinksSettings().rank if flight is None else flight.link.rss
+    carrier_hz = options.carrier_hz or (stated.carrier_ghz or 0.0) * 1e9 or link.carrier_hz
+    powers = (options.tx_power_dbm, stated.tx_power_dbm, link.transmit_power_dbm)
+    link = LinkSettings(carrier_hz=carrier_hz, transmit_power_dbm=next(p for p in powers if p is not None))
+    return Prior(site, link, tuple(site.towers))
+
+
+def _nodes_of(where: Path) -> set[str]:
+    """Nodes of the logs of a flight file; none of another WHERE."""
+    planned = flight_of(where)
+    return set() if planned is None else {log.node for log in planned.logs if log.node}
+
+
+def _check_shared(where: Path, sources: Mapping[str, Source], site: Site, who: str) -> None:
+    """UsageError where the sources share no tower with the site, or none with the planned flight and its band."""
+    planned = flight_of(where)
+    towers, bands = {s.tower for s in sources.values()}, {s.link.carrier_hz for s in sources.values()}
+    nodes = _nodes_of(where) if planned is not None else set(site.towers) | towers
+    links = [planned.link.rss, *planned.link.channels.values()] if planned is not None else []
+    carriers = {link.carrier_hz for link in links if "carrier_hz" in link.model_fields_set}
+    near = not carriers or any(abs(a / b - 1.0) <= CARRIER_BAND for a in carriers for b in bands)
+    if (not nodes or nodes & towers) and near:
+        return
+    raise UsageError(
+        f"{who} {', '.join(sorted(towers))} at {', '.join(f'{b / 1e9:g} GHz' for b in sorted(bands))}; "
+        f"{where.name} asks for {', '.join(sorted(nodes)) or 'any tower'}"
+        + (f" at {', '.join(f'{c / 1e9:g} GHz' for c in sorted(carriers))}" if carriers else ""),
+        expected="--with a flight that shares a tower and the band",
+    )
+
+
+def _best_model(
+    targets: Targets, sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path, remarks: list[str]
+) -> Flown:
+    """The model that predicts the named flights best; ``remarks`` receives a remark on the choice.
+
+    Parameters
+    ----------
+    targets : Targets
+    sources : mapping of str to Source
+    known : sequence of FlightData
+    place : str or Path
+        Of the site.
+    remarks : list of str
+
+    Returns
+    -------
+    Flown
+    """
+    samples = [s for source in sources.values() for s in source.samples]
+    bases, learned = _bases(sources, known, place)
+    beyond = bool(np.mean(outside(targets.position_m[targets.known], samples)) > 0.5)
+    if beyond:
+        remarks.append("Most points lie outside the flown places: models that remember places are left out.")
+        bases.pop("none")
+    correction = choose(samples, bases, STATED_FIELDS if beyond else ())
+    used = learned.get(correction.base, ())
+    return Flown(correction, sources, [item.trained_on for item in used], [item.marks for item in used])
+
+
+def _bases(
+    sources: Mapping[str, Source], known: Sequence[FlightData], place: str | Path
+) -> tuple[dict[str, Base], dict[str, list[MeasuredPattern | FlightFile]]]:
+    """Models that may carry the prediction, and what they use that was learned from logs.
+
+    Models that learned from these very flights elsewhere are left out.
+    """
+
+    def each(gain: Callable[[Source, LinkSamples], FloatArray]) -> Base:
+        return fixed_base(lambda s: gain(sources[s.antenna], s))
+
+    bases: dict[str, Base] = {
+        "learned": lambda train: by_degree(learned_antennas(train).predict),
+        "free space": each(lambda _, s: np.zeros(len(s))),
+        "none": each(lambda source, s: -source.free_space_db(s.position_m)),
+    }
+    links = [(s.link.build([s.tower], s.folder), s.folder) for s in sources.values()]
+    near = {
+        name: memory
+        for name, memory in remembered(place).items()
+        if name in sources and abs(memory.series.carrier_hz / sources[name].link.carrier_hz - 1.0) <= CARRIER_BAND
+    }
+    learned: dict[str, list[MeasuredPattern | FlightFile]] = {
+        "replay": [*(p for link, folder in links for p in learned_patterns(link, folder, place)),
+                   *(data.settings for data in known)],
+        "memory": [end for memory in near.values() for end in (memory.tower, memory.uav)],
+    }  # fmt: skip
+    if not any(knows(data, learned["replay"]) for data in known):
+        bases["replay"] = each(lambda source, s: source.replayed_db(s))
+    if len(near) == len(sources) and not any(knows(data, learned["memory"]) for data in known):
+        bases["memory"] = lambda _: by_degree(lambda s: near[s.antenna].gain_db(s))
+    if len({s.flight for source in sources.values() for s in source.samples}) < 2:
+        bases = {"free space": bases.pop("free space"), **bases}
+    return bases, learned
+
+
+# --- levels --------------------------------------------------------------------------------------------------------
+
+
+def _table(
+    targets: Targets,
+    site: Site,
+    learned: tuple[Mapping[str, Source], Flown | Memory | Prior, Receivers],
+    progress: Progress,
+) -> pd.DataFrame:
+    """Rows of every tower and channel, then of every receiver; float32, or a million points take gigabytes.
+
+    Parameters
+    ----------
+    targets : Targets
+    site : Site
+    learned : tuple
+        Sources, model, receivers.
+    progress : callable
+
+    Returns
+    -------
+    DataFrame
+    """
+    sources, model, receivers = learned
+    level, slow, guess = _levels(targets, sources, model, progress)
+    serving = _serving(level, slow, [source.channel for source in sources.values()])
+    towers = pd.CategoricalDtype(list(dict.fromkeys([*(s.tower for s in sources.values()), *receivers])))
+    channels = pd.CategoricalDtype(list(dict.fromkeys([*(s.channel for s in sources.values()), "rank"])))
+
+    def rows(tower: str, channel: str, flag: IntArray, index: Any, values: Mapping[str, FloatArray]) -> pd.DataFrame:
+        names = {"tower": (tower, towers), "channel": (channel, channels)}
+        kinds = pd.CategoricalDtype(list(_FLAG_CODES))
+        frame: pd.DataFrame = pd.DataFrame(
+            {
+                "point": np.arange(len(targets), dtype=np.int32)[index],
+                "time_s": targets.time_s[index],
+                **dict(zip(("east_m", "north_m", "height_m"), targets.position_m[index].T, strict=True)),
+                "yaw_deg": targets.yaw_deg[index],
+                **{
+                    column: pd.Categorical.from_codes(np.full(len(flag), kind.categories.get_loc(text)), dtype=kind)
+                    for column, (text, kind) in names.items()
+                },
+                **{name: np.asarray(value, dtype=np.float32) for name, value in values.items()},
+                "flag": pd.Categorical.from_codes(flag, dtype=kinds),
+            }
+        )
+        return frame
+
+    parts, nothing = [], np.full(len(targets), np.nan, dtype=np.float32)
+    for k, source in enumerate(sources.values()):
+        values = _stated(model, source.antenna, level[k], slow[k]) | {"p_serving": serving[k]}
+        values |= dict.fromkeys(RANKS, nothing) if receivers else {}
+        flag = np.where(guess[k], _FLAG_CODES["outside_flown"], 0)
+        flag[~np.isfinite(level[k])] = _FLAG_CODES["out_of_coverage"]
+        flag[~targets.known] = _FLAG_CODES["no_position"]
+        parts.append(rows(source.tower, source.channel, flag, slice(None), values))
+    for tower, index, p in _ranks(targets, receivers, site, progress):
+        values = dict(zip(RANKS, p.T, strict=True))
+        parts.append(rows(tower, "rank", np.zeros(len(index), dtype=np.int64), index, values))
+    table: pd.DataFrame = pd.concat(parts, ignore_index=True)
+    return table
+
+
+def _stated(model: Flown | Memory | Prior, antenna: str, level_db: AnyArray, slow_db: AnyArray) -> dict[str, AnyArray]:
+    """Columns (n,) of a level: median, standard deviation, interval, and P(lock) of a receiver that loses its lock."""
+    lock = model.lost_lock(antenna, level_db)
+    if lock is None:
+        fading = model.fading(antenna)
+        half, sd = fading.half_width_db(slow_db, BAND), fading.total_db(slow_db)
+        ends = {"level_db": level_db, "sd_db": sd, "q05_db": level_db - half, "q95_db": level_db + half}
+        return ends | {"slow_sd_db": slow_db}
+    low, middle, high = (lock.quantile_db(share) for share in (0.5 - 0.5 * BAND, 0.5, 0.5 + 0.5 * BAND))
+    sd = lock.sd_db(middle)  # with and without lock differ for longer than 4 s
+    ends = {"level_db": level_db + middle, "sd_db": sd, "q05_db": level_db + low, "q95_db": level_db + high}
+    parts = {"locked_db": level_db + lock.locked_db, "lost_db": level_db + lock.lost_db}
+    spreads = {f"{name}_sd_db": np.full(len(sd), getattr(lock, f"{name}_sd_db")) for name in ("locked", "lost")}
+    return ends | {"slow_sd_db": sd, P_LOCK: lock.probability} | parts | spreads
+
+
+def _levels(
+    targets: Targets, sources: Mapping[str, Source], model: Flown | Memory | Prior, progress: Progress
+) -> tuple[AnyArray, AnyArray, BoolArray]:
+    """Level, standard deviation of 4 s means (series, n) [dB], and where the model is a guess.
+
+    All headings count alike where none is known.
+    """
+    level, slow = np.full((2, len(sources), len(targets)), np.nan, dtype=np.float32)
+    guess: BoolArray = np.zeros(level.shape, dtype=np.bool_)
+    for k, source in enumerate(sources.values()):
+        for rows, share in _in_parts(targets):
+            position, yaw = targets.position_m[rows], targets.yaw_deg[rows]
+            up = np.broadcast_to(targets.up, targets.position_m.shape)[rows]
+            each = [source.targets(position, np.where(np.isfinite(yaw), yaw, turn), up) for turn in _turns(yaw)]
+            level[k, rows], slow[k, rows], guess[k, rows] = model.levels(each, int(targets.known.sum()))
+            level[k, rows] += source.free_space_db(position)
+            progress(f"predict {source.antenna}", share)
+    return level, slow, guess
+
+
+def _in_parts(targets: Targets) -> Iterator[tuple[IntArray, float]]:
+    """Targets that have a position, neighbours at a time, and the share that is then done."""
+    known = np.flatnonzero(targets.known)
+    tile = np.floor(targets.position_m[known, :2] / _TILE_M)
+    known = known[np.lexsort(tile.T)]
+    for start in range(0, len(known), AT_ONCE):
+        rows = known[start : start + AT_ONCE]
+        yield rows, (start + len(rows)) / len(known)
+
+
+def _turns(yaw_deg: FloatArray) -> FloatArray:
+    """Headings that count alike where one is not known [deg]."""
+    count = 1 if np.isfinite(yaw_deg).all() else HEADINGS
+    return np.asarray(np.arange(count) * (360.0 / HEADINGS))
+
+
+def _serving(level: AnyArray, slow: AnyArray, channels: Sequence[str]) -> AnyArray:
+    """Probability (series, n) that each tower is the strongest among those of its channel.
+
+    By Gauss-Hermite quadrature over the tower's own level; levels of towers are taken as independent.
+    """
+    from scipy.special import ndtr
+
+    # the mean over the normal spread of a level of its own; rivals are independent at each of its values
+    nodes, weight = np.polynomial.hermite_e.hermegauss(24)
+    out: AnyArray = np.where(np.isfinite(level), np.float32(1.0), np.float32(np.nan))
+    # a tower without a path never serves
+    filled, sd = np.nan_to_num(level, nan=-1e9), np.nan_to_num(slow, nan=1.0)
+    for k, channel in enumerate(channels):
+        rivals = [j for j, name in enumerate(channels) if name == channel and j != k]
+        if not rivals:
+            continue
+        total = np.zeros(level.shape[1])
+        for node, w in zip(nodes, weight / weight.sum(), strict=True):
+            at = filled[k] + node * sd[k]
+            total += w * np.prod([ndtr((at - filled[j]) / sd[j]) for j in rivals], axis=0)
+        out[k] *= total
+    return out
+
+
+# --- ranks ---------------------------------------------------------------------------------------------------------
+
+
+def _receivers(known: Sequence[FlightData], place: str | Path, site: Site) -> Receivers:
+    """Receivers that the flights name or the site remembers, by tower."""
+    out: dict[str, tuple[FittedReceiver, LinkSettings, Path]] = {}
+    for data in known:
+        if data.settings.rank.receiver is not None:
+            for tower, fitted in read_receiver(data.folder / data.settings.rank.receiver).items():
+                out.setdefault(tower, (fitted, data.settings.link.rank, data.folder))
+    link, folder = LinksSettings().rank, Path()
+    if known:
+        link, folder = known[0].settings.link.rank, known[0].folder
+    for entry in read_learned(place).entries.values():
+        for file in dict.fromkeys(receiver.file for receiver in entry.receivers):
+            for tower, fitted in read_receiver(folder_of(place) / file).items():
+                out.setdefault(tower, (fitted, link, folder))
+    return {tower: fitted for tower, fitted in out.items() if tower in site.towers}
+
+
+def _ranks(
+    targets: Targets, receivers: Receivers, site: Site, progress: Progress
+) -> Iterator[tuple[str, IntArray, FloatArray]]:
+    """Tower, rows (n,) of the targets and probabilities (n, 4) of the ranks by every receiver.
+
+    Of more targets than :data:`MOST_RANKED` the nearest of so many stands for each.
+    """
+    from scipy.spatial import cKDTree
+
+    rows = np.flatnonzero(targets.known)
+    some = rows[:: -(-len(rows) // MOST_RANKED)]
+    for tower, (receiver, settings, folder) in receivers.items():
+        link = settings.build([tower], folder)
+        if {len(link.uav_array), len(link.tower_arrays[tower])} != {4}:
+            continue
+        position, yaw, each = targets.position_m[some], targets.yaw_deg[some], []
+        turns = _turns(yaw).tolist()
+        few = len(some) * len(turns) <= MOST_RANKED  # more would take more memory at once
+        asked = [turns] if few and not np.isfinite(yaw).any() else [[turn] for turn in turns]
+        for together in asked:
+            heading = np.where(np.isfinite(yaw), yaw, together[0])
+            samples = RankSamples(
+                flight="",
+                tower=tower,
+                tower_m=np.asarray(site.towers[tower].position_m),
+                poses=Poses(position, rotation_from_aircraft(0.0 * heading, 0.0 * heading, heading)),
+                rank=np.full(len(some), np.nan),
+                link=link,
+                # points of a grid lie hours apart: a receiver that averages over seconds averages none of them
+                time_s=targets.time_s[some] if targets.kind == "route" else 1e4 * np.arange(float(len(some))),
+            )
+            each.append(receiver.forecast(samples, [turn - together[0] for turn in together])[0])
+            progress(f"predict rank {tower}", len(each) / len(asked))
+        p = np.mean(each, axis=0)
+        if len(some) < len(rows):
+            p = p[cKDTree(_place_and_nose(targets, some)).query(_place_and_nose(targets, rows))[1]]
+        yield tower, rows, p
+
+
+def _place_and_nose(targets: Targets, rows: IntArray) -> FloatArray:
+    """Place and nose (n, 5) in units [m] in which ranks differ alike."""
+    yaw = np.radians(np.nan_to_num(targets.yaw_deg[rows]))
+    return np.column_stack([targets.position_m[rows], _NOSE_M * np.sin(yaw), _NOSE_M * np.cos(yaw)])
+
+
+def run_predict(
+    where: Path,
+    flights: Sequence[Path],
+    target: TargetOptions,
+    options: RunOptions = DEFAULT,
+) -> JobOutcome:
+    """Predict and write ``prediction.csv``, ``.nc``, ``.html`` and figures.
+
+    Parameters
+    ----------
+    where : Path
+        See :func:`.sources.find_targets`.
+    flights : sequence of Path
+        Flight files, or calibration.yaml files that list some; none: the memory of the site.
+    target : TargetOptions
+    options : RunOptions
+        ``out`` is ``reports/prediction-NAME`` by default.
+
+    Returns
+    -------
+    JobOutcome
+    """
+    known = named_flights(flights)
+    if known and (target.carrier_hz is not None or target.tx_power_dbm is not None):
+        raise UsageError(
+            "--with and --carrier-ghz or --tx-power-dbm", expected="one of them: flights state carrier and power"
+        )
+    inputs = [*target_files(where, target.site, options.logs_root), *files_of(known, options.logs_root)]
+    folder = options.out or Path("reports") / f"prediction-{where.stem}"
+    stages = options.stages("predict", inputs, folder)
+    with OutputFolder(folder, job="predict", inputs=inputs, force=options.force) as output:
+        prediction = predict(where, known, target, logs_root=options.logs_root, stages=stages)
+        with output.filling() as place:
+            options.progress("page")
+            written, remarks = write_prediction(prediction.page, place)
+        for text in remarks:
+            options.progress(text)
+        return JobOutcome(folder=folder, metrics=prediction_metrics(prediction.page), files=output.placed(written))
+
+
+# A sample is scored by the nearest predicted point within these distances whose nose differs by less.
+NEAR_M, _NEAR_UP_M, _TURNED_DEG = 30.0, 15.0, 45.0
+
+FEWEST = 20
+
+
+def score_against(data: FlightData, folder: Path) -> Against:
+    """Score a flight with the prediction of an earlier run of ``predict``.
+
+    Raises
+    ------
+    UsageError
+        The flight's own log was learned from; no sample was predicted.
+    InputError
+        The folder holds no prediction.
+    """
+    with parsing(folder, "the output folder of 'aerpaw-cmp predict'", any_shape=True):
+        about = json.loads(read_bounded(folder / "metrics.json", LARGEST_TABLE))
+        table = pd.read_csv(folder / "prediction.csv", low_memory=False)
+        learned, marked, sentence = list(about[KEY]), tuple(map(str, about.get(MARKS, ()))), str(about["sentence"])
+        groups = dict(iter(table[table["level_db"].notna()].groupby(["tower", "channel"])))
+        forecasts = dict(iter(table[table["channel"] == "rank"].groupby("tower")))
+    own = common(flight_logs(data), [learned])
+    if own or any(among(mark, marked) for mark in marks_of([data])):
+        raise UsageError(
+            f"the prediction learned from this flight's own {f'log (SHA-256 {own[0][:12]}...)' if own else 'readings'}",
+            expected="a prediction made before the flight, or from other flights",
+            path=folder,
+        )
+    series = [
+        scored
+        for o in (observe([data])[0] if data.rss else ())
+        if (part := groups.get((o.samples.tower, o.samples.channel))) is not None
+        and (scored := _matched(o, part)) is not None
+    ]
+    ranks = {
+        s.tower: score
+        for s in data.rank
+        if s.tower in forecasts and (score := _rank_score(rank_samples(data, s), forecasts[s.tower])) is not None
+    }
+    if not series and not ranks:
+        raise UsageError(
+            f"no tower and channel of the flight has {FEWEST} samples within {NEAR_M:g} m of predicted points",
+            expected="a prediction of this route: " + ", ".join(" ".join(map(str, key)) for key in groups),
+            path=folder,
+        )
+    return Against(
+        folder=folder.name,
+        sentence=sentence,
+        generated=str(about.get("generated", "")),
+        flights=tuple(map(str, about.get("flights", ()))),
+        series=tuple(series),
+        ranks=ranks,
+        words=against_words(series, ranks),
+    )
+
+
+def _matched(o: Observed, part: pd.DataFrame) -> AgainstSeries | None:
+    """Samples near predicted points, each with the level that was predicted there."""
+    good = np.isfinite(o.samples.residual_db)
+    finite = o.part(good)
+    index, near = _nearest(finite.samples.position_m, finite.heading_deg, part)
+    if near.sum() < FEWEST:
+        return None
+    predicted, s = part.iloc[index[near]], finite.samples.part(near)
+
+    def column(name: str) -> FloatArray:
+        return np.asarray(predicted[name], dtype=np.float64)
+
+    level_db, lock = column("level_db"), None
+    if P_LOCK in predicted and predicted[P_LOCK].notna().all():
+        lock = LostLock(
+            probability=column(P_LOCK),
+            locked_db=column("locked_db") - level_db,
+            lost_db=column("lost_db") - level_db,
+            locked_sd_db=float(column("locked_sd_db")[0]),
+            lost_sd_db=float(column("lost_sd_db")[0]),
+        )
+    return AgainstSeries(
+        name=f"{s.tower} {s.channel}",
+        time_s=s.time_s,
+        measured_db=s.residual_db + finite.free_space_db[near],
+        level_db=level_db,
+        lock=lock,
+        sd_db=column("sd_db"),
+        low_db=column("q05_db"),
+        high_db=column("q95_db"),
+        share_near=float(near.mean()),
+        common_db=column("slow_sd_db") if "slow_sd_db" in predicted else 0.0,
+        start=finite.start,
+    )
+
+
+def _rank_score(samples: RankSamples, part: pd.DataFrame) -> ForecastScore | None:
+    """Score of predicted probabilities; the constant forecast beside it is their mean over the predicted points."""
+    heading_deg = bearing_deg(samples.poses.rotation[:, :, 0])
+    index, near = _nearest(samples.poses.position_m, heading_deg, part)
+    if near.sum() < FEWEST:
+        return None
+    every = part[list(RANKS)].to_numpy(np.float64)
+    forecast = every[index[near]]
+    return score_forecast(samples.rank[near], forecast, forecast.argmax(axis=1) + 1, every.mean(axis=0))
+
+
+def _nearest(position_m: FloatArray, heading_deg: FloatArray, part: pd.DataFrame) -> tuple[IntArray, Any]:
+    """Predicted point (n,) of each sample, and which of them are near."""
+    from scipy.spatial import cKDTree
+
+    scale = np.array([NEAR_M, NEAR_M, _NEAR_UP_M, 1.0, 1.0])
+    turn = 2.0 * np.sin(np.radians(_TURNED_DEG) / 2.0)
+
+    def coordinates(place: FloatArray, yaw_deg: FloatArray) -> FloatArray:
+        yaw = np.radians(yaw_deg)
+        nose = np.column_stack([np.sin(yaw), np.cos(yaw)]) / turn
+        return np.asarray(np.column_stack([place, np.nan_to_num(nose)]) / scale)
+
+    points = coordinates(part[["east_m", "north_m", "height_m"]].to_numpy(), part["yaw_deg"].to_numpy())
+    heading = heading_deg if part["yaw_deg"].notna().all() else np.full(len(heading_deg), np.nan)
+    distance, index = cKDTree(points).query(coordinates(position_m, heading))
+    return np.asarray(index), distance <= np.sqrt(2.0)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CorrectedLevel:
+    """One tower and channel at one height, each (n,) in index order; ``raw_dbm`` with the nose to the north."""
+
+    link: str
+    height_m: float
+    raw_dbm: FloatArray
+    corrected_dbm: FloatArray
+    sd_db: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CorrectedMaps:
+    """All corrected maps of a run, and the page of the prediction.
+
+    ``ranks``: probabilities (n, 4) by tower and height, NaN where unknown.
+    """
+
+    levels: tuple[CorrectedLevel, ...]
+    ranks: dict[tuple[str, float], FloatArray]
+    prediction: PredictionPage
+
+    def layers(self) -> list[Layer]:
+        """For the files beside the page."""
+        out = []
+        for item in self.levels:
+            at = f"h{item.height_m:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', item.link)}"
+            for name, title, unit, values in (
+                ("rss_raw", "RSS, raw replay", "dBm", item.raw_dbm),
+                ("rss_corrected", "RSS, corrected by flights", "dBm", item.corrected_dbm),
+                ("rss_sd", "Standard deviation of the corrected RSS", "dB", item.sd_db),
+            ):
+                text = f"{title}, {item.link}, {item.height_m:g} m"
+                out.append(Layer(f"{name}_{at}", np.round(values, 2), unit, text))
+        for (tower, height), p in self.ranks.items():
+            name = f"rank_learned_h{height:03.0f}m_{re.sub(r'[^0-9A-Za-z]', '_', tower)}"
+            out.append(Layer(name, likeliest(p), "1", f"Rank, learned receiver, {tower}, {height:g} m", class_names(4)))
+        return out
+
+    def page_layers(self, grid: Grid) -> Iterator[page.MapLayer]:
+        """For the linked map: raw and corrected level, standard deviation."""
+        for item in self.levels:
+            axes = {"Link": item.link, **page.at_height(item.height_m)}
+            for version, values in (("corrected", item.corrected_dbm), ("raw", item.raw_dbm)):
+                yield page.MapLayer(quantity="RSS, raw and corrected", unit="dBm", axes={"Version": version, **axes},
+                                    values=grid.raster(values))  # fmt: skip
+            yield page.MapLayer(
+                quantity="SD of the corrected RSS", unit="dB", axes=axes, values=grid.raster(item.sd_db)
+            )
+
+    def rss_maps(self, grid: Grid) -> Iterator[page.RssMap]:
+        """For the figures: maps and distributions of both versions."""
+        for version in ("raw", "corrected"):
+            for item in self.levels:
+                values = item.raw_dbm if version == "raw" else item.corrected_dbm
+                yield page.RssMap(
+                    tower=item.link,
+                    antennas=version,
+                    altitude_m=item.height_m,
+                    rss_dbm=grid.raster(values),
+                    coverage=float(np.isfinite(values).mean()),
+                )
+
+    def rank_maps(self, grid: Grid) -> Iterator[page.RankMap]:
+        """For figures and the linked map: the most probable rank, and mean probabilities as shares."""
+        for (tower, height), p in self.ranks.items():
+            share = np.concatenate([[np.isnan(p[:, 0]).mean()], np.nan_to_num(p).mean(axis=0)])
+            rank = grid.raster(likeliest(p)).astype(np.int64)
+            yield page.RankMap(k=None, altitude_m=height, rank=rank, share=share, tower=tower)
+
+
+def likeliest(p: FloatArray) -> FloatArray:
+    """Most probable rank (n,) by probabilities (n, 4); 0 where they are NaN."""
+    return np.where(np.isnan(p[:, 0]), 0, np.nan_to_num(p).argmax(axis=1) + 1)
+
+
+def corrected_maps(
+    site: str,
+    spacing_m: float,
+    heights_m: tuple[Sequence[float], Sequence[float]],
+    flights: Sequence[NamedFlight],
+    logs_root: Path | None = None,
+    stages: Stages | None = None,
+) -> CorrectedMaps:
+    """Predict a map's grid from flights, beside the raw replay of the same links.
+
+    Parameters
+    ----------
+    site : str
+        As ``map`` takes it.
+    spacing_m : float
+    heights_m : (sequence of float, sequence of float)
+        Of levels, and of ranks.
+    flights : sequence of NamedFlight
+        To learn from.
+    logs_root : Path, optional
+    stages : Stages, optional
+
+    Returns
+    -------
+    CorrectedMaps
+
+    Raises
+    ------
+    UsageError, InputError
+        As :func:`.predict.predict`.
+    """
+    options = TargetOptions(heights_m=tuple(sorted({*heights_m[0], *heights_m[1]})), spacing_m=spacing_m)
+    prediction = predict(Path(site), flights, options, logs_root=logs_root, stages=stages)
+    grid = prediction.targets.grid
+    assert grid is not None
+    levels = (level for source in prediction.sources.values() for level in _map_levels(prediction, source, len(grid)))
+    return CorrectedMaps(
+        levels=tuple(level for level in levels if level.height_m in heights_m[0]),
+        ranks={key: p for key, p in _map_ranks(prediction, len(grid)) if key[1] in heights_m[1]},
+        prediction=prediction.page,
+    )
+
+
+def _map_levels(prediction: Prediction, source: Source, n: int) -> Iterator[CorrectedLevel]:
+    table = prediction.table
+    mine = table[(table["tower"] == source.tower) & (table["channel"] == source.channel)]
+    position = prediction.targets.position_m
+    raw = source.replayed_db(source.targets(position, np.zeros(len(position)))) + source.free_space_db(position)
+    level = mine["level_db"].to_numpy() - prediction.model.offset_db(source.antenna)
+    for k, height in enumerate(prediction.targets.heights_m):
+        part = slice(k * n, (k + 1) * n)
+        yield CorrectedLevel(
+            link=source.antenna.replace(".", " ", 1),
+            height_m=height,
+            raw_dbm=raw[part],
+            corrected_dbm=level[part],
+            sd_db=mine["sd_db"].to_numpy()[part],
+        )
+
+
+def _map_ranks(prediction: Prediction, n: int) -> Iterator[tuple[tuple[str, float], FloatArray]]:
+    ranks = prediction.table[prediction.table["channel"] == "rank"]
+    for tower, rows in ranks.groupby("tower", sort=False, observed=True):
+        p = np.full((len(prediction.targets), 4), np.nan)
+        p[rows["point"].to_numpy()] = rows[list(RANKS)].to_numpy()
+        for k, height in enumerate(prediction.targets.heights_m):
+            yield (str(tower), height), p[k * n : (k + 1) * n]

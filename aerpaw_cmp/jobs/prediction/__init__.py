@@ -1,1 +1,0 @@
-"""Levels before a flight, scored after it; which flight next."""

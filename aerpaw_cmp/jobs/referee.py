@@ -1,0 +1,766 @@
+"""Predictions of other programs beside ours and the baselines, scored on one flight by one card.
+
+``report flight.yaml --against FILE``. Samples are matched to predictions by time where the file has times, else by
+position. Every model is scored on the samples that the file predicts, so that the cards can be compared.
+
+Predictions of any program as one table: CSV, NetCDF, a radio map in .npz, or the logs of an emulated flight.
+
+Columns of a CSV and variables of a NetCDF file: ``time`` or ``time_utc``, or ``east_m north_m height_m``, or
+``latitude_deg longitude_deg height_m``; ``tower``; one of ``level_dbm``, ``level_db``, ``path_loss_db``; optionally
+``channel``, ``sd_db``, ``q05_db`` and ``q95_db``, ``rank``, ``p_rank1`` to ``p_rank4``. docs/referee.md has examples.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ..common.errors import InputError, parsing
+from ..common.files import LARGEST_TABLE, read_input
+from ..common.jsonable import fields_of
+from ..common.native import read as read_native
+from ..common.outputs import file_digest
+from ..common.text import counted
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..compare.rank import agreement, cohen_kappa, histogram, total_variation
+from ..compare.receiver import score_forecast
+from ..compare.referee import LevelCard, PredictedLevel, detection_floor_db, level_card, measured_thresholds
+from ..compare.result import BASELINE_TITLE, FlightResult, RankResult, RssResult
+from ..compare.statistics import PairedDifference, paired_difference
+from ..flight.data import FlightData, load_data
+from ..flight.drafting.draft import DraftOptions, drafts
+from ..flight.settings import FlightFile
+from ..flight.training import flight_logs
+from ..logs.ingest import ingest
+from ..logs.readers import ReadOptions
+from ..propagation.field.sum import mean_pair_power, rss_dbm
+from ..site.site import Site
+from .calibrate import observe
+
+QUANTITIES = ("level_dbm", "level_db", "path_loss_db")
+RANKS = ("p_rank1", "p_rank2", "p_rank3", "p_rank4")
+_PLACE = ("east_m", "north_m", "height_m")
+_GEOGRAPHIC = ("latitude_deg", "longitude_deg", "height_m")
+_OPTIONAL = ("sd_db", "q05_db", "q95_db", "rank", *RANKS)
+
+_WANTED = (
+    "time_utc, or east_m, north_m, height_m, or latitude_deg, longitude_deg, height_m; tower; level_dbm, level_db or "
+    "path_loss_db (docs/referee.md has an example)"
+)
+
+# A file of more bytes is refused.
+_MOST_BYTES = 4 * LARGEST_TABLE
+
+# A prediction whose positions lie farther from the site is one of another place [m].
+_FAR_M = 50_000.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForeignPrediction:
+    """A prediction of another program.
+
+    Parameters
+    ----------
+    path : Path
+        The file or folder.
+    program : str
+        What wrote it, as far as the file says.
+    quantity : str
+        One of :data:`QUANTITIES`; empty if only ranks are predicted.
+    table : DataFrame
+        One row per prediction: ``time`` (datetime64[ns], NaT if unknown), ``east_m north_m height_m`` in the site
+        frame (NaN if unknown), ``tower``, ``channel`` (empty: every channel of the tower), ``level`` [dB or dBm], and
+        those of ``sd_db q05_db q95_db rank p_rank1..4`` that the file has.
+    remarks : tuple of str
+        Sentences on how the file was read.
+    """
+
+    path: Path
+    program: str
+    quantity: str
+    table: pd.DataFrame
+    remarks: tuple[str, ...] = ()
+
+    @property
+    def timed(self) -> bool:
+        """True if the rows are matched by time, else by position."""
+        return bool(self.table["time"].notna().any())
+
+
+def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
+    """Return the prediction that a file or folder holds.
+
+    Parameters
+    ----------
+    path : Path
+        CSV, NetCDF, .npz, or a folder with the logs of an emulated flight.
+    data : FlightData
+        The flight that is scored: its site, time zone and towers.
+
+    Returns
+    -------
+    ForeignPrediction
+
+    Raises
+    ------
+    InputError
+        If the file is damaged, or lacks a position, a tower, or a level with its unit.
+    """
+    if (path / "prediction.csv").is_file():  # a folder of 'predict'
+        path = path / "prediction.csv"
+    if path.is_dir():
+        return _emulated(path, data)
+    content = read_input(path, _MOST_BYTES, "a prediction: CSV, NetCDF, .npz, or a folder")
+    if content[:8] == b"\x89HDF\r\n\x1a\n":
+        frame, program, remarks = _netcdf(content, path)
+    elif content[:4] == b"PK\x03\x04":
+        frame, program, remarks = _radio_map(content, path)
+    elif content[:3] == b"CDF":
+        raise InputError("a NetCDF file of version 3", expected="NetCDF 4 ('nccopy -k nc4 IN OUT')", path=path)
+    else:
+        frame, program, remarks = _csv(content, path)
+    quantity, table = _checked(frame, path, data.site)
+    _check_towers(table, data, path)
+    return ForeignPrediction(path=path, program=program, quantity=quantity, table=table, remarks=tuple(remarks))
+
+
+# --- formats -------------------------------------------------------------------------------------------------------
+
+
+def _csv(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
+    with parsing(path, "a CSV with a header: " + _WANTED, cause="another format"):
+        frame = pd.read_csv(io.BytesIO(content), comment="#", skipinitialspace=True, low_memory=False)
+    frame.columns = [str(name).strip().lower() for name in frame.columns]
+    return frame, "CSV", []
+
+
+def _netcdf(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
+    """Variables along the dimensions of the level, one row per element."""
+    with parsing(path, "a NetCDF file"):
+        arrays, notes = read_native("netcdf", content)
+    program = str(notes["attributes"].get("source", "NetCDF"))
+    dims = {name: notes["dims"][name][: values.ndim] for name, values in arrays.items()}
+    arrays = {name.lower(): values for name, values in arrays.items()}
+    dims = {name.lower(): names for name, names in dims.items()}
+    if "tower_name" in arrays:  # of an older channel.nc
+        arrays["tower"], dims["tower"] = arrays["tower_name"], dims["tower_name"]
+    if "height_m" not in arrays and "up_m" in arrays:
+        arrays["height_m"], dims["height_m"] = arrays["up_m"], dims["up_m"]
+    remarks: list[str] = []
+    if "h_real" in arrays and not set(arrays) & set(QUANTITIES):
+        h = arrays["h_real"] + 1j * arrays["h_imag"]
+        power_dbm = float(notes["attributes"].get("transmit_power_dbm", 0.0))
+        arrays["level_dbm"] = rss_dbm(mean_pair_power(h), power_dbm)
+        dims["level_dbm"] = dims["h_real"][:-2]
+        remarks.append(f"The levels of {path.name} are those of H, with {power_dbm:g} dBm transmitted.")
+    main = next((name for name in (*QUANTITIES, "rank", RANKS[0]) if name in arrays), None)
+    if main is None:
+        raise InputError("no variable with a level", expected=_WANTED, path=path)
+    shape = dict(zip(dims[main], arrays[main].shape, strict=True))
+    if "series" in shape and "series" in arrays:  # tower and channel in one name, as 'predict' writes them
+        words = [str(name).partition(" ") for name in arrays["series"]]
+        for name, values in (("tower", [w[0] for w in words]), ("channel", [w[2] for w in words])):
+            arrays[name], dims[name] = np.array(values, dtype=np.str_), ["series"]
+    columns = {}
+    known = ("time", "time_utc", "tower", "channel", *_PLACE, *_GEOGRAPHIC, *QUANTITIES, *_OPTIONAL)
+    for name in (name for name in known if name in arrays and set(dims[name]) <= set(shape)):
+        order = [dims[name].index(dim) for dim in shape if dim in dims[name]]
+        place = [size if dim in dims[name] else 1 for dim, size in shape.items()]
+        columns[name] = np.broadcast_to(arrays[name].transpose(order).reshape(place), tuple(shape.values())).ravel()
+    unit = str(notes["units"].get("time", ""))
+    if "time" in columns and columns["time"].dtype.kind in "fiu":
+        columns.pop("time") if " since " not in unit else columns.update(time=_since(columns["time"], unit, path))
+    return pd.DataFrame(columns), program, remarks
+
+
+def _since(values: AnyArray, unit: str, path: Path) -> AnyArray:
+    """Return times of a CF unit such as ``seconds since 2025-06-10T14:00:00Z``."""
+    word, _, start = unit.partition(" since ")
+    sizes = {"second": 1.0, "minute": 60.0, "hour": 3600.0, "day": 86400.0}
+    sizes |= {"s": 1.0, "ms": 1e-3, "millisecond": 1e-3, "microsecond": 1e-6, "nanosecond": 1e-9}
+    with parsing(path, "a time unit such as 'seconds since 2025-06-10T14:00:00Z'"):
+        origin = pd.Timestamp(start)
+        origin = origin.tz_localize("UTC") if origin.tzinfo is None else origin.tz_convert("UTC")
+        name = word.strip().lower()
+        size = sizes.get(name) or sizes[name.rstrip("s")]
+        nanoseconds = np.round(np.asarray(values, dtype=np.float64) * size * 1e9)
+        stamps = origin.value + np.nan_to_num(nanoseconds).astype(np.int64)
+        return np.asarray(pd.DatetimeIndex(stamps.astype("datetime64[ns]"), tz="UTC"))
+
+
+def _radio_map(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
+    """A radio map as ``np.savez(path_gain=..., cell_centers=..., tx_names=...)`` of Sionna RT writes it."""
+    with parsing(path, "an .npz with path_gain, cell_centers, tx_names"), np.load(io.BytesIO(content)) as book:
+        missing = {"path_gain", "cell_centers", "tx_names"} - set(book.files)
+        if missing:
+            raise InputError(
+                f"no array {', '.join(sorted(missing))}", expected="path_gain, cell_centers, tx_names", path=path
+            )
+        if sum(info.file_size for info in book.zip.infolist()) > _MOST_BYTES:
+            raise InputError("the arrays are too large", expected=f"at most {_MOST_BYTES >> 20} MiB", path=path)
+        gain, centre, names = (np.asarray(book[name]) for name in ("path_gain", "cell_centers", "tx_names"))
+    if gain.ndim != 3 or centre.shape != (*gain.shape[1:], 3) or names.shape != gain.shape[:1]:
+        raise InputError(
+            f"shapes {gain.shape}, {centre.shape}, {names.shape}",
+            expected="path_gain (towers, rows, columns), cell_centers (rows, columns, 3), tx_names (towers,)",
+            path=path,
+        )
+    with np.errstate(divide="ignore", invalid="ignore"):
+        loss = -10.0 * np.log10(gain.astype(np.float64).reshape(len(names), -1))
+    loss[~np.isfinite(loss)] = np.nan
+    columns = dict(zip(_PLACE, np.tile(centre.reshape(-1, 3), (len(names), 1)).T.astype(np.float64), strict=True))
+    table = pd.DataFrame(
+        {**columns, "tower": np.repeat(names.astype(str), loss.shape[1]), "path_loss_db": loss.ravel()}
+    )
+    remark = "The cell centres of the radio map are taken as east, north and up of the site [m]."
+    return table, "radio map (.npz)", [remark]
+
+
+def _emulated(folder: Path, data: FlightData) -> ForeignPrediction:
+    """Levels and positions of the logs of an emulated flight, matched by position."""
+    if (folder / "flight.yaml").is_file():
+        from ..flight.gains import load_with_learned
+
+        settings, home = load_with_learned(folder / "flight.yaml"), folder
+    else:
+        settings, home = _drafted(folder, data), folder
+    twin = load_data(settings, home)
+    if set(flight_logs(twin)) & set(flight_logs(data)):
+        raise InputError(
+            "logs of the scored flight itself",
+            expected="logs of an emulated flight",
+            cause="the folder of the real flight was named",
+            path=folder,
+        )
+    observed, _ = observe([twin])
+    parts = []
+    for o in observed:
+        samples = o.samples
+        level = samples.residual_db + o.free_space_db
+        place = dict(zip(_PLACE, samples.position_m.T, strict=True))
+        parts.append(pd.DataFrame({**place, "tower": samples.tower, "channel": samples.channel, "level_db": level}))
+    if not parts:
+        raise InputError("no level with a position", expected="levels and telemetry of an emulated flight", path=folder)
+    table = pd.concat(parts, ignore_index=True)
+    heard = {(s.tower, s.channel) for s in data.rss}
+    if not heard & set(zip(table["tower"], table["channel"], strict=True)):
+        table["channel"] = ""  # the emulator names its channels in another way
+    # a hover has many levels at one position: their mean is what the emulator predicts there
+    table = table.groupby(["tower", "channel", *_PLACE], as_index=False, sort=False)["level_db"].mean()
+    quantity, table = _checked(table, folder, data.site)
+    _check_towers(table, data, folder)
+    remark = f"{folder.name} is an emulated flight: {counted(len(table), 'level')} with a position."
+    return ForeignPrediction(path=folder, program="emulated flight", quantity=quantity, table=table, remarks=(remark,))
+
+
+def _drafted(folder: Path, data: FlightData) -> FlightFile:
+    """The flight file that a draft of the folder proposes for the site of the scored flight."""
+    from ..common.yamlfile import parse_yaml
+
+    site = str(data.site_place) if not Path(data.site_place).is_file() else str(Path(data.site_place).resolve())
+    timezone = data.settings.timezone
+    options = DraftOptions(timezone=timezone, site=site)
+    files = ingest([folder], options=ReadOptions(timezone=timezone))
+    if not files:
+        raise InputError("no log", expected="power logs and telemetry of an emulated flight", path=folder)
+    text = drafts(files, folder, options)[0].text
+    return parse_yaml(text, FlightFile)
+
+
+# --- checks --------------------------------------------------------------------------------------------------------
+
+
+def _checked(frame: pd.DataFrame, path: Path, site: Site) -> tuple[str, pd.DataFrame]:
+    """Return the quantity and the table under the names of :class:`ForeignPrediction`."""
+    quantities = [name for name in QUANTITIES if name in frame]
+    if len(quantities) > 1:
+        raise InputError(f"columns {', '.join(quantities)}", expected="one of them", path=path)
+    if not quantities and not {"rank", *RANKS} & set(frame):
+        near = [
+            str(name) for name in frame if str(name).lower() in ("level", "rss", "rsrp", "rssi", "power", "path_gain")
+        ]
+        raise InputError(
+            f"no column of a level with its unit (columns: {', '.join(map(str, frame))})",
+            expected="level_dbm, level_db (the unit of the log) or path_loss_db",
+            cause=f"the unit of {near[0]!r} is not in its name" if near else None,
+            path=path,
+        )
+    if "tower" not in frame:
+        raise InputError(f"no column tower (columns: {', '.join(map(str, frame))})", expected=_WANTED, path=path)
+    quantity = quantities[0] if quantities else ""
+    table = pd.DataFrame({"tower": frame["tower"].astype(str).str.strip()})
+    table["channel"] = frame["channel"].astype(str).str.strip().replace({"nan": ""}) if "channel" in frame else ""
+    table["time"] = _times(frame, path)
+    table[list(_PLACE)] = _places(frame, path, site)
+    if table["time"].isna().all() and table["east_m"].isna().all():
+        raise InputError("rows without a time and without a position", expected=_WANTED, path=path)
+    for name in (quantity, *_OPTIONAL):
+        if name in frame:
+            table["level" if name == quantity else name] = _numbers(frame[name])
+    if "level" not in table:
+        table["level"] = np.nan
+    _check_levels(table["level"].to_numpy(np.float64), quantity, path)
+    _check_repeats(table, path)
+    return quantity, table
+
+
+def _numbers(column: Any) -> Any:
+    return pd.to_numeric(column, errors="coerce").astype(np.float64)
+
+
+def _times(frame: pd.DataFrame, path: Path) -> Any:
+    """Times (n,) as naive UTC datetime64[ns]; NaT without a column of times."""
+    name = next((name for name in ("time_utc", "time") if name in frame), None)
+    if name is None:
+        return pd.Series(pd.NaT, index=frame.index, dtype="datetime64[ns]")
+    column = frame[name]
+    numeric = pd.api.types.is_numeric_dtype(column)
+    text = not numeric and not pd.api.types.is_datetime64_any_dtype(column)
+    if name == "time" and text and not column.astype(str).str.contains(r"Z$|[+-]\d\d:?\d\d$").all():
+        raise InputError(
+            f"times without a zone, such as {column.iloc[0]!r}", expected="a column time_utc, or times that end in Z",
+            path=path,
+        )  # fmt: skip
+    if numeric:
+        raise InputError(
+            f"times as numbers ({column.iloc[0]})", expected="ISO 8601, such as 2025-06-10T14:00:00Z", path=path
+        )
+    stamps = pd.to_datetime(column, utc=True, errors="coerce", format="ISO8601")
+    if stamps.isna().all():
+        raise InputError(f"no time that can be read ({column.iloc[0]!r})", expected="ISO 8601 in UTC", path=path)
+    return stamps.dt.tz_localize(None).astype("datetime64[ns]")
+
+
+def _places(frame: pd.DataFrame, path: Path, site: Site) -> AnyArray:
+    """East, north, up (n, 3) in the site frame [m]; NaN without columns of positions."""
+    if set(_PLACE) <= set(frame):
+        place = np.column_stack([_numbers(frame[name]) for name in _PLACE])
+    elif set(_GEOGRAPHIC) <= set(frame):
+        latitude, longitude, height = (np.asarray(_numbers(frame[name])) for name in _GEOGRAPHIC)
+        with np.errstate(invalid="ignore"):
+            east, north = site.frame.to_local(latitude, longitude)
+            swapped = site.frame.to_local(np.clip(longitude, -90, 90), latitude)
+        if np.nanmin(np.hypot(east, north)) > _FAR_M:
+            exchanged = np.nanmin(np.hypot(*swapped)) <= _FAR_M
+            raise InputError(
+                f"the nearest position is {np.nanmin(np.hypot(east, north)) / 1000:.0f} km from the site",
+                expected="latitude_deg, longitude_deg near the site",
+                cause="latitude and longitude are swapped" if exchanged else "a prediction of another place",
+                path=path,
+            )
+        place = np.column_stack([east, north, height + site.takeoff_ground_m])
+    else:
+        return np.full((len(frame), 3), np.nan)
+    if np.nanmin(np.hypot(place[:, 0], place[:, 1]), initial=np.inf) > _FAR_M:
+        raise InputError(
+            "every position is more than 50 km from the site's origin", expected="metres east and north of the origin",
+            cause="map coordinates (UTM) instead of metres from the origin", path=path,
+        )  # fmt: skip
+    return place
+
+
+def _check_levels(level: FloatArray, quantity: str, path: Path) -> None:
+    """Refuse levels that cannot have the unit of their column."""
+    known = level[np.isfinite(level)]
+    if not len(known) or not quantity:
+        return
+    middle, what = float(np.median(known)), f"a median {quantity} of {np.median(known):.3g}"
+    if quantity == "level_dbm" and known.min() > 0.0 and known.max() < 1.0:
+        raise InputError(
+            what, expected="levels in dBm", cause="watts or milliwatts; 10 log10(P / 1 mW) is the level", path=path
+        )
+    if quantity == "level_dbm" and middle > 60.0:
+        raise InputError(what, expected="received levels in dBm", cause="a path loss (path_loss_db)", path=path)
+    if quantity == "path_loss_db" and middle < 0.0:
+        raise InputError(what, expected="a loss, above 0", cause="a path gain; its negative is the loss", path=path)
+
+
+def _check_repeats(table: pd.DataFrame, path: Path) -> None:
+    """Refuse two rows of one tower, channel and time (or position) with different levels."""
+    key = ["tower", "channel", *(["time"] if table["time"].notna().any() else list(_PLACE))]
+    repeated = table.duplicated([*key, "level"], keep="first")
+    distinct = table[~repeated]
+    twice = distinct.duplicated(key, keep=False) & distinct["level"].notna()
+    if twice.any():
+        row = distinct[twice].iloc[0]
+        where = row["time"] if "time" in key else tuple(round(float(row[name]), 1) for name in _PLACE)
+        raise InputError(
+            f"{counted(int(twice.sum()), 'row')} with another level at the same place: tower {row['tower']}, {where}",
+            expected="one row per tower, channel and time or position",
+            cause="two channels or two heights without their column",
+            path=path,
+        )
+
+
+def _check_towers(table: pd.DataFrame, data: FlightData, path: Path) -> None:
+    """Refuse a prediction without any tower of the flight."""
+    ours, theirs = {s.tower for _, s in data.series}, set(table["tower"])
+    if not ours & theirs:
+        shown: Sequence[str] = sorted(theirs)[:8]
+        raise InputError(
+            f"towers {', '.join(shown)}", expected=f"towers of the flight: {', '.join(sorted(ours))}",
+            cause="other names for the same towers; rename them in the file", path=path,
+        )  # fmt: skip
+
+
+def split_by_series(table: pd.DataFrame, tower: str, channel: str) -> pd.DataFrame:
+    """Return the rows of a tower that count for one of its channels."""
+    part: pd.DataFrame = table[(table["tower"] == tower) & table["channel"].isin(["", channel])]
+    own: pd.DataFrame = part[part["channel"] == channel]
+    return part if own.empty else own
+
+
+# A sample is scored by the nearest predicted position within this distance [m], if no option says otherwise.
+NEAR_M = 5.0
+
+# A sample is scored by the nearest predicted time within this [s], and at least half of the prediction's step.
+_NEAR_S = 0.5
+
+# Fewer matched samples get no card.
+FEWEST = 20
+
+OURS = "ray tracing (this report)"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeriesVerdict:
+    """The cards of one tower and channel.
+
+    Parameters
+    ----------
+    tower, channel, unit : str
+    matched, unmatched : int
+        Samples of the flight with and without a prediction nearby.
+    cards : mapping of str to LevelCard
+        The prediction first, then ours and the baselines, on the same samples.
+    differences : mapping of str to PairedDifference
+        RMSE of the prediction minus that of ours and of each baseline, each after one offset, with its interval.
+    floor_db : float, optional
+        Detection floor that the predicted levels show (an emulated receiver).
+    """
+
+    tower: str
+    channel: str
+    unit: str
+    matched: int
+    unmatched: int
+    cards: Mapping[str, LevelCard]
+    differences: Mapping[str, PairedDifference]
+    floor_db: float | None = None
+
+    @property
+    def name(self) -> str:
+        """Tower and channel as one label."""
+        return f"{self.tower} {self.channel}".strip()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankVerdict:
+    """Predicted ranks of one tower beside ours, on the same samples.
+
+    ``scores`` has kappa, total variation and agreement by model; ``log_score`` and ``constant_log_score`` are those of
+    probabilities, if the prediction has them.
+    """
+
+    tower: str
+    matched: int
+    unmatched: int
+    scores: Mapping[str, Mapping[str, float]]
+    log_score: float | None = None
+    constant_log_score: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """One prediction against one flight."""
+
+    name: str
+    sha256: str
+    program: str
+    series: tuple[SeriesVerdict, ...]
+    ranks: tuple[RankVerdict, ...] = ()
+    remarks: tuple[str, ...] = ()
+    fitted_here: tuple[str, ...] = field(default=("the offset of each model and channel",))
+
+    def metrics(self) -> dict[str, Any]:
+        """Return the entry of ``referee`` in metrics.json and of card.json."""
+        levels: dict[str, dict[str, Any]] = {}
+        for item in self.series:
+            levels.setdefault(item.tower, {})[item.channel] = {
+                "unit": item.unit,
+                "matched": item.matched,
+                "unmatched": item.unmatched,
+                "floor_db": item.floor_db,
+                "cards": {name: fields_of(card) for name, card in item.cards.items()},
+                "differences": {name: fields_of(pair) for name, pair in item.differences.items()},
+            }
+        ranks = {item.tower: fields_of(item) for item in self.ranks}
+        return {
+            "prediction": self.name,
+            "sha256": self.sha256,
+            "program": self.program,
+            "fitted_on_this_flight": list(self.fitted_here),
+            "sentence": self.sentence(),
+            "remarks": list(self.remarks),
+            "means": self.means(),
+            "levels": levels,
+            "rank": ranks,
+            "table": {"columns": list(TABLE), "rows": [list(row.values()) for row in self.rows()]},
+        }
+
+    def means(self) -> list[dict[str, Any]]:
+        """Return the means over channels of each model; None for a number that not every channel has."""
+        rows = []
+        for model in dict.fromkeys(name for item in self.series for name in item.cards):
+            cards = [item.cards[model] for item in self.series if model in item.cards]
+            row: dict[str, Any] = {"model": model, "channels": len(cards)}
+            for key in ("bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "crps_db", "coverage_90"):
+                values = [getattr(card, key) for card in cards]
+                row[key] = None if None in values else float(np.mean(values))
+            rows.append(row)
+        return rows
+
+    def rows(self) -> Iterator[dict[str, Any]]:
+        """Yield one row per series and model for terminal, page and card.json, under the heads of :data:`TABLE`."""
+        for item in self.series:
+            for name, card in item.cards.items():
+                pair = item.differences.get(name)
+                low, high = (None, None) if pair is None else pair.difference_ci95_db
+                yield dict(
+                    zip(
+                        TABLE,
+                        (
+                            item.name, name, card.n, card.bias_db, card.rmse_db, card.rmse_offset_db, card.rmse_1s_db,
+                            card.correlation, card.crps_db, card.coverage_90,
+                            None if pair is None else pair.difference_db, low, high,
+                        ),
+                        strict=True,
+                    )
+                )  # fmt: skip
+
+    def sentence(self) -> str:
+        """Return the result in two sentences: error beside ours, and whether the difference is significant."""
+        if not self.series:
+            return f"{self.name}: ranks only."
+        mean = {name: float(np.mean([s.cards[name].rmse_offset_db for s in self.series])) for name in (self.name, OURS)}
+        pairs = [s.differences[OURS] for s in self.series]
+        words = {kind: sum(p.verdict == kind for p in pairs) for kind in ("better", "worse")}
+        decided = " and ".join(f"significantly {kind} on {n}" for kind, n in words.items() if n)
+        unit = counted(len(self.series), "channel")
+        matched, every = (sum(getattr(s, key) for s in self.series) for key in ("matched", "unmatched"))
+        return (
+            f"{self.name}: RMSE {mean[self.name]:.1f} dB after one offset per channel, ray tracing {mean[OURS]:.1f} dB "
+            f"on the same samples ({unit}). It is {decided or 'on no channel significantly different from ray tracing'}"
+            f" (95 %). {matched} of {counted(matched + every, 'sample')} have a prediction."
+        )
+
+
+# Heads of the small table.
+TABLE = (
+    "series", "model", "n", "bias dB", "RMSE dB", "RMSE after offset dB", "RMSE 1 s dB", "correlation", "CRPS dB",
+    "inside 90 %", "prediction minus model dB", "95 % low", "95 % high",
+)  # fmt: skip
+
+
+def judged(
+    data: FlightData, result: FlightResult, given: Sequence[ForeignPrediction], near_m: float = NEAR_M
+) -> list[Verdict]:
+    """Score predictions of other programs on a flight.
+
+    Parameters
+    ----------
+    data : FlightData
+    result : FlightResult
+        Ours: levels, baselines and ranks at the same samples.
+    given : sequence of ForeignPrediction
+    near_m : float
+        Largest distance between a sample and its predicted position.
+
+    Returns
+    -------
+    list of Verdict
+
+    Raises
+    ------
+    InputError
+        If none of the predictions of a file is near a sample.
+    """
+    return [_verdict(prediction, data, result, near_m) for prediction in given]
+
+
+def _verdict(given: ForeignPrediction, data: FlightData, result: FlightResult, near_m: float) -> Verdict:
+    name = given.path.name
+    series = [
+        s for item in result.rss if given.quantity and (s := _series(given, item, data, name, near_m)) is not None
+    ]
+    ranks = [r for tower in result.rank if (r := _ranks(given, tower, name, near_m)) is not None]
+    if not series and not ranks:
+        raise InputError(
+            f"fewer than {FEWEST} samples of the flight have a prediction nearby",
+            expected="a time within the step of the prediction" if given.timed else f"positions within {near_m:g} m",
+            cause=_why_none(given, result),
+            path=given.path,
+        )
+    remarks = list(given.remarks)
+    lost = sum(s.unmatched for s in series)
+    if series and lost > 0.1 * sum(s.matched + s.unmatched for s in series):
+        where = "times" if given.timed else "positions"
+        remarks.append(
+            f"{name}: {counted(lost, 'sample')} lie outside the {where} of the prediction and are not scored."
+        )
+    digest = "" if given.path.is_dir() else file_digest(given.path)
+    return Verdict(
+        name=name,
+        sha256=digest,
+        program=given.program,
+        series=tuple(series),
+        ranks=tuple(ranks),
+        remarks=tuple(remarks),
+    )
+
+
+def _series(
+    given: ForeignPrediction, item: RssResult, data: FlightData, name: str, near_m: float
+) -> SeriesVerdict | None:
+    part = split_by_series(given.table, item.tower, item.channel)
+    part = part[part["time"].notna()] if given.timed else part[part["east_m"].notna()]
+    if part.empty:
+        return None
+    index, near = _nearest(item.time, item.position_m, part, given.timed, near_m)
+    near &= item.posed
+    chosen = part.iloc[index]
+    level = np.where(near, chosen["level"].to_numpy(np.float64), np.nan)
+    if given.quantity == "path_loss_db":
+        level = _power_dbm(data, item) - level
+    scored = near & np.isfinite(level) & np.isfinite(item.measured_db)
+    if scored.sum() < FEWEST:
+        return None
+    absolute = given.quantity == "level_db" or (item.unit == "dBm" and given.quantity == "level_dbm")
+
+    def column(key: str) -> FloatArray | None:
+        return np.where(near, chosen[key].to_numpy(np.float64), np.nan) if key in chosen else None
+
+    theirs = PredictedLevel(
+        level_db=level, sd_db=column("sd_db"), low_db=column("q05_db"), high_db=column("q95_db"),
+        absolute=absolute, asked=near.astype(np.float64),
+    )  # fmt: skip
+    models = {name: theirs, OURS: PredictedLevel(level_db=item.simulated_dbm, absolute=item.unit == "dBm")}
+    models |= {
+        BASELINE_TITLE[key]: PredictedLevel(level_db=model.level_dbm, absolute=False)
+        for key, model in item.baselines.items()
+    }
+    seconds = (item.time - item.time[0]) / np.timedelta64(1, "s")
+    thresholds = measured_thresholds(item.measured_db[near], ratio=item.unit == "dB")
+    rows = near if absolute else scored
+    cards, errors = {}, {}
+    for key, model in models.items():
+        same = rows if key == name else rows & (np.isfinite(level) | ~np.isfinite(item.measured_db))
+        if (np.isfinite(model.level_db) & np.isfinite(item.measured_db) & same).sum() < FEWEST:
+            continue
+        cards[key] = level_card(seconds[same], item.measured_db[same], _part(model, same), thresholds)
+        errors[key] = np.where(scored, item.measured_db - model.level_db, np.nan)
+    pairs = {key: paired_difference(errors[name], error) for key, error in errors.items() if key != name}
+    return SeriesVerdict(
+        tower=item.tower, channel=item.channel, unit=item.unit, matched=int((near & item.posed).sum()),
+        unmatched=int((item.posed & ~near).sum()), cards=cards, differences=pairs,
+        floor_db=detection_floor_db(part["level"].to_numpy(np.float64)),
+    )  # fmt: skip
+
+
+def _part(model: PredictedLevel, rows: BoolArray) -> PredictedLevel:
+    """Return the samples ``rows`` of a prediction."""
+
+    def some(values: FloatArray | None) -> FloatArray | None:
+        return None if values is None else values[rows]
+
+    return PredictedLevel(
+        level_db=model.level_db[rows], sd_db=some(model.sd_db), low_db=some(model.low_db), high_db=some(model.high_db),
+        absolute=model.absolute, asked=some(model.asked),
+    )  # fmt: skip
+
+
+def _power_dbm(data: FlightData, item: RssResult) -> float:
+    """Transmit power of the link of a series [dBm]."""
+    return next(s.link.transmit_power_dbm for s in data.rss if (s.tower, s.channel) == (item.tower, item.channel))
+
+
+def _nearest(
+    time: Any, position_m: FloatArray, part: pd.DataFrame, timed: bool, near_m: float
+) -> tuple[IntArray, BoolArray]:
+    """Return the nearest predicted row (n,) of each sample, and whether it is near (n,)."""
+    if timed:
+        known = part["time"].to_numpy("datetime64[ns]")
+        order = np.argsort(known, kind="stable")
+        at = known[order]
+        after = np.clip(np.searchsorted(at, time), 1, len(at) - 1) if len(at) > 1 else np.zeros(len(time), dtype=int)
+        before = np.maximum(after - 1, 0)
+        closer = np.where(np.abs(at[after] - time) < np.abs(time - at[before]), after, before)
+        steps = np.diff(np.unique(at)) / np.timedelta64(1, "s")
+        most_s = max(_NEAR_S, 0.51 * float(np.median(steps)) if len(steps) else 0.0)
+        apart_s = np.abs(at[closer] - time) / np.timedelta64(1, "s")
+        return order[closer], np.asarray(apart_s <= most_s)
+    from scipy.spatial import cKDTree
+
+    place = part[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
+    posed: BoolArray = np.asarray(np.isfinite(position_m).all(axis=1))
+    distance, index = cKDTree(place).query(np.where(posed[:, None], position_m, 0.0))
+    return np.asarray(index), np.asarray(posed & (distance <= near_m))
+
+
+def _ranks(given: ForeignPrediction, item: RankResult, name: str, near_m: float) -> RankVerdict | None:
+    if not {"rank", *RANKS} & set(given.table):
+        return None
+    part = given.table[given.table["tower"] == item.tower]
+    part = part[part["time"].notna()] if given.timed else part[part["east_m"].notna()]
+    if part.empty:
+        return None
+    index, near = _nearest(item.time, item.position_m, part, given.timed, near_m)
+    chosen, p = part.iloc[index], None
+    if set(RANKS) <= set(part):
+        p = chosen[list(RANKS)].to_numpy(np.float64)
+        predicted = np.where(np.isfinite(p).all(axis=1), np.nan_to_num(p).argmax(axis=1) + 1.0, np.nan)
+    if "rank" in part:
+        predicted = chosen["rank"].to_numpy(np.float64)
+    scored = near & np.isfinite(predicted) & np.isfinite(item.measured) & (item.measured > 0)
+    if scored.sum() < FEWEST:
+        return None
+    best = max(item.rank, key=lambda k: item.score.simulated[k].agreement)
+    models = {name: predicted, f"ray tracing, K = {best:g}": item.rank[best].astype(np.float64)}
+    measured = item.measured[scored]
+    scores = {
+        key: {
+            "kappa": cohen_kappa(measured, rank[scored]),
+            "total_variation": total_variation(histogram(measured), histogram(rank[scored])),
+            "agreement": agreement(measured, rank[scored]),
+        }
+        for key, rank in models.items()
+    }
+    log_score = constant = None
+    if p is not None:
+        stated = scored & np.isfinite(p).all(axis=1)
+        forecast = score_forecast(item.measured[stated], p[stated], predicted[stated], np.nanmean(p, axis=0))
+        log_score, constant = forecast.log_score, forecast.constant_log_score
+    return RankVerdict(
+        tower=item.tower, matched=int(scored.sum()), unmatched=int((~near).sum()), scores=scores,
+        log_score=log_score, constant_log_score=constant,
+    )  # fmt: skip
+
+
+def _why_none(given: ForeignPrediction, result: FlightResult) -> str | None:
+    """Return the likely cause if no sample is near a prediction: another time zone, another day, another route."""
+    if not given.timed or not result.series:
+        return "a prediction of another route or with another height reference; --against-distance widens the search"
+    flown = np.concatenate([item.time for item in result.series])
+    theirs = given.table["time"].dropna().to_numpy("datetime64[ns]")
+    apart_h = float((np.median(theirs.astype(np.int64)) - np.median(flown.astype(np.int64))) / 3.6e12)
+    spans = f"predicted {theirs.min()} to {theirs.max()}, flown {flown.min()} to {flown.max()} (UTC)"
+    hours = round(apart_h * 2) / 2
+    if 0.5 <= abs(hours) <= 14.0 and abs(apart_h - hours) < 0.25:
+        return f"another time zone, {hours:+g} h: {spans}"
+    return f"another flight: {spans}"

@@ -1,0 +1,664 @@
+"""The start of a prediction: the places asked for, and the links that can be predicted.
+
+Places asked for in a prediction: a grid over a site, a planned route, the plan or track of a flight, points.
+
+Links that can be predicted: of the flights that were named, or of the memory of the site.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+
+from ..common.errors import InputError, UsageError, parsing
+from ..common.geodesy import azimuth_rad
+from ..common.jsonable import named
+from ..common.text import counted
+from ..common.units import BoolArray, FloatArray
+from ..compare.calibration import BIN_S, Correction, Observed, Predictor, between_blocks_db, by_degree
+from ..compare.gains import NO_SPREAD, LinkSamples, LostLock, Spread, fading_of, link_directions, student_factor
+from ..compare.level import DetectionForecast
+from ..flight.data import FAR_M, FlightData, RssSeries, load_data, nearest_m
+from ..flight.drafting.proposals import Remembered, remembered
+from ..flight.gains import flight_of, load_with_learned, pair_db
+from ..flight.replay import attitude_rotation, replay_poses
+from ..flight.settings import FlightFile, LinkSettings, RssSettings, RtSettings
+from ..flight.simulate import LEAN_DEG_PER_MPS, planned_poses
+from ..flight.track import interpolated, raised
+from ..logs.readers import HEAD_BYTES
+from ..logs.route import MOST_POINTS, read_route, too_many_points
+from ..maps.grid import Grid
+from ..propagation.field.baselines import free_space_dbm
+from ..propagation.geometry import Poses, rotation_from_aircraft, rotation_from_axes
+from ..site.site import Site
+from ..site.siteyaml import inputs_of_site
+from .calibrate import load_calibration
+from .tasks import inputs_of_flight
+
+# Between points of a route that is given by its corners [m].
+STEP_M = 10.0
+
+# Of a route without times.
+SPEED_MPS = 8.0
+
+# Upward axis of level flight.
+UPRIGHT = np.array([0.0, 0.0, 1.0])
+
+# Points further away are none [m].
+NEAR_M = 1e6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Targets:
+    """Points of a prediction.
+
+    Parameters
+    ----------
+    kind : {"grid", "route", "points"}
+    name : str
+    position_m : (n, 3)
+        East, north, up [m]; NaN where a position is not known.
+    yaw_deg : (n,)
+        Clockwise from north; NaN: unknown, all headings count alike.
+    time_s : (n,)
+        Since the first point.
+    up : (3,) or (n, 3), optional
+        Upward axis of the aircraft; level flight without.
+    grid : Grid, optional
+        Of a grid: the points are its positions, height after height.
+    heights_m : tuple of float
+    remarks : tuple of str
+    """
+
+    kind: str
+    name: str
+    position_m: FloatArray
+    yaw_deg: FloatArray
+    time_s: FloatArray
+    up: FloatArray = field(default_factory=lambda: UPRIGHT)
+    grid: Grid | None = None
+    heights_m: tuple[float, ...] = ()
+    remarks: tuple[str, ...] = ()
+
+    def __len__(self) -> int:
+        return len(self.time_s)
+
+    @property
+    def known(self) -> BoolArray:
+        """Points (n,) that have a position near the site."""
+        return np.asarray((np.abs(self.position_m) < NEAR_M).all(axis=1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TargetOptions:
+    """Options of ``predict`` that say where.
+
+    Parameters
+    ----------
+    heights_m : tuple of float
+        Of a grid; the first also of route points without a height.
+    spacing_m : float
+        Of a grid.
+    heading_deg : float, optional
+        At all points; without it that of the route, and where none is said all headings count alike.
+    site : str, optional
+        Where neither flights nor the place name it.
+    carrier_hz, tx_power_dbm : float, optional
+        Of a prediction before any flight.
+    """
+
+    heights_m: tuple[float, ...] = (40.0,)
+    spacing_m: float = 30.0
+    heading_deg: float | None = None
+    site: str | None = None
+    carrier_hz: float | None = None
+    tx_power_dbm: float | None = None
+
+
+def level_samples(
+    end: tuple[str, str],
+    tower_m: FloatArray,
+    position_m: FloatArray,
+    yaw_deg: FloatArray,
+    time_s: FloatArray,
+    up: FloatArray = UPRIGHT,
+) -> LinkSamples:
+    """Poses of an aircraft as samples without a level.
+
+    Parameters
+    ----------
+    end : (str, str)
+        Tower and channel.
+    tower_m : (3,)
+        Place of the array [m].
+    position_m : (n, 3)
+    yaw_deg : (n,)
+        Clockwise from north.
+    time_s : (n,)
+    up : (n, 3), optional
+        Upward axis; level flight without.
+
+    Returns
+    -------
+    LinkSamples
+    """
+    at_uav, at_tower = link_directions(tower_m, position_m, rotation_from_axes(yaw_deg, up))
+    return LinkSamples(
+        flight="",
+        tower=end[0],
+        channel=end[1],
+        time_s=time_s,
+        position_m=position_m,
+        at_uav=at_uav,
+        at_tower=at_tower,
+        residual_db=np.zeros(len(yaw_deg)),
+    )
+
+
+def is_settings(path: Path) -> bool:
+    """Check whether a path names a YAML file."""
+    return path.suffix.lower() in (".yaml", ".yml")
+
+
+def target_files(where: Path, site: str | None, logs_root: Path | None) -> list[Path]:
+    """Files that WHERE and the site of ``--site`` are read from."""
+    files = [] if site is None else inputs_of_site(site)
+    if (flight := flight_of(where)) is not None:
+        return [*files, *inputs_of_flight(flight, where, logs_root)]
+    if is_settings(where) or not where.exists():
+        return [*files, *inputs_of_site(where)]
+    return [*files, where]
+
+
+def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Path | None = None) -> Targets:
+    """Points that WHERE names.
+
+    Parameters
+    ----------
+    where : Path
+        site.yaml or a packaged site (a grid), flight.yaml (its plan, else its track), a route, or a CSV of points.
+    site : Site
+    options : TargetOptions
+    logs_root : Path, optional
+        Where the logs of a flight file resolve.
+
+    Returns
+    -------
+    Targets
+
+    Raises
+    ------
+    UsageError, InputError
+        What is no place to predict, with the likely cause.
+    """
+    flight = flight_of(where)
+    if flight is not None:
+        targets = _planned(flight, site) if flight.flight.plan is not None else _flown(flight, where, logs_root)
+    elif is_settings(where) or not where.exists():
+        targets = _grid(site, options)
+    elif (local := _local_points(where)) is not None:
+        targets = local
+    else:
+        targets = _route(where, site, options)
+    if targets.grid is None and options.spacing_m != TargetOptions().spacing_m:
+        raise UsageError("--spacing along a route", expected="a site: the spacing is that of a grid")
+    if options.heading_deg is not None:
+        targets = replace(targets, yaw_deg=np.full(len(targets), options.heading_deg % 360.0))
+    if len(targets) > MOST_POINTS:
+        raise UsageError(f"{len(targets)} points", expected=f"at most {MOST_POINTS}", cause="too fine a spacing")
+    if not targets.known.any():
+        places = "east, north and height in metres, or latitude and longitude"
+        raise InputError("no point has a position near the site", expected=places, path=where)
+    return targets
+
+
+def _grid(site: Site, options: TargetOptions) -> Targets:
+    grid = Grid.over_area(site.area_m, options.spacing_m)
+    position = np.concatenate([grid.positions_m(h) for h in options.heights_m])
+    if site.dem is not None:
+        position[:, 2] += site.dem.ground_m(position[:, 0], position[:, 1])
+    return Targets(
+        kind="grid",
+        name=site.name,
+        position_m=position,
+        yaw_deg=np.full(len(position), np.nan),
+        time_s=np.zeros(len(position)),
+        grid=grid,
+        heights_m=options.heights_m,
+    )
+
+
+def _planned(flight: FlightFile, site: Site) -> Targets:
+    assert flight.flight.plan is not None
+    time, position, yaw = planned_poses(flight.flight.plan, site.takeoff_ground_m, 1.0)
+    up, name = _leaning(position, time), flight.flight.name
+    return Targets(kind="route", name=name, position_m=position, yaw_deg=yaw % 360.0, time_s=time, up=up)
+
+
+def _leaning(position_m: FloatArray, time_s: FloatArray) -> FloatArray:
+    """Upward axes (n, 3) of a multicopter on its way: it leans into its motion."""
+    time = np.maximum.accumulate(time_s)
+    # over two seconds: positions of a log are rounded, and aircraft lean no faster
+    begin, end = np.clip(time - 1.0, time[0], None), np.clip(time + 1.0, None, time[-1])
+    moved = interpolated(end, time, position_m) - interpolated(begin, time, position_m)
+    up = np.radians(LEAN_DEG_PER_MPS) * moved / np.maximum(end - begin, 1e-9)[:, None]
+    # the angle stands for its tangent: a jump of the positions turns no aircraft over
+    up[:, 2] = 1.0
+    return np.asarray(up / np.linalg.norm(up, axis=1, keepdims=True))
+
+
+def _flown(flight: FlightFile, where: Path, logs_root: Path | None) -> Targets:
+    """Track of a flight without a plan: its levels are not looked at."""
+    data: FlightData = load_data(flight, where.parent, logs_root)
+    if data.track is None:
+        raise UsageError("a flight file without a plan and without telemetry", expected="flight.plan", path=where)
+    start, end = data.track.start_ns, data.track.end_ns
+    time = np.arange(start, end, 1_000_000_000).astype("datetime64[ns]")
+    pose = data.poses_at(time)
+    return Targets(
+        kind="route",
+        name=flight.flight.name,
+        position_m=pose.position_m[pose.valid],
+        yaw_deg=pose.heading_deg[pose.valid],
+        up=attitude_rotation(pose, data.settings.rt.attitude)[pose.valid][:, :, 2],
+        time_s=((time - time[0]) / np.timedelta64(1, "s"))[pose.valid],
+        remarks=("The flight file has no plan: its track is the route. Its levels are not used.",),
+    )
+
+
+# Columns of a table of points; the last two may be missing.
+_COLUMNS = ("east_m", "north_m", "height_m", "yaw_deg", "time_s")
+
+
+def _local_points(path: Path) -> Targets | None:
+    """Points of a CSV with east_m, north_m and height_m (and yaw_deg, time_s); None for another file."""
+    if path.suffix.lower() != ".csv":
+        return None
+    with parsing(path, "columns east_m, north_m, height_m"):
+        with path.open("rb") as file:
+            head = file.readline(HEAD_BYTES).decode("utf-8-sig", errors="replace")
+        if not set(_COLUMNS[:3]) <= {name.strip() for name in head.split(",")}:
+            return None
+        # a longer table is refused when its limit is passed, not when all of it is in memory
+        table = pd.read_csv(
+            path, skipinitialspace=True, nrows=MOST_POINTS + 1, encoding="utf-8-sig", index_col=False,
+            usecols=lambda name: name.strip() in _COLUMNS,
+        ).rename(columns=str.strip)  # fmt: skip
+        if len(table) > MOST_POINTS:
+            raise too_many_points(path)
+    numbers = table.reindex(columns=list(_COLUMNS))
+    numbers = numbers.apply(pd.to_numeric, errors="coerce")
+    position = numbers[["east_m", "north_m", "height_m"]].to_numpy(np.float64)
+    lost = int((~(np.abs(position) < NEAR_M).all(axis=1)).sum())
+    return Targets(
+        kind="points",
+        name=path.stem,
+        position_m=position,
+        yaw_deg=numbers["yaw_deg"].to_numpy(np.float64),
+        time_s=time if np.isfinite(time := numbers["time_s"].to_numpy(np.float64)).all() else np.zeros(len(position)),
+        remarks=(f"{lost} of {counted(len(position), 'point')} without a position near the site.",) if lost else (),
+    )
+
+
+def _route(where: Path, site: Site, options: TargetOptions) -> Targets:
+    table = read_route(where, height_m=options.heights_m[0])
+    place = table["latitude_deg"].to_numpy(), table["longitude_deg"].to_numpy()
+    east, north = site.frame.to_local(*place)
+    if (away_m := nearest_m(site, *place)) > FAR_M:
+        exchanged = nearest_m(site, *place[::-1]) <= FAR_M
+        raise InputError(
+            f"the route comes no nearer than {away_m / 1000.0:.0f} km to any tower of site {site.name!r}",
+            expected="latitude, longitude near the site",
+            cause="latitude and longitude are exchanged" if exchanged else "a route of another place",
+            path=where,
+        )
+    takeoff_m = site.takeoff_ground_m
+    up = table["altitude_m"].to_numpy(np.float64) + takeoff_m
+    up, buried = raised(up, site.ground_under_m(east, north), takeoff_m)
+    if buried.any():
+        raise InputError(
+            f"{int(buried.sum())} of {counted(len(up), 'point')} below the site's ground",
+            expected="heights above take-off",
+            cause="heights of another datum, or origin.takeoff_ground_m of the site",
+            path=where,
+        )
+    position, yaw = np.column_stack([east, north, up]), table["yaw_deg"].to_numpy(np.float64)
+    remarks = tuple(table.attrs.get("remarks", ()))
+    time = table["time_s"].to_numpy(np.float64)
+    if not np.isfinite(time).all():
+        gaps = np.linalg.norm(np.diff(position, axis=0), axis=1)
+        along = np.concatenate([[0.0], np.cumsum(gaps)])
+        count = max(int(along[-1] / STEP_M) + 1, 2) if along[-1] > 0 else 1
+        at = np.linspace(0.0, along[-1], count)
+        leg = np.clip(np.searchsorted(along, at, side="right") - 1, 0, len(position) - 1)
+        position = interpolated(at, along, position)
+        yaw, time = yaw[leg], at / SPEED_MPS
+        remarks += (f"Points every {STEP_M:g} m; times by a speed of {SPEED_MPS:g} m/s.",)
+    up = _leaning(position, time)
+    return Targets(kind="route", name=where.stem, position_m=position, yaw_deg=yaw, time_s=time, up=up, remarks=remarks)
+
+
+_REPLAYED_AT_ONCE = 20_000
+
+
+@dataclass(frozen=True, slots=True)
+class NamedFlight:
+    """A flight file that ``--with`` names."""
+
+    path: Path
+    settings: FlightFile
+
+    def load(self, logs_root: Path | None) -> FlightData:
+        """Its logs and track."""
+        return load_data(self.settings, self.path.parent, logs_root)
+
+
+def named_flights(paths: Sequence[Path]) -> list[NamedFlight]:
+    """Flight files, and those that a calibration.yaml lists.
+
+    Raises
+    ------
+    UsageError, InputError
+        As of any settings file.
+    """
+    out = []
+    for path in paths:
+        text = path.read_text(encoding="utf-8", errors="replace") if is_settings(path) and path.is_file() else ""
+        listed = text.startswith("calibration:") or "\ncalibration:" in text
+        each = [path.parent / name for name in load_calibration(path).flights] if listed else [path]
+        out += [NamedFlight(file, load_with_learned(file)) for file in each]
+    return out
+
+
+def files_of(flights: Sequence[NamedFlight], logs_root: Path | None) -> list[Path]:
+    """Every file that the flights are read from."""
+    return [file for flight in flights for file in inputs_of_flight(flight.settings, flight.path, logs_root)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Link of one tower and channel, as the first flight that has it describes it, or the memory of the site.
+
+    Parameters
+    ----------
+    tower, channel, unit : str
+    link : LinkSettings
+    site : Site
+    folder : Path
+        Where antenna files resolve.
+    rt, rss : RtSettings, RssSettings
+        How a replay goes, and which sum of its paths counts.
+    samples : tuple of LinkSamples
+        Of the flights that have it.
+    """
+
+    tower: str
+    channel: str
+    unit: str
+    link: LinkSettings
+    site: Site
+    folder: Path = Path()
+    rt: RtSettings = field(default_factory=RtSettings)
+    rss: RssSettings = field(default_factory=RssSettings)
+    samples: tuple[LinkSamples, ...] = ()
+
+    @classmethod
+    def of(cls, data: FlightData, series: RssSeries, samples: Sequence[LinkSamples]) -> Source:
+        """As a flight has it; ``samples`` are those of all flights."""
+        of_series = tuple(s for s in samples if (s.tower, s.channel) == (series.tower, series.channel))
+        return cls(
+            **named(series, "tower channel unit link"),
+            **named(data, "site folder"),
+            **named(data.settings, "rt rss"),
+            samples=of_series,
+        )
+
+    @property
+    def antenna(self) -> str:
+        """``tower.channel``."""
+        return f"{self.tower}.{self.channel}"
+
+    @property
+    def tower_m(self) -> FloatArray:
+        """Place of the array (3,)."""
+        return np.asarray(self.site.towers[self.tower].position_m)
+
+    def free_space_db(self, position_m: FloatArray) -> FloatArray:
+        """Level (n,) of free space [dBm]."""
+        place, link = self.tower_m[None, :], self.link
+        return np.asarray(free_space_dbm(place, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
+
+    def targets(self, position_m: FloatArray, yaw_deg: FloatArray, up: FloatArray = UPRIGHT) -> LinkSamples:
+        """Targets (n,) of an aircraft of an upward axis (3,) or (n, 3) as samples without a level."""
+        time_s = np.zeros(len(yaw_deg))
+        return level_samples((self.tower, self.channel), self.tower_m, position_m, yaw_deg, time_s, up)
+
+    def replayed_db(self, samples: LinkSamples) -> FloatArray:
+        """Replayed level above free space (n,) of a level aircraft [dB]; NaN without a path."""
+        link = self.link.build([self.tower], self.folder)
+        turn = azimuth_rad(-samples.at_tower) - azimuth_rad(samples.at_uav)
+        flat = np.zeros(len(turn))
+        known = self.rt.attitude != "ignored"
+        rotation = rotation_from_aircraft(flat, flat, 90.0 - np.degrees(turn) if known else flat + 90.0)
+        level = np.empty(len(samples))
+        for start in range(0, len(samples), _REPLAYED_AT_ONCE):
+            part = slice(start, start + _REPLAYED_AT_ONCE)
+            poses = Poses(samples.position_m[part], rotation[part])
+            total = replay_poses(self.site, self.rt, link, poses).level_dbm(self.rss.field)
+            level[part] = total[:, 0] + pair_db(link, poses, self.tower_m[None, :])
+        return np.asarray(level - self.free_space_db(samples.position_m))
+
+
+def track_m(samples: LinkSamples) -> FloatArray:
+    """Some 500 positions (n, 2) of a flight, for drawings."""
+    return np.asarray(samples.position_m[:: max(1, len(samples) // 500), :2])
+
+
+def sources_of(known: Sequence[FlightData], observed: Sequence[Observed]) -> dict[str, Source]:
+    """Towers that stand still and their channels that a flight heard, by antenna."""
+    measured = [o.samples for o in observed if np.isfinite(o.samples.residual_db).any()]
+    out: dict[str, Source] = {}
+    for data in known:
+        for series in data.rss:
+            source = Source.of(data, series, measured)
+            if source.samples and series.tower not in data.nodes and series.unit != "dB":
+                out.setdefault(source.antenna, source)
+    if not out:
+        raise InputError("no flight has levels of a tower that stands still", expected="RSS logs with positions")
+    return out
+
+
+# --- models --------------------------------------------------------------------------------------------------------
+
+# Targets further than this from every sample that is known are flagged, horizontally and in height.
+_HULL_M, _HULL_UP_M = 60.0, 20.0
+
+# Level above free space and standard deviation of 4 s means (n,) [dB], and where the model is a guess.
+Levels = tuple[FloatArray, FloatArray, BoolArray]
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """The model that the named flights taught: a base with or without a residual field."""
+
+    correction: Correction
+    sources: Mapping[str, Source]
+    trained_on: Sequence[Sequence[str]] = ()
+    marks: Sequence[Sequence[str]] = ()
+    """SHA-256 of what its base knows besides the named flights."""
+
+    def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:
+        """Levels at targets as seen with each of some headings, which count alike; ``run_targets``: their count."""
+        antenna = each[0].antenna
+        level, slow = self.correction.over_headings(each, all_targets=run_targets)
+        guess = outside(each[0].position_m, self.sources[antenna].samples)
+        # the field's offset of a new flight is normal; few flights tell little of its spread, as in the memory
+        flights, fitted = len({s.flight for s in self.sources[antenna].samples}), self.correction
+        wider = math.sqrt((1.0 + 1.0 / flights) * (student_factor(flights) ** 2 - 1.0))
+        slow = np.hypot(slow, fitted.sd_factor * wider * fitted.model.offset_sd_db)
+        beyond = between_blocks_db(self.correction.channels[antenna])
+        return level, np.where(guess, np.hypot(slow, beyond), slow), guess
+
+    def fading(self, antenna: str) -> Spread:
+        """Spread of samples about their means over 4 s."""
+        sd_db, kurtosis = fading_of(self.sources[antenna].samples, BIN_S)
+        return dataclasses.replace(NO_SPREAD, fading_sd_db=sd_db, fading_kurtosis=kurtosis, bin_s=BIN_S)
+
+    def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:  # noqa: ARG002
+        """None: of the named flights only the level is learned."""
+        return None
+
+    def offset_db(self, antenna: str) -> float:
+        """Mean of logged minus replayed levels [dB]."""
+        source = self.sources[antenna]
+        binned = [samples.binned(BIN_S) for samples in source.samples]
+        return float(np.nanmean([np.nanmean(b.residual_db - source.replayed_db(b)) for b in binned]))
+
+
+class Memory:
+    """The model that the site remembers: antennas and level of each channel, from flights that are not named.
+
+    Parameters
+    ----------
+    known : mapping of str to Remembered
+        By antenna (``tower.channel``), each with a level.
+    site : Site
+    """
+
+    def __init__(self, known: Mapping[str, Remembered], site: Site) -> None:
+        self.known, self._site = known, site
+        self._gain_db: Predictor = by_degree(lambda samples: known[samples.antenna].gain_db(samples))
+
+    def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:  # noqa: ARG002
+        """As :meth:`Flown.levels`; a guess where flights taught less than half of the variance, or off the site."""
+        memory = self.known[each[0].antenna]
+        gains, sds = (np.stack(part) for part in zip(*map(self._gain_db, each), strict=True))
+        level, spread, gain_variance = memory.level, memory.spread, (sds**2).mean(axis=0)
+        variance_db2 = spread.own_sd_db**2 + spread.noise_sd_db**2 + level.sd_db**2
+        west, east, south, north = self._site.area_m
+        off = np.any(np.abs(each[0].position_m[:, :2] - (0.5 * (west + east), 0.5 * (south + north)))
+                     > (0.5 * (east - west), 0.5 * (north - south)), axis=1)  # fmt: skip
+        guess = off | (gain_variance > 0.5 * memory.prior_variance_db2)
+        return gains.mean(axis=0) + level.offset_db, np.sqrt(gain_variance + gains.var(axis=0) + variance_db2), guess
+
+    def fading(self, antenna: str) -> Spread:
+        """As :meth:`Flown.fading`."""
+        return dataclasses.replace(self.known[antenna].spread, own_sd_db=0.0, noise_sd_db=0.0)
+
+    def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:
+        """Forecast in two parts about levels in lock (n,) [dB], of a receiver that loses its lock."""
+        memory = self.known[antenna]
+        lock, level = memory.series.lock, memory.level
+        if lock is None:
+            return None
+        above_db = level_db - level.offset_db - level.transmit_power_dbm - lock.gain_db
+        return LostLock(
+            probability=DetectionForecast(level_db=0.0, per_db=lock.per_db, share=lock.share).probability(above_db),
+            locked_db=lock.locked_db + lock.locked_per_db * above_db - level_db,
+            lost_db=lock.lost_db + lock.lost_per_db * above_db - level_db,
+            locked_sd_db=float(np.hypot(lock.locked_sd_db, level.sd_db)),
+            lost_sd_db=lock.lost_sd_db,
+        )
+
+    def offset_db(self, antenna: str) -> float:
+        """Mean of logged levels minus those of the antennas [dB]."""
+        return self.known[antenna].level.offset_db
+
+    def sources(self) -> dict[str, Source]:
+        """Links by antenna, with isotropic ends."""
+        out = {}
+        for antenna, memory in self.known.items():
+            series, level = memory.series, memory.level
+            link = LinkSettings(carrier_hz=series.carrier_hz, transmit_power_dbm=level.transmit_power_dbm)
+            out[antenna] = Source(
+                tower=series.tower,
+                channel=series.channel,
+                unit=level.unit,
+                link=link,
+                site=self._site,
+                rss=RssSettings(field="power"),
+            )
+        return out
+
+
+def memory_of(place: str | Path, site: Site) -> Memory | None:
+    """Return the model of the antennas and levels learned for a site; None if no level of its towers was learned."""
+    known = {
+        name: entry
+        for name, entry in remembered(place).items()
+        if entry.series.level and entry.series.tower in site.towers
+    }
+    return Memory(known, site) if known else None
+
+
+# Standard deviations of a prediction before any flight [dB]. Offset: transmit power, cables and receiver gain that
+# nobody measured. Antennas: the gain of two unknown antennas over directions (a dipole's nulls, mast, airframe).
+# Shadowing: 3GPP TR 36.777, table B-3, gives 4.2 dB (LoS) and 6 dB (NLoS) for rural aerial links. Fading: Rayleigh's
+# 5.6 dB is the worst case. `benchmarks/first_flight_prediction.py` checks the sum on flights.
+PRIOR_OFFSET_DB, PRIOR_ANTENNA_DB, PRIOR_SHADOWING_DB, PRIOR_FADING_DB = 10.0, 8.0, 6.0, 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class Prior:
+    """The model before any flight: ray tracing with isotropic antennas, and a wide error that is stated.
+
+    Parameters
+    ----------
+    site : Site
+    link : LinkSettings
+        Carrier and transmit power.
+    towers : tuple of str
+        The towers that are predicted.
+    """
+
+    site: Site
+    link: LinkSettings
+    towers: tuple[str, ...]
+
+    def sources(self) -> dict[str, Source]:
+        """Return one link per tower, with isotropic ends and woods that attenuate."""
+        rt = RtSettings(foliage="attenuating")
+        return {
+            f"{tower}.level": Source(
+                tower=tower, channel="level", unit="dBm", link=self.link, site=self.site, rt=rt,
+                rss=RssSettings(field="power"),
+            )
+            for tower in self.towers
+        }  # fmt: skip
+
+    def levels(self, each: Sequence[LinkSamples], run_targets: int) -> Levels:  # noqa: ARG002
+        """Return level above free space and standard deviation (n,) [dB]; no heading matters to isotropic antennas."""
+        level = self.sources()[each[0].antenna].replayed_db(each[0])
+        return level, np.where(np.isfinite(level), self.slow_sd_db, np.nan), np.ones(len(level), dtype=np.bool_)
+
+    @property
+    def slow_sd_db(self) -> float:
+        """Standard deviation of a mean over 4 s on a first flight [dB]."""
+        return math.sqrt(PRIOR_OFFSET_DB**2 + PRIOR_ANTENNA_DB**2 + PRIOR_SHADOWING_DB**2)
+
+    def fading(self, antenna: str) -> Spread:  # noqa: ARG002
+        """Return the spread of samples about their means over 4 s."""
+        return dataclasses.replace(NO_SPREAD, fading_sd_db=PRIOR_FADING_DB)
+
+    def lost_lock(self, antenna: str, level_db: FloatArray) -> LostLock | None:  # noqa: ARG002
+        """Return None: no receiver is known."""
+        return None
+
+    def offset_db(self, antenna: str) -> float:  # noqa: ARG002
+        """Return 0: no level was measured [dB]."""
+        return 0.0
+
+
+def outside(position_m: FloatArray, flown: Sequence[LinkSamples]) -> BoolArray:
+    """Targets (n,) that are further than :data:`_HULL_M` or :data:`_HULL_UP_M` from every sample."""
+    from scipy.spatial import cKDTree
+
+    scaled = np.array([_HULL_M, _HULL_M, _HULL_UP_M])
+    places = np.concatenate([s.position_m for s in flown])
+    return np.asarray(cKDTree(places / scaled).query(position_m / scaled, distance_upper_bound=1.0)[0] > 1.0)

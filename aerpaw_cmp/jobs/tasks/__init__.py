@@ -1,1 +1,0 @@
-"""Work shared over processes: workers, outcomes that are kept, manifests; the options and the outcome of every job."""

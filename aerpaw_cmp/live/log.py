@@ -1,0 +1,539 @@
+"""The tap's durable log: append-only JSONL segments.
+
+One record is one line, written by one ``write`` to an ``O_APPEND`` file: what was written before a SIGKILL is
+in the file. ``fdatasync`` follows at an interval, so a power loss costs at most that interval. Each line ends with
+the CRC-32 of what stands before it; a torn or rotten line is told from a record.
+
+A disk that is full or read-only does not stop the caller: records wait in memory (bounded), in order, and go to the
+disk when it takes them again; what had to be let go is counted in a ``disk`` record.
+
+A disk that stalls for seconds, as memory cards do, delays no poll: each record is handed to a thread that writes it
+(:class:`LogWriter`), and the polling waits for it, so that in the ordinary case a record is in the kernel's hands
+before the next command goes out. It waits at most ``patience_s``: if the disk takes longer, records queue up in memory
+(bounded) and the polling goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import os
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..common.errors import InputError
+from ..common.text import counted
+from ..logs.files import Record, encode_record
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Wall and monotonic clock [ns]; a test gives its own."""
+
+    utc_ns: Callable[[], int] = time.time_ns
+    mono_ns: Callable[[], int] = time.monotonic_ns
+
+
+def boot_id() -> str:
+    """Identity of this boot; monotonic times compare only within one."""
+    try:
+        return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
+    except OSError:
+        return ""
+
+
+def clock_synchronised() -> bool | None:
+    """Check whether the kernel holds the wall clock for synchronised (adjtimex(2)); None if it cannot be asked."""
+    try:
+        # modes = 0 only reads; the structure is 208 bytes, we need none of it; 5 is TIME_ERROR
+        state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.create_string_buffer(512))
+    except (OSError, AttributeError):
+        return None
+    return None if state < 0 else bool(state != 5)
+
+
+def _sync_directory(folder: Path) -> None:
+    fd = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(fd)
+    finally:
+        os.close(fd)
+
+
+class _Syncer(threading.Thread):
+    """``fdatasync`` beside the polling, so that a slow card delays no poll."""
+
+    def __init__(self, on_error: Callable[[OSError], None]) -> None:
+        super().__init__(name="tap-fdatasync", daemon=True)
+        self._wanted = threading.Event()
+        self._fd_lock = threading.Lock()
+        self._fd = -1
+        self._ended = False
+        self._on_error = on_error
+
+    def request(self, fd: int) -> None:
+        with self._fd_lock:
+            self._fd = fd
+        self._wanted.set()
+
+    def run(self) -> None:
+        while True:
+            self._wanted.wait()
+            self._wanted.clear()
+            if self._ended:
+                return
+            try:
+                self._sync()
+            except OSError as error:
+                self._on_error(error)
+
+    def _sync(self) -> None:
+        with self._fd_lock:  # held while syncing: the descriptor must not be closed under it
+            # asked for twice while one sync ran, one more holds both
+            fd, self._fd = self._fd, -1
+            if fd >= 0:
+                os.fdatasync(fd)
+
+    @contextlib.contextmanager
+    def quiet(self) -> Iterator[None]:
+        """No sync runs and none is waiting inside."""
+        with self._fd_lock:
+            self._fd = -1
+            yield
+
+    def stop(self) -> None:
+        self._ended = True
+        self._wanted.set()
+        self.join(timeout=5.0)
+
+
+@dataclass(slots=True)
+class LogSettings:
+    """Settings for writing the log.
+
+    Parameters
+    ----------
+    sync_interval_s : float
+        Longest time between a record and its ``fdatasync``; 0: after every record.
+    segment_bytes : int
+        A segment is closed at this size.
+    segment_s : float
+        ... or at this age [s].
+    backlog_records, backlog_bytes : int
+        What may wait in memory while the disk takes nothing.
+    retry_s : float
+        Pause between attempts on a faulty disk.
+    patience_s : float
+        Longest wait of the polling for a record to be written; then it goes on and records wait in memory.
+    """
+
+    sync_interval_s: float = 1.0
+    segment_bytes: int = 16 * 2**20
+    segment_s: float = 3600.0
+    backlog_records: int = 200_000
+    backlog_bytes: int = 64 * 2**20
+    retry_s: float = 1.0
+    patience_s: float = 0.25
+
+
+@dataclass(slots=True)
+class DiskFault:
+    """An open fault of the log's disk."""
+
+    reason: str
+    since_utc_ns: int
+    lost: int = 0
+
+
+@dataclass(slots=True)
+class SegmentLog:
+    """Numbered segments of one session in a folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Made if missing.
+    header : callable
+        Gives the header record of each segment.
+    settings : LogSettings
+    clock : Clock
+    on_fault : callable
+        Called with a sentence when the disk fails and when it is back.
+
+    Raises
+    ------
+    InputError
+        From :meth:`open`, if the folder cannot be written to at all.
+    """
+
+    folder: Path
+    header: Callable[[], Record]
+    settings: LogSettings = field(default_factory=LogSettings)
+    clock: Clock = field(default_factory=Clock)
+    on_fault: Callable[[str], None] = lambda _text: None
+    path: Path | None = None
+    paths: list[Path] = field(default_factory=list)
+    bytes_written: int = 0
+    records: int = 0
+    fault: DiskFault | None = None
+    lost: int = 0
+    _fd: int = -1
+    _size: int = 0
+    _segment: int = 0
+    _stem: str = ""
+    _number: int = 0
+    _opened_ns: int = 0
+    _synced_ns: int = 0
+    _dirty: bool = False
+    _torn: bool = False
+    _retry_ns: int = 0
+    _backlog: deque[bytes] = field(default_factory=deque)
+    _backlog_bytes: int = 0
+    _syncer: _Syncer | None = None
+    _sync_error: OSError | None = None
+
+    def open(self) -> None:
+        """Make the folder and the first segment."""
+        self._stem = time.strftime("tap_%Y%m%dT%H%M%SZ", time.gmtime(self.clock.utc_ns() / 1e9)) + f"_{os.getpid()}"
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._new_segment()
+        except OSError as error:
+            raise InputError(
+                f"cannot write a log here ({error.strerror})",
+                expected="a folder that can be written to",
+                cause=_disk_cause(error),
+                path=self.folder,
+            ) from None
+        if self.settings.sync_interval_s > 0:
+            self._syncer = _Syncer(self._on_sync_error)
+            self._syncer.start()
+
+    def append(self, record: Record) -> bool:
+        """Write one record; True once the kernel has it, False if it waits in memory.
+
+        The record gets its number ``n`` in the session here.
+        """
+        record["n"] = self._number
+        self._number += 1
+        if self._sync_error is not None:
+            self._fail(self._sync_error)
+        self._put(encode_record(record))
+        if self._backlog and not self._drain():
+            return False
+        now = self.clock.mono_ns()
+        if self._size >= self.settings.segment_bytes or now - self._opened_ns > self.settings.segment_s * 1e9:
+            self._rotate()
+        elif self.settings.sync_interval_s <= 0:
+            self.sync()
+        else:
+            self.tick()
+        return self.fault is None
+
+    def tick(self) -> None:
+        """Called often: asks for the sync that is due, and tries a faulty disk again."""
+        now = self.clock.mono_ns()
+        if self.fault is not None:
+            self._drain()
+        elif self._dirty and self._syncer is not None and now - self._synced_ns >= self.settings.sync_interval_s * 1e9:
+            self._synced_ns = now
+            self._dirty = False
+            self._syncer.request(self._fd)
+
+    def sync(self) -> None:
+        """``fdatasync`` now (gap, rotation, stop)."""
+        if self._fd < 0 or self.fault is not None:
+            return
+        try:
+            with self._syncer.quiet() if self._syncer is not None else contextlib.nullcontext():
+                os.fdatasync(self._fd)
+        except OSError as error:
+            self._fail(error)
+            return
+        self._dirty = False
+        self._synced_ns = self.clock.mono_ns()
+
+    def close(self) -> None:
+        """Last attempt at what waits, sync, close."""
+        # the pause between attempts does not count any more
+        self._retry_ns = 0
+        if self.fault is not None:
+            self._drain()
+        self.sync()
+        if self._syncer is not None:
+            self._syncer.stop()
+            self._syncer = None
+        self._close_fd()
+        self.lost += len(self._backlog)
+
+    def free_bytes(self) -> int | None:
+        """Space left for an ordinary user on the log's disk."""
+        try:
+            state = os.statvfs(self.folder)
+        except OSError:
+            return None
+        return state.f_bavail * state.f_frsize
+
+    # inside -----------------------------------------------------------------------------------------------
+
+    def _put(self, line: bytes) -> None:
+        self._backlog.append(line)
+        self._backlog_bytes += len(line)
+        while len(self._backlog) > self.settings.backlog_records or self._backlog_bytes > self.settings.backlog_bytes:
+            self._backlog_bytes -= len(self._backlog.popleft())
+            self.lost += 1
+            if self.fault is not None:
+                self.fault.lost += 1
+
+    def _drain(self) -> bool:
+        """Write what waits; False while the disk does not take it."""
+        if self.fault is not None:
+            now = self.clock.mono_ns()
+            if now < self._retry_ns:
+                return False
+            self._retry_ns = now + int(self.settings.retry_s * 1e9)
+        try:
+            if self._fd < 0:
+                self._new_segment()
+            while self._backlog:
+                self._write(self._backlog[0])
+                self._backlog_bytes -= len(self._backlog.popleft())
+                self.records += 1
+            if self.fault is not None:
+                self._recover(self.fault)
+        except OSError as error:
+            self._fail(error)
+            return False
+        return True
+
+    def _recover(self, fault: DiskFault) -> None:
+        """The disk took everything: record the fault as past."""
+        os.fdatasync(self._fd)
+        self.fault = None
+        record = {
+            "kind": "disk",
+            "reason": fault.reason,
+            "from_utc_ns": fault.since_utc_ns,
+            "to_utc_ns": self.clock.utc_ns(),
+            "lost": fault.lost,
+            "n": self._number,
+        }
+        self._number += 1
+        self._write(encode_record(record))
+        self.records += 1
+        self.on_fault(f"the disk takes records again; {fault.lost} were lost")
+
+    def _write(self, line: bytes) -> None:
+        """One write; a short one is taken back, so that no torn line stays inside the file."""
+        # what could not be cut off becomes a line of its own, which its checksum refuses
+        data = b"\n" + line if self._torn else line
+        written = os.write(self._fd, data)
+        # the disk filled up within the line
+        if written < len(data):
+            try:
+                os.ftruncate(self._fd, self._size)
+            except OSError:
+                self._torn = True
+                self._size += written
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        self._torn = False
+        self._size += written
+        self.bytes_written += written
+        self._dirty = True
+
+    def _fail(self, error: OSError) -> None:
+        self._sync_error = None
+        if error.errno in (errno.EIO, errno.EROFS, errno.EBADF, errno.ESTALE):
+            self._close_fd()  # after a failed sync the kernel may have dropped pages: go on in a new segment
+        if self.fault is None:
+            self.fault = DiskFault(error.strerror or str(error), self.clock.utc_ns())
+            self._retry_ns = self.clock.mono_ns() + int(self.settings.retry_s * 1e9)
+            self.on_fault(
+                f"the log cannot be written: {self.fault.reason}. {_disk_cause(error)}; records wait in memory"
+            )
+
+    def _on_sync_error(self, error: OSError) -> None:
+        self._sync_error = error  # handled by the polling thread at its next record
+
+    def _rotate(self) -> None:
+        try:
+            self._write(encode_record({"kind": "rotate", "next_segment": self._segment + 1, "n": self._number}))
+            self._number += 1
+            self.records += 1
+            self.sync()
+            if self.fault is None:
+                self._close_fd()
+                self._new_segment()
+        except OSError as error:
+            self._fail(error)
+
+    def _new_segment(self) -> None:
+        self._segment += 1
+        path = self.folder / f"{self._stem}_{self._segment:04d}.jsonl"
+        # O_EXCL: never into the segment of another session
+        fd = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND | os.O_CLOEXEC, 0o644)
+        self._fd, self._size, self._torn = fd, 0, False
+        record = self.header()
+        record["segment"] = self._segment
+        record["n"] = self._number
+        try:
+            self._write(encode_record(record))
+            os.fdatasync(fd)
+            # the name of a new file survives a power loss only once its folder is synced
+            _sync_directory(self.folder)
+        except OSError:
+            self._close_fd()
+            self._segment -= 1
+            with contextlib.suppress(OSError):
+                path.unlink()  # it holds nothing but a torn header
+            raise
+        self._number += 1
+        self.path = path
+        self.paths.append(path)
+        self._opened_ns = self._synced_ns = self.clock.mono_ns()
+
+    def _close_fd(self) -> None:
+        if self._fd >= 0:
+            with self._syncer.quiet() if self._syncer is not None else contextlib.nullcontext():
+                os.close(self._fd)
+            self._fd = -1
+
+
+def _disk_cause(error: OSError) -> str:
+    return {
+        errno.ENOSPC: "the disk is full: free space or give another folder with -o",
+        errno.EDQUOT: "the quota is used up: free space or give another folder with -o",
+        errno.EFBIG: "a limit on file size: see 'ulimit -f'",
+        errno.EROFS: "the disk is mounted read-only",
+        errno.EACCES: "the folder belongs to another user: choose one of your own with -o",
+        errno.EPERM: "the folder belongs to another user: choose one of your own with -o",
+        errno.ENOTDIR: "part of the path is a file",
+        errno.EEXIST: "part of the path is a file",
+    }.get(error.errno or 0, "a failing disk or card")
+
+
+class LogWriter:
+    """Writes to a :class:`SegmentLog` in a thread of its own.
+
+    Parameters
+    ----------
+    log : SegmentLog
+        Not yet open; its settings bound the queue.
+    """
+
+    def __init__(self, log: SegmentLog) -> None:
+        self.log = log
+        log.on_fault = self._tell
+        self._messages: deque[str] = deque(maxlen=100)
+        self._queue: deque[tuple[Record, int]] = deque()
+        self._bytes = 0
+        self._dropped = 0
+        self._changed = threading.Condition()
+        self._busy = self._closing = self._sync_wanted = False
+        self.free_bytes: int | None = None
+        """Space left on the disk, as last seen."""
+        self._thread = threading.Thread(target=self._run, name="tap-log", daemon=True)
+
+    @property
+    def lost(self) -> int:
+        """Records that memory could not hold while the disk took none."""
+        return self.log.lost + self._dropped
+
+    @property
+    def fault(self) -> str:
+        """Reason why the disk takes no records now; empty while it does."""
+        fault = self.log.fault
+        return "" if fault is None else fault.reason
+
+    def messages(self) -> list[str]:
+        """Messages about the disk since the last call."""
+        # by number: the writing thread may add to them meanwhile
+        return [self._messages.popleft() for _ in range(len(self._messages))]
+
+    def open(self) -> None:
+        """Open the log; raises ``InputError`` as :meth:`SegmentLog.open` does."""
+        self.log.open()
+        self.free_bytes = self.log.free_bytes()
+        self._thread.start()
+
+    def append(self, record: Record) -> bool:
+        """Hand over one record; True once the kernel has it, False if it waits in memory."""
+        # about what the other fields of a record take as text
+        size = 500 + sum(len(line) for line in record.get("lines", ()) if isinstance(line, str))
+        settings = self.log.settings
+        with self._changed:
+            stalled = self._busy or bool(self._queue)
+            self._queue.append((record, size))
+            self._bytes += size
+            while len(self._queue) > settings.backlog_records or self._bytes > settings.backlog_bytes:
+                self._bytes -= self._queue.popleft()[1]
+                self._dropped += 1
+            self._changed.notify_all()
+            # during a stall that was waited for once, do not wait again
+            done = not stalled and self._changed.wait_for(self._idle, settings.patience_s)
+        return done and self.log.fault is None
+
+    def sync(self) -> None:
+        """``fdatasync`` soon; waits for it at most ``patience_s``."""
+        with self._changed:
+            self._sync_wanted = True
+            self._changed.notify_all()
+            self._changed.wait_for(self._idle, self.log.settings.patience_s)
+
+    def close(self, timeout_s: float = 30.0) -> None:
+        """Write what waits and close; a disk that still hangs after the time is left alone."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify_all()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            self._dropped += len(self._queue)
+            self._tell(f"the disk hangs: {counted(len(self._queue), 'record')} lost")
+        else:
+            self.log.close()
+
+    # inside -----------------------------------------------------------------------------------------------
+
+    def _tell(self, text: str) -> None:
+        self._messages.append(text)
+
+    def _idle(self) -> bool:
+        return not (self._queue or self._busy or self._sync_wanted)
+
+    def _run(self) -> None:
+        pause_s = min(1.0, max(0.02, self.log.settings.sync_interval_s / 2))
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: not self._idle() or self._closing, pause_s)
+                item = self._queue.popleft() if self._queue else None
+                if item is not None:
+                    self._bytes -= item[1]
+                sync = item is None and self._sync_wanted
+                closing = item is None and not sync and self._closing
+                self._busy = item is not None or sync
+            if closing:
+                return
+            self._work(item[0] if item is not None else None, sync)
+            with self._changed:
+                self._busy = False
+                if sync:
+                    self._sync_wanted = False
+                self._changed.notify_all()
+
+    def _work(self, record: Record | None, sync: bool) -> None:
+        try:
+            if record is not None:
+                self.log.append(record)
+            elif sync:
+                self.log.sync()
+            else:
+                self.log.tick()
+                self.free_bytes = self.log.free_bytes()
+        except Exception as error:  # one bad record must not end the log
+            self._dropped += record is not None
+            self._tell(f"a record could not be written: {type(error).__name__}: {error}")

@@ -1,0 +1,798 @@
+"""Commands that the tap may send to a Quectel RM5xxQ, and the meaning of its answers.
+
+Commands go out only if :data:`QUERIES` lists them; all of them read. The one that writes, ``csi_ctrl``, needs
+``allow_csi=True``. Nothing here asks for IMEI, IMSI, ICCID or numbers, and :class:`Redactor` removes them from
+whatever comes in unasked.
+
+Layouts: Quectel RG520N&RG525F&RG5x0F&RM5x0N Series AT Commands Manual, section 5.20 (QENG); ``nr5g_csi`` as quoted
+at community.teltonika.lt/t/read-csi-information/5568. SA and EN-DC order RSRQ and SINR differently, so fields are
+named after the token of the radio access technology, never after their place in the answer as a whole. A field
+outside its physical range becomes None with a flag; the row and the raw line stay.
+
+Bytes of an AT port to answers and unsolicited lines: no file, no port, no clock.
+
+:class:`Framer` knows the command in flight. It gives the same events however the bytes are cut into pieces, and holds
+a bounded buffer: a line is kept up to :data:`_MAX_LINE_BYTES`, an answer up to ``max_lines``; the rest is counted, not
+stored.
+
+A line ends at any run of CR and LF (a modem with echo ends the echo with CR CR LF). Bytes become text as Latin-1,
+so nothing that came in is lost, whatever it was.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any, Literal
+
+from ..common.errors import UsageError
+
+Values = dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Query:
+    """One read-only command.
+
+    Parameters
+    ----------
+    name : str
+        Used in settings and in the log.
+    text : str
+        The command, without its end.
+    prefixes : tuple of str, or None
+        Starts of its information lines without blanks; None: any line.
+    decode : callable
+        ``decode(lines, flags) -> values``; appends to ``flags``.
+    """
+
+    name: str
+    text: str
+    prefixes: tuple[str, ...] | None
+    decode: Callable[[Sequence[str], list[str]], Values]
+
+
+@dataclass(frozen=True, slots=True)
+class Decoded:
+    """Values of one answer and what was wrong with them."""
+
+    values: Values = field(default_factory=dict)
+    flags: tuple[str, ...] = ()
+
+
+# fields -------------------------------------------------------------------------------------------------------
+
+_FIELD = re.compile(r'\s*("[^"]*"?|[^,]*)\s*(?:,|$)')
+
+# Quectel's "no value", and the same after a division by ten.
+_INVALID = (-32768, -3276)
+
+
+def _split_fields(payload: str) -> list[str | None]:
+    """Comma-separated fields without quotes; ``-`` and nothing are None.
+
+    Examples
+    --------
+    >>> _split_fields('"NR5G-SA","TDD", 515,66,-,"-"')
+    ['NR5G-SA', 'TDD', '515', '66', None, None]
+    """
+    fields: list[str | None] = []
+    position = 0
+    while position <= len(payload):
+        match = _FIELD.match(payload, position)
+        if match is None:  # text after a closing quote: keep it as one field
+            stop = payload.find(",", position)
+            stop = len(payload) if stop < 0 else stop
+            text, position = payload[position:stop], stop + 1
+        else:
+            text, position = match.group(1), match.end() if match.group(0).endswith(",") else len(payload) + 1
+        text = text.strip().strip('"').strip()
+        fields.append(None if text in ("", "-") else text)
+    return fields
+
+
+def _payload_of(line: str, prefix: str) -> str | None:
+    """Text after ``prefix`` if the line starts with it, blanks and case of the colon aside."""
+    if not line.startswith(prefix):
+        return None
+    return line[len(prefix) :].lstrip(": ")
+
+
+@dataclass(frozen=True, slots=True)
+class Range:
+    """Physical range of a field, and the values that mean "no value"."""
+
+    low: float
+    high: float
+    missing: tuple[int, ...] = _INVALID
+
+
+# TS 38.214 table 5.1.3.1 (mcs), TS 38.133 10.1.6-10.1.16 (rsrp, rsrq, sinr), TS 38.104 5.4.2.1 (arfcn).
+RANGES: Mapping[str, Range] = {
+    "mcs": Range(0, 31),
+    "ri_raw": Range(0, 8),
+    "cqi": Range(0, 15, (255, *_INVALID)),
+    "pmi": Range(0, 65_535),
+    "mcc": Range(1, 999),
+    "mnc": Range(0, 999),
+    "pcid": Range(0, 1007, (65_535, *_INVALID)),
+    "arfcn": Range(0, 3_279_165),
+    "band": Range(1, 1024),
+    "rsrp_dbm": Range(-156, -31),
+    "rsrq_db": Range(-43, 20),
+    "sinr_db": Range(-23, 40),
+    "sinr_raw": Range(-200, 250),
+    "rssi_dbm": Range(-120, 0),
+    "srxlev_db": Range(-200, 200),
+    "scs_code": Range(0, 4),
+    "bandwidth_code": Range(0, 16),
+    "uplink_bandwidth_code": Range(0, 16),
+    "tx_power_tenth_dbm": Range(-600, 300),
+}
+
+_NR_BANDWIDTH_MHZ = (5, 10, 15, 20, 25, 30, 40, 50, 60, 70, 80, 90, 100, 200, 400, 35, 45)
+_LTE_BANDWIDTH_MHZ = (1.4, 3, 5, 10, 15, 20)
+
+
+def number(name: str, text: str | None, flags: list[str], *, prefix: str = "") -> int | None:
+    """Integer field in its range, else None; why goes into ``flags``.
+
+    Parameters
+    ----------
+    name : str
+        Field, a key of ``RANGES``.
+    text : str or None
+        As the modem wrote it.
+    flags : list of str
+        Receives why there is no value.
+    prefix : str
+        Before the field in the flag.
+
+    Returns
+    -------
+    int or None
+
+    Examples
+    --------
+    >>> flags = []
+    >>> number("sinr_db", "180", flags), flags
+    (None, ['sinr_db:out_of_range(180)'])
+    """
+    if text is None:
+        return None
+    limits = RANGES[name]
+    if re.fullmatch(r"[+-]?\d{1,9}", text) is None:
+        flags.append(f"{prefix}{name}:not_a_number")
+        return None
+    value = int(text)
+    if value in limits.missing:
+        return None
+    if not limits.low <= value <= limits.high:
+        flags.append(f"{prefix}{name}:out_of_range({value})")
+        return None
+    return value
+
+
+_WORDS = frozenset({"duplex", "cell_id", "tac", "state", "rat"})
+
+
+def _named(names: Sequence[str], fields: Sequence[str | None], flags: list[str], prefix: str) -> Values:
+    """Fields under their names; missing ones None, unknown further ones under ``extra``."""
+    values: Values = {}
+    for index, name in enumerate(names):
+        text = fields[index] if index < len(fields) else None
+        values[name] = text if name in _WORDS else number(name, text, flags, prefix=prefix)
+    if len(fields) > len(names):
+        values["extra"] = list(fields[len(names) :])
+    return values
+
+
+def _fields_of(lines: Sequence[str], prefix: str, flags: list[str]) -> Iterator[list[str | None]]:
+    """Fields of the lines that start with a prefix; a flag for each that does not."""
+    for line in lines:
+        payload = _payload_of(line, prefix)
+        if payload is None:
+            flags.append("foreign_line")
+        else:
+            yield _split_fields(payload)
+
+
+# answers ------------------------------------------------------------------------------------------------------
+
+
+def _decode_csi(lines: Sequence[str], flags: list[str], which: str) -> Values:
+    """``+QNWCFG: "nr5g_csi",<mcs>,<ri>,<cqi>,<pmi>``; RI 0 is no CSI, so ``rank`` is None."""
+    rows = []
+    for line in lines:
+        payload = _payload_of(line, "+QNWCFG")
+        fields = [] if payload is None else _split_fields(payload)
+        if fields and fields[0] == which:
+            rows.append(fields[1:])
+    if not rows:
+        flags.append("no_csi_line")
+        return {"rank": None, "ri_raw": None}
+    if len(rows) > 1:
+        flags.append(f"csi_lines:{len(rows)}")
+    fields = rows[-1]
+    if len(fields) < 4:
+        flags.append(f"torn:{len(fields)}_of_4_fields")
+        return {"rank": None, "ri_raw": None, "extra": fields}
+    values = _named(("mcs", "ri_raw", "cqi", "pmi"), fields, flags, "")
+    values["rank"] = values["ri_raw"] or None
+    if values["ri_raw"] == 0:
+        flags.append("no_csi")
+        if not any(values[name] for name in ("mcs", "cqi", "pmi")):
+            values.update(mcs=None, cqi=None, pmi=None)
+    return values
+
+
+_SA = (
+    *("duplex", "mcc", "mnc", "cell_id", "pcid", "tac", "arfcn", "band", "bandwidth_code"),
+    *("rsrp_dbm", "rsrq_db", "sinr_db", "scs_code", "srxlev_db"),
+)
+_NSA = ("mcc", "mnc", "pcid", "rsrp_dbm", "sinr_db", "rsrq_db", "arfcn", "band", "bandwidth_code", "scs_code")
+_NR: Mapping[str | None, Sequence[str]] = {"NR5G-SA": _SA, "NR5G-NSA": _NSA}
+_LTE = (
+    *("duplex", "mcc", "mnc", "cell_id", "pcid", "arfcn", "band", "uplink_bandwidth_code", "bandwidth_code", "tac"),
+    *("rsrp_dbm", "rsrq_db", "rssi_dbm", "sinr_raw", "cqi", "tx_power_tenth_dbm", "srxlev_db"),
+)
+
+
+def _nr(names: Sequence[str], fields: Sequence[str | None], flags: list[str]) -> Values:
+    values = _named(names, fields, flags, "nr.")
+    code = values.get("bandwidth_code")
+    values["bandwidth_mhz"] = None if code is None else _NR_BANDWIDTH_MHZ[code]
+    scs = values.get("scs_code")
+    values["scs_khz"] = None if scs is None else 15 * 2**scs
+    if values.get("pcid") is None and values.get("rsrp_dbm") is None:
+        flags.append("nr_absent")
+    return values
+
+
+def _lte(fields: Sequence[str | None], flags: list[str]) -> Values:
+    # 'sinr_raw': dB or 5 X - 20 by firmware, the manual does not decide; so no unit
+    values = _named(_LTE, fields, flags, "lte.")
+    code = values["bandwidth_code"]
+    values["bandwidth_mhz"] = _LTE_BANDWIDTH_MHZ[code] if code is not None and code < len(_LTE_BANDWIDTH_MHZ) else None
+    return values
+
+
+def _decode_servingcell(lines: Sequence[str], flags: list[str]) -> Values:
+    """``+QENG`` of SA, EN-DC (three lines) and LTE, told apart by the token of each line."""
+    values: Values = {"state": None, "rat": None}
+    for fields in _fields_of(lines, "+QENG", flags):
+        if fields[0] == "servingcell":
+            values["state"] = fields[1] if len(fields) > 1 else None
+            fields = fields[2:]
+            if not fields:
+                continue
+        rat, cell = fields[0], fields[1:]
+        if rat in _NR:
+            values["nr"] = _nr(_NR[rat], cell, flags)
+        elif rat == "LTE":
+            values["lte"] = _lte(cell, flags)
+        else:
+            flags.append(f"unknown_rat:{str(rat)[:16]}")
+            continue
+        values["rat"] = "EN-DC" if {"nr", "lte"} <= values.keys() else rat
+    return values
+
+
+def _decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind: str) -> Values:
+    """``+QRSRP: <PRX>,<DRX>,<RX2>,<RX3>[,<sysmode>]``, one line per radio access technology.
+
+    Parameters
+    ----------
+    lines : sequence of str
+        Of the answer.
+    flags : list of str
+        Receives what was odd.
+    command, kind : str
+        Such as ``+QRSRP``; the field that its values get.
+
+    Returns
+    -------
+    dict
+        By radio access technology: ``{kind: [level of each receiver, None where not known]}`` [dBm or dB], and
+        ``extra`` fields.
+    """
+    values: Values = {}
+    for fields in _fields_of(lines, command, flags):
+        tag = "untagged"
+        if fields and fields[-1] is not None and not re.fullmatch(r"[+-]?\d+", fields[-1]):
+            tag = str(fields.pop())[:16]
+        levels = [number(kind, text, flags, prefix=f"{tag}.rx{i}.") for i, text in enumerate(fields[:4])]
+        if kind == "rsrp_dbm":
+            flags += [f"{tag}.rx{i}.floor" for i, level in enumerate(levels) if level in (-140, -44)]
+        values[tag] = {kind: levels}
+        if len(fields) > 4:
+            values[tag]["extra"] = fields[4:]
+    return values
+
+
+def _decode_text(lines: Sequence[str], _flags: list[str]) -> Values:
+    """For answers kept for the record, not computed with."""
+    return {"text": list(lines)}
+
+
+def _decode_csi_ctrl(lines: Sequence[str], flags: list[str]) -> Values:
+    """``+QNWCFG: "csi_ctrl",<lte>,<nr5g>``."""
+    for line in lines:
+        match = re.match(r'\+QNWCFG: ?"csi_ctrl", ?([01]), ?([01])$', line)
+        if match:
+            return {"lte": int(match.group(1)), "nr5g": int(match.group(2))}
+    flags.append("no_csi_ctrl_line")
+    return {}
+
+
+def _decode_identity(lines: Sequence[str], flags: list[str]) -> Values:
+    """``ATI``: maker, model, ``Revision:``."""
+    values: Values = {"text": [line for line in lines if not line.startswith("Revision:")]}
+    for line in lines:
+        if line.startswith("Revision:"):
+            values["revision"] = line[9:].strip()
+    if "revision" not in values:
+        flags.append("no_revision")
+    return values
+
+
+# All that the tap may ask, by name.
+QUERIES: Mapping[str, Query] = {
+    query.name: query
+    for query in (
+        Query("sync", "AT", (), lambda _lines, _flags: {}),
+        Query("identity", "ATI", None, _decode_identity),
+        Query("firmware", "AT+CGMR", None, _decode_text),
+        Query("csi_ctrl", 'AT+QNWCFG="csi_ctrl"', ('+QNWCFG:"csi_ctrl"',), _decode_csi_ctrl),
+        Query("nr5g_csi", 'AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',), partial(_decode_csi, which="nr5g_csi")),
+        Query("lte_csi", 'AT+QNWCFG="lte_csi"', ('+QNWCFG:"lte_csi"',), partial(_decode_csi, which="lte_csi")),
+        Query("servingcell", 'AT+QENG="servingcell"', ("+QENG:",), _decode_servingcell),
+        Query("qrsrp", "AT+QRSRP", ("+QRSRP:",), partial(_decode_antennas, command="+QRSRP", kind="rsrp_dbm")),
+        Query("qrsrq", "AT+QRSRQ", ("+QRSRQ:",), partial(_decode_antennas, command="+QRSRQ", kind="rsrq_db")),
+        Query("qsinr", "AT+QSINR", ("+QSINR:",), partial(_decode_antennas, command="+QSINR", kind="sinr_db")),
+        Query("qnwinfo", "AT+QNWINFO", ("+QNWINFO:",), _decode_text),
+        Query("qcainfo", "AT+QCAINFO", ("+QCAINFO:",), _decode_text),
+    )
+}
+
+RI_QUERY = "nr5g_csi"
+# Polled at the slower rate, in this order.
+OTHER_QUERIES = ("servingcell", "qrsrp", "qsinr", "lte_csi", "qrsrq", "qnwinfo", "qcainfo")
+
+_BY_TEXT = {query.text: query for query in QUERIES.values()}
+_CSI_WRITE = re.compile(r'AT\+QNWCFG="csi_ctrl",[01],[01]')
+
+
+def csi_write(lte: int, nr5g: int) -> str:
+    """The command that switches CSI reporting; the only one that changes the modem."""
+    return f'AT+QNWCFG="csi_ctrl",{int(bool(lte))},{int(bool(nr5g))}'
+
+
+def encode(command: str, *, allow_csi: bool = False) -> bytes:
+    r"""Bytes of an allowed command.
+
+    Raises
+    ------
+    UsageError
+        If the command is not on the list, holds CR, LF or ``;``, or writes without ``allow_csi``.
+
+    Examples
+    --------
+    >>> encode("AT+QRSRP")
+    b'AT+QRSRP\r'
+    """
+    if command in _BY_TEXT or (allow_csi and _CSI_WRITE.fullmatch(command)):
+        return command.encode("ascii") + b"\r"
+    writes = _CSI_WRITE.fullmatch(command) is not None
+    raise UsageError(
+        f"command {command[:60]!a} is not allowed",
+        expected="one of " + ", ".join(_BY_TEXT),
+        cause="switching CSI reporting needs --enable-csi" if writes else "the tap sends read-only queries only",
+    )
+
+
+def decode(name: str, lines: Sequence[str]) -> Decoded:
+    """Meaning of the information lines of a query's answer; never raises on what a modem sends.
+
+    Examples
+    --------
+    >>> decode("nr5g_csi", ['+QNWCFG: "nr5g_csi",13,2,8,896']).values["rank"]
+    2
+    """
+    flags: list[str] = []
+    values = QUERIES[name].decode(lines, flags)
+    return Decoded(values, tuple(dict.fromkeys(flags)))
+
+
+# personal data ------------------------------------------------------------------------------------------------
+
+_PERSONAL = re.compile(
+    r"\d{2}-\d{6}-\d{6}-\d"  # IMEI with separators
+    r"|\+\d{7,}"  # international number
+    r"|\d{10,}F?"  # IMEI, IMSI, ICCID, national number; cell identities have at most 9 hex digits
+)
+_PRIVATE_ANSWER = re.compile(
+    r"\+(CNUM|CLIP|CMT|CMGR|CMGL|CDS|CUSD|COLP|CLCC|CBM|CIMI|CGSN|GSN|QCCID|CCID|ICCID|EGMR|CPBR|CSCA)\b"
+)
+_MESSAGE_FOLLOWS = re.compile(r"\+(CMT|CMGR|CMGL|CDS|CBM):")
+_CUT_NUMBER = re.compile(r"\d{5,}$")
+
+
+class Redactor:
+    """Removes IMEI, IMSI, ICCID, telephone numbers and message texts from lines, in their order of arrival.
+
+    Examples
+    --------
+    >>> Redactor().clean("IMEI: 490154203237518")
+    'IMEI: <redacted>'
+    >>> Redactor().clean('+QENG: "servingcell","NOCONN","NR5G-SA","TDD",999,99,0002A4001,7')
+    '+QENG: "servingcell","NOCONN","NR5G-SA","TDD",999,99,0002A4001,7'
+    """
+
+    def __init__(self) -> None:
+        self._message_follows = False
+        self.count = 0
+
+    def clean(self, text: str, *, cut: bool = False) -> str:
+        """The line without personal data; ``cut`` says that its end is missing."""
+        if self._message_follows and not text.startswith("+Q"):  # an answer may come between
+            self._message_follows = False
+            self.count += 1
+            return "<redacted message>"
+        self._message_follows = _MESSAGE_FOLLOWS.search(text) is not None
+        private = _PRIVATE_ANSWER.search(text)
+        if private:
+            self.count += 1
+            return text[: private.end()] + ": <redacted>"
+        cleaned, count = _PERSONAL.subn("<redacted>", text)
+        if cut:
+            cleaned, more = _CUT_NUMBER.subn("<redacted>", cleaned)
+            count += more
+        self.count += count
+        return cleaned
+
+
+_MAX_LINE_BYTES = 65_536
+_MAX_LINES = 256
+
+Status = Literal["ok", "error", "cme", "cms", "timeout", "lost", "cut"]
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line without its end; ``dropped`` bytes of it were not kept."""
+
+    text: str
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Response to one command.
+
+    Parameters
+    ----------
+    command : str or None
+        None where a transcript does not show it.
+    lines : tuple of str
+        Information lines, without echo and final result.
+    status : str
+        ``ok``, ``error``, ``cme``, ``cms``; or how it ended without a final result: ``timeout``, ``lost``
+        (port gone), ``cut`` (the next command or the end of a transcript).
+    code : str or None
+        Text after ``+CME ERROR:`` or ``+CMS ERROR:``.
+    flags : tuple of str
+        ``echo``, ``glued``, ``overlong:<bytes dropped>``, ``too_many_lines:<dropped>``, ``ambiguous``.
+    partial : str
+        Unfinished line at a time-out or loss.
+    """
+
+    command: str | None
+    lines: tuple[str, ...]
+    status: Status
+    code: str | None = None
+    flags: tuple[str, ...] = ()
+    partial: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Unsolicited:
+    """A line that belongs to no command."""
+
+    text: str
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Late:
+    """An answer that came after its time-out: kept, matched to nothing."""
+
+    lines: tuple[str, ...]
+    status: Status
+    code: str | None = None
+
+
+Event = Answer | Unsolicited | Late
+
+_UNSOLICITED = re.compile(
+    r"(RDY|APP RDY|RING|POWERED DOWN|NORMAL POWER DOWN|NO CARRIER|SMS DONE|PB DONE)$"
+    r"|\+(QUSIM|QIND|QGPSURC|QLWURC|QIURC|QNETDEVSTATUS|CREG|CGREG|CEREG|C5GREG|CGEV|CMTI|CMT|CDS|CDSI|CBM|CLIP"
+    r"|CRING|CCWA|CUSD|CTZV|CTZE|CTZDST|CPIN|CFUN):"
+)
+_GLUE = re.compile(r"\"|\+[A-Z][A-Z0-9]{1,15}(?: ERROR)?:")
+_GLUED_OK = re.compile(r"[0-9\"\-]OK$")
+
+
+def _final_result(text: str) -> tuple[Status, str | None] | None:
+    """Status and code if the whole line is a final result, else None (3GPP TS 27.007, clause 9; TS 27.005, 3.2.5).
+
+    Examples
+    --------
+    >>> _final_result("+CME ERROR: 516")
+    ('cme', '516')
+    >>> _final_result('+QNWINFO: "TDD NR5G","TOKYO OK"') is None
+    True
+    """
+    if text == "OK":
+        return "ok", None
+    if text == "ERROR":
+        return "error", None
+    for start, status in (("+CME ERROR:", "cme"), ("+CMS ERROR:", "cms")):
+        if text.startswith(start):
+            return status, text[len(start) :].strip()  # type: ignore[return-value]
+    return None
+
+
+def is_unsolicited(text: str) -> bool:
+    """Check whether a line is of a kind that modems send unasked (some are answers too, to their own query)."""
+    return _UNSOLICITED.match(text) is not None
+
+
+def unglue(text: str) -> tuple[str, ...]:
+    """Answers that a modem put on one line, apart; quotes protect what looks like a start.
+
+    Examples
+    --------
+    >>> unglue('+QCAINFO: "SCC",7,-,-+QCAINFO: "SCC",8')
+    ('+QCAINFO: "SCC",7,-,-', '+QCAINFO: "SCC",8')
+    >>> unglue('+QSPN: "X+CREG: 1"')
+    ('+QSPN: "X+CREG: 1"',)
+    """
+    if not text.startswith("+"):
+        return (text,)
+    cuts, quoted = [0], False
+    for match in _GLUE.finditer(text):
+        if match.group() == '"':
+            quoted = not quoted
+        elif not quoted and match.start() > 0:
+            cuts.append(match.start())
+    pieces = [text[a:b] for a, b in zip(cuts, [*cuts[1:], len(text)], strict=True)]
+    last = pieces[-1]
+    if not quoted and _GLUED_OK.search(last):
+        pieces[-1:] = [last[:-2], "OK"]
+    return tuple(piece.strip() for piece in pieces)
+
+
+class LineBuffer:
+    """Bytes to lines with a bounded buffer: of a longer line the rest is counted in :attr:`Line.dropped`."""
+
+    def __init__(self) -> None:
+        self._buffer = bytearray()
+        self._dropped = 0
+
+    def feed(self, data: bytes) -> Iterator[Line]:
+        """Complete lines, blank ones left out."""
+        start = 0
+        for match in _LINE_END.finditer(data):
+            self._keep(data, start, match.start())
+            start = match.end()
+            yield from self.flush()
+        self._keep(data, start, len(data))
+
+    def _keep(self, data: bytes, start: int, stop: int) -> None:
+        room = max(0, _MAX_LINE_BYTES - len(self._buffer))
+        self._buffer += data[start : min(stop, start + room)]
+        self._dropped += max(0, stop - start - room)
+
+    def peek(self) -> str:
+        """The unfinished line."""
+        return self._buffer.decode("latin-1")
+
+    def flush(self) -> list[Line]:
+        """The unfinished line as a line, if it is not blank; the buffer is empty then."""
+        text = self._buffer.decode("latin-1").strip(" \t")
+        line = Line(text, self._dropped)
+        self._buffer.clear()
+        self._dropped = 0
+        return [line] if text or line.dropped else []
+
+
+_LINE_END = re.compile(rb"[\r\n]+")
+
+
+@dataclass(slots=True)
+class _Open:
+    """The command in flight, and what came for it."""
+
+    command: str
+    prefixes: tuple[str, ...] | None
+    lines: list[str]
+    flags: list[str]
+    echoed: bool = False
+    too_many: int = 0
+
+
+def _matches(text: str, prefixes: tuple[str, ...] | None) -> bool:
+    if prefixes is None:
+        return not is_unsolicited(text)
+    return text.replace(" ", "").startswith(prefixes)
+
+
+class Framer:
+    r"""Answers to known commands, one in flight at a time.
+
+    A command that timed out still owes an answer. What comes for it later is a :class:`Late` event, told from the
+    next command's answer by its prefix, or by the echo where the modem echoes.
+
+    Parameters
+    ----------
+    max_lines : int
+        Of an answer that are kept.
+
+    Examples
+    --------
+    >>> framer = Framer()
+    >>> framer.send('AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',))
+    >>> framer.feed(b'\r\n+QNWCFG: "nr5g_csi",13,2,8,896\r\n\r\nOK\r\n')[0].lines
+    ('+QNWCFG: "nr5g_csi",13,2,8,896',)
+    """
+
+    def __init__(self, *, max_lines: int = _MAX_LINES) -> None:
+        self._buffer = LineBuffer()
+        self._max_lines = max_lines
+        self._open: _Open | None = None
+        self._owed: list[_Open] = []
+        self._stray: list[str] = []
+        self._echo_seen = False
+
+    def send(self, command: str, prefixes: tuple[str, ...] | None) -> None:
+        """A command goes out.
+
+        Parameters
+        ----------
+        command : str
+            As written to the port, without its end.
+        prefixes : tuple of str, or None
+            Starts of its information lines, without blanks; ``()`` if it has none, None if any line may be one.
+        """
+        self._open = _Open(command, prefixes, [], [])
+
+    def feed(self, data: bytes) -> list[Event]:
+        """Events that these bytes complete, in their order."""
+        events: list[Event] = []
+        for line in self._buffer.feed(data):
+            pieces = unglue(line.text) if not line.dropped else (line.text,)
+            if len(pieces) > 1 and self._open is not None:
+                self._flag("glued")
+            for piece in pieces:
+                self._line(Line(piece, line.dropped), events)
+        return events
+
+    def give_up(self, status: Literal["timeout", "lost"] = "timeout") -> Answer:
+        """End the command in flight without a final result.
+
+        After ``timeout`` its answer is owed and may come late; after ``lost`` the buffer is emptied.
+        """
+        assert self._open is not None
+        now, self._open = self._open, None
+        answer = Answer(
+            command=now.command,
+            lines=tuple(now.lines),
+            status=status,
+            code=None,
+            flags=tuple(now.flags),
+            partial=self._buffer.peek(),
+        )
+        self._echo_seen = now.echoed  # a reset modem may have stopped echoing
+        if status == "lost":
+            self._buffer.flush()
+            self._owed.clear()
+        else:
+            self._owed.append(now)
+            # a modem that never answers must not fill the memory
+            del self._owed[:-16]
+        return answer
+
+    def leave(self) -> tuple[tuple[str, ...], str]:
+        """Return and forget what is held and belongs to nothing: lines of owed answers, and the unfinished line."""
+        lines, self._stray = tuple(self._stray), []
+        partial = self._buffer.peek()
+        self._buffer.flush()
+        self._owed.clear()
+        return lines, partial
+
+    def settle(self) -> list[Event]:
+        """Forget what is owed (a probe was answered, so the modem is in step again)."""
+        self._owed.clear()
+        if not self._stray:
+            return []
+        lines, self._stray = tuple(self._stray), []
+        return [Late(lines, "cut")]
+
+    # one line ---------------------------------------------------------------------------------------------
+
+    def _line(self, line: Line, events: list[Event]) -> None:
+        text = line.text
+        final = _final_result(text)
+        if final is not None:
+            self._final(final[0], final[1], events)
+            return
+        now = self._open
+        if now is not None and self._is_echo(text, now):
+            return
+        if any(text == owed.command for owed in self._owed):
+            return
+        if now is not None and _matches(text, now.prefixes):
+            self._own(line, now)
+        elif any(_matches(text, owed.prefixes) for owed in self._owed) and len(self._stray) < self._max_lines:
+            self._stray.append(text)
+        else:
+            events.append(Unsolicited(text, line.dropped))
+
+    def _own(self, line: Line, now: _Open) -> None:
+        """Take a line of the answer in flight."""
+        if line.dropped:
+            self._flag(f"overlong:{line.dropped}")
+        if len(now.lines) < self._max_lines:
+            now.lines.append(line.text)
+        else:
+            now.too_many += 1
+
+    def _is_echo(self, text: str, now: _Open) -> bool:
+        # rubbish from before may stand in front of the echo on the same line
+        upper, command = text.upper(), now.command.upper()
+        # a short command, as AT, ends many lines that are no echo
+        if now.echoed or not (upper == command or (len(command) > 6 and upper.endswith(command))):
+            return False
+        now.echoed = self._echo_seen = True
+        self._flag("echo" if len(text) == len(now.command) else "echo_with_rubbish")
+        if self._owed and now.lines:  # they came before our echo, so they are not ours
+            self._stray += now.lines
+            now.lines.clear()
+        return True
+
+    def _final(self, status: Status, code: str | None, events: list[Event]) -> None:
+        now = self._open
+        if now is None or self._is_owed_final(now, status):
+            if now is not None:  # before the echo of our command: not ours
+                self._stray += now.lines
+                now.lines.clear()
+            events.append(Late(tuple(self._stray), status, code))
+            self._stray.clear()
+            del self._owed[:1]
+            return
+        if self._stray:
+            events.append(Late(tuple(self._stray), "cut"))
+            self._stray.clear()
+        if self._owed and not now.lines:
+            self._flag("ambiguous")
+        if now.too_many:
+            self._flag(f"too_many_lines:{now.too_many}")
+        events.append(Answer(now.command, tuple(now.lines), status, code, tuple(now.flags)))
+        self._open = None
+
+    def _is_owed_final(self, now: _Open, status: Status) -> bool:
+        """Check whether a final result ends an owed answer (a modem works off its commands in order)."""
+        if not self._owed:
+            return False
+        if self._echo_seen and not now.echoed:
+            return True
+        if now.lines:
+            return False
+        return bool(self._stray) or (status == "ok" and now.prefixes != ())
+
+    def _flag(self, flag: str) -> None:
+        if self._open is not None and flag not in self._open.flags:
+            self._open.flags.append(flag)

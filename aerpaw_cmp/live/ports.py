@@ -1,0 +1,686 @@
+"""Serial ports: find the modem's AT port, open it for us alone, say who else holds it.
+
+The port is opened with ``termios`` directly. pyserial empties the input queue when it opens (answers that wait
+there would be lost), insists on a DTR ioctl that some USB paths refuse, and reports an unplugged cable by three
+unrelated exceptions (its issues 401 and 417); here it is always :class:`PortGoneError`.
+
+Settings, status and summary of a session of the tap.
+
+The status goes to the terminal beside the polling: one that hangs (Ctrl-S, a lost ssh connection) holds no poll.
+
+Schedule of the queries: which one is due when.
+
+A request to end that wakes whoever waits.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import fnmatch
+import grp
+import os
+import pwd
+import queue
+import re
+import select
+import signal
+import stat
+import termios
+import threading
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..common.errors import AerpawCmpError, InputError, UsageError
+from ..common.interrupts import SIGNALS
+from ..common.text import counted
+from .log import LogSettings
+
+_QUECTEL_VENDOR = "2c7c"
+# Of 2c7c:0800: 00 is DIAG, 01 NMEA, 02 and 03 take AT commands (ModemManager's 77-mm-quectel-port-types.rules).
+_AT_INTERFACES = ("02", "03")
+
+_GONE = {errno.ENOENT, errno.ENXIO, errno.EIO, errno.ENODEV, errno.ENOTCONN, errno.ESHUTDOWN}
+
+
+class PortGoneError(Exception):
+    """The port is not there (any more); it may come back."""
+
+
+@dataclass(frozen=True, slots=True)
+class PortInfo:
+    """A serial port and how it was found.
+
+    Parameters
+    ----------
+    path : Path
+        What to open; a stable name if there is one.
+    device : Path
+        The node it leads to now.
+    how : str
+        ``given``, ``by-id``, ``usb``, ``node``.
+    interface : str or None
+        USB interface number, two hex digits.
+    product : str or None
+        ``vendor:product`` of the USB device.
+    """
+
+    path: Path
+    device: Path
+    how: str
+    interface: str | None = None
+    product: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """A process that has the port open."""
+
+    pid: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Roots:
+    """Folders where the system keeps devices; tests give their own tree."""
+
+    dev: Path = Path("/dev")
+    sys: Path = Path("/sys")
+
+
+def _usb_of(tty: str, roots: Roots) -> tuple[str, str] | None:
+    """``(vendor:product, interface)`` of a tty by sysfs."""
+    device = roots.sys / "class/tty" / tty / "device"
+    if not device.exists():
+        return None
+    for folder in (device.resolve(), *device.resolve().parents):
+        number = folder / "bInterfaceNumber"
+        if number.exists():
+            usb = folder.parent
+            try:
+                product = (usb / "idVendor").read_text().strip() + ":" + (usb / "idProduct").read_text().strip()
+                return product, number.read_text().strip()
+            except OSError:
+                return None
+    return None
+
+
+def _entries(folder: Path, pattern: str) -> list[Path]:
+    """Entries of a folder by name; none if it vanishes meanwhile, as /dev/serial/by-id does with its last device."""
+    try:
+        names = os.listdir(folder)  # noqa: PTH208 (Path.iterdir and glob are lazy: they may raise in the middle)
+    except OSError:
+        return []
+    return [folder / name for name in sorted(names) if fnmatch.fnmatchcase(name, pattern)]
+
+
+def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
+    """AT ports of Quectel modems, the likeliest first: by-id names, then USB interface numbers, then PCIe nodes."""
+    roots = roots or Roots()
+    ports: list[PortInfo] = []
+    for interface in _AT_INTERFACES:
+        for link in _entries(roots.dev / "serial/by-id", f"*[Qq]uectel*-if{interface}*"):
+            if link.exists():
+                usb = _usb_of(link.resolve().name, roots)
+                ports.append(PortInfo(link, link.resolve(), "by-id", interface, usb[0] if usb else None))
+    known = {port.device for port in ports}
+    ttys = sorted(_entries(roots.sys / "class/tty", "ttyUSB*"), key=lambda p: (len(p.name), p.name))
+    for interface in _AT_INTERFACES:
+        for tty in ttys:
+            usb = _usb_of(tty.name, roots)
+            node = roots.dev / tty.name
+            if usb and usb[0].startswith(_QUECTEL_VENDOR) and usb[1] == interface and node.resolve() not in known:
+                ports.append(PortInfo(node, node.resolve(), "usb", interface, usb[0]))
+    for name in ("mhi_DUN", "smd11"):
+        if (roots.dev / name).exists():
+            ports.append(PortInfo(roots.dev / name, roots.dev / name, "node"))
+    return ports
+
+
+def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
+    """The port to open now.
+
+    A given ``/dev/ttyUSB*`` that a by-id name leads to is followed by that name, so that it is found again when the
+    modem comes back under another number.
+
+    Raises
+    ------
+    PortGoneError
+        If it is not there.
+    UsageError
+        If it is a URL of pyserial.
+    """
+    roots = roots or Roots()
+    _refuse_url(port)
+    if port is None:
+        candidates = find_candidates(roots)
+        if not candidates:
+            raise PortGoneError("no AT port of a Quectel modem (USB 2c7c, interface 02 or 03) is there")
+        return candidates[0]
+    path = Path(port)
+    if not path.exists():
+        raise PortGoneError(f"{path} is not there")
+    usb = _usb_of(path.resolve().name, roots) or _usb_of(path.name, roots)
+    interface, product = (usb[1], usb[0]) if usb else (None, None)
+    by_id = roots.dev / "serial/by-id"
+    if path.parent == roots.dev:
+        for link in _entries(by_id, "*"):
+            if link.resolve() == path.resolve():
+                return PortInfo(link, path.resolve(), "by-id", interface, product)
+    return PortInfo(path, path.resolve(), "given", interface, product)
+
+
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.]{1,12})://(.*)", re.DOTALL)
+
+
+def _refuse_url(port: str | Path | None) -> None:
+    """The tap opens devices itself (see the head of this file); what pyserial calls a URL is refused by name."""
+    match = _URL.fullmatch(port) if isinstance(port, str) else None
+    if match is None:
+        return
+    kind, rest = match[1].lower(), match[2]
+    bridge = {
+        "socket": f"socat pty,link=/tmp/modem,rawer tcp:{rest or 'HOST:PORT'}",
+        "loop": "aerpaw-cmp modem-sim --link /tmp/modem",
+    }
+    command = bridge.get(kind, "socat pty,link=/tmp/modem,rawer ...")
+    raise UsageError(
+        f"the port is a URL of pyserial ({kind}://)",
+        expected="a serial device, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
+        cause=f"the tap opens devices only; '{command}' makes one, for 'aerpaw-cmp tap /tmp/modem'",
+    )
+
+
+def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
+    """Processes that have the port open, by ``/proc`` (as far as we may look); without our own by default."""
+    try:
+        wanted = path.stat().st_rdev
+    except OSError:
+        return []
+    holding = []
+    for process in _processes():
+        with contextlib.suppress(OSError):
+            # the master of a pseudo-terminal has another device number, so only openers of the port count
+            if any(stat.S_ISCHR(file.st_mode) and file.st_rdev == wanted for file in _open_files(process)):
+                holding.append(_holder(process))
+    return sorted((h for h in holding if not others_only or h.pid != os.getpid()), key=lambda h: h.pid)
+
+
+def _processes() -> Iterator[Path]:
+    return (folder for folder in Path("/proc").iterdir() if folder.name.isdigit())
+
+
+def _holder(process: Path) -> Holder:
+    return Holder(int(process.name), (process / "comm").read_text().strip())
+
+
+def _open_files(process: Path) -> Iterator[os.stat_result]:
+    for fd in (process / "fd").iterdir():
+        with contextlib.suppress(OSError):
+            yield fd.stat()
+
+
+def modem_manager() -> Holder | None:
+    """ModemManager if it runs; its name can be seen even where its open files cannot."""
+    for process in _processes():
+        with contextlib.suppress(OSError):
+            if (holder := _holder(process)).name == "ModemManager":
+                return holder
+    return None
+
+
+def _busy(path: Path, others: list[Holder]) -> InputError:
+    who = ", ".join(f"{h.name} (process {h.pid})" for h in others[:4]) or "a process that we may not look at"
+    if len(others) > 4:
+        who += f" and {len(others) - 4} more"
+    if any(h.name == "ModemManager" for h in others) or (not others and modem_manager()):
+        cause = (
+            "ModemManager took it. Free it now with 'sudo systemctl stop ModemManager', for good with the udev rule "
+            'ATTRS{idVendor}=="2c7c", ENV{ID_MM_DEVICE_IGNORE}="1"'
+        )
+    elif others:
+        cause = f"another program or another tap reads it; to end it: 'kill {others[0].pid}'"
+    else:
+        cause = f"see 'sudo fuser -v {path}'"
+    return InputError(f"the port is held by {who}", expected="a port for the tap alone", cause=cause, path=path)
+
+
+def _denied(path: Path) -> InputError:
+    state = path.stat()
+    try:
+        owner, group = pwd.getpwuid(state.st_uid).pw_name, grp.getgrgid(state.st_gid).gr_name
+    except KeyError:
+        owner, group = str(state.st_uid), str(state.st_gid)
+    return InputError(
+        f"no permission to open the port (owner {owner}, group {group}, mode {stat.S_IMODE(state.st_mode):o})",
+        expected=f"a user of group {group!r}",
+        cause=f"run 'sudo usermod -aG {group} $USER' and log in again",
+        path=path,
+    )
+
+
+class SerialPort:
+    """An open port: raw, non-blocking, locked for us.
+
+    Use :meth:`open`. Every method raises :class:`PortGoneError` when the device is gone.
+    """
+
+    def __init__(self, fd: int, path: Path) -> None:
+        self._fd = fd
+        self.path = path
+
+    @classmethod
+    def open(cls, path: Path) -> SerialPort:
+        """Open a port for us alone.
+
+        Raises
+        ------
+        PortGoneError
+            If it is not there or vanishes meanwhile.
+        InputError
+            If we may not open it, another process holds it, or it is no serial port.
+        """
+        try:
+            fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise cls._open_error(path, error) from None
+        try:
+            if not os.isatty(fd):
+                raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
+            users = holders(path)  # before anything is changed on a port that another one uses
+            if users:
+                raise _busy(path, users)
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            # the lock keeps out other taps alone; this refuses every further open, but for root
+            fcntl.ioctl(fd, termios.TIOCEXCL)
+            make_raw(fd, termios.B115200)
+            users = holders(path)  # again: someone may have come between
+            if users:
+                raise _busy(path, users)
+        except (OSError, termios.error, AerpawCmpError) as error:
+            os.close(fd)
+            if isinstance(error, AerpawCmpError):
+                raise
+            raise cls._open_error(path, error) from None
+        return cls(fd, path)
+
+    @staticmethod
+    def _open_error(path: Path, error: OSError | termios.error) -> Exception:
+        number = error.args[0]
+        if number in _GONE:
+            return PortGoneError(f"{path} is gone ({os.strerror(number)})")
+        if number in (errno.EBUSY, errno.EWOULDBLOCK):
+            return _busy(path, holders(path))
+        if number in (errno.EACCES, errno.EPERM):
+            return _denied(path)
+        return InputError(
+            f"cannot be opened as a serial port ({os.strerror(number)})",
+            expected="a serial port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
+            cause="the name of something else",
+            path=path,
+        )
+
+    def fileno(self) -> int:
+        """File descriptor, for ``select``."""
+        return self._fd
+
+    def read(self, limit: int = 65_536) -> bytes:
+        """Read what is there now; ``b""`` if nothing."""
+        try:
+            data = os.read(self._fd, limit)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
+        if not data:  # with VMIN=1 an empty read is a hang-up
+            raise PortGoneError(f"{self.path} is gone (hung up)")
+        return data
+
+    def write(self, data: bytes, timeout_s: float = 1.0) -> None:
+        """Write all of it within the time; a port that takes nothing for so long counts as gone."""
+        deadline = time.monotonic() + timeout_s
+        while data:
+            try:
+                data = data[os.write(self._fd, data) :]
+            except BlockingIOError:
+                poller = select.poll()
+                poller.register(self._fd, select.POLLOUT)
+                if not poller.poll(max(0.0, deadline - time.monotonic()) * 1e3):
+                    raise PortGoneError(f"{self.path} takes no bytes") from None
+            except OSError as error:
+                raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
+
+    def close(self) -> None:
+        """Give the port back; harmless if it is gone."""
+        if self._fd >= 0:
+            with contextlib.suppress(OSError, termios.error):
+                fcntl.ioctl(self._fd, termios.TIOCNXCL)
+            os.close(self._fd)
+            self._fd = -1
+
+
+def make_raw(fd: int, baud: int) -> None:
+    """No echo, no line editing, 8N1, no flow control; what waits in the queue stays."""
+    _, _, cflag, _, _, _, cc = termios.tcgetattr(fd)
+    # HUPCL stays as it was: whether a modem is told that its port closes is the system's choice, not ours
+    cflag = (cflag & termios.HUPCL) | termios.CS8 | termios.CREAD | termios.CLOCAL
+    cc[termios.VMIN], cc[termios.VTIME] = 1, 0
+    # every flag of input, output and local mode changes or holds back bytes: none is wanted
+    termios.tcsetattr(fd, termios.TCSANOW, [0, 0, cflag, 0, baud, baud, cc])
+
+
+@dataclass(frozen=True, slots=True)
+class TapSettings:
+    """Settings of the tap; the defaults suit a flight.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the log segments go (``-o``); made if missing.
+    port : str, optional
+        The serial port; None: the first AT port of a Quectel modem.
+    ri_hz : float
+        Rate of ``nr5g_csi`` [Hz].
+    other_hz : float
+        Rate of each of :data:`~aerpaw_cmp.live.modem.OTHER_QUERIES` [Hz].
+    pause_s : float
+        Rest between an answer and the next command [s].
+    answer_timeout_s : float
+        An answer later than this is a ``late`` record [s].
+    probe_timeout_s : float
+        Each of the two probes of a newly opened port waits so long [s].
+    silent_s : float
+        Without any final result for so long, the port is opened anew [s].
+    enable_csi : bool
+        Switch CSI reporting on, and back on exit (the only command that writes).
+    no_csi_alarm_s : float, optional
+        Alarm when no rank came for so long [s].
+    no_csi_exit : bool
+        End with exit code 1 on that alarm instead of going on.
+    status_s : float
+        Interval of the status calls [s].
+    duration_s : float, optional
+        End by itself after so long [s].
+    wait_for_port_s : float
+        At the start, wait so long for the port to appear [s].
+    reconnect_min_s, reconnect_max_s : float
+        Back-off after a loss [s].
+    log : LogSettings
+        Durability and rotation.
+    roots : Roots
+        Where devices are looked for.
+    """
+
+    folder: Path
+    port: str | None = None
+    ri_hz: float = 2.0
+    other_hz: float = 1.0
+    pause_s: float = 0.02
+    answer_timeout_s: float = 2.0
+    probe_timeout_s: float = 1.0
+    silent_s: float = 10.0
+    enable_csi: bool = False
+    no_csi_alarm_s: float | None = None
+    status_s: float = 1.0
+    duration_s: float | None = None
+    wait_for_port_s: float = 0.0
+    reconnect_min_s: float = 0.1
+    reconnect_max_s: float = 2.0
+    log: LogSettings = field(default_factory=LogSettings)
+    roots: Roots = field(default_factory=Roots)
+
+    def __post_init__(self) -> None:
+        # asked this way round, NaN is refused as well
+        for name in ("ri_hz", "answer_timeout_s", "probe_timeout_s", "silent_s", "status_s", "reconnect_min_s"):
+            if not 0 < getattr(self, name) < 1e6:
+                raise UsageError(f"{name} is {getattr(self, name)}", expected="a positive number")
+        for name in ("other_hz", "pause_s", "wait_for_port_s"):
+            if not 0 <= getattr(self, name) < 1e6:
+                raise UsageError(f"{name} is {getattr(self, name)}", expected="zero or a positive number")
+        if self.no_csi_alarm_s is not None and not self.no_csi_alarm_s > 0:
+            raise UsageError(f"no_csi_alarm_s is {self.no_csi_alarm_s}", expected="a positive number of seconds")
+
+
+@dataclass(frozen=True, slots=True)
+class TapStatus:
+    """Status that the terminal shows.
+
+    Parameters
+    ----------
+    connected : bool
+    rank : int or None
+        Of the last answer; None: no CSI.
+    rsrp_dbm, sinr_db : int or None
+        NR, last known.
+    ri_rate_hz : float
+        Answers with status ok over the last 10 s.
+    gaps, records, bytes_written : int
+    disk_free_bytes : int or None
+    disk_fault : str
+        Why the disk takes no records now; empty while it does.
+    missed : int
+        Poll slots that passed unused while connected.
+    predicted_rank : int or None
+        By the replay at the present pose.
+    predicts : bool
+        Whether predictions are made at all.
+    alarm : bool
+        No CSI for longer than asked: ring the bell.
+    message : str
+        Something to be read once (a loss, a fault, an advice); empty on regular calls.
+    """
+
+    connected: bool
+    rank: int | None
+    rsrp_dbm: int | None
+    sinr_db: int | None
+    ri_rate_hz: float
+    gaps: int
+    records: int
+    bytes_written: int
+    disk_free_bytes: int | None
+    disk_fault: str = ""
+    missed: int = 0
+    predicted_rank: int | None = None
+    predicts: bool = False
+    alarm: bool = False
+    message: str = ""
+
+
+class StatusNotifier:
+    """Calls ``on_status`` in a thread of its own, in order; what a hanging terminal cannot take is let go.
+
+    Parameters
+    ----------
+    on_status : callable
+        If it raises, it is not called again: a broken terminal must not end the log.
+    """
+
+    def __init__(self, on_status: Callable[[TapStatus], None]) -> None:
+        self._on_status = on_status
+        self._queue: queue.Queue[TapStatus | None] = queue.Queue(maxsize=1000)
+        self._thread = threading.Thread(target=self._run, name="tap-status", daemon=True)
+        self._thread.start()
+
+    def notify(self, status: TapStatus) -> None:
+        """Pass a status on; a mere line is let go while others wait, a message only when memory is full."""
+        # a line is written over by the next one, a message is said once
+        if status.message or self._queue.qsize() < 10:
+            try:
+                self._queue.put_nowait(status)
+            except queue.Full:
+                return
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Pass on what waits, but do not wait for a terminal that hangs."""
+        try:
+            self._queue.put_nowait(None)
+        except queue.Full:
+            return
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        try:
+            while (status := self._queue.get()) is not None:
+                self._on_status(status)
+        except Exception:
+            while self._queue.get() is not None:  # broken: only empty the queue
+                pass
+
+
+@dataclass(frozen=True, slots=True)
+class TapSummary:
+    """Summary of a session that ended.
+
+    Parameters
+    ----------
+    reason : str
+        ``SIGINT``, ``SIGTERM``, ``SIGHUP``, ``duration``, ``no_csi`` or what the caller's stop said.
+    exit_code : int
+        0; 1 if the no-CSI alarm ended it or records were lost to the disk.
+    segments : tuple of Path
+    answers : mapping
+        Query to ``{status: count}``.
+    rates_hz, missed : mapping
+        Query to achieved rate, and to poll slots passed unused while connected.
+    gaps : int
+    gap_s, duration_s : float
+    records, lost_records, redacted : int
+    """
+
+    reason: str
+    exit_code: int
+    segments: tuple[Path, ...]
+    answers: dict[str, dict[str, int]]
+    rates_hz: dict[str, float]
+    missed: dict[str, int]
+    gaps: int
+    gap_s: float
+    duration_s: float
+    records: int
+    lost_records: int
+    redacted: int
+    alarms: int = 0
+
+
+def format_status(status: TapStatus) -> str:
+    """One line for the terminal; nothing in it comes from the modem as text."""
+    if not status.connected:
+        head = "NO PORT"
+    elif status.rank is None:
+        head = "rank -"
+    else:
+        head = f"rank {status.rank}"
+    if status.predicts:
+        predicted = "-" if status.predicted_rank is None else str(status.predicted_rank)
+        head += f" (predicted {predicted})"
+    parts = [
+        head,
+        "RSRP " + ("-" if status.rsrp_dbm is None else f"{status.rsrp_dbm} dBm"),
+        "SINR " + ("-" if status.sinr_db is None else f"{status.sinr_db} dB"),
+        f"{status.ri_rate_hz:.1f} Hz",
+        counted(status.gaps, "gap"),
+        f"{status.bytes_written / 2**20:.1f} MiB",
+        "disk ?" if status.disk_free_bytes is None else f"disk {status.disk_free_bytes / 2**30:.1f} GiB",
+    ]
+    if status.alarm:
+        parts.append("NO CSI")
+    return "  ".join(parts)
+
+
+# A slot that is late by at most so many periods is still polled, at once; older ones are missed and counted.
+_CATCH_UP = 2
+
+
+class Schedule:
+    """Order and times of the queries. The first name goes first whenever it is due; the others by age.
+
+    After a short stall the polls that fell due meanwhile follow each other without a rest (each record has its true
+    times), so that a hiccup of the machine costs no answer; after a long one the schedule starts from now.
+
+    Parameters
+    ----------
+    periods_ns : mapping
+        Name to period.
+    """
+
+    def __init__(self, periods_ns: dict[str, int]) -> None:
+        self._periods = periods_ns
+        self._first = next(iter(periods_ns))
+        self._due: dict[str, int] = {}
+        self.missed: Counter[str] = Counter()
+
+    def reset(self, now_ns: int) -> None:
+        """Start anew: all due now."""
+        self._due = dict.fromkeys(self._periods, now_ns)
+
+    def next(self, now_ns: int) -> tuple[str, int]:
+        """Name and due time of the next poll."""
+        if self._due[self._first] <= now_ns:
+            return self._first, self._due[self._first]
+        name = min(self._due, key=lambda n: self._due[n])
+        return name, self._due[name]
+
+    def started(self, name: str, now_ns: int) -> None:
+        """A poll begins; slots that cannot be caught up any more are missed."""
+        period = self._periods[name]
+        late = max(0, (now_ns - self._due[name]) // period)
+        skipped = late if late > _CATCH_UP else 0
+        self.missed[name] += skipped
+        self._due[name] += (skipped + 1) * period
+
+    def slots(self, duration_ns: int) -> dict[str, int]:
+        """Polls that a gap of this length cost."""
+        return {name: duration_ns // period for name, period in self._periods.items()}
+
+
+class Stop:
+    """A request to end, from a signal or another thread; wakes the waiting tap.
+
+    As a context it is asked by SIGINT, SIGTERM and SIGHUP, and is closed at the end. Signals reach the main thread
+    alone, and an ignored one (nohup) stays so.
+    """
+
+    def __init__(self) -> None:
+        # a full pipe must not block a signal handler
+        self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self.reason = ""
+        self.count = 0
+
+    def __enter__(self) -> Stop:
+        alone = threading.current_thread() is threading.main_thread()
+        signals = [number for number in SIGNALS if alone and signal.getsignal(number) is not signal.SIG_IGN]
+        self._before = [(n, signal.signal(n, lambda by, _: self(signal.Signals(by).name))) for n in signals]
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        for number, handler in self._before:
+            signal.signal(number, handler)
+        self.close()
+
+    def __call__(self, reason: str = "stop") -> None:
+        """Ask for the end; a second time: at once."""
+        self.reason = self.reason or reason
+        self.count += 1
+        with contextlib.suppress(OSError):
+            os.write(self._write, b"x")
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until asked, at most so long; whether asked."""
+        poller = select.poll()
+        poller.register(self._read, select.POLLIN)
+        poller.poll(timeout_s * 1e3)
+        return self.count > 0
+
+    def fileno(self) -> int:
+        """Readable once asked."""
+        return self._read
+
+    def close(self) -> None:
+        """Close the pipe."""
+        os.close(self._read)
+        os.close(self._write)

@@ -1,1 +1,0 @@
-"""The tap's durable log, its writer and its export."""

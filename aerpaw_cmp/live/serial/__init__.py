@@ -1,1 +1,0 @@
-"""The serial port: framing, modem, ports, simulator."""

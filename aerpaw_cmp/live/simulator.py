@@ -1,0 +1,269 @@
+"""A modem that is not there: a pseudo-terminal that answers like an RM502Q-AE over a simulated flight.
+
+It speaks to whatever opens the port, so the tap, a terminal program and the tests all use the same thing.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import math
+import os
+import pty
+import re
+import select
+import termios
+import threading
+import time
+from bisect import bisect_right
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+from ..common.errors import AerpawCmpError, UsageError
+from ..logs.readers import ReadOptions, identify
+from .modem import QUERIES
+from .ports import Stop, make_raw
+
+# Time before an answer.
+_LATENCY_S = 0.02
+
+
+def _flight_rank(seconds: float) -> int:
+    """Rank of the built-in flight: 1 to 4 in slow turns, now and then no CSI."""
+    if seconds % 120.0 > 118.0:
+        return 0
+    return 1 + round(1.5 + 1.5 * math.sin(seconds / 20.0))
+
+
+def _flight_rsrp(seconds: float) -> float:
+    """RSRP of the built-in flight [dBm]."""
+    return -85.0 - 12.0 * (1.0 + math.sin(seconds / 31.0))
+
+
+class FlightModem:
+    """An RM502Q-AE in SA mode over a simulated flight.
+
+    Parameters
+    ----------
+    rank : callable, optional
+        ``rank(seconds) -> int``, 0 for no CSI; None: that of a built-in flight.
+    rsrp : callable, optional
+        ``rsrp(seconds) -> dBm``; None: that of a built-in flight.
+    """
+
+    def __init__(
+        self,
+        rank: Callable[[float], int] | None = None,
+        rsrp: Callable[[float], float] | None = None,
+    ) -> None:
+        self._rank, self._rsrp = rank or _flight_rank, rsrp or _flight_rsrp
+        self.csi = [1, 1]
+        self._start = time.monotonic()
+        self._asked = 0
+
+    def reply(self, command: str) -> tuple[str, ...]:
+        """Lines for a command, the final result last."""
+        now = time.monotonic() - self._start
+        rank = self._rank(now) if self.csi[1] else 0
+        rsrp = round(self._rsrp(now))
+        sinr = max(-20, min(38, 110 + rsrp + round(3 * math.sin(now / 3.0))))
+        self._asked += 1
+        write = re.fullmatch(r'AT\+QNWCFG="csi_ctrl",([01]),([01])', command)
+        if write:
+            self.csi = [int(write.group(1)), int(write.group(2))]
+            return ("OK",)
+        # PMI counts the questions, so that each answer can be told from the others
+        csi = f"{min(27, 4 + 6 * rank)},{rank},{min(15, 4 + 2 * rank)},{self._asked % 60_000}" if rank else "0,0,0,0"
+        answers: dict[str, tuple[str, ...]] = {
+            "sync": (),
+            "identity": ("Quectel", "RM502Q-AE", "Revision: RM502QAEAAR00A00M4G"),
+            "firmware": ("RM502QAEAAR00A00M4G",),
+            "csi_ctrl": (f'+QNWCFG: "csi_ctrl",{self.csi[0]},{self.csi[1]}',),
+            "nr5g_csi": (f'+QNWCFG: "nr5g_csi",{csi}',),
+            "lte_csi": ('+QNWCFG: "lte_csi",0,0,0,0',),
+            "servingcell": (
+                '+QENG: "servingcell","NOCONN","NR5G-SA","TDD",999,99,0002A4001,77,1F,633984,78,12,'
+                f"{rsrp},-11,{sinr},1,-",
+            ),
+            "qrsrp": (f"+QRSRP: {rsrp},{rsrp - 3},{rsrp - 2},{rsrp - 5},NR5G",),
+            "qrsrq": ("+QRSRQ: -11,-11,-11,-12,NR5G",),
+            "qsinr": (f"+QSINR: {sinr},{sinr - 2},{sinr - 1},{sinr - 4},NR5G",),
+            "qnwinfo": ('+QNWINFO: "TDD NR5G","99999","NR5G BAND 78",633984',),
+            "qcainfo": ('+QCAINFO: "PCC",633984,12,"NR5G BAND 78",77',),
+        }
+        for name, lines in answers.items():
+            if QUERIES[name].text == command:
+                return (*lines, "OK")
+        return ("ERROR",)
+
+
+def ranks_of(path: Path, options: ReadOptions) -> Callable[[float], int] | None:
+    """Rank over time since the start of a log, None if no reader finds ranks in it."""
+    data = path.read_bytes()
+    try:
+        result = identify(data).read(data, options)
+    except AerpawCmpError:
+        return None
+    streams = [stream for stream in result.streams if stream.kind == "rank" and len(stream.frame)]
+    if not streams:
+        return None
+    frame = streams[0].frame.sort_values("time")
+    times = frame["time"].to_numpy().astype("datetime64[ns]").astype("int64")
+    seconds = [float(t - times[0]) / 1e9 for t in times]
+    ranks = [0 if math.isnan(rank) else round(rank) for rank in frame["rank"].to_numpy(dtype="float64").tolist()]
+
+    def rank(elapsed_s: float) -> int:
+        return ranks[max(0, bisect_right(seconds, elapsed_s % (seconds[-1] + 1.0)) - 1)]
+
+    return rank
+
+
+class ModemSimulator:
+    """A simulated modem on a pseudo-terminal, served by a thread; a context manager.
+
+    Parameters
+    ----------
+    modem : FlightModem, optional
+        Answers; default: a built-in flight.
+    link : Path, optional
+        A symbolic link to the port; None: no link.
+
+    Examples
+    --------
+    >>> with ModemSimulator() as modem:
+    ...     modem.port.exists()
+    True
+    """
+
+    def __init__(self, modem: FlightModem | None = None, *, link: Path | None = None) -> None:
+        self.link = link
+        self._modem = modem or FlightModem()
+        self._lock = threading.RLock()
+        self._stop = threading.Event()
+        self._received = b""
+        self._master = -1
+        self._node = self._plug()
+        self._thread = threading.Thread(target=self._run, name="modem-sim", daemon=True)
+
+    def __enter__(self) -> ModemSimulator:
+        self._thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop.set()
+        self._thread.join(timeout=5.0)
+        with self._lock:
+            if self._master >= 0:
+                os.close(self._master)
+                self._master = -1
+        self._unlink()
+
+    @property
+    def port(self) -> Path:
+        """Path to open: the link if there is one, else the node."""
+        return self.link or self._node
+
+    def _plug(self) -> Path:
+        master, slave = pty.openpty()
+        try:
+            make_raw(slave, termios.B115200)
+            node = Path(os.ttyname(slave))
+        finally:
+            os.close(slave)  # only the tap shall hold the port
+        # a reader that stops reading must not hold the thread for ever
+        os.set_blocking(master, False)
+        self._master = master
+        link = self.link
+        if link is not None:
+            link.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                link.symlink_to(node)
+            except FileExistsError:
+                os.close(master)
+                raise UsageError(
+                    "the name is taken",
+                    expected="a new name",
+                    cause="a simulator that was killed: remove it",
+                    path=link,
+                ) from None
+        return node
+
+    def _unlink(self) -> None:
+        """Remove the link, if it is still the one to our node."""
+        link = self.link
+        with contextlib.suppress(OSError):
+            if link is not None and link.readlink() == self._node:
+                link.unlink()
+
+    def _read(self) -> bytes:
+        fd = self._master
+        if fd < 0:
+            return b""
+        poller = select.poll()
+        poller.register(fd, select.POLLIN)
+        try:
+            ready = poller.poll(20)
+            if not ready:
+                return b""
+            if not ready[0][1] & select.POLLIN:
+                self._stop.wait(0.02)  # nobody has the port open: poll reports a hang-up at once
+                return b""
+            return os.read(fd, 4096)
+        except OSError:
+            self._stop.wait(0.02)
+            return b""
+
+    def _write(self, data: bytes) -> bool:
+        """Write all of it; False where that fails."""
+        while data and not self._stop.is_set():
+            try:
+                with self._lock:
+                    count = os.write(self._master, data[:4096])
+            except OSError as error:
+                if error.errno not in (errno.EAGAIN, errno.EINTR):
+                    return False
+                self._stop.wait(0.002)
+                continue
+            data = data[count:]
+        return not data
+
+    def _run(self) -> None:
+        while not self._stop.is_set():
+            self._received += self._read()
+            while b"\r" in self._received:
+                line, self._received = self._received.split(b"\r", 1)
+                if command := line.strip(b"\n\0 ").decode("latin-1"):
+                    self._serve(command)
+
+    def _serve(self, command: str) -> None:
+        """Answer a command."""
+        self._stop.wait(_LATENCY_S)
+        self._write(framed(self._modem.reply(command)))
+
+
+def framed(lines: Iterable[str]) -> bytes:
+    """Lines of an answer as a modem writes them."""
+    return b"".join(b"\r\n" + line.encode("latin-1") + b"\r\n" for line in lines)
+
+
+def run_modem_sim(
+    simulator: ModemSimulator,
+    *,
+    on_ready: Callable[[Path], None],
+    meanwhile: Callable[[], None] | None = None,
+) -> None:
+    """Serve a simulated modem until a signal comes.
+
+    Parameters
+    ----------
+    simulator : ModemSimulator
+    on_ready : callable
+        Gets the port's name.
+    meanwhile : callable, optional
+        Called several times a second, e.g. to write the telemetry of the same flight.
+    """
+    with Stop() as stop, simulator:
+        on_ready(simulator.port)
+        while not stop.wait(0.1 if meanwhile else 1.0):
+            if meanwhile is not None:
+                meanwhile()

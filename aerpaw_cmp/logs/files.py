@@ -1,0 +1,475 @@
+"""Files of logs: archives, packed files, checksums, and files larger than memory in pieces.
+
+Logs packed by gzip, bzip2 or xz, unpacked piece by piece and bounded.
+
+A file may hold several streams, as parallel packers write them. Python may have been built without bzip2 or
+xz: then the message says so.
+
+Zip and tar archives as folders of logs: members are read as streams, bounded, and never written to disk.
+
+A member is named like a file in a folder: ``dataset.zip/LW1/power_log.txt``.
+
+Lines of the log of ``aerpaw-cmp tap``: a JSON object each, its last key the CRC-32 of what stands before it.
+
+Logs larger than memory: a file as pieces of whole lines.
+
+The one law of readers that take pieces (``Reader.read_pieces``): pieces of any size give what one piece gives. A reader
+keeps of each piece the few numbers that it needs and settles what only the whole log can tell at the end.
+
+Records of 2 GB fill memory all the same. Where only their number and span are asked for, ``Reader.read_sections`` gives
+them section by section (:func:`spans`), and last a result with the sums over all.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import lzma
+import struct
+import tarfile
+import zipfile
+import zlib
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import chain
+from os.path import isfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..common.units import AnyArray
+from .records import ReadResult, Stream
+
+_MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
+_PIECE = 2 << 20
+# What unpacks to more than so many times its size is no log: text of the most regular of them takes a hundredth.
+_MOST_RATIO = 1100
+# Of the xz library; its strongest setting takes 65 MiB.
+_MOST_MEMORY = 1 << 28
+
+
+def packed_form(head: bytes) -> str | None:
+    """``gzip``, ``bzip2`` or ``xz``, None for any other content."""
+    for magic, name in _MAGIC.items():
+        if head.startswith(magic) and (name != "bzip2" or head[3:10] in _BLOCKS):
+            return name
+    return None
+
+
+_BLOCKS = {b"%d1AY&SY" % level for level in range(1, 10)}
+
+
+class _Gunzip:
+    """One member of a gzip file, with the interface of the other two libraries."""
+
+    def __init__(self) -> None:
+        # 16: with the header of gzip, which is checked
+        self._machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
+
+    def decompress(self, data: bytes, most: int) -> bytes:
+        return self._machine.decompress(self._machine.unconsumed_tail + data, most)
+
+    @property
+    def eof(self) -> bool:
+        return self._machine.eof
+
+    @property
+    def unused_data(self) -> bytes:
+        return self._machine.unused_data
+
+    @property
+    def needs_input(self) -> bool:
+        return not self._machine.unconsumed_tail
+
+
+def _machine(name: str, path: str | Path) -> Callable[[], Any]:
+    if name == "gzip":
+        return _Gunzip
+    try:
+        # here: Python may lack these modules
+        if name == "bzip2":
+            import bz2
+
+            return bz2.BZ2Decompressor
+        import lzma
+
+        # a header may ask for GiB of dictionary
+        return lambda: lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=_MOST_MEMORY)
+    except ImportError as error:
+        raise InputError(
+            f"a {name} file, and this Python was built without {name}", expected="the log unpacked", path=path
+        ) from error
+
+
+def unpacked_pieces(content: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
+    """Content of a packed file, some MiB at a time.
+
+    Parameters
+    ----------
+    content : iterable of bytes
+        Of the file; the first one shows its form.
+    path : str or Path
+        What messages name.
+
+    Raises
+    ------
+    InputError
+        If it is damaged or cut, or unpacks to more than a log can.
+    """
+    content = iter(content)
+    unread = next(content, b"")
+    name = packed_form(unread) or "bzip2"
+    make, machine = _machine(name, path), None
+    bytes_in, bytes_out = len(unread), 0
+    while True:
+        unread = unread if machine is not None else unread.lstrip(b"\0")  # padding between streams
+        if not unread and (machine is None or machine.needs_input):
+            unread = next(content, b"")
+            bytes_in += len(unread)
+            if not unread:
+                break
+            continue
+        machine = make() if machine is None else machine
+        try:
+            piece = machine.decompress(unread, _PIECE)
+        except MemoryError:
+            raise
+        except Exception as error:  # bz2 raises OSError and ValueError, lzma an exception of its own
+            raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
+        bytes_out += len(piece)
+        # as it goes, so that a bomb is stopped at its first piece
+        if bytes_out > _MOST_RATIO * bytes_in + _PIECE:
+            raise InputError(f"the {name} file unpacks to more than {_MOST_RATIO} times its size", cause="no log",
+                             path=path)  # fmt: skip
+        if piece:
+            yield piece
+        unread = machine.unused_data if machine.eof else b""
+        machine = None if machine.eof else machine
+    if machine is not None:
+        raise InputError(f"the {name} file ends too early", cause="a cut download", path=path)
+
+
+def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
+    """All of a packed file, never more than ``most`` bytes; see :func:`pieces`."""
+    parts, size = [], 0
+    for piece in unpacked_pieces([raw], path):
+        parts.append(piece)
+        size += len(piece)
+        if size > most:
+            raise InputError(
+                f"the {packed_form(raw)} file unpacks to more than {most} bytes", cause="no log", path=path
+            )
+    return b"".join(parts)
+
+
+def head_of(place: Path, count: int) -> bytes:
+    """The first bytes of what a packed file holds, none where it is damaged: reading it says so."""
+    head = b""
+    try:
+        for piece in unpacked_pieces(read_chunks(place, _PIECE), place):
+            head += piece
+            if len(head) >= count:
+                break
+    except InputError:
+        return b""  # damaged further on than the beginning: refused alike when it is read
+    return head[:count]
+
+
+def read_chunks(place: Path, size: int) -> Iterator[bytes]:
+    """Content of a file, so many bytes at a time."""
+    with place.open("rb") as file:
+        while chunk := file.read(size):
+            yield chunk
+
+
+# A flight of half an hour with a burst every 0.1 s has 18 000.
+MOST_MEMBERS = 20_000
+# Of one member after decompression.
+MOST_BYTES = 2**31
+# Of all members together.
+_MOST_IN_ALL = 2**35
+# Of all members together to the archive, beyond ``_FREE_BYTES``: logs shrink to a fifth, the most even to a 50th.
+MOST_RATIO = 100
+_ZIP = (b"PK\x03\x04", b"PK\x05\x06")
+_TAR = b"ustar"
+_MARGIN = 2**20
+_FREE_BYTES = 2**28
+# Deflate makes a file at most 1032 times smaller: what claims more lies.
+_RATIO = 1200
+# What Python's libraries raise for damaged archives; a ValueError for a directory that begins before the file does.
+_DAMAGE = (
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, ValueError, IndexError,
+    OverflowError, NotImplementedError,
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A file of an archive.
+
+    Parameters
+    ----------
+    name : str
+        Relative, whatever the archive says.
+    size : int
+        After decompression, as the archive says [bytes].
+    read : callable
+        Content, all of it or at most so many bytes.
+    """
+
+    name: str
+    size: int
+    read: Callable[[int | None], bytes]
+
+
+def is_archive(head: bytes) -> bool:
+    """Check whether the first bytes of a file (gunzipped or not) are those of an archive."""
+    # the mark of POSIX tar stands behind 257 bytes of the first header
+    return head.startswith(_ZIP) or head[257:262] == _TAR
+
+
+def path_in_archive(path: Path) -> tuple[Path, str] | None:
+    """The archive and the member that a path names; None where no part of it is a file."""
+    # Path's own test raises for a name that is too long
+    file = next((parent for parent in path.parents if isfile(parent)), None)  # noqa: PTH113
+    return None if file is None else (file, path.relative_to(file).as_posix())
+
+
+def archive_members(data: bytes, path: str | Path) -> dict[str, Member]:
+    """Files of an archive by their names, in order.
+
+    Raises
+    ------
+    InputError
+        If the archive is damaged, or holds or unpacks to more than a data set can; also from a member's ``read``.
+    """
+    try:
+        entries = list(_zip(data, path) if data.startswith(_ZIP) else _tar(data, path))
+    except (*_DAMAGE, tarfile.TarError) as error:
+        raise InputError(f"a damaged archive ({error})", cause="a cut download", path=path) from error
+    _check(entries, len(data), path)
+    return {member.name: member for member in sorted(entries, key=lambda member: member.name)}
+
+
+def _hidden(name: str) -> bool:
+    return any((part.startswith(".") and part != "..") or part == "__MACOSX" for part in name.split("/"))
+
+
+def _zip(data: bytes, path: str | Path) -> Iterator[Member]:
+    book = zipfile.ZipFile(io.BytesIO(data))
+    for entry in book.infolist():
+        if not entry.is_dir() and not _hidden(entry.filename):
+            size = entry.file_size
+            # deflate cannot do it: the directory lies
+            lies = size > MOST_BYTES or size > _RATIO * entry.compress_size + _MARGIN
+            read = (
+                partial(_refused, f"the member unpacks to {size} bytes", f"at most {MOST_BYTES}", path)
+                if lies
+                else partial(_unzipped, book, entry, path)
+            )
+            yield _member(entry.filename, 0 if lies else size, path, read)
+
+
+def _unzipped(book: zipfile.ZipFile, entry: zipfile.ZipInfo, path: str | Path, most: int | None) -> bytes:
+    place = f"{path}/{entry.filename}"
+    try:
+        with book.open(entry) as stream:
+            # one byte more than is said shows a lie
+            content = stream.read(entry.file_size + 1 if most is None else most)
+    except (*_DAMAGE, RuntimeError) as error:
+        raise InputError(f"a damaged or locked member ({error})", cause="a cut download", path=place) from error
+    if len(content) > entry.file_size:
+        raise InputError("the member is larger than the archive says", cause="no log", path=place)
+    return content
+
+
+def _tar(data: bytes, path: str | Path) -> Iterator[Member]:
+    # "r:": no compression, which would be unpacked without a limit
+    book = tarfile.open(fileobj=io.BytesIO(data), mode="r:")  # noqa: SIM115 - members are read later
+    for entry in book.getmembers():
+        # no links, devices or pipes
+        if entry.isreg() and not _hidden(entry.name):
+            yield _member(entry.name, entry.size, path, partial(_untarred, book, entry))
+
+
+def _untarred(book: tarfile.TarFile, entry: tarfile.TarInfo, most: int | None) -> bytes:
+    stream = book.extractfile(entry)
+    return stream.read(-1 if most is None else most) if stream is not None else b""
+
+
+def _member(name: str, size: int, path: str | Path, read: Callable[[int | None], bytes]) -> Member:
+    """A member under a relative name: what a flight.yaml names by it lies in the archive and nowhere else."""
+    if ".." in name.split("/"):
+        return Member(name, 0, partial(_refused, "the member's name leads out of the archive", "a name below it", path))
+    return Member(name.lstrip("/"), size, read)
+
+
+def _refused(found: str, expected: str, path: str | Path, _most: int | None) -> bytes:
+    raise InputError(found, expected=expected, path=path)
+
+
+def most_bytes(size: int) -> int:
+    """Bytes that an archive or packed file of ``size`` bytes may unpack to."""
+    return min(_MOST_IN_ALL, MOST_RATIO * size + _FREE_BYTES)
+
+
+def _check(entries: list[Member], size: int, path: str | Path) -> None:
+    total = sum(member.size for member in entries)
+    if len(entries) > MOST_MEMBERS:
+        raise InputError(f"the archive holds {len(entries)} files", expected=f"at most {MOST_MEMBERS}", path=path)
+    if total > most_bytes(size):
+        raise InputError(
+            f"the archive of {size} bytes unpacks to {total} bytes",
+            expected=f"at most {MOST_RATIO} times its size and {_FREE_BYTES >> 20} MiB, and {_MOST_IN_ALL >> 30} GiB",
+            cause="no data set: an archive made to fill a disk or the memory",
+            path=path,
+        )
+
+
+SCHEMA = "aerpaw-cmp-tap/1"
+_CRC = b',"crc":"'
+
+Record = dict[str, Any]
+
+
+def encode_record(record: Record) -> bytes:
+    r"""One line, with its checksum and line end.
+
+    Examples
+    --------
+    >>> encode_record({"kind": "end", "n": 3})
+    b'{"kind":"end","n":3,"crc":"a5ccacec"}\n'
+    """
+    body = json.dumps(record, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii")[:-1]
+    return body + _CRC + b'%08x"}\n' % zlib.crc32(body)
+
+
+def decode_record(line: bytes) -> Record:
+    """A line's record.
+
+    Raises
+    ------
+    ValueError
+        With the reason, if the line is torn or its checksum is wrong.
+    """
+    body, mark, tail = line.strip().rpartition(_CRC)
+    if not mark or len(tail) != 10 or not tail.endswith(b'"}'):
+        raise ValueError("torn line: it does not end with a checksum")
+    if b"%08x" % zlib.crc32(body) != tail[:8]:
+        raise ValueError("damaged line: its checksum does not fit")
+    try:
+        record = json.loads(body + b"}")
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(record, dict):
+        raise ValueError("not a record")
+    return record
+
+
+PIECE_BYTES = 4 << 20
+
+
+def file_pieces(place: Path, digest: Any) -> Iterator[bytes]:
+    """Content of a log, unpacked, some MiB of whole lines at a time; ``digest`` takes that content."""
+    chunks = read_chunks(place, PIECE_BYTES)
+    first = next(chunks, b"")
+    content = chain((first,), chunks)
+    yield from whole_lines(_counted(content if packed_form(first) is None else unpacked_pieces(content, place), digest))
+
+
+def whole_lines(chunks: Iterable[bytes]) -> Iterator[bytes]:
+    r"""The same bytes, each piece but the last with a line end at its end, without a byte order mark in front.
+
+    Examples
+    --------
+    >>> list(whole_lines([b"a\nb", b"c", b"d\n", b"e"]))
+    [b'a\n', b'bcd\n', b'e']
+    """
+    pending: list[bytes] = []
+    started = False
+    for chunk in chunks:
+        cut = chunk.rfind(b"\n") + 1
+        if not cut:
+            pending.append(chunk)
+            continue
+        piece = b"".join([*pending, chunk[:cut]])
+        yield piece if started else piece.removeprefix(b"\xef\xbb\xbf")
+        started, pending = True, [chunk[cut:]] if cut < len(chunk) else []
+    if pending:
+        piece = b"".join(pending)
+        yield piece if started else piece.removeprefix(b"\xef\xbb\xbf")
+
+
+def _counted(chunks: Iterable[bytes], digest: Any) -> Iterator[bytes]:
+    for chunk in chunks:
+        digest.update(chunk)
+        yield chunk
+
+
+class Column:
+    """A column that grows in place: pieces that are kept one by one and joined take twice the memory."""
+
+    def __init__(self, dtype: Any, first: Any = ()) -> None:
+        self._values: AnyArray = np.array(first, dtype=dtype)
+        self._count = len(self._values)
+
+    def __len__(self) -> int:
+        """Count the values."""
+        return self._count
+
+    def extend(self, piece: AnyArray) -> None:
+        """Values behind those that are there."""
+        end = self._count + len(piece)
+        if end > len(self._values):
+            # a sixteenth more: few moves, little to spare
+            self._values.resize(end + end // 16, refcheck=False)  # the system moves pages, not bytes
+        self._values[self._count : end] = piece
+        self._count = end
+
+    def array(self) -> AnyArray:
+        """The column; it takes no more values."""
+        self._values.resize(self._count, refcheck=False)
+        return self._values
+
+
+class WholeLogError(Exception):
+    """Something that only all records of a log together can settle."""
+
+
+# Streams by section, and last the result without them.
+Sections = Iterator[Stream | ReadResult]
+
+# Records of a section, some 100 MB.
+SECTION = 1 << 20
+
+
+def spans(sections: Sections) -> ReadResult:
+    """Result of a log whose streams hold the first and the last record in time, and how many there are.
+
+    Raises
+    ------
+    WholeLogError
+        If values are impossible, or days lie between records: the limits of quantities judge all of them together.
+    """
+    import pandas as pd
+
+    from . import limits
+
+    ends: dict[str, Stream] = {}
+    for stream in sections:
+        if isinstance(stream, ReadResult):
+            return replace(stream, streams=tuple(ends.values()))
+        time, before = stream.frame["time"].to_numpy("datetime64[ns]"), ends.get(stream.name)
+        latest = time[:1] if before is None else before.frame["time"].to_numpy("datetime64[ns]")[-1:]
+        checked = limits.check(ReadResult("", (stream,), 0, 0, 0))
+        if checked.warnings or not limits.one_run(np.concatenate([latest, time]).view(np.int64)):
+            break
+        frame, rows = stream.frame.iloc[[int(time.argmin()), int(time.argmax())]], len(time)
+        if before is not None:
+            frame = pd.concat([before.frame, frame]).sort_values("time", kind="stable").iloc[[0, -1]]
+            rows += before.rows
+        ends[stream.name] = replace(stream, frame=frame, stand_for=rows)
+    raise WholeLogError

@@ -1,1 +1,0 @@
-"""Files of logs: archives, pieces, limits, kinds."""

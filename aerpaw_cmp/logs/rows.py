@@ -1,0 +1,603 @@
+"""From lines to records: what every text format repeats, so that a format is its pattern, its columns and its text.
+
+:func:`matched` takes a pattern with named groups (``time`` among them) and gives :class:`Rows`; :func:`built` does
+so for readers that find their rows another way. ``Rows.number`` and ``Rows.text`` are its columns, ``Rows.stream``
+makes a stream of them, ``Rows.result`` closes the account.
+
+A text format from its parts: the regular expression of its rows, what marks it, and the streams of its columns.
+
+:func:`reader` does the rest: sniffing, the account of all lines, times, torn last lines.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+
+from ..common.text import counted
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from . import text as _text
+from .readers import Reader, ReadOptions
+from .records import Attribute, Kind, ReadResult, RejectedLine, Stream
+
+_NO_DATE = "the time stamp is no date of the calendar"
+_UNREAD = "the time is empty or of a form that is not read"
+NO_TIME = "the time is beyond any flight"
+_SI = {b"k": 1e3, b"M": 1e6, b"G": 1e9, b"m": 1e-3, b"u": 1e-6, b"n": 1e-9}
+Reason = Callable[[bytes], "str | None"]
+
+
+@dataclass
+class Rows:
+    """Rows of a log that have a time, and the account of all other lines.
+
+    Parameters
+    ----------
+    reader : str
+        Name of the reader.
+    options : ReadOptions
+    lines : int
+        Lines of the file.
+    row : int array, shape (n,)
+        0-based line of each row.
+    time : datetime64[ns] array, shape (n,)
+    flag : object array, shape (n,)
+    columns : mapping of str to bytes array, shape (n,)
+        What the groups of the pattern matched.
+    blank : int
+    rejected : list of RejectedLine
+    warnings : list of str
+    relative : bool
+        Do the times count from an origin that nobody named?
+    clock_from : str, optional
+        ``written`` where all times carry an offset or are epochs.
+    height_from : str, optional
+        Of the track, where the table says more than its format.
+    about : dict
+        Attributes of all streams: who wrote these rows.
+    at : int array, shape (n,)
+        Index of each row among those that were given to :func:`built`.
+    data : bytes
+        The text itself, for what stands between the rows.
+    """
+
+    reader: str
+    options: ReadOptions
+    lines: int
+    row: IntArray
+    time: AnyArray
+    flag: AnyArray
+    columns: dict[str, AnyArray] = field(default_factory=dict)
+    blank: int = 0
+    rejected: list[RejectedLine] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    relative: bool = False
+    clock_from: str | None = None
+    height_from: str | None = None
+    about: dict[str, Attribute] = field(default_factory=dict)
+    at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    data: bytes = field(default=b"", repr=False)
+
+    def __len__(self) -> int:
+        """Count the rows."""
+        return len(self.row)
+
+    def number(self, name: str, *, none: Iterable[bytes] = (b"n/a", b"-")) -> FloatArray:
+        """A column as numbers; empty text and the words for none are NaN."""
+        cells = self.columns[name]
+        if cells.dtype.kind == "f":
+            return np.asarray(cells, dtype=np.float64)
+        for word in none:
+            cells = np.where(cells == word, b"", cells)
+        return np.asarray(_text.numbers(cells), dtype=np.float64)
+
+    def si(self, name: str) -> FloatArray:
+        """A column of numbers with SI suffix: ``-4.3k`` is -4300."""
+        cells = [cell.strip() for cell in self.columns[name].tolist()]
+        scaled = [cell[-1:] in _SI and cell[-2:-1].isdigit() for cell in cells]  # 'nan' is no nano
+        scale = np.array([_SI[cell[-1:]] if mark else 1.0 for cell, mark in zip(cells, scaled, strict=True)])
+        plain = _text.cells([cell[:-1] if mark else cell for cell, mark in zip(cells, scaled, strict=True)])
+        return np.asarray(replace(self, columns={name: plain}).number(name) * scale, dtype=np.float64)
+
+    def text(self, name: str) -> list[str]:
+        """A column as text."""
+        return [cell.decode("utf-8", "replace") for cell in self.columns[name].tolist()]
+
+    def mark(self, where: BoolArray, reason: str) -> None:
+        """Add a reason to the flag of some rows."""
+        _text.add_flag(self.flag, where, reason)
+
+    def part(self, where: BoolArray) -> Rows:
+        """The rows that a mask holds; warnings and rejected lines are shared, the account stays that of all."""
+        columns = {name: cells[where] for name, cells in self.columns.items()}
+        return replace(
+            self, row=self.row[where], time=self.time[where], flag=self.flag[where], at=self.at[where], columns=columns
+        )
+
+    def stream(
+        self,
+        kind: Kind,
+        name: str,
+        values: Mapping[str, AnyArray],
+        *,
+        where: BoolArray | None = None,
+        pick: IntArray | None = None,
+        flag: AnyArray | None = None,
+        about: Mapping[str, Attribute | None] | None = None,
+        **attributes: Attribute | None,
+    ) -> Stream | None:
+        """A stream of all rows, or of those of a mask; None where there are none.
+
+        Parameters
+        ----------
+        kind, name : str
+        values : mapping
+            Columns of the kind, and any others, each of shape (n,).
+        where : bool array, shape (n,), optional
+        pick : int array, shape (m,), optional
+            Index of the row of each record, for rows that hold several; ``values`` and ``flag`` are of shape (m,) then.
+        flag : object array, shape (n,), optional
+            In place of the flags that all streams of the rows share.
+        about : mapping, optional
+            Further attributes.
+        **attributes
+            Attributes; None leaves one out.
+
+        Returns
+        -------
+        Stream or None
+        """
+        shown = self.flag if flag is None else flag
+        time, row = self.time, self.row
+        if pick is not None:
+            time, row, shown = time[pick], row[pick], shown[pick] if flag is None else flag
+        elif where is not None and not where.all():
+            time, row, shown = time[where], row[where], shown[where]
+            values = {key: np.asarray(column)[where] for key, column in values.items()}
+        if not len(row):
+            return None
+        frame = _text.frame(kind, time, row + 1, shown, values)
+        shared = ({"clock": "relative"} if self.relative else {}) | {"clock_from": self.clock_from} | self.about
+        attributes = shared | dict(about or {}) | attributes
+        return Stream(kind, name, frame, _text.attributes(self.options, **attributes))
+
+    def level(self, values: FloatArray) -> tuple[FloatArray, AnyArray]:
+        """Levels with those at or below the floor as NaN, and their flags ``out_of_coverage``."""
+        flag, level = self.flag.copy(), np.array(values, dtype=np.float64)
+        silent = ~(level > self.options.floor_db)  # +inf is no silence: the limits of all readers flag it
+        _text.add_flag(flag, silent, "out_of_coverage")
+        level[silent] = np.nan
+        return level, flag
+
+    def rank(self, ri: FloatArray, *, none: BoolArray | None = None) -> dict[str, FloatArray]:
+        """Columns ``rank`` and ``ri_raw`` of reported indicators; see :func:`ranks`."""
+        return {"rank": ranks(ri, self.flag, none=none), "ri_raw": ri}
+
+    def result(self, streams: Iterable[Stream | None]) -> ReadResult:
+        """The streams that have rows, each with a name of its own, with the account."""
+        names: dict[str, Stream] = {}
+        for stream in streams:
+            if stream is not None:
+                # names are unique in a file: what comes again (a console that was started anew) gets a number
+                alike = sum(name == stream.name or name.startswith(f"{stream.name}_again") for name in names)
+                name = f"{stream.name}_again{alike}" if alike else stream.name
+                names[name] = replace(stream, name=name) if alike else stream
+        present = tuple(names.values())
+        back = [text for stream in present[:1] for text in _text.back_in_time(_text.steps_back(stream.frame))]
+        return ReadResult(
+            reader=self.reader,
+            streams=present,
+            lines=self.lines,
+            accepted=len(np.unique(self.row)),  # markup may have all its records on a line
+            blank=self.blank,
+            rejected=tuple(sorted(self.rejected, key=lambda line: line.number)),
+            warnings=tuple(dict.fromkeys([*self.warnings, *back])),
+        )
+
+
+def matched(
+    data: bytes,
+    pattern: re.Pattern[bytes],
+    options: ReadOptions,
+    *,
+    reader: str,
+    reason: Reason,
+    skip: Callable[[IntArray], BoolArray] | None = None,
+    clock: str = "wall",
+) -> Rows:
+    r"""Rows of a log whose lines a pattern describes.
+
+    Parameters
+    ----------
+    data : bytes
+    pattern : re.Pattern
+        MULTILINE, from ``^`` to ``\r?$``, unable to cross a line end, every repetition bounded; named groups, one of
+        them ``time``.
+    reason : callable
+        Why a line that does not match is rejected, or None for a header, a comment or a console's talk.
+    skip : callable, optional
+        Mask of the matching rows (0-based lines) that are comments.
+    options : ReadOptions
+    reader : str
+        Its name.
+    clock : str
+        See :func:`times`.
+
+    Returns
+    -------
+    Rows
+
+    Raises
+    ------
+    UsageError
+        If a zone-less clock has no zone.
+    """
+    lines = _text.split(data)
+    rows, groups = _text.match(lines, pattern)
+    texts = _text.columns(groups, pattern.groups)
+    column = {name: texts[i - 1] for name, i in pattern.groupindex.items()}
+    return built(lines, rows, column, options, reader=reader, reason=reason, skip=skip, clock=clock)
+
+
+def built(
+    lines: _text.Lines,
+    rows: IntArray,
+    column: dict[str, AnyArray],
+    options: ReadOptions,
+    *,
+    reader: str,
+    reason: Reason,
+    skip: Callable[[IntArray], BoolArray] | None = None,
+    clock: str = "wall",
+    extra: Iterable[RejectedLine] = (),
+    markup: IntArray | None = None,
+    closed: bool = False,
+) -> Rows:
+    """Rows from their lines and columns of text, ``time`` among them; see :func:`matched`.
+
+    Parameters
+    ----------
+    lines : Lines
+    rows : int array, shape (n,)
+        0-based lines of the rows.
+    column : mapping of str to array, shape (n,)
+        Their cells as bytes or floats.
+    options, reader, reason, skip, clock
+        As of :func:`matched`.
+    extra : iterable of RejectedLine
+        Lines that were rejected before.
+    markup : int array, optional
+        0-based lines known to be comments.
+    closed : bool
+        Are records known to be whole by their own end, whatever ends the line?
+
+    Returns
+    -------
+    Rows
+    """
+    comment = np.zeros(len(rows), dtype=bool) if skip is None else skip(rows)
+    before = list(extra)
+    # rejected before: they are accounted for, and are looked at no more
+    known = np.concatenate((rows, np.array([line.number - 1 for line in before], dtype=np.int64))).astype(np.int64)
+    blank, rejected = _text.remainder(lines, known, reason, blank=markup)
+    rejected += before
+    blank += int(comment.sum())
+    if comment.any():
+        rows, column = rows[~comment], {name: cells[~comment] for name, cells in column.items()}
+    column_time = column.pop("time")
+    relative, instants, valid = times(column_time, options, clock=clock, reader=reader)
+    rejected += _untimed(lines, rows, column_time, valid, clock)
+    flag = _text.flags(len(rows))
+    instants.flag(flag)
+    if lines.unterminated and not closed:
+        _text.add_flag(flag, rows == len(lines) - 1, _text.UNTERMINATED)
+    warnings = list(instants.warnings)
+    if relative and len(rows):
+        warnings.append(RELATIVE)
+    at, time = np.flatnonzero(~comment), instants.time
+    column = {name: cells for name, cells in column.items() if name != "time"}
+    if not valid.all():
+        rows, at, time, flag = rows[valid], at[valid], time[valid], flag[valid]
+        column = {name: cells[valid] for name, cells in column.items()}
+    return Rows(
+        reader=reader, options=options, lines=len(lines), row=rows, time=time, flag=flag, columns=column, blank=blank,
+        rejected=rejected, warnings=warnings, relative=relative,
+        clock_from="written" if clock.startswith("epoch") or instants.zoned else None, at=at, data=lines.data,
+    )  # fmt: skip
+
+
+def _untimed(lines: _text.Lines, rows: IntArray, cells: AnyArray, valid: BoolArray, clock: str) -> list[RejectedLine]:
+    """Lines rejected for their time: it is of no known form, no date of the calendar, or beyond any flight."""
+    bad = np.flatnonzero(~valid & ~np.isin(rows, rows[valid]))
+    # a line of several records is rejected once
+    bad = bad[np.unique(rows[bad], return_index=True)[1]] if len(bad) else bad
+    if clock != "wall":
+        return lines.reject_all(rows[bad], NO_TIME)
+    unread = cells[bad] == b"-"
+    return lines.reject_all(rows[bad[unread]], _UNREAD) + lines.reject_all(rows[bad[~unread]], _NO_DATE)
+
+
+RELATIVE = "the times are relative and no time_origin is given: they count from 1970-01-01T00:00"
+_MOST_S = 9.2e9
+# Relative times beyond about 285 years would leave the range of datetime64[ns].
+_FLIGHT_S = 9.0e9
+
+
+def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> tuple[bool, _text.Instants, BoolArray]:
+    """Instants of a column of times.
+
+    Parameters
+    ----------
+    cells : bytes or float array, shape (n,)
+    options : ReadOptions
+    clock : str
+        ``wall`` (text, local unless it carries an offset), ``epoch_s``, ``epoch_ms``, ``epoch_us`` (UTC),
+        ``relative_ns`` .. ``relative_h`` (from ``time_origin``, else from 1970-01-01).
+    reader : str
+        Its name, for messages.
+
+    Returns
+    -------
+    relative : bool
+        Are the times without an origin?
+    instants : Instants
+    valid : bool array, shape (n,)
+    """
+    if clock == "wall":
+        instants, valid = _text.texts_to_utc(cells, options, needed_by=reader)
+        return False, instants, valid
+    form, unit = clock.split("_")
+    unit_ns = _text.COUNTS[unit].ns
+    # tables are parsed to floats already
+    value = cells if cells.dtype.kind == "f" else np.asarray(_text.numbers(cells), dtype=np.float64)
+    origin = _text.origin_ns(options, needed_by=reader) if form == "relative" else 0
+    most = _FLIGHT_S if form == "relative" else _MOST_S
+    valid = np.isfinite(value) & (np.abs(value) * unit_ns <= most * 1e9)
+    safe = np.where(valid, value, 0.0)
+    integer = np.floor(safe)  # the fraction apart: a float64 epoch in ns has no room for it
+    ns = integer.astype(np.int64) * int(unit_ns)
+    ns += np.round((safe - integer) * unit_ns).astype(np.int64) + (origin or 0)
+    if form == "epoch" and options.clock in ("local", "local_as_utc"):
+        return False, _text.local_to_utc(ns, options.timezone, needed_by=reader), valid
+    none = np.zeros(len(ns), dtype=bool)
+    return origin is None, _text.Instants(ns.astype("datetime64[ns]"), none, none.copy()), valid
+
+
+def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = None) -> Stream | None:
+    """SNR stream of one tower; levels at or below the floor are out of coverage.
+
+    Parameters
+    ----------
+    rows : Rows
+    tower : str
+    values : (n,)
+        [dB].
+    where : (n,) bool, optional
+        Rows that are of this tower.
+
+    Returns
+    -------
+    Stream or None
+    """
+    level, flag = rows.level(values)
+    return rows.stream(
+        "rss", tower, {"rss_db": level}, where=where, flag=flag, node=tower, channel="snr", unit="dB", quantity="SNR"
+    )
+
+
+def ranks(ri: FloatArray, flag: AnyArray, *, none: BoolArray | None = None, means: bool = False) -> FloatArray:
+    """Ranks of indicators that count from one, NaN for what is none; the reason is added to ``flag``, in place.
+
+    Parameters
+    ----------
+    ri : float array, shape (m,)
+        As written; NaN where nothing is.
+    flag : object array, shape (m,)
+    none : bool array, shape (m,), optional
+        Where the number means that nothing was reported.
+    means : bool
+        Does the program print means over its period? Then a value between two ranks is none, but no fault.
+
+    Returns
+    -------
+    float array, shape (m,)
+    """
+    absent = np.isnan(ri) | (np.zeros(len(ri), dtype=bool) if none is None else none)
+    # 3GPP knows up to eight layers
+    inside = (ri >= 1) & (ri <= 8) & ~absent
+    integer = inside & (ri == np.round(ri))
+    _text.add_flag(flag, absent, "no_csi")
+    _text.add_flag(flag, ~(inside if means else integer) & ~absent, "ri_out_of_range")
+    _text.add_flag(flag, (inside & ~integer) if means else np.zeros(len(ri), dtype=bool), "rank_is_a_mean")
+    return np.where(integer, ri, np.nan)
+
+
+def mean_rank(
+    rows: Rows, ri: FloatArray, columns: Mapping[str, FloatArray], *, pick: IntArray | None = None
+) -> list[Stream | None]:
+    """Rank streams ``gnb`` of a base station that prints means over its report period, 0 where nothing was reported.
+
+    A mean between two ranks is no rank: it stands in ``rank_mean`` and its row is flagged ``rank_is_a_mean``.
+
+    Parameters
+    ----------
+    rows : Rows
+    ri : float array, shape (m,)
+    columns : mapping
+        Further columns.
+    pick : int array, shape (m,), optional
+        See :meth:`Rows.stream`.
+
+    Returns
+    -------
+    list of Stream or None
+        See :func:`of_ues`.
+    """
+    flag = (rows.flag if pick is None else rows.flag[pick]).copy()
+    rank = ranks(ri, flag, none=ri == 0, means=True)
+    rank_mean = np.where((ri >= 1) & (ri <= 8), ri, np.nan)
+    values = {"rank": rank, "ri_raw": ri, **columns, "rank_mean": rank_mean}
+    about = {"ri_base": "one", "source": "CSI report, mean over the period"}
+    return of_ues(rows, "rank", rows.options.channel or "gnb", values, pick=pick, flag=flag, about=about)
+
+
+def of_ues(
+    rows: Rows,
+    kind: Kind,
+    name: str,
+    values: Mapping[str, FloatArray],
+    *,
+    pick: IntArray | None = None,
+    flag: AnyArray,
+    about: Mapping[str, Attribute | None],
+) -> list[Stream | None]:
+    """A stream per UE (RNTI, cell) where several were attached at once, else one: who attaches again gets a new RNTI.
+
+    Parameters
+    ----------
+    rows : Rows
+    kind, name : str
+        Of the stream; of several each name ends in ``_rnti<hex>``, of one RNTI in several cells in ``_pci<n>``.
+    values : mapping
+        Columns of shape (m,), ``rnti`` among them (NaN where the log names none).
+    pick : int array, shape (m,), optional
+        See :meth:`Rows.stream`.
+    flag : object array, shape (m,)
+    about : mapping
+        Attributes of all.
+
+    Returns
+    -------
+    list of Stream or None
+    """
+    pick, rnti = np.arange(len(rows)) if pick is None else pick, values["rnti"]
+    rnti = _identity(rnti, _MOST_RNTI)
+    parts: list[tuple[str, BoolArray, dict[str, Attribute | None]]] = [
+        (ue, mine, {"identity_from": "assumed"} if number is None else {"rnti": int(number)})
+        for ue, mine, number in _divided(name, np.ones(len(rnti), dtype=bool), rnti, "rnti{:04x}")
+    ]
+    if "pci" in values:  # two cells may give one RNTI at one time
+        parts = [
+            (cell, within, {**more, "pci": int(number)} if cell != ue and number is not None else more)
+            for ue, mine, more in parts
+            for cell, within, number in _divided(ue, mine, _identity(values["pci"], _MOST_PCI), "pci{}")
+        ]
+    return [
+        rows.stream(
+            kind, ue, {key: column[mine] for key, column in values.items()}, pick=pick[mine], flag=flag[mine],
+            about={**about, **more},
+        )
+        for ue, mine, more in parts
+    ]  # fmt: skip
+
+
+def _divided(name: str, where: BoolArray, column: FloatArray, label: str) -> list[tuple[str, BoolArray, float | None]]:
+    """Rows by the values of a column where several of these are there at once, with that value; else all as one."""
+    known = np.unique(column[where & np.isfinite(column)]).tolist()
+    if not _together([np.flatnonzero(where & (column == item))[[0, -1]] for item in known]):
+        return [(name, where, known[0] if len(known) == 1 else None)]
+    parts: list[tuple[str, BoolArray, float | None]] = [
+        (f"{name}_{label.format(int(item))}", where & (column == item), item) for item in known
+    ]
+    return [*parts, (name, where & np.isnan(column), None)]
+
+
+def _identity(numbers: FloatArray, most: int) -> FloatArray:
+    """Numbers that can be an identity, NaN for others: a fraction is none."""
+    return np.where((numbers >= 0) & (numbers <= most) & (numbers == np.round(numbers)), numbers, np.nan)
+
+
+# RNTIs have sixteen bits; programs print up to six hex digits.
+_MOST_RNTI, _MOST_PCI = 0xFFFFFF, 1007
+
+
+def _together(spans: list[IntArray]) -> bool:
+    """Check whether any two spans (first, last) overlap."""
+    ordered = sorted(spans, key=lambda span: int(span[0]))
+    return any(later[0] < earlier[1] for earlier, later in pairwise(ordered))
+
+
+Pattern = re.Pattern[bytes]
+BOM = rb"(?:\xef\xbb\xbf)?"
+
+
+def reader(
+    name: str,
+    title: str,
+    *,
+    kinds: tuple[Kind, ...],
+    sample: str,
+    row: Pattern | Callable[[bytes], Pattern],
+    streams: Callable[[Rows], Iterable[Stream | None]],
+    header: Pattern | None = None,
+    mark: Pattern | None = None,
+    torn: Pattern | None = None,
+    otherwise: str = "of another form than the format's rows (torn line?)",
+    fields: int = 0,
+    clock: str = "wall",
+    skip: Callable[[bytes, IntArray], BoolArray] | None = None,
+) -> Reader:
+    r"""A reader of lines that a pattern describes.
+
+    Parameters
+    ----------
+    name, title, kinds, sample
+        As of :class:`aerpaw_cmp.logs.readers.Reader`.
+    row : re.Pattern or callable
+        See :func:`aerpaw_cmp.logs.rows.matched`; a callable makes it of the beginning of the file (of its
+        header, say).
+    streams : callable
+        ``streams(rows)``: the streams of the rows; its docstring is the reader's.
+    header : re.Pattern, optional
+        The whole line above a table: a comment wherever it stands. A file is known by its first line where there is
+        one, by ``mark`` where there is one, else by most of its first lines being rows.
+    mark : re.Pattern, optional
+        MULTILINE; a line by which a console is known.
+    torn : re.Pattern, optional
+        How a row of a console begins: such a line that is no row is rejected, all other lines are talk. Without it
+        every line that is neither row nor header is rejected.
+    otherwise : str
+        Reason of rejected lines.
+    fields : int
+        Number of fields of a table: lines with others are rejected with their number.
+    clock : str
+        See :func:`aerpaw_cmp.logs.rows.times`.
+    skip : callable, optional
+        ``skip(data, lines)``: which of the matching lines (0-based) are comments after all.
+
+    Returns
+    -------
+    Reader
+    """
+
+    def reason(line: bytes) -> str | None:
+        if header is not None and header.fullmatch(line):
+            return None
+        if torn is not None:
+            return "an incomplete row (torn line?)" if torn.match(line) else None
+        count = line.count(b",") + 1
+        return f"{counted(count, 'field')}, expected {fields} (torn line?)" if fields not in (0, count) else otherwise
+
+    def read(data: bytes, options: ReadOptions) -> ReadResult:
+        pattern = row if isinstance(row, re.Pattern) else row(data)
+        left_out = None if skip is None else lambda lines: skip(data, lines)
+        rows = matched(data, pattern, options, reader=name, reason=reason, clock=clock, skip=left_out)
+        return rows.result(streams(rows))
+
+    def known(head: bytes) -> bool:
+        if header is not None:
+            return header.fullmatch(head[:4000].split(b"\n", 1)[0]) is not None
+        return _text.mostly(head, row) if isinstance(row, re.Pattern) else False
+
+    def marked(head: bytes) -> bool:
+        # an expression that begins with a line's start takes 5 ms of each MiB, and a KML gives it four of them
+        return mark is not None and not head.startswith(_text.MARKUP) and mark.search(head) is not None
+
+    return Reader(
+        name=name, title=title, kinds=kinds, sample=sample, sniff=known if mark is None else marked,
+        read=read,
+    )  # fmt: skip

@@ -1,0 +1,730 @@
+"""Lines of a text log, their clocks, and the frames that are made of them.
+
+Lines of a file as byte ranges, without making one Python object per line.
+
+The accounting law starts here: a line ends with LF (a CR before it belongs to the line end); a last text
+without LF is a line too; a file that ends with LF has no further, empty line.
+
+Wall clocks to UTC, once and with the zone named.
+
+AERPAW nodes write naive America/New_York time almost everywhere; some authors then stored that wall clock
+as if it were UTC. Every reader comes here, so the rule exists once.
+
+Frames of the record model from plain arrays.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta, timezone, tzinfo
+from functools import cached_property
+from typing import Any, NamedTuple
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+import pandas as pd
+
+from ..common.errors import UsageError
+from ..common.jsonable import named
+from ..common.text import counted
+from ..common.units import AnyArray, BoolArray, IntArray
+from .readers import ReadOptions
+from .records import COLUMNS, KEPT_REJECTED, Attribute, Kind, RejectedLine, RejectedReason, by_reason
+
+# Characters of a rejected line that are kept.
+TEXT_LIMIT = 500
+
+# Flag of a record in a last line without line end: its last field may be cut short.
+UNTERMINATED = "unterminated_line"
+
+
+# First bytes of a file of tags: no console or table.
+MARKUP = (b"<?xml", b"<kml", b"<gpx")
+
+# A decimal number of bounded length (bytes pattern, no group): what pandas' parser takes, see ``_table``.
+NUMBER = rb"[-+]?\d{1,400}(?:\.\d{0,400})?(?:[eE][-+]?\d{1,400})?"
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines of ``data``: line ``i`` (0-based) is ``data[starts[i]:ends[i]]``, its line end left out."""
+
+    data: bytes
+    starts: IntArray
+    ends: IntArray
+
+    def __len__(self) -> int:
+        """Count the lines."""
+        return len(self.starts)
+
+    @cached_property
+    def buffer(self) -> AnyArray:
+        """The bytes as a uint8 array."""
+        return np.frombuffer(self.data, dtype=np.uint8)
+
+    @property
+    def unterminated(self) -> bool:
+        """True if the last line lacks its line end."""
+        return bool(self.data) and not self.data.endswith(b"\n")
+
+    @cached_property
+    def blank(self) -> BoolArray:
+        """Mask of lines that hold white space only."""
+        empty = self.ends <= self.starts
+        # only short lines or those that begin with white space can be blank: few are looked at one by one
+        first = self.buffer[np.minimum(self.starts, max(len(self.data) - 1, 0))] if len(self) else np.empty(0, np.uint8)
+        for i in np.flatnonzero(
+            ~empty & ((first == 32) | (first == 9) | (first == 13) | (first == 11) | (first == 12))
+        ):
+            empty[i] = not self.data[self.starts[i] : self.ends[i]].strip()
+        return empty
+
+    def raw(self, i: int) -> bytes:
+        """Bytes of line ``i``."""
+        return self.data[self.starts[i] : self.ends[i]]
+
+    def number_at(self, offsets: Iterable[int]) -> IntArray:
+        """0-based lines in which bytes of the file lie."""
+        return np.searchsorted(self.starts, np.array([*offsets], dtype=np.int64), side="right") - 1
+
+    def text(self, i: int) -> str:
+        """Line ``i`` as text for people: at most ``TEXT_LIMIT`` characters, broken bytes replaced."""
+        piece = self.data[self.starts[i] : min(self.ends[i], self.starts[i] + 4 * TEXT_LIMIT)]
+        return piece.decode("utf-8", errors="replace")[:TEXT_LIMIT]
+
+    def reject(self, i: int, reason: str) -> RejectedLine:
+        """Line ``i`` as a rejected line."""
+        return RejectedLine(int(i) + 1, reason, self.text(i))
+
+    def reject_all(self, numbers: IntArray, reason: str) -> list[RejectedLine]:
+        """Several lines rejected for one reason."""
+        return [self.reject(int(i), reason) for i in numbers]
+
+    def fixed(self, numbers: IntArray, width: int) -> AnyArray:
+        """Bytes of equally long lines as a ``(len(numbers), width)`` uint8 array."""
+        if len(numbers) == 0:
+            return np.empty((0, width), dtype=np.uint8)
+        starts = self.starts[numbers]
+        stride = int(starts[1] - starts[0]) if len(numbers) > 1 else width
+        if (np.diff(starts) == stride).all():  # one block of equal lines: no gather, a view is enough
+            return np.lib.stride_tricks.as_strided(
+                self.buffer[starts[0] :], (len(numbers), width), (stride, 1), writeable=False
+            )
+        return np.asarray(self.buffer[starts[:, None] + np.arange(width)])
+
+
+# Bytes that a look at each byte takes at a time: they stay in the processor's cache.
+_SLICE = 1 << 17
+
+
+def _places(buffer: AnyArray, byte: int) -> IntArray:
+    """Places where a byte stands, shape (n,)."""
+    starts = range(0, len(buffer), _SLICE)
+    # slice by slice: a mask of a GiB would be a GiB
+    parts = [np.flatnonzero(buffer[first : first + _SLICE] == byte) + first for first in starts]
+    return np.concatenate([np.zeros(0, dtype=np.int64), *parts])
+
+
+def split(data: bytes) -> Lines:
+    r"""Cut a file into lines.
+
+    Examples
+    --------
+    >>> [bytes(split(b"a\r\n\nb").raw(i)) for i in range(3)]
+    [b'a', b'', b'b']
+    """
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    ends = _places(buffer, 10)
+    starts = np.empty(len(ends) + 1, dtype=np.int64)
+    starts[0] = 0
+    np.add(ends, 1, out=starts[1:])
+    if len(data) and data[-1] != 10:
+        ends = np.append(ends, len(data))
+    else:
+        starts = starts[:-1]
+    if len(ends) and b"\r" in data:
+        # an empty first line has nothing before it
+        before = buffer[np.maximum(ends - 1, 0)]
+        ends = np.where((ends > starts) & (before == 13), ends - 1, ends)
+    return Lines(data, starts, ends)
+
+
+def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tuple[bytes, ...]]]:
+    r"""Lines that the pattern describes, and its groups.
+
+    Parameters
+    ----------
+    pattern : re.Pattern
+        MULTILINE, from ``^`` to ``\\r?$``, unable to cross a line end, every repetition bounded.
+
+    Returns
+    -------
+    numbers : int array, shape (n,)
+        0-based numbers of the matching lines.
+    groups : list of tuple of bytes, length n
+        One tuple per line.
+    """
+    if b"\r\r" in lines.data:  # the pattern has room for one carriage return, a line's own is left out
+        tried = ((i, pattern.match(lines.raw(i))) for i in range(len(lines)))
+        hits = [(int(lines.starts[i]), hit.groups(b"")) for i, hit in tried if hit is not None]
+    else:
+        hits = [(hit.start(), hit.groups(b"")) for hit in pattern.finditer(lines.data)]
+    return np.searchsorted(lines.starts, np.array([at for at, _ in hits], dtype=np.int64)), [row for _, row in hits]
+
+
+class Rejects:
+    """Rejected lines of a log that is read in pieces: the first of them verbatim, all counted by reason."""
+
+    def __init__(self) -> None:
+        self.before = 0  # lines of the pieces in front of this one
+        self._first_lines: list[RejectedLine] = []
+        self._reasons: list[RejectedReason] = []
+
+    def add(self, lines: Lines, numbers: Sequence[int] | IntArray, reason: str) -> None:
+        """Lines (0-based) of a piece, for one reason; of each reason and piece the first are kept."""
+        if not len(numbers):
+            return
+        # numbers count from the first piece of the file
+        low, high = int(min(numbers)) + self.before + 1, int(max(numbers)) + self.before + 1
+        self._reasons.append(RejectedReason(reason, len(numbers), low, high))
+        # more come in the order of the file, but for the reasons of a piece
+        if len(self._first_lines) < 4 * KEPT_REJECTED:
+            for i in sorted(numbers)[:KEPT_REJECTED]:
+                self._first_lines.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
+
+    def add_line(self, number: int, reason: str, text: str) -> None:
+        """A line by its number from 1."""
+        self._reasons.append(RejectedReason(reason, 1, number, number))
+        if len(self._first_lines) < 8 * KEPT_REJECTED:
+            self._first_lines.append(RejectedLine(number, reason, text))
+
+    def result(self) -> tuple[tuple[RejectedLine, ...], tuple[RejectedReason, ...]]:
+        """The first of them in the order of the file, and the reasons."""
+        ordered = sorted(self._first_lines, key=lambda line: line.number)[:KEPT_REJECTED]
+        return tuple(ordered), by_reason(self._reasons)
+
+
+def remainder(
+    lines: Lines, accepted: IntArray, reason: Callable[[bytes], str | None], *, blank: IntArray | None = None
+) -> tuple[int, list[RejectedLine]]:
+    """Account for the lines that gave no record.
+
+    Parameters
+    ----------
+    lines : Lines
+    accepted : int array
+        0-based numbers of the lines that gave records.
+    reason : callable
+        Reason why a line is rejected, or None for a header or comment.
+    blank : int array, optional
+        0-based numbers already known to be headers or comments.
+
+    Returns
+    -------
+    blank : int
+    rejected : list of RejectedLine
+    """
+    unaccounted = np.ones(len(lines), dtype=bool)
+    unaccounted[accepted] = False
+    if not unaccounted.any() and blank is None:
+        return 0, []
+    known = lines.blank & unaccounted
+    if blank is not None:
+        known[blank] = True
+    count = int(known.sum())
+    rejected: list[RejectedLine] = []
+    for i in np.flatnonzero(unaccounted & ~known):
+        why = reason(lines.raw(int(i)))
+        if why is None:
+            count += 1
+        else:
+            rejected.append(lines.reject(int(i), why))
+    return count, rejected
+
+
+def columns(groups: list[tuple[bytes, ...]], count: int) -> list[AnyArray]:
+    """Groups by column, as fixed-width byte arrays."""
+    return [cells([group[i] for group in groups]) for i in range(count)]
+
+
+def cells(texts: Sequence[bytes]) -> AnyArray:
+    """Texts as an array of bytes; NumPy makes none of an empty list."""
+    return np.array(texts or [b""], dtype=np.bytes_)[: len(texts)]
+
+
+def numbers(column: AnyArray) -> AnyArray:
+    """Text of numbers to float64; empty text is NaN."""
+    if column.dtype.itemsize == 0 or len(column) == 0:
+        return np.full(len(column), np.nan)
+    # Python programs print None for what they do not know
+    return np.asarray(np.where((column == b"") | (column == b"None"), b"nan", column).astype(np.float64))
+
+
+def flags(count: int) -> AnyArray:
+    """Empty flag column."""
+    column = np.empty(count, dtype=object)
+    column.fill("")  # one object; np.full would make one per row
+    return column
+
+
+def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
+    """Add a reason where the mask holds, in place."""
+    if mask.any():
+        old = column[mask]
+        if (old != "").any():
+            column[mask] = [f"{text};{reason}" if text else reason for text in old]
+        else:
+            column[mask] = reason  # one object for all rows
+
+
+def first_lines(head: bytes, count: int = 40) -> list[bytes]:
+    """Complete, non-blank lines at the start of a file: what sniffers judge by."""
+    # enough for any forty lines of a log
+    pieces = head[:16_384].split(b"\n")
+    if len(head) > 16_384 or (len(pieces) > 1 and not head.endswith(b"\n")):
+        pieces = pieces[:-1]  # a cut line proves nothing
+    return [piece.rstrip(b"\r") for piece in pieces if piece.strip()][:count]
+
+
+def mostly(head: bytes, pattern: re.Pattern[bytes], *, skip: int = 0) -> bool:
+    """Check whether the pattern describes more than half of the first lines."""
+    lines = first_lines(head)[skip:]
+    return bool(lines) and 2 * sum(pattern.match(line) is not None for line in lines) > len(lines)
+
+
+_AMBIGUOUS = "ambiguous_local_time"
+_NONEXISTENT = "nonexistent_local_time"
+# Wall clock as AERPAW tools write it (bytes pattern, no group).
+TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
+# Optional offset behind :data:`TIME`.
+ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
+
+# Abbreviations of winter that people also write in summer, and those of several countries: hours east of UTC, and the
+# zone whose clock is turned.
+WINTER = {
+    "EST": ((-5.0, "America/New_York"),), "CST": ((-6.0, "America/Chicago"),), "MST": ((-7.0, "America/Denver"),),
+    "PST": ((-8.0, "America/Los_Angeles"),), "AKST": ((-9.0, "America/Anchorage"),), "CET": ((1.0, "Europe/Berlin"),),
+    "MEZ": ((1.0, "Europe/Berlin"),), "EET": ((2.0, "Europe/Athens"),), "WET": ((0.0, "Europe/Lisbon"),),
+    "AEST": ((10.0, "Australia/Sydney"),), "NZST": ((12.0, "Pacific/Auckland"),),
+    "IST": ((5.5, "Asia/Kolkata"), (1.0, "Europe/Dublin"), (2.0, "Asia/Jerusalem")),
+}  # fmt: skip
+
+
+class Count(NamedTuple):
+    """A unit that clocks count in: nanoseconds, what a column's name says, and the least count that is an epoch."""
+
+    ns: float
+    said: re.Pattern[str]
+    least_epoch: float
+
+
+# In the order in which a name is searched. 1e9 microseconds are a quarter of an hour of PX4's own clock, no epoch.
+COUNTS = {
+    "ns": Count(1.0, re.compile(r"\bn(s|sec|anos\w*)\b"), 1e18),
+    "us": Count(1e3, re.compile(r"(\b|time|stamp)(us|usec|micros\w*)\b"), 1e15),
+    "ms": Count(1e6, re.compile(r"(\b|time|stamp)ms\b|^m?sec$|millisecond"), 1e12),
+    "s": Count(1e9, re.compile(r" s$|^s$|\bsec(ond)?s\b"), 1e9),
+    "min": Count(6e10, re.compile(r"\bmin(ute)?s?\b"), math.inf),
+    "h": Count(3.6e12, re.compile(r" h$|^h$|\bh(ou)?rs?\b"), math.inf),
+}
+
+_BUCKET_S = 900  # no zone in use changes its offset within a quarter of an hour of wall clock
+_MONTH_DAYS = np.array([0, 31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
+
+
+@dataclass(frozen=True)
+class Instants:
+    """UTC times and what is doubtful about them.
+
+    Parameters
+    ----------
+    time : datetime64[ns] array, shape (n,)
+        UTC, naive.
+    ambiguous, nonexistent : bool array, shape (n,)
+        Wall clock read twice, or never, because of a change of the clock.
+    warnings : tuple of str
+        What the user should know.
+    zoned : bool
+        Do all texts carry an offset?
+    """
+
+    time: AnyArray
+    ambiguous: BoolArray
+    nonexistent: BoolArray
+    warnings: tuple[str, ...] = field(default=())
+    zoned: bool = False
+
+    def flag(self, column: AnyArray) -> None:
+        """Add the reasons to a flag column, in place."""
+        add_flag(column, self.ambiguous, _AMBIGUOUS)
+        add_flag(column, self.nonexistent, _NONEXISTENT)
+
+
+def zone(name: str | None, *, needed_by: str) -> tzinfo:
+    """The named zone; ``UsageError`` naming the key ``timezone:`` where there is none."""
+    if not name:
+        raise UsageError(
+            f"no time zone for the zone-less clock of {needed_by}",
+            expected="the key 'timezone:' or --timezone, e.g. America/New_York",
+            cause="the log writes local wall time without an offset",
+        )
+    if name.upper() == "UTC":  # needs no zone database
+        return timezone.utc
+    try:
+        return ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        from ..common.yamlfile import nearest_zone
+
+        near = nearest_zone(name)
+        raise UsageError(
+            f"unknown time zone {name!r}",
+            expected="an IANA name for 'timezone:' or --timezone, e.g. America/New_York",
+            cause=f"did you mean '{near}'?" if near else "a misspelt name, or no zone database on this machine",
+        ) from error
+
+
+def _offset_s(wall_s: int, where: tzinfo, fold: int) -> int:
+    try:
+        moment = datetime(1970, 1, 1) + timedelta(seconds=wall_s)
+        # fold 0 and 1 differ where the wall clock was twice, or never
+        offset = moment.replace(tzinfo=where, fold=fold).utcoffset()
+    except (OverflowError, ValueError):
+        return 0
+    # some zones had seconds before 1900
+    return 0 if offset is None else round(offset.total_seconds())
+
+
+def _offsets_s(buckets: IntArray, where: tzinfo, fold: int) -> IntArray:
+    return np.array([_offset_s(int(bucket) * _BUCKET_S, where, fold) for bucket in buckets.tolist()], dtype=np.int64)
+
+
+def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Instants:
+    """Wall clock of a zone to UTC.
+
+    A wall clock that exists twice is read as the first pass (daylight time) until the log's clock steps back by
+    half an hour or more, afterwards as the second; both are flagged. One that never existed is read
+    with the offset before the change, and flagged.
+
+    Parameters
+    ----------
+    wall_ns : int array, shape (n,)
+        Wall clock as nanoseconds since 1970-01-01 00:00 of the same wall.
+    name : str or None
+        IANA zone.
+    needed_by : str
+        Whose clock, for the message.
+
+    Raises
+    ------
+    UsageError
+        If the zone is missing or unknown, or a winter time asked for in summer.
+    """
+    where = zone(name, needed_by=needed_by)
+    starts, buckets, index = _runs(wall_ns)
+    first, second = (_offsets_s(buckets, where, fold) for fold in (0, 1))
+    hours, turned = WINTER.get(name or "", ((0.0, ""),))[0]
+    if turned and (first != _offsets_s(buckets, zone(turned, needed_by=needed_by), 0)).any():
+        raise UsageError(
+            f"{name} is a winter time, and times of {needed_by} lie in summer",
+            expected=f"timezone: {turned} (clocks are turned) or Etc/GMT{-hours:+.0f} (they are not)",
+        )
+    length = np.diff(np.append(starts, len(wall_ns)))
+    if np.array_equal(first, second):
+        return Instants(_minus(wall_ns, first[index], length), *np.zeros((2, len(wall_ns)), dtype=bool))
+    ambiguous = np.repeat((first > second)[index], length)
+    nonexistent = np.repeat((first < second)[index], length)
+    utc = _minus(wall_ns, first[index], length)
+    back = _first_step_back(wall_ns) if ambiguous.any() else len(wall_ns)
+    if back < len(wall_ns):
+        behind = ambiguous.copy()
+        behind[:back] = False
+        # the second pass is later by what the clock was turned
+        utc[behind] += np.repeat((first - second)[index], length)[behind].astype("timedelta64[s]")
+    warnings = []
+    if ambiguous.any():
+        warnings.append(
+            f"{counted(int(ambiguous.sum()), 'time')} in the hour that {name} had twice: read as daylight time "
+            f"until the log's clock steps back; flagged {_AMBIGUOUS}"
+        )
+    if nonexistent.any():
+        warnings.append(
+            f"{counted(int(nonexistent.sum()), 'time')} in the hour that {name} skipped (wrong zone?): {_NONEXISTENT}"
+        )
+    return Instants(utc, ambiguous, nonexistent, tuple(warnings))
+
+
+def _minus(wall_ns: IntArray, offset_s: IntArray, length: IntArray) -> AnyArray:
+    """UTC of wall clocks [ns] in runs of so many with one offset [s]; no more memory than the result."""
+    utc = np.repeat(offset_s * 1_000_000_000, length)
+    np.subtract(wall_ns, utc, out=utc)
+    return utc.view("datetime64[ns]")
+
+
+def _first_step_back(wall_ns: IntArray) -> int:
+    """Index behind the first step back by half an hour or more; the number of times where there is none."""
+    for first in range(0, len(wall_ns) - 1, _AT_ONCE):
+        whole_s = wall_ns[first : first + _AT_ONCE + 1] // 1_000_000_000
+        steps = np.flatnonzero(whole_s[1:] - whole_s[:-1] <= -1800)
+        if len(steps):
+            return first + int(steps[0]) + 1
+    return len(wall_ns)
+
+
+_AT_ONCE = 1 << 20
+
+
+def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Starts of runs of times within a quarter of an hour, the distinct quarters, and that of each run."""
+    if len(wall_ns) == 0:
+        none = np.zeros(0, dtype=np.int64)
+        return none, none, none
+    # one look into the zone's table for a quarter of an hour of rows
+    bucket = wall_ns // (_BUCKET_S * 1_000_000_000)
+    starts = np.flatnonzero(np.concatenate(([True], bucket[1:] != bucket[:-1])))
+    unique, index = np.unique(bucket[starts], return_inverse=True)
+    return starts, unique, index
+
+
+def wall_to_utc(wall_ns: IntArray, options: ReadOptions, *, needed_by: str) -> Instants:
+    """Zone-less clock to UTC under the options: local unless ``clock: utc`` says otherwise."""
+    if options.clock == "utc":
+        none = np.zeros(len(wall_ns), dtype=bool)
+        return Instants(wall_ns.astype("datetime64[ns]"), none, none)
+    return local_to_utc(wall_ns, options.timezone, needed_by=needed_by)
+
+
+def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
+    """Fixed-layout ``YYYY-mm-dd HH:MM:SS[.f...]`` to wall nanoseconds.
+
+    Parameters
+    ----------
+    cells : uint8 array, shape (n, 19) or (n, 20 + fraction)
+        One time per row; ``fraction`` digits behind the dot.
+
+    Returns
+    -------
+    wall_ns : int array, shape (n,)
+        Zero where invalid.
+    valid : bool array, shape (n,)
+        Is it a date of the calendar and a time of the day?
+    """
+    count = len(cells)
+    if count == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
+    # logs run forward: the date and the minute of a run of times are read once
+    # sixteen characters as two integers: two comparisons a row
+    half = np.ascontiguousarray(cells[:, :16]).view(np.uint64)
+    starts = np.flatnonzero(np.concatenate(([True], (half[1:, 0] != half[:-1, 0]) | (half[1:, 1] != half[:-1, 1]))))
+    length = np.diff(np.append(starts, count))
+    minute, dated = _minutes(cells[starts, :16])
+    valid = np.repeat(dated, length)
+    second, worst = integers(cells[:, 17:19])
+    # a leap second (60) is no second of datetime64
+    valid &= (worst <= 9) & (second < 60) & (cells[:, 16] == 58)
+    wall = np.repeat(minute, length) + second * np.int64(1_000_000_000)
+    if fraction:
+        part, worst = integers(cells[:, 20 : 20 + fraction])
+        valid &= (worst <= 9) & (cells[:, 19] == 46)
+        wall += part * np.int64(10 ** (9 - fraction))
+    wall[~valid] = 0
+    return wall, valid
+
+
+def integers(cells: AnyArray, base: int = 10) -> tuple[IntArray, AnyArray]:
+    """Digits, uint8 of shape (n, some), as whole numbers; second, the largest digit, above 9 where one is none."""
+    total, worst = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells), dtype=np.uint8)
+    for column in cells.T:
+        # what is no digit wraps to more than 9
+        digit = column - np.uint8(48)
+        np.maximum(worst, digit, out=worst)
+        total *= base
+        total += digit
+    return total, worst
+
+
+def _minutes(cells: AnyArray) -> tuple[IntArray, BoolArray]:
+    """``YYYY-mm-dd HH:MM``, uint8 of shape (n, 16), to wall nanoseconds, and whether it is such a minute."""
+    digit = cells[:, [0, 1, 2, 3, 5, 6, 8, 9, 11, 12, 14, 15]].T.astype(np.int32) - 48
+    valid = np.all((digit >= 0) & (digit <= 9), axis=0)
+    for place, allowed in ((4, b"-/"), (7, b"-/"), (10, b" T"), (13, b":")):
+        valid &= (cells[:, place] == allowed[0]) | (cells[:, place] == allowed[-1])
+    year = digit[0] * 1000 + digit[1] * 100 + digit[2] * 10 + digit[3]
+    month, day, hour, minute = (digit[i] * 10 + digit[i + 1] for i in (4, 6, 8, 10))
+    inside = np.clip(month, 1, 12)
+    leap = (year % 4 == 0) & ((year % 100 != 0) | (year % 400 == 0))
+    days = _MONTH_DAYS[inside] - ((inside == 2) & ~leap)
+    # datetime64[ns] spans 1678-2262; a log outside 1970-2261 is a clock that was never set
+    valid &= (year >= 1970) & (year <= 2261) & (month == inside) & (day >= 1) & (day <= days)
+    valid &= (hour < 24) & (minute < 60)
+    months = (year.astype(np.int64) - 1970) * 12 + inside - 1
+    date = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + day - 1
+    wall = (date * 86_400 + hour * 3600 + minute * 60) * 1_000_000_000
+    return np.where(valid, wall, 0), valid
+
+
+def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolArray]:
+    """Times as byte strings of mixed length (the form of :data:`TIME` + :data:`ZONE`).
+
+    Returns
+    -------
+    wall_ns, valid : arrays, shape (n,)
+        As :func:`parse_digits`.
+    offset_s : int array, shape (n,)
+        Offset written in the text, else 0.
+    zoned : bool array, shape (n,)
+        Does the text carry an offset?
+    """
+    count = len(column)
+    wall, offset = np.zeros((2, count), dtype=np.int64)
+    valid, zoned = np.zeros((2, count), dtype=bool)
+    # room for nine digits and an offset, so that every row can be cut at the same places
+    width = max(column.dtype.itemsize, 30)
+    cells = column.astype(f"S{width}").view(np.uint8).reshape(count, width)
+    digits = (cells[:, 20:29] >= 48) & (cells[:, 20:29] <= 57)
+    dotted = cells[:, 19] == 46
+    fraction = np.where(dotted, np.cumprod(digits, axis=1).sum(axis=1), 0)
+    for length in np.unique(fraction):
+        rows = np.flatnonzero(fraction == length)
+        end = 20 + int(length) if length else 19
+        wall[rows], valid[rows] = parse_digits(cells[rows, :end], int(length))
+        tail = column[rows].astype(f"S{width}").view(f"S{1}").reshape(len(rows), width)[:, end:]
+        tails = np.ascontiguousarray(tail).view(f"S{width - end}").ravel()
+        for text in set(tails.tolist()):  # one entry per distinct offset
+            seconds = _zone_s(text)
+            of_tail = rows[tails == text]
+            valid[of_tail] &= seconds is not None
+            offset[of_tail], zoned[of_tail] = seconds or 0, bool(text) and seconds is not None
+    wall[~valid] = 0
+    return wall, valid, offset, zoned
+
+
+def _zone_s(text: bytes) -> int | None:
+    if text in (b"", b"Z"):
+        return 0
+    match = re.fullmatch(rb"([+-])(\d\d):?(\d\d)", text)
+    if not match:
+        return None
+    seconds = int(match[2]) * 3600 + int(match[3]) * 60
+    return -seconds if match[1] == b"-" else seconds
+
+
+def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> tuple[Instants, BoolArray]:
+    """Times as text to UTC: an offset in the text wins, the rest is wall clock of the zone.
+
+    Returns
+    -------
+    instants : Instants
+    valid : bool array, shape (n,)
+        Times that are none are False, and 1970-01-01 in ``instants``.
+    """
+    wall, valid, offset, zoned = parse_texts(column)
+    naive = valid & ~zoned
+    if len(wall) and naive.all():
+        return wall_to_utc(wall, options, needed_by=needed_by), valid
+    utc = (wall - offset * 1_000_000_000).astype("datetime64[ns]")
+    ambiguous, nonexistent = np.zeros((2, len(wall)), dtype=bool)
+    if not naive.any():
+        return Instants(utc, ambiguous, nonexistent, zoned=bool(valid.any())), valid
+    zones = np.unique(offset[zoned & valid])
+    alike = (wall[naive] - zones[0] * 1_000_000_000).astype("datetime64[ns]") if len(zones) == 1 else None
+    if alike is not None and _beside(alike, utc[zoned & valid]):
+        # one program wrote them all: what some of its rows lack is what the others have
+        where = f"UTC {zones[0] / 3600:+g} h"
+        text = f"{counted(int(naive.sum()), 'time')} without a zone between times at {where}: read as at {where}, too"
+        utc[naive] = alike
+        return Instants(utc, ambiguous, nonexistent, (text,), zoned=True), valid
+    local = wall_to_utc(wall[naive], options, needed_by=needed_by)
+    utc[naive], ambiguous[naive], nonexistent[naive] = local.time, local.ambiguous, local.nonexistent
+    return Instants(utc, ambiguous, nonexistent, local.warnings), valid
+
+
+def _beside(times: AnyArray, others: AnyArray) -> bool:
+    """Check whether most times lie within a quarter of an hour of some others."""
+    ordered = np.sort(others)
+    at = np.searchsorted(ordered, times)
+    apart = [np.abs(times - ordered[place.clip(0, len(ordered) - 1)]) for place in (at - 1, at)]
+    return bool(np.median(np.minimum(*apart)) < np.timedelta64(_BUCKET_S, "s"))
+
+
+def origin_ns(options: ReadOptions, *, needed_by: str) -> int | None:
+    """``time_origin`` as UTC nanoseconds; None where the option is absent."""
+    if options.time_origin is None:
+        return None
+    text = str(options.time_origin).strip().encode()
+    instants, valid = texts_to_utc(np.array([text or b"-"]), options, needed_by=f"time_origin of {needed_by}")
+    if not valid[0]:
+        raise UsageError(
+            f"time_origin {options.time_origin!r} is no time",
+            expected="an ISO time such as 2024-07-02T15:37:10.5Z, or local time with 'timezone:'",
+        )
+    return int(instants.time.astype(np.int64)[0])
+
+
+_INTEGERS = ("fix", "satellites")
+
+
+def frame(
+    kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Mapping[str, AnyArray], *, own: bool = False
+) -> pd.DataFrame:
+    """Frame of a kind; columns that the log does not have are NaN (``fix`` and ``satellites``: -1).
+
+    Its columns are copies, each an array of its own: streams of one log share their times.
+
+    Parameters
+    ----------
+    kind : Kind
+    time : (n,)
+        datetime64[ns], UTC.
+    line : (n,)
+        Of the file, from 1.
+    flag : (n,)
+        Reasons, empty where there is none.
+    values : mapping of str to (n,)
+        Columns of the kind that the log has.
+    own : bool
+        Whether the arrays are given away: a log of 1 GB has no room for copies.
+
+    Returns
+    -------
+    pandas.DataFrame
+    """
+    array = np.asarray if own else np.array
+    count = len(time)
+    content: dict[str, Any] = {
+        "time": array(time, dtype="datetime64[ns]"),
+        "line": array(line, dtype=np.int64),
+        # object, not pandas' string type: no scan of the column, the same on every pandas
+        "flag": pd.Series(array(flag, dtype=object), dtype=object, copy=False),
+    }
+    for name in COLUMNS[kind]:
+        if name in _INTEGERS:
+            content[name] = array(values[name], dtype=np.int64) if name in values else np.full(count, -1)
+        else:
+            content[name] = array(values[name], dtype=np.float64) if name in values else np.full(count, np.nan)
+    for name, column in values.items():
+        if name not in content:
+            # a copy: the same array may serve several streams
+            content[name] = np.array(column)
+    columns: pd.DataFrame = pd.DataFrame(content, copy=False)
+    return columns
+
+
+def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Attribute]:
+    """Attributes from the options, then those of the reader; what is unknown is left out."""
+    merged: dict[str, Attribute | None] = {**named(options, "node channel frequency_hz timezone"), **extra}
+    return {name: value for name, value in merged.items() if value is not None}
+
+
+def steps_back(records: pd.DataFrame) -> int:
+    """Number of places where the clock of a log runs backwards."""
+    time = records["time"].to_numpy()
+    # NaT compares as False
+    return int(np.count_nonzero(time[1:] < time[:-1]))
+
+
+def back_in_time(places: int) -> list[str]:
+    """Warning where there are any."""
+    return [f"time steps back at {counted(places, 'place')}"] if places else []

@@ -1,1 +1,0 @@
-"""Lines, rows and clocks of text logs."""

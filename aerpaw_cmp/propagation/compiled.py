@@ -1,0 +1,223 @@
+"""Use of compiled kernels: the choice whether they run, the folder that keeps them, threads.
+
+numba is optional (extra ``fast``). Importing it and reading compiled code takes about a second, compiling it once a
+machine ten to thirty. So a job is compiled where NumPy would take longer than that: the estimated seconds of all jobs
+of a process decide, and a first report never waits for a compiler. ``AERPAW_CMP_COMPILED`` decides otherwise: ``auto``,
+``never`` or ``always``.
+
+numba's cache on disk notices a change in the file of a kernel alone: laws and constants that a kernel takes from
+another file would stay as they were compiled. So the folder is named by a hash of every source of compiled code.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+import warnings
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from hashlib import sha256
+from importlib import import_module
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.files import cache_folder
+from ..common.units import AnyArray
+
+ROOM = Path(__file__).parents[1]
+SWITCH = "AERPAW_CMP_COMPILED"
+FIELD, BEAMS = "propagation.field.kernels", "propagation.search.beams"
+# Files of kernels, and those whose functions and constants they take in.
+SOURCES = tuple(
+    f"propagation/{name}.py" for name in (
+        "field/dyads", "field/fresnel", "field/kernels", "search/beams", "search/merging",
+        "search/mirror", "compiled", "numba_options",
+    )
+)  # fmt: skip
+
+# CPU seconds of the first compilation on a machine.
+COMPILE_S = {FIELD: 10.0, BEAMS: 25.0}
+# CPU seconds of NumPy from which numba's import and reading what was compiled before pay off.
+READ_S = 0.4
+# A job that NumPy does in less stays there, whatever is loaded.
+LEAST_S = 0.25
+
+# CPU seconds of NumPy per element pair of a link (``benchmarks/replay.py``).
+FIELD_S = 6e-7
+# CPU seconds of NumPy per link and face, sequences of two reflections: 2.2 s in a map of 12 780 links, 245 faces and
+# ten heights, which with numba took 1.6 s and 110 MiB more.
+MIRRORS_S = 7e-8
+
+# Estimated seconds of this process so far.
+_in_numpy_s = dict.fromkeys(COMPILE_S, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Compiled code, or why there is none."""
+
+    kernels: ModuleType | None
+    reason: str
+
+
+def switch() -> str:
+    """The value of ``AERPAW_CMP_COMPILED``.
+
+    Raises
+    ------
+    UsageError
+        If it is none of those known.
+    """
+    value = os.environ.get(SWITCH, "auto").strip().lower() or "auto"
+    if value not in ("auto", "never", "always"):
+        raise UsageError(f"{SWITCH}={value}", expected="auto, never or always")
+    return value
+
+
+def _source_hash() -> str:
+    """Hash of the sources, of numba's version and of Python's."""
+    # machine code of another numba or Python is another, and may not be loadable
+    digest = sha256(f"{version('numba')} {sys.version_info[:3]}".encode())
+    for name in SOURCES:
+        digest.update((ROOM / name).read_bytes())
+    return digest.hexdigest()[:16]
+
+
+@lru_cache(maxsize=1)
+def code_folder() -> Path | None:
+    """Folder of compiled code, this user's alone: in ``NUMBA_CACHE_DIR``, the package or the user's cache; or None."""
+    named = os.environ.get("NUMBA_CACHE_DIR")
+    for base in (Path(named),) if named else (ROOM / "__pycache__", cache_folder("compiled")):
+        folder = base / f"kernels-{_source_hash()}"
+        try:
+            folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+            # in a folder that others can write to, anybody could leave code for us to run
+            if not _is_private(folder.stat()):
+                continue
+            # trying is the only sure way: rights, quotas and read-only mounts look alike
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            continue
+    return None
+
+
+def _is_private(status: os.stat_result) -> bool:
+    """Check whether nobody but this user can write in a folder: what is in it will be run."""
+    return not hasattr(os, "geteuid") or (status.st_uid == os.geteuid() and not status.st_mode & 0o022)
+
+
+def kernels_for(pairs: int, work: int = 0) -> ModuleType | None:
+    """Compiled kernels of the field, or None: so many element pairs of links are too few, or they fail.
+
+    ``work`` is that of the job that these pairs are a part of.
+    """
+    return _worth(FIELD, pairs * FIELD_S, work * FIELD_S)
+
+
+def beams_for(links: int, faces: int) -> bool:
+    """Check whether compiled beams are worth it where mirror images in NumPy would do as well."""
+    return _worth(BEAMS, links * faces * MIRRORS_S) is not None
+
+
+def beams() -> State:
+    """The search among thousands of faces (:mod:`aerpaw_cmp.propagation.search.beams`), or why it cannot run."""
+    if switch() == "never":
+        return State(None, f"{SWITCH}=never")
+    return load(BEAMS)
+
+
+def _worth(name: str, numpy_s: float, job_s: float = 0.0) -> ModuleType | None:
+    """Compiled code for (a part of) a job that takes NumPy so many CPU seconds; None where that is quicker."""
+    chosen = switch()
+    _in_numpy_s[name] += numpy_s  # many small jobs of one process are a large one
+    # a job in parts is judged as a whole: no part alone would be worth a compiler
+    job_s = max(job_s, numpy_s)
+    if chosen == "never" or (chosen == "auto" and (job_s < LEAST_S or max(job_s, _in_numpy_s[name]) < _cost_s(name))):
+        return None
+    state = load(name)
+    if state.kernels is None and (chosen == "always" or find_spec("numba") is not None):
+        warn_once(state.reason)
+    return state.kernels
+
+
+def _cost_s(name: str) -> float:
+    """CPU seconds until compiled code runs: it is loaded, kept on disk, or has to be compiled."""
+    # loaded already: nothing left to pay
+    if f"aerpaw_cmp.{name}" in sys.modules:
+        return LEAST_S
+    folder = code_folder() if find_spec("numba") else None
+    return READ_S if folder is not None and (folder / f"{name}.compiled").exists() else COMPILE_S[name]
+
+
+@lru_cache(maxsize=4)
+def load(name: str) -> State:
+    """Import kernels and try them; whatever goes wrong there is a reason to do without, not an error.
+
+    A broken installation shows itself in many ways (no LLVM for this processor, a NumPy too new, a cache cut short),
+    and NumPy gives the same answer.
+    """
+    if find_spec("numba") is None:
+        return State(None, "numba is not installed (pip install 'aerpaw-cmp[fast]')")
+    if os.path.lexists(".numba_config.yaml"):  # it names files that numba then writes: a stranger's, it may be
+        return State(None, "the working folder holds a .numba_config.yaml, which numba would obey")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numba's own, about its cache
+            kernels = import_module(f"aerpaw_cmp.{name}")
+            # a broken LLVM shows itself when something is compiled, not on import
+            kernels.try_out()
+            if (folder := code_folder()) is not None:
+                (folder / f"{name}.compiled").touch()
+    except Exception as error:
+        line = (str(error).splitlines() or [""])[0]
+        return State(None, f"compiled code cannot run ({type(error).__name__}: {line})")
+    return State(kernels, "")
+
+
+@lru_cache(maxsize=1)
+def warn_once(reason: str) -> None:
+    """Say why compiled code is not there."""
+    warnings.warn(f"{reason}: the job runs in NumPy, up to ten times slower", RuntimeWarning, stacklevel=4)
+
+
+def thread_count() -> int:
+    """Threads to use: the cores that this process may use."""
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS and Windows
+        return os.cpu_count() or 1
+
+
+def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int) -> list[Any]:
+    """``call`` of each part, results in order; kernels release the interpreter's lock.
+
+    No thread stays: what is forked later has none.
+    """
+    parts = list(parts)
+    count = min(threads, len(parts))
+    if count < 2:
+        return [call(part) for part in parts]
+    # threads suffice: kernels let go of the interpreter's lock
+    with ThreadPoolExecutor(count) as pool:
+        waiting = [pool.submit(call, part) for part in parts]
+        try:
+            return [each.result() for each in waiting]
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+
+
+def column(values: AnyArray, kind: Any = np.float64) -> AnyArray:
+    """An array as kernels take it: of one type, contiguous, writable (a read-only one would be compiled for anew)."""
+    # numba compiles anew for every layout, and for what is read-only
+    return np.require(values, kind, ["C", "W"])

@@ -1,0 +1,495 @@
+"""Drivers that rerun the stages of a replay: element pairs, a tower that moves, parts of a long flight.
+
+A replay in parts of its poses, put together again: bounds the memory of long flights.
+
+A replay whose tower moves, too: a rover or a second UAV with its own place at every pose.
+
+Every place of the node is a source of its own, so nothing is approximated: the poses are taken in blocks of a few
+places, each place a tower that has links to its own poses alone. Poses at one and the same place share a tower, so a
+node that stands still is replayed as a fixed tower is, bit by bit.
+
+Channels of many antenna geometries at once, on line of sight and ground reflection.
+
+Which way a modem's antennas point and how its ports are slanted is hardly ever written down. Trying thousands of
+geometries takes no thousand replays: the field of an element slanted by ``s`` is ``cos s`` times that of a vertical
+plus ``sin s`` times that of a horizontal one at the same place, so one evaluation with both at every port
+(:func:`aerpaw_cmp.propagation.field.sum.of_one_depth`, float64, every pair of elements) serves all slants, and the
+ground reflection is one ray that is added at any strength.
+
+The rank that a modem reports is for its whole band. Over 100 MHz the ground ray turns against the direct one by about a
+cycle where the two differ by 3 m, so beside the coherent sum at the carrier there is the power sum
+``L L^H + g^2 G G^H`` over the receiving ports, whose eigenvalues are the squares of the singular values in the mean.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import groupby, product
+from typing import Any, Literal
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.text import counted
+from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
+from ..site.site import Site, Tower
+from .field.fresnel import FaceMaterials
+from .field.geometry import Elements, geometry
+from .field.sum import PAIRS_PER_CHUNK, of_one_depth, pattern_ends
+from .geometry import Array, Faces, Link, PathSet, Poses, RowsT, joined, rotation_from_yaw_pitch_roll
+from .options import Field, Job, Progress, Run, Search
+from .replay import PER_LINK, Ends, Replay, replay
+from .scene import Omission
+
+
+def replay_in_parts(
+    site: Site, link: Link, poses: Poses, search: Search, field: Field, run: Run, *, size: int
+) -> Replay:
+    """Replay at most ``size`` poses at once.
+
+    Parameters
+    ----------
+    site, link, poses, search, field, run
+        As for :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
+    size : int
+        Most poses of a part; the parts are of about one size.
+
+    Returns
+    -------
+    Replay
+        That of all poses at once.
+    """
+    rows = np.array_split(np.arange(len(poses)), max(1, -(-len(poses) // size)))
+    if len(rows) == 1:
+        return replay(site, link, poses, search, field, run)
+    links = len(poses) * len(link.tower_arrays)
+    pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
+    # each part would count from 0 to 1 again
+    progress, run = run.progress, replace(run, progress=None, job=Job.of(poses.position_m, links, pairs))
+
+    def of(at: IntArray) -> Replay:
+        return replay(site, link, poses[at], search, field, run)
+
+    result = in_turn(rows, map(of, rows), progress)
+    return replace(result, ends=replace(result.ends, poses=poses))
+
+
+def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | None) -> Replay:
+    """One replay of parts that are made as they are asked for; ``rows`` are their poses."""
+    replays: list[Replay] = []
+    finished, count = 0, max(1, sum(map(len, rows)))
+    for at, part in zip(rows, parts, strict=True):
+        replays.append(part)
+        finished += len(at)
+        if progress is not None:
+            progress(finished / count)
+    return _put_together(replays, rows)
+
+
+def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
+    """One replay of parts, poses in their order; the parts are taken apart, so that memory holds them once."""
+    first, count = parts[0], sum(map(len, rows))
+    # planes of terrain are numbered as they are met: other blocks have others
+    faces, shifted = _joined_faces(parts)
+    pieces = [shifted, *zip(*(part.further for part in parts), strict=True)]
+    further: dict[str, Any] = {
+        "faces": faces,
+        "seconds": sum(part.seconds for part in parts),
+        "search_seconds": sum(part.search_seconds for part in parts),
+        "omitted": added_up(item for part in parts for item in part.omitted),
+        "contributions": tuple(_in_flight(piece, rows) for piece in pieces),
+    }
+    columns = {name: [getattr(part, name) for part in parts] for name in PER_LINK}
+    parts.clear()
+    arrays: dict[str, Any] = {}
+    # one array at a time, whose parts are freed before the next: the peak is one array more
+    for name in PER_LINK:
+        values = columns.pop(name)
+        arrays[name] = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
+        for at, value in zip(rows, values, strict=True):
+            arrays[name][at] = value
+    return replace(first, **arrays, **further)
+
+
+def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
+    """Paths of all parts as one set: their poses are numbered as in the flight, and in order."""
+    numbered = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]  # type: ignore[type-var]
+    paths = numbered[0].one_after_another(numbered)
+    # stable: within a pose the order by tower, depth and faces stays
+    return paths.select(np.argsort(paths.pose, kind="stable")) if (np.diff(paths.pose) < 0).any() else paths
+
+
+def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
+    """Faces of all blocks and their paths over them; faces that all blocks share are held once."""
+    common = min(_shared(parts[0].faces, part.faces) for part in parts)
+    if all(len(part.faces) == common for part in parts):
+        return parts[0].faces, [part.paths for part in parts]
+    faces, out = parts[0].faces.select(np.arange(common)), []
+    for part in parts:
+        shift = len(faces) - common
+        numbers = part.paths.faces
+        out.append(replace(part.paths, faces=np.where(numbers >= common, numbers + shift, numbers)))
+        faces = joined(faces, part.faces.select(np.arange(common, len(part.faces))))
+    return faces, out
+
+
+def _shared(first: Faces, second: Faces) -> int:
+    """Number of faces, from the first on, that are the same in both."""
+    count = min(len(first), len(second))
+    same = (first.normal[:count] == second.normal[:count]).all(axis=1)
+    same &= first.offset_m[:count] == second.offset_m[:count]
+    # faces of two buildings may lie in one plane, and are two
+    same &= np.array([a == b for a, b in zip(first.label, second.label, strict=False)], dtype=np.bool_)
+    # argmin of booleans is the first that differs
+    return count if same.all() else int(np.argmin(same))
+
+
+def added_up(omissions: Iterable[Omission]) -> list[Omission]:
+    """Omissions of the parts of a replay, each once, counts added up."""
+    added: dict[tuple[str, str], Omission] = {}
+    for item in omissions:
+        key = item.tower, item.what
+        before = added.get(key)
+        counts = item.counts if before is None else tuple(map(sum, zip(before.counts, item.counts, strict=True)))
+        added[key] = replace(item, counts=counts)
+    return list(added.values())
+
+
+# Places of a node in one block: H of a block has this many times the links that count.
+PLACES_AT_ONCE = 64
+
+# Links (poses times places) of a block: some 4 MB of H with 4 x 4 elements.
+LINKS_AT_ONCE = 16_384
+
+# Element pairs that NumPy evaluates in the time of one pose with a source of its own.
+WORK_PER_POSE = 200
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """Poses (rows of the flight) and their places: ``place`` (rows,) indexes ``places_m`` (places, 3)."""
+
+    rows: IntArray
+    places_m: FloatArray
+    place: IntArray
+
+
+def _blocks(sources_m: FloatArray) -> Iterator[_Block]:
+    """Poses in blocks, in the order in which their places first occur."""
+    unique, first, member = np.unique(sources_m, axis=0, return_index=True, return_inverse=True)
+    # unique sorts places by coordinate; blocks follow the flight
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    place, places_m = rank[member.ravel()], unique[order]
+    rows = np.argsort(place, kind="stable")
+    count = np.bincount(place, minlength=len(order))
+    ends = np.cumsum(count)
+    start = 0
+    while start < len(order):
+        stop = start + 1
+        before = ends[start] - count[start]
+        while (
+            stop < len(order)
+            and stop - start < PLACES_AT_ONCE
+            and (ends[stop] - before) * (stop + 1 - start) <= LINKS_AT_ONCE
+        ):
+            stop += 1
+        some = rows[before : ends[stop - 1]]
+        yield _Block(some, places_m[start:stop], place[some] - start)
+        start = stop
+
+
+def site_with_tower_at(site: Site, tower: str, place_m: AnyArray) -> Site:
+    """The site with a tower's array at a place (3,) [m], above the ground that it had."""
+    return replace(site, towers={**site.towers, tower: _moved(site, site.towers[tower], tower, place_m)})
+
+
+def _moved(site: Site, tower: Tower, name: str, place_m: AnyArray) -> Tower:
+    east, north, up = (float(x) for x in place_m)
+    latitude, longitude = site.frame.to_geographic(np.array([east]), np.array([north]))
+    return replace(
+        tower,
+        name=name,
+        latitude_deg=float(latitude[0]),
+        longitude_deg=float(longitude[0]),
+        east_m=east,
+        north_m=north,
+        antenna_height_m=up - tower.ground_m,
+    )
+
+
+def replay_moving(
+    site: Site, link: Link, poses: Poses, sources_m: FloatArray,
+    search: Search = Search(), field: Field = Field(), run: Run = Run(),
+) -> Replay:  # fmt: skip
+    """Replay a flight against one tower that has a place of its own at every pose.
+
+    Parameters
+    ----------
+    site : Site
+    link : Link
+        With one tower; its array keeps its orientation in the site.
+    poses : Poses
+    sources_m : (poses, 3)
+        Centre of the tower's array at each pose, east, north, up [m].
+    search, field, run
+        As for :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
+
+    Returns
+    -------
+    Replay
+        As of one tower. ``paths`` run from the place that the tower had at their pose.
+
+    Raises
+    ------
+    UsageError
+        Another engine than ``image``, more than one tower; what :func:`replay` raises.
+
+    Notes
+    -----
+    Exact: each pose is traced from its own place. Paths and fields are those of a fixed tower there.
+    """
+    if len(link.tower_arrays) != 1:
+        raise UsageError(
+            f"{counted(len(link.tower_arrays), 'tower')} in a link whose tower moves",
+            expected="one tower: links of their own",
+        )
+    (name,) = link.tower_arrays
+    if search.engine != "image":
+        raise UsageError(
+            f"towers.{name} moves and the engine is {search.engine!r}",
+            expected="rt.engine: image (or --engine image)",
+            cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
+        )
+    progress, run = run.progress, replace(run, progress=None)
+    blocks = list(_blocks(sources_m))
+    if not blocks:
+        return replay(site, link, poses, search, field, run)
+    if len(blocks) > 1:
+        run = replace(run, job=_shared_by_blocks(link, poses, sources_m))
+
+    def of(block: _Block) -> Replay:
+        moved_site, several, some, links = _scene_of(site, link, name, poses, block)
+        return _of_one_tower(replay(moved_site, several, some, replace(search, links=links), field, run), name, block)
+
+    # lazily: a block is traced when it is put in, so one scene is alive at a time
+    result = in_turn([block.rows for block in blocks], map(of, blocks), progress)
+    return replace(result, ends=Ends(link, poses, sources_m[:, None], field))
+
+
+def _shared_by_blocks(link: Link, poses: Poses, sources_m: FloatArray) -> Job:
+    """Properties of all blocks that each must know: one tolerance, and whether compiled code is worth loading."""
+    pairs = len(poses) * len(link.uav_array) * sum(map(len, link.tower_arrays.values()))
+    points = np.concatenate([poses.position_m, sources_m])
+    return Job.of(points, 0, pairs * WORK_PER_POSE)  # each place has few faces in reach: mirror images
+
+
+def _scene_of(
+    site: Site, link: Link, name: str, poses: Poses, block: _Block
+) -> tuple[Site, Link, Poses, BoolArray | None]:
+    """Site, link and poses of a block, each place a tower; which links count."""
+    # one place keeps the tower's own name, so that it is replayed as a fixed tower is
+    names = [name] if len(block.places_m) == 1 else [f"{name}@{i}" for i in range(len(block.places_m))]
+    towers = {n: _moved(site, site.towers[name], n, at) for n, at in zip(names, block.places_m, strict=True)}
+    moved_site = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
+    several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
+    some = poses[block.rows]
+    # each place has links to its own poses alone: all others would be searched for nothing
+    links = None if len(names) == 1 else np.arange(len(names))[:, None] == block.place[None, :]
+    return moved_site, several, some, links
+
+
+def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
+    """Replay of a block as of one tower, which had its own place at each pose."""
+    row = np.arange(len(block.rows))
+
+    def at_place(values: AnyArray) -> AnyArray:
+        return np.ascontiguousarray(values[row, block.place][:, None])
+
+    columns: dict[str, Any] = {name: at_place(getattr(replayed, name)) for name in PER_LINK}
+    return replace(
+        replayed,
+        **columns,
+        contributions=tuple(replace(some, tower=np.zeros_like(some.tower)) for some in replayed.contributions),
+        towers=(name,),
+        omitted=[replace(item, tower=name if item.tower else "") for item in replayed.omitted],
+    )
+
+
+# How the ground ray is added to the direct one.
+Ground = Literal["coherent", "power_sum"]
+
+# The default ground of a site; its strength is what the search fits.
+_GROUND_MATERIAL = "itu_medium_dry_ground"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Geometry:
+    """One way the antennas may hang.
+
+    Parameters
+    ----------
+    uav_yaw_deg, uav_pitch_deg, uav_roll_deg : float
+        Mount of the UAV's array in its carrier: body, or site axes where no attitude is known.
+    tower_slant_deg, uav_slant_deg : tuple of float
+        Per port; 0 vertical.
+    ground : float
+        Amplitude factor on the ground reflection: 1 that of a smooth half-space, 0 none.
+    sum : {"coherent", "power_sum"}
+    """
+
+    uav_yaw_deg: float
+    uav_pitch_deg: float
+    uav_roll_deg: float
+    tower_slant_deg: tuple[float, ...]
+    uav_slant_deg: tuple[float, ...]
+    ground: float
+    sum: Ground = "power_sum"
+
+    @property
+    def mount_deg(self) -> tuple[float, float, float]:
+        """Yaw, pitch and roll."""
+        return self.uav_yaw_deg, self.uav_pitch_deg, self.uav_roll_deg
+
+    def in_words(self) -> str:
+        """For tables."""
+        slants = "/".join(f"{s:g}" for s in self.uav_slant_deg)
+        tower = "/".join(f"{s:g}" for s in self.tower_slant_deg)
+        turn = f"yaw {self.uav_yaw_deg:g}, pitch {self.uav_pitch_deg:g}, roll {self.uav_roll_deg:g} deg"
+        return f"{turn}; slants UAV {slants}, tower {tower}; ground x {self.ground:g} ({self.sum.replace('_', ' ')})"
+
+
+def every_geometry(
+    mounts_deg: Sequence[tuple[float, float, float]],
+    tower_slants_deg: Sequence[tuple[float, ...]],
+    uav_slants_deg: Sequence[tuple[float, ...]],
+    grounds: Sequence[float],
+    sums: Sequence[Ground] = ("power_sum",),
+) -> tuple[Geometry, ...]:
+    """All combinations; mounts are (yaw, pitch, roll). Geometries of one mount follow each other.
+
+    Parameters
+    ----------
+    mounts_deg : sequence of (yaw, pitch, roll)
+        Of the UAV's array [deg].
+    tower_slants_deg, uav_slants_deg : sequence of tuple of float
+        Polarisation of each port from vertical [deg].
+    grounds : sequence of float
+        Strength of the ground reflection against Fresnel's.
+    sums : sequence of {"power_sum", "coherent", ...}
+        How the two rays add up.
+
+    Returns
+    -------
+    tuple of Geometry
+    """
+    return tuple(
+        Geometry(
+            uav_yaw_deg=yaw, uav_pitch_deg=pitch, uav_roll_deg=roll, tower_slant_deg=tower, uav_slant_deg=uav,
+            ground=ground, sum=how,
+        )
+        for (yaw, pitch, roll), tower, uav, how, ground in product(
+            mounts_deg, tower_slants_deg, uav_slants_deg, sums, grounds
+        )
+    )  # fmt: skip
+
+
+def singular_values_of(
+    geometries: Sequence[Geometry],
+    tower: Array,
+    tower_m: FloatArray,
+    uav: Array,
+    poses: Poses,
+    carrier_hz: float,
+) -> Iterator[FloatArray]:
+    """Singular values (n, ports) of each geometry, absolute, descending.
+
+    Parameters
+    ----------
+    geometries : sequence of Geometry
+        In runs of one mount: each run costs one evaluation of the field, two with the ground.
+    tower : Array
+        Positions, pattern and mount; its slants are those of the geometry.
+    tower_m : (3,)
+        Array centre, east, north, up over flat ground at 0 [m].
+    uav : Array
+        Positions and pattern; slants and mount are those of the geometry.
+    poses : Poses
+    carrier_hz : float
+
+    Yields
+    ------
+    (n, ports)
+        Of the next geometry.
+
+    Notes
+    -----
+    Over receiving ports at the UAV. With the power sum they are the roots of the eigenvalues of ``L L^H + g^2 G G^H``:
+    the mean of ``H H^H`` over a band in which the ground ray takes all phases against the direct one.
+    """
+    runs = [(mount, list(run)) for mount, run in groupby(geometries, lambda g: g.mount_deg)]
+    for mount, run in runs:
+        turned = dataclasses.replace(uav, mount=np.asarray(rotation_from_yaw_pitch_roll(*map(np.radians, mount))))
+        fields = basis_fields(tower, tower_m, turned, poses, carrier_hz, any(g.ground for g in run))
+        for g in run:
+            los, ground = (slanted(field, g.uav_slant_deg, g.tower_slant_deg) for field in fields)
+            ground *= g.ground
+            coherent = g.sum == "coherent"
+            yield np.asarray(np.linalg.svd(los + ground, compute_uv=False)) if coherent else _of_power_sum(los, ground)
+
+
+def _of_power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
+    covariance = sum(field @ field.conj().swapaxes(-1, -2) for field in (los, ground))
+    # the eigenvalues of a Hermitian matrix come ascending; rounding leaves the zero ones slightly negative
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., ::-1], 0.0)))
+
+
+def basis_fields(
+    tower: Array, tower_m: FloatArray, uav: Array, poses: Poses, carrier_hz: float, with_ground: bool = True
+) -> tuple[ComplexArray, ComplexArray]:
+    """Channel matrices of line of sight and of the ground reflection alone, ports vertical and horizontal.
+
+    Parameters
+    ----------
+    tower, uav : Array
+        Slants do not count.
+    tower_m : (3,)
+        [m].
+    poses : Poses
+    carrier_hz : float
+    with_ground : bool
+        Otherwise the second is all zeros.
+
+    Returns
+    -------
+    direct, bounced : (2, 2, n, uav ports, tower ports) complex
+        Vertical, then horizontal, at the UAV and at the tower: :func:`slanted` combines them.
+    """
+    link, wavelength = Link(carrier_hz, {"tower": tower}, uav, uav_transmits=False), wavelength_m(carrier_hz)
+    faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (_GROUND_MATERIAL,), ("ground",))
+    table, elements = FaceMaterials.of(faces, carrier_hz).table(wavelength), Elements.of(link)
+    n, ports = len(poses), (len(uav), len(tower))
+    index, zero, step = np.arange(n), np.zeros(n, dtype=np.int64), max(1, PAIRS_PER_CHUNK // (len(uav) * len(tower)))
+    # cosine and sine of the two slants, against (tower's slant, paths, pairs) and (UAV's, tower's, paths, pairs)
+    upright, level = np.array([1.0, 0.0]), np.array([0.0, 1.0])
+    slants = [(upright.reshape(shape), level.reshape(shape)) for shape in ((2, 1, 1), (2, 1, 1, 1))]
+    fields = np.zeros((2, 2, 2, n, *ports), dtype=np.complex128)
+    for depth in (0, 1) if with_ground else (0,):
+        # the reflection point is NaN: the field asks for images alone, never for points
+        path = PathSet(index, zero, zero + depth, np.full((n, 1), depth - 1), np.full((n, 1, 3), np.nan))
+        columns = geometry(path, faces, table, np.asarray(tower_m)[None, :], poses, link)
+        for start in range(0, n, step):
+            some = columns.some(slice(start, start + step))
+            parts = of_one_depth(some, elements, pattern_ends(some, elements, link), (slants[0], slants[1]), wavelength)
+            fields[depth, :, :, start : start + step] = parts.view(np.complex128).reshape(2, 2, -1, *ports)
+    return fields[0], fields[1]
+
+
+def slanted(field: ComplexArray, uav_slant_deg: Sequence[float], tower_slant_deg: Sequence[float]) -> ComplexArray:
+    """Channel matrices (n, uav ports, tower ports) of :func:`basis_fields` for slants of the ports [deg]."""
+    at_uav, at_tower = (np.radians(slant) for slant in (uav_slant_deg, tower_slant_deg))
+    upright, level = field[:, 0] * np.cos(at_tower) + field[:, 1] * np.sin(at_tower)
+    return np.asarray(np.cos(at_uav)[:, None] * upright + np.sin(at_uav)[:, None] * level)

@@ -1,0 +1,292 @@
+"""Paths by the engine that is asked for, read from the cache where they were searched before.
+
+The cache is content-addressed. Paths depend on the faces, the ends and the search, not on arrays, attitude or power:
+one entry serves every array.
+"""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from importlib.util import find_spec
+from pathlib import Path
+
+import numpy as np
+
+from .. import __version__
+from ..common.content import content_digest
+from ..common.files import cache_folder, read_sealed, write_sealed
+from ..common.jsonable import named
+from ..common.text import counted
+from ..common.units import FloatArray, spread_out
+from ..common.versions import version
+from .compiled import beams, beams_for, switch, warn_once
+from .geometry import Faces, Link, PathSet, Poses
+from .options import Run, Search
+from .scene import Scene
+from .search import mirror
+
+# Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same.
+MANY_FACES = 400
+
+# PathSolver finds a wall of solid angle W with the chance ``1 - exp(-N W / 4 pi)``, so what a scene needs depends on
+# its smallest and farthest walls: pilots on a batch of poses, each with more rays than the one before, until two find
+# the same paths. A wall that both miss and that other poses see can still be lost: the audit says so.
+# Rays per tower of the first pilot.
+FIRST = 10_000
+
+_FACTOR = 4
+
+# Rays per tower at which pilots end in any case.
+MOST = 2_560_000
+
+
+def path_cache(search: Search, run: Run) -> PathCache | None:
+    """Cache of a replay, None where there is none."""
+    folder = run.cache_dir
+    if folder is None:
+        # the image engine is faster than reading its paths back
+        if search.engine != "sionna":
+            return None
+        folder = cache_folder()
+    return PathCache(Path(folder)) if str(folder) else None
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Rays per tower and why."""
+
+    samples: int
+    reason: str
+
+
+def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) -> Choice:
+    """The number of rays at which two pilots agree.
+
+    Parameters
+    ----------
+    pilot : callable
+        ``pilot(samples)`` gives the paths of the pilot's poses.
+    faces : Faces
+    poses : int
+        Of the pilot, for the words.
+
+    Returns
+    -------
+    Choice
+    """
+    plane = mirror.planes_of(faces)
+    samples = FIRST
+    before = pilot(samples)
+    while samples < MOST:
+        samples *= _FACTOR
+        paths = pilot(samples)
+        # the paths themselves, not their number: one may be lost while another is found
+        if set(mirror.plane_keys(paths, plane)) == set(mirror.plane_keys(before, plane)):
+            words = f"{samples // _FACTOR:,} and {samples:,} rays a tower found the same {counted(len(paths), 'path')}"
+            return Choice(samples, f"{words} at {counted(poses, 'pose')}".replace(",", " "))
+        before = paths
+    words = f"{samples:,} rays a tower still found other paths than {samples // _FACTOR:,} at {counted(poses, 'pose')}"
+    return Choice(samples, words.replace(",", " "))
+
+
+def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache: PathCache | None) -> Choice | None:
+    """Rays per tower at which two pilots on a batch of poses, spread over the flight, find the same paths.
+
+    Parameters
+    ----------
+    scene, link, poses, search
+        As for :func:`search_or_read`.
+    cache : PathCache or None
+
+    Returns
+    -------
+    Choice or None
+        None where the number is given, or no rays are cast.
+    """
+    if search.engine != "sionna" or search.samples != "auto":
+        return None
+    known = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
+    some = known[spread_out(len(known), search.batch)]
+    part = replace(scene, excluded=scene.excluded[:, some])
+    few = poses[some]
+
+    def pilot(samples: int) -> PathSet:
+        # through the cache, or each report would cast the pilots anew
+        return search_or_read(part, link, few, replace(search, samples=samples), Run(), cache)[0]
+
+    return enough_samples(pilot, scene.faces, len(some))
+
+
+def search_or_read(
+    scene: Scene, link: Link, poses: Poses, search: Search, run: Run, cache: PathCache | None
+) -> tuple[PathSet, float, bool]:
+    """Paths, the seconds of their search, and whether they were read from the cache.
+
+    Parameters
+    ----------
+    scene : Scene
+    link : Link
+    poses : Poses
+    search : Search
+        With a number of samples, where rays are cast.
+    run : Run
+    cache : PathCache or None
+
+    Returns
+    -------
+    paths : PathSet
+    seconds : float
+    from_cache : bool
+    """
+    key = cache.key(scene, poses.position_m, link.carrier_hz, search) if cache else ""
+    entry = cache.load(key) if cache else None
+    if entry:
+        return *entry, True
+    started = time.perf_counter()
+    paths = search_paths(scene, link, poses, search, run)
+    seconds = time.perf_counter() - started
+    if cache:
+        cache.save(key, paths, seconds)
+    return paths, seconds, False
+
+
+def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Run) -> PathSet:
+    """Paths by the engine of ``search``.
+
+    Parameters
+    ----------
+    scene, link, poses, search, run
+        As for :func:`search_or_read`.
+
+    Returns
+    -------
+    PathSet
+    """
+    depth = search.max_depth
+    links = scene.links_to(poses)
+    extent, count = (None, scene.excluded.size) if run.job is None else (run.job.extent_m, run.job.links)
+    if by_beams(scene, search, count):
+        from .search import beams as prisms  # compiled: loaded where there are many faces
+        from .search import beams as search_beams
+
+        if scene.surfaces is not None:
+            return search_beams.grow_paths(scene.surfaces, links, run, max_depth=depth)
+        return prisms.find_paths(scene.faces, links, run, max_depth=depth, extent_m=extent)
+    if search.engine == "image":
+        return mirror.find_paths(scene.faces, links, max_depth=depth, extent_m=extent, progress=run.progress)
+    from .search import sionna
+
+    return sionna.find_paths(
+        scene.faces, links, sionna.Rays(**search.rays),
+        carrier_hz=link.carrier_hz, surfaces=scene.surfaces, progress=run.progress,
+    )  # fmt: skip
+
+
+def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
+    """Check whether the image engine searches by compiled beams: a scene of triangles, many faces, or a large job."""
+    if search.engine != "image":
+        return False
+    if scene.surfaces is not None:
+        return True
+    if search.max_depth < 2:
+        return False
+    # few faces: worth it for a job of many links only
+    if len(scene.faces) <= MANY_FACES:
+        return links > 0 and beams_for(links, len(scene.faces))
+    if find_spec("numba") is None:
+        return False
+    state = beams()
+    if state.kernels is None and switch() != "never":
+        warn_once(state.reason)
+    return state.kernels is not None
+
+
+# ------------------------------------------------------------------------------------------------------- the cache
+
+# Raised whenever the entries or the search change.
+LAYOUT = 4
+
+# Stands behind the entry, before the SHA-256 of all bytes in front of it.
+_SEAL = b"AERPAWCP"
+
+_COLUMNS = ("pose", "tower", "depth", "faces", "vertices_m")
+
+
+class PathCache:
+    """Path sets as ``<sha256>.npz`` in one folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Created when the first entry is saved.
+
+    Attributes
+    ----------
+    warnings : list of str
+        Entries that were damaged, for people.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.warnings: list[str] = []
+
+    def key(
+        self,
+        scene: Scene,
+        targets_m: FloatArray,
+        carrier_hz: float,
+        search: Search,
+    ) -> str:
+        """Digest of everything that decides the paths.
+
+        Parameters
+        ----------
+        scene : Scene
+            Faces, sources and what hides them.
+        targets_m : (n, 3)
+            Poses [m].
+        carrier_hz : float
+            Counts for Sionna alone: an image path is the same at every frequency.
+        search : Search
+            Engine, depth, samples and the rest.
+
+        Returns
+        -------
+        str
+            SHA-256, in hexadecimal.
+        """
+        faces, surfaces = scene.faces, scene.surfaces
+        decides: list[object] = [__version__, LAYOUT, sorted({"engine": search.engine, **search.rays}.items())]
+        if search.engine == "sionna":
+            # another version of its tracer may find other paths; the image engine's are exact
+            decides += [[version(name) for name in ("sionna-rt", "mitsuba", "drjit")], carrier_hz, faces.material]
+        columns = (faces.normal, faces.offset_m, faces.along, faces.lower, faces.upper, faces.solid)
+        mesh = None if surfaces is None else (surfaces.corners_m, surfaces.first)
+        # which links and mirrors count changes what is found, not only where they are
+        links = (scene.sources_m, scene.usable, scene.excluded, targets_m)
+        return content_digest(decides, faces.polygon, columns, mesh, links)
+
+    def load(self, key: str) -> tuple[PathSet, float] | None:
+        """Paths and the seconds that their search took; None where there is no whole entry (see ``warnings``)."""
+        place = self.folder / f"{key}.npz"
+        try:
+            entry = read_sealed(place, _SEAL)
+        except ValueError:
+            self.warnings.append(
+                f"a damaged entry of the path cache was not used, the paths were searched anew: {place}"
+            )
+            return None
+        if entry is None:
+            return None
+        # never pickled: an entry of a shared folder must not run code
+        with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
+            return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
+
+    def save(self, key: str, paths: PathSet, seconds: float) -> None:
+        """Write an entry; another process sees either nothing or all of it."""
+        entry = io.BytesIO()
+        np.savez(entry, seconds=np.float64(seconds), **named(paths, " ".join(_COLUMNS)))
+        write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)

@@ -1,1 +1,0 @@
-"""Arrays, faces and paths, shared by search and field."""

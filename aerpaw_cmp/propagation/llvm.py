@@ -1,0 +1,464 @@
+"""The LLVM that Dr.Jit compiles with: find one, try it in a child process, name the line that installs one.
+
+Standard library only, so that set-up can use it before anything else works.
+
+Why a trial: Dr.Jit 1.5 refuses LLVM 14 and loads LLVM 15 and 16, but on machines with AVX-512 these two abort the
+whole process in the first solver call ("Cannot select: fmaximum"). An abort cannot be caught, so the choice is tried
+in a child process with an empty kernel cache (a cached kernel would hide the fault).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+from pathlib import Path
+
+from ..common.errors import CheckError
+from ..common.files import cache_folder
+from ..common.versions import version
+
+# 14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine.
+MINIMUM_MAJOR = 17
+
+# What Dr.Jit reads; a path set by the user is tried, never replaced.
+LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
+
+# Folders to look into instead of the system's, separated as in PATH.
+FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
+
+# Far above the two seconds that it takes: a slow disk must not look like a library that hangs.
+_TRIAL_TIMEOUT_S = 300.0
+
+# Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have.
+APT_RUNTIME = "libatomic1"
+
+_FOLDERS = (
+    "/usr/lib/*-linux-gnu",
+    "/lib/*-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/lib/llvm*/lib",
+    "/usr/lib/llvm*/lib64",
+    "/usr/local/lib",
+    "/usr/local/opt/llvm*/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    f"{sys.prefix}/lib",
+)
+
+_NAME = re.compile(r"libLLVM(?:-(?P<dash>\d+(?:\.\d+)*))?\.(?:so|dylib)(?:\.(?P<dot>\d+(?:\.\d+)*))?")
+
+# One triangle of ground, one link: the direct and the reflected path of known length, by the kinds of instructions that
+# Sionna's solver compiles to. With LLVM 15 on AVX-512 it aborts as the solver does; loading Sionna would take 2 s.
+TRIAL_PROGRAM = """
+import json, math, sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except (ImportError, ValueError, OSError):
+    pass
+import drjit as dr, mitsuba as mi
+mi.set_variant(sys.argv[1])
+mesh = mi.Mesh("ground", vertex_count=3, face_count=1)
+buffers = mi.traverse(mesh)
+buffers["vertex_positions"] = mi.Float([-500.0, -500.0, 0.0, 500.0, -500.0, 0.0, 0.0, 800.0, 0.0])
+buffers["faces"] = mi.UInt32([0, 1, 2])
+buffers.update()
+scene = mi.load_dict({"type": "scene", "ground": mesh})
+tower, uav = mi.Point3f(0.0, 0.0, 10.0), mi.Point3f(30.0, 0.0, 20.0)
+dr.make_opaque(tower, uav)
+direct = dr.norm(uav - tower)
+hidden = scene.ray_test(mi.Ray3f(tower, dr.normalize(uav - tower), direct, 0.0, []))
+hit = scene.ray_intersect(mi.Ray3f(tower, dr.normalize(mi.Point3f(uav.x, uav.y, -uav.z) - tower)))
+lost = scene.ray_test(hit.spawn_ray_to(uav)) | ~hit.is_valid() | (hit.bsdf().flags() == 0)
+start = (mi.UInt32(0), mi.UInt64(dr.round(dr.minimum(hit.t, 1e3))))
+key = dr.while_loop(start, lambda k, h: k < 3, lambda k, h: (k + 1, (h ^ mi.UInt64(k)) * 1099511628211))[1]
+lost |= dr.scatter_inc(dr.zeros(mi.UInt32, 8), mi.UInt32(key % 8), ~lost) != 0
+lengths = [dr.select(hidden, 0, direct), dr.select(lost, 0, dr.maximum(hit.t, 1e-3) + dr.norm(uav - hit.p))]
+dr.eval(lengths)
+found = [float(length[0]) for length in lengths]
+right = all(abs(a - math.hypot(30.0, b)) < 1e-3 for a, b in zip(found, (10.0, 30.0)))
+llvm = list(dr.detail.llvm_version()) if "llvm" in sys.argv[1] else []
+print(json.dumps({"right": right, "found_m": found, "llvm": llvm}))
+"""
+
+# The same for ``doctor`` and ``make setup``, which name a Sionna RT that cannot be loaded, too.
+_SIONNA_LOADS = f"""{TRIAL_PROGRAM}
+import typing, typing_extensions
+typing.__dict__.setdefault("Self", typing_extensions.Self)
+import sionna.rt
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """A libLLVM file; ``version`` is empty when its name does not tell."""
+
+    path: Path
+    version: tuple[int, ...]
+
+    @property
+    def label(self) -> str:
+        """``LLVM 19.1 (/usr/lib/...)``."""
+        return f"LLVM {'.'.join(map(str, self.version)) or '?'} ({self.path})"
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """Result of trying one library, or one GPU variant (``library`` is None), in a child process.
+
+    ``reason`` is empty when ``ok``; ``blames_library`` is False when the trial could not even start, and
+    ``missing`` then names the shared library that Dr.Jit itself lacks, if that was the cause.
+    """
+
+    library: Library | None
+    ok: bool
+    reason: str = ""
+    blames_library: bool = True
+    missing: str = ""
+
+
+def version_in_name(name: str) -> tuple[int, ...] | None:
+    """Version told by a libLLVM file name; empty if it tells none, None if it is no libLLVM.
+
+    >>> version_in_name("libLLVM.so.19.1"), version_in_name("libLLVM-15.so.1"), version_in_name("libLLVM.so")
+    ((19, 1), (15,), ())
+    >>> version_in_name("libLLVM-C.so") is None
+    True
+    """
+    match = _NAME.fullmatch(name)
+    if match is None:
+        return None
+    digits = match["dash"] or match["dot"] or ""
+    return tuple(int(part) for part in digits.split(".") if part)
+
+
+def _library(path: Path) -> Library | None:
+    """The file behind a name; links are followed because ``libLLVM.so`` often points to ``libLLVM.so.19.1``."""
+    # a link to nothing is left where a package was removed
+    if path.suffix == ".a" or not path.is_file():  # an LLVM to compile against brings two hundred of them
+        return None
+    versions = [version_in_name(name) for name in (path.resolve().name, path.name)]
+    if versions == [None, None]:
+        return None
+    # of two names the one with the release: 'libLLVM.so.1' says the revision of an interface
+    return Library(path.resolve(), max((version for version in versions if version), default=()))
+
+
+def _system_paths() -> list[Path]:
+    """Every file the linker or the usual folders offer under a libLLVM name."""
+    paths: list[Path] = []
+    # /sbin is not in the path of a plain Debian user
+    if ldconfig := shutil.which("ldconfig") or shutil.which("/sbin/ldconfig"):
+        listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
+        paths += [Path(line.rpartition("=> ")[2]) for line in listing.splitlines() if "libLLVM" in line]
+    for pattern in _FOLDERS:
+        folder = Path(pattern)
+        # pathlib refuses absolute patterns: they are taken from the root
+        paths += folder.parents[-1].glob(str(folder.relative_to(folder.anchor) / "libLLVM*"))
+    return paths
+
+
+def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
+    """The libLLVM files in the order they are worth trying: newest first, unknown versions last.
+
+    With ``DRJIT_LIBLLVM_PATH`` set, that file alone.
+
+    Raises
+    ------
+    CheckError
+        If ``DRJIT_LIBLLVM_PATH`` names no file.
+    """
+    if chosen := environ.get(LIBRARY_VARIABLE):
+        path = Path(chosen)
+        if not path.is_file():
+            raise CheckError(
+                f"{LIBRARY_VARIABLE} names {chosen}, which is not a file",
+                expected="the path of a libLLVM",
+                cause=f"an old setting; 'unset {LIBRARY_VARIABLE}' lets one be found",
+            )
+        return [_library(path) or Library(path.resolve(), ())]
+    if folders := environ.get(FOLDERS_VARIABLE):
+        paths = [path for folder in folders.split(os.pathsep) for path in Path(folder).glob("libLLVM*")]
+    else:
+        paths = _system_paths()
+    by_path: dict[Path, Library] = {}
+    for library in filter(None, map(_library, paths)):  # one file under several names: the one that tells the release
+        by_path[library.path] = max(by_path.get(library.path, library), library, key=lambda file: file.version)
+    # an empty version sorts below every number, so unknown files come last
+    return sorted(by_path.values(), key=lambda library: (library.version, str(library.path)), reverse=True)
+
+
+def _too_old(version: Sequence[int]) -> str:
+    if version and version[0] < MINIMUM_MAJOR:
+        return f"LLVM {version[0]} is too old; {MINIMUM_MAJOR} or newer is needed"
+    return ""
+
+
+def _missing_library(text: str) -> str:
+    match = re.search(r"(lib\S+\.so[.\d]*)(?:: cannot open shared object file|$)", text, flags=re.MULTILINE)
+    return match[1] if match else ""
+
+
+def _failure(child: subprocess.CompletedProcess[str]) -> str:
+    """Reason why a child failed, in one line: the signal that ended it and what it said last."""
+    if missing := _missing_library(child.stderr):
+        return f"Dr.Jit cannot be loaded, the system has no {missing}"
+    lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
+    message = next((line for line in lines if "LLVM ERROR" in line), lines[-1] if lines else "no message")
+    # a negative code is the signal's number: LLVM aborts
+    how = f"was ended by signal {-child.returncode}" if child.returncode < 0 else f"ended with {child.returncode}"
+    return f"the trial {how}: {message[:200]}"
+
+
+def _run_trial(
+    library: Library | None, variant: str, python: str, program: str, timeout_s: float
+) -> tuple[str, dict[str, object]]:
+    """Reason of failure (empty if none) and the child's answer."""
+    with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-trial-") as scratch:
+        # a kernel in the user's cache would hide that this library cannot compile
+        environ = {**os.environ, "DRJIT_CACHE_DIR": scratch}
+        if library is not None:
+            environ[LIBRARY_VARIABLE] = str(library.path)
+        try:
+            child = subprocess.run(
+                [python, "-c", program, variant],
+                # Python puts the working folder first in its path: a file mitsuba.py there would be run
+                cwd=scratch,
+                env=environ,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                # LLVM's own messages may hold any bytes
+                errors="replace",
+                timeout=timeout_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return f"the trial gave no answer within {timeout_s:g} s", {}
+    if child.returncode:
+        return _failure(child), {}
+    try:
+        answer = dict(json.loads(child.stdout.splitlines()[-1]))
+    except (ValueError, IndexError, TypeError):
+        return f"the trial's answer is unreadable: {child.stdout[-200:]!r}", {}
+    if not answer.get("right"):
+        return f"the trial's path lengths are wrong: {answer.get('found_m')}", answer
+    return "", answer
+
+
+def try_library(
+    library: Library,
+    *,
+    python: str = sys.executable,
+    program: str = _SIONNA_LOADS,
+    timeout_s: float = _TRIAL_TIMEOUT_S,
+) -> Trial:
+    """Trace two paths with this library in a child process (about 2 s with Sionna); never raises, never crashes.
+
+    Parameters
+    ----------
+    library : Library
+    python : str
+        Interpreter of the child.
+    program : str
+        What it runs: prints one JSON line.
+    timeout_s : float
+        After it the child is ended and the trial has failed [s].
+
+    Returns
+    -------
+    Trial
+        Whether it works, and why not.
+    """
+    if reason := _too_old(library.version):
+        return Trial(library, False, reason)
+    reason, answer = _run_trial(library, "llvm_ad_mono_polarized", python, program, timeout_s)
+    version = answer.get("llvm")
+    if isinstance(version, list) and version:
+        library = Library(library.path, tuple(int(part) for part in version))
+    return _verdict(library, reason or _too_old(library.version))
+
+
+def try_variant(variant: str, *, python: str = sys.executable, timeout_s: float = _TRIAL_TIMEOUT_S) -> Trial:
+    """Trace two paths with another Mitsuba variant (``cuda_ad_mono_polarized``) in a child process."""
+    return _verdict(None, _run_trial(None, variant, python, TRIAL_PROGRAM, timeout_s)[0])
+
+
+def _verdict(library: Library | None, reason: str) -> Trial:
+    missing = _missing_library(reason) if reason.startswith("Dr.Jit cannot be loaded") else ""
+    blameless = missing or "ModuleNotFoundError" in reason or "ImportError" in reason
+    return Trial(library, not reason, reason, not blameless, missing)
+
+
+def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], Trial] | None = None) -> list[Trial]:
+    """Try libraries in order (by default with :func:`try_library`) until one works; the trials made, that one last."""
+    attempt = attempt or try_library
+    trials: list[Trial] = []
+    for library in libraries:
+        trials.append(attempt(library))
+        # what is missing is Sionna itself: the next library would fare no better
+        # a failure of Sionna itself would come back with every library
+        if trials[-1].ok or not trials[-1].blames_library:
+            break
+    return trials
+
+
+def _verdict_file(library: Library) -> Path:
+    """File where a good trial is remembered: it holds for this library file, these versions and this processor."""
+    try:
+        processor = next(
+            (line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))),
+            platform.processor(),
+        )
+    except OSError:
+        processor = platform.processor()
+    stat = library.path.stat()
+    versions = [version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
+    # the nodes of a cluster share home folders: hence the processor in the key
+    key = repr((str(library.path), stat.st_size, stat.st_mtime_ns, versions, processor, sys.prefix))
+    return cache_folder("llvm", sha256(key.encode()).hexdigest()[:24])
+
+
+def _remembered_trial(library: Library) -> Trial:
+    """As :func:`try_library` without Sionna, once per machine where it is good. Failures are tried anew each time."""
+    note = _verdict_file(library)
+    if note.is_file() and not _too_old(library.version):
+        return Trial(library, True)
+    trial = try_library(library, program=TRIAL_PROGRAM)
+    if trial.ok:
+        with suppress(OSError):  # an unwritable cache costs half a second per run, nothing else
+            note.parent.mkdir(parents=True, exist_ok=True)
+            note.write_text(f"{library.label}\n")
+    return trial
+
+
+@cache
+def _trials() -> tuple[Trial, ...]:
+    """The trials that led to this process's choice, made once."""
+    return tuple(first_that_works(candidates(), _remembered_trial))
+
+
+class SionnaMissingError(CheckError):
+    """Sionna RT cannot be loaded on this machine: nothing but the audit and ``rt.engine: sionna`` needs it."""
+
+
+def prepare_llvm() -> Path:
+    """Point Dr.Jit to an LLVM that works; call it before importing drjit, mitsuba or sionna.
+
+    Returns
+    -------
+    Path
+        The library, now also in ``os.environ["DRJIT_LIBLLVM_PATH"]``.
+
+    Raises
+    ------
+    SionnaMissingError
+        If no usable LLVM is found; the message holds the line that installs one.
+    """
+    trials = _trials()
+    if not trials or not trials[-1].ok or trials[-1].library is None:
+        line = INSTALL_AGAIN if sionna_fails(trials) else install_line()
+        raise SionnaMissingError(f"{explain(trials)}. Mend it with: {line}")
+    # Dr.Jit reads it once, when it is imported
+    os.environ[LIBRARY_VARIABLE] = str(trials[-1].library.path)
+    return trials[-1].library.path
+
+
+def let_sionna_load() -> None:
+    """Put ``Self`` into ``typing`` where Python 3.10 has none.
+
+    Sionna RT 2.2.0 says that it runs there, and imports it from there; other names of 3.11 it takes from
+    typing_extensions.
+    """
+    import typing
+
+    import typing_extensions
+
+    vars(typing).setdefault("Self", typing_extensions.Self)
+
+
+INSTALL_AGAIN = "pip install --force-reinstall sionna-rt"
+
+
+def sionna_fails(trials: Sequence[Trial]) -> bool:
+    """Check whether it is Sionna RT or a package that it needs which cannot be loaded, not an LLVM."""
+    return bool(trials) and not trials[-1].ok and not trials[-1].blames_library and not trials[-1].missing
+
+
+def explain(trials: Sequence[Trial]) -> str:
+    """One sentence on why none of the tried libraries serves."""
+    if sionna_fails(trials):
+        return f"Sionna RT cannot be loaded, whatever the LLVM ({trials[-1].reason})"
+    if not trials:
+        return f"Dr.Jit needs LLVM {MINIMUM_MAJOR} or newer, and no libLLVM was found"
+    tried = "; ".join(f"{trial.library.label if trial.library else 'GPU'}: {trial.reason}" for trial in trials)
+    return f"Dr.Jit needs LLVM {MINIMUM_MAJOR} or newer, and none works here ({tried})"
+
+
+# ---------------------------------------------------------------------------------------------- installing
+
+
+def os_families() -> set[str]:
+    """Names of the distribution and of those that it is like; the system where there is none."""
+    try:
+        release = platform.freedesktop_os_release()
+    except OSError:
+        return {platform.system().lower()}
+    # Mint and Pop say that they are like Ubuntu
+    return {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
+
+
+def apt_packages(search_output: str) -> list[str]:
+    """LLVM runtime packages new enough, newest first, from the output of ``apt-cache search``.
+
+    >>> apt_packages(os.linesep.join(["libllvm14 - x", "libllvm19 - x", "libllvm17t64 - x", "libllvm19-dbg - x"]))
+    ['libllvm19', 'libllvm17t64']
+    """
+    packages = re.findall(r"^(libllvm(\d+)(?:t64)?)\s", search_output + "\n", flags=re.MULTILINE)
+    new_enough = sorted(((int(major), name) for name, major in packages if int(major) >= MINIMUM_MAJOR), reverse=True)
+    return [name for _, name in new_enough]
+
+
+def known_to_apt() -> str:
+    """Entries of apt's lists for LLVM runtimes of any version; empty where there are no lists."""
+    apt_cache = shutil.which("apt-cache")
+    if apt_cache is None:
+        return ""
+    command = [apt_cache, "search", "--names-only", "^libllvm[0-9]+(t64)?$"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+
+
+def install_line() -> str:
+    """The one line that installs an LLVM on this machine."""
+    families = os_families()
+    if families & {"debian", "ubuntu"}:
+        known = known_to_apt()
+        offered = apt_packages(known)
+        if known and not offered:  # Ubuntu 22.04 ends at 15: packages of the LLVM project
+            # a minimal image has none of these
+            needs = "wget gnupg lsb-release software-properties-common"  # what that script calls
+            fetch = "wget https://apt.llvm.org/llvm.sh && sudo bash llvm.sh 19"
+            first = f"sudo apt-get update && sudo apt-get install -y {needs} && {fetch}"
+            return f"{first} && sudo apt-get install -y libllvm19 {APT_RUNTIME}"
+        package = next(iter(offered), "libllvm19")
+        return f"sudo apt-get update && sudo apt-get install -y {package} {APT_RUNTIME}"
+    if families & {"fedora", "rhel", "centos"}:
+        return "sudo dnf install -y llvm-libs libatomic"
+    if families & {"arch"}:
+        return "sudo pacman -S --needed llvm-libs"
+    if families & {"suse", "opensuse"}:
+        return "sudo zypper install -y libLLVM19 libatomic1"
+    if families & {"darwin"}:
+        return "brew install llvm"
+    return f"export {LIBRARY_VARIABLE}=/path/to/libLLVM.so  # any LLVM of {MINIMUM_MAJOR} or newer"

@@ -1,1 +1,0 @@
-"""Antennas: patterns, files of patterns, what flights taught."""

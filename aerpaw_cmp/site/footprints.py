@@ -1,0 +1,812 @@
+"""Buildings, forests and geofences from map files: classified, projected, repaired, with a list of what was done.
+
+Heights: the ``height`` tag, else ``building:levels`` times 3 m, else that of the outline around a part, else a default,
+which is counted. Parts of a building keep the ground
+before its outline. Overlapping buildings of one height become one; of different heights the higher keeps the ground.
+Holes stay. Slivers and duplicates go. Single trees keep their tagged sizes; tree rows become trees along their line.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import shapely
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from shapely.geometry import LineString, MultiPolygon, Point, Polygon, box
+from shapely.geometry.base import BaseGeometry
+
+from ..common.errors import InputError, UsageError
+from ..common.geodesy import SiteFrame
+from ..common.jsonable import named
+from ..common.text import counted
+from ..common.units import FloatArray
+from ..common.yamlfile import dump_yaml
+from .mapfiles import (
+    MAX_CROSSINGS,
+    Kind,
+    MapFile,
+    Outline,
+    Position,
+    TreeLine,
+    below_ground,
+    height_of,
+    is_part,
+    is_tangled,
+    kind_of,
+    levels_of,
+    main_tag,
+    material_of,
+    metres,
+    positive_metres,
+    read_map_file,
+)
+from .site import Building, Forest, Geofence
+from .siteyaml import SiteModel, extent_m, site_model
+from .trees import TALLEST_TREE_M, WIDEST_CROWN_M
+
+# OpenStreetMap's own rule of thumb for a storey.
+_LEVEL_M = 3.0
+# Two storeys: a barn, a house.
+_DEFAULT_HEIGHT_M = 6.0
+TALLEST_M = 300.0
+# Outlines farther from the origin are not of this site.
+FAR_M = 20_000.0
+
+# The area of a site without a base: the map within this square around the first tower, and this far around each tower.
+_AROUND_M, _NEAR_TOWER_M = 2000.0, 500.0
+
+# Coordinates are rounded to this.
+_GRID_M = 0.001
+
+# Areas narrower than this everywhere are drawing errors; vertices closer to a straight line are dropped too.
+_SLIVER_M = 0.3
+
+_MINIMUM_AREA_M2 = 2.0
+_SAME_HEIGHT_M = 0.25
+
+# Height of a wood that states none, the mean of all stands by LiDAR at Lake Wheeler.
+_DEFAULT_CANOPY_M = 20.0
+# Share of trees that keep their leaves by OpenStreetMap's tags of a wood.
+_EVERGREEN = {"evergreen": 1.0, "needleleaved": 1.0, "mixed": 0.5}
+
+# Forests are cut off this far outside the area of the site: trees there shadow nothing.
+_FOREST_MARGIN_M = 1000.0
+
+# The thickest trunk known is 42 m around.
+_WIDEST_GIRTH_M = 45.0
+# Distance of the trees of a row without a tagged crown diameter: the default crowns touch.
+_ROW_SPACING_M = 10.0
+
+_MAXIMUM_ROW_TREES = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class SingleTree:
+    """A tree of a map file in the site frame [m]; sizes that it does not state are None."""
+
+    east_m: float
+    north_m: float
+    height_m: float | None = None
+    crown_diameter_m: float | None = None
+    trunk_diameter_m: float | None = None
+
+
+@dataclass(slots=True)
+class Footprints:
+    """Elements found in map files, in the site frame, and the actions taken on them.
+
+    ``actions`` are sentences for the user; those that ask for a look begin with ``warning:``. ``credits`` name those
+    whose data they are; ``assumed`` tells of sizes that the maps do not state.
+    """
+
+    buildings: list[Building] = field(default_factory=list)
+    forests: list[Forest] = field(default_factory=list)
+    geofences: list[Geofence] = field(default_factory=list)
+    trees: list[SingleTree] = field(default_factory=list)
+    credits: list[str] = field(default_factory=list)
+    assumed: str = ""
+    actions: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Shape:
+    """A projected outline on its way to a record."""
+
+    name: str
+    source: str
+    area: BaseGeometry
+    height_m: float = 0.0
+    stated: bool = False
+    assumed: bool = False
+    """Neither height nor levels are in the map."""
+    material: str = "concrete"
+    part: bool = False
+    evergreen: float = 0.0
+
+
+def import_footprints(
+    files: Sequence[str | Path],
+    frame: SiteFrame,
+    *,
+    untagged: Kind | None = None,
+    trees: bool = False,
+    area_m: tuple[float, float, float, float] | None = None,
+) -> Footprints:
+    """Outlines of map files as records of the site.
+
+    Parameters
+    ----------
+    files : sequence of paths
+        GeoJSON, OSM XML, Overpass JSON, KML or KMZ, told by content.
+    frame : SiteFrame
+        Of the site that they belong to.
+    untagged : {"building", "forest", "geofence"}, optional
+        What areas without a known tag are. By default a KML area is a geofence and others are left out.
+    trees : bool
+        Forests are single trees at random places; by default media with a height.
+    area_m : (east_min, east_max, north_min, north_max), optional
+        Of the site; forests are cut off :data:`_FOREST_MARGIN_M` outside.
+
+    Returns
+    -------
+    Footprints
+
+    Raises
+    ------
+    InputError
+        Unreadable file, swapped coordinates, a file of another place, heights that cannot be metres, or no area.
+    UsageError
+        ``untagged`` is no kind of area.
+    """
+    if untagged is not None and untagged not in get_args(Kind):
+        raise UsageError(f"untagged areas as '{untagged}'", expected="one of " + ", ".join(get_args(Kind)))
+    result = Footprints()
+    shapes: dict[Kind, list[_Shape]] = {"building": [], "forest": [], "geofence": []}
+    for path in files:
+        content = read_map_file(path)
+        _check_place(content, frame, Path(path))
+        result.actions += content.notes
+        if content.credit and content.credit not in result.credits:
+            result.credits.append(content.credit)
+        _sort(content, Path(path), frame, untagged, shapes, result.actions)
+        for tree in content.trees:
+            result.trees += _single_trees(tree, frame, result.actions)
+    # heights before duplicates go: a part may have its height from an outline that repeats another
+    _inherit(shapes["building"], result.actions)
+    _warn_of_feet(shapes["building"], result.actions)
+    near = None if area_m is None else box(area_m[0], area_m[2], area_m[1], area_m[3]).buffer(_FOREST_MARGIN_M)
+    shapes["forest"] = _cut_off(shapes["forest"], near, result.actions)
+    canopy_m = None if trees else _DEFAULT_CANOPY_M
+    _fill(result, shapes, canopy_m)
+    if not (result.buildings or result.forests or result.geofences or result.trees):
+        alone = f"{Path(files[0]).name}: " if len(files) == 1 else ""
+        raise InputError(
+            "no building, forest, geofence or tree found in " + ", ".join(Path(f).name for f in files),
+            expected="areas tagged building, natural=wood or landuse=forest, or '--untagged building'",
+            cause="; ".join(text.removeprefix(alone) for text in result.actions[-3:]) or "the map is empty",
+        )
+    return result
+
+
+def _sort(
+    content: MapFile,
+    path: Path,
+    frame: SiteFrame,
+    untagged: Kind | None,
+    shapes: dict[Kind, list[_Shape]],
+    actions: list[str],
+) -> None:
+    """Each outline of a file to the shapes of its kind; what has none is counted."""
+    skipped: Counter[str] = Counter()
+    for outline in content.outlines:
+        bare = untagged if main_tag(outline.tags) == "untagged" else None
+        kind = kind_of(outline.tags) or bare or ("geofence" if content.kind == "KML" else None)
+        if kind is None or (kind == "building" and below_ground(outline.tags)):
+            skipped[main_tag(outline.tags) if kind is None else "building below the ground"] += 1
+            continue
+        actions += [f"{outline.source}: {problem}" for problem in dict.fromkeys(outline.broken)]
+        if kind == "geofence" and "height" in outline.tags and kind_of(outline.tags) is None and untagged is None:
+            text = f"an area {outline.tags['height']} m high without a tag: taken as a geofence"
+            actions.append(f"{outline.source}: {text}; '--untagged building' makes it a building")
+        shape = _project(outline, frame, actions)
+        if shape is not None:
+            if kind == "building":
+                _describe(shape, outline, path, actions)
+            elif kind == "forest":
+                _describe_wood(shape, outline.tags, actions)
+            shapes[kind].append(shape)
+    if skipped:
+        listed = ", ".join(f"{count} {tag}" for tag, count in skipped.most_common(5))
+        more = "" if len(skipped) <= 5 else f" and {counted(len(skipped) - 5, 'other tag')}"
+        hint = "; '--untagged building' takes areas without tags for buildings" if skipped["untagged"] else ""
+        actions.append(f"{path.name}: left out, no building or forest above the ground: {listed}{more}{hint}")
+
+
+def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTree]:
+    """A tree with its tagged sizes, or those of a row, a crown's diameter apart."""
+    notes: list[str] = []
+    height = positive_metres(tree.tags, ("height", "est_height"), notes)
+    if height is not None and height > TALLEST_TREE_M:
+        notes.append(f"a tree {height:g} m high; feet or centimetres? The site's default holds")
+        height = None
+    crown = positive_metres(tree.tags, ("diameter_crown", "crown_diameter"), notes)
+    if crown is not None and crown > WIDEST_CROWN_M:
+        notes.append(f"a crown {crown:g} m wide; feet or centimetres? The site's default is used")
+        crown = None
+    girth = positive_metres(tree.tags, ("circumference",), notes)
+    if girth is not None and girth > _WIDEST_GIRTH_M:
+        # a number without unit that no tree reaches in metres or in feet is in centimetres
+        bare = metres(f"{tree.tags['circumference'].strip()} m") is not None
+        if bare and 3.3 * _WIDEST_GIRTH_M < girth <= 100.0 * _WIDEST_GIRTH_M:
+            notes.append(
+                f"the circumference '{girth:g}' is taken as centimetres: a trunk {girth / 100 / math.pi:.2g} m thick"
+            )
+            girth /= 100.0
+        else:
+            notes.append(f"a trunk {girth:g} m around; feet or centimetres? The site's default is used")
+            girth = None
+    points = np.stack(frame.to_local(*np.array(tree.positions, dtype=np.float64).reshape(-1, 2).T), axis=1)
+    # a torn number of degrees projects to infinity
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points) or float(np.hypot(*points.mean(axis=0))) > FAR_M:
+        actions.append(f"{tree.source}: a tree left out, it does not stand at the site")
+        return []
+    # a tree row is mapped as a line
+    if len(points) > 1:
+        points = _along(points, crown or _ROW_SPACING_M)
+        notes.append(f"{counted(len(points), 'tree')} placed along the row, {crown or _ROW_SPACING_M:g} m apart")
+    actions += [f"{tree.source}: {note}" for note in notes]
+    trunk = None if girth is None else girth / math.pi
+    return [SingleTree(float(east), float(north), height, crown, trunk) for east, north in points]
+
+
+def _along(line_m: FloatArray, spacing_m: float) -> FloatArray:
+    """Points (n, 2) on a line (corners, 2) from its beginning to its end, about ``spacing_m`` apart."""
+    line = LineString(line_m)
+    count = min(max(round(line.length / max(spacing_m, 0.5)), 1), _MAXIMUM_ROW_TREES)
+    return np.asarray(shapely.get_coordinates(line.interpolate(np.linspace(0.0, 1.0, count + 1), normalized=True)))
+
+
+def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> list[_Shape]:
+    """Forests without what lies far outside the site."""
+    near_shapes = []
+    for shape in shapes:
+        inside = shape.area if near is None else _areas_only(shape.area.intersection(near))
+        # less is rounding of the cut, not worth a line
+        if inside.area < 0.999 * shape.area.area:
+            lost = (shape.area.area - inside.area) / 1e4
+            actions.append(
+                f"{shape.source}: {lost:.0f} ha more than {_FOREST_MARGIN_M:g} m outside the site's area were cut away"
+            )
+            shape.area = inside
+        if not inside.is_empty:
+            near_shapes.append(shape)
+    return near_shapes
+
+
+def _fill(result: Footprints, shapes: dict[Kind, list[_Shape]], canopy_m: float | None) -> None:
+    actions = result.actions
+    buildings = _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions)
+    # woods have no height that could decide: the first in the file keeps the ground
+    woods = _first_keeps(_without_duplicates(shapes["forest"], actions), actions)
+    for name, shape, area in _parts(buildings, actions):
+        result.buildings.append(
+            Building(name, area, round(shape.height_m, 2), material=shape.material, source=shape.source)
+        )
+    for name, shape, area in _parts(woods, actions):
+        wood = Forest(name, area, source=shape.source, evergreen_share=shape.evergreen)
+        result.forests.append(
+            # 0 is "not stated"
+            wood if canopy_m is None else replace(wood, height_m=round(shape.height_m, 2) or canopy_m)
+        )
+    for name, _, area in _parts(shapes["geofence"], actions):
+        result.geofences.append(Geofence(name, area))
+    guesses = [_assumed_heights(buildings)]
+    if canopy_m is None and result.forests:
+        density = result.forests[0].trees_per_hectare
+        guesses.append(f"trees assumed: {density:g} per hectare at random places in {counted(len(woods), 'wood')}")
+    elif low := [shape for shape in woods if not shape.height_m]:
+        guesses.append(
+            f"height assumed: none in the map for {len(low)} of {counted(len(woods), 'wood')}, {canopy_m:g} m each"
+        )
+    result.assumed = "; ".join(filter(None, guesses))
+    if result.assumed:
+        actions.insert(0, result.assumed)
+
+
+# ---------------------------------------------------------------- what an outline is, and where
+
+
+def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
+    """Refuses a file whose outlines all lie elsewhere, and says so when swapping would bring them here."""
+    positions = [p for outline in content.outlines for outer, _ in outline.parts for p in outer]
+    positions += [p for tree in content.trees for p in tree.positions]
+    if not positions:
+        return
+    latitude, longitude = np.array(positions).T
+    # one outline near is enough: a file may reach beyond the site
+    if _distance_m(latitude, longitude, frame).min() <= FAR_M:
+        return
+    centre = f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}"
+    first = f"latitude {latitude[0]:.5f}, longitude {longitude[0]:.5f}"
+    if _distance_m(longitude, latitude, frame).min() <= FAR_M:
+        raise InputError(
+            f"the positions are of another place ({first})",
+            expected=f"near the site's origin {centre}",
+            cause="latitude and longitude are swapped",
+            path=path,
+        )
+    spans = [abs(np.diff([p[1] for p in outer])).max(initial=0) for o in content.outlines for outer, _ in o.parts]
+    away = float(_distance_m(latitude, longitude, frame).min())
+    raise InputError(
+        f"the nearest position is {away / 1000:.0f} km from the site ({first})"
+        if math.isfinite(away)
+        else f"the positions are no latitudes and longitudes ({first})",
+        expected=f"WGS84 degrees near the site's origin {centre}, or a site where the map is: --base SITE, or "
+        "--tower NAME=LATITUDE,LONGITUDE,HEIGHT of its antenna",
+        cause="the area crosses the antimeridian (180 deg)"
+        if max(spans, default=0) > 180
+        else ("metres or feet instead of degrees" if not math.isfinite(away) else "a map of another place"),
+        path=path,
+    )
+
+
+def _distance_m(latitude: Any, longitude: Any, frame: SiteFrame) -> Any:
+    """Rough distance [m] from the origin; inf where it is no position on Earth."""
+    good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
+    north = np.where(good, latitude, 0.0) - frame.latitude_deg  # a torn number may be 1e306
+    # the short way round the Earth
+    turn = (np.where(good, longitude, 0.0) - frame.longitude_deg + 180) % 360 - 180
+    east = turn * math.cos(math.radians(frame.latitude_deg))
+    return np.where(good, 111_200 * np.hypot(north, east), np.inf)
+
+
+def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape | None:
+    """The outline in metres, valid; None (and a line in ``actions``) when nothing is left."""
+    areas, notes = [], []
+    for outer, holes in outline.parts:
+        # no outline spans half of the Earth: it goes over 180 degrees
+        if max(np.abs(np.diff([p[1] for p in outer])), default=0) > 180:
+            notes.append("crosses the antimeridian; its parts were joined")
+        ring = _ring(outer, frame)
+        if ring is None:
+            notes.append(_why_no_ring(outer))
+            continue
+        area = _repaired(ring, notes, "a self-crossing ring was repaired")
+        inner = [shape for shape in (_ring(hole, frame) for hole in holes) if shape is not None]
+        if len(inner) < len(holes):
+            notes.append("a hole with fewer than 3 distinct points was left out")
+        if inner:
+            # holes joined first: two that overlap would make an outline that is not valid
+            without = shapely.union_all([_repaired(hole, notes, "a hole was repaired") for hole in inner])
+            if not without.intersects(area):
+                notes.append("a hole outside its outline was left out")
+            area = area.difference(without)
+            if area.is_empty:
+                notes.append("its holes cover all of it")
+        areas.append(area)
+    actions += [f"{outline.source}: {note}" for note in dict.fromkeys(notes)]
+    union = _areas_only(shapely.union_all(areas))
+    if union.is_empty:
+        actions.append(f"{outline.source}: left out, it has no area")
+        return None
+    if math.hypot(union.centroid.x, union.centroid.y) > FAR_M:
+        away = math.hypot(union.centroid.x, union.centroid.y) / 1000
+        first = np.array(outline.parts[0][0][0])
+        swapped = _distance_m(first[1], first[0], frame) <= FAR_M
+        hint = "; latitude and longitude are swapped" if swapped else ""
+        actions.append(f"warning: {outline.source}: left out, it lies {away:.0f} km from the site{hint}")
+        return None
+    return _Shape(outline.name, outline.source, union, part=is_part(outline.tags))
+
+
+def _why_no_ring(positions: Sequence[Position]) -> str:
+    for latitude, longitude in positions:
+        if abs(latitude) > 90 or abs(longitude) > 540:
+            return (
+                f"an outer ring with latitude {latitude:g}, longitude {longitude:g} was left out; "
+                "metres or feet in place of degrees"
+            )
+    return "an outer ring with fewer than 3 distinct points was left out"
+
+
+def _ring(positions: Sequence[Position], frame: SiteFrame) -> Polygon | None:
+    # a ring repeats its first point, and some repeat all
+    if len(set(positions)) < 3:
+        return None
+    latitude, longitude = np.array(positions).T
+    east, north = frame.to_local(latitude, longitude)
+    points = np.column_stack([east, north])
+    return Polygon(points[np.isfinite(points).all(axis=1)]) if np.isfinite(points).all(axis=1).sum() >= 3 else None
+
+
+def _repaired(ring: Polygon, notes: list[str], note: str) -> BaseGeometry:
+    if ring.is_valid:
+        return ring
+    if is_tangled(ring):
+        notes.append(f"a ring that crosses itself at more than {MAX_CROSSINGS} places was left out")
+        return Polygon()
+    notes.append(f"{note} ({shapely.is_valid_reason(ring).split('[')[0].lower()})")
+    # "structure" keeps what the ring runs round; "linework" would make holes of what it runs round twice
+    return _areas_only(shapely.make_valid(ring, method="structure"))
+
+
+def _areas_only(shape: BaseGeometry) -> BaseGeometry:
+    return MultiPolygon([part for part in shapely.get_parts(shape, return_index=False) if isinstance(part, Polygon)])
+
+
+# ---------------------------------------------------------------- heights and materials
+
+
+def _describe(shape: _Shape, outline: Outline, path: Path, actions: list[str]) -> None:
+    # shapefiles write the names of their columns in capitals
+    tags = {key.lower(): value for key, value in outline.tags.items()}
+    notes: list[str] = []
+    height = height_of(tags, notes)
+    levels = levels_of(tags, notes)
+    shape.stated, shape.assumed = height is not None, height is None and not levels
+    if height is None:
+        height = levels * _LEVEL_M if levels else _DEFAULT_HEIGHT_M
+        notes = [f"{note}; it is drawn {height:g} m high" for note in notes]
+    lowest = tags.get("min_height", tags.get("building:min_level", tags.get("min_level", "0")))
+    if (metres(lowest) or 0.0) > 0:
+        notes.append("it begins above the ground (min_height, min_level), but is drawn from the ground up")
+    actions += [f"{shape.source}: {note}" for note in notes]
+    if not 0 < height <= TALLEST_M:
+        raise InputError(
+            f"{shape.source}: a building {height:g} m high",
+            expected=f"0 to {TALLEST_M:g} m",
+            cause="feet or centimetres in place of metres",
+            path=path,
+        )
+    shape.height_m = height
+    shape.material = material_of(tags)
+    # 3.28 feet a metre: such a ratio of height to storeys is no accident
+    if height > 2 * _LEVEL_M and levels and 2.7 <= height / (levels * _LEVEL_M) <= 4.5:
+        shape.stated = False  # counted by _warn_of_feet
+        actions.append(f"warning: {shape.source}: {height:g} m for {levels:g} levels; are these feet?")
+
+
+def _inherit(shapes: list[_Shape], actions: list[str]) -> None:
+    """Parts without a height are as high as the building whose outline holds them."""
+    # whole buildings whose height the map states
+    known = [shape for shape in shapes if not (shape.part or shape.assumed)]
+    tree = shapely.STRtree([shape.area for shape in known])
+    for part in (shape for shape in shapes if shape.part and shape.assumed):
+        around = [known[int(i)] for i in tree.query(part.area.representative_point(), predicate="within")]
+        if around:
+            part.height_m, part.assumed = around[0].height_m, False
+            actions.append(f"{part.source}: no height; as high as {around[0].source}, {part.height_m:g} m")
+
+
+def _assumed_heights(shapes: list[_Shape]) -> str:
+    """One line on the buildings whose height no map says."""
+    assumed = [shape for shape in shapes if shape.assumed]
+    if not assumed:
+        return ""
+    heights = " and ".join(f"{height:g} m" for height in sorted({shape.height_m for shape in assumed}))
+    named = ", ".join(shape.name for shape in assumed[:5]) + ("" if len(assumed) <= 5 else ", ...")
+    of = counted(len(shapes), "building")
+    return f"height assumed: none in the map for {len(assumed)} of {of}, {heights} each: {named}"
+
+
+def _describe_wood(shape: _Shape, tags: Mapping[str, str], actions: list[str]) -> None:
+    notes: list[str] = []
+    height = positive_metres(tags, ("height", "est_height"), notes) or 0.0
+    if height > TALLEST_TREE_M:
+        notes.append(f"a wood {height:g} m high; feet or centimetres? The default holds")
+        height = 0.0
+    shape.height_m = height
+    shape.evergreen = max(_EVERGREEN.get(tags.get(key, ""), 0.0) for key in ("leaf_type", "leaf_cycle"))
+    actions += [f"{shape.source}: {note}" for note in notes]
+
+
+def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
+    """A country site where most stated heights are tower blocks was probably drawn in feet."""
+    stated = [shape.height_m for shape in shapes if shape.stated]
+    if len(stated) >= 3 and float(np.median(stated)) > 20 and max(shape.area.area for shape in shapes) < 50_000:
+        actions.append(
+            f"warning: the median stated height of {len(stated)} buildings is {np.median(stated):.0f} m; "
+            "if the file is in feet, give the heights a unit ('20 ft')"
+        )
+
+
+# ---------------------------------------------------------------- cleaning
+
+
+def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    """Drops outlines that cover the same ground as an earlier one, parts those of parts; a stated height is kept."""
+    tree = shapely.STRtree([shape.area for shape in shapes])
+    duplicates: set[int] = set()
+    for i, shape in enumerate(shapes):
+        if i in duplicates:
+            continue
+        for j in sorted(int(k) for k in tree.query(shape.area) if k > i and int(k) not in duplicates):
+            other = shapes[j]
+            # of like size first: an intersection is dear
+            ratio = shape.area.area / max(other.area.area, 1e-9)
+            alike = shape.part == other.part and 0.98 < ratio < 1.02
+            if not (alike and shape.area.intersection(other.area).area > 0.98 * shape.area.area):
+                continue
+            duplicates.add(j)
+            actions.append(f"{other.source}: left out, it repeats {shape.source}")
+            if other.stated and not shape.stated:
+                shape.height_m, shape.stated, shape.assumed = other.height_m, True, False
+    return [shape for i, shape in enumerate(shapes) if i not in duplicates]
+
+
+def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
+    """Sets of shapes whose areas overlap, directly or by way of others."""
+    if not shapes:
+        return []
+    areas = np.array([shape.area for shape in shapes], dtype=object)
+    first, second = shapely.STRtree(areas).query(areas, predicate="intersects")
+    # neighbours share a wall, and rounding an area of it
+    overlap = shapely.area(shapely.intersection(areas[first], areas[second])) > 0.01
+    pairs = coo_array((overlap[overlap], (first[overlap], second[overlap])), shape=(len(shapes), len(shapes)))
+    groups: dict[int, list[_Shape]] = {}
+    for group, shape in zip(connected_components(pairs, directed=False)[1].tolist(), shapes, strict=True):
+        groups.setdefault(group, []).append(shape)
+    return list(groups.values())
+
+
+def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    """Outlines without the ground of their parts: where parts are mapped, theirs are the heights."""
+    parts = [shape for shape in shapes if shape.part]
+    if not parts:
+        return shapes
+    tree, disjoint = shapely.STRtree([shape.area for shape in parts]), []
+    for shape in shapes:
+        inside = [] if shape.part else [parts[int(i)].area for i in tree.query(shape.area, predicate="intersects")]
+        remainder = _areas_only(shape.area.difference(shapely.union_all(inside))) if inside else shape.area
+        if remainder.area < 0.98 * shape.area.area:
+            actions.append(f"{shape.source}: gives way to its mapped parts")
+            shape.area = remainder
+        if not remainder.is_empty:
+            disjoint.append(shape)
+    return disjoint
+
+
+def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    """Disjoint shapes: of one height and material merged, lower ones cut where they lie under higher ones."""
+    disjoint: list[_Shape] = []
+    for group in _groups(shapes):
+        disjoint += group if len(group) == 1 else _higher_first(group, actions)
+    return disjoint
+
+
+def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
+    disjoint: list[_Shape] = []
+    # from the highest down: what is under a higher roof is not seen
+    for shape in sorted(group, key=lambda shape: -shape.height_m):
+        over = [higher for higher in disjoint if higher.area.intersects(shape.area)]
+        free = _areas_only(shape.area.difference(shapely.union_all([higher.area for higher in over])))
+        same = next((higher for higher in over if _alike(higher, shape)), None)
+        if free.is_empty:
+            actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
+        elif same is not None:
+            same.area = _areas_only(same.area.union(free))
+            actions.append(f"{shape.source}: overlaps {same.source} at the same height; they were merged")
+        else:
+            if shape.area.area - free.area > 0.01:
+                actions.append(f"{shape.source}: the part under a higher building was cut away")
+            shape.area = free
+            disjoint.append(shape)
+    return disjoint
+
+
+def _alike(first: _Shape, second: _Shape) -> bool:
+    return abs(first.height_m - second.height_m) <= _SAME_HEIGHT_M and first.material == second.material
+
+
+def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    """Forests do not overlap: trees would stand twice as dense."""
+    disjoint: list[_Shape] = []
+    for group in _groups(shapes):
+        covered: BaseGeometry = Polygon()
+        for shape in group:
+            free = _areas_only(shape.area.difference(covered))
+            if free.area < 0.999 * shape.area.area:
+                actions.append(f"{shape.source}: the part inside another forest was cut away")
+            covered = covered.union(shape.area)
+            if not free.is_empty:
+                disjoint.append(replace(shape, area=free))
+    return disjoint
+
+
+def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, Polygon]]:
+    """Single polygons with unique names, without slivers and needless vertices."""
+    parts: list[tuple[str, _Shape, Polygon]] = []
+    used: set[str] = set()
+    for shape in shapes:
+        # rounded here to what site.yaml keeps: rounding coordinates one by one can make a ring cross itself
+        for part in shapely.get_parts(_areas_only(shapely.set_precision(shape.area, _GRID_M))):
+            plain = part.simplify(_SLIVER_M / 2)
+            plain = plain if isinstance(plain, Polygon) and plain.is_valid and not plain.is_empty else part
+            plain = Polygon(
+                plain.exterior, [hole for hole in plain.interiors if Polygon(hole).area >= _MINIMUM_AREA_M2]
+            )
+            if plain.area < _MINIMUM_AREA_M2 or plain.buffer(-_SLIVER_M / 2).is_empty:
+                actions.append(f"{shape.source}: a sliver of {part.area:.1f} m2 was left out")
+                continue
+            name, number = shape.name, 1
+            while name in used:
+                number += 1
+                name = f"{shape.name} ({number})"
+            used.add(name)
+            parts.append((name, shape, shapely.normalize(plain)))
+    return parts
+
+
+# ---------------------------------------------------------------- site.yaml
+
+
+def import_site(
+    files: Sequence[str | Path],
+    *,
+    base: str | Path | None = None,
+    towers: Sequence[str] = (),
+    **options: Any,
+) -> tuple[SiteModel, list[str]]:
+    """Return a site whose buildings, woods and geofences come from map files.
+
+    Parameters
+    ----------
+    files : sequence of paths
+        Map files.
+    base : str or path, optional
+        Packaged site or site.yaml from which towers and settings are kept. Without ``towers`` the default is Lake
+        Wheeler, if the map is there.
+    towers : sequence of str
+        ``NAME=LATITUDE,LONGITUDE,HEIGHT``: antennas [deg, deg, m above the ground]. They replace those of ``base``.
+        Without a base the first one is the origin and the ground is flat.
+    **options
+        For :func:`import_footprints`.
+
+    Returns
+    -------
+    SiteModel, list of str
+        The settings (see :func:`site_yaml`), and what was done.
+
+    Raises
+    ------
+    UsageError
+        If no file or no tower is known, or a tower is not ``NAME=LATITUDE,LONGITUDE,HEIGHT``.
+    InputError
+        If the map cannot be read, or does not lie at the site.
+    """
+    if not files:
+        raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
+    named_towers = _named_towers(towers)
+    if towers and base is None:
+        return _site_around(files, named_towers, options)
+    base = base or "lake_wheeler"
+    model = site_model(base)
+    frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
+    content = model.model_dump()
+    if towers:
+        content["towers"] = named_towers
+    if model.dem is not None:  # the new file may lie in another folder
+        content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
+    actions = _from_maps(content, import_footprints(files, frame, area_m=extent_m(model, frame), **options))
+    imported = SiteModel.model_validate(content)
+    return imported, [_kept_of_base(imported, base), *actions]
+
+
+def _site_around(
+    files: Sequence[str | Path], towers: dict[str, dict[str, float]], options: dict[str, Any]
+) -> tuple[SiteModel, list[str]]:
+    """Return a site with flat ground whose origin is the first tower, and whose area is that of the map around it."""
+    first = next(iter(towers.values()))
+    origin = {key: first[key] for key in ("latitude_deg", "longitude_deg")}
+    frame = SiteFrame(**origin)
+    positions = [frame.to_local(tower["latitude_deg"], tower["longitude_deg"]) for tower in towers.values()]
+    reach = box(-_AROUND_M, -_AROUND_M, _AROUND_M, _AROUND_M)
+    imports = import_footprints(files, frame, area_m=(-_AROUND_M, _AROUND_M, -_AROUND_M, _AROUND_M), **options)
+    shapes = [item.footprint for item in imports.buildings] + [item.area for item in imports.forests]
+    mapped = shapely.union_all([shape.intersection(reach) for shape in shapes])
+    around = [Point(*position).buffer(_NEAR_TOWER_M) for position in positions]
+    west, south, east, north = shapely.union_all([mapped, *around]).bounds
+    content: dict[str, Any] = {
+        "name": Path(files[0]).stem,
+        "origin": origin,
+        "towers": towers,
+        "area_m": [math.floor(west), math.ceil(east), math.floor(south), math.ceil(north)],
+        "trees": {},
+    }
+    actions = _from_maps(content, imports)
+    west, east, south, north = content["area_m"]
+    ground = SiteModel.model_fields["ground_material"].default
+    about = (
+        f"the origin is tower {next(iter(towers))}; the ground is flat ({ground}); the area is {east - west} m x "
+        f"{north - south} m: the map within {_AROUND_M / 1000:g} km of the origin. Change them in the file"
+    )
+    return SiteModel.model_validate(content), [about, *actions]
+
+
+def _named_towers(towers: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Return towers by name from ``NAME=LATITUDE,LONGITUDE,HEIGHT``."""
+    form = "--tower NAME=LATITUDE,LONGITUDE,HEIGHT, such as --tower roof=40.009,-105.267,25 [deg, deg, m above ground]"
+    by_name: dict[str, dict[str, float]] = {}
+    for text in towers:
+        name, _, place = text.partition("=")
+        try:
+            latitude, longitude, height = (float(word) for word in place.split(","))
+        except ValueError:
+            raise UsageError(f"--tower '{text}'", expected=form) from None
+        if not (name and math.isfinite(height) and 0 < height <= TALLEST_M):
+            raise UsageError(f"--tower '{text}'", expected=form, cause=f"a height outside 0 to {TALLEST_M:g} m")
+        if not (abs(latitude) <= 90 and abs(longitude) <= 180):
+            swapped = abs(longitude) <= 90 and abs(latitude) <= 180
+            raise UsageError(f"--tower '{text}'", expected=form, cause="the two are swapped" if swapped else None)
+        if name in by_name:
+            raise UsageError(f"two towers named '{name}'", expected="one --tower per name")
+        by_name[name] = {"latitude_deg": latitude, "longitude_deg": longitude, "antenna_height_m": height}
+    return by_name
+
+
+def _from_maps(content: dict[str, Any], imports: Footprints) -> list[str]:
+    """Outlines and trees of maps in place of those of the base."""
+    content |= {
+        "buildings": [
+            _outline_dict(b.name, b.footprint) | named(b, "height_m material source") for b in imports.buildings
+        ],
+        "forests": [
+            _outline_dict(f.name, f.area)
+            | named(f, "trees_per_hectare minimum_spacing_m source height_m evergreen_share")
+            for f in imports.forests
+        ],
+        "geofences": [_outline_dict(g.name, g.area) for g in imports.geofences],
+        "credit": "; ".join(imports.credits),
+        "assumed": imports.assumed,
+    }
+    content["trees"] |= {"single": [_tree_dict(tree) for tree in imports.trees]}
+    return imports.actions
+
+
+def _kept_of_base(model: SiteModel, base: str | Path) -> str:
+    """Sentence on the data that an import takes over from its base."""
+    origin = f"{model.origin.latitude_deg:.6f}, {model.origin.longitude_deg:.6f}"
+    ground = "flat ground" if model.dem is None else f"the elevation model {model.dem.path}"
+    return (
+        f"kept from the base '{base}': the name '{model.name}', the origin {origin}, the towers "
+        f"{', '.join(model.towers)} with their positions and antennas, {ground} of {model.ground_material}, tree "
+        "sizes; change them in the file, or name a base of your own with --base"
+    )
+
+
+def _tree_dict(tree: SingleTree) -> dict[str, Any]:
+    sizes = {name: getattr(tree, name) for name in ("height_m", "crown_diameter_m", "trunk_diameter_m")}
+    known = {name: round(size, 2) for name, size in sizes.items() if size is not None}
+    return {"at_m": (round(tree.east_m, 2), round(tree.north_m, 2)), **known}
+
+
+def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
+    """Name and polygon as site.yaml writes them."""
+
+    def ring(line: Any) -> list[tuple[float, float]]:
+        return [(round(float(x), 3), round(float(y), 3)) for x, y in list(line.coords)[:-1]]
+
+    return {"name": name, "polygon_m": ring(area.exterior), "holes_m": [ring(hole) for hole in area.interiors]}
+
+
+def _printable(text: str) -> str:
+    """Without control characters, which map data may hold and YAML refuses even in comments."""
+    return "".join(character if character.isprintable() else "?" for character in text)
+
+
+def site_yaml(model: SiteModel, *, header: Sequence[str] = ()) -> str:
+    """The text of a site.yaml that :func:`~aerpaw_cmp.site.siteyaml.load_site` reads back to the same site.
+
+    ``header`` lines become comments at the top (what the import did).
+    """
+    content = model.model_dump(mode="json", exclude_defaults=True)
+    text = "".join(f"# {_printable(line)}\n" for entry in header for line in str(entry).splitlines())
+    return text + dump_yaml(content)

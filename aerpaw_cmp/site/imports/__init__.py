@@ -1,1 +1,0 @@
-"""Maps of others: buildings, woods and heights from OSM, GeoJSON, KML."""

@@ -1,0 +1,1036 @@
+"""Calibrations of a site from flights, beside its file: ``NAME.learned/learned.yaml`` and the tables that it names.
+
+Each entry is a calibration: learned antennas by tower, channel and reader, its airframe, or a rank receiver, with the
+band and the logs (SHA-256) that it was learned from, its errors on flights left out, the source of the flights and the
+command that made it.
+
+The gain that a channel has towards both ends at once, beside its two antennas: learned, written, interpolated.
+
+Antenna files over the full sphere with a standard deviation: read, written, and as cuts for planning tools.
+
+Directions at which the gain of an airframe is known, and the covariance of the gain there: written and read.
+
+Tables to which a name leads in the memory of a site, checked: of the same band, learned from the logs it says.
+"""
+
+from __future__ import annotations
+
+import copy
+import csv
+import gzip
+import hashlib
+import io
+import json
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, Field
+
+from ..common.content import marks, trained_on
+from ..common.errors import InputError, UsageError, parsed, parsing
+from ..common.files import LARGEST_TABLE, inside, locked, read_bounded, write_whole
+from ..common.gaussian import Factor, gaussian_kernel
+from ..common.geodesy import azimuth_rad, elevation_rad
+from ..common.outputs import explained_os_errors, file_digest
+from ..common.text import counted, guarded_comment
+from ..common.units import BoolArray, FloatArray, db_from_power, power_from_db
+from ..common.yamlfile import StrictModel, dump_yaml, load_yaml
+from .antennas import HIGHEST_DBI, MeasuredPattern, check_power
+
+_INDEX = "learned.yaml"
+
+# Share by which a carrier may differ from the one that a tower's antenna was learned at.
+# Lake Wheeler's bands at 3.3, 3.4 and 3.51 GHz lie 3 % apart: other antennas, other gains.
+BAND = 0.02
+
+# The same for an airframe: 3.3 and 3.51 GHz share 90 % of the variance of its gain. Farther bands were never compared.
+AIRFRAME_BAND = 0.07
+
+
+class Source(StrictModel):
+    """Source of the flights, as calibration.yaml says."""
+
+    title: str = ""
+    doi: str = ""
+    licence: str = "not stated"
+    airframe: str = "not stated"
+
+
+class Errors(StrictModel):
+    """Means over held-out series: RMSE [dB] after one offset, and the share inside 90 % intervals.
+
+    ``rmse_db`` is that of held-out flights; ``height_rmse_db``, ``sector_rmse_db`` and ``heading_rmse_db`` are those of
+    heights, sectors of azimuth at the tower and headings that no other flight has. ``heights_m``: the cruise heights.
+    """
+
+    series: int
+    rmse_db: float
+    rmse_4s_db: float
+    free_space_rmse_db: float
+    inside_90: float
+    sector_rmse_db: float | None = None
+    height_rmse_db: float | None = None
+    heading_rmse_db: float | None = None
+    heights_m: list[float] = Field(default_factory=list)
+
+
+class LearnedLock(StrictModel):
+    """Lock probability of a receiver: P = 1 / (1 + exp(-per_db (path gain - gain_db))) of the predicted path gain [dB].
+
+    In lock the levels lie about ``locked_db`` at ``gain_db``, ``locked_per_db`` higher for each dB of path gain (less
+    than 1: of weak levels the receiver locks on the strong), with ``locked_sd_db`` in a flight; without lock about
+    ``lost_db`` and so on [unit of the measurement].
+    The scores are means over flights left out: Brier and log score (nat) beside those of each flight's own share, and
+    the RMSE [dB] of all samples where levels below the floor count as the floor.
+    """
+
+    gain_db: float
+    per_db: Annotated[float, Field(gt=0)]
+    share: Annotated[float, Field(gt=0, lt=1)]
+    locked_db: float
+    locked_per_db: float
+    locked_sd_db: Annotated[float, Field(gt=0)]
+    lost_db: float
+    lost_per_db: float
+    lost_sd_db: Annotated[float, Field(gt=0)]
+    flights: int
+    brier: float
+    constant_brier: float
+    log_score: float
+    constant_log_score: float
+    floor_db: float
+    floor_rmse_db: float
+    free_space_floor_rmse_db: float
+
+
+class LearnedLevel(StrictModel):
+    """Level of a log minus free space of a transmit power and the gains as written [dB]; ``sd_db``: of a new flight."""
+
+    offset_db: float
+    sd_db: Annotated[float, Field(gt=0)]
+    transmit_power_dbm: float
+    unit: str
+
+
+class LearnedSpread(StrictModel):
+    """Error model of a level besides the SD of the gain: see :class:`aerpaw_cmp.compare.gains.Spread`."""
+
+    own_sd_db: Annotated[float, Field(ge=0)]
+    noise_sd_db: Annotated[float, Field(ge=0)]
+    fading_sd_db: Annotated[float, Field(ge=0)]
+    fading_kurtosis: float
+    bin_s: Annotated[float, Field(gt=0)]
+
+
+class LearnedPair(StrictModel):
+    """Gain towards both ends at once: its table, and the kernel that interpolates it."""
+
+    file: str
+    sha256: str | None = None
+    """Of the table, where no index names it."""
+    length: Annotated[float, Field(gt=0)]
+    prior_sd_db: Annotated[float, Field(ge=0)]
+
+
+class LearnedAntenna(StrictModel):
+    """Knowledge about a learned antenna besides its table, as a flight file or calibrated.yaml contains it."""
+
+    sha256: Annotated[str, Field(pattern="^[0-9a-f]{64}$")]
+    """Of the table; another table is refused."""
+    command: str
+    """Command that learns it again."""
+    pair: LearnedPair | None = None
+    spread: LearnedSpread
+
+
+class LearnedHealth(StrictModel):
+    """Errors of held-out flights of one channel, by which faults of a later flight are judged; None: not measured.
+
+    ``slow_sd_db`` is the SD of the correlated part of the error, with its correlation time and length; ``white_sd_db``
+    the SD of the rest of 4-s means. ``channel_difference_db`` are differences of the offset to other channels, by name.
+    ``run`` is the usual longest run of equal readings.
+    """
+
+    rmse_db: float | None = None
+    slow_sd_db: float | None = None
+    correlation_s: float | None = None
+    correlation_m: float | None = None
+    white_sd_db: float | None = None
+    offset_db: float | None = None
+    offset_sd_db: float | None = None
+    channel_difference_db: dict[str, float] = Field(default_factory=dict)
+    channel_difference_sd_db: dict[str, float] = Field(default_factory=dict)
+    below_lock_share: float | None = None
+    run: float | None = None
+
+
+class LearnedSeries(StrictModel):
+    """Antennas of one tower and channel, and the properties of the levels of that channel."""
+
+    tower: str
+    channel: str
+    """Label of the antenna in the flights that were learned from; a name, not a condition."""
+    receiver: str = ""
+    """Receiver whose level ``level`` and ``lock`` describe, as ``receiver`` of a flight file; empty: not named."""
+    carrier_hz: float
+    tower_file: str
+    uav_file: str
+    known_file: str
+    """Directions at the UAV that determine its gain, and the covariance of the gain there."""
+    pair: LearnedPair | None = None
+    spread: LearnedSpread
+    sd_db: float
+    """Mean standard deviation of the level over directions that were flown."""
+    shares_airframe: bool = True
+    """False if the gain of the UAV does not predict held-out flights of its own campaign: it is not used elsewhere."""
+    lock: LearnedLock | None = None
+    level: LearnedLevel | None = None
+    """Of receivers that lose their lock: of the levels in lock."""
+    health: LearnedHealth | None = None
+
+    @property
+    def files(self) -> list[str]:
+        """Names of the tables."""
+        return [self.tower_file, self.uav_file, self.known_file, *([] if self.pair is None else [self.pair.file])]
+
+
+class LearnedReceiver(StrictModel):
+    """A rank receiver of one tower: error on flights left out as kappa and log score beside the constant forecast."""
+
+    tower: str
+    quantity: str
+    """Rank that it was learned from, such as ``scheduled PDSCH rank``; whatever reader reads it."""
+    carrier_hz: float
+    file: str
+    kappa: float | None = None
+    log_score: float | None = None
+    constant_log_score: float | None = None
+
+
+class Entry(StrictModel):
+    """Antennas and receivers of one campaign, as one calibration learned them."""
+
+    command: str
+    made: str
+    flights: list[str]
+    flown: list[str]
+    joined: list[str] = Field(default_factory=list)
+    """Other campaigns whose flights the gain of the UAV was learned from as well."""
+    trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]]
+    """SHA-256 of all logs of the calibration."""
+    source: Source = Source()
+    errors: Errors | None = None
+    series: list[LearnedSeries] = Field(default_factory=list)
+    receivers: list[LearnedReceiver] = Field(default_factory=list)
+    ground_roughness_m: float | None = None
+    tables: dict[str, Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = Field(default_factory=dict)
+    """SHA-256 of the tables as they were written: nothing else is ever replaced or removed."""
+    sha256: str = ""
+    """Of all other values of the entry."""
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the values, without ``sha256``."""
+        values = self.model_dump(mode="json", exclude={"sha256"}, exclude_none=True)
+        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+    def about(self) -> str:
+        """Return one sentence: learned from which flights, and which error to expect."""
+        days = f" of {', '.join(self.flown)}" if self.flown else ""  # none where the logs have relative times
+        text = f"learned on {counted(len(self.flights), 'flight')}{days}"
+        text += f", the UAV also on {', '.join(self.joined)}" if self.joined else ""
+        if self.errors is not None:
+            text += (
+                f"; expect an RMSE of {self.errors.rmse_db:.1f} dB on another flight, free space "
+                f"{self.errors.free_space_rmse_db:.1f} dB"
+            )
+        for lock in [item.lock for item in self.series if item.lock is not None][:1]:
+            text += (
+                f", {lock.floor_rmse_db:.1f} and {lock.free_space_floor_rmse_db:.1f} dB where levels below "
+                f"{lock.floor_db:g} count as {lock.floor_db:g}"
+            )
+        kappas = [receiver.kappa for receiver in self.receivers if receiver.kappa is not None]
+        return text + (f"; expect kappa {sum(kappas) / len(kappas):.2f} on another flight" if kappas else "")
+
+
+class _Foreign(BaseModel, extra="allow"):
+    """An entry of another version: nothing is read of it, but others can be replaced beside it."""
+
+    tables: dict[str, str] = Field(default_factory=dict)
+
+
+_Name = Annotated[str, Field(pattern="^[A-Za-z0-9][A-Za-z0-9_.-]*$")]
+
+
+class Learned(StrictModel):
+    """All that a site remembers, by name."""
+
+    format: Literal["aerpaw-cmp learned 3"] = "aerpaw-cmp learned 3"
+    entries: dict[_Name, Entry] = Field(default_factory=dict)
+
+
+class _Index(Learned):
+    """The same as it is written, with entries of any version."""
+
+    # a newer entry must not be lost because an older version adds one beside it
+    entries: dict[_Name, Entry | _Foreign] = Field(default_factory=dict)  # type: ignore[assignment]
+
+
+def folder_of(site: str | Path) -> Path:
+    """Folder of what a site remembers: beside its file, or in the package."""
+    path = Path(site)
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return path.with_suffix(".learned")
+    name = str(site).lower().replace("-", "_").replace(" ", "_")
+    return Path(str(resources.files("aerpaw_cmp.site") / "data" / f"{name}.learned"))
+
+
+def read_learned(site: str | Path) -> Learned:
+    """Read the memory of a site; empty for a site without one.
+
+    Raises
+    ------
+    UsageError
+        An index that is damaged, or of another version; values that were edited.
+    InputError
+        It names a file outside its folder.
+    """
+    folder = folder_of(site)
+    memory = _read(folder, Learned)
+    for name, entry in memory.entries.items():
+        if entry.sha256 != entry.digest:
+            raise UsageError(
+                f"the values of {name!r} are not those that were written (SHA-256)",
+                expected=f"an entry as calibrate writes it; learn it again: {entry.command}",
+                cause="an edited value",
+                path=folder / _INDEX,
+            )
+    return memory
+
+
+def _read(folder: Path, model: type[Learned]) -> Learned:
+    index = inside(folder, _INDEX, folder / _INDEX)
+    memory = load_yaml(index, model) if index.is_file() else model()
+    for name in {name for entry in memory.entries.values() for name in (*files_of(entry), *entry.tables)}:
+        # before any is opened: an index may come from a stranger
+        inside(folder, name, index, plain=True)
+    return memory
+
+
+def remember(site: str | Path, name: str, entry: Entry, files: Mapping[str, bytes]) -> list[Path]:
+    """Write an entry and its tables (name: content, packed here) into the memory of a site; the index comes last.
+
+    Parameters
+    ----------
+    site : str or Path
+    name : str
+        Of the entry; one of this name is replaced.
+    entry : Entry
+    files : mapping of str to bytes
+        As the entry names them, with the ending ``.gz``.
+
+    Returns
+    -------
+    list of Path
+
+    Raises
+    ------
+    UsageError
+        A file of the name of a table that no calibration wrote; a damaged index.
+    InputError, OutputError
+        As :func:`read_learned`; the folder cannot be written.
+    """
+    folder = folder_of(site)
+    # mtime=0: the same content has the same bytes, and so the same SHA-256
+    packed = {file: gzip.compress(content, 9, mtime=0) for file, content in files.items()}
+    tables = {file: hashlib.sha256(content).hexdigest() for file, content in packed.items()}
+    with explained_os_errors(folder):
+        folder.mkdir(exist_ok=True)
+        # two calibrations of one site at once: each must see the other's entry
+        with locked(folder):
+            memory = _read(folder, _Index)
+            # what an entry names with its digest is ours, and so is an edited table or one of a killed calibration
+            written = {item for known in memory.entries.values() for item in known.tables.items()}
+            for file in packed:
+                place = inside(folder, file, folder / _INDEX, plain=True)
+                known = {*written, *tables.items()}
+                if place.exists() and (file, file_digest(place)) not in known and not _is_table(place):
+                    raise UsageError(
+                        "no calibration wrote this file",
+                        expected="another 'calibration:' name, or that file moved away",
+                        path=place,
+                    )
+            for file, content in packed.items():
+                write_whole(folder / file, content)
+            made = entry.model_copy(update={"tables": tables})
+            made = made.model_copy(update={"sha256": made.digest})
+            entries = dict(sorted({**memory.entries, name: made}.items()))
+            text = dump_yaml(memory.model_copy(update={"entries": entries}).model_dump(mode="json", exclude_none=True))
+            # after the tables that it names: a reader meets no entry without its files
+            write_whole(folder / _INDEX, text)
+            used = {file for known in entries.values() for file in files_of(known)}
+            for file, digest in sorted(written):
+                # changed since, it is no longer the table that was written: it stays
+                if file not in used and (folder / file).is_file() and file_digest(folder / file) == digest:
+                    (folder / file).unlink()
+    return [folder / _INDEX, *(folder / file for file in files)]
+
+
+def carry_memory(base: str | Path, site: Path) -> list[str]:
+    """Copy the memory of a base beside a site made of it, which has none yet; a line that says so."""
+    origin, folder = folder_of(base), folder_of(site)
+    if not origin.is_dir() or (folder / _INDEX).exists():
+        return []
+    entries = read_learned(base).entries
+    with explained_os_errors(folder):
+        folder.mkdir(exist_ok=True)
+        # the index last: until it is there the new site has no memory
+        for name in [*sorted(set().union(*map(files_of, entries.values()))), _INDEX]:  # without it there is no memory
+            place = inside(origin, name, origin / _INDEX, plain=True)
+            if place.is_file() and not (folder / name).exists():
+                write_whole(folder / name, place.read_bytes())
+    return [f"learned antennas and receivers of the base were copied to {folder.name}: {', '.join(entries)}"]
+
+
+def memory_lines(site: str | Path) -> list[str]:
+    """Lines that say what a site remembers."""
+    lines = []
+    for name, entry in read_learned(site).entries.items():
+        what = [f"{s.tower}.{s.channel} at {s.carrier_hz / 1e9:g} GHz (SD {s.sd_db:.1f} dB)" for s in entry.series]
+        what += [f"rank receiver at {r.tower}" for r in entry.receivers]
+        source = ", ".join(part for part in (entry.source.title, entry.source.doi, entry.source.licence) if part)
+        lines.append(f"{name}: {', '.join(what)}; {entry.about()}; airframe: {entry.source.airframe}")
+        lines.append(
+            f"  source: {source}; {counted(len(entry.trained_on), 'log')}, SHA-256 in {folder_of(site).name}/{_INDEX}"
+        )
+        lines.append(f"  made {entry.made} by: {entry.command}")
+    return lines
+
+
+def files_of(entry: Entry | _Foreign) -> set[str]:
+    """Names of the tables of an entry."""
+    if isinstance(entry, _Foreign):
+        return set(entry.tables)
+    return {file for s in entry.series for file in s.files} | {r.file for r in entry.receivers}
+
+
+# Begins the comment that names a calibration and, after ``, from``, its flights.
+LEARNED = "# aerpaw-cmp calibrate: "
+
+
+def _is_table(place: Path) -> bool:
+    """Check whether a file is a table of some calibration: it begins as one, or is a rank receiver."""
+    with suppress(InputError, OSError, EOFError):
+        content = read_table(place, "a table")
+        return content.startswith(LEARNED.encode()) or (content.startswith(b"{") and b'"trained_on"' in content)
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class Written:
+    """SHA-256 of a file as a calibration wrote it, and the command that writes it again."""
+
+    sha256: str
+    command: str
+
+
+def read_table(path: Path, expected: str, written: Written | None = None) -> bytes:
+    """Return the content of a table, packed or not.
+
+    Parameters
+    ----------
+    path : Path
+    expected : str
+        What the table is, for messages.
+    written : Written, optional
+        The table must be as it was written.
+
+    Raises
+    ------
+    OSError
+    InputError
+        Too large, a damaged packed file, or not as it was written.
+    """
+    content = read_bounded(path, LARGEST_TABLE, expected)
+    if written is not None and hashlib.sha256(content).hexdigest() != written.sha256:
+        raise InputError(
+            f"this table is not the one that was learned (SHA-256 {written.sha256[:12]}...)",
+            expected=f"{expected} as it was written; learn it again: {written.command}",
+            cause="an edited table, or a calibration that was killed while it wrote",
+            path=path,
+        )
+    if not content.startswith(b"\x1f\x8b"):
+        return content
+    with parsing(path, expected, "a cut copy"), gzip.open(path) as book:
+        # one byte more than allowed tells a table that is too large without unpacking all of it
+        unpacked = book.read(LARGEST_TABLE + 1)
+    if len(unpacked) > LARGEST_TABLE:
+        raise InputError(f"it unpacks to more than {LARGEST_TABLE} bytes", expected=expected, path=path)
+    return unpacked
+
+
+class Named(StrictModel):
+    """An entry by name, such as ``lake_wheeler/dataset12_uav``, and its part: ``uav``, ``TOWER.CHANNEL`` or all."""
+
+    entry: Entry
+    part: str
+    folder: Path
+
+    def antenna(self, end: str, carrier_hz: float) -> LearnedSeries | None:
+        """Return the series whose antenna fits an end (``uav``, ``tower``) of a link; None if there is none."""
+        if end == "tower":
+            return next((s for s in self.entry.series if f"{s.tower}.{s.channel}" == self.part), None)
+        # an airframe has one antenna for all channels of a band
+        return min(self.entry.series, key=lambda s: abs(s.carrier_hz / carrier_hz - 1.0), default=None)
+
+    def written(self, file: str) -> Written:
+        """Return the SHA-256 of a table of the entry, and the command that writes it."""
+        return Written(self.entry.tables[file], self.entry.command)
+
+
+class UnknownName(UsageError):  # noqa: N818  # a case of its base, which is the error
+    """A name of the learned models of a site that can never apply."""
+
+
+def find_named(name: str, folder: Path, end: str = "") -> Named:
+    """Return the entry of a name ``SITE/ENTRY``, ``SITE/ENTRY_uav`` or ``SITE/ENTRY_TOWER.CHANNEL``.
+
+    Parameters
+    ----------
+    name : str
+    folder : Path
+        Where sites that are not packaged lie: SITE.learned in it.
+    end : {"uav", "tower", "receiver", ""}
+        Part that is wanted: the airframe, the antenna of a tower, a rank receiver, or any.
+
+    Raises
+    ------
+    UnknownName
+        No such site, entry or part, or a part for another end.
+    UsageError
+        A memory that cannot be read.
+    """
+    site, _, entry_part = name.rpartition("/")
+    # a site beside the flight file comes before a packaged one of its name
+    place: str | Path = folder.absolute() / f"{site}.yaml"  # the paths in it hold in any working folder
+    packaged = folder_of(site)
+    if not folder_of(place).is_dir() and packaged.is_absolute() and packaged.is_dir():
+        place = site
+    fitting = []
+    for entry_name, entry in read_learned(place).entries.items():
+        for part, full in _parts(entry_name, entry, end).items():
+            if full == entry_part:
+                return Named(entry=entry, part=part, folder=folder_of(place))
+            fitting.append(f"{site}/{full}")
+    raise UnknownName(
+        f"nothing learned is called {name!r}" + (f" for {_WANTED[end]}" if end else ""),
+        expected="one of " + ", ".join(fitting) if fitting else "SITE/ENTRY of a site with learned models",
+        cause=None if fitting else f"there is no such learned model in {folder_of(place)}",
+    )
+
+
+_WANTED = {"uav": "the UAV", "tower": "a tower", "receiver": "the rank receiver"}
+
+
+def _parts(name: str, entry: Entry, end: str) -> dict[str, str]:
+    """Return the full names of the parts of an entry that fit an end, by part."""
+    parts = {"": name} if end in ("", "receiver") and (not end or entry.receivers) else {}
+    if end in ("", "uav") and entry.series:
+        parts["uav"] = f"{name}_uav"
+    if end in ("", "tower"):
+        parts |= {f"{s.tower}.{s.channel}": f"{name}_{s.tower}.{s.channel}" for s in entry.series}
+    return parts
+
+
+# Share of the variance by which rounded values may miss the function.
+# The table has gains to 0.01 dB and angles to 0.1 deg: neighbours may contradict by as much.
+_NUGGET = 1e-3
+
+
+@dataclass(frozen=True, kw_only=True)
+class PairGain:
+    """A Gaussian process over the directions at both ends, known at some of them.
+
+    Parameters
+    ----------
+    directions : (k, 6)
+        Unit vectors, from the UAV to the tower in the body and from the tower to the UAV at the mast.
+    gain_db : (k,)
+        What the antennas of both ends together leave [dB].
+    sd_db : (k,)
+        Standard deviation of the level that both antennas and this gain predict there [dB].
+    length : float
+        Of the Gaussian kernel of the chord.
+    prior_sd_db : float
+        Of the gain where nothing is known [dB].
+    """
+
+    directions: FloatArray
+    gain_db: FloatArray
+    sd_db: FloatArray
+    length: float
+    prior_sd_db: float
+
+    @cached_property
+    def _factor(self) -> Factor:
+        matrix = gaussian_kernel(self.directions, self.directions, self.length)
+        # directions flown twice would make two equal rows, which have no factor
+        matrix[np.diag_indices(len(matrix))] += _NUGGET
+        return Factor.of(matrix)
+
+    def at(self, directions: FloatArray, apart_sd_db: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Gain and standard deviation of the level (n,) towards directions (n, 6) [dB].
+
+        Parameters
+        ----------
+        directions : (n, 6)
+            As those of the record.
+        apart_sd_db : (n,)
+            Standard deviation of both antennas as if each were learned alone [dB].
+
+        Returns
+        -------
+        gain_db, sd_db : (n,)
+
+        Notes
+        -----
+        The variance is that of the record by the share of the process that its directions determine, and the sum of
+        the antennas' and of the prior's by the rest.
+        """
+        gain, sd = np.empty(len(directions)), np.empty(len(directions))
+        white = self._factor.whiten(self.gain_db)
+        # bounds the memory of the kernel against all known directions
+        for start in range(0, len(directions), 4096):
+            part = slice(start, start + 4096)
+            across = gaussian_kernel(directions[part], self.directions, self.length)
+            gain[part], known = self._factor.condition(across, white)
+            # a share: rounding takes it beyond 1 at a known direction
+            known = np.minimum(known, 1.0)
+            near = across @ self.sd_db**2 / np.maximum(across.sum(axis=1), 1e-12)
+            away = apart_sd_db[part] ** 2 + self.prior_sd_db**2
+            sd[part] = np.sqrt(known * near + (1.0 - known) * away)
+        return gain, sd
+
+    def table(self, notes: Sequence[str]) -> str:
+        """Return the content of a table of the directions, gains and standard deviations, with comments at its head."""
+        angles = np.concatenate([angles_of(self.directions[:, :3]), angles_of(self.directions[:, 3:])], axis=1)
+        rows = np.column_stack([angles, self.gain_db, self.sd_db])
+        lines = [f"# {note}" for note in notes] + [",".join(PAIR_COLUMNS)]
+        lines += [f"{a:.1f},{b:.1f},{c:.1f},{d:.1f},{g:.2f},{s:.2f}" for a, b, c, d, g, s in rows]
+        return "\n".join(lines) + "\n"
+
+
+PAIR_COLUMNS = ("uav_azimuth_deg", "uav_elevation_deg", "tower_azimuth_deg", "tower_elevation_deg", "gain_db", "sd_db")
+
+
+@parsed("a table of the gain towards both ends")
+def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | None = None) -> PairGain:
+    """Read a table of :meth:`PairGain.table`.
+
+    Parameters
+    ----------
+    path : Path
+    length, prior_sd_db : float
+        Kernel of the gain, as in :class:`PairGain`.
+    written : Written, optional
+        The table must be as it was written.
+
+    Raises
+    ------
+    InputError
+        Other columns, no row, values that are not finite; a table that is not as it was written.
+    """
+    text = read_table(path, "a table of the gain towards both ends", written).decode("utf-8-sig")
+    lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
+    table = np.loadtxt(lines[1:], delimiter=",", ndmin=2) if len(lines) > 1 else np.zeros((0, len(PAIR_COLUMNS)))
+    if lines[:1] != [",".join(PAIR_COLUMNS)] or not len(table) or table.shape[1] != len(PAIR_COLUMNS):
+        raise InputError("not the columns, or no row", expected=", ".join(PAIR_COLUMNS), path=path)
+    if not np.isfinite(table).all():
+        raise InputError("values that are not finite", expected="angles [deg], gains and SDs [dB]", path=path)
+    return PairGain(
+        directions=np.concatenate([vectors_of(table[:, :2]), vectors_of(table[:, 2:4])], axis=1),
+        gain_db=table[:, 4],
+        sd_db=table[:, 5],
+        length=length,
+        prior_sd_db=prior_sd_db,
+    )
+
+
+def angles_of(vectors: FloatArray) -> FloatArray:
+    """Return azimuths and elevations (n, 2) [deg] of unit vectors (n, 3)."""
+    return np.column_stack([np.degrees(azimuth_rad(vectors)) % 360.0, np.degrees(elevation_rad(vectors))])
+
+
+def vectors_of(angles_deg: FloatArray) -> FloatArray:
+    """Return unit vectors (n, 3) of azimuths and elevations (n, 2) [deg]."""
+    azimuth, elevation = np.radians(angles_deg).T
+    across = np.cos(elevation)
+    return np.column_stack([across * np.cos(azimuth), across * np.sin(azimuth), np.sin(elevation)])
+
+
+SPHERE_COLUMNS = ("azimuth_deg", "elevation_deg", "gain_dbi", "gain_sd_db")
+
+
+class SpherePattern(MeasuredPattern):
+    """A gain grid with its standard deviation.
+
+    Parameters
+    ----------
+    name : str
+    gain_dbi, sd_db : (thetas, phis)
+        Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
+    notes : str
+        Comments of the file, from which its provenance is read.
+
+    Attributes
+    ----------
+    pair : PairGain or None
+        Gain towards both ends at once, besides that of a tower's antenna.
+    spread : LearnedSpread or None
+        Error model of a level besides the SD of the gain.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        gain_dbi: FloatArray,
+        sd_db: FloatArray,
+        frequency_hz: float | None = None,
+        notes: str = "",
+    ) -> None:
+        super().__init__(name, np.sqrt(power_from_db(gain_dbi)).astype(np.complex128), None, frequency_hz)
+        self.trained_on, self.marks = trained_on(notes), marks(notes)
+        self.notes = notes
+        self.pair: PairGain | None = None
+        self.spread: LearnedSpread | None = None
+        self._sd_db = np.asarray(sd_db, dtype=np.float64)
+
+    @property
+    def largest_sd_db(self) -> float:
+        """Standard deviation of the gain in the direction that is known least [dB]."""
+        return float(self._sd_db.max())
+
+    def gain_sd_db(self, theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
+        """Standard deviation of the gain towards directions [dB], bilinear."""
+        from scipy.ndimage import map_coordinates
+
+        theta, phi = np.broadcast_arrays(np.asarray(theta_rad, dtype=float), np.asarray(phi_rad, dtype=float))
+        rows, columns = self._sd_db.shape
+        # the first meridian again behind the last, so that interpolation goes round
+        wrapped = np.concatenate([self._sd_db, self._sd_db[:, :1]], axis=1)
+        at = [theta.ravel() / np.pi * (rows - 1), (phi.ravel() % (2 * np.pi)) / (2 * np.pi) * columns]
+        return np.asarray(map_coordinates(wrapped, at, order=1, mode="nearest").reshape(theta.shape))
+
+
+def sphere_grid(step_deg: float = 5.0) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Zenith angles (t,) and azimuths (p,) [deg] of a full sphere, and unit vectors (t, p, 3)."""
+    # both poles, but 360 deg not again: it is 0
+    theta, phi = np.arange(0.0, 180.0 + step_deg / 2, step_deg), np.arange(0.0, 360.0, step_deg)
+    t, p = np.radians(theta)[:, None], np.radians(phi)[None, :]
+    vectors = np.stack(np.broadcast_arrays(np.sin(t) * np.cos(p), np.sin(t) * np.sin(p), np.cos(t)), axis=-1)
+    return theta, phi, vectors
+
+
+def unit_mean_gain(gain_db: FloatArray) -> FloatArray:
+    """A grid (thetas, phis) [dB] shifted so that its mean power over the sphere is that of an isotropic antenna.
+
+    The level of a learned gain is not identified: it stands in the offset.
+    """
+    theta = np.linspace(0.0, np.pi, gain_db.shape[0])
+    # area of a ring; a pole has none
+    weight = np.sin(theta)[:, None] * np.ones_like(gain_db)
+    return np.asarray(gain_db - db_from_power((power_from_db(gain_db) * weight).sum() / weight.sum()))
+
+
+def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] = (), decimals: int = 3) -> str:
+    """Text of an antenna file: comment lines, a header, a line per direction.
+
+    Parameters
+    ----------
+    gain_dbi, sd_db : (thetas, phis)
+        Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
+    notes : tuple of str
+        Comments, a line each.
+    decimals : int
+        Of the gains.
+
+    Returns
+    -------
+    str
+    """
+    rows, columns = gain_dbi.shape
+    theta, phi = np.linspace(0.0, 180.0, rows), np.arange(columns) * (360.0 / columns)
+    lines = [guarded_comment(f"# {note}") for note in notes] + [",".join(SPHERE_COLUMNS)]
+    for i in range(rows):
+        lines += [
+            f"{phi[j]:g},{90.0 - theta[i]:g},{gain_dbi[i, j]:.{decimals}f},{sd_db[i, j]:.{decimals}f}"
+            for j in range(columns)
+        ]
+    return "\n".join(lines) + "\n"
+
+
+@parsed("a table of gain over direction")
+def read_sphere_csv(path: str | Path, written: Written | None = None) -> SpherePattern:
+    """Read an antenna file of :func:`sphere_csv`; azimuth counter-clockwise from the device's x axis, elevation up.
+
+    Parameters
+    ----------
+    path : str or Path
+    written : Written, optional
+        The file must be as it was written.
+
+    Raises
+    ------
+    InputError
+        Missing columns or directions, values that are no gains, with the line; a file that is not as it was written.
+    """
+    path = Path(path)
+    # shallow: the pattern of a text is kept, and pair and spread belong to one use of it
+    return copy.copy(_pattern_of(read_table(path, "an antenna file", written).decode("utf-8-sig"), path))
+
+
+@lru_cache(maxsize=64)
+def _pattern_of(text: str, path: Path) -> SpherePattern:
+    """The antenna of a file's text; kept, for each draft of a folder reads all of a site's memory."""
+    numbered = [(n, line) for n, line in enumerate(text.splitlines(), start=1) if line.strip() and line[0] != "#"]
+    header = [cell.strip() for cell in numbered[0][1].split(",")] if numbered else []
+    if header[:3] != list(SPHERE_COLUMNS[:3]):
+        raise InputError(
+            f"the columns are {', '.join(header) or 'none'}",
+            expected=", ".join(SPHERE_COLUMNS),
+            path=path,
+            line=numbered[0][0] if numbered else None,
+        )
+    values = _values(numbered[1:], len(header), path)
+    azimuth, elevation = np.unique(np.round(values[:, 0] % 360.0, 6)), np.unique(np.round(values[:, 1], 6))[::-1]
+    _check_grid(azimuth, elevation, len(values), path)
+    row = np.argmin(np.abs(elevation[None, :] - values[:, 1:2]), axis=1)
+    column = np.argmin(np.abs(azimuth[None, :] - values[:, :1] % 360.0), axis=1)
+    # the grid is complete by number, so a direction twice means another is missing
+    if len(np.unique(row * len(azimuth) + column)) != len(values):
+        raise InputError("a direction is given twice", expected="each direction once", path=path)
+    gain, sd = np.zeros((2, len(elevation), len(azimuth)))
+    gain[row, column] = values[:, 2]
+    if len(header) > 3:
+        sd[row, column] = values[:, 3]
+    notes = "\n".join(line for line in text.splitlines() if line.startswith("#"))
+    # the name of the file is that of the antenna in reports
+    pattern = SpherePattern(path.stem, gain, sd, notes=notes)
+    check_power(pattern, path)
+    return pattern
+
+
+def _values(numbered: Sequence[tuple[int, str]], width: int, path: Path) -> FloatArray:
+    """Cells (lines, width) of numbered lines; line by line only where that finds the one that is wrong."""
+    with suppress(ValueError):
+        if numbered:
+            # quick for files that are right, which most are
+            values = np.loadtxt([line for _, line in numbered], delimiter=",", comments=None, ndmin=2)
+            if values.shape == (len(numbered), width) and not _refused(values).any():
+                return values
+    return np.array([_row(line, number, width, path) for number, line in numbered]).reshape(-1, width)
+
+
+def _refused(values: FloatArray) -> BoolArray:
+    """Rows (n,) of cells (n, width) that are no gains in a direction."""
+    loud, negative = values[:, 2] > HIGHEST_DBI, (values[:, 3:4] < 0).any(axis=1)
+    return np.asarray(~np.isfinite(values).all(axis=1) | loud | negative)
+
+
+def _row(line: str, number: int, width: int, path: Path) -> list[float]:
+    cells = next(csv.reader(io.StringIO(line)))
+    try:
+        row = [float(cell) for cell in cells]
+    except ValueError:
+        row = []
+    if len(row) != width or _refused(np.array([row]))[0]:
+        raise InputError(
+            f"'{line[:60]}'",
+            expected=f"{width} numbers: angles in degrees, gain in dBi (at most {HIGHEST_DBI:g}), standard deviation",
+            cause="the line was cut off" if len(cells) < width else None,
+            path=path,
+            line=number,
+        )
+    return row
+
+
+def _check_grid(azimuth: FloatArray, elevation: FloatArray, count: int, path: Path) -> None:
+    is_sphere = (
+        len(azimuth) >= 4
+        and len(azimuth) % 2 == 0
+        and len(elevation) >= 3
+        and np.allclose(azimuth, np.arange(len(azimuth)) * 360.0 / len(azimuth), atol=1e-3)
+        and np.allclose(elevation, np.linspace(90.0, -90.0, len(elevation)), atol=1e-3)
+    )
+    if not is_sphere or count != len(azimuth) * len(elevation):
+        raise InputError(
+            f"{count} directions of {len(azimuth)} azimuths and {len(elevation)} elevations",
+            expected="a full sphere: azimuth from 0 deg and elevation from 90 to -90 deg in equal steps, each once",
+            cause="lines are missing",
+            path=path,
+        )
+
+
+def planning_cuts(pattern: MeasuredPattern, name: str, carrier_hz: float, notes: Sequence[str] = ()) -> str:
+    """Comments and the two principal cuts in the MSI Planet text format: attenuation below the peak, 360 lines each.
+
+    HORIZONTAL runs clockwise seen from above, as azimuths of planning tools do; VERTICAL starts at the horizon in front
+    and goes down first.
+
+    Parameters
+    ----------
+    pattern : MeasuredPattern
+    name : str
+        Of the antenna.
+    carrier_hz : float
+    notes : sequence of str
+        A COMMENT line each.
+
+    Returns
+    -------
+    str
+        Text with a line end at its end.
+    """
+    degrees = np.radians(np.arange(360.0))
+    # minus: HORIZONTAL runs clockwise
+    level = pattern.gain_dbi(np.full(360, np.pi / 2), -degrees)
+    below = np.pi / 2 + degrees  # zenith angle on the great circle through the boresight
+    over = pattern.gain_dbi(below, np.zeros(360))
+    peak = max(float(level.max()), float(over.max()))
+    lines = [f"NAME {name}", f"FREQUENCY {carrier_hz / 1e6:g}", f"GAIN {peak:.2f} dBi"]
+    lines += [*(f"COMMENT {note}" for note in notes), "HORIZONTAL 360"]
+    lines += [f"{i} {peak - v:.2f}" for i, v in enumerate(level)]
+    lines += ["VERTICAL 360", *(f"{i} {peak - v:.2f}" for i, v in enumerate(over))]
+    return "\n".join(lines) + "\n"
+
+
+_WHAT = "a table of the directions at which a gain is known"
+_COLUMNS = ("azimuth_deg", "elevation_deg", "covariance_db2 (columns up to the row's own)")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownDirections:
+    """Unit vectors (m, 3) in the body frame, and the covariance (m, m) of the gain towards them [dB^2]."""
+
+    directions: FloatArray
+    covariance_db2: FloatArray
+
+    def table(self, notes: Sequence[str]) -> str:
+        """Return the content of the table, with comments at its head."""
+        lines = [f"# {note}" for note in notes] + [",".join(_COLUMNS)]
+        for number, (azimuth, elevation) in enumerate(angles_of(self.directions)):
+            row = self.covariance_db2[number, : number + 1]
+            lines.append(f"{azimuth:.1f},{elevation:.1f}," + ",".join(f"{value:.2f}" for value in row))
+        return "\n".join(lines) + "\n"
+
+
+@parsed(_WHAT)
+def read_known(path: Path, written: Written | None = None) -> KnownDirections:
+    """Read a table of :meth:`KnownDirections.table`.
+
+    Raises
+    ------
+    InputError
+        Other columns, rows of another length, values that are not finite; a table that is not as it was written.
+    """
+    text = read_table(path, _WHAT, written).decode("utf-8-sig")
+    lines = [line for line in text.splitlines() if line.strip() and line[0] != "#"]
+    rows = [[float(cell) for cell in line.split(",")] for line in lines[1:]]
+    if lines[:1] != [",".join(_COLUMNS)] or not rows or [len(row) for row in rows] != [*range(3, len(rows) + 3)]:
+        raise InputError("not the columns, or rows of another length", expected=", ".join(_COLUMNS), path=path)
+    lower = np.zeros((len(rows), len(rows)))
+    for number, row in enumerate(rows):
+        lower[number, : number + 1] = row[2:]
+    if not np.isfinite(lower).all() or not np.isfinite([row[:2] for row in rows]).all():
+        raise InputError("values that are not finite", expected="angles [deg] and covariances [dB^2]", path=path)
+    return KnownDirections(
+        directions=vectors_of(np.array([row[:2] for row in rows])),
+        covariance_db2=lower + np.tril(lower, -1).T,
+    )
+
+
+def learned_antenna(named: Named, end: str, carrier_hz: float) -> tuple[Path, LearnedAntenna]:
+    """Return the table of a learned antenna and its error model.
+
+    Parameters
+    ----------
+    named : Named
+    end : {"uav", "tower"}
+    carrier_hz : float
+        At which it is to be used [Hz].
+
+    Raises
+    ------
+    UsageError
+        No antenna of that name for this end, or one of another band.
+    InputError
+        A table that is damaged, not as it was written, or learned from other logs than its entry names.
+    """
+    series = named.antenna(end, carrier_hz)
+    if series is None:
+        raise UsageError("the entry has no such antenna", expected="one that the entry has")
+    _check_band(series.carrier_hz, carrier_hz, AIRFRAME_BAND if end == "uav" else BAND)
+    file = series.uav_file if end == "uav" else series.tower_file
+    path, written = named.folder / file, named.written(file)
+    check_logs(read_sphere_csv(path, written).trained_on, named, path)
+    pair = series.pair
+    if pair is not None:
+        read_pair(named.folder / pair.file, pair.length, pair.prior_sd_db, named.written(pair.file))
+        pair = LearnedPair(
+            file=str(named.folder / pair.file), sha256=named.entry.tables[pair.file], length=pair.length,
+            prior_sd_db=pair.prior_sd_db,
+        )  # fmt: skip
+    return path, LearnedAntenna(
+        sha256=written.sha256, command=written.command, pair=pair if end == "tower" else None, spread=series.spread
+    )
+
+
+def _check_band(learned_hz: float, used_hz: float, band: float) -> None:
+    if abs(used_hz / learned_hz - 1.0) > band:
+        raise UsageError(
+            f"learned at {learned_hz / 1e9:g} GHz, used at {used_hz / 1e9:g} GHz",
+            expected=f"a carrier within {100 * band:g} %: farther bands were not compared",
+        )
+
+
+def receiver_file(named: Named, carrier_hz: float) -> Path:
+    """Return the file of a learned rank receiver of the same band, which was made from the logs that its entry names.
+
+    Parameters
+    ----------
+    named : Named
+        An entry with a receiver.
+    carrier_hz : float
+        Carrier of the rank link [Hz].
+
+    Raises
+    ------
+    UsageError
+        A receiver of another band.
+    InputError
+        A table that is damaged, or learned from other logs than its entry says.
+    """
+    _check_band(named.entry.receivers[0].carrier_hz, carrier_hz, BAND)
+    path = named.folder / named.entry.receivers[0].file
+    with parsing(path, "a rank receiver"):
+        content = json.loads(read_table(path, "a rank receiver", named.written(path.name)))
+    check_logs(content.get("trained_on", []) if isinstance(content, dict) else [], named, path)
+    return path
+
+
+def check_logs(trained_on: Sequence[str], named: Named, path: Path) -> None:
+    """Refuse a table that was learned from logs which its entry does not name: scores would trust the wrong ones."""
+    strange = set(trained_on) - set(named.entry.trained_on)
+    if strange:
+        raise InputError(
+            f"learned from logs (SHA-256 {min(strange)[:12]}...) that its entry does not name",
+            expected="the table that was written with the entry",
+            cause="a table of another calibration",
+            path=path,
+        )

@@ -1,1 +1,0 @@
-"""Scenes of meshes: Mitsuba files and what they hold."""

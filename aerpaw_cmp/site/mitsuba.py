@@ -1,0 +1,539 @@
+"""Scenes of meshes: PLY files, and Mitsuba scenes as Sionna RT reads them.
+
+Triangles and radio materials of a Mitsuba scene, as Sionna RT reads them; without Mitsuba.
+
+Read are shapes of type ``ply`` in the coordinates of the scene, as every scene of Sionna RT and of AERPAW has them, and
+the materials ``itu-radio-material``, ``radio-material``, ``absorber-radio-material`` or any other whose id begins with
+``itu_`` or ``mat-itu_``. A scene may name files in its own folder only.
+
+Triangles of PLY files in their three formats (ASCII, binary of either byte order); pure functions of bytes.
+
+Polygons become fans of triangles; one that is not flat is counted, since how it is cut then decides its shape.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+
+from ..common.errors import InputError, UsageError, parsed, parsing
+from ..common.files import inside, read_input
+from ..common.kml import xml_root
+from ..common.text import counted
+from ..common.units import AnyArray, FloatArray, IntArray
+from .materials import CROWN, material, stated_name
+
+# Bytes within which a PLY header ends; a longer one is no header.
+_LARGEST_HEADER = 65_536
+
+# Bytes of one mesh file.
+_LARGEST_FILE = 2**30
+
+# A polygon whose corners depart further [m] from the plane of its first three is not flat.
+_FLAT_M = 1e-3
+
+_TYPES = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "i2", "int16": "i2", "ushort": "u2",
+    "uint16": "u2", "int": "i4", "int32": "i4", "uint": "u4", "uint32": "u4", "float": "f4", "float32": "f4",
+    "double": "f8", "float64": "f8",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True)
+class RawMesh:
+    """Contents of a mesh file: vertices (n, 3), triangles (m, 3) int, and how many of its polygons were not flat."""
+
+    vertices: FloatArray
+    triangles: IntArray
+    bent: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class _Element:
+    name: str
+    count: int
+    properties: tuple[tuple[str, str, str], ...]
+    """(name, type, type of the list's length or "")"""
+
+
+def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
+    """A PLY file and its bytes (for a digest).
+
+    Raises
+    ------
+    InputError
+        No such file, too large, or damaged.
+    """
+    data = read_input(path, _LARGEST_FILE, "a mesh")
+    with parsing(path, "a mesh"):
+        return check(read_ply(data, path), path), data
+
+
+def check(mesh: RawMesh, path: Path) -> RawMesh:
+    """The mesh, if every index names a vertex and every used vertex is a place."""
+    if len(mesh.triangles):
+        low, high = int(mesh.triangles.min()), int(mesh.triangles.max())
+        if low < 0 or high >= len(mesh.vertices):
+            raise InputError(
+                f"a face names vertex {low if low < 0 else high}",
+                expected=f"0 to {len(mesh.vertices) - 1}",
+                cause="the file is damaged",
+                path=path,
+            )
+        if not np.isfinite(mesh.vertices[mesh.triangles.ravel()]).all():
+            raise InputError("a vertex is not a finite number", expected="coordinates in metres", path=path)
+    return mesh
+
+
+def read_ply(data: bytes, path: Path) -> RawMesh:
+    """A PLY file."""
+    kind, elements, start = _header(data, path)
+    body = _Body(data, ">" if kind == "binary_big_endian" else "<", start, path)
+    if kind == "ascii":  # the words as numbers of one kind: from here on a binary file
+        body = _Body(_numbers(data[start:].split(), path).tobytes(), "=", 0, path)
+        elements = [replace(e, properties=tuple((n, "f8", k and "f8") for n, _, k in e.properties)) for e in elements]
+    vertices: FloatArray = np.zeros((0, 3))
+    triangles, bent = np.zeros((0, 3), dtype=np.int64), 0
+    for element in elements:
+        columns = body.read(element)
+        if element.name == "vertex":
+            vertices = _vertices(element, columns, path)
+        elif element.name == "face":
+            triangles, bent = _fans(_polygons(element, columns, path), vertices, path)
+    return RawMesh(vertices, triangles, bent)
+
+
+def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
+    if not data.startswith(b"ply"):
+        raise InputError("it does not begin with 'ply'", expected="a PLY mesh", path=path)
+    end = data.find(b"end_header", 0, _LARGEST_HEADER)
+    if end < 0:
+        raise InputError(
+            f"no 'end_header' in its first {_LARGEST_HEADER} bytes", expected="a PLY mesh", cause="a damaged file",
+            path=path,
+        )  # fmt: skip
+    start = data.find(b"\n", end) + 1
+    kind = ""
+    elements: list[_Element] = []
+    for number, line in enumerate(data[:end].decode("latin-1").splitlines(), 1):
+        words = line.split()
+        try:
+            kind = words[1] if words[:1] == ["format"] else kind
+            _declare(words, elements)
+        except (IndexError, KeyError, ValueError):
+            raise InputError(
+                f"the header says '{line.strip()[:60]}'", expected="a PLY header", path=path, line=number
+            ) from None
+    # a negative count would read backwards
+    if kind not in ("ascii", "binary_little_endian", "binary_big_endian") or any(e.count < 0 for e in elements):
+        raise InputError(f"a PLY of format '{kind}'", expected="ascii or binary", path=path)
+    return kind, elements, start
+
+
+def _declare(words: list[str], elements: list[_Element]) -> None:
+    """An element of the header, or a property of its last one; IndexError, KeyError, ValueError where it is neither."""
+    if words[:1] == ["element"]:
+        elements.append(_Element(words[1], int(words[2]), ()))
+    elif words[:1] == ["property"]:
+        last = elements[-1]
+        listed = words[1] == "list"
+        item = (words[4], _TYPES[words[3]], _TYPES[words[2]]) if listed else (words[2], _TYPES[words[1]], "")
+        elements[-1] = _Element(last.name, last.count, (*last.properties, item))
+
+
+def _numbers(words: list[bytes], path: Path) -> FloatArray:
+    try:
+        return np.array(words, dtype=np.bytes_).astype(np.float64) if words else np.zeros(0)
+    except ValueError as error:
+        raise InputError(f"not a number: {error}", path=path) from None
+
+
+@dataclass(slots=True)
+class _Body:
+    """Bytes behind the header, read from ``place`` on."""
+
+    data: bytes
+    order: str
+    place: int
+    path: Path
+
+    def take(self, kind: Any, count: int, element: _Element) -> AnyArray:
+        """The next ``count`` items of a type."""
+        # numpy's own order is that of this machine
+        what = np.dtype(kind).newbyteorder(self.order)
+        if count < 0 or self.place + count * what.itemsize > len(self.data):
+            raise InputError(
+                f"the file ends before the {element.count} entries of '{element.name}' that its header promises",
+                cause="it was cut off, or the header is damaged",
+                path=self.path,
+            )
+        values = np.frombuffer(self.data, what, count, self.place)
+        self.place += count * what.itemsize
+        return values
+
+    def read(self, element: _Element) -> dict[str, Any]:
+        """Values of each property, a row an entry: an array, or a list of arrays where lists differ in length."""
+        least = sum(np.dtype(length or kind).itemsize for _, kind, length in element.properties)
+        begun = self.place
+        if not element.count or not least:
+            return {name: np.zeros((0, 1)) for name, *_ in element.properties}
+        # a header that promises more than the file holds ends here, before memory is asked for it
+        self.take(("V", least), element.count, element)  # or no row need be looked at
+        self.place = begun
+        # most meshes are triangles throughout: lists as long as the first are read as one table
+        first, fields = self._row(element), list[Any]()
+        for i, ((_, kind, length), values) in enumerate(zip(element.properties, first, strict=True)):
+            fields += [(f"length {i}", length)] if length else []
+            fields.append((f"{i}", kind, (len(values),)))
+        self.place, record = begun, np.dtype(fields)
+        if begun + element.count * record.itemsize <= len(self.data):
+            rows = self.take(record, element.count, element)
+            if all((rows[f"length {i}"] == len(first[i])).all() for i, p in enumerate(element.properties) if p[2]):
+                return {name: rows[f"{i}"] for i, (name, *_) in enumerate(element.properties)}
+            self.place = begun
+        several = [self._row(element) for _ in range(element.count)]
+        return {name: [row[i] for row in several] for i, (name, *_) in enumerate(element.properties)}
+
+    def _row(self, element: _Element) -> list[AnyArray]:
+        """Values of the properties of the next entry."""
+        return [
+            self.take(kind, int(self.take(length, 1, element)[0]) if length else 1, element)
+            for _, kind, length in element.properties
+        ]
+
+
+def _vertices(element: _Element, columns: dict[str, Any], path: Path) -> FloatArray:
+    if not {"x", "y", "z"} <= set(columns) or any(length for *_, length in element.properties):
+        raise InputError("its vertices have no x, y and z", expected="a PLY mesh", path=path)
+    return np.column_stack([columns[axis][:, 0].astype(np.float64) for axis in "xyz"])
+
+
+def _polygons(element: _Element, columns: dict[str, Any], path: Path) -> list[IntArray]:
+    """Corners of the polygons, those of one size together."""
+    lists = [name for name, _, length in element.properties if length]
+    which = next((name for name in lists if name in ("vertex_indices", "vertex_index")), None)
+    if which is None:
+        raise InputError("its faces list no vertices", expected="'vertex_indices' or 'vertex_index'", path=path)
+    corners, by_size = columns[which], dict[int, list[AnyArray]]()
+    for row in [corners] if isinstance(corners, np.ndarray) else corners:
+        by_size.setdefault(row.shape[-1], []).append(row.reshape(-1, row.shape[-1]))
+    # no index is as large: what is no number becomes one that no vertex has
+    polygons = {size: np.concatenate(rows) for size, rows in by_size.items() if size >= 3}
+    return [np.where(np.abs(rows) < 2**53, rows, -1).astype(np.int64) for rows in polygons.values()]
+
+
+def _fans(polygons: list[IntArray], vertices: FloatArray, path: Path) -> tuple[IntArray, int]:
+    """Triangles (n, 3) of polygons, and how many of those are not flat."""
+    triangles: list[IntArray] = []
+    bent = 0
+    for group in polygons:
+        corners = group.shape[1]
+        if corners > 3:
+            check(RawMesh(vertices, group), path)
+            points = vertices[group]
+            normal = np.cross(points[:, 1] - points[:, 0], points[:, 2] - points[:, 0])
+            size = np.linalg.norm(normal, axis=1, keepdims=True)
+            height = np.einsum("pki,pi->pk", points - points[:, :1], normal / np.where(size > 0.0, size, 1.0))
+            bent += int((np.abs(height).max(axis=1) > _FLAT_M).sum())
+        for k in range(1, corners - 1):
+            # a fan from the first corner
+            triangles.append(group[:, [0, k, k + 1]])
+    return (np.concatenate(triangles) if triangles else np.zeros((0, 3), dtype=np.int64)), bent
+
+
+# Of a slab without a stated thickness, as in Sionna RT.
+_DEFAULT_THICKNESS_M = 0.1
+
+_LARGEST_XML = 256 * 2**20
+# Munich, a scene of Sionna's, has 40 000.
+_MOST_TRIANGLES = 20_000_000
+
+# Names and materials of meshes that are vegetation, as words: no street, no treehouse.
+_VEGETATION = re.compile(
+    r"(?<![a-z])(trees?|canop(y|ies)|crowns?|foliage|vegetation|lea(f|ves)|hedges?|bush(es)?|shrubs?|trunks?)(?![a-z])"
+)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TriangleScene:
+    """A scene as triangles.
+
+    Parameters
+    ----------
+    vertices_m : (vertices, 3)
+        East, north, up.
+    triangles : (triangles, 3) int
+        Indices of vertices.
+    shape : (triangles,) int
+        Index into ``shapes`` and ``materials``.
+    shapes : tuple of str
+        Names.
+    materials : tuple of str
+        Of each shape, as :func:`aerpaw_cmp.site.materials.material` knows them.
+    notes : tuple of str
+        What was repaired or not modelled.
+    sha256 : str
+        Of the scene's files.
+    """
+
+    vertices_m: FloatArray
+    triangles: IntArray
+    shape: IntArray
+    shapes: tuple[str, ...]
+    materials: tuple[str, ...]
+    notes: tuple[str, ...] = ()
+    sha256: str = ""
+
+    def __len__(self) -> int:
+        return len(self.triangles)
+
+
+@dataclass(slots=True)
+class _Reading:
+    """Data collected so far."""
+
+    path: Path
+    folder: Path
+    radio: dict[str, str]
+    vertices: list[FloatArray] = field(default_factory=list)
+    triangles: list[IntArray] = field(default_factory=list)
+    names: list[str] = field(default_factory=list)
+    materials: list[str] = field(default_factory=list)
+    bent: int = 0
+    total: int = 0
+    skipped: dict[str, int] = field(default_factory=dict)
+    digest: hashlib._Hash = field(default_factory=hashlib.sha256)
+
+
+@parsed("a Mitsuba scene")
+def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> TriangleScene:
+    """Read a Mitsuba scene.
+
+    Parameters
+    ----------
+    path : str or Path
+        The XML file.
+    materials : mapping of str to str, optional
+        Radio materials of those of the scene, by id, that are none: ``{"wall": "concrete"}``.
+
+    Returns
+    -------
+    TriangleScene
+
+    Raises
+    ------
+    InputError
+        The XML or a mesh cannot be read, a file outside the scene's folder is named, there is no triangle.
+    UsageError
+        Materials that say nothing about radio.
+    """
+    path = Path(path)
+    root, data = _root(path)
+    parameters = dict(materials or {})
+    for name in parameters.values():
+        material(name)  # or say what is wrong with it
+    radio, unknown, notes = _materials(root, parameters, path)
+    reading = _Reading(path, path.parent.resolve(), radio)
+    reading.digest.update(data)
+    for shape in root.findall("./shape"):
+        _add(reading, shape, unknown)
+    if not reading.triangles:
+        raise InputError("the scene has no triangle", expected="shapes of type ply", path=path)
+    return _gathered(reading, notes)
+
+
+def _gathered(reading: _Reading, notes: list[str]) -> TriangleScene:
+    starts = np.cumsum([0, *(len(v) for v in reading.vertices)])
+    triangles = [t + start for t, start in zip(reading.triangles, starts, strict=False)]
+    if reading.bent:
+        notes.append(f"{reading.bent} polygons are not flat: they were cut into triangles from their first corner")
+    for kind, count in reading.skipped.items():
+        notes.append(f"warning: {counted(count, 'shape')} of type '{kind}' left out; read is ply")
+    return TriangleScene(
+        vertices_m=np.concatenate(reading.vertices),
+        triangles=np.concatenate(triangles),
+        shape=np.repeat(np.arange(len(triangles)), [len(t) for t in triangles]),
+        shapes=tuple(reading.names),
+        materials=tuple(reading.materials),
+        notes=tuple(notes),
+        sha256=reading.digest.hexdigest(),
+    )
+
+
+def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
+    data = read_input(path, _LARGEST_XML, "a scene")
+    root = xml_root(data, path, "a plain Mitsuba scene")
+    if root.tag != "scene":
+        raise InputError(f"XML of '{root.tag}'", expected="a Mitsuba scene ('scene')", path=path)
+    if root.find(".//include") is not None:
+        raise InputError("the scene includes another XML file", expected="one file: paste it in", path=path)
+    return root, data
+
+
+# ---------------------------------------------------------------- materials
+
+
+def _materials(
+    root: ElementTree.Element, parameters: Mapping[str, str], path: Path
+) -> tuple[dict[str, str], dict[str, str], list[str]]:
+    """Radio material by id; type by id of those that are none; notes."""
+    radio: dict[str, str] = {}
+    unknown: dict[str, str] = {}
+    rough: list[str] = []
+    # those of the scene first: a shape may carry one of its own without a name
+    for number, bsdf in enumerate((*root.findall("./bsdf"), *root.findall(".//shape/bsdf"))):
+        name = bsdf.get("id") or bsdf.get("name") or f"unnamed {number + 1}"
+        bsdf.set("id", name)
+        if name in parameters:
+            radio[name] = parameters[name]
+            continue
+        material = _radio_material(bsdf, name, path)
+        if material is None:
+            unknown[name] = bsdf.get("type", "?")
+        else:
+            radio[name] = material
+            if _float(bsdf, "scattering_coefficient", 0.0, path) > 0.0 and not _VEGETATION.search(name.lower()):
+                rough.append(name)
+    stray = sorted(set(parameters) - set(radio))
+    if stray:
+        raise UsageError(
+            f"the scene has no material '{stray[0]}'", expected="one of " + ", ".join([*radio, *unknown]), path=path
+        )
+    notes = []
+    if rough:
+        notes.append(f"diffuse scattering of {', '.join(rough)} is not modelled: they reflect as smooth surfaces")
+    return radio, unknown, notes
+
+
+def _radio_material(bsdf: ElementTree.Element, name: str, path: Path) -> str | None:
+    """Name of the radio material that a bsdf is, None where it says nothing about radio."""
+    kind, plain = bsdf.get("type", ""), name.removeprefix("mat-")
+    thickness = _float(bsdf, "thickness", _DEFAULT_THICKNESS_M, path)
+    stated = bsdf.find("string[@name='type']")
+    if kind == "itu-radio-material" or plain.startswith(("itu_", "itu-")):
+        # Blender's exporter names materials so, and Sionna takes the name for the kind
+        itu = plain[4:] if plain.startswith(("itu_", "itu-")) else plain
+        if stated is not None:
+            itu = stated.get("value", "")
+        elif kind == "itu-radio-material" and itu == plain:
+            raise InputError(f"the material '{name}' has no type", expected='<string name="type" .../>', path=path)
+        try:
+            return material(f"{itu} with thickness={thickness:.9g}").name
+        except UsageError as error:
+            raise InputError(f"material '{name}': {error.found}", expected=error.expected, path=path) from None
+    if kind == "radio-material":
+        permittivity = _float(bsdf, "relative_permittivity", 1.0, path)
+        conductivity = _float(bsdf, "conductivity", 0.0, path)
+        if permittivity < 1.0 or conductivity < 0.0 or thickness < 0.0:
+            raise InputError(
+                f"material '{name}': permittivity {permittivity:g}, conductivity {conductivity:g} S/m, "
+                f"thickness {thickness:g} m",
+                expected="a permittivity of at least 1 and no negative number",
+                path=path,
+            )
+        return stated_name(permittivity, conductivity, thickness)
+    return "vacuum" if kind == "absorber-radio-material" else None
+
+
+def _float(parent: ElementTree.Element, name: str, default: float, path: Path) -> float:
+    item = parent.find(f"float[@name='{name}']")
+    text = str(default) if item is None else item.get("value", "")
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not math.isfinite(value):
+        raise InputError(f"'{text[:60]}'", expected="a finite number", path=path)
+    return value
+
+
+# ---------------------------------------------------------------- shapes
+
+
+def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, str]) -> None:
+    kind = shape.get("type", "?")
+    if kind != "ply":
+        reading.skipped[kind] = reading.skipped.get(kind, 0) + 1
+        return
+    name = shape.get("id") or f"shape {len(reading.names) + 1}"
+    # an empty transform moves nothing, and exporters write it
+    if len(shape.find("transform[@name='to_world']") or ()):
+        raise InputError(
+            f"the shape '{name}' is moved by a to_world",
+            expected="meshes in the coordinates of the scene, as Sionna RT's own",
+            cause="apply the transform where the scene was made (Blender: Object, Apply), and export it anew",
+            path=reading.path,
+        )
+    mesh = _mesh(reading, shape, name)
+    reading.total += len(mesh.triangles)
+    if reading.total > _MOST_TRIANGLES:
+        raise InputError(
+            f"more than {_MOST_TRIANGLES} triangles",
+            expected="a scene that fits into memory",
+            cause="a terrain or scan that is finer than a wavelength asks for: simplify it first",
+            path=reading.path,
+        )
+    reading.vertices.append(mesh.vertices)
+    reading.triangles.append(mesh.triangles)
+    reading.names.append(name)
+    reading.materials.append(_of_shape(reading, shape, name, unknown))
+    reading.bent += mesh.bent
+
+
+def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown: Mapping[str, str]) -> str:
+    """Radio material of a shape."""
+    inner = shape.find("bsdf")
+    # a shape may refer to media and emitters as well
+    refs = [item.get("id", "") for item in shape.findall("ref") if item.get("name", "bsdf") == "bsdf"]
+    which = inner.get("id", "") if inner is not None else (refs[0] if refs else "")
+    # before its material is asked for: leaves often have one that says nothing about radio
+    if _VEGETATION.search(f"{name} {which}".lower()):
+        return CROWN
+    if which in reading.radio:
+        return reading.radio[which]
+    if not which:
+        raise InputError(
+            f"the shape '{name}' has no material", expected='<ref id="..." name="bsdf"/>', path=reading.path
+        )
+    if which in unknown:
+        others = "" if len(unknown) == 1 else f" and {len(unknown) - 1} more ({', '.join(list(unknown)[:6])})"
+        raise UsageError(
+            f"the material '{which}'{others} is of type '{unknown[which]}', which says nothing about radio",
+            expected="itu-radio-material, radio-material, or an id such as 'mat-itu_concrete'",
+            cause=f"say what it is: --material '{which}=concrete'",
+            path=reading.path,
+        )
+    raise InputError(
+        f"the shape '{name}' names the material '{which}', which the scene has not",
+        expected="one of " + ", ".join([*reading.radio, *unknown][:20]),
+        path=reading.path,
+    )
+
+
+def _mesh(reading: _Reading, shape: ElementTree.Element, name: str) -> RawMesh:
+    item = shape.find("string[@name='filename']")
+    wanted = "" if item is None else item.get("value", "")
+    if not wanted:
+        raise InputError(
+            f"the shape '{name}' names no file", expected='<string name="filename" .../>', path=reading.path
+        )
+    place = inside(reading.folder, wanted, reading.path)
+    if not place.is_file():
+        raise InputError(
+            f"the shape '{name}' names '{wanted}', which is not there",
+            expected=f"a mesh below {reading.folder}",
+            cause="the XML file was copied without its folder 'meshes'",
+            path=reading.path,
+        )
+    mesh, data = read_mesh(place)
+    # digests of digests: where one file ends cannot be shifted into the next
+    reading.digest.update(hashlib.sha256(data).digest())
+    return mesh

@@ -1,0 +1,359 @@
+"""Antenna files of any kind that is known by its content: measured spheres, one great circle, planning tools' cuts.
+
+Written: Sionna RT's custom pattern, MSI Planet's cuts, a table over the sphere.
+
+Cuts say nothing between them: a sphere is made of a horizontal and a vertical one by horizontal projection
+interpolation (F. Gil et al., IEEE Trans. Antennas Propag. 47, 1999, doi:10.1109/8.774131), which gives both cuts back.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ..common.content import marks, trained_on
+from ..common.errors import InputError, UsageError, parsed
+from ..common.files import LARGEST_TABLE, read_input
+from ..common.text import counted
+from ..common.units import FloatArray, power_from_db
+from .antennas import HIGHEST_DBI, MeasuredPattern, check_power, read_pattern_text
+from .learned import BAND, SPHERE_COLUMNS, SpherePattern, planning_cuts, read_sphere_csv, sphere_csv, sphere_grid
+
+# A half-wave dipole over an isotropic antenna.
+_DBI_OF_DBD = 2.15
+STEP_DEG = 3.0
+
+# Values of a cut may lie this far beyond the peak, and the peak this far from both cuts [dB].
+_RIPPLE_DB = 1.0
+
+# Greatest mean gain over the sphere of a pattern made of two cuts [dB]: 0.5 dB for the measurement, 0.5 dB for the
+# interpolation, which changed the mean of ten sector antennas and arrays by -0.3 to +0.2 dB.
+_MOST_OF_CUTS_DB = 1.0
+# The same for a learned antenna: its level is not known, and cuts through its only lobe added 3.7 dB.
+_MOST_OF_LEARNED_CUTS_DB = 5.0
+_PLANET = re.compile(r"(?im)^\s*(HORIZONTAL|VERTICAL)\s+(\d{1,4})\s*$")
+_GAIN = re.compile(r"(?im)^\s*GAIN\s+([-+]?\d{1,3}(?:\.\d{1,6})?)\s*(dBd|dBi)?\s*$")
+_FREQUENCY = re.compile(r"(?im)^\s*FREQUENCY\s+(\d{1,6}(?:\.\d{1,6})?)\s*(?:MHz)?\s*$")
+_PHI_CUT = re.compile(r"(?im)^\s*Phi\s*=\s*(-?\d{1,3}(?:\.\d{1,6})?)\s*\(deg\)")
+_GAIN_TABLE = re.compile(r"(?im)^\s*Frequency\s+E ?Total\. ?dB\s*$")
+
+
+@parsed("an antenna pattern file")
+def read_pattern_file(path: str | Path, *, carrier_hz: float | None = None) -> MeasuredPattern:
+    """An antenna pattern: AERPAW's text over the sphere or along one great circle, MSI Planet (.msi, .pln).
+
+    Parameters
+    ----------
+    path : str or Path
+    carrier_hz : float, optional
+        Which frequency of a file with several.
+
+    Returns
+    -------
+    MeasuredPattern
+
+    Raises
+    ------
+    InputError
+        Another kind of file, missing angles or units; with the line where there is one.
+    """
+    path = Path(path)
+    text = read_input(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig", errors="replace")
+    if any(line.replace(" ", "").startswith(",".join(SPHERE_COLUMNS[:3])) for line in text.splitlines()[:100]):
+        return read_sphere_csv(path)
+    if _PLANET.search(text):
+        pattern = _planet(text, path)
+    elif _PHI_CUT.search(text):
+        pattern = _great_circle(text, path.stem, path, carrier_hz)
+    elif _GAIN_TABLE.search(text):
+        raise InputError(
+            "peak gain over frequency, without directions",
+            expected="a pattern of the same antenna, such as SA-1400-5900_F3300.txt",
+            path=path,
+        )
+    else:
+        pattern = read_pattern_text(path)
+    pattern.trained_on, pattern.marks = trained_on(text), marks(text)
+    return pattern
+
+
+def _planet(text: str, path: Path) -> MeasuredPattern:
+    """Return the pattern of an MSI Planet file; cuts run clockwise from the front, and from the front downwards.
+
+    Raises
+    ------
+    InputError
+        No gain, a cut that is not a full circle, or cuts from which no antenna of the stated gain results.
+    """
+    gain = _GAIN.search(text)
+    if gain is None:
+        raise InputError("no line 'GAIN value dBi'", expected="GAIN in dBi or dBd", path=path)
+    # MSI Planet's own default is dBd
+    peak_dbi = float(gain[1]) + (0.0 if (gain[2] or "dBd").lower() == "dbi" else _DBI_OF_DBD)
+    cuts: dict[str, FloatArray] = {}
+    for cut in _PLANET.finditer(text):
+        # the header says how many lines follow; what stands behind them is the next cut's
+        rows = _pairs(text[cut.end() :].split("\n"), int(cut[2]), path)
+        cuts[cut[1].upper()] = _each_degree(rows, cut[1], path)
+    carrier, learned = _FREQUENCY.search(text), bool(trained_on(text))
+    cause = "the gain is too high for beams as wide as these cuts"
+    if gain[2] is None:
+        cause = f"'GAIN {gain[1]}' has no unit and is read as dBd; if it is a gain over isotropic: 'GAIN {gain[1]} dBi'"
+    return _from_cuts(
+        _about_peak(cuts, peak_dbi, path),
+        path.stem,
+        path,
+        float(carrier[1]) * 1e6 if carrier else None,
+        stated_dbi=None if learned else peak_dbi,
+        most_db=_MOST_OF_LEARNED_CUTS_DB if learned else _MOST_OF_CUTS_DB,
+        cause=cause,
+    )
+
+
+def _about_peak(cuts: dict[str, FloatArray], peak_dbi: float, path: Path) -> dict[str, FloatArray]:
+    """Gain [dBi] of cuts that hold attenuations below the peak, of whichever sign the program wrote."""
+    values = np.concatenate(list(cuts.values()))
+    # attenuations have one sign, whichever; both signs are gains about a level
+    if min(-values.min(), values.max()) > _RIPPLE_DB:
+        raise InputError(
+            f"values from {values.min():g} to {values.max():g} dB below the peak",
+            expected="attenuations of one sign",
+            cause="gains in place of attenuations",
+            path=path,
+        )
+    if (least := np.abs(values).min()) > _RIPPLE_DB:
+        raise InputError(
+            f"no direction of the cuts is less than {least:.1f} dB below the gain of {peak_dbi:g} dBi",
+            expected="cuts through the peak",
+            cause="another gain, or gains in place of attenuations",
+            path=path,
+        )
+    return {name: peak_dbi - np.abs(cut) for name, cut in cuts.items()}
+
+
+def _pairs(lines: list[str], count: int, path: Path) -> FloatArray:
+    """Angle and value of the first lines that hold any."""
+    rows = []
+    for line in [line for line in lines if line.strip()][:count]:
+        cells = line.split()
+        try:
+            rows.append((float(cells[0]), float(cells[1])))
+        except (ValueError, IndexError):
+            raise InputError(f"'{line.strip()[:60]}'", expected="an angle and a value", path=path) from None
+    if len(rows) < count or count < 4:
+        raise InputError(
+            f"a cut of {counted(len(rows), 'line')}", expected=f"{max(count, 4)}", cause="a cut file", path=path
+        )
+    return np.array(rows, dtype=np.float64)
+
+
+def _each_degree(rows: FloatArray, cut: str, path: Path) -> FloatArray:
+    """Values at 0 to 359 degrees of a cut over a full circle; half a vertical circle stands for both halves."""
+    angle, value = rows[:, 0] % 360.0, rows[:, 1]
+    if not np.isfinite(rows).all() or np.abs(value).max() > 10 * HIGHEST_DBI:
+        raise InputError(f"cut {cut} reaches {np.abs(value).max():g} dB", expected="attenuation in dB", path=path)
+    if np.ptp(rows[:, 0]) <= 180.0 and np.abs(rows[:, 0]).max() <= 90.0:  # front half alone: the back as the front
+        angle, value = np.concatenate((angle, (180.0 - rows[:, 0]) % 360.0)), np.concatenate((value, value))
+    order = np.argsort(angle, kind="stable")
+    # round the circle: the gap over the front counts too
+    if np.diff(np.append(angle[order], angle[order][0] + 360.0)).max() > 15.0:
+        raise InputError(f"cut {cut} has gaps above 15 deg", expected="a full circle", path=path)
+    return np.asarray(np.interp(np.arange(360.0), angle[order], value[order], period=360.0))
+
+
+def _from_cuts(
+    cuts: dict[str, FloatArray],
+    name: str,
+    path: Path,
+    frequency_hz: float | None,
+    *,
+    stated_dbi: float | None = None,
+    most_db: float = _MOST_OF_CUTS_DB,
+    cause: str = "the values are not gain over isotropic",
+) -> MeasuredPattern:
+    """Return the sphere of two cuts [dBi at each degree]; see the module text."""
+    for cut in ("HORIZONTAL", "VERTICAL"):
+        if cut not in cuts:
+            raise InputError(f"no cut {cut}", expected="a horizontal and a vertical cut", path=path)
+    horizontal, vertical = cuts["HORIZONTAL"], cuts["VERTICAL"]
+    theta, phi = _grid()
+    below = np.degrees(theta) - 90.0
+    around = np.degrees(phi)
+    # how far round the back: it weighs the vertical cut's front against its back
+    share = np.minimum(around, 360.0 - around) / 180.0  # 0 in front, 1 behind
+    # planning tools count clockwise, azimuth here counter-clockwise
+    level = _at(horizontal, -around)[None, :] + (1.0 - share)[None, :] * (_at(vertical, below) - horizontal[0])[:, None]
+    # a vertical cut that is the same in front and behind knows nothing of the back: the horizontal cut gives its level
+    same = np.allclose(vertical, vertical[(180 - np.arange(360)) % 360], atol=1e-6)
+    behind = horizontal[0 if same else 180]
+    level = level + share[None, :] * (_at(vertical, 180.0 - below) - behind)[:, None]
+    if stated_dbi is not None and (above_db := level.max() - stated_dbi) > _RIPPLE_DB:
+        down = " and ".join(f"{stated_dbi - cut[0]:.1f} dB ({cut_name})" for cut_name, cut in cuts.items())
+        raise InputError(
+            f"the cuts make a peak of {level.max():.1f} dBi, {above_db:.1f} dB above the stated gain; at 0 deg they "
+            f"are {down} below it",
+            expected="two cuts with the same value at 0 deg",
+            cause="a beam turned to the side, and each cut relative to its own peak",
+            path=path,
+        )
+    return _pattern(level, name, path, frequency_hz, most_db, cause)
+
+
+def _at(cut: FloatArray, degrees: FloatArray) -> FloatArray:
+    return np.asarray(np.interp(degrees, np.arange(360.0), cut, period=360.0))
+
+
+def _grid() -> tuple[FloatArray, FloatArray]:
+    return np.radians(np.arange(0.0, 180.5, STEP_DEG)), np.radians(np.arange(0.0, 360.0, STEP_DEG))
+
+
+def _pattern(
+    level_dbi: FloatArray, name: str, path: Path, frequency_hz: float | None, most_db: float, cause: str
+) -> MeasuredPattern:
+    if level_dbi.max() > HIGHEST_DBI:
+        raise InputError(f"a gain of {level_dbi.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
+    pattern = MeasuredPattern(name, np.sqrt(power_from_db(level_dbi)).astype(np.complex128), None, frequency_hz)
+    check_power(pattern, path, most_db=most_db, cause=cause)
+    return pattern
+
+
+def _great_circle(text: str, name: str, path: Path, carrier_hz: float | None) -> MeasuredPattern:
+    """AERPAW's total gain along one great circle at several frequencies, theta from -pi to pi; both halves blended."""
+    rows = [line.split() for line in text.splitlines() if re.match(r"\s*\d{6,}(?:\.\d+)?\s", line)]
+    table = np.array([[float(cell) for cell in row[:3]] for row in rows if len(row) >= 3])
+    if not len(table):
+        raise InputError("no rows", expected="frequency [Hz], theta [rad], total gain [dBi], ...", path=path)
+    frequencies = np.unique(table[:, 0])
+    frequency = float(frequencies[0])
+    if len(frequencies) > 1:
+        if carrier_hz is None:
+            raise InputError(f"{len(frequencies)} frequencies", expected="a carrier that says which", path=path)
+        frequency = float(frequencies[np.argmin(np.abs(frequencies - carrier_hz))])
+    cut = table[table[:, 0] == frequency]
+    # -pi and pi, or a row written twice: interpolation needs ascending angles
+    _, once = np.unique(np.round(cut[:, 1], 6), return_index=True)
+    angle, gain = cut[once, 1], cut[once, 2]
+    if len(angle) < 8 or angle[0] > -3.1 or angle[-1] < 3.1 or np.diff(angle).max() > 0.3:
+        raise InputError(f"{len(angle)} angles at {frequency / 1e6:g} MHz", expected="theta from -pi to pi", path=path)
+    theta, phi = _grid()
+    share = np.minimum(np.degrees(phi), 360.0 - np.degrees(phi)) / 180.0
+    # the circle's two halves: blended round the axis, since nothing says what lies between
+    front, back = np.interp(theta, angle, gain), np.interp(-theta, angle, gain)
+    level = (1.0 - share) * front[:, None] + share * back[:, None]
+    # one circle leaves more of the sphere to the interpolation than two cuts do
+    return _pattern(level, name, path, frequency, _MOST_OF_LEARNED_CUTS_DB, "the values are not gain over isotropic")
+
+
+# Columns of a cut by the first letters of its angle: degrees clockwise from the front, degrees below the horizon.
+_CUT_ANGLES = {"az": -1.0, "phi": -1.0, "el": -1.0, "th": 1.0, "zen": 1.0}
+
+
+@parsed("a cut of an antenna pattern")
+def read_cut_files(azimuth: Path, elevation: Path) -> MeasuredPattern:
+    """A pattern of two CSV files of an angle [deg] and a gain [dBi], as users of Sionna RT keep them.
+
+    Parameters
+    ----------
+    azimuth : Path
+        Angles counter-clockwise from the front, a full circle: ``azimuth_deg,gain_dbi`` (or ``phi_deg``).
+    elevation : Path
+        Through the front: ``elevation_deg`` up from the horizon or ``theta_deg`` down from the zenith; a half circle
+        stands for both halves.
+
+    Returns
+    -------
+    MeasuredPattern
+
+    Raises
+    ------
+    InputError
+        Other columns, gaps, cuts that differ in front.
+    """
+    cuts = {"HORIZONTAL": _cut_file(azimuth, ("az", "phi")), "VERTICAL": _cut_file(elevation, ("el", "th", "zen"))}
+    apart = abs(float(cuts["HORIZONTAL"][0] - cuts["VERTICAL"][0]))
+    if apart > _RIPPLE_DB:
+        raise InputError(
+            f"in front the cuts of {azimuth.name} and {elevation.name} differ by {apart:.1f} dB",
+            expected="two cuts of one antenna through its front, gains in dBi",
+            cause="one of them is relative to its own peak, or the files are exchanged",
+            path=elevation,
+        )
+    return _from_cuts(cuts, azimuth.stem, azimuth, None)
+
+
+def _cut_file(path: Path, angles: tuple[str, ...]) -> FloatArray:
+    """Gain [dBi] at each degree, as :func:`_planet` has it, of a CSV file with a header."""
+    text = read_input(path, LARGEST_TABLE, "a cut of an antenna pattern").decode("utf-8-sig", errors="replace")
+    header, *lines = [line for line in text.splitlines() if line.strip() and not line.startswith("#")] or [""]
+    names = [name.strip().lower() for name in header.split(",")]
+    begin = next((word for word in angles if names[0].startswith(word)), None)
+    if len(names) < 2 or begin is None or "gain" not in names[1] or "rad" in names[0]:
+        raise InputError(
+            f"the columns are {', '.join(names)}",
+            expected=f"an angle ({' or '.join(angles)}..., degrees) and a gain [dBi], named in the first line",
+            path=path,
+        )
+    rows = _pairs([line.replace(",", " ") for line in lines], len(lines), path)
+    rows[:, 0] = _CUT_ANGLES[begin] * rows[:, 0] - (90.0 if begin in ("th", "zen") else 0.0)
+    return _each_degree(rows, path.name, path)
+
+
+def exported(pattern: MeasuredPattern, name: str, target: Path, carrier_hz: float | None = None) -> str:
+    """Text of a pattern in the format that the ending of a file says: ``.py`` (Sionna RT), ``.msi``, ``.csv``.
+
+    What the pattern was learned from goes along as comments.
+
+    Parameters
+    ----------
+    pattern : MeasuredPattern
+    name : str
+    target : Path
+    carrier_hz : float, optional
+        For ``.msi``, where the pattern has no frequency of its own.
+
+    Returns
+    -------
+    str
+
+    Raises
+    ------
+    UsageError
+        Another ending; ``.msi`` without a frequency.
+    """
+    notes = getattr(pattern, "notes", "") or f"trained_on: {' '.join(pattern.trained_on)}" * bool(pattern.trained_on)
+    lines = tuple(line.lstrip("# ") for line in notes.splitlines())
+    if target.suffix == ".msi":
+        frequency = pattern.frequency_hz or carrier_hz
+        if not frequency or abs((carrier_hz or frequency) / frequency - 1.0) > BAND:
+            found = f"the pattern has {f'{frequency / 1e9:g} GHz' if frequency else 'no frequency'}"
+            raise UsageError(found, expected="--carrier HZ, within 2 % of the pattern's own", path=target)
+        return planning_cuts(pattern, name, frequency, lines)
+    theta, phi, _ = sphere_grid(STEP_DEG)
+    if target.suffix == ".csv":
+        check_power(pattern, target)  # what the reader of spheres asks: two cuts may make more power than goes in
+        at = np.meshgrid(np.radians(theta), np.radians(phi), indexing="ij")
+        sd = pattern.gain_sd_db(*at) if isinstance(pattern, SpherePattern) else np.zeros(at[0].shape)
+        return sphere_csv(pattern.gain_dbi(*at), sd, lines)
+    if target.suffix == ".py":
+        return _sionna_module(pattern, name, target, lines)
+    raise UsageError(f"the ending {target.suffix!r}", expected=".py (Sionna RT), .msi or .csv", path=target)
+
+
+def _sionna_module(pattern: MeasuredPattern, name: str, target: Path, notes: tuple[str, ...]) -> str:
+    import base64
+
+    theta, phi, _ = sphere_grid(STEP_DEG)
+    # closed at 360 deg: the module that is written interpolates within its table, not round its end
+    at = np.meshgrid(np.radians(theta), np.radians(np.append(phi, 360.0)), indexing="ij")
+    table = np.stack([part for field in pattern.field(*at) for part in (field.real, field.imag)], axis=-1)
+    template = Path(__file__).with_name("sionna_pattern.txt").read_text(encoding="utf-8")
+    return template.format(
+        name=re.sub(r"\W", "_", name),
+        module=re.sub(r"\W", "_", target.stem),
+        # notes stand in a docstring: a quote or a backslash of a file name would end it
+        notes="\n".join(re.sub(r'["\\]', "'", note) for note in notes),
+        table=base64.b64encode(table.astype("<f4").tobytes()).decode("ascii"),
+        shape=table.shape,
+    )

@@ -1,1 +1,0 @@
-"""Ground heights: elevation models, surfaces through points, datums."""

@@ -382,7 +382,7 @@ print(w[kernels._TE])
 @needs_numba
 def test_a_fault_planted_in_a_file_that_a_kernel_takes_in_reaches_compiled_code(tmp_path):
     """numba alone would go on with what it compiled before: its cache knows the file of the kernel."""
-    package = Path(compiled.__file__).parents[2]
+    package = Path(compiled.__file__).parents[1]
     shutil.copytree(package, tmp_path / "aerpaw_cmp", ignore=shutil.ignore_patterns("__pycache__"))
 
     def coefficient():
@@ -405,7 +405,7 @@ def test_every_file_that_kernels_take_in_names_the_folder_of_compiled_code():
 
     known = {(ROOM / name).resolve() for name in SOURCES}
     holders = {path for path in ROOM.rglob("*.py") if "\n@kernel\n" in path.read_text(encoding="utf-8")}
-    assert len(holders) > 3
+    assert len(holders) > 2
     assert holders <= known
     for path in holders:
         tree = ast.parse(path.read_text(encoding="utf-8"))
@@ -420,7 +420,9 @@ def test_every_file_that_kernels_take_in_names_the_folder_of_compiled_code():
             if isinstance(function, ast.FunctionDef) and "kernel" in {
                 getattr(d, "id", "") for d in function.decorator_list
             }:
-                body = {n.id for statement in function.body for n in ast.walk(statement) if isinstance(n, ast.Name)}
+                names = [n for statement in function.body for n in ast.walk(statement) if isinstance(n, ast.Name)]
+                own = {n.id for n in names if isinstance(n.ctx, ast.Store)} | {a.arg for a in function.args.args}
+                body = {n.id for n in names} - own
                 assert {taken[name].resolve() for name in body & set(taken)} <= known, function.name
 
 

@@ -80,7 +80,7 @@ QUANTITIES: tuple[Quantity, ...] = (
         r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s| us| ns)?$",
         r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| ns| local| epoch)?$",
         r"^time ?millisecond$", r"^(rel|relative|elapsed) ?time( ms| s| us| ns)?$", r"^elapsed$", r"^time boot ms$",
-        r"^(epoch|unix|ts)( ms| s| us| ns| utc)?$", r"^utc$", r"^t$",
+        r"^((gpst|tai)( time)?|time (gpst|tai))$", r"^(epoch|unix|ts)( ms| s| us| ns| utc)?$", r"^utc$", r"^t$",
         r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
     )),
     Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$", r"^(datum|fecha)$")),
@@ -324,7 +324,8 @@ def meaning(name: str, words: str | None = None) -> Meaning | None:
         texts += [bare, plain(in_brackets(name)[2]), plain(re.sub(r"(?<=[a-z])(?=[A-Z])", " ", name))]
     hits = ((row, text) for text in dict.fromkeys(texts) for form, row in _forms() if form.search(text))
     row, text = next(hits, (None, ""))
-    if row is None or row.role == "other":
+    # 'rx [dBm]' is a level, and no name of a receiver
+    if row is None or row.role == "other" or (row.role == "identity" and is_unit(unit)):
         return None
     if row.unit and unit in UNITS and (UNITS[unit][0] != row.unit) and row.role in ("position", "angle", "velocity"):
         unit = ""  # 'Longitude (W)' counts no watts, 'vel_n_m_s' no metres

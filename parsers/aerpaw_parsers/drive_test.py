@@ -22,7 +22,7 @@ from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from aerpaw_cmp.readers import dictionary
 
-from . import _cells, _identity, _pose, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri
+from . import _cells, _identity, _pose, _sheet, aadm_snr, ardupilot_bin, nemo_csv, pose_csv, quectel_ri
 
 # A tower of Lake Wheeler that a column is named by.
 _TOWER = re.compile(r"\blw ?([1-5])\b")
@@ -40,7 +40,7 @@ def is_header(names: list[str]) -> bool:
 def sniff(head: bytes) -> bool:
     """Check whether a header of such names stands in front, and it is none of the narrower formats."""
     # their headers hold a time and a level, too, and their readers know units that no name tells
-    narrower = [module.READER.sniff for module in (nemo_csv, quectel_ri, aadm_snr)]
+    narrower = [module.READER.sniff for module in (nemo_csv, quectel_ri, aadm_snr, ardupilot_bin)]
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
 

@@ -11,7 +11,7 @@ from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_cmp.readers import dictionary
 
-from . import _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, vehicle_out
+from . import _identity, _pose, _sheet, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos, vehicle_out
 
 
 def is_header(names: list[str]) -> bool:
@@ -40,7 +40,7 @@ def has_time(names: list[str]) -> bool:
 
 def sniff(head: bytes) -> bool:
     """Check whether a header with position and time stands in front, and it is not AERPAW's own layout."""
-    narrower = [module.READER.sniff for module in (vehicle_out, ardupilot_bin, nemo_csv, quectel_ri)]
+    narrower = [module.READER.sniff for module in (vehicle_out, ardupilot_bin, nemo_csv, quectel_ri, rtklib_pos)]
     return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
 

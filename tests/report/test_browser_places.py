@@ -67,10 +67,10 @@ def test_the_map_names_its_towers_and_reads_the_point_under_the_pointer(driver, 
 def test_a_saved_table_has_no_formula_of_a_name(driver):
     """As the tables that Python writes; numbers stay numbers."""
     driver.execute_script("""
-        const rows = () => [["=1+1", "a;@b", "plain"], [-1.5, null, "+2"]], button = common.downloads(document.createElement("canvas"), "t", rows, () => {})[2];
-        button.id = "guarded"; document.body.append(button);
+        const rows = () => [["=1+1", "a;@b", "plain"], [-1.5, null, "+2"]], menu = common.downloads(document.createElement("canvas"), "t", rows, () => {});
+        menu.id = "guarded"; document.body.append(menu);
     """)
-    (text,) = saved(driver, "#guarded").values()
+    text = saved(driver, "#guarded")["t.csv"]
     assert text == "'=1+1,a;'@b,plain\n-1.5,,'+2\n"
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 def flight(samples: int):
     """An export of one link."""
+    from aerpaw_cmp.report.columns import Column
     from aerpaw_cmp.report.exports import Export, points_table
     from aerpaw_cmp.site.siteyaml import load_site
 
@@ -33,7 +34,8 @@ def flight(samples: int):
         **{name: rng.normal(-80, 8, samples) for name in names},
     }
     site = load_site("lake_wheeler")
-    rss = tuple(points_table("rss", "long", [(time_utc, columns)], site.frame))
+    known = [Column(name, "dBm", name) for name in names]
+    rss = tuple(points_table("rss", "long", known, [(time_utc, columns)], site.frame))
     about = {"flight": "long", "title": "A long flight", "synthetic": True, "attributes": {}}
     return Export(site=site, sets=rss, track=None, clock=True, **about)
 

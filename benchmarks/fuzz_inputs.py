@@ -603,11 +603,11 @@ def _scene(path: Path) -> Any:
 def _report(path: Path) -> Any:
     """Differences of a report from itself; the tables beside its numbers have no rows."""
     from aerpaw_cmp.jobs.diff_reports import run_diff
-    from aerpaw_cmp.report.page import RANK_COLUMNS, RSS_COLUMNS
+    from aerpaw_cmp.report.columns import RANK, RSS, header
 
     with tempfile.TemporaryDirectory(dir=SCRATCH) as folder:
         path.rename(Path(folder) / "metrics.json")
-        for name, columns in (("rss.csv", RSS_COLUMNS), ("rank.csv", RANK_COLUMNS)):
+        for name, columns in (("rss.csv", header(RSS)), ("rank.csv", header(RANK))):
             (Path(folder) / name).write_text(",".join(columns) + "\n", encoding="utf-8")
         return run_diff(Path(folder), Path(folder))
 

@@ -12,7 +12,7 @@ from aerpaw_cmp.compare.result import RssResult
 from aerpaw_cmp.flight.data import gather, load_data, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.report.columns import metrics
+from aerpaw_cmp.report.flight import metrics
 from aerpaw_cmp.report.flight_data import report_data
 from tests.simulated import simulate
 

@@ -19,8 +19,9 @@ from ..common.text import unguarded
 from ..common.units import FloatArray
 from ..compare import verdict
 from ..compare.statistics import pooled_difference
+from ..report.columns import RANK, RSS, header
 from ..report.diff import Entry, InputEntry, ReportDiff, ReportSide
-from ..report.page import RANK_COLUMNS, RSS_COLUMNS, links_of
+from ..report.page import links_of
 
 _NEEDED: dict[str, type] = {
     "flight": str, "versions": dict, "inputs": list, "settings": dict, "rss": dict, "rank": dict,
@@ -90,7 +91,7 @@ def _read_report(place: Path) -> ReadReport:
     """
     metrics = read_metrics(place / "metrics.json", place)
     files = {kind: place / f"{kind}.csv" for kind in ("rss", "rank")}
-    rss, rank = (_table(files[kind], kind, columns) for kind, columns in (("rss", RSS_COLUMNS), ("rank", RANK_COLUMNS)))
+    rss, rank = (_table(files[kind], kind, header(columns)) for kind, columns in (("rss", RSS), ("rank", RANK)))
     changed = [name for name in changed_files(place) if name in ("metrics.json", "rss.csv", "rank.csv")]
     remarks = [f"{place / name} was changed after the report wrote it." for name in changed]
     return ReadReport(

@@ -224,7 +224,7 @@ def run_report(flight: Path, chosen: ReportOptions = ReportOptions(), options: R
     from ..flight.gains import foliage_notes
     from ..flight.replay import replay_flight
     from ..flight.settings import load_flight
-    from ..report.columns import metrics as metrics_of
+    from ..report.flight import metrics as metrics_of
     from ..report.flight import write_report
     from ..report.flight_data import pose_paths, report_data
     from .flight_run import check_recommended, recommended_text, report_stages, run_flight

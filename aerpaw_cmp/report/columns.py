@@ -1,244 +1,205 @@
-"""metrics.json, rss.csv and rank.csv: finished numbers to JSON and tables."""
+"""Every column of rss.csv and rank.csv in one table: name, unit, meaning, and how its values are computed.
+
+:data:`RSS` and :data:`RANK` produce the CSV files, the NetCDF variables of the exports, the list of columns on a
+report's page and the table in docs/outputs.md. A new column is one row here.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ..common.content import KEY, union
-from ..common.jsonable import fields_of, json_safe, named
 from ..common.text import guarded
 from ..common.units import FloatArray
-from ..compare.result import APPLIED, GIVEN, ClockResult, EngineResult, RankResult, RssResult
-from ..compare.statistics import Interval
+from ..compare.result import RankResult, RssResult
 from ..logs.records import has_wall_clock
-from .flight_data import RANKS, ReportData
-from .flight_words import audit_summary, cautions, offset_sentences, paragraph
-from .page import RANK_COLUMNS, RSS_COLUMNS, about, merge
 from .texts import iso_time, k_key
 
 # 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable.
 DECIMALS = 4
 
+_RANKS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
+_NO_YES = ("no", "yes")
 
-def metrics(data: ReportData) -> dict[str, Any]:
-    """The numbers of a report under their stable names; plain JSON values only.
 
-    Keys keep one order: that of the report. ``extra_metrics`` of the data is merged in last, key by key.
+@dataclass(frozen=True, slots=True)
+class Column:
+    """A column, or a family of columns whose name and meaning have a gap for a model, K or rank.
+
+    Parameters
+    ----------
+    name : str
+    unit : str
+        As people write it; empty for text, codes and shares.
+    meaning : str
+    values : callable, optional
+        Values (n,) of a series, or one value for all its rows; of a family a mapping by model, K or rank. None: the
+        series has no such column. Columns without a function are computed from the times of a whole table.
+    flags : tuple of str
+        Meanings of 0, 1, ...; empty for a number.
+    optional : bool
+        Missing in a file without any series that has it.
     """
-    rss: dict[str, dict[str, Any]] = {}
-    for item in data.rss:
-        rss.setdefault(item.tower, {})[item.channel] = _rss_metrics(item)
-    pairs: dict[str, dict[str, Any]] = {}
-    for pair in data.pairs:
-        pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score
-    result: dict[str, Any] = {
-        **named(data, "flight title synthetic settings"),
-        "sentence": paragraph(data),
-        "warnings": cautions(data),
-        "antennas": data.antennas,
-        "site": named(data.site, "name credit assumed"),
-        "inputs": [
-            named(f, "path sha256 reader lines accepted rejected blank role warnings")
-            | ({"learned_on": f.learned_on} if f.learned_on else {})
-            for f in data.inputs
-        ],
-        KEY: list(union(*(f.learned_on for f in data.inputs))),
-        "rss": rss,
-        "verdict": data.verdict,
-        **named(data, "likely_cause next_step"),
-        "offsets": offset_sentences(data.rss),
-        "rank": {item.tower: _rank_metrics(item) for item in data.rank},
-        "rt": None if data.engine is None else _engine_metrics(data.engine),
-        **about(data),
-        **({"ladder": data.ladder} if data.ladder else {}),
-        "clock": {name: clock_metrics(clock) for name, clock in data.clocks.items()},
-        **({} if data.serving is None else {"serving": data.serving.as_dict()}),
-        **({"pairs": pairs} if pairs else {}),
-    }
-    safe: dict[str, Any] = json_safe(result)
-    merge(safe, json_safe(data.extra_metrics))
-    return safe
+
+    name: str
+    unit: str
+    meaning: str
+    values: Callable[[Any], Any] | None = None
+    flags: tuple[str, ...] = ()
+    optional: bool = False
 
 
-def _rss_metrics(series: RssResult) -> dict[str, Any]:
-    score = series.score
-    return {
-        **named(score, "offset_db rmse_db n n_out_of_coverage"),
-        "at_search_edge": score.at_edge,
-        **named(score, "correlation rmse_ci95_db"),
-        "offset_ci95_db": score.intervals.offset_db,
-        "correlation_ci95": score.intervals.correlation,
-        "n_effective": score.intervals.autocorrelation.n_effective,
-        "lag_s": score.lag_s,
-        "lag_verdict": series.clock_verdict,
-        "unit": series.unit,
-        "fitted": score.fitted_on_scored,
-        "baselines": {name: named(model, "offset_db rmse_db") for name, model in series.baselines.items()},
-        **fields_of(series.further),
-    }
+_TIMES = (
+    Column("time_utc", "", "ISO 8601, UTC; empty: the log has relative times and no origin was given"),
+    Column("time_s", "s", "seconds after the first row of this tower and channel"),
+)
 
 
-def clock_metrics(clock: ClockResult) -> dict[str, Any]:
-    """``clock.<receiver>`` of metrics.json: numbers, verdict, whether applied, and the checks it rests on."""
-    return {
-        **clock.checks,
-        **named(clock, "radio_minus_telemetry_s ci95_s verdict reason"),
-        "applied": clock.applied in (APPLIED, GIVEN),
-    }
+def _place(axis: int) -> Callable[[RssResult | RankResult], FloatArray]:
+    return lambda series: series.position_m[:, axis]
 
 
-def _histogram(share: FloatArray, intervals: Sequence[Interval]) -> dict[str, Any]:
-    names = [str(rank) for rank in RANKS]
-    return {
-        "histogram": dict(zip(names, share, strict=True)),
-        "histogram_ci95": dict(zip(names, intervals, strict=True)),
-    }
+def _tower_place(axis: int) -> Callable[[RssResult | RankResult], FloatArray | None]:
+    return lambda series: None if series.tower_m is None else series.tower_m[:, axis]
 
 
-def _rank_metrics(series: RankResult) -> dict[str, Any]:
-    score = series.score
-    simulated = {
-        k_key(k): {
-            **_histogram(fit.histogram, fit.histogram_ci95),
-            **named(fit, "out_of_coverage agreement agreement_ci95 kappa total_variation total_variation_ci95"),
-            "wasserstein": fit.wasserstein,
-            "p_value": fit.p_histogram,
-            "confusion": fit.confusion[1:],
-        }
-        for k, fit in score.simulated.items()
-    }
-    return {
-        "measured": {
-            **_histogram(score.histogram, score.histogram_ci95),
-            "n": int(np.isfinite(series.measured).sum()),
-            "n_no_csi": int((~np.isfinite(series.measured)).sum()),
-        },
-        "simulated": simulated,
-        "best_k": score.best_k,
-        "best_k_ci95": score.curve.best_k_interval,
-        **further_numbers(series),
-    }
+_PLACES = (
+    Column("east_m", "m", "UAV position, metres east of the site origin", _place(0)),
+    Column("north_m", "m", "metres north", _place(1)),
+    Column("up_m", "m", "metres above the ground at the origin", _place(2)),
+)
+_TOWER_PLACES = (
+    Column("tower_east_m", "m", "place of a tower that moves, metres east", _tower_place(0), optional=True),
+    Column("tower_north_m", "m", "metres north", _tower_place(1), optional=True),
+    Column("tower_up_m", "m", "metres above the ground at the origin", _tower_place(2), optional=True),
+)
 
 
-def further_numbers(series: RssResult | RankResult) -> dict[str, Any]:
-    """Numbers of a series that stand in a table of their own on the page, as JSON has them."""
-    numbers: dict[str, Any] = {}
-    if isinstance(series, RankResult):
-        curve = series.score.curve
-        numbers = {
-            **named(series.score, "n n_effective n_no_csi"),
-            "best_k_total_variation": curve.best_k_total_variation,
-            "best_k_total_variation_ci95": curve.best_k_total_variation_interval,
-            "stale": named(series.score.staleness, "verdict n_reports hold_s"),
-        }
-    safe: dict[str, Any] = json_safe(numbers | fields_of(series.further))
-    return safe
+def _stated(name: str) -> Callable[[RssResult], FloatArray | None]:
+    return lambda series: None if series.stated is None else series.stated.columns(series.simulated_dbm)[name]
 
 
-def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
-    audit = engine.audit
-    return {
-        **named(engine, "engine links seconds paths left_out not_audited"),
-        "audit": None
-        if audit is None
-        else {
-            "summary": audit_summary(audit),
-            **named(audit, "reference links missing_paths extra_paths rss_max_error_db"),
-            "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
-            "field": None if audit.fields is None else {**fields_of(audit.fields), "failed": audit.fields.failed},
-            **named(audit, "seconds reference_seconds"),
-        },
-    }
+RSS: tuple[Column, ...] = (
+    *_TIMES,
+    Column("tower", "", "name of the tower", lambda p: p.tower),
+    Column("channel", "", "name of the channel", lambda p: p.channel),
+    Column("unit", "", "unit of measured_db", lambda p: p.unit),
+    *_PLACES,
+    Column("measured_db", "as logged", "as logged; empty: no signal", lambda p: p.measured_db),
+    Column("calibrated_db", "dBm", "measured_db plus the offset of this tower and channel", lambda p: p.calibrated_db),
+    Column("simulated_dbm", "dBm", "ray tracing; empty: no path", lambda p: p.simulated_dbm),
+    Column("residual_db", "dB", "calibrated_db minus simulated_dbm", lambda p: p.residual_db),
+    Column("measured_out_of_coverage", "", "1: the log has no signal here",
+           lambda p: p.measured_out_of_coverage.astype(int), _NO_YES),
+    Column("simulated_out_of_coverage", "", "1: the ray tracing has no path here",
+           lambda p: p.simulated_out_of_coverage.astype(int), _NO_YES),
+    Column("{}_dbm", "dBm", "level of the baseline {}",
+           lambda p: {name: model.level_dbm for name, model in p.baselines.items()}, optional=True),
+    Column("simulated_sd_db", "dB", "standard deviation of a sample, all parts", _stated("simulated_sd_db"),
+           optional=True),
+    Column("gain_sd_db", "dB", "its part of the learned antennas", _stated("gain_sd_db"), optional=True),
+    Column("own_sd_db", "dB", "its part of a flight's own shadowing", _stated("own_sd_db"), optional=True),
+    Column("noise_sd_db", "dB", "its part of the receiver's noise", _stated("noise_sd_db"), optional=True),
+    Column("fading_sd_db", "dB", "its part of fading", _stated("fading_sd_db"), optional=True),
+    Column("simulated_low_dbm", "dBm", "lower end of the 90 % interval", _stated("simulated_low_dbm"), optional=True),
+    Column("simulated_high_dbm", "dBm", "upper end of the 90 % interval", _stated("simulated_high_dbm"), optional=True),
+    *_TOWER_PLACES,
+)  # fmt: skip
 
 
-def rss_csv(series: Sequence[RssResult]) -> Iterator[str]:
-    """The text of rss.csv in pieces of bounded size."""
-    return _text(rss_tables(series), RSS_COLUMNS)
+def _integers(values: Any) -> Any:
+    """Return whole numbers of which NaN becomes an empty cell and 2.0 becomes 2."""
+    import pandas as pd
+
+    return pd.Series(values, dtype="float64").astype("Int64").array
 
 
-def rank_csv(series: Sequence[RankResult]) -> Iterator[str]:
-    """The text of rank.csv in pieces of bounded size."""
-    return _text(rank_tables(series), RANK_COLUMNS)
+def _finite(values: FloatArray) -> FloatArray:
+    return np.where(np.isfinite(values), values, np.nan)
 
 
-# Times (n,) of a panel, and its further columns: arrays (n,), or one value for all rows.
+RANK: tuple[Column, ...] = (
+    *_TIMES,
+    Column("tower", "", "name of the tower", lambda p: p.tower),
+    *_PLACES,
+    Column("measured_rank", "", "reported rank 1 to 4; empty: no CSI", lambda p: _integers(p.measured), _RANKS),
+    Column("simulated_rank_k{}", "", "rank by ray tracing, K = {}; 0: no path",
+           lambda p: {k: _integers(rank) for k, rank in p.rank.items()}, _RANKS, True),
+    Column("level_dbm", "dBm", "simulated level; empty: no path", lambda p: _finite(p.level_dbm), optional=True),
+    *_TOWER_PLACES,
+    Column("sigma{}_over_sigma1_db", "dB", "singular value {} over the largest; empty: no path, or zero",
+           lambda p: {i: _finite(ratio) for i, ratio in enumerate(p.singular_ratio_db.T, start=2)}, optional=True),
+    Column("probability_rank{}", "", "probability of rank {} by the fitted receiver",
+           lambda p: {i: _finite(share) for i, share in enumerate(() if p.probability is None else p.probability.T, 1)},
+           optional=True),
+)  # fmt: skip
+
+
+def header(columns: Sequence[Column]) -> list[str]:
+    """Return the names of the columns that every file has."""
+    return [column.name for column in columns if not column.optional]
+
+
+def described(columns: Sequence[Column]) -> list[tuple[str, str, str]]:
+    """Return name, unit and meaning of each column; a family has an ellipsis for its model, K or rank."""
+    return [(column.name.format("…"), column.unit, column.meaning.format("…")) for column in columns]
+
+
+# --- tables ---------------------------------------------------------------------------------------------------------
+
+# Times (n,) of a series, and its further columns by name: arrays (n,), or one value for all rows.
 _Table = tuple[Any, dict[str, Any]]
+
+
+def tables(columns: Sequence[Column], series: Sequence[Any]) -> tuple[list[Column], list[_Table]]:
+    """Compute the columns of some series, not yet rounded; a series has NaN in columns that only others have.
+
+    Parameters
+    ----------
+    columns : sequence of Column
+        :data:`RSS` or :data:`RANK`.
+    series : sequence of RssResult or RankResult
+
+    Returns
+    -------
+    columns : list of Column
+        Those that any series has, each family as its members.
+    tables : list of (times, mapping)
+    """
+    members: list[Column] = []
+    rows: list[dict[str, Any]] = [{} for _ in series]
+    for column in columns:
+        if column.values is None:
+            continue
+        each = [_members(column.values(item)) for item in series]
+        keys = list(dict.fromkeys(key for values in each for key in values))
+        for key in keys if any(isinstance(key, str) for key in keys) else sorted(keys):
+            text = key if isinstance(key, str) else k_key(key)
+            name = column.name.format(text)
+            members.append(replace(column, name=name, meaning=column.meaning.format(text)))
+            for row, values, item in zip(rows, each, series, strict=True):
+                row[name] = values[key] if key in values else np.full(len(item.time), np.nan)
+    return members, [(item.time, row) for item, row in zip(series, rows, strict=True)]
+
+
+def _members(values: Any) -> Mapping[Any, Any]:
+    """Return values by model, K or rank; a single column has the key ""."""
+    return values if isinstance(values, Mapping) else {} if values is None else {"": values}
+
+
+def csv_text(columns: Sequence[Column], series: Sequence[Any]) -> Iterator[str]:
+    """Return the text of rss.csv or rank.csv in pieces of bounded size."""
+    return _text(tables(columns, series)[1], header(columns))
+
 
 # Rows that are text at once.
 _ROWS = 50_000
 
 
-def rss_tables(series: Sequence[RssResult]) -> Iterator[_Table]:
-    """Times and further columns of rss.csv by tower and channel, not yet rounded; what a series lacks is NaN."""
-    models = list(dict.fromkeys(name for item in series for name in item.baselines))
-    more = [_rss_columns(item) for item in series]
-    names = dict.fromkeys(name for columns in more for name in columns)
-    for panel, optional in zip(series, more, strict=True):
-        nowhere = np.full(len(panel.time), np.nan)
-        yield (
-            panel.time,
-            {
-                **named(panel, "tower channel unit"),
-                **_places(panel.position_m),
-                **named(panel, "measured_db calibrated_db simulated_dbm residual_db"),
-                "measured_out_of_coverage": panel.measured_out_of_coverage.astype(int),
-                "simulated_out_of_coverage": panel.simulated_out_of_coverage.astype(int),
-                **{f"{m}_dbm": panel.baselines[m].level_dbm if m in panel.baselines else nowhere for m in models},
-                **{name: optional.get(name, nowhere) for name in names},
-            },
-        )
-
-
-def _rss_columns(series: RssResult) -> dict[str, FloatArray]:
-    """Columns that not every series has: stated intervals, the place of a moving tower."""
-    return {
-        **({} if series.stated is None else series.stated.columns(series.simulated_dbm)),
-        **({} if series.tower_m is None else _places(series.tower_m, "tower_")),
-    }
-
-
-def _places(position_m: FloatArray, whose: str = "") -> dict[str, FloatArray]:
-    """Columns of positions (n, 3)."""
-    return dict(zip((f"{whose}east_m", f"{whose}north_m", f"{whose}up_m"), position_m.T, strict=True))
-
-
-def rank_tables(series: Sequence[RankResult]) -> Iterator[_Table]:
-    """Times and further columns of rank.csv by tower, not yet rounded; what a series lacks is empty."""
-    import pandas as pd
-
-    def integers(values: Any) -> Any:
-        return pd.Series(values, dtype="float64").astype("Int64").array  # NaN becomes an empty cell, 2.0 becomes 2
-
-    ks = sorted({k for item in series for k in item.rank})
-    more = [_number_columns(item) for item in series]
-    names = dict.fromkeys(name for columns in more for name in columns)
-    for panel, optional in zip(series, more, strict=True):
-        nowhere = np.full(len(panel.time), np.nan)
-        yield (
-            panel.time,
-            {
-                "tower": panel.tower,
-                **_places(panel.position_m),
-                "measured_rank": integers(panel.measured),
-                **{f"simulated_rank_k{k_key(k)}": integers(panel.rank.get(k, nowhere)) for k in ks},
-                **{name: optional.get(name, nowhere) for name in names},
-            },
-        )
-
-
-def _number_columns(series: RankResult) -> dict[str, FloatArray]:
-    """Numbers a receiver decides by; no path, a ratio of nothing and a vanishing singular value are empty cells."""
-    columns = {"level_dbm": series.level_dbm, **({} if series.tower_m is None else _places(series.tower_m, "tower_"))}
-    columns |= {f"sigma{i}_over_sigma1_db": ratio for i, ratio in enumerate(series.singular_ratio_db.T, start=2)}
-    if series.probability is not None:
-        columns |= {f"probability_rank{rank}": share for rank, share in enumerate(series.probability.T, start=1)}
-    return {name: np.where(np.isfinite(values), values, np.nan) for name, values in columns.items()}
-
-
-def _text(tables: Iterator[_Table], columns: Iterable[str]) -> Iterator[str]:
+def _text(tables: Iterable[_Table], columns: Iterable[str]) -> Iterator[str]:
     """Tables below each other as CSV, some rows at a time: a day of samples as text would not fit into memory."""
     head = True
     for table in tables:

@@ -12,9 +12,8 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
-import re
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,49 +30,15 @@ from ..common.units import AnyArray, FloatArray, IntArray
 from ..logs.records import has_wall_clock
 from ..site.site import Site
 from .canvas import keep_extremes
-from .columns import DECIMALS, rank_tables, rss_tables
+from .columns import DECIMALS, RANK, RSS, Column, tables
 from .flight_data import ReportData, Track
-from .page import RANK_COLUMNS, RSS_COLUMNS
 from .texts import iso_time
 
 # 1 mm.
 _DEGREE_DECIMALS = 8
 
-# Meanings of 0 to 4 in a simulated rank.
-_RANK_FLAGS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
-_YES_NO = ("no", "yes")
-
-_UNITS = (
-    (r"_dbm$|^calibrated_db$", DBM, "dBm"),
-    (r"_db$", DB, "dB"),
-    (r"_deg$", "degree", "deg"),
-    (r"_m$", "m", "m"),
-    (r"_s$", "s", "s"),
-)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Column:
-    """One quantity of the samples.
-
-    Parameters
-    ----------
-    name : str
-        As in the CSV.
-    unit : str
-        As UDUNITS reads it.
-    shown_unit : str
-        As people write it: dBm.
-    meaning : str
-    flags : tuple of str
-        Meanings of 0, 1, ...; empty for a number.
-    """
-
-    name: str
-    unit: str = "1"
-    shown_unit: str = ""
-    meaning: str
-    flags: tuple[str, ...] = ()
+# Units as UDUNITS reads them; those of logs that are not dBm are ratios.
+_UDUNITS = {"": "1", "m": "m", "s": "s", "dBm": DBM}
 
 
 # What names a link.
@@ -159,25 +124,12 @@ class Export:
             yield tower.name, float(latitude), float(longitude), float(tower.position_m[2])
 
 
-# --- columns --------------------------------------------------------------------------------------------------------
-
-
-def column(name: str, unit: str | None = None) -> Column:
-    """The column of a name: its unit from the name's end, its meaning as rss.csv and rank.csv have it."""
-    meaning = (RANK_COLUMNS | RSS_COLUMNS).get(name, name.replace("_", " "))
-    if name.endswith("out_of_coverage"):
-        return Column(name=name, meaning=meaning, flags=_YES_NO)
-    if name == "measured_rank" or name.startswith("simulated_rank_k"):
-        k = name.removeprefix("simulated_rank_k")
-        return Column(name=name, meaning=meaning if k == name else f"rank by ray tracing, K = {k}", flags=_RANK_FLAGS)
-    if name == "measured_db":
-        return Column(name=name, unit=DBM if unit == "dBm" else DB, shown_unit=unit or "dB", meaning=meaning)
-    _, udunits, shown = next((known for known in _UNITS if re.search(known[0], name)), ("", "1", ""))
-    return Column(name=name, unit=udunits, shown_unit=shown, meaning=meaning)
-
-
 def points_table(
-    kind: str, flight: str, links: Iterable[tuple[Any, dict[str, Any]]], frame: SiteFrame
+    kind: str,
+    flight: str,
+    columns: Sequence[Column],
+    links: Iterable[tuple[Any, dict[str, Any]]],
+    frame: SiteFrame,
 ) -> Iterator[Points]:
     """The points of the links of a flight one below the other; nothing without links.
 
@@ -186,6 +138,7 @@ def points_table(
     kind : str
         Name of files and layers.
     flight : str
+    columns : sequence of Column
     links : iterable of (times, dict)
         Instants (n,) of a link and its further columns: arrays (n,), or one value for all rows.
     frame : SiteFrame
@@ -197,13 +150,14 @@ def points_table(
     import pandas as pd
 
     link = {"channel": "", "unit": "1", "flight": flight}
-    parts = [pd.DataFrame({**link, "time": time, **columns}, index=range(len(time))) for time, columns in links]
+    parts = [pd.DataFrame({**link, "time": time, **values}, index=range(len(time))) for time, values in links]
     if not parts:
         return
     table = pd.concat(parts, ignore_index=True)
     table["time"] = table["time"].to_numpy("datetime64[ns]")
     units = table["unit"].unique()
-    names = [name for name in table.columns if name not in {"time", *LINK, "unit", *PLACES}]
+    columns = [column for column in columns if column.name not in {*LINK, "unit", *PLACES}]
+    names = [column.name for column in columns]
     for name in ("east_m", "north_m", "up_m", *names):
         values = np.round(table[name].to_numpy(np.float64, na_value=np.nan), DECIMALS)
         table[name] = np.where(np.isfinite(values), values, np.nan)
@@ -212,7 +166,8 @@ def points_table(
     )
     table = table.astype(dict.fromkeys((*LINK, "unit"), "category"))[["time", *LINK, "unit", *PLACES, *names]]
     shared = str(units[0]) if len(units) == 1 else "dB, reference by link"
-    yield Points(kind=kind, table=table, columns=tuple(column(name, shared) for name in names))
+    known = (replace(column, unit=shared) if column.name == "measured_db" else column for column in columns)
+    yield Points(kind=kind, table=table, columns=tuple(known))
 
 
 def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[FloatArray, FloatArray]:
@@ -230,8 +185,8 @@ def latitude_longitude(frame: SiteFrame, east_m: Any, north_m: Any) -> tuple[Flo
 
 def of_report(data: ReportData) -> Export:
     """The samples of a flight."""
-    tables = {"rss": rss_tables(data.rss), "rank": rank_tables(data.rank)}
-    sets = tuple(p for kind, links in tables.items() for p in points_table(kind, data.flight, links, data.site.frame))
+    kinds = {"rss": tables(RSS, data.rss), "rank": tables(RANK, data.rank)}
+    sets = tuple(p for kind, of in kinds.items() for p in points_table(kind, data.flight, *of, data.site.frame))
     times = [points.table["time"].to_numpy() for points in sets] + ([] if data.track is None else [data.track.time])
     known = [time.min() for time in (time[~np.isnat(time)] for time in times) if len(time)]
     return Export(
@@ -318,8 +273,9 @@ def _values(column: Column, values: Any) -> tuple[Any, ...]:
         codes = np.where(np.isfinite(values), values, _NO_CODE).astype(np.int8)
         flags = {"flag_values": np.arange(len(column.flags), dtype=np.int8), "flag_meanings": " ".join(column.flags)}
         return codes, shared | flags, {"_FillValue": np.int8(_NO_CODE)}
-    comment = {} if column.shown_unit in ("", column.unit) else {"comment": f"unit: {column.shown_unit}"}
-    return values, {**shared, "units": column.unit, **comment}, {"_FillValue": np.nan}
+    unit = _UDUNITS.get(column.unit, DB)
+    comment = {} if column.unit in ("", unit) else {"comment": f"unit: {column.unit}"}
+    return values, {**shared, "units": unit, **comment}, {"_FillValue": np.nan}
 
 
 # Points of all coloured lines together: more, and Google Earth gets slow.
@@ -436,7 +392,7 @@ def _label(shown: _Shown, values: AnyArray, number: int) -> str:
     if shown.scale.edges is None or not len(known):
         return shown.scale.labels[number]
     low, high = known.min(), known.max()
-    return (f"{low:.1f}" if high - low < 0.05 else f"{low:.1f} to {high:.1f}") + f" {shown.column.shown_unit}"
+    return (f"{low:.1f}" if high - low < 0.05 else f"{low:.1f} to {high:.1f}") + f" {shown.column.unit}"
 
 
 def _legend_name(scale: Scale) -> str:

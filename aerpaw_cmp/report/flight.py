@@ -9,25 +9,29 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from markupsafe import Markup
 
+from ..common.content import KEY, union
+from ..common.jsonable import fields_of, json_safe, named
 from ..common.stages import Stages
 from ..common.text import counted
-from ..common.units import AnyArray
+from ..common.units import AnyArray, FloatArray
 from ..compare.ladder import LadderRow, distinct
 from ..compare.level import PART_DB, ErrorSpan, FieldAudit
-from ..compare.result import AuditResult, RankResult, RssResult
+from ..compare.result import APPLIED, GIVEN, AuditResult, ClockResult, EngineResult, RankResult, RssResult
+from ..compare.statistics import Interval
 from ..logs.records import has_wall_clock
 from . import flight_figures as figures
 from . import flight_words as words
 from .canvas import FORMATS
 from .cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Positions, Table, bold, estimate, paragraph, settings_card
 from .charts import charts_of, shown_confusion
-from .columns import further_numbers, metrics, rank_csv, rss_csv
+from .columns import RANK, RSS, csv_text, described
 from .explorer import payload
 from .exports import FOLDER
 from .flight_data import RANKS, InputFile, ReportData, start_of
-from .page import RANK_COLUMNS, RSS_COLUMNS, json_text, rendered, write_figures, write_file
+from .page import about, json_text, merge, rendered, write_figures, write_file
 from .texts import clock, coded, cut, duration, flat, interval, k_key, minute, number, percent
 
 # Rejected lines shown per file; the flight file holds all.
@@ -35,6 +39,140 @@ _REJECTED_SHOWN = 20
 
 # Figures that are drawn as files: none, or every one in a format or in all.
 FIGURES = ("none", "svg", "png", "pdf", "all")
+
+# --- metrics.json ---------------------------------------------------------------------------------------------------
+
+
+def metrics(data: ReportData) -> dict[str, Any]:
+    """The numbers of a report under their stable names; plain JSON values only.
+
+    Keys keep one order: that of the report. ``extra_metrics`` of the data is merged in last, key by key.
+    """
+    rss: dict[str, dict[str, Any]] = {}
+    for item in data.rss:
+        rss.setdefault(item.tower, {})[item.channel] = _rss_metrics(item)
+    pairs: dict[str, dict[str, Any]] = {}
+    for pair in data.pairs:
+        pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score
+    result: dict[str, Any] = {
+        **named(data, "flight title synthetic settings"),
+        "sentence": words.paragraph(data),
+        "warnings": words.cautions(data),
+        "antennas": data.antennas,
+        "site": named(data.site, "name credit assumed"),
+        "inputs": [
+            named(f, "path sha256 reader lines accepted rejected blank role warnings")
+            | ({"learned_on": f.learned_on} if f.learned_on else {})
+            for f in data.inputs
+        ],
+        KEY: list(union(*(f.learned_on for f in data.inputs))),
+        "rss": rss,
+        "verdict": data.verdict,
+        **named(data, "likely_cause next_step"),
+        "offsets": words.offset_sentences(data.rss),
+        "rank": {item.tower: _rank_metrics(item) for item in data.rank},
+        "rt": None if data.engine is None else _engine_metrics(data.engine),
+        **about(data),
+        **({"ladder": data.ladder} if data.ladder else {}),
+        "clock": {name: clock_metrics(clock) for name, clock in data.clocks.items()},
+        **({} if data.serving is None else {"serving": data.serving.as_dict()}),
+        **({"pairs": pairs} if pairs else {}),
+    }
+    safe: dict[str, Any] = json_safe(result)
+    merge(safe, json_safe(data.extra_metrics))
+    return safe
+
+
+def _rss_metrics(series: RssResult) -> dict[str, Any]:
+    score = series.score
+    return {
+        **named(score, "offset_db rmse_db n n_out_of_coverage"),
+        "at_search_edge": score.at_edge,
+        **named(score, "correlation rmse_ci95_db"),
+        "offset_ci95_db": score.intervals.offset_db,
+        "correlation_ci95": score.intervals.correlation,
+        "n_effective": score.intervals.autocorrelation.n_effective,
+        "lag_s": score.lag_s,
+        "lag_verdict": series.clock_verdict,
+        "unit": series.unit,
+        "fitted": score.fitted_on_scored,
+        "baselines": {name: named(model, "offset_db rmse_db") for name, model in series.baselines.items()},
+        **fields_of(series.further),
+    }
+
+
+def clock_metrics(clock: ClockResult) -> dict[str, Any]:
+    """``clock.<receiver>`` of metrics.json: numbers, verdict, whether applied, and the checks it rests on."""
+    return {
+        **clock.checks,
+        **named(clock, "radio_minus_telemetry_s ci95_s verdict reason"),
+        "applied": clock.applied in (APPLIED, GIVEN),
+    }
+
+
+def _histogram(share: FloatArray, intervals: Sequence[Interval]) -> dict[str, Any]:
+    names = [str(rank) for rank in RANKS]
+    return {
+        "histogram": dict(zip(names, share, strict=True)),
+        "histogram_ci95": dict(zip(names, intervals, strict=True)),
+    }
+
+
+def _rank_metrics(series: RankResult) -> dict[str, Any]:
+    score = series.score
+    simulated = {
+        k_key(k): {
+            **_histogram(fit.histogram, fit.histogram_ci95),
+            **named(fit, "out_of_coverage agreement agreement_ci95 kappa total_variation total_variation_ci95"),
+            "wasserstein": fit.wasserstein,
+            "p_value": fit.p_histogram,
+            "confusion": fit.confusion[1:],
+        }
+        for k, fit in score.simulated.items()
+    }
+    return {
+        "measured": {
+            **_histogram(score.histogram, score.histogram_ci95),
+            "n": int(np.isfinite(series.measured).sum()),
+            "n_no_csi": int((~np.isfinite(series.measured)).sum()),
+        },
+        "simulated": simulated,
+        "best_k": score.best_k,
+        "best_k_ci95": score.curve.best_k_interval,
+        **further_numbers(series),
+    }
+
+
+def further_numbers(series: RssResult | RankResult) -> dict[str, Any]:
+    """Numbers of a series that stand in a table of their own on the page, as JSON has them."""
+    numbers: dict[str, Any] = {}
+    if isinstance(series, RankResult):
+        curve = series.score.curve
+        numbers = {
+            **named(series.score, "n n_effective n_no_csi"),
+            "best_k_total_variation": curve.best_k_total_variation,
+            "best_k_total_variation_ci95": curve.best_k_total_variation_interval,
+            "stale": named(series.score.staleness, "verdict n_reports hold_s"),
+        }
+    safe: dict[str, Any] = json_safe(numbers | fields_of(series.further))
+    return safe
+
+
+def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
+    audit = engine.audit
+    return {
+        **named(engine, "engine links seconds paths left_out not_audited"),
+        "audit": None
+        if audit is None
+        else {
+            "summary": words.audit_summary(audit),
+            **named(audit, "reference links missing_paths extra_paths rss_max_error_db"),
+            "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
+            "field": None if audit.fields is None else {**fields_of(audit.fields), "failed": audit.fields.failed},
+            **named(audit, "seconds reference_seconds"),
+        },
+    }
+
 
 # --- cards ----------------------------------------------------------------------------------------------------------
 
@@ -343,14 +481,11 @@ def _rejected(f: InputFile) -> Table:
 def method_card(data: ReportData, files: Sequence[str]) -> Card:
     """Return the card of the method, the notes of site and flight, and the columns of the files beside the page."""
     notes = list(dict.fromkeys([*data.site.notes, *data.notes]))  # a flight repeats what its site says
+    heads = {"Column": HEAD, "Unit": TEXT, "Meaning": TEXT}
     tables = [
-        Table(caption=caption, columns={"Column": HEAD, "Meaning": TEXT}, rows=list(columns.items()))
-        for caption, columns in (
-            ("Columns of rss.csv, followed by one level per baseline [dBm].", RSS_COLUMNS),
-            ("Columns of rank.csv, followed by one simulated rank per K (0: no path), the simulated level and the "
-             "ratios of singular values.", RANK_COLUMNS),
-        )
-    ]  # fmt: skip
+        Table(caption=f"Columns of {name}.", columns=heads, rows=described(columns))
+        for name, columns in (("rss.csv", RSS), ("rank.csv", RANK))
+    ]
     pictures = "The command writes every figure as a picture with --figures svg, png, pdf or all."
     beside = [f"{', '.join(files)}. {'' if 'figures/' in files else pictures}"]
     return Card(
@@ -439,7 +574,7 @@ def write_report(
     with stages("report"):
         specs = [] if drawn == "none" else figures.figure_specs(data)
         formats = FORMATS if drawn == "all" else (drawn,)
-        for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
+        for name, text in (("rss.csv", csv_text(RSS, data.rss)), ("rank.csv", csv_text(RANK, data.rank))):
             # written even without rows: a reader finds the same files in every report
             written.append(write_file(folder / name, text))
         _, pictures = write_figures(specs, folder / "figures", formats, style, stages.progress)

@@ -24,37 +24,6 @@ from ..common.versions import commit, utc_now, versions
 from .canvas import FigureSpec, Picture, render
 from .texts import coded
 
-# Columns of rss.csv, followed by one ``<baseline>_dbm`` per baseline.
-RSS_COLUMNS: dict[str, str] = {
-    "time_utc": "instant of the sample, ISO 8601, UTC; empty: the log has relative times and no origin was given",
-    "time_s": "seconds after the first sample of this tower and channel",
-    "tower": "name of the tower",
-    "channel": "name of the channel",
-    "unit": "unit of measured_db",
-    "east_m": "UAV position, metres east of the site origin",
-    "north_m": "metres north",
-    "up_m": "metres above the ground at the origin",
-    "measured_db": "as logged; empty: no signal",
-    "calibrated_db": "measured_db plus the offset of this tower and channel",
-    "simulated_dbm": "ray tracing; empty: no path",
-    "residual_db": "calibrated_db minus simulated_dbm",
-    "measured_out_of_coverage": "1: the log has no signal here",
-    "simulated_out_of_coverage": "1: the ray tracing has no path here",
-}
-
-# Columns of rank.csv, followed by one ``simulated_rank_k<K>`` per K (0: no path), then what a receiver decides by:
-# ``level_dbm`` and ``sigma<i>_over_sigma1_db``, 20 log10 of the ratio of singular values (empty: no path, or zero);
-# with ``rank.receiver`` also ``probability_rank<r>``.
-RANK_COLUMNS: dict[str, str] = {
-    "time_utc": "instant of the report, ISO 8601, UTC; empty: the log has relative times and no origin was given",
-    "time_s": "seconds after the first report of this tower",
-    "tower": "name of the tower",
-    "east_m": "UAV position, metres east of the site origin",
-    "north_m": "metres north",
-    "up_m": "metres above the ground at the origin",
-    "measured_rank": "reported rank 1 to 4; empty: no CSI",
-}
-
 
 def links_of(by_tower: Mapping[str, Mapping[str, Any]]) -> dict[tuple[str, str], Any]:
     """Numbers by tower and channel, of ``rss`` in metrics.json."""

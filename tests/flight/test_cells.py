@@ -18,7 +18,7 @@ from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.report import flight as html
 from aerpaw_cmp.report.charts import shown_confusion
-from aerpaw_cmp.report.columns import metrics
+from aerpaw_cmp.report.flight import metrics
 from aerpaw_cmp.report.flight_data import report_data
 from aerpaw_cmp.site.siteyaml import load_site
 

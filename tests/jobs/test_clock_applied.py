@@ -9,7 +9,7 @@ import pytest
 from aerpaw_cmp.compare.result import ESTIMATED, FlightResult
 from aerpaw_cmp.flight.clock import ClockEstimate
 from aerpaw_cmp.flight.replay import _clock_of, telemetry_time
-from aerpaw_cmp.report.columns import clock_metrics
+from aerpaw_cmp.report.flight import clock_metrics
 from aerpaw_cmp.report.flight_data import clock_warnings
 
 TIME = np.datetime64("2024-07-15T15:48:16", "ns") + (np.arange(100) * 1e9).astype("timedelta64[ns]")

@@ -19,7 +19,7 @@ from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.report import explorer
-from aerpaw_cmp.report.columns import rank_csv, rss_csv
+from aerpaw_cmp.report.columns import RANK, RSS, csv_text
 from aerpaw_cmp.site.siteyaml import load_site
 from tests.simulated import write_yaml
 from tests.tables import ORIGIN, POSITIONS, rank_log, rss_log, table_log, write_csv
@@ -125,8 +125,8 @@ def test_the_audit_takes_moments_at_which_the_rover_stands_where_it_was(case):
 
 def test_the_tables_carry_the_place(case):
     _, data, (replayed,), (rank,) = case
-    rss = "".join(rss_csv([compare_rss_series(data, data.rss[0], replayed)])).splitlines()
-    ranks = "".join(rank_csv([compare_rank_series(data, data.rank[0], rank)])).splitlines()
+    rss = "".join(csv_text(RSS, [compare_rss_series(data, data.rss[0], replayed)])).splitlines()
+    ranks = "".join(csv_text(RANK, [compare_rank_series(data, data.rank[0], rank)])).splitlines()
     for head, first, *_ in (rss, ranks):
         row = dict(zip(head.split(","), first.split(","), strict=True))
         place = [float(row[f"tower_{axis}_m"]) for axis in ("east", "north", "up")]

@@ -7,26 +7,25 @@ import pytest
 
 from aerpaw_cmp.compare.result import EngineResult
 from aerpaw_cmp.report import columns as export
-from aerpaw_cmp.report import page as names
-from aerpaw_cmp.report import texts
+from aerpaw_cmp.report import flight, texts
 from benchmarks.fabricated import with_numbers
 
 
-def joined(tables, columns):
-    frames = [export._rows(table, slice(None)) for table in tables]
-    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
+def joined(columns, series):
+    frames = [export._rows(table, slice(None)) for table in export.tables(columns, series)[1]]
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=export.header(columns))
 
 
 def rss_frame(series):
-    return joined(export.rss_tables(series), names.RSS_COLUMNS)
+    return joined(export.RSS, series)
 
 
 def rank_frame(series):
-    return joined(export.rank_tables(series), names.RANK_COLUMNS)
+    return joined(export.RANK, series)
 
 
 def test_metrics_hold_the_contract(report_data):
-    m = json.loads(json.dumps(export.metrics(report_data), allow_nan=False))
+    m = json.loads(json.dumps(flight.metrics(report_data), allow_nan=False))
     for key in ("flight", "versions", "inputs", "rss", "rank", "rt", "stages"):
         assert key in m
     assert {"path", "sha256", "reader", "lines", "accepted", "rejected"} <= set(m["inputs"][0])
@@ -63,7 +62,7 @@ def test_nan_is_null_and_extra_metrics_are_merged(report_data):
         rss=(bad,),
         extra_metrics={"rss": {"LW1": {"USRP1": {"repeat_db": np.float32(3.0)}}}, "new": {1: (np.int8(2), None)}},
     )
-    m = json.loads(json.dumps(export.metrics(data), allow_nan=False))
+    m = json.loads(json.dumps(flight.metrics(data), allow_nan=False))
     channel = m["rss"]["LW1"]["USRP1"]
     assert channel["rmse_db"] is None
     assert channel["correlation"] is None
@@ -78,14 +77,14 @@ def test_nan_is_null_and_extra_metrics_are_merged(report_data):
 def test_key_order_does_not_depend_on_the_order_of_versions(report_data):
     a = dataclasses.replace(report_data, versions={"b": "1", "a": "2"})
     b = dataclasses.replace(report_data, versions={"a": "2", "b": "1"})
-    assert json.dumps(export.metrics(a)) == json.dumps(export.metrics(b))
+    assert json.dumps(flight.metrics(a)) == json.dumps(flight.metrics(b))
 
 
 def test_rss_csv_comes_back_as_it_went(report_data, tmp_path):
     path = tmp_path / "rss.csv"
     rss_frame(report_data.rss).to_csv(path, index=False)
     back = pd.read_csv(path, parse_dates=["time_utc"])
-    assert [c for c in names.RSS_COLUMNS if c not in back.columns] == []
+    assert [c for c in export.header(export.RSS) if c not in back.columns] == []
     for panel in report_data.rss:
         rows = back[(back.tower == panel.tower) & (back.channel == panel.channel)]
         assert len(rows) == len(panel.time)
@@ -116,12 +115,12 @@ def test_tables_written_in_pieces_are_the_tables(report_data, rows, monkeypatch)
     bare = [dataclasses.replace(few(p, 9), time=p.time[:9] - p.time[0]) for p in report_data.rss]
     for panels in ([], bare, [few(report_data.rss[0], 0), *bare], list(report_data.rss[:1]) if rows > 1 else bare):
         text = rss_frame(panels).to_csv(index=False, lineterminator="\n")
-        assert "".join(export.rss_csv(panels)) == text
+        assert "".join(export.csv_text(export.RSS, panels)) == text
     rank = report_data.rank[0]
     longer, shorter = few(rank, 11), dataclasses.replace(few(rank, 5), probability=np.full((5, 4), 0.25))
     for ranks in ([], [longer, shorter], [shorter, longer]):
         text = rank_frame(ranks).to_csv(index=False, lineterminator="\n")
-        assert "".join(export.rank_csv(ranks)) == text
+        assert "".join(export.csv_text(export.RANK, ranks)) == text
 
 
 def test_relative_times_are_no_times_of_day(report_data):
@@ -169,9 +168,9 @@ def test_time_is_rounded_not_cut(stored, text):
 
 
 def test_no_engine_no_audit(report_data):
-    assert export.metrics(dataclasses.replace(report_data, engine=None))["rt"] is None
+    assert flight.metrics(dataclasses.replace(report_data, engine=None))["rt"] is None
     bare = dataclasses.replace(report_data, engine=EngineResult(engine="sionna", links=1, seconds=1.0))
-    assert export.metrics(bare)["rt"]["audit"] is None
+    assert flight.metrics(bare)["rt"]["audit"] is None
 
 
 def test_rank_csv_holds_what_a_receiver_decides_by(report_data):

@@ -56,7 +56,10 @@ def data(report_data):
 def frames(data, tmp_path_factory):
     """rss.csv and rank.csv as a user reads them, with where each sample is."""
     by_kind = {}
-    for kind, pieces in (("rss", export.rss_csv(data.rss)), ("rank", export.rank_csv(data.rank))):
+    for kind, pieces in (
+        ("rss", export.csv_text(export.RSS, data.rss)),
+        ("rank", export.csv_text(export.RANK, data.rank)),
+    ):
         path = tmp_path_factory.mktemp("csv") / f"{kind}.csv"
         path.write_text("".join(pieces), encoding="utf-8")
         table = pd.read_csv(path)

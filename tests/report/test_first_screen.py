@@ -19,8 +19,8 @@ from aerpaw_cmp.compare.verdict import (
     with_corrected_verdicts,
     without_copies,
 )
-from aerpaw_cmp.report.columns import metrics
 from aerpaw_cmp.report.diff import DIFFERENCE
+from aerpaw_cmp.report.flight import metrics
 from aerpaw_cmp.report.flight_words import (
     AS_SET,
     MOST_WORDS,

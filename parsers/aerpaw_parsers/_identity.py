@@ -143,11 +143,14 @@ def _divides(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
 
 _OF_A_CELL = re.compile(
     r"((serving|lte|nr|nr5g|4g|5g|e ?utran?|global|full|dl|rx|tx|carrier|cent(er|re)) )*(tower|node|site|base ?station"
-    r"|bs|[eg]nb|cell|sector|e?ci|nci|l?cid|[en]?cgi|channel|(antenna |ant )?port|antenna|ant|pol(ari[sz]ation)?"
-    r"|freq(uency)?|band|beam|ssb|csi ?rs)( (global|beam|port))? ?(id(entity|x)?|name|no|num(ber)?|index|[mgk]?hz)?"
+    r"|bs|[eg]nb|cell|sector|e?ci|nci|l?cid|[en]?cgi|psc|bsic|channel|(antenna |ant )?port|antenna|ant|beam|ssb|csi ?rs"
+    r"|pol(ari[sz]ation)?|freq(uency)?|band)( (global|beam|port))? ?(id(entity|x)?|name|no|num(ber)?|index|[mgk]?hz)?"
 )
-# Whose words name another cell than that of the row's level, or what somebody does.
-_OTHERS = re.compile(r"\b(serving|best|target|source|dest|destination|strongest|prev|previous|next|handover)\b")
+# Words of another cell than that of the row's level, of what the aircraft does, and of the level itself in steps.
+_OTHERS = re.compile(
+    r"\b(serving|best|target|source|dest|destination|strongest|prev|previous|next|handover|mode|state|status|event"
+    r"|bars?|asu|quality|percent|strength|signal|level|rate|step|waypoint|wp|rank|layers)\b"
+)
 
 
 def of_a_cell(sheet: _sheet.Sheet) -> list[int]:

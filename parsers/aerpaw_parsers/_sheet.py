@@ -30,8 +30,8 @@ from aerpaw_cmp.readers import ReadOptions, dictionary
 from . import _stamps
 
 SEPARATORS = (",", ";", "\t", "|")
-# Lines in front of a header, at most, and rows below it that a sniffer looks at.
-TITLES, _LOOKED_AT = 60, 5
+# Lines in front of a header, at most.
+TITLES = 60
 _NUMBER = re.compile(r"([-+]?\d{0,20}(?:[.,]\d{0,40})?(?:[eE][-+]?\d{1,3})?) ?([^\d\s,.][^\d\s]{0,9})?")
 
 _IsHeader = Callable[[list[str]], bool]
@@ -77,16 +77,8 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
     if header is None:
         return False
     at, separator, names = header
-    below, unclosed = list[bytes](), False
-    for line in (line for line in lines[at + 1 :] if line.strip()):
-        if unclosed:  # a line break within a quoted cell
-            below[-1] += b" " + line
-        elif len(below) == _LOOKED_AT:
-            break
-        else:
-            below.append(line)
-        unclosed = below[-1].count(b'"') % 2 == 1 and below[-1].count(b" ") < 1000
-    widths = [len(split_row(line, separator)) for line in below]
+    below = [(i, line) for i, line in enumerate(lines[at + 1 :]) if line.strip()]
+    widths = [len(fields) for _, fields in _logical(below, separator, len(names))[:5]]
     # rows may miss trailing cells, or have one more behind a separator at their end
     return 2 * sum(len(names) < 2 * width and width <= len(names) + 1 for width in widths) >= len(widths)
 
@@ -454,9 +446,9 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     numbers = np.flatnonzero(below).tolist()
     group = [text.strip() for text in split_row(lines.raw(at - 1), separator)] if at else []
     table = _Table(_unlike(names, group), [*range(at + 1)])
-    written = [(i, split_row(lines.raw(i), separator)) for i in numbers]
-    if any(lines.raw(i).count(b'"') % 2 for i in numbers):
-        written = _joined(lines, written, separator, len(names), table.comments)
+    written = _logical([(i, lines.raw(i)) for i in numbers], separator, len(names))
+    if len(written) < len(numbers):  # the further lines of a row are comments
+        table.comments += sorted({*numbers} - {i for i, _ in written})
     for i, fields in _fitted(written, names):
         table.add(i, fields)
     return table.sheet(lines, numbers[-1] if numbers else at)
@@ -466,31 +458,23 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
 _MOST_LINES = 40
 
 
-def _joined(
-    lines: _text.Lines, rows: list[tuple[int, list[str]]], separator: str, width: int, comments: list[int]
-) -> list[tuple[int, list[str]]]:
-    """Rows whose quoted cells have line breaks, on their first lines; their further lines are added to the comments.
+def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> list[tuple[int, list[str]]]:
+    """Return the rows of lines with the number of the first line of each: a quoted cell may have line breaks.
 
-    A lone quote, such as the sign of inches, joins nothing: the joined row has to have the width of the header.
+    A lone quote, such as the sign of inches, joins nothing: a joined row has the width of the header.
     """
-    joined, last = list[tuple[int, list[str]]](), -1
-    for place, (i, fields) in enumerate(rows):
-        if i <= last:
+    rows, last = list[tuple[int, list[str]]](), -1
+    for place, (i, line) in enumerate(lines):
+        if place <= last:
             continue
-        text, end = lines.raw(i), i
-        if text.count(b'"') % 2 and len(fields) != width:
-            for end, _ in rows[place + 1 : place + _MOST_LINES]:
-                text += b" " + lines.raw(end)
-                if lines.raw(end).count(b'"') % 2:
-                    break
-            whole = split_row(text, separator)
-            if len(whole) == width:
-                joined.append((i, whole))
-                comments += [number for number, _ in rows if i < number <= end]
-                last = end
-                continue
-        joined.append((i, fields))
-    return joined
+        fields = split_row(line, separator)
+        if line.count(b'"') % 2 and len(fields) != width:
+            ends = (k for k in range(place + 1, min(place + _MOST_LINES, len(lines))) if lines[k][1].count(b'"') % 2)
+            if (end := next(ends, None)) is not None:
+                joined = split_row(b" ".join(text for _, text in lines[place : end + 1]), separator)
+                fields, last = (joined, end) if len(joined) == width else (fields, last)
+        rows.append((i, fields))
+    return rows
 
 
 def _unlike(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:

@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.text import counted
-from aerpaw_cmp.common.units import BoolArray, FloatArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
@@ -169,6 +169,22 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell], more: list[str]) -> pd.Da
     return joined
 
 
+# Share of the times with several cells that call themselves serving from which a table is a scan.
+_SCANNED = 0.3
+
+
+def _of_one_phone(readings: pd.DataFrame, time: AnyArray) -> pd.DataFrame:
+    """Readings without the claim to serve where rows of one time make it for several cells: a phone has one."""
+    claims = readings[readings["serving"].astype(bool)]
+    claims = claims.assign(time=time[claims["row"].to_numpy(np.int64)])
+    of_time = claims.groupby(["time", "rat"])[["row", "pci", "arfcn"]].nunique()
+    several = of_time[(of_time["row"] > 1) & (of_time[["pci", "arfcn"]] > 1).any(axis=1)].index
+    if len(several) < _SCANNED * len(of_time):  # a handover within a second of a clock of seconds
+        return readings
+    keys = pd.MultiIndex.from_arrays([time[readings["row"].to_numpy(np.int64)], readings["rat"]])
+    return readings.assign(serving=readings["serving"].astype(bool) & ~keys.isin(several))
+
+
 def _identities(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[str]:
     """PCI and carrier of the serving cell in each row, as text."""
     columns = next((cell.columns for cell in cells if cell.place == "serving"), {})
@@ -239,7 +255,9 @@ def _radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     levels = [
         _renamed(stream, "_".join(word for word in (owner if several else "", port) if word))
         for (owner, port), part in owned.items()
-        for stream in _cells.streams(rows, _readings(sheet, part, more), source="drive test", more=about)
+        for stream in _cells.streams(
+            rows, _of_one_phone(_readings(sheet, part, more), rows.time), source="drive test", more=about
+        )
     ]
     _name_others(rows, sheet, cells, others)
     columns = [*ranks, *others, *_event_columns(sheet, cells)]

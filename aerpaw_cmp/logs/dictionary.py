@@ -75,12 +75,13 @@ QUANTITIES: tuple[Quantity, ...] = (
     # when; the surest first
     Quantity("time", "time", (
         r"^time utc usec$", r"^time (edt|est|cdt|cst|mdt|mst|pdt|pst|cest|cet|bst|utc|gmt)$",
-        r"^(measured|recorded|logged|sampled|seen) at$",
+        r"^(measured|recorded|logged|sampled|seen|received|captured|created) at$",
         r"^(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| us| ns| iso| unix)?$",
-        r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s| us| ns)?$",
+        r"^(abs|log|pc|device|event|system|utc|gps|local|unix|epoch|server|host|wall|phone|sample|recording|receive)"
+        r" ?time( stamp)?( utc| gps| local| ms| s| us| ns)?$",
         r"^(custom )?(update ?)?(local |utc )?time( ?stamp)?( utc| ms| s| us| usec| ns| local| epoch)?$",
         r"^time ?millisecond$", r"^(rel|relative|elapsed) ?time( ms| s| us| ns)?$", r"^elapsed$", r"^time boot ms$",
-        r"^((gpst|tai)( time)?|time (gpst|tai))$", r"^(epoch|unix|ts)( ms| s| us| ns| utc)?$", r"^utc$", r"^t$",
+        r"^((gpst|tai)( time)?|time (gpst|tai))$", r"^(epoch|unix|ts)( ms| s| us| ns| utc)?$", r"^utc$", r"^t( utc)?$",
         r"^(zeit|uhrzeit|zeitstempel|hora|heure)( mesz| mez)?$",
     )),
     Quantity("date", "time", (r"^(custom |gps |utc |local )?date( local| utc)?$", r"^(datum|fecha)$")),
@@ -173,7 +174,7 @@ QUANTITIES: tuple[Quantity, ...] = (
     Quantity("network", "identity", (
         r"^(network )?(operator|carrier|provider|plmn|sim|slot|sub|subscription)( ?(id|name|code|slot|no|index))?$",
         r"^network name$", r"^query$",
-        r"^mcc$", r"^mnc$", r"^mcc ?mnc$", r"^(c ?)?rnti$", r"^(ap|access point|ssid)( ?(id|name|no|mac))?$",
+        r"^mcc$", r"^mnc$", r"^mcc ?mnc$", r"^(c ?)?rnti$", r"^(ap|access point|ssid|gateway|gw)( ?(id|name|no|mac))?$",
         r"^(receiver|rx|cent(er|re)|carrier) freq(uency)?( hz| mhz| ghz)?$",
     )),
     Quantity("technology", "cell", (

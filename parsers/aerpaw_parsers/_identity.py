@@ -15,7 +15,7 @@ from dataclasses import replace
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.units import BoolArray, FloatArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Attribute
 
@@ -31,7 +31,7 @@ _LAG_ROWS, _LAG_SHARE = 2, 0.1
 
 
 def parts(
-    rows: _rows.Rows, sheet: _sheet.Sheet, *keys: str, found: bool = True
+    rows: _rows.Rows, sheet: _sheet.Sheet, *keys: str, found: bool = True, level: int | None = None
 ) -> Iterator[tuple[str, _rows.Rows, _sheet.Sheet]]:
     """A table by its identities: the name of each part, its rows and its cells.
 
@@ -43,6 +43,8 @@ def parts(
         Quantities of the dictionary, such as ``device`` or ``network``; the combination of all their columns counts.
     found : bool
         Look for columns of unknown names that distinguish rows, too.
+    level : int, optional
+        The column of levels, if its name does not show it.
 
     Yields
     ------
@@ -52,7 +54,7 @@ def parts(
     columns = [
         i for i, what in enumerate(sheet.meanings) if what and what.quantity.name in keys and _of_row(what.place)
     ]
-    marks = _marks(rows, sheet, keys, columns) if found else []
+    marks = _marks(rows, sheet, keys, columns, level) if found else []
     texts = {i: _named(sheet, i) for i in (*columns, *marks)}
     counted = _with_level(sheet)
     several = [i for i in columns if 1 < len({texts[i][row] for row in np.flatnonzero(counted)}) <= _MOST_PARTS]
@@ -148,8 +150,8 @@ _OF_A_CELL = re.compile(
 )
 # Words of another cell than that of the row's level, of what the aircraft does, and of the level itself in steps.
 _OTHERS = re.compile(
-    r"\b(serving|best|target|source|dest|destination|strongest|prev|previous|next|handover|mode|state|status|event"
-    r"|bars?|asu|quality|percent|strength|signal|level|rate|step|waypoint|wp|rank|layers)\b"
+    r"\b(serving|best|target|source|dest|destination|strongest|prev|previous|next|handover|bars?|asu|quality|percent"
+    r"|strength|signal|level|rate|wp|rank|layers)\b|(mode|state|status|event|step|waypoint)\b"
 )
 
 
@@ -158,7 +160,9 @@ def of_a_cell(sheet: _sheet.Sheet) -> list[int]:
     return [i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and _OF_A_CELL.fullmatch(words)]
 
 
-def _marks(rows: _rows.Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int]) -> list[int]:
+def _marks(
+    rows: _rows.Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int], level: int | None
+) -> list[int]:
     """Columns of no known quantity whose values are networks or devices of their own.
 
     Networks are distinguished by the names of cells where no PCI does it, and by columns without which most times have
@@ -187,9 +191,22 @@ def _marks(rows: _rows.Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: li
         marks.append(best)
         unknown.remove(best)
         table[str(best)] = sheet.texts(best)
-    if key == "network":
-        marks += [i for i in unknown if _takes_turns(rows, sheet, i)]
+    if key == "network" and unknown:
+        names = ("RSRP", "RSSI", "SNR", "SINR", "power") if level is None else ()
+        level = next((i for name in names if (i := sheet.find(name)) is not None), level)
+        # among the rows of one known key: a cell's number that goes with its PCI says nothing more
+        same = _of_one_key(table.drop(columns=["time", "levels"]))
+        part, time = sheet.part(same), rows.time[same]
+        marks += [i for i in unknown if i != level and level is not None and _takes_turns(time, part, i, level)]
     return marks
+
+
+def _of_one_key(table: pd.DataFrame) -> BoolArray:
+    """Mask of the rows of the key that most rows have; of all, if there is no key."""
+    if not table.shape[1]:
+        return np.ones(len(table), dtype=bool)
+    key = table.groupby(list(table.columns), sort=False).ngroup().to_numpy()
+    return np.asarray(key == np.bincount(key).argmax()) if len(key) else np.zeros(0, dtype=bool)
 
 
 _CELL = ("PCI", "ARFCN", "technology", "device", "network")
@@ -204,13 +221,12 @@ def _few(texts: Iterable[str]) -> bool:
 _IN_TURN, _SMALLER, _FEWEST_TURNS = 0.8, 0.5, 8
 
 
-def _takes_turns(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> bool:
+def _takes_turns(time: AnyArray, sheet: _sheet.Sheet, column: int, level: int) -> bool:
     """Check whether the values of a column take turns from row to row, and the level with them."""
-    level = next((i for name in ("RSRP", "RSSI", "SNR", "SINR", "power") if (i := sheet.find(name)) is not None), None)
     texts = np.array(sheet.texts(column), dtype=object)
-    if level is None or not _few(texts.tolist()) or len(texts) < _FEWEST_TURNS:
+    if not _few(texts.tolist()) or len(texts) < _FEWEST_TURNS:
         return False
-    order = np.argsort(rows.time, kind="stable")
+    order = np.argsort(time, kind="stable")
     texts, values = texts[order], sheet.numbers(level)[order]
     count = len({*texts.tolist()})
     if len(texts) < 2 * count or (texts[1:] != texts[:-1]).mean() < _IN_TURN:

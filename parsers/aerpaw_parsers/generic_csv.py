@@ -147,7 +147,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         rows.warnings.append(_pose.small_angles(angles))
     streams: list[Stream | None] = []
     for device, of_device, table in _identity.parts(rows, sheet, "device"):
-        divided = _identity.parts(of_device, table, *_KEYS) if kind != "telemetry" else [("", of_device, table)]
+        divided = (
+            _identity.parts(of_device, table, *_KEYS, level=where.get("rss_db"))
+            if kind != "telemetry"
+            else [("", of_device, table)]
+        )
         for label, part, cells in divided:
             words = "_".join(word for word in (options.channel or kind, label, device) if word)
             streams.append(_stream(part, cells, kind, where, words, options.unit or unit))

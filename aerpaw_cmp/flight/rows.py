@@ -152,12 +152,18 @@ FLAG = "level_frozen"
 _LEAST_S, _LEAST, _LEAST_M = 5.0, 10, 15.0
 # Levels in whole and half dB repeat themselves in every hover.
 _COARSE_DB = 0.5
-# Chance of such a run, by the share of equal neighbours elsewhere, below which it is none of the channel.
+# Chance of such a run, by the share of equal neighbours elsewhere, below which the channel does not explain it.
 _CHANCE = 1e-6
+# Second differences of noise are larger than its differences (by the root of 3), those of a smooth level are smaller.
+_NOISY, _LEAP = 1.2, 3.0
 
 
 def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> BoolArray:
     """Return the mask of samples (n,) that repeat a frozen level; the first of each run is a reading.
+
+    A smooth level repeats itself where it passes its maximum or reaches the end of its scale, and goes on from there.
+    It is frozen only if it leaps as the run ends, or if the series ends there with higher and lower levels before. A
+    level with noise is frozen wherever chance does not explain the run.
 
     Parameters
     ----------
@@ -170,9 +176,11 @@ def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> Bool
     """
     out = np.zeros(len(level_db), dtype=np.bool_)
     same = np.diff(level_db) == 0
-    fine = np.abs(level_db / _COARSE_DB - np.round(level_db / _COARSE_DB)) > 1e-6
-    if same.sum() < _LEAST or 2 * fine.sum() < np.isfinite(level_db).sum():
+    # distinct levels: a run that is frozen at a half dB must not make a coarse series of a fine one
+    levels = np.unique(level_db[np.isfinite(level_db)]) / _COARSE_DB
+    if same.sum() < _LEAST or (np.abs(levels - np.round(levels)) > 1e-6).mean() < 0.5:
         return out
+    noisy, usual_db = _is_noisy(level_db), _large(np.diff(level_db)[~same])
     begins = np.concatenate([[0], np.flatnonzero(~same) + 1])
     ends = np.append(begins[1:], len(level_db))
     for begin, end in zip(begins, ends, strict=True):
@@ -182,6 +190,28 @@ def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> Bool
         elsewhere = (same.sum() - repeats + 1) / (len(same) - repeats + 1)
         place = position_m[begin:end][np.isfinite(position_m[begin:end]).all(axis=1)]
         flown = len(place) > 1 and np.linalg.norm(np.ptp(place, axis=0)) > _LEAST_M
-        if flown and len(level_db) * elsewhere**repeats < _CHANCE:
+        if end < len(level_db):
+            leaps = abs(level_db[end] - level_db[begin]) > _LEAP * usual_db
+        else:
+            leaps = np.nanmin(level_db) < level_db[begin] < np.nanmax(level_db)
+        if flown and (noisy or leaps) and len(level_db) * elsewhere**repeats < _CHANCE:
             out[begin + 1 : end] = True
     return out
+
+
+def _large(difference_db: FloatArray) -> float:
+    """Return the size that nine differences in ten (n,) stay below [dB]; 0 if there is none."""
+    known = np.abs(difference_db[np.isfinite(difference_db)])
+    return float(np.quantile(known, 0.9)) if len(known) else 0.0
+
+
+def _is_noisy(level_db: FloatArray) -> bool:
+    """Check whether a level (n,) changes by noise rather than smoothly; the rounding of a smooth level is not noise."""
+    step = np.diff(level_db[np.isfinite(level_db)])
+    sizes = np.abs(step[step != 0])
+    if not len(sizes):
+        return False
+    # leaps count as large steps: one of them must not make noise of a smooth level
+    first, second = (np.minimum(np.abs(d), _large(d)) for d in (step, np.diff(step)))
+    rms, rms_second = float(np.sqrt(np.mean(first**2))), float(np.sqrt(np.mean(second**2)))
+    return rms_second > _NOISY * rms and rms > sizes.min()

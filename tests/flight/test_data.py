@@ -12,6 +12,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.flight import data
 from aerpaw_cmp.flight.data import FlightData, choose_site, gather, load_data, read_logs
+from aerpaw_cmp.flight.rows import frozen
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.flight.simulate import FlightSimulator
 from aerpaw_cmp.site.siteyaml import load_site, site_model
@@ -79,6 +80,18 @@ def test_a_level_frozen_to_all_digits_in_flight_is_not_scored(digits: int, froze
     assert series.flagged.get("level_frozen", 0) == frozen
     assert len(series.time) == len(lines) - frozen
     assert any("repeat one level" in text for text in flight.warnings) is bool(frozen)
+
+
+@pytest.mark.parametrize(("stops", "expected"), [(None, 0), (30, 69), (130, 69)])
+def test_a_smooth_level_is_frozen_only_if_it_leaps_or_stops_within_its_range(stops: int | None, expected: int) -> None:
+    """A phone in tenths of a dB that passes a tower at 60 m at 4 m/s, and whose scale ends at -58 dBm."""
+    time = (np.arange(200) * 1_000_000_000).astype("datetime64[ns]")
+    position_m = np.column_stack([np.full(200, 60.0), -400.0 + 4.0 * np.arange(200), np.full(200, 30.0)])
+    level = np.minimum(np.round(-20.0 - 20.0 * np.log10(np.linalg.norm(position_m, axis=1)), 1), -58.0)
+    assert (level == -58.0).sum() > 15
+    if stops is not None:
+        level[stops : stops + 70] = level[stops]
+    assert frozen(time, level, position_m).sum() == expected
 
 
 def test_a_receiver_whose_week_number_rolled_over_is_named_and_shifted(tmp_path: Path) -> None:

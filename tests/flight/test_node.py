@@ -28,10 +28,10 @@ ORIGIN = "2025-06-01T14:00:00Z"
 
 def _track() -> FloatArray:
     """A lawnmower of 300 m by 300 m, once a second: east, north, up from the site's origin."""
-    along = np.linspace(0.0, 5.0, 500)
+    along = np.linspace(0.0, 5.0, 500, endpoint=False)
     leg, part = np.divmod(along, 1.0)
     east = np.where(leg % 2 == 0, part, 1.0 - part) * 300.0 - 250.0
-    return np.column_stack([east, np.minimum(leg, 5.0) * 60.0 - 50.0, np.full(500, 30.0)])
+    return np.column_stack([east, leg * 60.0 - 50.0, np.full(500, 30.0)])
 
 
 def _logs(folder: Path, node: tuple[float, float, float], level_100_m: float, slope: float = 3.0) -> list[IngestedFile]:

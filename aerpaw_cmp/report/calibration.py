@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ..common.jsonable import json_object, named
+from ..common.jsonable import json_object
 from ..common.units import FloatArray
 from ..compare.calibration import BASELINES, CurvePoint, Score, mean_rmse, with_one_more
 from ..compare.verdict import Verdict, antenna_or_place, by_flight
@@ -217,14 +217,16 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
     """The numbers of the page under stable names."""
     return json_object(
         calibration=data.name,
-        **named(data, "flights trained_on marks scores controls mounts strengths ground words warnings"),
+        flights=data.flights, trained_on=data.trained_on, marks=data.marks, scores=data.scores,
+        controls=data.controls, mounts=data.mounts, strengths=data.strengths, ground=data.ground, words=data.words,
+        warnings=data.warnings,
         learning_curve={"points": data.curve, "one_more_rmse_db": data.one_more_rmse_db},
         antennas=[
             {"name": a.name, "share_of_sphere_seen": _share_seen(a), "n_bins": len(a.flown)} for a in data.antennas
         ],
         rank=data.rank or {},
         **about(data),
-    )
+    )  # fmt: skip
 
 
 def _directions(antenna: AntennaMap) -> FloatArray:

@@ -13,7 +13,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
-from ..common.jsonable import fields_of, json_safe, named
+from ..common.jsonable import fields_of, json_safe
 from ..common.text import counted, guarded
 from ..common.units import FloatArray, IntArray
 from ..compare.level import LEARNED_HERE
@@ -627,7 +627,8 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
     failed = {f.flight for f in data.failures}
     result = {
         "campaign": data.name,
-        **named(data, "title settings reference rank rank_transfers workers"),
+        "title": data.title, "settings": data.settings, "reference": data.reference, "rank": data.rank,
+        "rank_transfers": data.rank_transfers, "workers": data.workers,
         "flights": [
             {"flight": name, "ok": name not in failed, "synthetic": name in data.synthetic} for name in data.flights
         ],
@@ -637,19 +638,20 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
         "rss": _entries(data.rss, (*ARRAYS, "difference")),
         "calibration": {"per": data.calibration, "groups": data.pooled},
         "repeatability": {
-            **named(data, "radius_m heading_within_deg cell_m"),
+            "radius_m": data.radius_m, "heading_within_deg": data.heading_within_deg, "cell_m": data.cell_m,
             "pairs_total": len(data.repeats),
             "links": by_link(data.repeats),
             "pairs": telling(data.repeats),
             "table": _PAIR_TABLE if data.repeats else None,
         },
         "season": {
-            **named(data.season, "held_out started ranking nodes"),
+            "held_out": data.season.held_out, "started": data.season.started, "ranking": data.season.ranking,
+            "nodes": data.season.nodes,
             "steps": step_words(data),
             "cells": 0 if data.season.places is None else len(data.season.places.cells),
         },
         **about(data),
-    }
+    }  # fmt: skip
     safe: dict[str, Any] = json_safe(result)
     return safe
 

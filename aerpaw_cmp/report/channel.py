@@ -15,7 +15,6 @@ import pandas as pd
 
 from ..common.cf import Dataset, GrowingNetcdf, file_attributes
 from ..common.content import KEY
-from ..common.jsonable import named
 from ..common.stages import Stages
 from ..common.text import guarded
 from ..common.units import AnyArray, FloatArray
@@ -61,7 +60,8 @@ class Along:
 
     def part(self, rows: slice) -> Along:
         """Some of the poses."""
-        arrays = named(self, "time_s towers_m velocity_mps tower_mps")
+        arrays = {"time_s": self.time_s, "towers_m": self.towers_m, "velocity_mps": self.velocity_mps,
+                  "tower_mps": self.tower_mps}  # fmt: skip
         some: Any = {name: None if values is None else values[rows] for name, values in arrays.items()}
         return replace(self, poses=self.poses[rows], **some)
 
@@ -133,7 +133,8 @@ def channel_dataset(channel: Channel) -> Dataset:
         comment=" ".join(channel.warnings),
     )
     ends = {"transmitter": "UAV" if link.uav_transmits else "tower", "trained_on": " ".join(channel.trained_on)}
-    data = Dataset(variables, {**written, **named(link, "carrier_hz transmit_power_dbm"), **ends})
+    data = Dataset(variables, {**written, "carrier_hz": link.carrier_hz,
+                                          "transmit_power_dbm": link.transmit_power_dbm, **ends})  # fmt: skip
     described = {name: variable.attrs for name, variable in data.variables.items()}
     described["kind"] |= {"flag_values": np.arange(len(kinds), dtype=np.int8), "flag_meanings": " ".join(kinds)}
     if channel.along.start is not None:
@@ -231,7 +232,7 @@ def write_channel(
                 files = [write(latest, folder) for write in writers]
     return files, {
         "flight": latest.along.name,
-        **named(latest, "link carrier_hz"),
+        "link": latest.link, "carrier_hz": latest.carrier_hz,
         "towers": list(latest.replay.towers),
         "poses": poses,
         "paths": paths,
@@ -239,7 +240,7 @@ def write_channel(
         "has_level": latest.level_db is not None,
         KEY: list(latest.trained_on),
         "warnings": latest.warnings,
-    }
+    }  # fmt: skip
 
 
 @contextmanager
@@ -267,8 +268,8 @@ def _arrays(channel: Channel) -> dict[str, Any]:
         "towers": np.array(channel.replay.towers),
         "carrier_hz": channel.carrier_hz,
         "doppler_hz": channel.by_link(channel.doppler_hz),
-        **named(channel, "level_db level_sd_db"),
-    }
+        "level_db": channel.level_db, "level_sd_db": channel.level_sd_db,
+    }  # fmt: skip
     return {name: values for name, values in arrays.items() if values is not None}
 
 

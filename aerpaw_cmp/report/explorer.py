@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from ..common.jsonable import named
 from ..common.units import BoolArray, IntArray, spread_out
 from ..compare.level import PART_DB, RssComparison
 from ..compare.offset import STEP_DB
@@ -93,14 +92,14 @@ def _rss(
         if key in GEOMETRY
     ]
     channel = {
-        **named(panel, "name tower unit"),
+        "name": panel.name, "tower": panel.tower, "unit": panel.unit,
         "of": len(panel.time),
         "time": arrays.add(seconds_since(panel.time, start)[pick], "f8"),
         **_place(panel, pick, arrays),
         "measured": arrays.add(panel.measured_db[pick]),
         "models": models,
         "geometry": geometry,
-    }
+    }  # fmt: skip
     if panel.stated is not None:
         band = panel.stated.columns(panel.simulated_dbm)
         channel["band"] = [arrays.add(band[f"simulated_{end}_dbm"][pick]) for end in ("low", "high")]

@@ -23,7 +23,6 @@ from ..common import kml
 from ..common.cf import DB, DBM, WGS84, Dataset, file_attributes, netcdf_bytes
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
-from ..common.jsonable import named
 from ..common.kml import CLASS_COLOURS, xml_text
 from ..common.stages import Progress, logged
 from ..common.units import AnyArray, FloatArray, IntArray
@@ -190,10 +189,10 @@ def of_report(data: ReportData) -> Export:
     times = [points.table["time"].to_numpy() for points in sets] + ([] if data.track is None else [data.track.time])
     known = [time.min() for time in (time[~np.isnat(time)] for time in times) if len(time)]
     return Export(
-        **named(data, "flight title site track synthetic"),
+        flight=data.flight, title=data.title, site=data.site, track=data.track, synthetic=data.synthetic,
         sets=sets,
         clock=bool(known) and has_wall_clock(min(known)),
-    )
+    )  # fmt: skip
 
 
 # Stands for a missing code in NetCDF; attribute ``_FillValue``.

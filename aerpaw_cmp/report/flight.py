@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from ..common.content import KEY, union
-from ..common.jsonable import fields_of, json_safe, named
+from ..common.jsonable import fields_of, json_safe
 from ..common.stages import Stages
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray
@@ -55,20 +55,21 @@ def metrics(data: ReportData) -> dict[str, Any]:
     for pair in data.pairs:
         pairs.setdefault(pair.tower, {})[f"{pair.first} - {pair.second}"] = pair.score
     result: dict[str, Any] = {
-        **named(data, "flight title synthetic settings"),
+        "flight": data.flight, "title": data.title, "synthetic": data.synthetic, "settings": data.settings,
         "sentence": words.paragraph(data),
         "warnings": words.cautions(data),
         "antennas": data.antennas,
-        "site": named(data.site, "name credit assumed"),
+        "site": {"name": data.site.name, "credit": data.site.credit, "assumed": data.site.assumed},
         "inputs": [
-            named(f, "path sha256 reader lines accepted rejected blank role warnings")
+            {"path": f.path, "sha256": f.sha256, "reader": f.reader, "lines": f.lines, "accepted": f.accepted,
+             "rejected": f.rejected, "blank": f.blank, "role": f.role, "warnings": f.warnings}
             | ({"learned_on": f.learned_on} if f.learned_on else {})
             for f in data.inputs
         ],
         KEY: list(union(*(f.learned_on for f in data.inputs))),
         "rss": rss,
         "verdict": data.verdict,
-        **named(data, "likely_cause next_step"),
+        "likely_cause": data.likely_cause, "next_step": data.next_step,
         "offsets": words.offset_sentences(data.rss),
         "rank": {item.tower: _rank_metrics(item) for item in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),
@@ -77,7 +78,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         "clock": {name: clock_metrics(clock) for name, clock in data.clocks.items()},
         **({} if data.serving is None else {"serving": data.serving.as_dict()}),
         **({"pairs": pairs} if pairs else {}),
-    }
+    }  # fmt: skip
     safe: dict[str, Any] = json_safe(result)
     merge(safe, json_safe(data.extra_metrics))
     return safe
@@ -86,9 +87,10 @@ def metrics(data: ReportData) -> dict[str, Any]:
 def _rss_metrics(series: RssResult) -> dict[str, Any]:
     score = series.score
     return {
-        **named(score, "offset_db rmse_db n n_out_of_coverage"),
+        "offset_db": score.offset_db, "rmse_db": score.rmse_db, "n": score.n,
+        "n_out_of_coverage": score.n_out_of_coverage,
         "at_search_edge": score.at_edge,
-        **named(score, "correlation rmse_ci95_db"),
+        "correlation": score.correlation, "rmse_ci95_db": score.rmse_ci95_db,
         "offset_ci95_db": score.intervals.offset_db,
         "correlation_ci95": score.intervals.correlation,
         "n_effective": score.intervals.autocorrelation.n_effective,
@@ -96,18 +98,21 @@ def _rss_metrics(series: RssResult) -> dict[str, Any]:
         "lag_verdict": series.clock_verdict,
         "unit": series.unit,
         "fitted": score.fitted_on_scored,
-        "baselines": {name: named(model, "offset_db rmse_db") for name, model in series.baselines.items()},
+        "baselines": {
+            name: {"offset_db": model.offset_db, "rmse_db": model.rmse_db} for name, model in series.baselines.items()
+        },
         **fields_of(series.further),
-    }
+    }  # fmt: skip
 
 
 def clock_metrics(clock: ClockResult) -> dict[str, Any]:
     """``clock.<receiver>`` of metrics.json: numbers, verdict, whether applied, and the checks it rests on."""
     return {
         **clock.checks,
-        **named(clock, "radio_minus_telemetry_s ci95_s verdict reason"),
+        "radio_minus_telemetry_s": clock.radio_minus_telemetry_s, "ci95_s": clock.ci95_s, "verdict": clock.verdict,
+        "reason": clock.reason,
         "applied": clock.applied in (APPLIED, GIVEN),
-    }
+    }  # fmt: skip
 
 
 def _histogram(share: FloatArray, intervals: Sequence[Interval]) -> dict[str, Any]:
@@ -123,13 +128,15 @@ def _rank_metrics(series: RankResult) -> dict[str, Any]:
     simulated = {
         k_key(k): {
             **_histogram(fit.histogram, fit.histogram_ci95),
-            **named(fit, "out_of_coverage agreement agreement_ci95 kappa total_variation total_variation_ci95"),
+            "out_of_coverage": fit.out_of_coverage, "agreement": fit.agreement, "agreement_ci95": fit.agreement_ci95,
+            "kappa": fit.kappa, "total_variation": fit.total_variation,
+            "total_variation_ci95": fit.total_variation_ci95,
             "wasserstein": fit.wasserstein,
             "p_value": fit.p_histogram,
             "confusion": fit.confusion[1:],
         }
         for k, fit in score.simulated.items()
-    }
+    }  # fmt: skip
     return {
         "measured": {
             **_histogram(score.histogram, score.histogram_ci95),
@@ -149,11 +156,12 @@ def further_numbers(series: RssResult | RankResult) -> dict[str, Any]:
     if isinstance(series, RankResult):
         curve = series.score.curve
         numbers = {
-            **named(series.score, "n n_effective n_no_csi"),
+            "n": series.score.n, "n_effective": series.score.n_effective, "n_no_csi": series.score.n_no_csi,
             "best_k_total_variation": curve.best_k_total_variation,
             "best_k_total_variation_ci95": curve.best_k_total_variation_interval,
-            "stale": named(series.score.staleness, "verdict n_reports hold_s"),
-        }
+            "stale": {"verdict": series.score.staleness.verdict, "n_reports": series.score.staleness.n_reports,
+                      "hold_s": series.score.staleness.hold_s},
+        }  # fmt: skip
     safe: dict[str, Any] = json_safe(numbers | fields_of(series.further))
     return safe
 
@@ -161,17 +169,19 @@ def further_numbers(series: RssResult | RankResult) -> dict[str, Any]:
 def _engine_metrics(engine: EngineResult) -> dict[str, Any]:
     audit = engine.audit
     return {
-        **named(engine, "engine links seconds paths left_out not_audited"),
+        "engine": engine.engine, "links": engine.links, "seconds": engine.seconds, "paths": engine.paths,
+        "left_out": engine.left_out, "not_audited": engine.not_audited,
         "audit": None
         if audit is None
         else {
             "summary": words.audit_summary(audit),
-            **named(audit, "reference links missing_paths extra_paths rss_max_error_db"),
+            "reference": audit.reference, "links": audit.links, "missing_paths": audit.missing_paths,
+            "extra_paths": audit.extra_paths, "rss_max_error_db": audit.rss_max_error_db,
             "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
             "field": None if audit.fields is None else {**fields_of(audit.fields), "failed": audit.fields.failed},
-            **named(audit, "seconds reference_seconds"),
+            "seconds": audit.seconds, "reference_seconds": audit.reference_seconds,
         },
-    }
+    }  # fmt: skip
 
 
 # --- cards ----------------------------------------------------------------------------------------------------------

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..common.jsonable import named
 from ..common.text import counted
 from ..common.units import AnyArray, FloatArray, IntArray
 from ..common.versions import utc_now, versions
@@ -332,13 +331,14 @@ def _inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tu
         InputFile(
             path=log.path,
             sha256=file.sha256,
-            **named(file.result, "reader lines accepted blank warnings"),
+            reader=file.result.reader, lines=file.result.lines, accepted=file.result.accepted,
+            blank=file.result.blank, warnings=file.result.warnings,
             rejected=file.result.rejected_count,
             role=", ".join(sorted({s.kind for s in file.result.streams})),
             rejected_lines=file.result.rejected,
         )
         for log, file in zip(logs, files, strict=True)
-    )
+    )  # fmt: skip
 
 
 def track_of(data: FlightData) -> Track | None:
@@ -372,11 +372,11 @@ def waypoints_of(data: FlightData) -> tuple[Waypoint, ...]:
         index = start + int(near[0])
         out.append(
             Waypoint(
-                **named(point, "label east_m north_m"),
+                label=point.label, east_m=point.east_m, north_m=point.north_m,
                 time=track.time[index],
                 up_m=point.height_m,
             )
-        )
+        )  # fmt: skip
         start = index
     return tuple(out)
 

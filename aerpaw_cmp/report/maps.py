@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from ..common.geodesy import SiteFrame
-from ..common.jsonable import json_object, json_safe, named
+from ..common.jsonable import json_object, json_safe
 from ..common.kml import CLASS_COLOURS
 from ..common.text import counted
 from ..common.units import FloatArray, IntArray, spread_out
@@ -833,22 +833,24 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
     numbers = json_object(
         name=data.name,
         title=data.title,
-        site=named(data.site, "name credit assumed"),
+        site={"name": data.site.name, "credit": data.site.credit, "assumed": data.site.assumed},
         grid={"columns": columns, "rows": rows, "positions": columns * rows},
-        coverage=[named(m, "tower antennas foliage altitude_m coverage") for m in data.rss],
+        coverage=[{"tower": m.tower, "antennas": m.antennas, "foliage": m.foliage, "altitude_m": m.altitude_m,
+                   "coverage": m.coverage} for m in data.rss],
         rank=[
             {
-                **named(m, "k foliage altitude_m"),
+                "k": m.k, "foliage": m.foliage, "altitude_m": m.altitude_m,
                 "share": dict(zip(("Z", *map(str, RANKS)), m.share, strict=True)),
             }
             for m in data.rank
         ],
         layers=[layer_numbers(layer) for layer in page_layers(data)],
-        mae=[named(e, "evaluation method k altitude_m mae mae_ci95 n") for e in data.errors],
-        paper=[named(p, "where what paper ours") for p in data.paper],
+        mae=[{"evaluation": e.evaluation, "method": e.method, "k": e.k, "altitude_m": e.altitude_m, "mae": e.mae,
+              "mae_ci95": e.mae_ci95, "n": e.n} for e in data.errors],
+        paper=[{"where": p.where, "what": p.what, "paper": p.paper, "ours": p.ours} for p in data.paper],
         warnings=warnings(data),
         **about(data),
-    )
+    )  # fmt: skip
     merge(numbers, json_safe(data.metrics))
     return numbers
 

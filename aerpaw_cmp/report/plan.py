@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from ..common.jsonable import json_object, named
+from ..common.jsonable import json_object
 from ..common.text import guarded
 from ..common.units import FloatArray
 from ..site.site import Site
@@ -55,11 +55,12 @@ def _sd_now_db(data: PlanPage) -> float:
 def plan_metrics(data: PlanPage) -> dict[str, Any]:
     """The numbers of the page under stable names."""
     return json_object(
-        **named(data, "target sentence antennas flights candidates warnings"),
+        target=data.target, sentence=data.sentence, antennas=data.antennas, flights=data.flights,
+        candidates=data.candidates, warnings=data.warnings,
         sd_now_db=_sd_now_db(data),
         length=data.curve,
         **about(data),
-    )
+    )  # fmt: skip
 
 
 def plan_page(data: PlanPage, shown: Mapping[str, Any]) -> Page:

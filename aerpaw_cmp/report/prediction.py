@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from ..common.cf import Dataset, file_attributes, netcdf_bytes
 from ..common.errors import UsageError
-from ..common.jsonable import json_object, named
+from ..common.jsonable import json_object
 from ..common.text import guarded
 from ..common.units import FloatArray
 from ..compare.calibration import OFF, Correction, crps_difference
@@ -351,7 +351,8 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
     ranks = data.table[data.table["channel"] == "rank"]
     return json_object(
         prediction=data.name,
-        **named(data, "kind flights trained_on marks chosen candidates warnings"),
+        kind=data.kind, flights=data.flights, trained_on=data.trained_on, marks=data.marks, chosen=data.chosen,
+        candidates=data.candidates, warnings=data.warnings,
         sentence=data.verdict,
         field=data.model,
         series=series,
@@ -360,7 +361,7 @@ def prediction_metrics(data: PredictionPage) -> dict[str, Any]:
             for tower, part in ranks.groupby("tower", observed=True)
         },
         **about(data),
-    )
+    )  # fmt: skip
 
 
 def prediction_page(data: PredictionPage, numbers: Mapping[str, Any], shown: Mapping[str, Any]) -> Page:

@@ -87,10 +87,7 @@ HELPS: dict[str, tuple[str, str]] = {
         "The difference of {effect:+.1f} dB is not significant (95 %: {low:+.1f} to {high:+.1f} dB).",
         "add flights with other headings",
     ),
-    "no interval": (
-        "The difference is {effect:+.1f} dB; two flights give no interval.",
-        "add a third flight",
-    ),
+    "no interval": ("The difference is {effect:+.1f} dB; two flights give no interval.", "add a third flight"),
 }
 
 # Body frame against frames that do not turn, by :func:`~aerpaw_cmp.compare.verdict.antenna_or_place`.

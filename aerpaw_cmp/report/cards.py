@@ -232,7 +232,4 @@ def write_page(folder: Path, name: str, page: Page, numbers: Mapping[str, Any]) 
     list of Path
         The page first.
     """
-    return [
-        write_file(folder / f"{name}.html", page.html()),
-        write_file(folder / "metrics.json", json_text(numbers)),
-    ]
+    return [write_file(folder / f"{name}.html", page.html()), write_file(folder / "metrics.json", json_text(numbers))]

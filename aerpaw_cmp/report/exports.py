@@ -124,11 +124,7 @@ class Export:
 
 
 def points_table(
-    kind: str,
-    flight: str,
-    columns: Sequence[Column],
-    links: Iterable[tuple[Any, dict[str, Any]]],
-    frame: SiteFrame,
+    kind: str, flight: str, columns: Sequence[Column], links: Iterable[tuple[Any, dict[str, Any]]], frame: SiteFrame
 ) -> Iterator[Points]:
     """The points of the links of a flight one below the other; nothing without links.
 

@@ -478,11 +478,7 @@ def inputs_card(data: ReportData) -> Card:
 def _rejected(f: InputFile) -> Table:
     first = f", the first {_REJECTED_SHOWN} of {number(f.rejected, 0)}" if f.rejected > _REJECTED_SHOWN else ""
     rows = [
-        (
-            line.number,
-            line.reason,
-            Markup("<code>{}</code>").format(cut(line.text)),
-        )
+        (line.number, line.reason, Markup("<code>{}</code>").format(cut(line.text)))
         for line in f.rejected_lines[:_REJECTED_SHOWN]
     ]
     return Table(caption=f"Rejected lines{first}.", columns={"Line": RIGHT, "Reason": TEXT, "Text": TEXT}, rows=rows)

@@ -275,7 +275,14 @@ def _spans(data: ReportData, time: AnyArray, spans: Sequence[ErrorSpan], caption
         (*(clock(at, start) for at in words.instants(time, span)), *span.position_m, span.mean_db)
         for span in spans or ()
     ]
-    heads = {f"From ({unit})": TEXT, "To": TEXT, "East [m]": 0, "North [m]": 0, "Up [m]": 0, "Mean [dB]": 1}
+    heads: dict[str, str | int] = {
+        f"From ({unit})": TEXT,
+        "To": TEXT,
+        "East [m]": 0,
+        "North [m]": 0,
+        "Up [m]": 0,
+        "Mean [dB]": 1,
+    }
     return Table(caption=caption, columns=heads, rows=rows)
 
 

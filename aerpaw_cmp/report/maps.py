@@ -930,7 +930,12 @@ def error_tables(errors: Sequence[MapError]) -> list[Table]:
             mae = {e.altitude_m: e.mae for e in group}
             mean = bold(number(sum(mae.values()) / len(mae), 3))
             rows.append((method, k_key(k), *(mae.get(height) for height in heights), mean))
-        columns = {"Method": HEAD, "K": TEXT, **{f"{height:g} m": 3 for height in heights}, "Mean": RIGHT}
+        columns: dict[str, str | int] = {
+            "Method": HEAD,
+            "K": TEXT,
+            **{f"{height:g} m": 3 for height in heights},
+            "Mean": RIGHT,
+        }
         caption = f"Mean absolute error of the interpolated rank, {evaluation}."
         tables.append(Table(caption=caption, columns=columns, rows=rows))
     return tables

@@ -376,8 +376,8 @@ def prediction_page(data: PredictionPage, numbers: Mapping[str, Any], shown: Map
 
 
 def _levels_card(numbers: Mapping[str, Any], *, lock: bool) -> Card:
-    columns = {"Tower, channel": HEAD, "Unit": TEXT, "Points": 0, "Level": 1, "SD [dB]": 1,
-               **({"P(lock)": 2} if lock else {}), "Outside flown places": SHARE}  # fmt: skip
+    columns: dict[str, str | int] = {"Tower, channel": HEAD, "Unit": TEXT, "Points": 0, "Level": 1, "SD [dB]": 1,
+                        **({"P(lock)": 2} if lock else {}), "Outside flown places": SHARE}  # fmt: skip
     keys = ("unit", "points", "mean_level_db", "mean_sd_db", *(["mean_p_lock"] if lock else []), "share_outside_flown")
     levels = Table(
         caption="Means over all points. The standard deviation is that of one sample.", columns=columns,

@@ -8,6 +8,8 @@ from markupsafe import Markup
 
 from aerpaw_cmp.report import calibration, campaign, flight, maps
 from aerpaw_cmp.report.cards import HEAD, RIGHT, SHARE, TEXT, Card, Page, Table
+from aerpaw_cmp.report.flight_data import ReportData
+from aerpaw_cmp.report.maps import MapsData
 from aerpaw_cmp.report.page import environment
 
 TABLE = Table(caption="c", columns={"name": HEAD, "text": TEXT, "dB": 2, "share": SHARE, "made": RIGHT}, rows=[])
@@ -48,7 +50,23 @@ def test_every_card_function_of_a_page_stands_on_it() -> None:
         assert all(source.count(name) > 1 for name in mine)  # defined, and in CARDS or the page
 
 
-def test_no_page_changes_the_template_environment(report_data, maps_data) -> None:
+def test_a_new_card_is_one_function(report_data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As CONTRIBUTING says: the function, and its name in CARDS."""
+
+    def samples_card(data: ReportData) -> Card:
+        table = Table(
+            caption="Samples.", columns={"Channel": HEAD, "n": 0}, rows=[(p.name, p.score.n) for p in data.rss]
+        )
+        return Card(title="Samples by channel", id="samples", link="Samples", tables=[table])
+
+    monkeypatch.setattr(flight, "CARDS", (*flight.CARDS, samples_card))
+    html = flight.page(report_data, [])
+    assert '<a href="#samples">Samples</a>' in html
+    card = html.partition('<section id="samples">')[2].partition("</section>")[0]
+    assert card.count("<tr>") == 1 + len(report_data.rss)
+
+
+def test_no_page_changes_the_template_environment(report_data: ReportData, maps_data: MapsData) -> None:
     known = dict(environment().filters), dict(environment().globals), dict(environment().tests)
     flight.page(report_data, [])
     maps.maps_page(maps_data, [])

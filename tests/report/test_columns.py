@@ -13,6 +13,7 @@ from aerpaw_cmp.report import columns as report_columns
 from aerpaw_cmp.report import flight
 from aerpaw_cmp.report.columns import RANK, RSS, Column, csv_text, described, header, tables
 from aerpaw_cmp.report.exports import of_report
+from aerpaw_cmp.report.flight_data import ReportData
 
 DOCS = Path(__file__).parents[2] / "docs" / "outputs.md"
 BEGIN, END = "<!-- columns -->\n", "<!-- end of columns -->"
@@ -35,7 +36,7 @@ def test_the_docs_have_the_columns_of_the_code() -> None:
     assert text == written(), "python -m tests.report.test_columns"
 
 
-def test_a_new_column_is_one_row(report_data, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_column_is_one_row(report_data: ReportData, monkeypatch: pytest.MonkeyPatch) -> None:
     """File, export and page have it, with unit and meaning."""
     twice = Column("twice_db", "dB", "twice the residual", lambda p: 2.0 * p.residual_db)
     monkeypatch.setattr(report_columns, "RSS", (*RSS, twice))
@@ -50,7 +51,7 @@ def test_a_new_column_is_one_row(report_data, monkeypatch: pytest.MonkeyPatch) -
     assert "twice the residual" in flight.page(report_data, [])
 
 
-def test_a_column_of_some_series_is_empty_in_the_others(report_data) -> None:
+def test_a_column_of_some_series_is_empty_in_the_others(report_data: ReportData) -> None:
     """A family has the members of all series in one order; without any series its name is in no header."""
     first, second = report_data.rss[:2]
     fewer = dataclasses.replace(second, baselines={"two_ray": second.baselines["two_ray"]})

@@ -75,10 +75,6 @@ _BEAMS = (
 )  # fmt: skip
 # Of compiled code no line is seen running: these tests call it, and it is interpreted for each mutant.
 COMPILED = {
-    "aerpaw_cmp/propagation/field/kernels.py": (
-        f"{_ALIKE}compiled_equals_numpy[False-one each]", f"{_ALIKE}compiled_equals_numpy[True-foreign]",
-        f"{_ALIKE}more_pairs_than_lanes_and_paths_in_any_order",
-    ),
     "aerpaw_cmp/propagation/search/beams.py": _BEAMS,
     "aerpaw_cmp/propagation/search/merging.py": _BEAMS,
 }  # fmt: skip

@@ -128,7 +128,7 @@ def channel_parts(
         at_once, room, size = count, MOST_BYTES, size + _PATH_BYTES * links * _PATHS
         further = ", or netcdf and csv alone" + (" with rt.engine: image" if drawn else "")
     _refuse(size, f"{counted(count, 'pose')}, {counted(len(towers), 'tower')}", room, further)
-    job = None if at_once >= count else Job.of(along.poses.position_m, links, pairs)
+    job = None if at_once >= count else Job.of(along.poses.position_m, links)
     progress = stages.progress if job is None else lambda *_: None  # one of many parts is silent
     names = {"": 0}  # the line of sight
     for start in range(0, count, at_once):

@@ -279,7 +279,7 @@ class SiteChannels:
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (n, 3, 3)))
         search = Search(max_depth=s.max_depth)
         links = n * len(self.site.towers)
-        run = Run(job=Job(self.reach.extent_m, links, links))
+        run = Run(job=Job(self.reach.extent_m, links))
         replayed = replay(self.site, self.siso, poses, search, run=run)
         self.paths += len(replayed.paths)
         siso, mimo = replayed.h, channel_matrices(replayed.paths, replayed.faces, self.sources_m, poses, self.mimo).h

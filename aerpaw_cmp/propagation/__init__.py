@@ -3,7 +3,7 @@
 ``replay.replay(site, link, poses, Search(...), Field(...), Run(...))`` is the door; ``search.sionna`` alone loads
 Sionna.
 
-Each law stands once; NumPy and the compiled loops (``field.kernels``) evaluate one source:
+Each formula has one place:
 
 ======================================  ==============================================================
 Fresnel coefficients of a face          ``field.fresnel.coefficients`` (``half_space``, ``slab``)

@@ -1,4 +1,4 @@
-"""Use of compiled kernels: the choice whether they run, the folder that keeps them, threads.
+"""Use of the compiled path search: the choice whether it runs, the folder that keeps its code, threads.
 
 numba is optional (extra ``fast``). Importing it and reading compiled code takes about a second, compiling it once a
 machine ten to thirty. So a job is compiled where NumPy would take longer than that: the estimated seconds of all jobs
@@ -35,30 +35,23 @@ from ..common.units import AnyArray
 
 ROOM = Path(__file__).parents[1]
 SWITCH = "AERPAW_CMP_COMPILED"
-FIELD, BEAMS = "propagation.field.kernels", "propagation.search.beams"
-# Files of kernels, and those whose functions and constants they take in.
-SOURCES = tuple(
-    f"propagation/{name}.py" for name in (
-        "field/dyads", "field/fresnel", "field/kernels", "search/beams", "search/merging",
-        "search/mirror", "compiled", "numba_options",
-    )
+BEAMS = "propagation.search.beams"
+# Files of compiled code, and those whose functions and constants it takes in.
+SOURCES = (
+    "propagation/search/beams.py", "propagation/search/merging.py", "propagation/search/mirror.py",
+    "propagation/geometry.py", "propagation/compiled.py", "propagation/numba_options.py",
 )  # fmt: skip
 
 # CPU seconds of the first compilation on a machine.
-COMPILE_S = {FIELD: 10.0, BEAMS: 25.0}
+COMPILE_S = 25.0
 # CPU seconds of NumPy from which numba's import and reading what was compiled before pay off.
 READ_S = 0.4
 # A job that NumPy does in less stays there, whatever is loaded.
 LEAST_S = 0.25
 
-# CPU seconds of NumPy per element pair of a link (``benchmarks/replay.py``).
-FIELD_S = 6e-7
 # CPU seconds of NumPy per link and face, sequences of two reflections: 2.2 s in a map of 12 780 links, 245 faces and
 # ten heights, which with numba took 1.6 s and 110 MiB more.
 MIRRORS_S = 7e-8
-
-# Estimated seconds of this process so far.
-_in_numpy_s = dict.fromkeys(COMPILE_S, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -116,51 +109,42 @@ def _is_private(status: os.stat_result) -> bool:
     return not hasattr(os, "geteuid") or (status.st_uid == os.geteuid() and not status.st_mode & 0o022)
 
 
-def kernels_for(pairs: int, work: int = 0) -> ModuleType | None:
-    """Compiled kernels of the field, or None: so many element pairs of links are too few, or they fail.
+class _Spent:
+    """Estimated CPU seconds of NumPy that this process has spent on searches: many small jobs are a large one."""
 
-    ``work`` is that of the job that these pairs are a part of.
-    """
-    return _worth(FIELD, pairs * FIELD_S, work * FIELD_S)
+    seconds = 0.0
 
 
 def beams_for(links: int, faces: int) -> bool:
-    """Check whether compiled beams are worth it where mirror images in NumPy would do as well."""
-    return _worth(BEAMS, links * faces * MIRRORS_S) is not None
+    """Check whether compiled beams are worth their start where mirror images in NumPy would find the same paths."""
+    chosen, numpy_s = switch(), links * faces * MIRRORS_S
+    _Spent.seconds += numpy_s
+    if chosen == "never" or (chosen == "auto" and (numpy_s < LEAST_S or _Spent.seconds < _cost_s())):
+        return False
+    state = load()
+    if state.kernels is None and (chosen == "always" or find_spec("numba") is not None):
+        warn_once(state.reason)
+    return state.kernels is not None
 
 
 def beams() -> State:
     """The search among thousands of faces (:mod:`aerpaw_cmp.propagation.search.beams`), or why it cannot run."""
     if switch() == "never":
         return State(None, f"{SWITCH}=never")
-    return load(BEAMS)
+    return load()
 
 
-def _worth(name: str, numpy_s: float, job_s: float = 0.0) -> ModuleType | None:
-    """Compiled code for (a part of) a job that takes NumPy so many CPU seconds; None where that is quicker."""
-    chosen = switch()
-    _in_numpy_s[name] += numpy_s  # many small jobs of one process are a large one
-    # a job in parts is judged as a whole: no part alone would be worth a compiler
-    job_s = max(job_s, numpy_s)
-    if chosen == "never" or (chosen == "auto" and (job_s < LEAST_S or max(job_s, _in_numpy_s[name]) < _cost_s(name))):
-        return None
-    state = load(name)
-    if state.kernels is None and (chosen == "always" or find_spec("numba") is not None):
-        warn_once(state.reason)
-    return state.kernels
-
-
-def _cost_s(name: str) -> float:
-    """CPU seconds until compiled code runs: it is loaded, kept on disk, or has to be compiled."""
+def _cost_s() -> float:
+    """Return the CPU seconds until compiled code runs: it is loaded, kept on disk, or has to be compiled."""
     # loaded already: nothing left to pay
-    if f"aerpaw_cmp.{name}" in sys.modules:
+    if f"aerpaw_cmp.{BEAMS}" in sys.modules:
         return LEAST_S
     folder = code_folder() if find_spec("numba") else None
-    return READ_S if folder is not None and (folder / f"{name}.compiled").exists() else COMPILE_S[name]
+    return READ_S if folder is not None and (folder / f"{BEAMS}.compiled").exists() else COMPILE_S
 
 
-@lru_cache(maxsize=4)
-def load(name: str) -> State:
+@lru_cache(maxsize=1)
+def load() -> State:
     """Import kernels and try them; whatever goes wrong there is a reason to do without, not an error.
 
     A broken installation shows itself in many ways (no LLVM for this processor, a NumPy too new, a cache cut short),
@@ -173,11 +157,11 @@ def load(name: str) -> State:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba's own, about its cache
-            kernels = import_module(f"aerpaw_cmp.{name}")
+            kernels = import_module(f"aerpaw_cmp.{BEAMS}")
             # a broken LLVM shows itself when something is compiled, not on import
             kernels.try_out()
             if (folder := code_folder()) is not None:
-                (folder / f"{name}.compiled").touch()
+                (folder / f"{BEAMS}.compiled").touch()
     except Exception as error:
         line = (str(error).splitlines() or [""])[0]
         return State(None, f"compiled code cannot run ({type(error).__name__}: {line})")

@@ -65,9 +65,8 @@ def replay_in_parts(
     if len(rows) == 1:
         return replay(site, link, poses, search, field, run)
     links = len(poses) * len(link.tower_arrays)
-    pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
     # each part would count from 0 to 1 again
-    progress, run = run.progress, replace(run, progress=None, job=Job.of(poses.position_m, links, pairs))
+    progress, run = run.progress, replace(run, progress=None, job=Job.of(poses.position_m, links))
 
     def of(at: IntArray) -> Replay:
         return replay(site, link, poses[at], search, field, run)
@@ -162,9 +161,6 @@ PLACES_AT_ONCE = 64
 
 # Links (poses times places) of a block: some 4 MB of H with 4 x 4 elements.
 LINKS_AT_ONCE = 16_384
-
-# Element pairs that NumPy evaluates in the time of one pose with a source of its own.
-WORK_PER_POSE = 200
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,7 +265,8 @@ def replay_moving(
     if not blocks:
         return replay(site, link, poses, search, field, run)
     if len(blocks) > 1:
-        run = replace(run, job=_shared_by_blocks(link, poses, sources_m))
+        # all blocks share one tolerance; each place has few faces in reach, so that mirror images suffice
+        run = replace(run, job=Job.of(np.concatenate([poses.position_m, sources_m]), 0))
 
     def of(block: _Block) -> Replay:
         moved_site, several, some, links = _scene_of(site, link, name, poses, block)
@@ -278,13 +275,6 @@ def replay_moving(
     # lazily: a block is traced when it is put in, so one scene is alive at a time
     result = in_turn([block.rows for block in blocks], map(of, blocks), progress)
     return replace(result, ends=Ends(link, poses, sources_m[:, None], field))
-
-
-def _shared_by_blocks(link: Link, poses: Poses, sources_m: FloatArray) -> Job:
-    """Properties of all blocks that each must know: one tolerance, and whether compiled code is worth loading."""
-    pairs = len(poses) * len(link.uav_array) * sum(map(len, link.tower_arrays.values()))
-    points = np.concatenate([poses.position_m, sources_m])
-    return Job.of(points, 0, pairs * WORK_PER_POSE)  # each place has few faces in reach: mirror images
 
 
 def _scene_of(

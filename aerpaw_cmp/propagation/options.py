@@ -87,20 +87,19 @@ class Job:
     ----------
     extent_m : (points, 3)
         Points that span all poses: they set the tolerance of the path search.
-    links, pairs : int
-        All links and their element pairs: they decide whether compiled code is worth loading.
+    links : int
+        All links: they decide whether compiled code is worth loading.
     """
 
     extent_m: FloatArray
     links: int
-    pairs: int
 
     @classmethod
-    def of(cls, points_m: FloatArray, links: int, pairs: int) -> Job:
+    def of(cls, points_m: FloatArray, links: int) -> Job:
         """The box of the points (n, 3) that are known."""
         known = points_m[np.isfinite(points_m).all(axis=1)]
         # two corners say as much of the tolerance as all points do
-        return cls(np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known, links, pairs)
+        return cls(np.stack([known.min(axis=0), known.max(axis=0)]) if len(known) else known, links)
 
 
 Progress = Callable[[float], None]

@@ -537,7 +537,7 @@ def replay(
     # on the scene before terrain changed it: these paths reflect off level ground
     further = further_paths(site, scene, link, poses, search, field)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
-    fields, has_path = _channels(scene, link, poses, paths, [added for _, added in further], field, run)
+    fields, has_path = _channels(scene, link, poses, paths, [added for _, added in further], field)
     level_dbm, power_dbm = _levels(fields, has_path, link)
     notes += [*stopped, *(Omission(some.missing) for some, _ in further)]
     return Replay(
@@ -655,12 +655,11 @@ def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) ->
 
 
 def _channels(
-    scene: Scene, link: Link, poses: Poses, paths: PathSet, further: Sequence[Fields], field: Field, run: Run
+    scene: Scene, link: Link, poses: Poses, paths: PathSet, further: Sequence[Fields], field: Field
 ) -> tuple[Fields, BoolArray]:
     """H and powers of the paths with what further kinds of them add, and which links (poses, towers) have a path."""
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
-    work = 0 if run.job is None else run.job.pairs
-    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, work=work)
+    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     # a blocked path adds zero to H; only the flag tells it from one that fades
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle

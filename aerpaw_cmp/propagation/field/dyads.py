@@ -7,8 +7,7 @@ field vector ``w`` into::
     -r_tm w + (r_te + r_tm) s (s . w) / |s|^2,    s = k x n,    cos theta = |k . n|
 
 which is ``r_te e_s + r_tm e_p'`` of the textbook, mirrored. At normal incidence ``s`` is not defined, but there
-``r_te + r_tm`` is zero. Every law takes arrays or numbers: NumPy evaluates it as it is, and
-:mod:`aerpaw_cmp.propagation.field.kernels` compiles the same source.
+``r_te + r_tm`` is zero. Every formula takes arrays or numbers.
 """
 
 from __future__ import annotations
@@ -24,21 +23,6 @@ Vector = tuple[Number, Number, Number]
 Rotation = tuple[Vector, Vector, Vector]
 
 _ROUND = 6755399441055744.0  # 1.5 * 2**52: adding and taking it off rounds to an integer, ties to even
-
-
-def select(condition: Number, yes: Number, no: Number) -> Number:
-    """``yes`` where the condition holds, else ``no``; both are evaluated."""
-    return np.where(condition, yes, no)
-
-
-def larger(a: Number, b: Number) -> Number:
-    """The larger of two numbers."""
-    return np.maximum(a, b)
-
-
-def smaller(a: Number, b: Number) -> Number:
-    """The smaller of two numbers."""
-    return np.minimum(a, b)
 
 
 def sine_cosine(turns: Number) -> tuple[Number, Number]:
@@ -57,10 +41,10 @@ def sine_cosine(turns: Number) -> tuple[Number, Number]:
     cosine = 1.0 - (0.5 * z - z * z * (4.16666666666666019037e-02 + z * tail))
     # in the quarters up and down, sine and cosine change places
     odd = quarter * quarter == 1.0
-    sine_there, cosine_there = select(odd, cosine, sine), select(odd, sine, cosine)
+    sine_there, cosine_there = np.where(odd, cosine, sine), np.where(odd, sine, cosine)
     return (
-        select((quarter < 0.0) | (quarter > 1.5), -sine_there, sine_there),
-        select((quarter > 0.5) | (quarter < -1.5), -cosine_there, cosine_there),
+        np.where((quarter < 0.0) | (quarter > 1.5), -sine_there, sine_there),
+        np.where((quarter > 0.5) | (quarter < -1.5), -cosine_there, cosine_there),
     )
 
 
@@ -105,7 +89,7 @@ def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector
     z = place_m[2] + uav_offset[2] - (image_m[2] + tower_offset[2])
     length = np.sqrt(x * x + y * y + z * z)
     # both branches are evaluated: the divisor must not be zero
-    scale = select(length > 0.0, 1.0 / larger(length, 1e-300), 0.0)
+    scale = np.where(length > 0.0, 1.0 / np.maximum(length, 1e-300), 0.0)
     return x * scale, y * scale, z * scale, length
 
 
@@ -149,8 +133,8 @@ def field_vector(m: Rotation, toward: Vector, e_theta: Number, e_phi: Number) ->
     across = np.sqrt(x * x + y * y)
     # at a pole phi means nothing; 0 is what atan2(0, 0) gives a pattern
     off_pole = across > 0.0
-    scale = select(off_pole, 1.0 / larger(across, 1e-300), 0.0)
-    cosine, sine = select(off_pole, x * scale, 1.0), y * scale
+    scale = np.where(off_pole, 1.0 / np.maximum(across, 1e-300), 0.0)
+    cosine, sine = np.where(off_pole, x * scale, 1.0), y * scale
     a = e_theta * (z * cosine) - e_phi * sine
     b = e_theta * (z * sine) + e_phi * cosine
     return turned_back(m, (a, b, -e_theta * across))
@@ -182,7 +166,7 @@ def reflected(
     (x, y, z), (n0, n1, n2) = toward, normal
     s0, s1, s2 = y * n2 - z * n1, z * n0 - x * n2, x * n1 - y * n0
     # at normal incidence s is zero, and so is te + tm, which multiplies it
-    scale = 1.0 / larger(s0 * s0 + s1 * s1 + s2 * s2, 1e-300)
+    scale = 1.0 / np.maximum(s0 * s0 + s1 * s1 + s2 * s2, 1e-300)
     q_re, q_im = (te_re + tm_re) * scale, (te_im + tm_im) * scale
     a = s0 * re[0] + s1 * re[1] + s2 * re[2]
     b = s0 * im[0] + s1 * im[1] + s2 * im[2]
@@ -204,7 +188,7 @@ def reflected(
 def spreading(cycles: Number) -> Number:
     """``lambda / (4 pi L)`` of a length in wavelengths, at most 1: nobody receives more than was sent."""
     # where two elements meet the length is zero: infinity becomes 1
-    return smaller(1.0, 1.0 / (4.0 * np.pi * cycles))
+    return np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))
 
 
 def received(wave_re: Vector, wave_im: Vector, uav_re: Vector, uav_im: Vector, cycles: Number) -> tuple[Number, Number]:

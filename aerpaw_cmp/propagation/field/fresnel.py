@@ -1,8 +1,7 @@
 """Fresnel coefficients of half-spaces and slabs, and what the faces of a scene are made of.
 
-The laws are written once, for arrays and for numbers alike: NumPy evaluates them as they are, and
-:mod:`aerpaw_cmp.propagation.field.kernels` compiles the same source. Complex numbers are pairs (re, im) there, because
-compiled loops over pairs of numbers use vector instructions and loops over complex numbers do not.
+Each formula is written once, for arrays and for numbers alike. Complex numbers are pairs (re, im): their parts are
+evaluated in place, without arrays of complex intermediate results.
 """
 
 from __future__ import annotations
@@ -15,7 +14,7 @@ import numpy as np
 from ...common.units import ComplexArray, FloatArray
 from ...site.materials import material
 from ..geometry import Faces
-from .dyads import larger, select, sine_cosine
+from .dyads import sine_cosine
 
 
 def half_space(cosine: Any, eta_re: Any, eta_im: Any) -> tuple[Any, Any, Any, Any, Any, Any]:
@@ -38,9 +37,9 @@ def half_space(cosine: Any, eta_re: Any, eta_im: Any) -> tuple[Any, Any, Any, An
     # eta less the squared sine of incidence
     a = eta_re - (1.0 - cosine * cosine)
     t = np.sqrt(0.5 * (np.sqrt(a * a + eta_im * eta_im) + np.abs(a)))
-    q = eta_im / larger(2.0 * t, 1e-300)
-    root_re = select(a >= 0.0, t, np.abs(q))
-    root_im = select(a >= 0.0, q, np.copysign(t, eta_im))
+    q = eta_im / np.maximum(2.0 * t, 1e-300)
+    root_re = np.where(a >= 0.0, t, np.abs(q))
+    root_im = np.where(a >= 0.0, q, np.copysign(t, eta_im))
     below, above = cosine + root_re, cosine - root_re
     scale = 1.0 / (below * below + root_im * root_im)
     te_re = (above * below - root_im * root_im) * scale
@@ -88,8 +87,8 @@ def returned(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
     """The echo of a slab, 0 of a half-space, whose thickness is infinite."""
     # infinity times the root would be NaN before it is thrown away
     finite = np.isfinite(thickness)
-    e_re, e_im = echo(select(finite, thickness, 0.0), root_re, root_im)
-    return select(finite, e_re, 0.0), select(finite, e_im, 0.0)
+    e_re, e_im = echo(np.where(finite, thickness, 0.0), root_re, root_im)
+    return np.where(finite, e_re, 0.0), np.where(finite, e_im, 0.0)
 
 
 def reflection(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:

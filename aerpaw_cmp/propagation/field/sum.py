@@ -22,7 +22,6 @@ import numpy as np
 
 from ...common.errors import UsageError
 from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
-from .. import compiled
 from ..geometry import Array, Faces, Link, PathSet, Poses, Rows
 from . import dyads
 from .fresnel import FaceMaterials, coefficients
@@ -127,10 +126,8 @@ def channel_matrices(
     poses: Poses,
     link: Link,
     loss_db: FloatArray | None = None,
-    *,
-    work: int = 0,
 ) -> Fields:
-    """Channel matrices of a path set.
+    """Return the channel matrices of a path set.
 
     Source: arXiv 2502.10324 eq. 1; arXiv 2502.10324 eq. 6.
 
@@ -145,9 +142,6 @@ def channel_matrices(
     link : Link
     loss_db : (paths,), optional
         Further loss of each path, such as foliage.
-    work : int, optional
-        Element pairs of all links of the job that this call is a part of; decides whether compiled code is worth
-        loading (:mod:`aerpaw_cmp.propagation.compiled`).
 
     Returns
     -------
@@ -157,16 +151,10 @@ def channel_matrices(
     ------
     UsageError
         If the towers' arrays have different numbers of elements, or an array has patterns for some elements only.
-
-    Notes
-    -----
-    Compiled code differs from NumPy's by rounding alone: some 1e-15 of H (``tests/propagation/test_compiled.py``).
     """
     arrays = list(link.tower_arrays.values())
     ports, uavs = _ports(arrays), len(link.uav_array)
     _check_patterns([*arrays, link.uav_array])
-    kernels = compiled.kernels_for(len(poses) * len(arrays) * ports * uavs, work)
-    evaluate = amplitudes if kernels is None else kernels.amplitudes
     elements, wavelength = Elements.of(link), wavelength_m(link.carrier_hz)
     table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
     # a link's paths side by side: reduceat adds runs
@@ -179,10 +167,10 @@ def channel_matrices(
     h = np.zeros((len(poses) * len(arrays), ports * uavs), dtype=np.complex128)
     power = np.zeros(len(paths))
 
-    def run(part: slice) -> None:
+    for part in parts_between_poses(ordered.pose):
         some = ordered.select(part)
         columns = geometry(some, faces, table, sources_m, poses, link)
-        amplitude = evaluate(columns, elements, pattern_ends(columns, elements, link), wavelength)
+        amplitude = amplitudes(columns, elements, pattern_ends(columns, elements, link), wavelength)
         if lost is not None:
             amplitude *= lost[part, None, None]
         power[part] = np.einsum("npc,npc->n", amplitude, amplitude) / (ports * uavs)
@@ -190,9 +178,6 @@ def channel_matrices(
         first = np.flatnonzero(np.diff(key, prepend=-1))
         # pairs of reals seen as complex numbers: no copy
         h[key[first]] = np.add.reduceat(amplitude.view(np.complex128)[..., 0], first, axis=0)
-
-    threads = 1 if kernels is None else compiled.thread_count()
-    compiled.in_threads(run, parts_between_poses(ordered.pose), threads)
     if order is not None:
         # back to the order in which the caller has the paths
         power[order] = power.copy()

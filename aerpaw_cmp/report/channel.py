@@ -278,13 +278,6 @@ def _write_npz(channel: Channel, folder: Path) -> Path:
     return folder / "channel.npz"
 
 
-def _write_mat(channel: Channel, folder: Path) -> Path:
-    from scipy.io import savemat
-
-    savemat(folder / "channel.mat", _arrays(channel), do_compression=True, oned_as="column")
-    return folder / "channel.mat"
-
-
 def _write_csv(channel: Channel, folder: Path) -> Path:
     """A row per instant and tower: the level of the link, delay and Doppler shift of its strongest path."""
     path, table, (poses, towers) = folder / "channel.csv", channel.table, channel.replay.has_path.shape
@@ -349,7 +342,7 @@ def _deepmimo_parameters(channel: Channel, points: Mapping[str, tuple[int, int]]
 
 
 # Writers of a part by the name of their format; each gives the file to open. A NetCDF file grows.
-_WRITERS = {"npz": _write_npz, "deepmimo": _write_deepmimo, "mat": _write_mat, "csv": _write_csv}
+_WRITERS = {"npz": _write_npz, "deepmimo": _write_deepmimo, "csv": _write_csv}
 FORMATS = ("netcdf", *_WRITERS)
 
 # Those that take a channel part by part; the others are held in memory.

@@ -182,7 +182,7 @@ def channel(
     step: Annotated[float, Option(min=0.001, help="Time between poses [s].")] = 1.0,
     formats: Annotated[
         list[str] | None,
-        Option("--format", help="netcdf, npz, deepmimo, mat, csv, all; repeatable  [default: netcdf]"),
+        Option("--format", help="netcdf, npz, deepmimo, csv, all; repeatable  [default: netcdf]"),
     ] = None,
     bandwidth: Annotated[
         float | None, Option(min=1.0, help="Also H at the subcarriers of a band of this width [Hz] (NetCDF).")

@@ -553,11 +553,15 @@ class Verdict:
         words = {kind: sum(p.verdict == kind for p in pairs) for kind in ("better", "worse")}
         decided = " and ".join(f"significantly {kind} on {n}" for kind, n in words.items() if n)
         unit = counted(len(self.series), "channel")
-        matched, every = (sum(getattr(s, key) for s in self.series) for key in ("matched", "unmatched"))
+        lost = sum(s.unmatched for s in self.series)
+        matched = sum(s.matched for s in self.series)
+        extent = f"All {counted(matched, 'sample')} have a prediction."
+        if lost:
+            extent = f"{counted(matched, 'sample')} have a prediction, {counted(lost, 'sample')} have none."
         return (
             f"{self.name}: RMSE {mean[self.name]:.1f} dB after one offset per channel, ray tracing {mean[OURS]:.1f} dB "
             f"on the same samples ({unit}). It is {decided or 'on no channel significantly different from ray tracing'}"
-            f" (95 %). {matched} of {counted(matched + every, 'sample')} have a prediction."
+            f" (95 %). {extent}"
         )
 
 

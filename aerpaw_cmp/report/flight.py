@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -314,6 +314,53 @@ _AGAINST = ("rmse_db", "rmse_4s_db", "own_offset_rmse_db", "bias_db", "crps_db",
             "coverage_90", "coverage_95", "mean_sd_db", "n", "share_near")  # fmt: skip
 
 
+def referee_card(data: ReportData) -> Card:
+    """Return the card of predictions of other programs, each beside ray tracing and the baselines."""
+    return Card(
+        title="Predictions of other programs",
+        id="referee",
+        text=["Every model is scored on the samples that the prediction covers. Fitted on this flight: one offset per "
+              "model and channel."] if data.extra_metrics.get("referee") else [],
+        parts=[_prediction_card(verdict) for verdict in data.extra_metrics.get("referee", ())],
+    )  # fmt: skip
+
+
+def _prediction_card(verdict: Mapping[str, Any]) -> Card:
+    """Return the card of one prediction: means over channels, then each channel."""
+    errors: dict[str, str | int] = {"Bias [dB]": 1, "RMSE [dB]": 2, "after offset": 2, "over 1 s": 2}
+    means = Table(
+        caption="Means over channels; a dash where the levels have no reference in common with the log, or no band.",
+        columns={"Model": HEAD, "Channels": 0, **errors, "CRPS [dB]": 2, "In 90 %": SHARE},
+        rows=[[row[key] for key in _MEANS] for row in verdict["means"]],
+    )
+    every = verdict["table"]["rows"]
+    channels = Table(
+        caption="Each channel. Last two columns: RMSE of the prediction minus that of the model, after offsets, and "
+        "its 95 % interval [dB]; negative: the prediction is better.",
+        columns={"Tower, channel": HEAD, "Model": TEXT, "Samples": 0, **errors, "Correlation": 2, "CRPS [dB]": 2,
+                 "In 90 %": SHARE, "Difference": 2, "95 %": 2},
+        rows=[[*row[:11], None if row[11] is None else (row[11], row[12])] for row in every], look="dense",
+    )  # fmt: skip
+    ranks = Table(
+        caption="Ranks on the same samples.",
+        columns={"Tower": HEAD, "Model": TEXT, "Samples": 0, "Kappa": 2, "Total variation": 3, "Agreement": SHARE},
+        rows=[
+            (tower, name, entry["matched"], score["kappa"], score["total_variation"], score["agreement"])
+            for tower, entry in verdict["rank"].items()
+            for name, score in entry["scores"].items()
+        ],
+    )
+    return Card(
+        title=verdict["prediction"],
+        text=[paragraph(bold(verdict["sentence"])), *verdict["remarks"]],
+        tables=[means, ranks],
+        parts=[Card(title=f"{verdict['prediction']}, channel by channel", tables=[channels], fold=True)],
+    )
+
+
+_MEANS = ("model", "channels", "bias_db", "rmse_db", "rmse_offset_db", "rmse_1s_db", "crps_db", "coverage_90")
+
+
 def ladder_card(data: ReportData) -> Card:
     """Return the card that compares models by their error on held-out segments."""
     models: dict[str, dict[str, LadderRow]] = {}
@@ -509,7 +556,10 @@ def method_card(data: ReportData, files: Sequence[str]) -> Card:
 
 
 # Cards in the order of the page. A new card is one function more.
-CARDS = (result_card, channels_card, against_card, ladder_card, serving_card, ranks_card, engine_card, inputs_card)
+CARDS = (
+    result_card, channels_card, against_card, referee_card, ladder_card, serving_card, ranks_card, engine_card,
+    inputs_card,
+)  # fmt: skip
 
 
 def page(data: ReportData, files: Sequence[str]) -> str:

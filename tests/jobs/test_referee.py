@@ -75,6 +75,8 @@ def test_a_copy_of_our_levels_in_three_formats_scores_as_ours_do(flight: Path) -
                 assert theirs["n"] > 300
                 assert theirs["rmse_offset_db"] == pytest.approx(mine["rmse_offset_db"], abs=0.15)
                 assert entry["differences"]["ray tracing (this report)"]["verdict"] != "worse"
+    page = (flight / "out" / "report.html").read_text()
+    assert all(f"{card['prediction']}: RMSE" in page for card in cards)
     assert cards[0]["fitted_on_this_flight"] == ["the offset of each model and channel"]
 
 

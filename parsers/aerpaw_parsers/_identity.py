@@ -57,7 +57,9 @@ def parts(
     marks = _marks(rows, sheet, keys, columns, level) if found else []
     texts = {i: _named(sheet, i) for i in (*columns, *marks)}
     counted = _with_level(sheet)
-    several = [i for i in columns if 1 < len({texts[i][row] for row in np.flatnonzero(counted)}) <= _MOST_PARTS]
+    picked = np.flatnonzero(counted).tolist()
+    several = [i for i in columns if len({*texts[i]}) > 1]
+    several = [i for i in several if 1 < len({texts[i][row] for row in picked}) <= _MOST_PARTS]
     base = ["\t".join(row) for row in zip(*(texts[i] for i in several), strict=True)]
     several += refining({i: texts[i] for i in marks}, counted, base)
     if unknown := [sheet.names[i] for i in several if i in marks and sheet.meanings[i] is None]:
@@ -87,20 +89,20 @@ def _values(texts: _Texts) -> dict[int, set[str]]:
     return {i: {*cells} - {""} for i, cells in texts.items()}
 
 
-def _levels(sheet: _sheet.Sheet) -> list[str]:
-    """Which levels, ratios and ranks each row has; empty if it has none."""
+def _levels(sheet: _sheet.Sheet) -> AnyArray:
+    """Return which levels, ratios and ranks each row has, as bytes; empty bytes if it has none."""
     columns = [
         np.isfinite(sheet.numbers(i))
         for i, meaning in enumerate(sheet.meanings)
         if meaning is not None and (meaning.quantity.role in ("rss", "rank") or meaning.quantity.name == "SINR")
     ]
-    filled = (" ".join(str(i) for i, has in enumerate(row) if has) for row in zip(*columns, strict=True))
-    return list(filled) if columns else [""] * len(sheet)
+    bits = np.packbits(np.stack(columns or [np.zeros(len(sheet), dtype=bool)], axis=1), axis=1)
+    return np.asarray(bits.view(f"S{bits.shape[1]}").ravel())
 
 
 def _with_level(sheet: _sheet.Sheet) -> BoolArray:
     """Mask of the rows with a level, a ratio or a rank; of all, if the table has none."""
-    filled = np.array([bool(text) for text in _levels(sheet)], dtype=bool)
+    filled: BoolArray = _levels(sheet) != b""
     return filled if filled.any() else np.ones(len(sheet), dtype=bool)
 
 
@@ -121,7 +123,8 @@ def refining(texts: _Texts, counts: BoolArray, base: Sequence[str] = ()) -> list
     chosen = []
     for i, cells in texts.items():
         values = {*cells} - {""}
-        if not values or len(values) > _MOST_PARTS:
+        # one text in all rows divides nothing
+        if len({*cells}) < 2 or len(values) > _MOST_PARTS:
             continue
         both = Counter((before, cells[row]) for before, row in zip(key, picked, strict=True))
         if _divides(both, alone=len(values) == 1):
@@ -248,7 +251,9 @@ def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
     zero = (
         meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(("sim", "slot", "sub"))
     )
-    return [text if _says(text, zero=zero) else "" for text in sheet.texts(column)]
+    texts = sheet.texts(column)
+    named = {text: text if _says(text, zero=zero) else "" for text in {*texts}}
+    return [named[text] for text in texts]
 
 
 def further(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[str, dict[str, Attribute]]]:

@@ -87,9 +87,8 @@ def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
     for place, columns in fields.items():
         cells[place] = cell = _Cell(*place)
         for name, listed in columns.items():
-            cell.columns[name], *second = (
-                listed if name in _IDENTITY else sorted(listed, key=lambda i: _doubts(sheet, i))
-            )
+            alone = len(listed) == 1 or name in _IDENTITY
+            cell.columns[name], *second = listed if alone else sorted(listed, key=lambda i: _doubts(sheet, i))
             if name == "rsrp_dbm":
                 cell.ports = [i for i in second if _part(sheet, i) != "mean"]
             others += [i for i in second if i not in cell.ports and name not in _IDENTITY]  # kept as KPIs

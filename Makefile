@@ -91,7 +91,7 @@ clean:
 # what the packaged Lake Wheeler site remembers, anew from the real logs in FIELD
 learned: $(READY_DEV)
 	@mkdir -p reports/learned
-	for name in dataset12 lte afar nr_rank; do \
+	for name in joint afar nr_rank; do \
 	  $(BIN)/aerpaw-cmp calibrate tests/field/learned/$$name.yaml --into-site lake_wheeler --logs-root $(FIELD) \
 	    -o reports/learned/$$name.yaml || exit $$?; \
 	done

@@ -29,7 +29,12 @@ COMMANDS: dict[str, tuple[float, float, list[str], bool]] = {
     "report of dataset 12": (5.1, 3.2, ["report", str(ROOT / "tests/field/dataset12_40m.yaml"), *REAL], True),
     "report of the sample": (10.3, 6.0, ["report", f"{ROOT}/sample_logs/flight.yaml"], False),
     "map lake_wheeler": (60.0, 28.0, ["map", "lake_wheeler"], False),
-    "calibrate three flights": (15.0, 8.0, ["calibrate", f"{ROOT}/tests/field/learned/dataset12.yaml", *REAL], True),
+    "calibrate three flights": (
+        15.0,
+        8.0,
+        ["calibrate", f"{ROOT}/tests/field/calibrations/dataset12.yaml", *REAL],
+        True,
+    ),
     "predict a route of 30 minutes": (6.6, 3.5, ["predict", "{folder}/route.csv", "--site", "lake_wheeler"], False),
 }
 

@@ -36,6 +36,7 @@ from .gains import (
     fit_gain,
     fit_mounts,
     inside_shares,
+    rotated,
     turned,
 )
 from .ladder import log_distance_level_db
@@ -55,7 +56,10 @@ _LEAST_SAMPLES = 50
 # Fields of :class:`Score` that a learned model is held against, with their titles.
 BASELINES = {f"{name}_rmse_db": BASELINE_TITLE[name] for name in ("free_space", "log_distance", "constant")}
 
-SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_left_out", "route_left_out")
+SPLITS = (
+    *("flight_left_out", "altitude_left_out", "heading_left_out", "sector_left_out", "route_left_out"),
+    "campaign_left_out",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,9 +144,11 @@ class Learned(Mounted):
         """Spread of a level at an antenna besides the standard deviation of the gain."""
         model = self.model
         sd_db, kurtosis = self.fading.get(antenna, (0.0, 0.0))
+        campaign = next((s.campaign for s in self.fit.rows if s.antenna == antenna), "")
+        own_sd_db, noise_sd_db = model.scales_db(campaign)
         return Spread(
-            own_sd_db=model.own_sd_db,
-            noise_sd_db=model.noise_sd_db,
+            own_sd_db=own_sd_db,
+            noise_sd_db=noise_sd_db,
             fading_sd_db=sd_db,
             fading_kurtosis=kurtosis,
             bin_s=model.bin_s,
@@ -345,6 +351,28 @@ def flight_left_out(
             scores += [score(o, learned.mean(o.samples)) for o in unseen if o.samples.antenna in known]
         else:
             scores += _scored_with(unseen, learned, _offsets(train, learned))
+    return tuple(s for s in scores if s is not None)
+
+
+def campaign_left_out(observed: Sequence[Observed], recipe: Recipe, turn_deg: float = 0.0) -> tuple[Score, ...]:
+    """Return the scores of each campaign, predicted by the airframe of the others alone; empty for one campaign.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+    recipe : Recipe
+    turn_deg : float
+        Control: directions at the UAV rotated anticlockwise.
+    """
+    scores: list[Score | None] = []
+    for name in dict.fromkeys(o.samples.campaign for o in observed):
+        train = [o.samples for o in observed if o.samples.campaign != name]
+        pupils = [o for o in observed if o.samples.campaign == name]
+        if any(s.airframe == pupils[0].samples.airframe for s in train):
+            fit = learn(train, recipe).fit
+            for o in pupils:
+                at_uav = rotated(o.samples.at_uav, turn_deg)
+                scores.append(score(o, fit.airframe_mean(dataclasses.replace(o.samples, at_uav=at_uav))))
     return tuple(s for s in scores if s is not None)
 
 

@@ -11,13 +11,14 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from ..common.content import union
 from ..common.errors import InputError, UsageError
+from ..common.gaussian import determining
 from ..common.stages import PlannedStage, Stages
 from ..common.text import counted
 from ..common.units import FloatArray
@@ -35,7 +36,7 @@ from ..compare.calibration import (
     learn,
     learning_curve,
 )
-from ..compare.gains import GainOf
+from ..compare.gains import FlightEvidence, GainOf, KnownProcess
 from ..compare.level import DetectionScore, learn_detection, score_detection
 from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ..flight.gains import flight_of, load_with_learned, mean_gain_db, sphere_angles
@@ -45,7 +46,7 @@ from ..flight.settings import AntennaSettings, load_pattern
 from ..flight.training import counted_once, flight_logs, marks_of
 from ..propagation.field.baselines import two_ray_dbm
 from ..report.calibration import sentences
-from ..site.learned import LearnedLock, Source
+from ..site.learned import AIRFRAME_BAND, KnownDirections, LearnedLock, Source
 
 
 def learned_locks(observed: Sequence[Observed], recipe: Recipe, fits: Mapping[str, Learned]) -> dict[str, LearnedLock]:
@@ -180,16 +181,42 @@ class PatternsSettings(StrictModel):
     """By ``tower.channel``, where they differ."""
 
 
+_Name = Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
+
+
+class CampaignSettings(StrictModel):
+    """Flights of one campaign: they share their noise, and the gain of the UAV with others of its airframe."""
+
+    flights: Annotated[list[str], Field(min_length=1)]
+    source: Source = Source()
+
+
 class CalibrationFile(StrictModel):
     """The whole calibration.yaml."""
 
-    calibration: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
+    calibration: _Name
     flights: Annotated[list[str], Field(min_length=1)]
+    """With ``campaigns``: all of theirs."""
+    campaigns: dict[_Name, CampaignSettings] = Field(default_factory=dict)
+    """Several campaigns, whose flights are learned from together; each becomes an entry of a site."""
     patterns: PatternsSettings = PatternsSettings()
     source: Source = Source()
     """Title, DOI and licence of the flights' data, and their airframe: kept beside what a site remembers."""
     rank: bool = False
     """Also learn how the receiver decides its rank."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _flights_of_campaigns(cls, data: Any) -> Any:
+        campaigns = data.get("campaigns") if isinstance(data, dict) else None
+        if not isinstance(campaigns, dict) or "flights" in data:
+            return data
+        each = [campaign.get("flights") for campaign in campaigns.values() if isinstance(campaign, dict)]
+        return {**data, "flights": [name for some in each if isinstance(some, list) for name in some]}
+
+    def by_campaign(self) -> dict[str, CampaignSettings]:
+        """Return the campaigns; one with the name of the calibration if none is named."""
+        return self.campaigns or {self.calibration: CampaignSettings(flights=self.flights, source=self.source)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -219,6 +246,8 @@ class Calibration:
 
     settings: CalibrationFile
     flights: tuple[FlightData, ...]
+    campaigns: Mapping[str, str]
+    """Campaign of each flight by name."""
     observed: tuple[Observed, ...]
     learned: Learned
     scores: Mapping[str, tuple[Score, ...]]
@@ -227,6 +256,8 @@ class Calibration:
     curve: tuple[CurvePoint, ...]
     locks: Mapping[str, LearnedLock]
     """By antenna, of receivers that lose their lock."""
+    teaching: frozenset[str]
+    """Campaigns whose gain of the UAV predicts most of their own held-out flights: it may be used elsewhere."""
     warnings: tuple[str, ...]
     words: tuple[str, ...]
 
@@ -280,6 +311,7 @@ def calibrate(
     folder: Path,
     logs_root: Path | None = None,
     *,
+    campaigns: Mapping[str, str] | None = None,
     stages: Stages | None = None,
     score: Sequence[Path] = (),
 ) -> Calibration:
@@ -292,6 +324,8 @@ def calibrate(
         As :func:`read_flights` gives them.
     folder, logs_root : Path
         Against which patterns resolve, and logs of ``score`` in place of their flight file's folder.
+    campaigns : mapping of str to str, optional
+        Campaign of each flight, as :func:`read_flights` gives it; by default all flights are of one.
     stages : Stages, optional
     score : sequence of Path
         Further flight files, scored with all that was learned.
@@ -309,7 +343,9 @@ def calibrate(
         Logs that cannot be read; flights without RSS.
     """
     stages = stages or Stages()
+    campaigns = campaigns or dict.fromkeys((f.settings.flight.name for f in flights), settings.calibration)
     observed, warnings = observe(flights)
+    observed = in_campaigns(settings, observed, flights, campaigns)
     recipe = recipe_of(settings, observed, logs_root or folder)
     with stages("read"):
         further = [load_data(load_with_learned(path), path.parent, logs_root) for path in score]
@@ -328,6 +364,7 @@ def calibrate(
         stages.progress("scores: controls")
         controls = _controls_of(observed, recipe, scores["flight_left_out"])
         locks = learned_locks(observed, recipe, fits)
+        taught = teaching(observed, campaigns, fits)
     with stages("curve"):
         curve = learning_curve(observed, recipe)
     warnings += _mount_warnings(learned)
@@ -338,6 +375,7 @@ def calibrate(
     return Calibration(
         settings=settings,
         flights=tuple(flights),
+        campaigns=campaigns,
         observed=tuple(observed),
         learned=learned,
         scores=scores,
@@ -345,6 +383,7 @@ def calibrate(
         ground=ground,
         curve=curve,
         locks=locks,
+        teaching=taught,
         warnings=tuple(warnings),
         words=(
             *sentences(scores, controls, ground.likely_m, curve),
@@ -377,15 +416,53 @@ def _score_further(
 # --- flights -------------------------------------------------------------------------------------------------------
 
 
-def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None) -> tuple[list[FlightData], list[str]]:
-    """Every flight of the calibration, gathered, each log once, and what is to be said of copies."""
+def read_flights(
+    settings: CalibrationFile, folder: Path, logs_root: Path | None
+) -> tuple[list[FlightData], list[str], dict[str, str]]:
+    """Return every flight of the calibration, each log once, remarks on copies, and the campaign of each flight."""
     places = [folder / name for name in settings.flights]
     out = [load_data(load_with_learned(path), path.parent, logs_root) for path in places]
     names = [data.settings.flight.name for data in out]
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"two flights are named {name!r}", expected="an own 'flight: {name: ...}' in each file")
-    return counted_once(out)
+    of = {file: name for name, campaign in settings.by_campaign().items() for file in campaign.flights}
+    campaigns = {name: of.get(file, settings.calibration) for name, file in zip(names, settings.flights, strict=True)}
+    return *counted_once(out), campaigns
+
+
+def in_campaigns(
+    settings: CalibrationFile,
+    observed: Sequence[Observed],
+    flights: Sequence[FlightData],
+    campaigns: Mapping[str, str],
+) -> list[Observed]:
+    """Return samples with their campaign, and with their airframe and band, of several campaigns.
+
+    Airframes of one name share their gain within 7 % of frequency, from the lowest carrier of each band on.
+    """
+    of = settings.by_campaign()
+    if len(of) < 2:
+        return list(observed)
+    carriers = {
+        (data.settings.flight.name, f"{s.tower}.{s.channel}"): s.link.carrier_hz for data in flights for s in data.rss
+    }
+    bands: list[float] = []
+    for carrier in sorted(carriers.values()):
+        if not bands or carrier > bands[-1] * (1.0 + AIRFRAME_BAND):
+            bands.append(carrier)
+
+    def placed(o: Observed) -> Observed:
+        s = o.samples
+        campaign, carrier = campaigns[s.flight], carriers[s.flight, s.antenna]
+        band = max(low for low in bands if low <= carrier)
+        source = of[campaign].source.airframe if campaign in of else settings.source.airframe
+        # an airframe that is not stated is that of its campaign alone
+        airframe = campaign if source == Source().airframe else source
+        samples = dataclasses.replace(s, campaign=campaign, airframe=f"{airframe}, {band / 1e9:g} GHz")
+        return dataclasses.replace(o, samples=samples)
+
+    return [placed(o) for o in observed]
 
 
 def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
@@ -542,6 +619,7 @@ def _score_all(
     ):
         stages.progress(f"scores: {split.replace('_', ' ')}")
         scores[split] = calibration.parts_left_out(observed, recipe, fits, parts, own_rest=own_rest)
+    scores["campaign_left_out"] = calibration.campaign_left_out(observed, recipe)
     return scores
 
 
@@ -552,11 +630,51 @@ def _controls_of(
     if len(calibration.flights_of(observed)) < 2:
         return {}
     left_out, bare = calibration.flight_left_out, dataclasses.replace(recipe, patterns={})
-    return {
+    turns = (90.0, 180.0, 270.0) if len({o.samples.campaign for o in observed}) > 1 else ()
+    turned = {
+        f"another campaign's airframe, rotated by {turn:.0f} deg": calibration.campaign_left_out(observed, bare, turn)
+        for turn in turns
+    }
+    return turned | {
         "world frame at the UAV": left_out(calibration.world_frame(observed), bare),
         "heading turned the wrong way": left_out(calibration.wrong_way(observed), bare),
         "body frame, no patterns": left_out(observed, bare) if recipe.patterns else scores,
     }
+
+
+# Directions at the UAV that stand for its gain when its evidence is judged.
+_KNOWN_SHARE, _MOST_KNOWN = 0.002, 100
+
+
+def known_directions(fit: gains.GainFit, antenna: str) -> KnownDirections:
+    """Return the directions at the UAV that determine its gain, and the covariance there.
+
+    With 60, 100 or 200 of them the evidence for an airframe differs by at most 3 nat.
+    """
+    from scipy.spatial.distance import cdist
+
+    flown = fit.seen("body", antenna)
+    at = flown[determining(flown, lambda a, b: np.exp(-cdist(a, b)), _KNOWN_SHARE, _MOST_KNOWN)]
+    return KnownDirections(directions=at, covariance_db2=fit.covariance("body", antenna, at))
+
+
+def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: Mapping[str, Learned]) -> frozenset[str]:
+    """Return the campaigns of which more than half of the held-out flights support the gain of the UAV."""
+    passed: dict[str, list[bool]] = {}
+    for flight, learned in fits.items():
+        series = [o.samples for o in observed if o.samples.flight == flight]
+        antenna = next((s.antenna for s in series if s.antenna in learned.fit.antennas), None)
+        if antenna is None:  # nothing that was learned without this flight is of its campaign
+            continue
+        fit, known = learned.fit, known_directions(learned.fit, antenna)
+        process = KnownProcess(
+            gain_db=lambda at, fit=fit, antenna=antenna: fit.gain("body", antenna, at)[0],
+            sd_db=lambda at, fit=fit, antenna=antenna: fit.gain("body", antenna, at)[1],
+            directions=known.directions,
+            covariance_db2=known.covariance_db2,
+        )
+        passed.setdefault(campaigns[flight], []).append(FlightEvidence(series).of_airframe(process).fits)
+    return frozenset(name for name, each in passed.items() if 2 * sum(each) > len(each))
 
 
 def _mount_warnings(learned: Learned) -> list[str]:

@@ -19,7 +19,7 @@ from ..common.content import KEY, MARKS, union
 from ..common.gaussian import determining, gaussian_kernel
 from ..common.jsonable import named
 from ..common.units import spread_out
-from ..compare.calibration import cruise_height_m, mean_rmse, with_one_more
+from ..compare.calibration import Score, cruise_height_m, mean_rmse, with_one_more
 from ..compare.gains import Frame, Spread, directed, student_factor
 from ..flight.data import FlightData, RssSeries, quantity_of
 from ..flight.training import flight_logs, marks_of
@@ -30,7 +30,6 @@ from ..report.texts import safe_name
 from ..site.learned import (
     Entry,
     Errors,
-    KnownDirections,
     LearnedAntenna,
     LearnedLevel,
     LearnedLock,
@@ -45,7 +44,7 @@ from ..site.learned import (
     sphere_grid,
     unit_mean_gain,
 )
-from .calibrate import Calibration, CalibrationFile
+from .calibrate import Calibration, CalibrationFile, known_directions
 from .calibrate_rank import RankCalibration
 
 # First words of calibrated.yaml, by which an own earlier output is known.
@@ -53,9 +52,6 @@ _MARK = "# aerpaw-cmp calibrate"
 
 # Share of the variance over both directions that the stored directions leave, and their largest number.
 _PAIR_SHARE, _MOST_PAIRS = 0.01, 400
-
-# The same for the directions at the UAV. Of 60, 100 and 200 the evidence for an airframe differs by at most 3 nat.
-_KNOWN_SHARE, _MOST_KNOWN = 0.002, 100
 
 
 def _antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
@@ -133,17 +129,6 @@ def _pair_gain(calibration: Calibration, antenna: str) -> PairGain | None:
         length=term.length,
         prior_sd_db=term.sd_db,
     )
-
-
-def _known_directions(calibration: Calibration, antenna: str) -> KnownDirections:
-    """Return the directions at the UAV that determine its gain, and the covariance there."""
-    from scipy.spatial.distance import cdist
-
-    fit = calibration.fit
-    flown = fit.seen("body", antenna)
-    # as far apart as rounding to a tenth of a degree keeps them
-    at = flown[determining(flown, lambda a, b: np.exp(-cdist(a, b)), _KNOWN_SHARE, _MOST_KNOWN)]
-    return KnownDirections(directions=at, covariance_db2=fit.covariance("body", antenna, at))
 
 
 def _listed(key: str, entries: Sequence[str]) -> list[str]:
@@ -277,6 +262,7 @@ class Calibrated:
     calibration: Calibration | None
     ranked: RankCalibration | None
     command: str
+    campaigns: Mapping[str, str]
 
 
 def write_files(
@@ -332,48 +318,47 @@ def write_files(
     return metrics, text
 
 
-def site_entry(calibrated: Calibrated) -> tuple[Entry, dict[str, bytes]]:
-    """Return the entry of a calibration for a site, antennas and rank receivers, and its tables by name.
-
-    Parameters
-    ----------
-    calibrated : Calibrated
-
-    Returns
-    -------
-    entry : Entry
-    tables : dict of str to bytes
-    """
-    begins = [s.time.min() for data in calibrated.flights for _, s in data.series]
-    made = Entry(
-        command=calibrated.command,
-        made=datetime.now(timezone.utc).date().isoformat(),
-        flights=[data.settings.flight.name for data in calibrated.flights],
-        flown=sorted({str(begin.astype("datetime64[D]")) for begin in begins if has_wall_clock(begin)}),
-        trained_on=list(union(*map(flight_logs, calibrated.flights))),
-        source=calibrated.settings.source,
-    )
-    tables: dict[str, bytes] = {}
-    if calibrated.calibration is not None:
-        series, tables = _learned_series(calibrated.calibration)
-        ground_m = calibrated.calibration.ground.used_m
-        errors = _errors(calibrated.calibration)
-        made = made.model_copy(update={"errors": errors, "series": series, "ground_roughness_m": ground_m})
-    if calibrated.ranked is not None:
-        file = f"{safe_name(calibrated.settings.calibration)}.receiver.json.gz"
-        made = made.model_copy(update={"receivers": _learned_receivers(calibrated.flights, calibrated.ranked, file)})
-        tables = {**tables, file: calibrated.ranked.text().encode()}
-    return made, tables
+def site_entries(calibrated: Calibrated) -> dict[str, tuple[Entry, dict[str, bytes]]]:
+    """Return the entries of a calibration for a site by campaign, each with its tables by name."""
+    settings, out = calibrated.settings, {}
+    maps = None if calibrated.calibration is None else _antenna_maps(calibrated.calibration)
+    for name, campaign in settings.by_campaign().items():
+        flights = [f for f in calibrated.flights if calibrated.campaigns[f.settings.flight.name] == name]
+        begins = [s.time.min() for data in flights for _, s in data.series]
+        made = Entry(
+            command=calibrated.command,
+            made=datetime.now(timezone.utc).date().isoformat(),
+            flights=[data.settings.flight.name for data in flights],
+            flown=sorted({str(begin.astype("datetime64[D]")) for begin in begins if has_wall_clock(begin)}),
+            joined=[other for other in settings.by_campaign() if other != name],
+            trained_on=list(union(*map(flight_logs, calibrated.flights))),
+            source=campaign.source,
+        )
+        tables: dict[str, bytes] = {}
+        if calibrated.calibration is not None and maps is not None:
+            series, tables = _learned_series(calibrated.calibration, name, maps)
+            ground_m = calibrated.calibration.ground.used_m
+            errors = _errors(calibrated.calibration, name)
+            made = made.model_copy(update={"errors": errors, "series": series, "ground_roughness_m": ground_m})
+        if calibrated.ranked is not None:
+            file = f"{safe_name(name)}.receiver.json.gz"
+            made = made.model_copy(update={"receivers": _learned_receivers(flights, calibrated.ranked, file)})
+            tables = {**tables, file: calibrated.ranked.text().encode()}
+        out[name] = made, tables
+    return out
 
 
-def _learned_series(calibration: Calibration) -> tuple[list[LearnedSeries], dict[str, bytes]]:
-    """Antennas of every tower and channel, and their tables by name."""
-    name, maps = calibration.settings.calibration, _antenna_maps(calibration)
+def _learned_series(
+    calibration: Calibration, name: str, maps: Mapping[tuple[str, str], AntennaMap]
+) -> tuple[list[LearnedSeries], dict[str, bytes]]:
+    """Return the antennas of every tower and channel of a campaign, and their tables by name."""
     tables: dict[str, bytes] = {}
     series = []
-    for antenna in calibration.fit.antennas:
-        # the UAV has one antenna for all towers
-        shared = calibration.fit.antennas[0]
+    mine = [o.samples for o in calibration.observed if calibration.campaigns[o.samples.flight] == name]
+    for antenna in (a for a in calibration.fit.antennas if any(s.antenna == a for s in mine)):
+        samples = [s for s in mine if s.antenna == antenna]
+        # the UAV has one antenna for all towers of a band
+        shared = next(s.antenna for s in mine if s.airframe == samples[0].airframe)
         parts = {"tower": antenna, "pair": antenna, "uav": shared, "known": shared}
         files = {part: f"{safe_name(f'{name}.{owner}.{part}')}.csv.gz" for part, owner in parts.items()}
         notes = {p: (f"aerpaw-cmp calibrate: {name}, {antenna} {p}", *_provenance_notes(calibration)) for p in files}
@@ -384,14 +369,13 @@ def _learned_series(calibration: Calibration) -> tuple[list[LearnedSeries], dict
             content = sphere_csv(gains.gain_dbi, gains.sd_db, notes[end], decimals=2)
             tables.setdefault(files[end], content.encode())
         if files["known"] not in tables:
-            tables[files["known"]] = _known_directions(calibration, antenna).table(notes["known"]).encode()
+            tables[files["known"]] = known_directions(calibration.fit, antenna).table(notes["known"]).encode()
         both = None
         if (pair := _pair_gain(calibration, antenna)) is not None:
             tables[files["pair"]] = pair.table(notes["pair"]).encode()
             both = LearnedPair(file=files["pair"], length=pair.length, prior_sd_db=_rounded(pair.prior_sd_db))
-        samples = [o.samples for o in calibration.observed if o.samples.antenna == antenna]
         (data, first), ends = calibration.first_series(antenna), (maps[shared, "uav"], maps[antenna, "tower"])
-        sds = np.concatenate([calibration.learned.predict(o.part(spread_out(len(o), _SD_SAMPLES)))[1] for o in samples])
+        sds = np.concatenate([calibration.learned.predict(s.part(spread_out(len(s), _SD_SAMPLES)))[1] for s in samples])
         series.append(
             LearnedSeries(
                 tower=samples[0].tower,
@@ -404,6 +388,7 @@ def _learned_series(calibration: Calibration) -> tuple[list[LearnedSeries], dict
                 pair=both,
                 spread=rounded_spread(calibration.learned.spread(antenna)),
                 sd_db=round(float(np.nanmean(sds)), 2),
+                shares_airframe=name in calibration.teaching,
                 lock=_at_unit_gain(calibration.locks.get(antenna), *ends),
                 level=_level(calibration, first, *ends),
             )
@@ -467,18 +452,23 @@ def _learned_receivers(flights: Sequence[FlightData], ranked: RankCalibration, f
     return receivers
 
 
-def _errors(calibration: Calibration) -> Errors | None:
-    scores = calibration.scores["flight_left_out"]
+def _errors(calibration: Calibration, name: str) -> Errors | None:
+    """Return the errors of held-out flights of a campaign, and of parts that no other flight has; None without any."""
+
+    def mine(split: str) -> list[Score]:
+        return [s for s in calibration.scores[split] if calibration.campaigns[s.flight] == name]
+
+    scores = mine("flight_left_out")
     if not scores:
         return None
-    parts = {name: calibration.scores[f"{split}_left_out"] for name, split in _PARTS.items()}
     values = {
-        name: round(mean_rmse(scores, name), 3) for name in ("rmse_db", "rmse_4s_db", "free_space_rmse_db", "inside_90")
+        key: round(mean_rmse(scores, key), 3) for key in ("rmse_db", "rmse_4s_db", "free_space_rmse_db", "inside_90")
     }
-    values |= {f"{name}_rmse_db": round(mean_rmse(some), 3) for name, some in parts.items() if some}
-    heights = sorted({float(cruise_height_m(o)) for o in calibration.observed})
-    return Errors(series=len(scores), heights_m=heights, **values)
+    parts = {key: mine(f"{split}_left_out") for key, split in _PARTS.items()}
+    values |= {f"{key}_rmse_db": round(mean_rmse(some), 3) for key, some in parts.items() if some}
+    heights = {cruise_height_m(o) for o in calibration.observed if calibration.campaigns[o.samples.flight] == name}
+    return Errors(series=len(scores), heights_m=sorted(heights), **values)
 
 
-# Parts of a flight that no other flight has, by the prefix of their error.
-_PARTS = {"sector": "sector", "height": "altitude", "heading": "heading"}
+# Parts of a flight that no other flight has, by the prefix of their error; and the airframe of other campaigns alone.
+_PARTS = {"sector": "sector", "height": "altitude", "heading": "heading", "airframe": "campaign"}

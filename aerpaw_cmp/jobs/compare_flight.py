@@ -354,7 +354,9 @@ def _rmse_without(wild: BoolArray, settings: RssSettings, levels: Levels, score:
 
 def _elsewhere(case: _Case, score: rss.RssComparison, detection: DetectionScore | None) -> dict[str, float] | None:
     """Error to expect on another flight, where the antennas of the site say it and this flight does not refute it."""
-    errors, lock = errors_elsewhere(case.data.settings.antennas, case.series, case.data.folder), _lock(case)
+    gain, lock = case.replayed.learned, _lock(case)
+    flown = None if gain is None else (case.replayed.poses.position_m, gain.sd_db)
+    errors = errors_elsewhere(case.data.settings.antennas, case.series, case.data.folder, flown)
     if errors is not None and score.rmse_ci95_db[0] > errors.rmse_db:
         return None
     if lock is not None and detection is not None and detection.rmse_ci95_db[0] > lock.floor_rmse_db:

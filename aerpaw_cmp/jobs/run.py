@@ -610,7 +610,7 @@ def run_calibrate(
     further : sequence of Path
         Flight files that are learned from, too.
     into_site : str, optional
-        Site (site.yaml or packaged) whose memory gets what was learned, as an entry of the calibration's name.
+        Site (site.yaml or packaged) that stores the results: an entry of each campaign.
     score : sequence of Path
         Flight files that are scored with all that was learned; those of training logs are named and not scored.
 
@@ -619,17 +619,17 @@ def run_calibrate(
     JobOutcome
         The settings file is the first of its ``files``.
     """
-    from ..site.learned import read_learned, remember
+    from ..site.learned import check_index, remember
     from ..site.siteyaml import inputs_of_site, site_model
     from .calibrate import calibrate, load_calibration, read_flights
     from .calibrate_rank import fit_rank, samples_by_tower
-    from .calibration_files import Calibrated, site_entry, write_files
+    from .calibration_files import Calibrated, site_entries, write_files
     from .tasks import inputs_of_flights
 
     settings = load_calibration(path, further)
     if into_site is not None:
         site_model(into_site)  # a misspelt one is told before the fit, and gets no memory of its own
-        read_learned(into_site)
+        check_index(into_site)
     target = options.out or Path(f"{settings.calibration}.calibrated.yaml")
     if target.suffix.lower() not in (".yaml", ".yml"):
         raise UsageError("the output is no YAML file", expected="-o NAME.yaml", path=target)
@@ -642,21 +642,23 @@ def run_calibrate(
         OutputFolder(folder, job="calibrate", inputs=inputs, force=options.force) as output,
     ):
         with stages("read"):
-            flights, remarks = read_flights(settings, path.parent, options.logs_root)
+            flights, remarks, campaigns = read_flights(settings, path.parent, options.logs_root)
             reports = samples_by_tower(flights) if settings.rank else {}
         ranked, calibration = None, None
         if not settings.rank or any(data.rss for data in flights):
-            calibration = calibrate(settings, flights, path.parent, options.logs_root, stages=stages, score=score)
+            calibration = calibrate(
+                settings, flights, path.parent, options.logs_root, campaigns=campaigns, stages=stages, score=score
+            )
         stages.checked(lambda: [PlannedStage("rank", counted(len(reports), "receiver"))])
         if settings.rank:
             with stages("rank"):
                 ranked = fit_rank(reports)
         command = f"aerpaw-cmp calibrate {path.name}" + (f" --into-site {into_site}" if into_site is not None else "")
-        calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked, command)
+        calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked, command, campaigns)
         with output.filling() as place:
             metrics, text = write_files(calibrated, place, folder.name, stages.seconds)
         file.write(sealed(text))
     if into_site is not None:
-        entry, tables = site_entry(calibrated)
-        metrics["into_site"] = [str(f) for f in remember(into_site, settings.calibration, entry, tables)]
+        entries = site_entries(calibrated)
+        metrics["into_site"] = [str(f) for name, made in entries.items() for f in remember(into_site, name, *made)]
     return JobOutcome(folder=folder, metrics=metrics, files=(target,))

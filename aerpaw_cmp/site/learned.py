@@ -77,7 +77,28 @@ class Errors(StrictModel):
     sector_rmse_db: float | None = None
     height_rmse_db: float | None = None
     heading_rmse_db: float | None = None
+    airframe_rmse_db: float | None = None
+    """Of the airframe of other campaigns alone, on the flights of this one."""
     heights_m: list[float] = Field(default_factory=list)
+
+    def expected(self, height_m: float, *, unseen: bool) -> Errors:
+        """Return the errors with the RMSE of the kind of a flight.
+
+        Parameters
+        ----------
+        height_m : float
+            Cruise height; NaN if it is not known.
+        unseen : bool
+            Most directions were not flown.
+        """
+        new_height = bool(self.heights_m) and min(abs(height_m - h) for h in self.heights_m) > _SAME_HEIGHT_M
+        kinds = ((unseen, self.sector_rmse_db), (new_height, self.height_rmse_db))
+        rmse_db = next((value for is_so, value in kinds if is_so and value is not None), self.rmse_db)
+        return self.model_copy(update={"rmse_db": rmse_db})
+
+
+# Flights whose cruise heights differ by less are at one height.
+_SAME_HEIGHT_M = 5.0
 
 
 class LearnedLock(StrictModel):
@@ -240,15 +261,16 @@ class Entry(StrictModel):
         values = self.model_dump(mode="json", exclude={"sha256"}, exclude_none=True)
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
-    def about(self) -> str:
-        """Return one sentence: learned from which flights, and which error to expect."""
+    def about(self, errors: Errors | None = None) -> str:
+        """Return one sentence: learned from which flights, and which error to expect (default: held-out flights)."""
+        errors = errors or self.errors
         days = f" of {', '.join(self.flown)}" if self.flown else ""  # none where the logs have relative times
         text = f"learned on {counted(len(self.flights), 'flight')}{days}"
         text += f", the UAV also on {', '.join(self.joined)}" if self.joined else ""
-        if self.errors is not None:
+        if errors is not None:
             text += (
-                f"; expect an RMSE of {self.errors.rmse_db:.1f} dB on another flight, free space "
-                f"{self.errors.free_space_rmse_db:.1f} dB"
+                f"; expect an RMSE of {errors.rmse_db:.1f} dB on another flight, free space "
+                f"{errors.free_space_rmse_db:.1f} dB"
             )
         for lock in [item.lock for item in self.series if item.lock is not None][:1]:
             text += (
@@ -312,6 +334,17 @@ def read_learned(site: str | Path) -> Learned:
                 path=folder / _INDEX,
             )
     return memory
+
+
+def check_index(site: str | Path) -> None:
+    """Check that entries can be added for a site: an index that can be read, whatever the values of its entries.
+
+    Raises
+    ------
+    UsageError, InputError
+        As :func:`read_learned`.
+    """
+    _read(folder_of(site), _Index)
 
 
 def _read(folder: Path, model: type[Learned]) -> Learned:

@@ -39,5 +39,5 @@ def past_sector_antenna(place: Path) -> Path:
 def calibrated(path: Path) -> tuple[Calibration, list[str]]:
     """What was learned, and what is said of copied logs."""
     settings = load_calibration(path)
-    flights, said = read_flights(settings, path.parent, None)
+    flights, said, _ = read_flights(settings, path.parent, None)
     return calibrate(settings, flights, path.parent), said

@@ -82,7 +82,7 @@ def report(folder: Path, flight: Path) -> tuple[dict[str, Any], str]:
     """Numbers of a report, and its first sentences."""
     assert main(["report", str(flight), "-o", str(folder / "out"), "--audit", "none", "--figures", "none"]) == 0
     page = (folder / "out" / "report.html").read_text(encoding="utf-8")
-    begin = page.index('class="verdict">') + len('class="verdict">')
+    begin = page.index(">", page.index('class="verdict"')) + 1
     return json.loads((folder / "out" / "metrics.json").read_text()), page[begin : page.index("</p>", begin)]
 
 
@@ -303,7 +303,13 @@ def test_what_was_learned_from_ranks_alone_names_its_logs_too(tmp_path: Path) ->
     (tmp_path / "calibrated").mkdir()
     ranked = RankCalibration(receivers={}, scores={}, warnings=())
     learned = Calibrated(
-        CalibrationFile(calibration="c", flights=["flight.yaml"]), flights, (), None, ranked, "calibrate"
+        CalibrationFile(calibration="c", flights=["flight.yaml"]),
+        flights,
+        (),
+        None,
+        ranked,
+        "calibrate",
+        dict.fromkeys((f.settings.flight.name for f in flights), "c"),
     )
     _, text = write_files(learned, tmp_path / "calibrated", "calibrated", {})
     (tmp_path / "calibrated.yaml").write_text(text)

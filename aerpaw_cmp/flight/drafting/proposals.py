@@ -266,7 +266,7 @@ class Placer:
         level = np.where(track.below, np.nan, track.level_db)
         samples = LinkSamples("", tower, "", track.time_s, track.position_m, at_uav, at_tower, level - free)
         odds = FlightEvidence([samples]).of_link(0, gains.moments)
-        return odds.over_own >= LEAST_ODDS and odds.over_turned > 0.0
+        return odds.fits
 
     def _taught_odds(self, track: LevelTrack, tower: str, gains: Taught) -> float:
         """Log evidence of a tower with the antennas at both ends that flights taught."""
@@ -373,6 +373,14 @@ class Remembered:
             directions=self.known.directions,
             covariance_db2=self.known.covariance_db2,
         )
+
+    @property
+    def teaches(self) -> bool:
+        """True if the airframe may be used at towers that its flights did not hear.
+
+        A receiver that loses its lock, and flights that do not predict each other, say nothing about other flights.
+        """
+        return self.series.lock is None and self.series.shares_airframe
 
     def gain_db(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
         """Gain of both ends (n,) and its standard deviation (n,) [dB]."""
@@ -505,17 +513,24 @@ def _antennas_for(
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
                 continue
             named_odds = _named_odds(data, series, item)
-            odds, best = evidence.of_link(number, item.moments).with_prior(named_odds), chosen.setdefault(item.name, {})
+            airframe = item.airframe if item.teaches else None
+            odds = evidence.of_link(number, item.moments, airframe).with_prior(named_odds)
+            best = chosen.setdefault(item.name, {})
             key = f"{series.tower}.{series.channel}"
-            if odds.over_own >= LEAST_ODDS and odds.over_turned > 0.0:
+            if odds.over_own > 0.0:
                 best[key] = max(best.get(key, (item, odds)), (item, odds), key=lambda pair: pair[1].over_own)
     entry = max(chosen, key=lambda name: sum(e.over_own for _, e in chosen[name].values()), default="")
-    if fits := chosen.get(entry):
+    fits = chosen.get(entry, {})
+    # channels of one flight are judged together: their antennas are those of one entry, and of one airframe
+    odds = _pooled([odds for _, odds in fits.values()])
+    if fits and odds.over_own >= LEAST_ODDS and odds.over_turned > -_MOUNTED_AS_LEARNED:
         first = next(iter(fits.values()))[0]
+        samples = evidence.rows[0]
+        errors = _expected(first.entry, first.series, samples.position_m, first.gain_db(samples)[1])
         names = {key: f"{site}/{entry}_{k.series.tower}.{k.series.channel}" for key, (k, _) in fits.items()}
         return Proposal(
             antennas=names | {"uav": f"{site}/{entry}_uav"},
-            antennas_about=f"{first.entry.about()}; {_odds(_pooled([odds for _, odds in fits.values()]))}",
+            antennas_about=f"{first.entry.about(errors)}; {_odds(odds)}",
             carrier_hz=first.series.carrier_hz,
         )
     return _airframe_for(data, known, site, evidence, band=learned.AIRFRAME_BAND if carrier_known else math.inf)
@@ -528,11 +543,9 @@ def _airframe_for(
     own, marks = set(flight_logs(data)), marks_of([data])
     tried: dict[str, tuple[Remembered, Evidence]] = {}
     for item in known:
-        # a receiver that loses its lock, and flights that do not predict each other, say nothing about other flights
-        silent = item.series.lock is not None or not item.series.shares_airframe
         same_log = own & set(item.entry.trained_on) or any(among(mark, item.uav.marks) for mark in marks)
         near = all(_in_band(item, series, band) for series in data.rss)
-        if not silent and not same_log and near and item.series.uav_file not in tried:
+        if item.teaches and not same_log and near and item.series.uav_file not in tried:
             tried[item.series.uav_file] = item, evidence.of_airframe(item.airframe)
     if not tried:
         return Proposal()
@@ -540,9 +553,11 @@ def _airframe_for(
     if not odds.fits:
         text = f"none of the learned airframes fits these levels; the best one, {best.name}: {_odds(odds)}"
         return Proposal(antennas_about=text)
+    errors = _expected(best.entry, None)
+    about = best.entry.about(errors) if errors is not None else best.entry.about()
     return Proposal(
         antennas={"uav": f"{site}/{best.name}_uav"},
-        antennas_about=f"the airframe alone, {best.entry.about()}, there with its tower antenna; {_odds(odds)}",
+        antennas_about=f"the airframe alone, {about}; {_odds(odds)}",
         carrier_hz=None if math.isfinite(band) else best.series.carrier_hz,
     )
 
@@ -550,6 +565,9 @@ def _airframe_for(
 # Log odds of antennas of both ends before any level: with the names of its tower and channel, or of its receiver; and
 # with levels in another unit, which are those of another receiver. Levels of field flights decide by 13 and more.
 _SAME_NAME, _OTHER_UNIT = 4.0, -3.0
+
+# Log odds that a known pair of antennas is mounted as it was, and not rotated by a quarter turn or more.
+_MOUNTED_AS_LEARNED = 3.0
 
 
 def _named_odds(data: FlightData, series: RssSeries, item: Remembered) -> float:
@@ -661,15 +679,58 @@ def offered(data: FlightData) -> FlightFile | None:
     return settings if settings.link != data.settings.link else None
 
 
-def errors_elsewhere(antennas: Mapping[str, str], series: RssSeries, folder: Path) -> learned.Errors | None:
-    """Return the errors on held-out flights of the learned antennas of a tower and channel; None without such."""
+def errors_elsewhere(
+    antennas: Mapping[str, str],
+    series: RssSeries,
+    folder: Path,
+    flown: tuple[FloatArray, FloatArray] | None = None,
+) -> learned.Errors | None:
+    """Return the errors of learned antennas on held-out flights of the kind of a series; None without such antennas.
+
+    Parameters
+    ----------
+    antennas : mapping of str to str
+        As the flight file names them.
+    series : RssSeries
+    folder : Path
+        Of the flight file.
+    flown : (n, 3) and (n,), optional
+        Positions [m], and standard deviation of the learned gain there [dB]: a new height, or new directions, have the
+        errors of such.
+    """
     name = antennas.get(f"{series.tower}.{series.channel}")
-    if name is None or "uav" not in antennas:
+    if "uav" not in antennas:
         return None
     try:
-        return learned.find_named(name, folder).entry.errors
+        named = learned.find_named(name or antennas["uav"], folder)
     except (InputError, UsageError):
         return None
+    antenna = None if name is None else named.antenna("tower", series.link.carrier_hz)
+    return _expected(named.entry, antenna, *(flown or ()))
+
+
+# Directions whose standard deviation is so many times that of flown ones were not flown.
+_UNSEEN_SD = 2.0
+
+
+def _expected(
+    entry: learned.Entry,
+    series: learned.LearnedSeries | None,
+    position_m: FloatArray | None = None,
+    sd_db: FloatArray | None = None,
+) -> learned.Errors | None:
+    """Return the errors to expect of an antenna of an entry, of its airframe alone for a series of None."""
+    errors = entry.errors
+    if errors is None:
+        return None
+    if series is None:
+        alone_db = errors.airframe_rmse_db
+        return None if alone_db is None else errors.model_copy(update={"rmse_db": alone_db})
+    if position_m is None or sd_db is None or not np.isfinite(sd_db).any():
+        return errors
+    heights, count = np.unique(np.round(position_m[np.isfinite(position_m[:, 2]), 2]), return_counts=True)
+    unseen = bool(np.nanmedian(sd_db) > _UNSEEN_SD * series.sd_db)
+    return errors.expected(float(heights[count.argmax()]), unseen=unseen)
 
 
 def lock_elsewhere(antennas: Mapping[str, str], folder: Path) -> learned.LearnedLock | None:

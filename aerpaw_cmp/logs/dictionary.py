@@ -250,7 +250,7 @@ _INDIRECT = re.compile(
 
 
 # Levels beside the one that the receiver measured: averaged over time, or of one of its ports.
-_MEAN = re.compile(r"\b(mean|avg|average|averaged|filtered|filt|smooth(ed)?|median|ema|rolling|moving)\b")
+_MEAN = re.compile(r"\b(mean|avg|average|averaged|filtered|filt|smooth(ed)?|median|ema|rolling|moving)\d*\b")
 _PORT = re.compile(r"\b(rx|ant(enna)?|port|branch|chain|path) ?\d\b")
 
 

@@ -321,6 +321,8 @@ _MOST_DBM = {"RSRP": -20.0}
 _LOST_DB, _FAR_DB, _LOST_SHARE = 1.0, 20.0, 0.2
 # Levels that alternate from record to record: further apart than fading, and back with the next.
 _APART_DB, _BACK_SHARE, _FEW_ALTERNATE, _MOST_TURNS = 10.0, 0.2, 6, 5
+# Levels of one time that are of several sources: further apart than fading within a second of a coarse clock.
+_AT_ONCE_DB = 6.0
 
 
 class _Check:
@@ -451,7 +453,7 @@ class _Check:
             return
         at_once = pd.Series(level).groupby(time).agg(["min", "max", "size"])
         apart_db = (at_once["max"] - at_once["min"])[at_once["size"] > 1]
-        if not turns and (2 * len(apart_db) < len(at_once) or apart_db.median() < _APART_DB):
+        if not turns and (2 * len(apart_db) < len(at_once) or apart_db.median() < _AT_ONCE_DB):
             return
         how = f"{step:.0f} dB apart from record to record" if turns else f"{apart_db.median():.0f} dB apart at one time"
         self._said.append(

@@ -65,7 +65,7 @@ def reading(row: int, fields: Mapping[str, float], *, rat: str, serving: bool) -
         if what is not None and np.isfinite(value) and not name.startswith("csi"):  # SS-RSRP is the cell's level
             known.setdefault(what.quantity.name, value)
     values = {field: known.get(name, np.nan) for field, name in QUANTITIES.items()}
-    return Reading(row=row, rat=rat, serving=serving, **values)
+    return Reading(row, rat, serving=serving, **values)  # type: ignore[arg-type]
 
 
 # Quantities of the dictionary, by the fields of a reading.

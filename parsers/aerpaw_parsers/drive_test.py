@@ -160,8 +160,10 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell], more: list[str]) -> pd.Da
         # refused above where most are fractions; here a single damaged cell
         pci = np.where(values["pci"] == np.round(values["pci"]), values["pci"], np.nan)  # a fraction is no identity
         rat = of_row if technology is not None and not cell.rat else cell.rat
-        about = {"row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle}
-        about["more"] = more if cell.place == "serving" else ""
+        about = {
+            "row": np.arange(len(level)), "rat": rat, "rsrp_dbm": level, "serving": cell.serving & ~idle,
+            "more": more if cell.place == "serving" else "",
+        }  # fmt: skip
         # a leg or a neighbour that is not there is no reading
         tables.append(pd.DataFrame({**values, **about, "pci": pci})[np.isfinite(level) & ~np.asarray(none)])
     joined: pd.DataFrame = pd.concat(tables) if tables else pd.DataFrame(columns=list(_cells.Reading._fields))
@@ -181,7 +183,8 @@ def _of_one_phone(readings: pd.DataFrame, time: AnyArray) -> pd.DataFrame:
     if len(several) < _SCANNED * len(of_time):  # a handover within a second of a clock of seconds
         return readings
     keys = pd.MultiIndex.from_arrays([time[readings["row"].to_numpy(np.int64)], readings["rat"]])
-    return readings.assign(serving=readings["serving"].astype(bool) & ~keys.isin(several))
+    doubted: pd.DataFrame = readings.assign(serving=readings["serving"].astype(bool) & ~keys.isin(several))
+    return doubted
 
 
 def _identities(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[str]:
@@ -248,8 +251,8 @@ def _radio(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         owner = cell.place if cell.place.startswith(_OWNERS) else ""
         owned.setdefault((owner, ""), []).append(cell)
         for port in cell.ports:  # of the same cell, under a name of its own
-            columns = {name: i for name, i in cell.columns.items() if name in _IDENTITY} | {"rsrp_dbm": port}
-            owned.setdefault((owner, _short(sheet, port)), []).append(replace(cell, columns=columns))
+            of_port = {name: i for name, i in cell.columns.items() if name in _IDENTITY} | {"rsrp_dbm": port}
+            owned.setdefault((owner, _short(sheet, port)), []).append(replace(cell, columns=of_port))
     several = len({owner for owner, _ in owned}) > 1
     levels = [
         _renamed(stream, "_".join(word for word in (owner if several else "", port) if word))

@@ -1,6 +1,7 @@
 """Whose reading a row holds: two sources never become one series without a warning, and one source never becomes two."""
 
 import random
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -20,7 +21,7 @@ IDENTITIES = {
     "cgi": ("310260-1", "310260-2", "310260-3"), "bssid": ("aa:01", "aa:02", "aa:03"), "tower": ("LW1", "LW2", "LW3"),
 }  # fmt: skip
 # What changes along a flight, and says nothing of who.
-OTHERS = {
+OTHERS: dict[str, Callable[[int], str]] = {
     "waypoint": lambda i: str(i // 12), "flight_mode": lambda i: "AUTO" if i % 40 > 9 else "LOITER",
     "height_step": lambda i: str(30 + 10 * (i // 20)), "battery": lambda i: str(100 - i // 5), "armed": lambda _i: "1",
 }  # fmt: skip

@@ -36,6 +36,7 @@ BIN_S, _MOST_BINS = 1.0, 2000
 # A slow orbit of 1.5 m/s loses no second.
 _NEAR_M, _NEAR_DEG = 1.0, 5.0
 _FEWEST_BINS, _ENOUGH_BINS = 24, 100
+FEWEST_SAMPLES = 100
 # A trouble is in one flight of ten; named where the odds for it are five to one.
 _SELDOM, _MARGIN = math.log(10.0), math.log(5.0)
 # Of sentence and next step of a cause: a page begins with sixty in all.
@@ -44,9 +45,12 @@ MOST_CAUSE_WORDS = 28
 # a floor where the flight fades leaves the error of all that is above it.
 _LEAST_SHARE, _CERTAIN = 0.1, 30.0
 # The sentence states the error without a cause and with it: they must differ in print, however certain the cause.
-_SHOWN_DB = 0.1
+SHOWN_DB = 0.1
 # Learned antennas miss some decibels of each flight by themselves: less is no trouble of this one.
 _OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
+# Causes that must bring the error back to what is usual, and the least part of what all candidates take off together.
+_RESTORING = frozenset({"pattern", "heading", "height", "telemetry", "clock", "saturation", "place", "channels"})
+_LEAST_PART = 0.5
 # Half of the 95 % point of chi-squared with one degree of freedom.
 _NEAR = 1.92
 _EPOCH = np.datetime64(0, "s")
@@ -132,6 +136,16 @@ class LevelEvidence:
     clock: JudgedClock | None = None
     floored: bool = False
     """True where the settings leave out what lies at the floor: of the lowest links those that fade upwards remain."""
+    limits_known: bool = False
+    """True if both levels are no lower than the receiver's floor already, as the page counts them."""
+    usual_db: Interval = (math.nan, math.nan)
+    """RMSE of held-out flights of the learned antennas [dB]: mean, and mean + 2 SD; NaN without such antennas."""
+    distance_db: FloatArray | None = None
+    """Part of the predicted level that depends on the distance alone (n,)."""
+    displaced_db: Mapping[tuple[float, float], FloatArray] = field(default_factory=dict)
+    """Change of the predicted level with the tower elsewhere, by distance [m] and azimuth [deg]; of all azimuths."""
+    swapped_db: FloatArray | None = None
+    """Change of the predicted level (n,) if the log is that of the other channel of the tower."""
     least: BoolArray | None = None
     """Samples at the least level of the log, where it has that again and again, exactly or within its noise."""
 
@@ -265,35 +279,94 @@ def flight_cause(channels: Sequence[LevelEvidence]) -> Cause | None:
         models = [_best(table, some) for table in tables]
         used = frozenset().union(*map(_names, models))
         odds[used] = sum(model.gain for model in models) - _SELDOM * len(used)
-    best, lead = max(odds, key=lambda some: odds[some]), {}
-    for name in best:
-        with_it, without = ([odds[some] for some in odds if (name in some) == side] for side in (True, False))
-        lead[name] = float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without))
-    least, named = _MARGIN + math.log(max(len(channels), 1)), {}
-    for name in (trouble for trouble in best - {_UNNAMED} if lead[trouble] >= least):
+    best = max(odds, key=lambda some: odds[some])
+    least, named = _MARGIN + math.log(max(len(channels), 1)), dict[frozenset[str], list[_Models]]()
+    for either in _alternatives(best, odds, least):
+        name = max(either & best)
         shown = [table for table in tables if name in _names(_best(table, best))]
         # the clearest channel gives the words
         shown.sort(key=lambda table: -_best(table, {name}).gain)
-        # also alone it must bring levels and prediction together, not only their changes from second to second
-        alone = _share_of_error(shown, _SOUND, {name})
-        share = min(alone, _share_of_error(shown, best - {name}, best))
-        certain, least_share = lead[name] >= _CERTAIN * len(channels), _LEAST_SHARE
-        if name in _OF_ANTENNA and any(table[_SOUND].evidence.antenna == "learned" for table in shown):
-            certain, least_share = False, _LEARNED_SHARE
-        fall_db = (1.0 - alone) * _rmse_db([table[_SOUND] for table in shown])
-        alone_models = [table[frozenset([name])] for table in shown]
-        # a log of noise alone likes another antenna better, too: it must leave less than a constant level does
-        if name == _CATCH_ALL and any(m.residual_db.std() >= m.evidence.measured_db.std() for m in alone_models):
-            continue
-        # a floor that the settings leave out explains why the low links that are left look too strong, and is known
-        known = name == "floor" and shown[0][_SOUND].evidence.floored
-        if not known and fall_db >= _SHOWN_DB and (share <= 1.0 - least_share or certain):
-            named[name] = shown
+        if all(_explains(other, shown, _lead({other}, odds) / len(channels), best - either) for other in either):
+            named[either] = shown
     if not named:
         return None
     # a gain over directions takes the place of much else: it is named where nothing else can be
-    name = min(named, key=lambda name: (name == _CATCH_ALL, -sum(_best(table, {name}).gain for table in tables)))
-    return _named(name, named[name], lead[name])
+    either = min(named, key=lambda e: (_CATCH_ALL in e, -sum(_best(table, e & best).gain for table in tables)))
+    return _named(sorted(either, key=lambda n: n not in best), named[either], _lead(either, odds))
+
+
+def _lead(names: Set[str], odds: Mapping[frozenset[str], float]) -> float:
+    """Return the log odds of the explanations with any of some causes against all without them."""
+    with_it, without = ([odds[some] for some in odds if bool(some & names) == side] for side in (True, False))
+    return float(np.logaddexp.reduce(with_it) - np.logaddexp.reduce(without)) if with_it else -math.inf
+
+
+def _alternatives(best: Set[str], odds: Mapping[frozenset[str], float], least: float) -> list[frozenset[str]]:
+    """Return the causes that are likelier by a margin than all else: alone, or two that cannot be distinguished."""
+    out = []
+    for name in sorted(best - {_UNNAMED}):
+        if _lead({name}, odds) >= least:
+            out.append(frozenset({name}))
+            continue
+        others = {other for some in odds for other in some} - {name, _UNNAMED, *best}
+        rival = max(others, key=lambda other: _lead({name, other}, odds), default="")
+        if rival and _lead({name, rival}, odds) >= least:
+            out.append(frozenset({name, rival}))
+    return out
+
+
+def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]) -> bool:
+    """Check whether a cause explains the error of the channels that show it, by what it takes off their RMSE.
+
+    ``beside`` are the other causes of the likeliest explanation.
+    """
+    sound = [table[_SOUND] for table in shown]
+    if not all(frozenset([name]) in table for table in shown):
+        return False
+    # also alone it must bring levels and prediction together, not only their changes from second to second
+    alone_models = [table[frozenset([name])] for table in shown]
+    known_db, alone_db = _rmse_db(sound), _rmse_db(alone_models)
+    share = max(alone_db / known_db, _share_of_error(shown, beside, {*beside, name})) if known_db else 1.0
+    certain, least_share = lead >= _CERTAIN, _LEAST_SHARE
+    if name in _OF_ANTENNA and sound[0].evidence.antenna == "learned":
+        certain, least_share = False, _LEARNED_SHARE
+    # a log of noise alone likes another antenna better, too: it must leave less than a constant level does
+    if name == _CATCH_ALL and any(m.residual_db.std() >= m.evidence.measured_db.std() for m in alone_models):
+        return False
+    # a floor that the settings leave out explains why the low links that are left look too strong, and is known
+    if (name == "floor" and sound[0].evidence.floored) or known_db - alone_db < SHOWN_DB:
+        return False
+    return (share <= 1.0 - least_share or certain) and _is_enough(name, shown, known_db, alone_db)
+
+
+def _is_enough(name: str, shown: Sequence[_Models], known_db: float, alone_db: float) -> bool:
+    """Check whether what a cause leaves is the error of a flight without one.
+
+    With learned antennas that is the error of held-out flights; else a cause must take off half of what all candidates
+    take off together.
+    """
+    usual = np.array([table[_SOUND].evidence.usual_db for table in shown])
+    mean_db, most_db = np.sqrt(np.mean(usual**2, axis=0)).tolist()
+    if math.isfinite(most_db):
+        # an error as large as that of any flight has no such cause
+        least_db = {_CATCH_ALL: most_db, "blocked": most_db, "gain step": mean_db, "saturation": mean_db}.get(name, 0.0)
+        return bool(known_db > least_db and (name not in _RESTORING or alone_db <= most_db))
+    if name not in _RESTORING:
+        return True
+    together_db = math.sqrt(float(np.mean([_together_db(table) ** 2 for table in shown])))
+    return alone_db <= known_db - _LEAST_PART * (known_db - together_db)
+
+
+def _together_db(table: _Models) -> float:
+    """Return the RMSE of a channel with all candidates at once, each with a free coefficient [dB]."""
+    e = table[_SOUND].evidence
+    columns = [np.ones(len(e.time_s))]
+    for trial in (model.trials[0] for names, model in table.items() if len(names) == 1):
+        columns += [] if trial.change_db is None else [trial.change_db]
+        columns += [] if trial.columns is None else list(trial.columns.T)
+    design, target = np.column_stack(columns), e.measured_db - e.predicted_db
+    residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
+    return float(np.sqrt((residual**2).sum() / max(len(target) - design.shape[1], 1)))
 
 
 def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
@@ -303,9 +376,23 @@ def gains_by_direction(channels: Iterable[LevelEvidence]) -> bool:
         learned = _fitted(evidence, antenna, at=sound.memories)
         left_db = float(learned.residual_db.std())
         fall_db = min(float(sound.residual_db.std()), float(evidence.measured_db.std())) - left_db
-        if learned.log_likelihood > sound.log_likelihood + _SELDOM and fall_db >= _SHOWN_DB:
+        if learned.log_likelihood > sound.log_likelihood + _SELDOM and fall_db >= SHOWN_DB:
             return True
     return False
+
+
+def fall_without_lag_db(channels: Iterable[LevelEvidence]) -> float:
+    """Return by how much the RMSE of some channels falls if the lags of their clocks are corrected [dB]."""
+    errors: list[tuple[FloatArray, FloatArray]] = []
+    for e in channels:
+        lag = 0.0 if e.clock is None else e.clock.radio_minus_telemetry_s
+        known = np.isfinite(e.measured_db) & np.isfinite(e.predicted_db)
+        time_s, measured_db, predicted_db = e.time_s[known], e.measured_db[known], e.predicted_db[known]
+        if len(time_s):
+            late_db = np.interp(time_s - lag, time_s, predicted_db)
+            errors.append((measured_db - predicted_db, measured_db - late_db))
+    before, after = ([error - error.mean() for error in of] for of in zip(*errors, strict=True)) if errors else ([], [])
+    return float(np.concatenate(before).std() - np.concatenate(after).std()) if errors else 0.0
 
 
 def _names(model: _Model) -> frozenset[str]:
@@ -377,8 +464,9 @@ def _rmse_db(models: Sequence[_Model]) -> float:
     return float(np.concatenate([model.residual_db - model.residual_db.mean() for model in models]).std())
 
 
-def _named(name: str, shown: Sequence[_Models], gain: float) -> Cause:
-    """The trouble in words, those of the channel that shows it best."""
+def _named(names: Sequence[str], shown: Sequence[_Models], gain: float) -> Cause:
+    """Return the cause in words, those of the channel that shows it best; a second name cannot be distinguished."""
+    name = names[0]
     trial = shown[0][frozenset([name])].trials[0]
     # a channel with other numbers, such as those of another clock, would belie the sentence
     shown = [table for table in shown if table[frozenset([name])].trials[0].sentence == trial.sentence]
@@ -386,10 +474,11 @@ def _named(name: str, shown: Sequence[_Models], gain: float) -> Cause:
     rmse, rmse_with = _rmse_db([table[_SOUND] for table in shown]), _rmse_db(alone)
     channels = tuple(model.evidence.name for model in alone)
     where = channels[0] if len(channels) == 1 else f"{len(channels)} channels"
+    others = [shown[0][frozenset([other])].trials[0].sentence for other in names[1:]]
     value, low, high = trial.estimate
     return Cause(
-        name=name,
-        sentence=f"Likely cause at {where}: {trial.sentence}; "
+        name=" or ".join(names),
+        sentence=f"Likely cause at {where}: {', or '.join([trial.sentence, *others])}; "
         f"1-s RMSE {rmse:.1f} \N{RIGHTWARDS ARROW} {rmse_with:.1f} dB.",
         next_step=trial.next_step,
         estimate=value,
@@ -407,7 +496,9 @@ _ANGLES = ("uav_azimuth_deg", "tower_azimuth_deg")
 def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
     """Means over :data:`BIN_S`, and over hovers, of the samples with both levels; None where they are too few."""
     finite = np.isfinite(evidence.measured_db) & np.isfinite(evidence.predicted_db)
-    if not finite.any():
+    level = evidence.measured_db[finite]
+    # two levels alone, or so few samples, let no form be recognised
+    if len(level) < FEWEST_SAMPLES or len(np.unique(level)) == 2:
         return None
     time, level = evidence.time_s[finite], evidence.measured_db[finite]
     width = max(min(BIN_S, float(np.ptp(time)) / _ENOUGH_BINS), float(np.ptp(time)) / _MOST_BINS, 1e-3)
@@ -591,16 +682,54 @@ def _clock(e: LevelEvidence) -> Iterator[Trial]:
             name="clock", cost=0.0, sentence=f"the radio clock is {e.clock.in_words}", next_step="`rss: {lag: apply}`",
             change_db=late - e.predicted_db, estimate=(lag, *e.clock.ci95_s),
         )  # fmt: skip
+        yield from _drifting(e)
         return
+    yield from _drifting(e)
     # a clock may be further off than was looked, or hidden by another trouble: what else fits is no cause then
     levels = np.array([np.interp(e.time_s - lag, e.time_s, e.predicted_db) for lag in _LAGS_S])
     nearer = _nearer(e, levels)
     if not nearer.any():
         return
-    left = (e.measured_db - levels)[:, 1:] - _SEARCHED_PHI[1] * (e.measured_db - levels)[:, :-1]
-    gain = np.where(nearer, -0.5 * left.shape[1] * np.log(left.var(axis=1) + _LEAST_VARIANCE), -np.inf)
+    gain = np.where(nearer, _likelihoods(e, levels), -np.inf)
     cost, change_db = _concentration(gain, np.ones(len(gain))), levels[gain.argmax()] - e.predicted_db
     yield Trial(name=_UNNAMED, cost=cost, sentence="", next_step="", change_db=change_db)
+
+
+def _drifting(e: LevelEvidence) -> Iterator[Trial]:
+    """Yield the likeliest radio clock that gains or loses a share of the time, right somewhere in the flight."""
+    if e.clock is None:
+        return
+    middle, length = 0.5 * (e.time_s[0] + e.time_s[-1]), float(np.ptp(e.time_s))
+    rates = [r for r in _RATES if _LEAST_DRIFT_S <= abs(r) * length <= _MOST_DRIFT_S]
+    pairs = [(rate, begin) for rate in rates for begin in _RIGHT_AT]
+    if not pairs:
+        return
+    lags = [rate * (e.time_s - middle + (0.5 - begin) * length) for rate, begin in pairs]
+    levels = np.array([np.interp(e.time_s - lag, e.time_s, e.predicted_db) for lag in lags])
+    gain = np.where(_nearer(e, levels), _likelihoods(e, levels), -np.inf)
+    if not np.isfinite(gain).any():
+        return
+    best = int(gain.argmax())
+    rate = pairs[best][0]
+    yield Trial(
+        name="clock", cost=_RARE + _concentration(gain, np.ones(len(gain))), change_db=levels[best] - e.predicted_db,
+        sentence=f"the radio clock {'gains' if rate > 0 else 'loses'} {Printed(100.0 * abs(rate)):.1f} % "
+        f"({abs(rate) * length:.0f} s in {length:.0f} s)",
+        next_step="synchronise both clocks by GPS or NTP", estimate=(rate * length, math.nan, math.nan),
+    )  # fmt: skip
+
+
+# Shares of the time that a clock may gain, how far off that leads it [s], and where in the flight it is right.
+_RATES = tuple(sign * rate for rate in (0.0025, 0.004, 0.006, 0.008, 0.01, 0.015, 0.02, 0.025, 0.03, 0.04, 0.05)
+               for sign in (-1.0, 1.0))  # fmt: skip
+_LEAST_DRIFT_S, _MOST_DRIFT_S, _RIGHT_AT = 3.0, 60.0, (0.0, 0.25, 0.5)
+
+
+def _likelihoods(e: LevelEvidence, levels_db: FloatArray) -> FloatArray:
+    """Return the log likelihood of levels (m, n) under noise of a usual correlation: a quick search."""
+    error = e.measured_db - levels_db
+    left = error[:, 1:] - _SEARCHED_PHI[1] * error[:, :-1]
+    return np.asarray(-0.5 * left.shape[1] * np.log(left.var(axis=1) + _LEAST_VARIANCE))
 
 
 def _nearer(e: LevelEvidence, level_db: FloatArray) -> BoolArray:
@@ -721,6 +850,55 @@ def _tower(e: LevelEvidence) -> Iterator[Trial]:
         )  # fmt: skip
 
 
+def _place(e: LevelEvidence) -> Iterator[Trial]:
+    """Yield the likeliest place of the tower, near the one in the files; the track may be displaced instead."""
+    if not e.displaced_db:
+        return
+    radii = np.array(sorted({radius for radius, _ in e.displaced_db}))
+    azimuths = np.array(sorted({azimuth for _, azimuth in e.displaced_db}))
+    table = np.array([[e.displaced_db[radius, azimuth] for azimuth in azimuths] for radius in radii])
+    # the radii grow by a factor: each counts for an area, and far places are unlikely
+    weight = np.repeat(radii**2 * (1.0 + (radii / _NEAR_PLACE_M) ** 2) ** -1.5, len(azimuths))
+    gain = _likelihoods(e, e.predicted_db + table.reshape(len(weight), -1))
+    cost = _concentration(gain, weight)
+    i, j = np.unravel_index(int(gain.argmax()), table.shape[:2])
+    fine = [(i + r, j + a) for r in _FINER for a in _FINER if 0 <= i + r <= len(radii) - 1]
+    changes = np.array([_between(table, at, around) for at, around in fine])
+    best = int(_likelihoods(e, e.predicted_db + changes).argmax())
+    at, around = fine[best]
+    radius = float(np.exp(np.interp(at, np.arange(len(radii)), np.log(radii))))
+    azimuth = (around * 360.0 / len(azimuths)) % 360.0
+    side = _SIDES[round(azimuth / 45.0) % 8]
+    yield Trial(
+        name="place", cost=cost, change_db=changes[best], estimate=(radius, math.nan, math.nan),
+        sentence=f"the tower is about {radius:.0f} m {side} of its place in the files, or the track opposite",
+        next_step="check the coordinates of both",
+    )  # fmt: skip
+
+
+def _between(table: FloatArray, at: float, around: float) -> FloatArray:
+    """Return a change (n,) between rows and columns of a table (radii, azimuths, n) by bilinear interpolation."""
+    row, column = min(int(at), len(table) - 2), math.floor(around)
+    up, on = at - row, around - column
+    left, right = column % table.shape[1], (column + 1) % table.shape[1]
+    rows = [(1.0 - on) * table[row + k, left] + on * table[row + k, right] for k in (0, 1)]
+    return np.asarray((1.0 - up) * rows[0] + up * rows[1])
+
+
+# A place further away than this is unlikely [m]; steps between the places that are computed.
+_NEAR_PLACE_M, _FINER = 50.0, (-0.75, -0.5, -0.25, 0.0, 0.25, 0.5, 0.75)
+_SIDES = ("north", "north-east", "east", "south-east", "south", "south-west", "west", "north-west")
+
+
+def _channels(e: LevelEvidence) -> Iterator[Trial]:
+    """Yield the log of the other channel of the tower."""
+    if e.swapped_db is not None:
+        yield Trial(
+            name="channels", cost=0.0, sentence="the channels of the tower are swapped", change_db=e.swapped_db,
+            next_step="check the cables, or swap the channels in the flight file",
+        )  # fmt: skip
+
+
 _CATCH_ALL = "pattern"
 
 # Functions of direction alone: they also take up what a wrong model leaves.
@@ -772,22 +950,58 @@ def _cell(e: LevelEvidence) -> Iterator[Trial]:
 
 
 def _decibels(e: LevelEvidence) -> Iterator[Trial]:
-    """Decibels of an amplitude as if it were a power, or the reverse; none where any other slope is likelier."""
-    any_slope = Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=_SLOPE * e.predicted_db[:, None])
-    # what is left above a floor changes by fewer decibels than the link
-    least = math.inf if e.floored else _fitted(e, any_slope, climb=False).log_likelihood
+    """Yield the decibels of an amplitude as if it were a power, or the reverse.
+
+    The slope of the levels must say so within an interval, and a path-loss exponent and a gain over elevation must be
+    much less likely: they change levels alike.
+    """
+    up = np.sin(np.radians(e.uav_elevation_deg))
+    elevation = _GAIN_DB * np.column_stack([up, up**2, up**3])
+    rivals = [_SLOPE * e.predicted_db[:, None], elevation]
+    rivals += [] if e.distance_db is None else [_SLOPE * e.distance_db[:, None]]
     for factor, words in ((0.5, "half"), (2.0, "twice")):
         trial = Trial(
             name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
             sentence=f"the levels change by {words} the link's decibels",
             next_step="check: 10 lg of power, 20 lg of amplitude",
         )  # fmt: skip
-        if _nearer(e, factor * e.predicted_db) and _fitted(e, trial, climb=False).log_likelihood > least:
+        if not _nearer(e, factor * e.predicted_db):
+            continue
+        fit = _fitted(e, trial)
+        if not _is_slope(e, factor, fit.memories):
+            continue
+        others = [
+            _fitted(e, Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=columns), at=fit.memories)
+            for columns in rivals
+        ]
+        # what is left above a floor changes by fewer decibels than the link
+        least = -math.inf if e.floored else max(other.log_likelihood for other in others[1:])
+        if fit.log_likelihood > max(least + _RARE, others[0].log_likelihood):
             yield trial
 
 
 # Standard deviation of the slope of levels about their prediction, before the flight.
 _SLOPE = 0.5
+# Ends of the slopes that are half of a decibel, or twice.
+_SLOPES = {0.5: (0.45, 0.55), 2.0: (1.9, 2.1)}
+
+
+def _is_slope(e: LevelEvidence, factor: float, at: _Memories) -> bool:
+    """Check whether slopes outside the ends of a factor are less likely than those inside."""
+    low, high = _SLOPES[factor]
+    step = high - factor
+
+    def likelihood(slope: float) -> float:
+        change = Trial(name="", cost=0.0, sentence="", next_step="", change_db=(slope - 1.0) * e.predicted_db)
+        return _fitted(e, change, at=at, climb=False).log_likelihood
+
+    # a parabola through three slopes: the log likelihood is one in the slope
+    below, middle, above = (likelihood(factor + i * step) for i in (-1, 0, 1))
+    bend = below - 2.0 * middle + above
+    if bend >= 0.0:
+        return False
+    best, sd = factor + 0.5 * step * (below - above) / bend, step / math.sqrt(-bend)
+    return low <= best <= high and best - 1.96 * sd > 2.0 * low - factor and best + 1.96 * sd < 2.0 * high - factor
 
 
 # --- troubles of the receiver ----------------------------------------------------------------------------------------
@@ -813,7 +1027,7 @@ def _is_flat(e: LevelEvidence) -> bool:
 
 def _lock(e: LevelEvidence) -> Iterator[Trial]:
     """Noise that the receiver writes without its lock, by the quality in the log."""
-    if e.locked is not None and (lost := e.locked < 0.5).any():
+    if not e.limits_known and e.locked is not None and (lost := e.locked < 0.5).any():
         yield Trial(
             name="lock", cost=0.0, clipped=lost,
             sentence="the receiver had no lock in parts of the flight",  # the cautions count the samples
@@ -823,7 +1037,7 @@ def _lock(e: LevelEvidence) -> Iterator[Trial]:
 
 def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
     """The least level, written again and again: nothing was detected there."""
-    if e.least is not None and e.least.any() and not e.least.all():
+    if not e.limits_known and e.least is not None and e.least.any() and not e.least.all():
         level, share = float(np.median(e.measured_db[e.least])), 100 * e.least.mean()
         # means of seconds spread less than samples do
         top = level + (0.0 if np.ptp(e.measured_db[e.least]) < 1e-9 else _OVER_FLOOR_DB)
@@ -836,7 +1050,8 @@ def _no_detection(e: LevelEvidence) -> Iterator[Trial]:
 
 def _floor(e: LevelEvidence) -> Iterator[Trial]:
     """A receiver that shows no level below its floor; what it shows there spreads less."""
-    if e.least is None and not _is_flat(e):  # else the log itself says where nothing was detected
+    # else the log itself says where nothing was detected
+    if e.least is None and not e.limits_known and not _is_flat(e):
         yield from _clipping(e, 1.0)
 
 
@@ -998,6 +1213,6 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
 
 
 CANDIDATES: tuple[Callable[[LevelEvidence], Iterator[Trial]], ...] = (
-    _clock, _heading, _attitude, _misread, _height, _tower, _pattern, _cell, _decibels,
+    _clock, _heading, _attitude, _misread, _height, _tower, _place, _channels, _pattern, _cell, _decibels,
     _lock, _no_detection, _flat, _floor, _saturation, _blocked, _gain_step,
 )  # fmt: skip

@@ -3,18 +3,29 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
+from itertools import product
 from typing import TypeVar
 
 import numpy as np
 
 from ..common.units import FloatArray
 from ..compare import level as rss
-from ..compare.causes import OF_DIRECTION, Cause, LevelEvidence, flight_cause, gains_by_direction
+from ..compare.causes import (
+    OF_DIRECTION,
+    SHOWN_DB,
+    Cause,
+    LevelEvidence,
+    fall_without_lag_db,
+    flight_cause,
+    gains_by_direction,
+)
 from ..compare.gains import turned
 from ..compare.result import RssResult
-from ..compare.verdict import without_copies
+from ..compare.verdict import lock_lost, without_copies
 from ..flight.data import FlightData, RssSeries, Times
+from ..flight.drafting.proposals import errors_elsewhere
 from ..flight.gains import mean_gain_db
 from ..flight.replay import FlightReplay, Replayed, attitude_rotation, telemetry_time
 from ..flight.track import MISREAD
@@ -50,28 +61,46 @@ def cause_of(data: FlightData, replays: FlightReplay, results: Sequence[RssResul
     telemetry = [stream for file in data.files for stream in file.result.streams if stream.kind == "telemetry"]
     if any(map(is_simulated, telemetry)):
         return SIMULATED, None
-    if meaning := next(filter(None, map(heights_meant, telemetry)), ""):
+    meant = [meaning for stream in telemetry if (meaning := heights_meant(stream)) is not None]
+    if meaning := next(filter(None, meant), ""):
         sentence = f"Likely cause: {meaning}, by the logged vertical speed."
         return Cause(name="telemetry", sentence=sentence, next_step="check the telemetry's columns and units"), None
     names = {result.name for result in without_copies(results)}  # a copy is replayed with antennas of another channel
-    evidence = [
-        _evidence(data, series, replayed, result)
+    compared = [
+        (series, replayed, result)
         for series, replayed, result in zip(data.rss, replays.rss, results, strict=True)
         if replayed.tower_m is None and not result.training and result.name in names
     ]
+    evidence = [_evidence(data, *each, scaled=not meant) for each in compared]
+    evidence = [_with_other(e, each, compared, evidence) for e, each in zip(evidence, compared, strict=True)]
     cause = flight_cause(evidence)
-    clocks = [(s.tower, r.clock.result) for s, r in zip(data.rss, replays.rss, strict=True) if r.clock is not None]
-    late = next((f"The radio clock at {tower} is {clock.in_words}." for tower, clock in clocks if clock.shifted), None)
-    # judged by itself: it is mended first, however little of the error it explains, and before what directions tell
-    if late is not None and (cause is None or cause.name in OF_DIRECTION):
-        return Cause(name="clock", sentence=late, next_step="`rss: {lag: apply}`"), None
+    late = _late_clock(evidence, [series.tower for series, _, _ in compared])
+    by_direction = cause is None or any(name in OF_DIRECTION for name in cause.name.split(" or "))
+    # a clock is judged by itself, and before what directions explain
+    if late is not None and by_direction:
+        return late, None
     # an antenna that the file names is missing: errors by direction are expected, and the first caution has the reason
-    if any(not c.used for c in data.settings.cautions) and (cause is None or cause.name in OF_DIRECTION):
+    if any(not c.used for c in data.settings.cautions) and by_direction:
         return None, "see the first caution: a learned antenna that the flight file names is not used"
     # learned antennas miss some decibels of any flight
     if cause is not None or data.settings.antennas or not gains_by_direction(evidence):
         return cause, None
     return None, _CALIBRATE
+
+
+def _late_clock(evidence: Sequence[LevelEvidence], towers: Sequence[str]) -> Cause | None:
+    """Return the radio clocks that are late, if correcting them lowers the error of their towers as printed."""
+    late: dict[str, str] = {}
+    for tower in dict.fromkeys(towers):
+        here = [e for e, at in zip(evidence, towers, strict=True) if at == tower]
+        clock = here[0].clock
+        if clock is not None and clock.shifted and fall_without_lag_db(here) >= SHOWN_DB:
+            late[tower] = f"The radio clock at {tower} is {clock.in_words}"
+    if not late:
+        return None
+    others = sorted(set(towers) - set(late))
+    only = f"; those at {', '.join(others)} are not" if others else ""
+    return Cause(name="clock", sentence=f"{'. '.join(late.values())}{only}.", next_step="`rss: {lag: apply}`")
 
 
 _CALIBRATE = "`aerpaw-cmp calibrate FLIGHT FLIGHT` with two flights of this site"
@@ -107,8 +136,11 @@ SIMULATED = Cause(
 )
 
 
-def heights_meant(telemetry: Stream) -> str:
-    """Unit of heights where logged speeds fit the track along the ground but not upwards, in words; else empty."""
+def heights_meant(telemetry: Stream) -> str | None:
+    """Return the meaning of heights whose changes do not fit the logged vertical speed, in words.
+
+    Empty if they fit as they are; None if the speeds do not decide.
+    """
     rows, time_s, place_m = path_of(telemetry.frame)
     speed_mps = telemetry.frame[list(_SPEED)].to_numpy(np.float64)[rows] * [1.0, 1.0, -1.0]
     step_s, flown = np.diff(time_s)[:, None], np.diff(place_m, axis=0)
@@ -116,12 +148,13 @@ def heights_meant(telemetry: Stream) -> str:
     near = np.isfinite(told).all(axis=1) & (step_s[:, 0] > 0.0) & (step_s[:, 0] < _LONG_STEP_S)
     flown, told = flown[near], told[near]
     if min(np.abs(told[:, :2]).sum(), np.abs(told[:, 2]).sum()) < _LEAST_PATH_M:
-        return ""
+        return None
     # speeds of another unit are so along the ground, too
     along, upwards = ((flown[:, axes] * told[:, axes]).sum() / np.square(told[:, axes]).sum() for axes in (slice(2), 2))
-    alike = upwards * (flown[:, 2] @ told[:, 2]) > _ALIKE * (flown[:, 2] @ flown[:, 2])
-    fits = [meaning for meaning, to_m in _HEIGHTS.items() if alike and abs(upwards * to_m - along) < _AS_TOLD * along]
-    return fits[0] if fits else ""
+    if upwards * (flown[:, 2] @ told[:, 2]) <= _ALIKE * (flown[:, 2] @ flown[:, 2]):
+        return None
+    meanings = {"": 1.0, **_HEIGHTS}
+    return next((m for m, to_m in meanings.items() if abs(upwards * to_m - along) < _AS_TOLD * along), None)
 
 
 # The log of another unit, by what its heights have to be multiplied with.
@@ -132,7 +165,36 @@ _AS_TOLD, _ALIKE, _LONG_STEP_S, _LEAST_PATH_M = 0.2, 0.5, 3.0, 10.0
 _SPEED = ("velocity_east_mps", "velocity_north_mps", "velocity_down_mps")
 
 
-def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: RssResult) -> LevelEvidence:
+_Compared = tuple[RssSeries, Replayed, RssResult]
+
+
+def _with_other(
+    e: LevelEvidence, own: _Compared, compared: Sequence[_Compared], evidence: Sequence[LevelEvidence]
+) -> LevelEvidence:
+    """Return the evidence with the change of the level if the log is that of the other channel of its tower."""
+    pairs = zip(compared, evidence, strict=True)
+    others = [o for (series, _, _), o in pairs if series.tower == own[0].tower and o is not e and o.unit == e.unit]
+    if len(others) != 1 or len(others[0].time_s) < 2:
+        return e
+    start_s = (e.start - others[0].start) / np.timedelta64(1, "s")
+    other_db = np.interp(e.time_s + start_s, others[0].time_s, others[0].predicted_db)
+    return dataclasses.replace(e, swapped_db=other_db - e.predicted_db)
+
+
+def _usual_db(data: FlightData, series: RssSeries) -> tuple[float, float]:
+    """Return the RMSE of held-out flights of the learned antennas: mean, and mean + 2 SD [dB]; NaN without such."""
+    errors = errors_elsewhere(data.settings.antennas, series, data.folder)
+    # six held-out series of one campaign: 3.2 to 3.9 dB
+    return (math.nan, math.nan) if errors is None else (errors.rmse_db, errors.rmse_db * (1.0 + 2.0 * _USUAL_SD))
+
+
+_USUAL_SD = 0.08
+
+
+def _evidence(
+    data: FlightData, series: RssSeries, replayed: Replayed, result: RssResult, *, scaled: bool = True
+) -> LevelEvidence:
+    """Return the evidence of a series, levels as the page scores them; ``scaled``: heights may have another unit."""
     link = _Direct(data.site, series.tower, replayed)
     known_db = link.level_db
     time_s = rss.seconds(series.time)
@@ -141,11 +203,18 @@ def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: R
     def at_samples(values: FloatArray) -> FloatArray:
         return replayed.spread(values)[order]
 
+    lock = lock_lost(result)
+    simulated_db, floor_db = result.simulated_dbm[order], -math.inf
+    measured_db = result.measured_db[order]
+    if lock is not None:  # both sides no lower than the floor, as the page scores them
+        floor_db, measured_db = lock.floor_db + lock.offset_db, np.maximum(measured_db, lock.floor_db)
+    predicted = np.maximum(simulated_db, floor_db)
+
     def changed(levels_db: Mapping[_Key, FloatArray]) -> dict[_Key, FloatArray]:
-        return {key: at_samples(level - known_db) for key, level in levels_db.items()}
+        levels = {key: at_samples(level - known_db) + simulated_db for key, level in levels_db.items()}
+        return {key: np.maximum(level, floor_db) - predicted for key, level in levels.items()}
 
     directions = link.directions(link.place_m, replayed.poses.position_m, replayed.poses.rotation)
-    predicted = result.simulated_dbm[order]
     patterns = replayed.link.uav_array.patterns
     kinds = {"learned": any(isinstance(p, SpherePattern) for p in patterns) or replayed.learned is not None,
              "isotropic": all(isinstance(p, Isotropic) for p in patterns), "measured": True}  # fmt: skip
@@ -155,7 +224,7 @@ def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: R
         start=series.time.min() if len(series.time) else np.datetime64(0, "s"),
         antenna=next(name for name, holds in kinds.items() if holds),
         time_s=time_s[order],
-        measured_db=result.measured_db[order],
+        measured_db=measured_db,
         predicted_db=predicted,
         place_m=result.position_m[order],
         uav_azimuth_deg=at_samples(directions["uav_azimuth_deg"]),
@@ -164,11 +233,17 @@ def _evidence(data: FlightData, series: RssSeries, replayed: Replayed, result: R
         turned_db=changed(link.turned_db()),
         raised_db=changed(link.raised_db()),
         attitude_db=changed(link.attitude_db(data.settings.rt.attitude)),
-        misread_db=changed(link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid])),
+        misread_db=changed(
+            link.misread_db(data, telemetry_time(series.time, replayed.clock)[replayed.valid], scaled=scaled)
+        ),
         other_towers_db={name: predicted + change for name, change in changed(link.other_towers_db()).items()},
         locked=None if series.locked is None else series.locked[order],
         serving=None if series.serving is None else series.serving[order],
         clock=None if replayed.clock is None else replayed.clock.result,
+        limits_known=lock is not None,
+        usual_db=_usual_db(data, series),
+        distance_db=at_samples(link.distance_db),
+        displaced_db=changed(link.displaced_db(known_db)),
         floored=any("floor_db" in data.settings.logs[log].model_fields_set for log in np.unique(series.log)),
     )
 
@@ -218,13 +293,40 @@ class _Direct:
             if mode != used
         }
 
-    def misread_db(self, data: FlightData, time: Times) -> dict[str, FloatArray]:
-        """Levels with telemetry that means something else, at the instants of the poses (m,)."""
+    @property
+    def distance_db(self) -> FloatArray:
+        """Free space alone."""
+        link = self.replayed.link
+        position_m = self.replayed.poses.position_m
+        return np.asarray(free_space_dbm(self.place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0])
+
+    def displaced_db(self, known_db: FloatArray) -> dict[tuple[float, float], FloatArray]:
+        """Return levels with the tower elsewhere, by distance [m] and azimuth [deg]; ``known_db`` with it in place."""
+        poses = self.replayed.poses
+        n = len(poses.position_m)
+        if not n:
+            return {}
+        # a change varies slowly along the track: so many poses, and straight lines between them
+        at = np.unique(np.linspace(0, n - 1, min(n, _DISPLACED_POSES)).astype(np.int64))
+        position_m, rotation = poses.position_m[at], poses.rotation[at]
+        levels = {}
+        for radius, azimuth in product(_RADII_M, _AZIMUTHS_DEG):
+            turn = math.radians(azimuth)
+            place_m = self.place_m + radius * np.array([math.sin(turn), math.cos(turn), 0.0])
+            change = self._level(place_m, position_m, rotation) - known_db[at]
+            levels[radius, azimuth] = known_db + np.interp(np.arange(n), at, change)
+        return levels
+
+    def misread_db(self, data: FlightData, time: Times, *, scaled: bool = True) -> dict[str, FloatArray]:
+        """Return levels with telemetry that means something else, at the instants of the poses (m,)."""
         poses, track, used = self.replayed.poses, self.replayed.track, data.settings.rt.attitude
         if data.track is None or track is None:
             return {}
         ground_m, levels = data.track.ground_m, {}
-        for meaning, scale in _HEIGHTS.items():
+        mirrored_m = poses.position_m.copy()
+        mirrored_m[:, :2] = mirrored_m[0, :2] + (mirrored_m[:, :2] - mirrored_m[0, :2])[:, ::-1]
+        levels[_MIRRORED] = self._level(self.place_m, mirrored_m, poses.rotation)
+        for meaning, scale in _HEIGHTS.items() if scaled else ():
             place = np.column_stack([poses.position_m[:, :2], ground_m + scale * (poses.position_m[:, 2] - ground_m)])
             levels[meaning] = self._level(self.place_m, place, poses.rotation)
         if used != "ignored" and self._has_pattern and track.attitude_known.any():
@@ -258,5 +360,9 @@ class _Direct:
         return np.asarray(free_space_dbm(place_m, position_m, link.carrier_hz, link.transmit_power_dbm)[:, 0] + gain)
 
 
+_MIRRORED = "east and north of the track are swapped"
+# Places of the tower that are tried, and poses at which they are.
+_RADII_M, _AZIMUTHS_DEG = (25.0, 40.0, 65.0, 105.0, 170.0, 275.0), tuple(22.5 * i for i in range(16))
+_DISPLACED_POSES = 300
 # A track under another datum may begin so far below the ground [m].
 _BELOW_GROUND_M = 20.0

@@ -12,6 +12,7 @@ import numpy as np
 
 from ..common.text import counted
 from ..common.units import AnyArray, Printed
+from ..compare.causes import FEWEST_SAMPLES
 from ..compare.ladder import LadderRow, costs
 from ..compare.level import DetectionScore, ErrorSpan
 from ..compare.receiver import ForecastScore
@@ -211,6 +212,8 @@ def expected_sentence(panels: Sequence[RssResult]) -> str:
 
 
 NO_CAUSE = "No likely cause was identified."
+FEW_SAMPLES = "No cause can be identified in fewer than {n} samples."
+TWO_LEVELS = "No cause can be identified: the log has two levels only."
 ONE_PLACE = "No model predicts a change of 1 dB, as at one place: this flight tells no models apart."
 BEYOND_SPAN = "No error can be given: the best offset lies beyond the searched span."
 BEYOND = "The best offset of {name} lies beyond the searched span."
@@ -552,7 +555,7 @@ def paragraph(data: ReportData) -> str:
     elif error and data.against is not None and data.against.scores:
         parts = [error, before_flight(data.against.scores), advice]
     elif error:
-        none = ONE_PLACE if is_one_place(panels) else NO_CAUSE if panels else ""
+        none = _without_cause(data.verdict, panels) if panels else ""
         # the step of such a flight is a wider span, whatever its cause
         beyond = next((BEYOND.format(name=p.name) for p in data.rss if p.score.at_edge), "")
         cause = beyond or data.cause or none
@@ -570,6 +573,22 @@ def _level_sentence(pooled: FlightVerdict | None, panels: Sequence[RssResult]) -
     if pooled is None:
         return f"Ray tracing: RMSE {_pooled(panels):.1f} dB. No baseline could be scored."
     return flight_sentence(pooled, next((lock.floor_db for p in panels if (lock := lock_lost(p))), None))
+
+
+# After an error of so few decibels a sentence on its cause reads like a fault.
+_SMALL_ERROR_DB = 3.0
+
+
+def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) -> str:
+    """Return the sentence of a flight without a likely cause; none after a good result."""
+    if is_one_place(panels):
+        return ONE_PLACE
+    if pooled is not None and (pooled.rmse_db <= _SMALL_ERROR_DB or pooled.ci95_db[1] < 0.0):
+        return ""
+    if max(panel.score.n for panel in panels) < FEWEST_SAMPLES:
+        return FEW_SAMPLES.format(n=FEWEST_SAMPLES)
+    levels = [np.unique(panel.measured_db[np.isfinite(panel.measured_db)]) for panel in panels]
+    return TWO_LEVELS if all(len(of) == 2 for of in levels) else NO_CAUSE
 
 
 def _training(data: ReportData) -> str:

@@ -222,12 +222,14 @@ def test_what_learned_antennas_miss_on_any_flight_is_no_cause(antenna: str, name
     assert _named(replace(sound, measured_db=sound.measured_db + wave, antenna=antenna)) == named
 
 
-def test_troubles_that_explain_the_same_error_are_not_told_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_causes_that_explain_the_same_error_are_both_named(monkeypatch: pytest.MonkeyPatch) -> None:
     sound = _sound()
     wave = 5.0 * np.cos(sound.time_s / 9.0)
     twins = [Trial(name=name, cost=1.0, sentence=name, next_step="", change_db=wave) for name in ("first", "second")]
     monkeypatch.setattr(causes, "CANDIDATES", (lambda _: iter(twins),))
-    assert _named(replace(sound, measured_db=sound.measured_db + wave)) == NONE
+    both = flight_cause([replace(sound, measured_db=sound.measured_db + wave)])
+    assert both is not None
+    assert (both.name, " first, or second; " in both.sentence) == ("first or second", True)
     monkeypatch.setattr(causes, "CANDIDATES", (lambda _: iter(twins[:1]),))
     assert _named(replace(sound, measured_db=sound.measured_db + wave)) == "first"
 
@@ -390,3 +392,82 @@ def test_a_second_is_the_mean_of_its_samples_and_directions_turn_the_short_way()
     turned = [np.degrees(np.angle(np.exp(1j * np.radians(around[rows])).mean())) for rows in seconds]
     np.testing.assert_allclose(binned.tower_azimuth_deg, turned)
     np.testing.assert_allclose(np.exp(1j * np.radians(binned.uav_azimuth_deg)), np.exp(1j * np.radians(turned)))
+
+
+def test_a_displaced_tower_is_no_error_of_height_and_has_its_side() -> None:
+    """The tower is 170 m north of its true place: the true one is south of that of the files."""
+    sound = _sound()
+    place = np.column_stack(
+        [200.0 * np.sin(sound.time_s / 37.0), 250.0 * np.cos(sound.time_s / 61.0), 40.0 + 0.0 * sound.time_s]
+    )
+
+    def level(tower: np.ndarray) -> np.ndarray:
+        return np.asarray(-20.0 * np.log10(np.linalg.norm(place - tower, axis=1)))
+
+    logged = np.array([0.0, 170.0, 10.0])
+    displaced = {
+        (radius, azimuth): level(
+            logged + radius * np.array([np.sin(np.radians(azimuth)), np.cos(np.radians(azimuth)), 0.0])
+        )
+        - level(logged)
+        for radius in (40.0, 65.0, 105.0, 170.0, 275.0)
+        for azimuth in np.arange(0.0, 360.0, 22.5)
+    }
+    raised = {rise: level(logged - [0.0, 0.0, rise]) - level(logged) for rise in (-15.0, 15.0, 40.0, 100.0, 150.0)}
+    noise = sound.measured_db - sound.predicted_db
+    e = replace(
+        sound, predicted_db=level(logged), measured_db=level(np.array([0.0, 0.0, 10.0])) + noise, place_m=place,
+        displaced_db=displaced, raised_db=raised, turned_db={}, other_towers_db={},
+    )  # fmt: skip
+    cause = flight_cause([e])
+    assert cause is not None
+    assert (cause.name, "south of its place" in cause.sentence) == ("place", True)
+    assert cause.estimate == pytest.approx(170.0, abs=30.0)
+    assert _named(replace(e, measured_db=e.predicted_db + noise)) == NONE
+
+
+def test_a_clock_that_drifts_is_no_constant_lag() -> None:
+    sound = _sound(n=600)
+    late = np.interp(0.98 * sound.time_s, sound.time_s, sound.predicted_db) + sound.measured_db - sound.predicted_db
+    cause = flight_cause([replace(sound, measured_db=late, clock=_clock(6.1, "shifted"))])
+    assert cause is not None
+    assert (cause.name, "gains 2.0 % (12 s in 599 s)" in cause.sentence) == ("clock", True)
+
+
+def test_channels_that_are_swapped_are_named() -> None:
+    sound = _sound()
+    change = 5.0 * np.cos(np.radians(3.0 * sound.uav_azimuth_deg))
+    assert _named(replace(sound, measured_db=sound.measured_db + change, swapped_db=change)) == "channels"
+
+
+def test_an_exponent_of_the_distance_or_a_gain_over_elevation_is_no_unit() -> None:
+    """A walk between houses: exponent 4, while all else changes by its decibels."""
+    sound = _sound()
+    distance = 6.0 * np.sin(sound.time_s / 31.0)
+    e = replace(sound, predicted_db=distance, distance_db=distance + 2.0 * np.cos(np.radians(sound.uav_azimuth_deg)))
+    noise = sound.measured_db - sound.predicted_db
+    assert _named(replace(e, measured_db=noise + 0.5 * distance)) == "decibels"
+    for slope in (0.62, 1.7):  # neither half nor twice
+        assert _named(replace(e, measured_db=noise + slope * distance)) != "decibels"
+    antenna = 6.0 * np.cos(np.radians(3.0 * sound.uav_azimuth_deg))
+    walk = replace(e, predicted_db=distance + antenna, distance_db=distance, turned_db={})
+    assert _named(replace(walk, measured_db=noise + antenna + 2.0 * distance)) != "decibels"
+
+
+def test_a_cause_brings_the_error_back_to_that_of_other_flights() -> None:
+    """A wave over directions beside a wave of time: the antenna explains a part, and less than is usual."""
+    sound = _sound()
+    pattern, time = 4.0 * np.sin(np.radians(2 * sound.uav_azimuth_deg)), 4.0 * np.sign(np.sin(sound.time_s / 17.0))
+    e = replace(sound, antenna="learned", measured_db=sound.measured_db + pattern)
+    for more, usual, named in ((0.0, 1.5, "pattern"), (time, 1.5, NONE), (0.0, 4.0, NONE)):
+        seen = replace(e, measured_db=e.measured_db + more, usual_db=(0.9 * usual, usual))
+        assert _named(seen) == named
+
+
+@pytest.mark.parametrize("levels", ["few", "two"])
+def test_too_few_samples_or_levels_have_no_cause(levels: str) -> None:
+    stepped = _planted()["gain step"]
+    assert _named(stepped) == "gain step"
+    coarse = np.where(stepped.measured_db > np.median(stepped.measured_db), -60.0, -70.0)
+    few = np.where(np.arange(300) % 4 == 0, stepped.measured_db, np.nan)
+    assert _named(replace(stepped, measured_db=few if levels == "few" else coarse)) == NONE

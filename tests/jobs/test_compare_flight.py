@@ -34,26 +34,37 @@ from tests.tables import LW1, ORIGIN, POSITIONS, eastwards, rank_log, rss_log, w
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
 
-def test_a_clock_that_is_no_cause_of_the_error_is_still_the_first_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Sentence, warning and table have one clock; nothing is asked where it was corrected."""
-    for name in ("_evidence", "gains_by_direction"):
-        monkeypatch.setattr(likely_cause, name, lambda *_: None)
-    for shifted, other, first in (
-        (True, None, True),
-        (True, "pattern", True),
-        (True, "lock", False),
-        (False, None, False),
+def test_a_late_clock_is_the_first_step_where_it_lowers_the_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Sentence, warning and table have one clock; nothing is asked where it was corrected, or where it changes nothing."""
+    monkeypatch.setattr(likely_cause, "gains_by_direction", lambda *_: None)
+    monkeypatch.setattr(likely_cause, "_with_other", lambda e, *_: e)
+    for shifted, other, fall_db, first in (
+        (True, None, 0.4, True),
+        (True, None, 0.02, False),
+        (True, "pattern or blocked", 0.4, True),
+        (True, "lock", 0.4, False),
+        (False, None, 0.4, False),
     ):
-        clock = SimpleNamespace(shifted=shifted, in_words="0.40 s ahead")
+        late = SimpleNamespace(clock=SimpleNamespace(shifted=shifted, in_words="0.40 s ahead"))
+        right = SimpleNamespace(clock=SimpleNamespace(shifted=False))
         named = None if other is None else Cause(name=other, sentence="", next_step="")
         monkeypatch.setattr(likely_cause, "flight_cause", lambda _, named=named: named)
-        data: Any = SimpleNamespace(
-            files=[], rss=[SimpleNamespace(tower="LW1")], settings=SimpleNamespace(antennas={}, cautions=())
+        monkeypatch.setattr(likely_cause, "fall_without_lag_db", lambda _, fall_db=fall_db: fall_db)
+        monkeypatch.setattr(
+            likely_cause, "_evidence", lambda _, s, *__, of={"LW1": late, "LW2": right}, **___: of[s.tower]
         )
-        replays: Any = SimpleNamespace(rss=[SimpleNamespace(tower_m=None, clock=SimpleNamespace(result=clock))])
-        result: Any = SimpleNamespace(name="LW1 A", measured_db=np.zeros(9), training=False)
-        cause, _ = likely_cause.cause_of(data, replays, [result])
-        assert (cause is not None and cause.sentence == "The radio clock at LW1 is 0.40 s ahead.") == first
+        data: Any = SimpleNamespace(
+            files=[], rss=[SimpleNamespace(tower=name) for name in ("LW1", "LW2")],
+            settings=SimpleNamespace(antennas={}, cautions=()),
+        )  # fmt: skip
+        replays: Any = SimpleNamespace(rss=[SimpleNamespace(tower_m=None)] * 2)
+        results: Any = [
+            SimpleNamespace(name=f"{name} A", measured_db=np.arange(9.0) * i, training=False)
+            for i, name in enumerate(("LW1", "LW2"), 1)
+        ]
+        cause, _ = likely_cause.cause_of(data, replays, results)
+        said = "The radio clock at LW1 is 0.40 s ahead; those at LW2 are not."
+        assert (cause is not None and (cause.sentence, cause.next_step) == (said, "`rss: {lag: apply}`")) == first
 
 
 FLOOR_DB = -758.6  # what the sounder writes without a signal

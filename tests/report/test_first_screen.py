@@ -23,9 +23,12 @@ from aerpaw_cmp.report.diff import DIFFERENCE
 from aerpaw_cmp.report.flight import metrics
 from aerpaw_cmp.report.flight_words import (
     AS_SET,
+    FEW_SAMPLES,
     MOST_WORDS,
+    NO_CAUSE,
     OFFSETS,
     ONE_PLACE,
+    TWO_LEVELS,
     Judged,
     cautions,
     first_sentence,
@@ -284,6 +287,29 @@ def test_a_flight_at_one_place_tells_no_models_apart(report_data):
     for panels, said in ((still, True), (report_data.rss, False)):
         text = paragraph(dataclasses.replace(report_data, rss=tuple(panels), likely_cause=None))
         assert (ONE_PLACE in text) == said
+
+
+def test_a_good_result_says_nothing_about_causes(report_data):
+    """An error of 2 dB, or one below that of the best baseline, is no fault; few samples and two levels have a reason."""
+    verdict, panel = report_data.verdict, report_data.rss[0]
+    few = dataclasses.replace(panel, score=dataclasses.replace(panel.score, n=60))
+    two = dataclasses.replace(
+        panel, measured_db=np.where(panel.measured_db > np.nanmedian(panel.measured_db), -60.0, -70.0)
+    )
+    for rmse_db, low, high, one, said in (
+        (2.0, -0.1, 0.4, panel, ""),
+        (7.0, -1.0, -0.2, panel, ""),
+        (7.0, -0.1, 0.4, panel, NO_CAUSE),
+        (7.0, -0.1, 0.4, few, FEW_SAMPLES.format(n=100)),
+        (7.0, -0.1, 0.4, two, TWO_LEVELS),
+    ):
+        judged = dataclasses.replace(verdict, rmse_db=rmse_db, ci95_db=(low, high))
+        text = paragraph(
+            dataclasses.replace(report_data, rss=(one,), verdict=judged, likely_cause=None, next_step=None)
+        )
+        assert [word for word in (NO_CAUSE, FEW_SAMPLES.format(n=100), TWO_LEVELS) if word in text] == [said] * bool(
+            said
+        )
 
 
 def test_at_most_four_numbers_each_with_something_beside_it(report_data):

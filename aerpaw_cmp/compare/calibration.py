@@ -739,6 +739,8 @@ class Correction:
     rmse_db : mapping of (base, title) to float
     held_out : mapping of (base, title) to ((n,), (n,))
         Errors on what was left out, in one order for all, and the standard deviations stated for them; NaN: no error.
+    held_out_parts : tuple of (str, int)
+        Flight and number of samples of each tower and channel in ``held_out``, in its order.
     sd_factor : float
         On all standard deviations: makes the errors of what was left out as large as stated. Each candidate of
         ``held_out`` has its own.
@@ -753,6 +755,7 @@ class Correction:
     crps_db: Mapping[tuple[str, str], float]
     rmse_db: Mapping[tuple[str, str], float]
     held_out: Mapping[tuple[str, str], _HeldOut] = field(default_factory=dict)
+    held_out_parts: tuple[tuple[str, int], ...] = ()
     sd_factor: float = 1.0
     fits: dict[str, FieldFit] = field(default_factory=dict, repr=False, compare=False)
     """Solved fields by antenna."""
@@ -961,6 +964,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
                 many = len({s.flight for s in series}) > MOST_GROUPS
                 _score_fold(fold, base, models, {t: tallies[name, t] for t in titles}, keep=many)
     joined = {key: _joined(parts) for key, parts in tallies.items() if parts}
+    left_out = [s.flight for fold in folds if fold.known for s in fold.left_out if np.isfinite(s.residual_db).any()]
     # scaled before they are scored: CRPS then compares errors, not how badly spreads are stated
     factors = {key: _sd_factor(*errors) for key, errors in joined.items()}
     held_out = {key: (error, factors[key] * sd) for key, (error, sd) in joined.items()}
@@ -982,6 +986,7 @@ def choose(series: Sequence[LinkSamples], bases: Mapping[str, Base], titles: Seq
         rmse_db=dict.fromkeys(tallies, math.nan)
         | {key: math.sqrt(_mean(np.square(error))) for key, (error, _) in held_out.items()},
         held_out=held_out,
+        held_out_parts=tuple((name, len(part[0])) for name, part in zip(left_out, tallies[best], strict=True)),
         sd_factor=factors.get(best, 1.0),
     )
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ..common.units import FloatArray
 from ..compare.calibration import OFF, Correction, crps_difference
 from ..compare.receiver import ForecastScore
 from ..compare.statistics import mean_interval, paired_difference
-from ..compare.verdict import Verdict, stated_errors
+from ..compare.verdict import Verdict, by_flight, stated_errors
 from ..site.learned import Entry, LearnedSeries
 from ..site.site import Site
 from .against import AgainstSeries
@@ -58,14 +58,15 @@ AGAINST_FREE_SPACE = {
         "",
     ),
     "no interval": ("The flight is too short for an interval of the difference from free space.", ""),
+    "two flights": (
+        "On {over} left out the RMSE differs from free space by {effect:+.1f} dB; two flights give no interval.",
+        "",
+    ),
 }
 
 # The residual field, by the interval of the difference of the CRPS; ``off`` where it holds zero.
 FIELD = {
-    "better": (
-        "The residual field is on: it lowers the CRPS by {size:.2f} dB (95 %: {high:+.2f} to {low:+.2f} dB).",
-        "",
-    ),
+    "better": ("The residual field is on: it lowers the CRPS by {size:.2f} dB on held-out samples.", ""),
     "worse": ("The residual field is off: it raises the CRPS by {size:.2f} dB on held-out samples.", ""),
     "off": ("The residual field is off: the CRPS differs by {size:.2f} dB, not significantly.", ""),
 }
@@ -244,12 +245,24 @@ def _inside_share(error: FloatArray, sd: FloatArray) -> float:
 
 
 def _against_free_space(correction: Correction) -> Verdict:
-    """The chosen model and free space on the same samples that were left out."""
+    """Compare the chosen model with free space on what was held out: by flight, or by the blocks of one flight."""
     error, free_space = (
         correction.held_out[key][0] for key in ((correction.base, correction.title), ("free space", OFF))
     )
+    if len(correction.flights) > 1:
+        # a mean over few flights, as of calibrate: samples of one flight share its offset and its weather
+        verdict = by_flight(*(_by_part(errors, correction.held_out_parts) for errors in (error, free_space)))
+        return replace(verdict, cause="two flights") if verdict.cause == "no interval" else verdict
     pair = paired_difference(error, free_space, free_offset=False)
     return Verdict(cause=pair.verdict, effect=pair.difference_db, interval=pair.difference_ci95_db)
+
+
+def _by_part(error: FloatArray, parts: Sequence[tuple[str, int]]) -> Iterator[tuple[str, float]]:
+    """Yield flight and RMSE [dB] of each part of held-out errors (n,)."""
+    ends = np.cumsum([size for _, size in parts])
+    for (flight, _), part in zip(parts, np.split(error, ends[:-1]), strict=True):
+        known = part[np.isfinite(part)]
+        yield flight, float(np.sqrt(np.mean(known**2))) if len(known) else float("nan")
 
 
 def field(correction: Correction) -> Verdict:

@@ -150,6 +150,7 @@ def test_a_field_that_helps_by_chance_stays_off() -> None:
 
 def test_headings_that_count_alike_add_their_spread() -> None:
     choice = choose([flight(name, k) for k, name in enumerate("ab")], {"made": fixed_base(gain)})
+    assert choice.held_out_parts == (("a", 80), ("b", 80))
     here = flight("n", 5)
     turned = dataclasses.replace(
         here, position_m=here.position_m + np.array([100.0, 0.0, 0.0])

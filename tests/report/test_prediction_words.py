@@ -15,7 +15,9 @@ from aerpaw_cmp.report.prediction import FIELD, FLOWN, after_flight, cautions, f
 FREE, LEARNED, WITH_FIELD = ("free space", OFF), ("learned", OFF), ("learned", "field of 2 dB, 30 m")
 
 
-def correction(key: tuple[str, str], errors: dict[tuple[str, str], float], sd: float) -> Correction:
+def correction(
+    key: tuple[str, str], errors: dict[tuple[str, str], float], sd: float, flights: tuple[str, ...] = ("a", "b", "c")
+) -> Correction:
     """Independent errors of 600 samples with these standard deviations, all stated as ``sd``."""
     unit = np.random.default_rng(6).standard_normal((3, 600))
     held: dict[tuple[str, str], Any] = {
@@ -23,7 +25,8 @@ def correction(key: tuple[str, str], errors: dict[tuple[str, str], float], sd: f
     }
     return Correction(
         base=key[0], predictor=lambda s: (np.zeros(len(s)), np.zeros(len(s))), title=key[1], model=FieldModel(),
-        channels={}, flights=("a", "b"), crps_db=dict(errors), rmse_db=dict(errors), held_out=held,
+        channels={}, flights=flights, crps_db=dict(errors), rmse_db=dict(errors), held_out=held,
+        held_out_parts=tuple((name, 600 // len(flights)) for name in flights),
     )  # fmt: skip
 
 
@@ -50,6 +53,17 @@ def test_equal_models_are_called_neither_better_nor_worse() -> None:
     assert "is not significant (95 %)" in words
     assert "better" not in words
     assert "worse" not in words
+
+
+def test_two_flights_give_no_interval_as_in_a_calibration() -> None:
+    """However many samples they have: 600 independent ones would bound the difference to some tenths of a decibel."""
+    errors = {FREE: 6.0, LEARNED: 3.0, WITH_FIELD: 3.1}
+    words = first_words(correction(LEARNED, errors, 3.0, ("a", "b")), 0.0, 4.2, 7.5)
+    assert re.search(r"differs from free space by −?-?[23]\.\d dB; two flights give no interval", words)
+    assert "95 %" not in words
+    single = first_words(correction(LEARNED, errors, 3.0, ("a",)), 0.0, 4.2, 7.5)
+    assert "On 300 m blocks left out it is" in single
+    assert "(95 %)" in single
 
 
 @pytest.mark.parametrize(("sd", "said"), [(1.5, "too narrow: errors are 2.0 times"), (6.0, "too wide: errors are 0.5")])

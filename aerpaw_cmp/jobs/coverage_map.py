@@ -46,6 +46,7 @@ from ..maps.evaluate import (
     Study,
     blocked,
     interpolation_study,
+    paper_scores,
     rank_fields,
 )
 from ..maps.export import maps_dataset
@@ -386,6 +387,9 @@ def level_sd_db(h: ComplexArray) -> FloatArray:
 
 # --- the job -------------------------------------------------------------------------------------------------------
 
+# Draws of M random samples: the number of wins of an interpolator depends on the draw.
+DRAWS = 10
+
 
 @dataclass(slots=True)
 class MapOutcome:
@@ -393,13 +397,15 @@ class MapOutcome:
 
     ``maps`` by foliage mode; of a map in tiles some positions, as ``tiles`` says. ``studies``: positions out of
     coverage as no sample ("missing"), as rank 0 ("zero"), and as rank 0 with M random samples within the radius in
-    place of the M nearest ("random"). ``blocks``: errors of each interpolator with square blocks left out whole.
+    place of the M nearest ("random"). ``draws``: scores of "random" for each of :data:`DRAWS` draws. ``blocks``:
+    errors of each interpolator with square blocks left out whole.
     """
 
     site: Site
     settings: MapSettings
     maps: dict[str, job.MapResult] = field(default_factory=dict)
     studies: dict[str, Study] = field(default_factory=dict)
+    draws: list[Mapping[str, Score]] = field(default_factory=list)
     blocks: dict[str, Score] = field(default_factory=dict)
     correlations: dict[str, BinnedCorrelation] = field(default_factory=dict)
     paths: int = 0
@@ -570,7 +576,11 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
         zeros, towers = rank_fields(result, "zero")[1], result.towers_m
         outcome.studies["missing"] = interpolation_study(result.grid, rank, towers, **local)
         outcome.studies["zero"] = interpolation_study(result.grid, zeros, towers, **local)
-        outcome.studies["random"] = interpolation_study(result.grid, zeros, towers, selection="random", **local)
+        random = outcome.studies["random"] = interpolation_study(
+            result.grid, zeros, towers, selection="random", **local
+        )
+        further = [{**local, "selection": "random", "seed": s.seed + draw} for draw in range(1, DRAWS)]
+        outcome.draws = [random.scores, *(paper_scores(result.grid, zeros, random.fit, **rule) for rule in further)]
     with stages("correlation"):
         points, width = result.grid.points_m, s.spacing_m
         outcome.correlations = {

@@ -14,7 +14,7 @@ import yaml
 
 from ..common.text import counted
 from ..common.units import finite_mean, power_from_db
-from ..maps.evaluate import rank_fields
+from ..maps.evaluate import kriging_wins, rank_fields
 from ..maps.grid import PAPER_BUDGET, Antennas
 from ..report.maps import PaperRow
 from ..report.texts import k_key
@@ -163,9 +163,11 @@ def _interpolation(outcome: MapOutcome) -> dict[str, str]:
         for measure in ("mae", "rmse"):
             means = [f"{name} {finite_mean(getattr(scores[name], measure)):.3f}" for name in names]
             ours[f"{measure}_{key}"] = ", ".join(means)
-        kriging, makima, spline = (scores[name].mae for name in names)
-        ours[f"wins_{key}"] = f"{int(((kriging <= makima) & (kriging <= spline)).sum())} of {kriging.size}"
     mae = outcome.studies["random"].scores["Kriging"].mae
+    ours["wins_zero"] = f"{kriging_wins(outcome.studies['zero'].scores)} of {mae.size}"
+    wins = sorted(map(kriging_wins, outcome.draws))
+    many = f"{wins[0]} to {wins[-1]}" if wins[0] < wins[-1] else f"{wins[0]}"
+    ours["wins_random"] = f"{many} of {mae.size} in {len(wins)} draws"
     worst = np.nan_to_num(mae, nan=-1.0).argmax(axis=0)
     ours["mae_by_k"] = _by_k(ks, [finite_mean(column) for column in mae.T], "{:.3f}")
     ours["worst_height"] = _by_k(ks, [heights[i] for i in worst], "{:g} m")

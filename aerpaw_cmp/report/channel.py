@@ -132,7 +132,7 @@ def channel_dataset(channel: Channel) -> Dataset:
         source="ray tracing along a flight",
         comment=" ".join(channel.warnings),
     )
-    ends = {"transmitter": "UAV" if link.uav_transmits else "tower", "trained_on": " ".join(channel.trained_on)}
+    ends = {"transmitter": "UAV" if link.uav_transmits else "tower"}
     data = Dataset(variables, {**written, "carrier_hz": link.carrier_hz,
                                           "transmit_power_dbm": link.transmit_power_dbm, **ends})  # fmt: skip
     described = {name: variable.attrs for name, variable in data.variables.items()}
@@ -141,7 +141,10 @@ def channel_dataset(channel: Channel) -> Dataset:
         start = str(channel.along.start).replace("T", " ")
         described["time"] |= {"long_name": f"since {start} UTC", "units": f"seconds since {start[:19]} UTC"}
     if channel.level_db is not None:
-        described["level_db"]["comment"] = f"unit: {channel.level_unit}"
+        described["level_db"]["comment"] = f"unit: {channel.level_unit}; the paths and H do not use what was learned"
+        # of the levels alone: no other variable of the file is learned from logs
+        for name in ("level_db", "level_sd_db"):
+            described[name][KEY] = " ".join(channel.trained_on)
     return data
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,7 +19,7 @@ from ..compare.verdict import LevelDifference, Overlap, RankDifference
 from .cards import HEAD, RIGHT, TEXT, Card, Page, Table, bold
 from .flight_words import count
 from .page import json_text, write_file
-from .texts import interval, minute, number
+from .texts import cut, interval, minute, number, short
 
 # Differences up to this count as none: the tables hold four decimals, offsets one.
 TOLERANCE_DB = 0.01
@@ -220,8 +221,24 @@ def changes_card(diff: ReportDiff) -> Card:
     )  # fmt: skip
 
 
+# A hash or a fingerprint of a log.
+_DIGEST = re.compile(r"\b([0-9a-f]{12})[0-9a-f.]{20,}")
+
+
+def in_short(value: Any) -> str:
+    """Return the text of a value, with the first 12 digits of each hash and fingerprint; diff.json has all digits.
+
+    Examples
+    --------
+    >>> in_short(["0123456789abcdef" * 4]), in_short(None), in_short(0.25)
+    ("['0123456789ab…']", 'not there', '0.25')
+    """
+    text = _DIGEST.sub(r"\1…", "not there" if value is None else short(value))
+    return cut(text, 300)
+
+
 def _entries(caption: str, entries: Sequence[Entry]) -> Table:
-    rows = [(Markup("<code>{}</code>").format(one.key), one.first, one.second) for one in entries]
+    rows = [(Markup("<code>{}</code>").format(one.key), in_short(one.first), in_short(one.second)) for one in entries]
     return Table(caption=caption, columns={"Key": HEAD, "First": "entry", "Second": "entry"}, rows=rows)
 
 

@@ -267,6 +267,10 @@ def test_a_flown_flight_gives_the_same_in_a_notebook(tmp_path):
     assert str(flight.track.time.iloc[0])[:19].replace(" ", "T") in book.time.attrs["units"].replace(" ", "T")
     h = complex_of(book, "h")
     assert complex_of(book, "gain").sum(axis=0) == pytest.approx(h, rel=0, abs=1e-12 * np.abs(h).max())
+    # paths of a synthetic flight are not learned from logs of real flights; the calibrated levels are
+    assert "trained_on" not in book.attrs
+    assert {name for name in book.variables if "trained_on" in book[name].attrs} == {"level_db", "level_sd_db"}
+    assert all(len(digest) == 64 for digest in book.level_db.attrs["trained_on"].split())
 
 
 def test_points_without_times_have_no_doppler_and_a_site_without_memory_no_level(folder, capsys):

@@ -86,6 +86,18 @@ def test_one_setting_is_named_by_its_key(pair):
     assert "1 version" in verdict(diff)
 
 
+def test_fingerprints_that_differ_are_printed_by_their_first_digits(pair, capsys):
+    """A fingerprint of a log has 2000 digits; nobody compares those by eye."""
+    fingerprints = ["3501f" + "7a" * 1000 + "f" + "0c" * 256, "3502f" + "6b" * 1000 + "f"]
+    change_metrics(pair[1], lambda m: m["settings"].update(rank={"marks": fingerprints}))
+    assert main(["diff", str(pair[0]), str(pair[1])]) == 0
+    (line,) = (text for text in capsys.readouterr().out.splitlines() if "rank.marks" in text)
+    assert line == "setting rank.marks: not there -> ['3501f7a7a7a7…', '3502f6b6b6b6…']"
+    page = diff_page(run_diff(*pair))
+    assert "3501f7a7a7a7…" in page
+    assert "3501f7a7a7a7a" not in page
+
+
 def test_inputs_are_compared_by_content(pair):
     def change(metrics):
         first, second = metrics["inputs"][:2]

@@ -112,23 +112,19 @@ _SHOWN = 20
 
 
 def _print_diff(comparison: Any) -> None:
-    from ...report.diff import verdict
+    from ...report.diff import in_short, verdict
 
     show(verdict(comparison))
     for text in comparison.remarks:
         say.warn(f"warning: {one_line(text)}")
     for title, items in (("setting", comparison.settings), ("version", comparison.versions)):
         for item in items[:_SHOWN]:
-            show(one_line(f"{title} {item.key}: {_value(item.first)} -> {_value(item.second)}"))
+            show(one_line(f"{title} {item.key}: {in_short(item.first)} -> {in_short(item.second)}"))
         if len(items) > _SHOWN:
             show(f"and {len(items) - _SHOWN} more {title}s")
     for item in comparison.inputs:
         show(one_line(f"input {item.path} ({item.role}): {item.what}"))
     _print_numbers(comparison)
-
-
-def _value(value: Any) -> str:
-    return "not there" if value is None else str(value)
 
 
 def _print_numbers(comparison: Any) -> None:

@@ -93,8 +93,6 @@ class Table:
         ``dense`` for many columns, ``tall`` for many rows.
     notes : sequence of str
         Paragraphs below the table.
-    marked : int, optional
-        Number of the row that is shaded.
     """
 
     caption: str
@@ -102,7 +100,6 @@ class Table:
     rows: Sequence[Sequence[Any]]
     look: str = ""
     notes: Sequence[str] = ()
-    marked: int | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -20,7 +20,8 @@ from . import _pose, _stamps
 _HEADER = re.compile(rb"(?m)^%\s{0,8}(GPST|UTC|JST)[\s,]{1,40}((?:latitude|x-ecef|e-baseline)\([^)\n]{1,9}\))")
 _N = r"[\s,]+(-?\d{1,9}\.\d{1,12})"
 # Day or GPS week, clock or second of the week, latitude, longitude, height, quality, satellites.
-_ROW = re.compile(r"\s*(\d{4}(?:/\d\d/\d\d)?)[\s,]+([\d:.]{1,16})" + 3 * _N + r"[\s,]+(\d)[\s,]+(\d{1,3})\b.*")
+_CLOCK = r"[\s,]+(\d\d:\d\d:\d\d(?:\.\d{1,9})?|\d{1,6}\.?\d{0,9})"
+_ROW = re.compile(r"\s*(\d{4}(?:/\d\d/\d\d)?)" + _CLOCK + 3 * _N + r"[\s,]+(\d)[\s,]+(\d{1,3})\b.*")
 _SCALE_S = {b"GPST": _stamps.LEAP_S, b"UTC": 0, b"JST": 9 * 3600}
 _FIX = dict(zip("123456", "653438", strict=True))
 

@@ -159,7 +159,7 @@ _NOISY, _LEAP = 1.2, 3.0
 
 
 def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> BoolArray:
-    """Return the mask of samples (n,) that repeat a frozen level; the first of each run is a reading.
+    """Return the mask of samples (n,) that repeat a frozen level, without the first of each run.
 
     A smooth level repeats itself where it passes its maximum or reaches the end of its scale, and goes on from there.
     It is frozen only if it leaps as the run ends, or if the series ends there with higher and lower levels before. A
@@ -172,7 +172,7 @@ def frozen(time: AnyArray, level_db: FloatArray, position_m: FloatArray) -> Bool
     level_db : (n,)
         NaN out of coverage.
     position_m : (n, 3)
-        Of the UAV; NaN where the track does not know it.
+        Position of the UAV, NaN if the track does not know it.
     """
     out = np.zeros(len(level_db), dtype=np.bool_)
     same = np.diff(level_db) == 0

@@ -9,11 +9,11 @@ overflow, a sentinel), not what is unusual.
 
 Speeds judge clocks and positions: no small aircraft flies faster than 100 m/s, or gains 10 m/s in a second.
 
-A few positions that the rows around them cannot be reached from in time are jumps of the receiver, flagged and read as
-missing; so is a place at which a log begins or ends without moving, such as the origin of an autopilot's filter.
+A few positions that cannot be reached in time from the rows around them are jumps of the receiver. They are flagged and
+read as missing, as is a place where a log begins or ends without moving: the origin of an autopilot's filter, say.
 Positions that stay the same while the logged speed moves the aircraft on are stale, flagged and read as missing, too.
-A track that is too fast throughout has its times in another unit; one that is in two places at once is of two
-vehicles. Both are reported, and their values stay as they are.
+A track that is too fast throughout has its times in another unit; one that is in two places at once
+belongs to two vehicles. Both are reported, and their values stay as they are.
 """
 
 from __future__ import annotations
@@ -116,7 +116,7 @@ def _speed_mps(time_s: FloatArray, place_m: FloatArray) -> float:
 
 
 class _Reach:
-    """How far an aircraft gets between two rows of a track: not faster than any, nor than its own speed and thrust.
+    """The reach of an aircraft between two rows of a track, by the fastest aircraft and by its own speed and thrust.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class _Reach:
 
     def beyond(self, first: IntArray, second: IntArray) -> BoolArray:
         """Return the mask of pairs of rows that are farther apart than the time between them allows."""
-        # either way in time: a clock that steps back is no jump of the position
+        # the sign of the time does not count: a clock that steps back is not a jump of the position
         seconds = np.abs(self._time_s[second] - self._time_s[first])
         apart_m = self._place_m[second] - self._place_m[first]
         usual_s = np.maximum(seconds, self._interval_s)
@@ -205,9 +205,9 @@ def _comes_back(time_s: FloatArray, place_m: FloatArray) -> bool:
 def _astray(time_s: FloatArray, place_m: FloatArray) -> tuple[BoolArray, BoolArray, float, int]:
     """Rows (n,) off the track, those of them at rest at an end, the greatest speed that the first implies, its number.
 
-    Rows between two fast steps form a run. From the longest run that moves on, in both directions, a run that the
-    track cannot reach in time is off it if it is short, or if the log begins or ends with it and it does not move; any
-    other goes on elsewhere, as after a time without fixes.
+    Rows between two fast steps form a run. The longest run that moves is the track. A run that the track cannot reach
+    in time is off it if it is short, or if it does not move and the log begins or ends with it. Any other run is a
+    continuation elsewhere, as after a time without fixes.
     """
     count = len(time_s)
     astray, at_rest = np.zeros((2, count), dtype=np.bool_)

@@ -116,7 +116,7 @@ def streams(
             about["arfcn"] = int(carrier) if np.isfinite(carrier) else None
             words = [rat, f"pci{about['pci']}" if identity >= 0 else "rsrp"]
             words += [f"arfcn{about['arfcn']}"] if several and np.isfinite(carrier) else []
-            for further, part in of_carrier.groupby("more"):
+            for further, part in of_carrier.groupby("more") if more else [("", of_carrier)][: len(of_carrier)]:
                 name = "_".join(word for word in (*words, str(further)) if word)
                 known = {**about, **(more or {}).get(str(further), {}), "source": source}
                 per_cell.append(_stream(rows, part, name, known))

@@ -1,8 +1,8 @@
-"""Whose reading a row of a table holds: all columns that name a device, a network, a cell or a beam, taken together.
+"""The identity of a reading: the combination of all columns that name a device, a network, a cell or a beam.
 
-A column joins the key of a series if it distinguishes rows that the other columns of the key do not: a cell's number
-beside its PCI does not, unless one PCI has two. A column of an unknown name joins it where rows of one time, or rows
-that take turns, differ in it.
+A column joins the key of a series if it distinguishes rows that the other columns of the key do not distinguish. The
+number of a cell does so next to a PCI only if one PCI has two numbers. A column with an unknown name joins the key if
+rows of one time, or rows that take turns with the level, differ in it.
 """
 
 from __future__ import annotations
@@ -24,16 +24,17 @@ from . import _sheet
 # Texts of each column, by its number.
 _Texts = Mapping[int, list[str]]
 
-# More values of a key than these are no devices or networks: they count something.
+# A column with more values than this counts something: it does not name devices or networks.
 _MOST_PARTS = 64
-# A program's lag at a handover: at most so many rows of a value, and this share of the rows of the other columns' key.
+# A program updates its columns one after the other at a handover: a value in at most this number of rows, and in at
+# most this share of the rows of the other columns' key, is such a delay.
 _LAG_ROWS, _LAG_SHARE = 2, 0.1
 
 
 def parts(
     rows: _rows.Rows, sheet: _sheet.Sheet, *keys: str, found: bool = True, level: int | None = None
 ) -> Iterator[tuple[str, _rows.Rows, _sheet.Sheet]]:
-    """A table by its identities: the name of each part, its rows and its cells.
+    """Divide a table by identity: yield the name of each part, its rows and its cells.
 
     Parameters
     ----------
@@ -64,7 +65,7 @@ def parts(
     several += refining({i: texts[i] for i in marks}, counted, base)
     if unknown := [sheet.names[i] for i in several if i in marks and sheet.meanings[i] is None]:
         shown = ", ".join(map(repr, unknown))
-        rows.warnings.append(f"column {shown} tells the rows apart: a series for each of its values")
+        rows.warnings.append(f"column {shown} distinguishes the rows: each of its values is a series")
     alone = {sheet.plain[i]: next(iter(values)) for i, values in _values(texts).items() if len(values) == 1}
     alone = {name: text for name, text in alone.items() if not any(sheet.plain[i] == name for i in several)}
     if not several:
@@ -90,7 +91,7 @@ def _values(texts: _Texts) -> dict[int, set[str]]:
 
 
 def _levels(sheet: _sheet.Sheet) -> AnyArray:
-    """Return which levels, ratios and ranks each row has, as bytes; empty bytes if it has none."""
+    """Return which levels, ratios and ranks each row has, as bytes that are empty if it has none."""
     columns = [
         np.isfinite(sheet.numbers(i))
         for i, meaning in enumerate(sheet.meanings)
@@ -101,7 +102,7 @@ def _levels(sheet: _sheet.Sheet) -> AnyArray:
 
 
 def _with_level(sheet: _sheet.Sheet) -> BoolArray:
-    """Mask of the rows with a level, a ratio or a rank; of all, if the table has none."""
+    """Return the mask of the rows with a level, a ratio or a rank, of all rows if the table has none."""
     filled: BoolArray = _levels(sheet) != b""
     return filled if filled.any() else np.ones(len(sheet), dtype=bool)
 
@@ -140,7 +141,7 @@ def _divides(counts: Counter[tuple[str, str]], *, alone: bool) -> bool:
         totals[before] += count
     several = len(totals) > 1
     for (before, _), count in counts.items():
-        # beside another column a value of few rows is a lag of it; of a column alone each value counts
+        # next to another column, a value in few rows is its delay; in a column alone, each value counts
         lag = count <= _LAG_ROWS and count <= _LAG_SHARE * totals[before]
         values[before] += not (lag and (several or alone))
     return max(values.values(), default=0) > 1
@@ -159,17 +160,17 @@ _OTHERS = re.compile(
 
 
 def of_a_cell(sheet: _sheet.Sheet) -> list[int]:
-    """Columns whose names are of a cell, and that the dictionary does not know."""
+    """Return the columns that are named like a cell and that the dictionary does not know."""
     return [i for i, words in enumerate(sheet.plain) if not sheet.meanings[i] and _OF_A_CELL.fullmatch(words)]
 
 
 def _marks(
     rows: _rows.Rows, sheet: _sheet.Sheet, keys: Sequence[str], known: list[int], level: int | None
 ) -> list[int]:
-    """Columns of no known quantity whose values are networks or devices of their own.
+    """Return the columns without a known quantity whose values are separate networks or devices.
 
-    Networks are distinguished by the names of cells where no PCI does it, and by columns without which most times have
-    several rows (a node, a beam, a direction), or that take turns with the level; devices by several positions.
+    Such columns are the names of cells if there is no PCI, columns without which most times have several rows (a node,
+    a beam, a direction), and columns that take turns with the level. Devices also differ in their positions.
     """
     key = keys[0]
     marks = of_a_cell(sheet) if key == "network" and ("PCI" in keys or sheet.find("PCI") is None) else []
@@ -205,7 +206,7 @@ def _marks(
 
 
 def _of_one_key(table: pd.DataFrame) -> BoolArray:
-    """Mask of the rows of the key that most rows have; of all, if there is no key."""
+    """Return the mask of the rows with the most frequent key, of all rows if there is no key."""
     if not table.shape[1]:
         return np.ones(len(table), dtype=bool)
     key = table.groupby(list(table.columns), sort=False).ngroup().to_numpy()
@@ -220,7 +221,8 @@ def _few(texts: Iterable[str]) -> bool:
     return 1 < len({*texts}) <= _MOST_MARKS
 
 
-# Of rows in turns this share follows the order of the rows before, and steps within a device are so much smaller.
+# Rows take turns if this share of them repeats the order of the rows before, and if the median step within a source
+# is below this share of the median step between rows.
 _IN_TURN, _SMALLER, _FEWEST_TURNS = 0.8, 0.5, 8
 
 
@@ -246,7 +248,7 @@ def _typical(steps: FloatArray) -> float:
 
 
 def _named(sheet: _sheet.Sheet, column: int) -> list[str]:
-    """Texts of a column, empty where they name nothing; networks have no number 0, devices, beams and SIMs may."""
+    """Return the texts of a column, empty if they name nothing: a network is never 0, a device, beam or SIM may be."""
     meaning = sheet.meanings[column]
     zero = (
         meaning is None or meaning.quantity.name != "network" or sheet.plain[column].startswith(("sim", "slot", "sub"))
@@ -267,7 +269,7 @@ def further(sheet: _sheet.Sheet, base: Sequence[str]) -> tuple[list[str], dict[s
     """
     texts = {i: _named(sheet, i) for i in of_a_cell(sheet)}
     chosen = refining(texts, _with_level(sheet), base)
-    labels, about = [""] * len(sheet), {"": dict[str, Attribute]()}
+    labels, about = [""] * len(sheet), dict[str, dict[str, Attribute]]()
     for row in range(len(sheet)) if chosen else ():
         written = {sheet.plain[i]: texts[i][row] for i in chosen if texts[i][row]}
         labels[row] = "_".join(_label(name, text) for name, text in written.items())

@@ -11,9 +11,10 @@ import csv
 import math
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import islice
 
 import numpy as np
 import pandas as pd
@@ -78,7 +79,7 @@ def starts(head: bytes, is_header: _IsHeader) -> bool:
         return False
     at, separator, names = header
     below = [(i, line) for i, line in enumerate(lines[at + 1 :]) if line.strip()]
-    widths = [len(fields) for _, fields in _logical(below, separator, len(names))[:5]]
+    widths = [len(fields) for _, fields in islice(_logical(below, separator, len(names)), 5)]
     # rows may miss trailing cells, or have one more behind a separator at their end
     return 2 * sum(len(names) < 2 * width and width <= len(names) + 1 for width in widths) >= len(widths)
 
@@ -446,7 +447,7 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
     numbers = np.flatnonzero(below).tolist()
     group = [text.strip() for text in split_row(lines.raw(at - 1), separator)] if at else []
     table = _Table(_unlike(names, group), [*range(at + 1)])
-    written = _logical([(i, lines.raw(i)) for i in numbers], separator, len(names))
+    written = list(_logical([(i, lines.raw(i)) for i in numbers], separator, len(names)))
     if len(written) < len(numbers):  # the further lines of a row are comments
         table.comments += sorted({*numbers} - {i for i, _ in written})
     for i, fields in _fitted(written, names):
@@ -458,12 +459,12 @@ def cut(lines: _text.Lines, at: int, separator: str, names: list[str]) -> Sheet:
 _MOST_LINES = 40
 
 
-def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> list[tuple[int, list[str]]]:
-    """Return the rows of lines with the number of the first line of each: a quoted cell may have line breaks.
+def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> Iterator[tuple[int, list[str]]]:
+    """Yield the rows of lines with the number of the first line of each: a quoted cell may have line breaks.
 
     A lone quote, such as the sign of inches, joins nothing: a joined row has the width of the header.
     """
-    rows, last = list[tuple[int, list[str]]](), -1
+    last = -1
     for place, (i, line) in enumerate(lines):
         if place <= last:
             continue
@@ -473,8 +474,7 @@ def _logical(lines: Sequence[tuple[int, bytes]], separator: str, width: int) -> 
             if (end := next(ends, None)) is not None:
                 joined = split_row(b" ".join(text for _, text in lines[place : end + 1]), separator)
                 fields, last = (joined, end) if len(joined) == width else (fields, last)
-        rows.append((i, fields))
-    return rows
+        yield i, fields
 
 
 def _unlike(names: Sequence[str], group: Sequence[str] = ()) -> list[str]:

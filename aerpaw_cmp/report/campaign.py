@@ -722,7 +722,7 @@ def _worst(data: CampaignData) -> Table:
     link, first = Markup('<a href="{}">{}</a>'), next((r.setting for r in season.over_all()), "")
     return Table(
         caption=f"Flights with the largest error under “{first}”{few}.",
-        columns={"Flight": HEAD, "Start (UTC)": TEXT, "Error [dB]": 2, "Worst link": TEXT},
+        columns={"Flight": HEAD, "Start (UTC)": "when", "Error [dB]": 2, "Worst link": TEXT},
         rows=[(link.format(reports[name], name) if name in reports else name, season.started.get(name, ""), error, at)
               for name, error, at in worst[:_FEW_FLIGHTS]],
     )  # fmt: skip

@@ -80,7 +80,7 @@ def paragraph(*parts: Any) -> Markup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """A table of a card; it is not shown without rows.
+    """A table of a card. A table without rows is not shown.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class Table:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Positions:
-    """Data of the canvas that shows positions; ``view`` is explorer, map_explorer or places."""
+    """The data of the canvas that shows positions. ``view`` is explorer, map_explorer or places."""
 
     view: str
     data: Mapping[str, Any]
@@ -118,10 +118,10 @@ class Card:
     ----------
     title : str
     text : sequence
-        A string is a paragraph with commands between backquotes; a list is a list; Markup stands as it is.
+        A string is a paragraph with commands between backquotes, a list is a list, and Markup is unchanged.
     tables : sequence of Table
     chart : str or sequence of Picture
-        Section of the charts that stand here (:class:`~aerpaw_cmp.report.charts.Chart`), or drawn figures.
+        Section of the charts of this card (:class:`~aerpaw_cmp.report.charts.Chart`), or drawn figures.
     positions : Positions, optional
     id, link : str
         Anchor of a section, and its name in the navigation.
@@ -160,7 +160,7 @@ class Page:
     Parameters
     ----------
     kind, title, tag : str
-        Of which command, the heading, and a word beside the command.
+        Name of the command, heading, and a word next to the name of the command.
     verdict : str
         The result in a paragraph.
     cautions : sequence of str
@@ -188,7 +188,7 @@ class Page:
 
     @property
     def view(self) -> str:
-        """The view of the page's positions; empty without any."""
+        """The view of the page's positions, or an empty text if no card has positions."""
         return next((card.positions.view for card in (*self.first, *self.cards) if card.positions), "")
 
     def html(self) -> str:
@@ -199,7 +199,7 @@ class Page:
 
 
 def settings_card(made: Any, *settings: Mapping[str, Any], fold: bool = False) -> Card:
-    """Return the card of nested settings, versions and seconds; ``made`` has the fields of :class:`Made`."""
+    """Return the card of nested settings, versions and seconds. ``made`` has the fields of :class:`Made`."""
     rows = [row for part in settings for row in flat(part)]
     checked = Table(caption="The checked settings.", columns={"Key": HEAD, "Value": TEXT}, rows=rows)
     software = Table(caption="Software.", columns={"Name": HEAD, "Version": TEXT}, rows=list(made.versions.items()))

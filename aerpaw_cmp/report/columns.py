@@ -36,8 +36,8 @@ class Column:
         As people write it; empty for text, codes and shares.
     meaning : str
     values : callable, optional
-        Values (n,) of a series, or one value for all its rows; of a family a mapping by model, K or rank. None: the
-        series has no such column. Columns without a function are computed from the times of a whole table.
+        Returns the values (n,) of a series, or one value for all its rows. A family returns a mapping by model, K or
+        rank; a series without the column returns None. The columns of times have no function.
     flags : tuple of str
         Meanings of 0, 1, ...; empty for a number.
     optional : bool
@@ -144,7 +144,7 @@ def header(columns: Sequence[Column]) -> list[str]:
 
 
 def described(columns: Sequence[Column]) -> list[tuple[str, str, str]]:
-    """Return name, unit and meaning of each column; a family has an ellipsis for its model, K or rank."""
+    """Return name, unit and meaning of each column. A family has an ellipsis for its model, K or rank."""
     return [(column.name.format("…"), column.unit, column.meaning.format("…")) for column in columns]
 
 
@@ -155,7 +155,7 @@ _Table = tuple[Any, dict[str, Any]]
 
 
 def tables(columns: Sequence[Column], series: Sequence[Any]) -> tuple[list[Column], list[_Table]]:
-    """Compute the columns of some series, not yet rounded; a series has NaN in columns that only others have.
+    """Compute the columns of some series, not yet rounded. A series has NaN in columns that only other series have.
 
     Parameters
     ----------
@@ -186,7 +186,7 @@ def tables(columns: Sequence[Column], series: Sequence[Any]) -> tuple[list[Colum
 
 
 def _members(values: Any) -> Mapping[Any, Any]:
-    """Return values by model, K or rank; a single column has the key ""."""
+    """Return values by model, K or rank. A single column has the key ""."""
     return values if isinstance(values, Mapping) else {} if values is None else {"": values}
 
 
@@ -222,12 +222,12 @@ def _rows(table: _Table, part: slice) -> Any:
 
 
 def _times(time: Any, part: slice) -> dict[str, Any]:
-    """Columns ``time_utc`` and ``time_s`` of some rows; seconds count from the first instant of all."""
+    """Return the columns ``time_utc`` and ``time_s`` of some rows. Seconds count from the first instant of the table."""
     instants = np.asarray(time, dtype="datetime64[ns]")
     known = instants[~np.isnat(instants)]
     if not len(known):
         return {"time_utc": "", "time_s": np.full(len(instants[part]), np.nan)}
-    # of the whole table, not of these rows: a part must count as the one before it did
+    # the first instant of the whole table: each part must count from the same instant
     first = known.min()
     seconds = (instants[part] - first) / np.timedelta64(1, "s")
     return {"time_utc": iso_time(instants[part]) if has_wall_clock(first) else "", "time_s": seconds}

@@ -127,7 +127,7 @@ RANK: tuple[Column, ...] = (
     *_PLACES,
     Column("measured_rank", "", "reported rank 1 to 4; empty: no CSI", lambda p: _integers(p.measured), _RANKS),
     Column("simulated_rank_k{}", "", "rank by ray tracing, K = {}; 0: no path",
-           lambda p: {k: _integers(rank) for k, rank in p.rank.items()}, _RANKS, True),
+           lambda p: {k: _integers(rank) for k, rank in p.rank.items()}, _RANKS, optional=True),
     Column("level_dbm", "dBm", "simulated level; empty: no path", lambda p: _finite(p.level_dbm), optional=True),
     *_TOWER_PLACES,
     Column("sigma{}_over_sigma1_db", "dB", "singular value {} over the largest; empty: no path, or zero",
@@ -222,7 +222,7 @@ def _rows(table: _Table, part: slice) -> Any:
 
 
 def _times(time: Any, part: slice) -> dict[str, Any]:
-    """Return the columns ``time_utc`` and ``time_s`` of some rows. Seconds count from the first instant of the table."""
+    """Return the columns ``time_utc`` and ``time_s`` of some rows. Seconds count from the table's first instant."""
     instants = np.asarray(time, dtype="datetime64[ns]")
     known = instants[~np.isnat(instants)]
     if not len(known):

@@ -112,12 +112,13 @@ def distinct(rows: Sequence[LadderRow], keep: str) -> tuple[list[LadderRow], lis
 class Ladder:
     """All rungs, scored: ``error_db[rung][series]`` (n,), NaN outside the shared samples.
 
-    ``rmse_db`` is over all series. ``best`` (of all rungs), ``best_replay`` and ``recommended`` (without the lines that
-    replay nothing) are indices of rungs, None where nothing was compared.
+    ``position_m`` is by series (n, 3). ``rmse_db`` is over all series. ``best`` (of all rungs), ``best_replay`` and
+    ``recommended`` (without the lines that replay nothing) are indices of rungs, None where nothing was compared.
     """
 
     rungs: tuple[Rung, ...]
     error_db: tuple[tuple[FloatArray, ...], ...]
+    position_m: tuple[FloatArray, ...]
     rmse_db: tuple[float, ...]
     best: int | None
     best_replay: int | None
@@ -204,17 +205,21 @@ def climb(
     )
     in_time = np.argsort(np.concatenate([*time_s, np.zeros(0)]), kind="stable")
     joined = [np.concatenate([*e, np.zeros(0)])[in_time] for e in errors]
+    place = np.concatenate([*position_m, np.zeros((0, 3))])[in_time]
     rmse = tuple(_rmse(e) for e in joined)
     if not any(np.isfinite(rmse)):
-        return Ladder(rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=None, best_replay=None, recommended=None)
+        return Ladder(
+            rungs=tuple(rungs), error_db=errors, position_m=tuple(position_m), rmse_db=rmse, best=None,
+            best_replay=None, recommended=None,
+        )  # fmt: skip
     replays = [i for i, rung in enumerate(rungs) if rung.regressor_db is None and np.isfinite(rmse[i])]
     # lines replay nothing: they are shown, and never recommended
     chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
     if chosen is not None:
-        recommended = next(i for i in replays if i == chosen or _as_good(joined[i], joined[chosen]))
+        recommended = next(i for i in replays if i == chosen or _as_good(joined[i], joined[chosen], place))
     return Ladder(
-        rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=int(np.nanargmin(rmse)), best_replay=chosen,
-        recommended=recommended,
+        rungs=tuple(rungs), error_db=errors, position_m=tuple(position_m), rmse_db=rmse,
+        best=int(np.nanargmin(rmse)), best_replay=chosen, recommended=recommended,
     )  # fmt: skip
 
 
@@ -236,7 +241,9 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[Ladd
     rows = []
     for index, rung in enumerate(ladder.rungs):
         error = ladder.error_db[index][series]
-        against_best = None if ladder.best is None else compared(error, ladder.error_db[ladder.best][series])
+        against_best = None
+        if ladder.best is not None:
+            against_best = compared(error, ladder.error_db[ladder.best][series], ladder.position_m[series])
         rows.append(
             LadderRow(
                 model=rung.model,
@@ -394,13 +401,13 @@ def log_distance_level_db(measured_db: FloatArray, distance_m: FloatArray, posit
     return level
 
 
-def compared(error_db: FloatArray, best_db: FloatArray) -> PairedDifference:
+def compared(error_db: FloatArray, best_db: FloatArray, position_m: FloatArray) -> PairedDifference:
     """A model against the best one; errors of stretches left out count as they are."""
-    return paired_difference(error_db, best_db, free_offset=False)
+    return paired_difference(error_db, best_db, free_offset=False, place_m=position_m)
 
 
-def _as_good(error: FloatArray, best: FloatArray) -> bool:
-    against_best = compared(error, best)
+def _as_good(error: FloatArray, best: FloatArray, position_m: FloatArray) -> bool:
+    against_best = compared(error, best, position_m)
     return bool(against_best.difference_db <= against_best.standard_error_db)
 
 

@@ -114,6 +114,7 @@ def compare_rss(
     *,
     baselines: Mapping[str, ArrayLike] | None = None,
     posed: ArrayLike | None = None,
+    position_m: FloatArray | None = None,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> RssComparison:
     """Compare a measured with a simulated sequence of levels.
@@ -130,6 +131,8 @@ def compare_rss(
         Levels of simpler models at the same poses [dB].
     posed : array_like of bool, (n,), optional
         Whether the pose of the sample is known. A sample without a pose is not out of coverage.
+    position_m : (n, 3), optional
+        East, north and up, NaN if unknown [m]: intervals then consider correlation over place, too.
     span_db : (float, float)
         Offset search.
 
@@ -142,6 +145,7 @@ def compare_rss(
     use = has_pose & np.isfinite(measured) & np.isfinite(simulated)
     order = np.flatnonzero(use)[np.argsort(time[use], kind="stable")]
     m, s = measured[order], simulated[order]
+    place = None if position_m is None else position_m[order]
     fit = grid_offset(m, s, span_db=span_db)
     offsets, curve = offset_curve(m, s, span_db=span_db)
     simple = {name: _levels(levels)[order] for name, levels in (baselines or {}).items()}
@@ -153,10 +157,10 @@ def compare_rss(
         n_simulated_out=int((has_pose & ~np.isfinite(simulated)).sum()),
         n_no_pose=int((~has_pose).sum()),
         correlation=correlation(m, s),
-        intervals=replace(error_intervals(m, s), rmse_db=_rmse_interval(m - s, fit)),
+        intervals=replace(error_intervals(m, s, place), rmse_db=_rmse_interval(m - s, fit, place)),
         identifiable_db=identifiable_range(offsets, curve),
         baselines=fits,
-        baseline_intervals={name: _rmse_interval(m - level, fits[name]) for name, level in simple.items()},
+        baseline_intervals={name: _rmse_interval(m - level, fits[name], place) for name, level in simple.items()},
         residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
     )
 
@@ -209,9 +213,10 @@ def _levels(values: ArrayLike) -> FloatArray:
     return np.where(np.isfinite(array), array, np.nan)
 
 
-def _rmse_interval(difference: FloatArray, fit: OffsetFit) -> Interval:
-    known = difference[np.isfinite(difference)]
-    return rmse_interval(known + fit.offset_db, fit.rmse_db)
+def _rmse_interval(difference: FloatArray, fit: OffsetFit, place_m: FloatArray | None) -> Interval:
+    known = np.isfinite(difference)
+    place = None if place_m is None else place_m[known]
+    return rmse_interval(difference[known] + fit.offset_db, fit.rmse_db, place)
 
 
 # --- both sides averaged over the same window ----------------------------------------------------------------------
@@ -768,6 +773,7 @@ def score_detection(
     floor_db: float,
     free_space_db: FloatArray,
     forecast: DetectionForecast | None = None,
+    position_m: FloatArray | None = None,
 ) -> DetectionScore | None:
     """Score of a log in two parts; None where either outcome is rare.
 
@@ -783,6 +789,8 @@ def score_detection(
         Level of free space, for comparison.
     forecast : DetectionForecast, optional
         Learned on other flights, of ``simulated_db``; without, each segment is forecast from the others.
+    position_m : (n, 3), optional
+        As for :func:`compare_rss`.
 
     Returns
     -------
@@ -801,7 +809,8 @@ def score_detection(
         stated = np.stack([1.0 - (p := forecast.probability(simulated)), p], axis=1)
     constant = np.tile([1.0 - detected.mean(), detected.mean()], (len(time), 1))
     fit = floored_fit(measured, simulated, floor_db)
-    residual = measured - np.maximum(simulated - fit.offset_db, floor_db)
+    residual, order = measured - np.maximum(simulated - fit.offset_db, floor_db), np.argsort(time, kind="stable")
+    place = None if position_m is None else position_m[finite][order]
     return DetectionScore(
         floor_db=floor_db,
         n=len(time),
@@ -812,7 +821,7 @@ def score_detection(
         constant_log_score=float(log_losses(constant, outcome).mean()),
         offset_db=fit.offset_db,
         rmse_db=fit.rmse_db,
-        rmse_ci95_db=rmse_interval(residual[np.argsort(time, kind="stable")], fit.rmse_db),
+        rmse_ci95_db=rmse_interval(residual[order], fit.rmse_db, place),
         free_space_rmse_db=floored_fit(measured, free_space_db[finite], floor_db).rmse_db,
         detected_rmse_db=float(np.sqrt(np.mean(residual[detected] ** 2))),
         reliability=_reliability(stated[:, 1], detected),

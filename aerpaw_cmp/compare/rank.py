@@ -595,6 +595,7 @@ def compare_rank(
     *,
     time_s: ArrayLike | None = None,
     sinr_db: ArrayLike | None = None,
+    place_m: FloatArray | None = None,
     replicates: int = REPLICATES,
 ) -> RankComparison:
     """Compare measured RI with the ranks of simulated channels.
@@ -611,6 +612,8 @@ def compare_rank(
         Instants [s], for the hold time of stale RI; by default the row number.
     sinr_db : array_like, (n,), optional
         Reported SINR [dB]: a rank that is held repeats it, too.
+    place_m : (n, 3), optional
+        East, north and up, NaN if unknown [m]: intervals then consider correlation over place, too.
     replicates : int
         Bootstrap.
 
@@ -632,32 +635,37 @@ def compare_rank(
         raise ValueError(f"H must have shape ({len(ri)}, n_rx, n_tx), found {matrix.shape}")
     sigma = singular_values(matrix)
     simulated = {float(k): rank_from_singular_values(sigma, k) for k in ks}
-    known = autocorrelation(ri[np.isfinite(ri)])
+    reported = np.isfinite(ri)
+    place = None if place_m is None else place_m[reported]
+    known = autocorrelation(ri[reported], place)
     time = np.arange(len(ri)) if time_s is None else time_s
     return RankComparison(
-        n=int(np.isfinite(ri).sum()),
+        n=int(reported.sum()),
         n_effective=known.n_effective,
-        n_no_csi=int((~np.isfinite(ri)).sum()),
+        n_no_csi=int((~reported).sum()),
         histogram=histogram(ri),
-        histogram_ci95=_histogram_intervals(ri[np.isfinite(ri)], replicates),
-        simulated={k: compare_ranks(ri, rank, replicates=replicates) for k, rank in simulated.items()},
+        histogram_ci95=_histogram_intervals(ri[reported], replicates, place),
+        simulated={k: compare_ranks(ri, rank, place_m, replicates=replicates) for k, rank in simulated.items()},
         curve=k_curve(ri, sigma, replicates=replicates),
         staleness=stale_reports(time, ri, {} if sinr_db is None else {"sinr_db": sinr_db}),
     )
 
 
-def _histogram_intervals(rank: FloatArray, replicates: int) -> list[Interval]:
+def _histogram_intervals(rank: FloatArray, replicates: int, place_m: FloatArray | None = None) -> list[Interval]:
     if len(rank) < 2:
         return [NO_INTERVAL] * MAX_RANK
-    intervals, overall = [], autocorrelation(rank)
+    intervals, overall = [], autocorrelation(rank, place_m)
     for bar in one_hot(rank).T:
-        known = autocorrelation(bar) if np.ptp(bar) else overall  # a rank never seen says nothing about its own memory
+        # a rank never seen says nothing about its own memory
+        known = autocorrelation(bar, place_m) if np.ptp(bar) else overall
         drawn = bootstrap_means(bar[:, None], known.block_length, replicates=replicates)
         intervals.append(share_interval(float(bar.mean()), float(drawn.std()), known))
     return intervals
 
 
-def compare_ranks(measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES) -> RankFit:
+def compare_ranks(
+    measured: ArrayLike, simulated: ArrayLike, place_m: FloatArray | None = None, *, replicates: int = REPLICATES
+) -> RankFit:
     """Compare two sequences of ranks by pose and by histogram; arguments as in :func:`agreement`.
 
     The histogram distances compare all measured with all simulated ranks; their intervals come from poses at which
@@ -667,6 +675,8 @@ def compare_ranks(measured: ArrayLike, simulated: ArrayLike, *, replicates: int 
     ----------
     measured, simulated : array_like, (n,)
         Ranks of the same samples: NaN unknown, 0 no channel.
+    place_m : (n, 3), optional
+        As for :func:`compare_rank`.
     replicates : int
         Of the bootstrap and the permutation test.
 
@@ -680,10 +690,12 @@ def compare_ranks(measured: ArrayLike, simulated: ArrayLike, *, replicates: int 
     a, b = _pairs(measured_rank, simulated_rank)
     agree, kappa = agreement(a, b), cohen_kappa(a, b)
     tv, move = total_variation(bars, simulated_bars), wasserstein(bars, simulated_bars)
-    bounds = _pair_intervals(a, b, (agree, kappa, tv, move), replicates)
+    both = (measured_rank >= 1) & (simulated_rank >= 1)
+    places = None if place_m is None else (place_m[both], place_m[simulated_rank >= 1])
+    bounds = _pair_intervals(a, b, (agree, kappa, tv, move), replicates, places and places[0])
     return RankFit(
         histogram=simulated_bars,
-        histogram_ci95=_histogram_intervals(simulated_rank[simulated_rank >= 1], replicates),
+        histogram_ci95=_histogram_intervals(simulated_rank[simulated_rank >= 1], replicates, places and places[1]),
         out_of_coverage=int((simulated_rank == 0).sum()),
         agreement=agree,
         agreement_ci95=bounds[0],
@@ -710,8 +722,10 @@ class CommonestRank:
     agreement_ci95: Interval
 
 
-def commonest_rank(measured: ArrayLike) -> CommonestRank:
+def commonest_rank(measured: ArrayLike, place_m: FloatArray | None = None) -> CommonestRank:
     """The commonest of the measured ranks (n,), NaN where none, and how often it is right.
+
+    Positions ``place_m`` (n, 3) [m] are used as by :func:`compare_rank`.
 
     Examples
     --------
@@ -724,7 +738,8 @@ def commonest_rank(measured: ArrayLike) -> CommonestRank:
     if not np.isfinite(bars).all():
         return CommonestRank(rank=0, agreement=float("nan"), agreement_ci95=NO_INTERVAL)
     best = int(np.argmax(bars))
-    bounds = _histogram_intervals(ri[np.isfinite(ri)], REPLICATES)[best]
+    reported = np.isfinite(ri)
+    bounds = _histogram_intervals(ri[reported], REPLICATES, None if place_m is None else place_m[reported])[best]
     return CommonestRank(rank=best + 1, agreement=float(bars[best]), agreement_ci95=bounds)
 
 
@@ -786,7 +801,11 @@ def _explored(a: IntArray, b: IntArray) -> bool:
 
 
 def _pair_intervals(
-    a: IntArray, b: IntArray, values: tuple[float, float, float, float], replicates: int
+    a: IntArray,
+    b: IntArray,
+    values: tuple[float, float, float, float],
+    replicates: int,
+    place_m: FloatArray | None = None,
 ) -> list[Interval]:
     """Intervals of agreement, kappa, total variation and Wasserstein from one bootstrap of the pairs."""
     if len(a) < 2 or not _explored(a, b):
@@ -795,7 +814,7 @@ def _pair_intervals(
     columns = np.column_stack([equal, first, second])
     intervals: list[Interval] = []
     for influence, statistic, bounds in _pair_statistics(equal, first, second):
-        known = autocorrelation(influence)
+        known = autocorrelation(influence, place_m)
         drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates))
         value = values[len(intervals)]
         intervals.append(

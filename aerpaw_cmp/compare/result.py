@@ -137,6 +137,8 @@ class RssFurther:
     """Of a ratio to the noise whose receiver's bandwidth is given."""
     rmse_bound: str | None = None
     """Reason why the interval of the RMSE is a lower bound alone, where it is."""
+    interval_notes: tuple[str, ...] | None = None
+    """Sentences on what limits the intervals: no correlation over place, an error that is not stationary."""
     simulated_sd_db: float | None = None
     """Mean of what learned antennas state for one sample: gain, the flight's own nuisance, noise, fading."""
     error_bars: Mapping[str, float] | None = None

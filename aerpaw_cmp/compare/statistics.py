@@ -38,7 +38,7 @@ import hashlib
 import json
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache
+from functools import cache, lru_cache
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any, Literal
@@ -67,6 +67,28 @@ _SMOOTH_FLOOR = 1e-7
 
 Kind = Literal["mean", "power", "ratio"]
 
+# Correlation lengths over the root mean square distance of a track from its centre. Neighbours differ by the root of 2,
+# so that squares of the correlations of one length are those of the next but one below it.
+LENGTHS = 0.06 * 2.0 ** (0.5 * np.arange(12))
+
+# What a correlation over place is mixed with: shares of the power of the slow terms that are white noise, and shares
+# that are correlated over a fortieth of the flight in time, as fading is.
+PLACE_WHITE = 0.002 * 2.0 ** np.arange(9)
+PLACE_FADING = (0.1, 0.25, 0.5, 0.75)
+_FADING_RATE = 40.0
+
+# Weight of a correlation over place, over the mean weight of one over time, by kind; and the length beyond which it
+# falls as one over the length. The terms hardly distinguish such lengths, while the mean and the power of a test depend
+# on them. Found by simulation; differences of squares are correlated over half of the errors' length.
+_PLACE_WEIGHT = {"mean": (0.06, 1.0), "power": (0.06, 1.0), "ratio": (0.07, 0.3)}
+
+# Positions of a track that its correlations are computed from.
+_THINNED = 400
+
+# Share of the samples without a position, and distance from the centre of the track [m], at which only time counts: a
+# UAV that hovers is at one place, and what its receiver logs there is noise of the position.
+_UNPLACED, _HOVER_M = 0.1, 15.0
+
 # Logarithms of the weights in tenths, by kind, rough memories of each white share and smooth ones, and rate. Stretches
 # of the draws in hundredths: what the weighted shares of the memories add, then what the shares without weights do.
 _TABLES = Path(__file__).with_name("memory_weights.json")
@@ -74,6 +96,11 @@ _TABLES = Path(__file__).with_name("memory_weights.json")
 # Of the standard deviation of the logarithm of the power upwards, over that which the fourth moment says; by simulation
 # with Student's t of four degrees of freedom. Most sequences with heavy tails look calmer than the process.
 CALM = 1.8
+
+# Parts of a flight whose powers are compared, times the median power from which a part is loud, and samples below which
+# it is not asked: on the simulated kinds of ``benchmarks/coverage_of_intervals.py`` at most 4 % of steady flights have
+# two loud parts (Student's t of four degrees of freedom, 100 samples), others below 1 %.
+_PARTS, _LOUD, _FEWEST_FOR_PARTS = 12, 4.0, 60
 
 # A sum over shares that no simulated flight showed may fall to nothing: eight of ten draws stay within the ends.
 _LEAST_STRETCH = 0.6
@@ -84,7 +111,7 @@ _PAIRS = 2048
 
 @dataclass(frozen=True, slots=True)
 class Memories:
-    """All memories (m,) at ``terms`` cosine terms: normal distributions of the mean and the terms, up to a scale.
+    """Memories (m,) at ``terms`` cosine terms: normal distributions of the mean and the terms, up to a scale.
 
     ``whiten`` (m, terms, terms) makes the terms independent, ``log_det`` (m,) is the logarithm of its determinant;
     ``slope`` (m, terms) and ``variance`` (m,) give mean and variance of the sequence's mean once the terms are known;
@@ -97,6 +124,20 @@ class Memories:
     variance: FloatArray
     power: FloatArray
 
+    @classmethod
+    def of(cls, covariances: FloatArray) -> Memories:
+        """Return the memories whose mean and terms have these covariances (m, terms + 1, terms + 1)."""
+        whiten = np.linalg.inv(np.linalg.cholesky(covariances[:, 1:, 1:]))
+        cross = covariances[:, 0, 1:]
+        slope = np.einsum("mij,mi->mj", whiten, np.einsum("mij,mj->mi", whiten, cross))
+        return cls(
+            whiten=whiten,
+            log_det=np.log(np.diagonal(whiten, axis1=1, axis2=2)).sum(axis=1),
+            slope=slope,
+            variance=covariances[:, 0, 0] - (cross * slope).sum(axis=1),
+            power=np.trace(covariances[:, 1:, 1:], axis1=1, axis2=2),
+        )
+
 
 @cache
 def memories(terms: int = TERMS) -> Memories:
@@ -106,17 +147,82 @@ def memories(terms: int = TERMS) -> Memories:
         (1.0 - share) * 0.5 * rate * _exponential(rate, terms).real + share * white
         for share in WHITE_SHARES for rate in RATES
     ] + [0.25 * rate * _smooth(rate, terms) + _SMOOTH_FLOOR * white for rate in RATES]  # fmt: skip
-    every = np.array(covariances)
-    whiten = np.linalg.inv(np.linalg.cholesky(every[:, 1:, 1:]))
-    cross = every[:, 0, 1:]
-    slope = np.einsum("mij,mi->mj", whiten, np.einsum("mij,mj->mi", whiten, cross))
-    return Memories(
-        whiten=whiten,
-        log_det=np.log(np.diagonal(whiten, axis1=1, axis2=2)).sum(axis=1),
-        slope=slope,
-        variance=every[:, 0, 0] - (cross * slope).sum(axis=1),
-        power=np.trace(every[:, 1:, 1:], axis1=1, axis2=2),
-    )
+    return Memories.of(np.array(covariances))
+
+
+def place_memories(place_m: FloatArray, terms: int = TERMS) -> Memories | None:
+    """Compute the memories of errors that are correlated over place.
+
+    Parameters
+    ----------
+    place_m : (n, 3)
+        East, north and up of each sample, in time order; NaN if unknown [m].
+    terms : int
+        Cosine terms.
+
+    Returns
+    -------
+    Memories or None
+        One for each mixture of :data:`PLACE_WHITE` and :data:`PLACE_FADING` and for each of :data:`LENGTHS`, which run
+        fastest. None if only time counts (:func:`only_time`).
+
+    Notes
+    -----
+    The terms of errors with covariance K are T K T', where row k of T is the k-th cosine over the number of samples.
+    K is exp(-|p_i - p_j| / L) (Gudmundson 1991), formed from every m-th position.
+    """
+    if only_time(place_m):
+        return None
+    known = np.flatnonzero(np.isfinite(place_m).all(axis=1))
+    step = -(-len(known) // _THINNED)
+    at = known[step // 2 :: step]
+    return _place_memories(place_m[at].tobytes(), ((at + 0.5) / len(place_m)).tobytes(), terms)
+
+
+# Channels and models of a flight share its track; each entry takes 4 MB.
+@lru_cache(maxsize=8)
+def _place_memories(positions: bytes, instants: bytes, terms: int) -> Memories:
+    place, instant = np.frombuffer(positions).reshape(-1, 3), np.frombuffer(instants)
+    place = place - place.mean(axis=0)
+    square = np.square(place).sum(axis=1)
+    apart = np.sqrt(np.maximum(square[:, None] + square - 2.0 * place @ place.T, 0.0) / square.mean())
+    cosines = np.cos(np.pi * np.outer(np.arange(terms + 1), instant)) * np.sqrt(2.0) / len(instant)
+    cosines[0] = 1.0 / len(instant)
+    by_length = {}
+    for longest in (len(LENGTHS) - 1, len(LENGTHS) - 2):
+        correlation = np.exp(-apart / LENGTHS[longest])
+        for at in range(longest, -1, -2):
+            by_length[at] = cosines @ correlation @ cosines.T
+            correlation = np.square(correlation)
+    placed = np.array([_unit(by_length[at]) for at in range(len(LENGTHS))])
+    white, fading = _unit(np.eye(terms + 1)), _unit(_exponential(_FADING_RATE, terms).real)
+    noise = [(share, white) for share in PLACE_WHITE]
+    noise += [(share, 0.9 * fading + 0.1 * white) for share in PLACE_FADING]
+    return Memories.of(np.concatenate([(1.0 - share) * placed + share * other for share, other in noise]))
+
+
+def _unit(covariance: FloatArray) -> FloatArray:
+    """Scale a covariance of mean and terms to a power of 1 of the terms."""
+    return np.asarray(covariance / np.trace(covariance[1:, 1:]))
+
+
+def only_time(place_m: FloatArray | None) -> str:
+    """Return the reason why intervals consider correlation over time alone; empty if they consider place as well.
+
+    Parameters
+    ----------
+    place_m : (n, 3) or None
+        East, north and up of each sample; NaN if unknown [m].
+    """
+    if place_m is None or not len(place_m):
+        return "the positions are not known"
+    known = np.isfinite(place_m).all(axis=1)
+    if (missing := 1.0 - known.mean()) > _UNPLACED:
+        return f"{100.0 * missing:.0f} % of the samples have no position"
+    away_m = place_m[known] - place_m[known].mean(axis=0)
+    if np.square(away_m).sum(axis=1).mean() < _HOVER_M**2:
+        return "the UAV hardly left one place"
+    return ""
 
 
 def _smooth(rate: float, terms: int) -> FloatArray:
@@ -177,11 +283,38 @@ def cosine_terms(values: FloatArray) -> Terms:
     return Terms(every[:count], float(fast.sum()), freedom)
 
 
-def likelihoods(slow: FloatArray) -> tuple[FloatArray, FloatArray]:
+@dataclass(frozen=True, slots=True)
+class Known:
+    """Memories that a sequence may have: over time, then over place, with weights (m,) and stretches (2, m) by kind."""
+
+    parts: tuple[Memories, ...]
+    weights: FloatArray
+    stretches: FloatArray
+
+    def joined(self, name: str) -> FloatArray:
+        """Return a column of the memories, over time and place."""
+        return np.concatenate([getattr(part, name) for part in self.parts])
+
+
+def known_memories(kind: Kind, terms: int, place_m: FloatArray | None = None) -> Known:
+    """Return the memories over time, and over place if positions (n, 3) [m] allow it, with what each counts."""
+    over_time, weight, stretch = memories(terms), weights(kind), stretches(kind)
+    over_place = None if place_m is None else place_memories(place_m, terms)
+    if over_place is None:
+        return Known((over_time,), weight, stretch)
+    size, longest = _PLACE_WEIGHT[kind]
+    by_length = size * weight.mean() * longest / np.maximum(LENGTHS, longest)
+    placed = np.tile(by_length, len(over_place.power) // len(LENGTHS))
+    usual = np.repeat([[1.0], [0.0]], len(placed), axis=1)
+    return Known((over_time, over_place), np.concatenate([weight, placed]), np.hstack([stretch, usual]))
+
+
+def likelihoods(slow: FloatArray, parts: Sequence[Memories] = ()) -> tuple[FloatArray, FloatArray]:
     """Likelihood (..., m) of each memory, its scale integrated out, and the whitened sum of squares (..., m)."""
-    known = memories(slow.shape[-1])
-    square = np.square(slow @ known.whiten.swapaxes(1, 2)).sum(axis=-1).T
-    log = known.log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
+    parts = parts or (memories(slow.shape[-1]),)
+    square = np.concatenate([np.square(slow @ part.whiten.swapaxes(1, 2)).sum(axis=-1).T for part in parts], axis=-1)
+    log_det = np.concatenate([part.log_det for part in parts])
+    log = log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
     # over the likeliest: the likelihoods themselves leave the range of numbers
     return np.exp(log - log.max(axis=-1, keepdims=True)), square
 
@@ -199,15 +332,15 @@ def _random(terms: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]
     return chance[:, 0], 2.0 * gammaincinv(0.5 * terms, chance[:, 1]), ndtri(chance[:, 2]), ndtri(chance[:, 3])
 
 
-def _picked(slow: FloatArray, kind: Kind) -> tuple[IntArray, FloatArray, float]:
+def _picked(slow: FloatArray, known: Known) -> tuple[IntArray, FloatArray, float]:
     """Memory (draws,) and squared scale (draws,) of each draw, and what :func:`_stretched` does to them all."""
-    likelihood, square = likelihoods(slow)
-    weighted = likelihood * weights(kind)
+    likelihood, square = likelihoods(slow, known.parts)
+    weighted = likelihood * known.weights
     running = np.cumsum(weighted)
     uniform, chi_squared, *_ = _random(len(slow))
     # a chance near 1 may round to the whole sum
     index = np.minimum(np.searchsorted(running, uniform * running[-1]), len(running) - 1)
-    own, even = stretches(kind)
+    own, even = known.stretches
     stretch = float(weighted @ own / running[-1] + likelihood @ even / likelihood.sum())
     return index, square[index] / chi_squared, max(stretch, _LEAST_STRETCH)
 
@@ -229,7 +362,7 @@ def memory_share(values: FloatArray) -> float:
     return float(1.0 / np.tile(RATES, len(WHITE_SHARES) + 1)[int(np.argmax(likelihood * weights("power")))])
 
 
-def mean_draws(values: FloatArray, kind: Kind = "mean") -> FloatArray:
+def mean_draws(values: FloatArray, kind: Kind = "mean", place_m: FloatArray | None = None) -> FloatArray:
     """Draws of the mean of the process minus the mean of the sequence.
 
     Parameters
@@ -238,14 +371,16 @@ def mean_draws(values: FloatArray, kind: Kind = "mean") -> FloatArray:
         In time order, at least :data:`FEWEST`.
     kind : {"mean", "ratio"}
         Errors, or differences of their squares.
+    place_m : (n, 3), optional
+        East, north and up of each sample, NaN if unknown [m]: errors may then be correlated over place as well.
     """
     if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
     slow = cosine_terms(values).slow
-    known = memories(len(slow))
-    index, scale, stretch = _picked(slow, kind)
-    centre = -(known.slope @ slow)[index]
-    reach = np.sqrt(scale * known.variance[index]) * _random(len(slow))[2]
+    known = known_memories(kind, len(slow), place_m)
+    index, scale, stretch = _picked(slow, known)
+    centre = -(known.joined("slope") @ slow)[index]
+    reach = np.sqrt(scale * known.joined("variance")[index]) * _random(len(slow))[2]
     drawn = np.concatenate([centre + reach, centre - reach])
     return drawn if kind == "ratio" else _stretched(drawn, stretch)
 
@@ -265,7 +400,32 @@ def heavy_tails(values: FloatArray) -> float:
     return float(np.sqrt(max(excess, 0.0) / n) * (300.0 / n) ** 0.1)
 
 
-def power_draws(values: FloatArray) -> FloatArray:
+def loud_part(values: FloatArray) -> tuple[float, float]:
+    """Find parts of a sequence (n,) that are much louder than the others.
+
+    Returns
+    -------
+    share, ratio : float
+        Share of the samples in the loud parts, and their mean square over that of the others; 0 and 1 if the sequence
+        is steady. Two parts at least are loud by the innovations of a second-order autoregression, which are hardly
+        correlated, and by their own mean square.
+    """
+    away = values - values.mean()
+    if len(away) < _FEWEST_FOR_PARTS or not away.any():
+        return 0.0, 1.0
+    later, past = away[2:], np.column_stack([away[1:-1], away[:-2]])
+    innovations = later - past @ np.linalg.lstsq(past, later, rcond=None)[0]
+    part = np.arange(len(later)) * _PARTS // len(later)
+    count, power, square = (np.bincount(part, weight, _PARTS) for weight in (None, innovations**2, later**2))
+    loud = power / count > _LOUD * np.median(power / count)
+    if not 1 < loud.sum() < _PARTS:
+        return 0.0, 1.0
+    share = float(count[loud].sum() / len(later))
+    ratio = float(square[loud].sum() / square[~loud].sum()) * (1.0 - share) / share
+    return (share, ratio) if ratio > _LOUD else (0.0, 1.0)
+
+
+def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatArray:
     """Draws of the mean square about their own mean that sequences of this length and spacing have on average.
 
     In the order of :func:`mean_draws`. What a memory longer than the sequence adds to the mean does not count.
@@ -273,19 +433,28 @@ def power_draws(values: FloatArray) -> FloatArray:
     Parameters
     ----------
     values : (n,)
-        In time order, at least :data:`FEWEST`. Tails heavier than normal widen the draws.
+        In time order, at least :data:`FEWEST`. Tails heavier than normal and loud parts (:func:`loud_part`) widen the
+        draws.
+    place_m : (n, 3), optional
+        As for :func:`mean_draws`.
     """
     if np.ptp(values) == 0.0:
         return np.zeros(2 * _PAIRS)
     terms = cosine_terms(values)
-    index, scale, stretch = _picked(terms.slow, "power")
+    known = known_memories("power", len(terms.slow), place_m)
+    index, scale, stretch = _picked(terms.slow, known)
     *_, normal, second_normal = _random(len(terms.slow))
     third = 2.0 / (9.0 * terms.fast_freedom)
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
     tails = np.exp(heavy_tails(values) * np.where(normal > 0.0, CALM, 1.0) * normal)
-    drawn = (scale * memories(len(terms.slow)).power[index] + fast) * tails
-    return np.tile(np.exp(_stretched(np.log(drawn), stretch)), 2)
+    drawn = (scale * known.joined("power")[index] + fast) * tails
+    log = _stretched(np.log(drawn), stretch)
+    share, ratio = loud_part(values)
+    # a loud part has fewer independent samples than the flight: what the variance of a weighted mean grows by
+    more = np.sqrt(share * ratio**2 + 1.0 - share) / (share * ratio + 1.0 - share)
+    middle = np.median(log)
+    return np.tile(np.exp(middle + more * (log - middle)), 2)
 
 
 # Bootstrap replicates.
@@ -414,13 +583,16 @@ def _exponential_decay(covariance: FloatArray, n: int) -> tuple[float, float]:
     return float(covariance[0] + 2.0 * correlated / (1.0 - decay)), float(correlated / (1.0 - decay) ** 2)
 
 
-def autocorrelation(values: ArrayLike) -> Autocorrelation:
+def autocorrelation(values: ArrayLike, place_m: FloatArray | None = None) -> Autocorrelation:
     """Block length and effective sample size of a sequence.
 
     Parameters
     ----------
     values : array_like, (n,)
         In time order, without NaN.
+    place_m : (n, 3), optional
+        As for :func:`mean_draws`: the variance of the mean is then that over time and that over place, each by its
+        share of the evidence.
 
     Returns
     -------
@@ -473,7 +645,26 @@ def autocorrelation(values: ArrayLike) -> Autocorrelation:
     # five blocks at least: of fewer the draws repeat each other
     block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
     factor = 1.0 / (1.0 - min(0.5, slope / block))
-    return Autocorrelation(n, block, float(np.clip(n * (unbiased[0] + hidden) / long_run, 1.0, n)), factor)
+    effective = float(np.clip(n * (unbiased[0] + hidden) / long_run, 1.0, n))
+    share, variance = _over_place(x, place_m)
+    # how much larger the variance of the mean is than over time alone
+    more = 1.0 - share + share * variance * effective / float(unbiased[0] + hidden)
+    return Autocorrelation(n, block, float(np.clip(effective / more, 1.0, n)), factor * more)
+
+
+def _over_place(values: FloatArray, place_m: FloatArray | None) -> tuple[float, float]:
+    """Share of the evidence for correlation over place, and the variance of the mean of ``values`` (n,) if it is so."""
+    if place_m is None or len(values) < FEWEST:
+        return 0.0, 0.0
+    slow = cosine_terms(values).slow
+    known = known_memories("mean", len(slow), place_m)
+    if len(known.parts) == 1:
+        return 0.0, 0.0
+    likelihood, square = likelihoods(slow, known.parts)
+    weighted, placed = likelihood * known.weights, slice(len(known.parts[0].power), None)
+    variance = square / (len(slow) - 2.0) * known.joined("variance") + np.square(known.joined("slope") @ slow)
+    by_place = weighted[placed] / max(float(weighted[placed].sum()), 1e-300)
+    return float(weighted[placed].sum() / weighted.sum()), float(by_place @ variance[placed])
 
 
 def bootstrap_means(
@@ -578,21 +769,28 @@ class ErrorIntervals:
         statistic does not exist.
     autocorrelation : Autocorrelation
         Of the residual.
+    notes : tuple of str
+        Sentences on what limits the intervals.
     """
 
     offset_db: Interval
     rmse_db: Interval
     correlation: Interval
     autocorrelation: Autocorrelation
+    notes: tuple[str, ...] = ()
 
 
-def error_intervals(measured_db: FloatArray, simulated_db: FloatArray) -> ErrorIntervals:
+def error_intervals(
+    measured_db: FloatArray, simulated_db: FloatArray, place_m: FloatArray | None = None
+) -> ErrorIntervals:
     """Intervals of offset (mean difference), RMSE about it and correlation of the process behind a flight.
 
     Parameters
     ----------
     measured_db, simulated_db : (n,)
         Pairs in time order, without NaN [dB].
+    place_m : (n, 3), optional
+        As for :func:`mean_draws`.
 
     Returns
     -------
@@ -604,14 +802,27 @@ def error_intervals(measured_db: FloatArray, simulated_db: FloatArray) -> ErrorI
     if len(difference) < FEWEST:
         return ErrorIntervals(NO_INTERVAL, NO_INTERVAL, NO_INTERVAL, known)
     return ErrorIntervals(
-        mean_interval(difference),
-        spread_interval(difference),
-        _correlation_interval(measured_db, simulated_db),
+        mean_interval(difference, place_m),
+        spread_interval(difference, place_m),
+        _correlation_interval(measured_db, simulated_db, place_m),
         known,
+        tuple(_notes(difference, place_m)),
     )
 
 
-def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray) -> Interval:
+def _notes(values: FloatArray, place_m: FloatArray | None) -> Iterator[str]:
+    """Sentences on what limits the intervals of a sequence (n,)."""
+    if place_m is not None and (reason := only_time(place_m)):
+        yield f"The intervals consider correlation over time alone: {reason}."
+    share, ratio = loud_part(values)
+    if share:
+        yield (
+            f"The error is not stationary: it is {np.sqrt(ratio):.1f} times larger in {100.0 * share:.0f} % of the "
+            "flight. The interval of the RMSE is widened for that and can still be too narrow."
+        )
+
+
+def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray, place_m: FloatArray | None) -> Interval:
     """The route was flown as it was: only slope and rest of the measurement over the simulation are random."""
     s, m = simulated_db - simulated_db.mean(), measured_db - measured_db.mean()
     spread = float(s @ s) / len(s)
@@ -619,38 +830,42 @@ def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray) -> 
         return NO_INTERVAL
     slope = float(m @ s) / len(s) / spread
     residual = m - slope * s
-    along = (slope + mean_draws(residual * s) / spread) * np.sqrt(spread)
-    return _around(correlation(measured_db, simulated_db), along / np.sqrt(along**2 + power_draws(residual)))
+    along = (slope + mean_draws(residual * s, place_m=place_m) / spread) * np.sqrt(spread)
+    return _around(correlation(measured_db, simulated_db), along / np.sqrt(along**2 + power_draws(residual, place_m)))
 
 
-def mean_interval(values: FloatArray) -> Interval:
-    """95 % interval of the mean of the process that a sequence (n,) in time order comes from."""
+def mean_interval(values: FloatArray, place_m: FloatArray | None = None) -> Interval:
+    """95 % interval of the mean of the process that a sequence (n,) in time order comes from.
+
+    Errors may be correlated over the positions ``place_m`` (n, 3) [m] as well, as for :func:`mean_draws`.
+    """
     if len(values) < FEWEST:
         return NO_INTERVAL
     mean = float(values.mean())
-    return _around(mean, mean + mean_draws(values))
+    return _around(mean, mean + mean_draws(values, place_m=place_m))
 
 
-def spread_interval(values: FloatArray) -> Interval:
+def spread_interval(values: FloatArray, place_m: FloatArray | None = None) -> Interval:
     """95 % interval of the standard deviation that sequences such as this one (n,), in time order, have on average.
 
-    Wider than :data:`_BOUND` times the value, it is given as a bound: its upper end is infinite.
+    Wider than :data:`_BOUND` times the value, it is given as a bound: its upper end is infinite. Positions ``place_m``
+    (n, 3) [m] are used as by :func:`mean_draws`.
     """
     if len(values) < FEWEST:
         return NO_INTERVAL
-    low, high = _around(float(values.std()), np.sqrt(power_draws(values)))
+    low, high = _around(float(values.std()), np.sqrt(power_draws(values, place_m)))
     return low, np.inf if high - low > _BOUND * values.std() else high
 
 
-def rmse_interval(residual: FloatArray, rmse: float) -> Interval:
+def rmse_interval(residual: FloatArray, rmse: float, place_m: FloatArray | None = None) -> Interval:
     """95 % interval of the root mean square of residuals (n,) in time order, whose value is ``rmse``.
 
     An offset from a grid, at the edge of its span or beside a floor leaves a mean, which moves both ends as it moves
-    the RMSE.
+    the RMSE. Positions ``place_m`` (n, 3) [m] are used as by :func:`mean_draws`.
     """
     if len(residual) < FEWEST:
         return NO_INTERVAL
-    low, high = np.hypot(spread_interval(residual), residual.mean())
+    low, high = np.hypot(spread_interval(residual, place_m), residual.mean())
     return float(min(low, rmse)), float(max(high, rmse))
 
 
@@ -738,7 +953,9 @@ class PairedDifference:
         return f"{self.verdict} than {other_model} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
 
 
-def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_offset: bool = True) -> PairedDifference:
+def paired_difference(
+    error_db: ArrayLike, other_error_db: ArrayLike, *, free_offset: bool = True, place_m: FloatArray | None = None
+) -> PairedDifference:
     """Compare two models on the same samples by the difference of their mean square errors.
 
     Parameters
@@ -748,6 +965,8 @@ def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_of
     free_offset : bool
         Each model has an offset of its own fitted on these samples (an error counts about its mean). False for errors
         on samples kept out of the fit: they count as they are.
+    place_m : (n, 3), optional
+        As for :func:`mean_draws`.
 
     Returns
     -------
@@ -775,7 +994,8 @@ def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_of
     rmse, other_rmse = float(np.sqrt(square)), float(np.sqrt(other_square))
     bounds, squares, spread, chance = NO_INTERVAL, NO_INTERVAL, nan, 1.0
     if len(first) >= FEWEST:
-        drawn = square - other_square + mean_draws(undecided(first, second), "ratio")
+        places = None if place_m is None else place_m[finite]
+        drawn = square - other_square + mean_draws(undecided(first, second), "ratio", places)
         low, high = np.quantile(drawn, [0.025, 0.975])
         squares = float(low), float(high)
         scale = max(rmse + other_rmse, 1e-300)
@@ -811,7 +1031,10 @@ def undecided(first: FloatArray, second: FloatArray) -> FloatArray:
 
 
 def pooled_difference(
-    channels: Sequence[tuple[FloatArray, FloatArray, FloatArray]], *, free_offset: bool = True
+    channels: Sequence[tuple[FloatArray, FloatArray, FloatArray]],
+    *,
+    free_offset: bool = True,
+    place_m: Sequence[FloatArray] | None = None,
 ) -> PairedDifference:
     """Two models over all channels of a flight at once.
 
@@ -821,6 +1044,8 @@ def pooled_difference(
         Per channel: instants, and the errors of the two models at them [dB]. NaN takes no part.
     free_offset : bool
         Each channel and model has an own offset.
+    place_m : sequence of (n, 3), optional
+        Positions of each channel's samples, as for :func:`mean_draws`.
 
     Returns
     -------
@@ -829,16 +1054,17 @@ def pooled_difference(
         that fading which the channels share counts as shared.
     """
     parts = []
-    for time, error, other in channels:
+    for at, (time, error, other) in enumerate(channels):
         finite = np.isfinite(error) & np.isfinite(other)
         if finite.any():
             columns = (values[finite] - free_offset * values[finite].mean() for values in (error, other))
-            parts.append((np.asarray(time)[finite], *columns))
+            place = np.full((len(finite), 3), np.nan) if place_m is None else place_m[at]
+            parts.append((np.asarray(time)[finite], *columns, place[finite]))
     if not parts:
         return paired_difference([], [])
-    time, first, second = (np.concatenate(column) for column in zip(*parts, strict=True))
+    time, first, second, place = (np.concatenate(column) for column in zip(*parts, strict=True))
     order = np.argsort(time, kind="stable")
-    return paired_difference(first[order], second[order], free_offset=False)
+    return paired_difference(first[order], second[order], free_offset=False, place_m=place[order])
 
 
 def corrected(pairs: Sequence[PairedDifference], measured: Sequence[Hashable] | None = None) -> list[PairedDifference]:

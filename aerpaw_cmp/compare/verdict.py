@@ -130,7 +130,8 @@ def flight_verdict(panels: Sequence[RssResult]) -> FlightVerdict | None:
     if not best:
         return None
     channels = [(panel.time, of[_RAY], of[best]) for panel, of in zip(panels, residuals, strict=True)]
-    pair = pooled_difference(channels, free_offset=not any(map(lock_lost, panels)))
+    places = [panel.position_m for panel in panels]
+    pair = pooled_difference(channels, free_offset=not any(map(lock_lost, panels)), place_m=places)
     return FlightVerdict(
         against=best, rmse_db=errors[_RAY], baseline_rmse_db=errors[best], difference_db=pair.difference_db,
         ci95_db=pair.difference_ci95_db, channels=len(panels),
@@ -898,6 +899,7 @@ def level_difference(
     *,
     scored: tuple[int, int],
     offsets_db: tuple[float, float],
+    place_m: FloatArray | None = None,
 ) -> LevelDifference:
     """Compare one link.
 
@@ -911,6 +913,8 @@ def level_difference(
         Samples with a residual in each whole report.
     offsets_db : (float, float)
         Fitted offset of each [dB].
+    place_m : (n, 3), optional
+        Positions of the common samples, NaN if unknown [m]: the interval then considers correlation over place, too.
 
     Returns
     -------
@@ -929,7 +933,9 @@ def level_difference(
         simulated_max_db=_largest(moved),
         simulated_rms_db=float(np.sqrt(np.mean(moved**2))) if len(moved) else float("nan"),
         offset_db=_changed(*offsets_db),
-        rmse=statistics.paired_difference(second_error, first_error),
+        rmse=statistics.paired_difference(
+            second_error, first_error, place_m=None if place_m is None else place_m[scored_in_both]
+        ),
     )
 
 
@@ -953,6 +959,7 @@ def rank_difference(
     samples: Overlap,
     first: tuple[FloatArray, FloatArray],
     second: tuple[FloatArray, FloatArray],
+    place_m: FloatArray | None = None,
 ) -> RankDifference:
     """Compare the rank of one tower at one K.
 
@@ -962,6 +969,8 @@ def rank_difference(
     samples : Overlap
     first, second : tuple of two (n,)
         Reported and simulated rank of each report on the common samples in time order; NaN: none, 0: no path.
+    place_m : (n, 3), optional
+        As for :func:`level_difference`.
 
     Returns
     -------
@@ -973,7 +982,7 @@ def rank_difference(
     usable = np.column_stack([*pairs])
     ranked = (usable >= 1).all(axis=1) & (usable <= MAX_RANK).all(axis=1)
     first_rank, second_rank = (pair[ranked].astype(np.int64) for pair in pairs)
-    agree, kappa = _agreement_change(first_rank, second_rank)
+    agree, kappa = _agreement_change(first_rank, second_rank, None if place_m is None else place_m[ranked])
     return RankDifference(
         tower=tower,
         k=k,
@@ -985,7 +994,7 @@ def rank_difference(
     )
 
 
-def _agreement_change(first: IntArray, second: IntArray) -> tuple[Changed, Changed]:
+def _agreement_change(first: IntArray, second: IntArray, place_m: FloatArray | None) -> tuple[Changed, Changed]:
     """Agreement and kappa of two reports on the same poses, each (n, 2): measured and simulated rank."""
     agree = [agreement(*pairs.T) for pairs in (first, second)]
     kappa = [cohen_kappa(*pairs.T) for pairs in (first, second)]
@@ -997,7 +1006,7 @@ def _agreement_change(first: IntArray, second: IntArray) -> tuple[Changed, Chang
 
     # one resample for both reports: what they share cancels in the difference
     def change(of: list[float], influence: FloatArray, statistic: Callable[[FloatArray], FloatArray]) -> Changed:
-        known = statistics.autocorrelation(influence)
+        known = statistics.autocorrelation(influence, place_m)
         drawn = statistics.bootstrap_means(joined, known.block_length)
         shift = statistic(drawn[:, width:]) - statistic(drawn[:, :width])
         return replace(_changed(*of), ci95=statistics.interval(of[1] - of[0], shift, known))

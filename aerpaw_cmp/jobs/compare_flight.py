@@ -184,6 +184,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         levels.simulated_db,
         baselines=case.simple,
         posed=levels.posed,
+        position_m=case.position_m,
         span_db=settings.span_db,
     )
     if clock is not None:
@@ -321,12 +322,13 @@ def _further(case: _Case, score: rss.RssComparison, stated: StatedSpread | None)
         elsewhere=_elsewhere(case, score, detection),
         trained_on=case.trained or None,
         rmse_bound=_bound(series, score),
+        interval_notes=score.intervals.notes or None,
     )
     if case.trained:
         return further
     return dataclasses.replace(
         further,
-        compared_with=_paired(levels, case.simple),
+        compared_with=_paired(levels, case.simple, case.position_m),
         averaged=_averaged(case),
         detection=detection,
         snr=_snr(series, levels),
@@ -406,10 +408,15 @@ def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> di
     }
 
 
-def _paired(levels: Levels, models: Mapping[str, FloatArray]) -> dict[str, statistics.PairedDifference]:
+def _paired(
+    levels: Levels, models: Mapping[str, FloatArray], position_m: FloatArray
+) -> dict[str, statistics.PairedDifference]:
     """The replay against each other model on the samples that both have, each with its own offset."""
     error_db = levels.measured_db - levels.simulated_db
-    return {name: statistics.paired_difference(error_db, levels.measured_db - level) for name, level in models.items()}
+    return {
+        name: statistics.paired_difference(error_db, levels.measured_db - level, place_m=position_m)
+        for name, level in models.items()
+    }
 
 
 def _averaged(case: _Case) -> dict[str, dict[str, Fit]]:
@@ -463,6 +470,7 @@ def _detection(case: _Case) -> DetectionScore | None:
         floor_db=floor_db,
         free_space_db=case.simple["free_space"][at],
         forecast=None if lock is None else _forecast(series, lock),
+        position_m=case.position_m[at],
     )
     return None if score is None else dataclasses.replace(score, locks=series.locked is not None)
 
@@ -599,6 +607,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         settings.k,
         time_s=(series.time[rows] - series.time[:1]) / np.timedelta64(1, "s") if len(rows) else None,
         sinr_db=sinr_db,
+        place_m=position[rows],
     )
     sigma, towers = ranks.singular_values(h), tower_places(replayed)
     probability, forecast, trained = _receiver_forecast(data, series)
@@ -618,7 +627,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         further=RankFurther(
             n_flagged=dict(series.flagged),
             kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
-            commonest=ranks.commonest_rank(series.rank[rows]),
+            commonest=ranks.commonest_rank(series.rank[rows], position[rows]),
             repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], heading),
             receiver=forecast,
             trained_on=trained or None,

@@ -182,7 +182,7 @@ def _same_flight(first: ReadReport, second: ReadReport) -> None:
 
 def _compare_reports(first: ReadReport, second: ReadReport) -> ReportDiff:
     """Everything that differs between two reports."""
-    levels, residuals = _levels(first, second)
+    levels, residuals, places = _levels(first, second)
     alone = [sorted(_links(a) - _links(b)) for a, b in ((first, second), (second, first))]
     return ReportDiff(
         first=_side(first),
@@ -192,7 +192,7 @@ def _compare_reports(first: ReadReport, second: ReadReport) -> ReportDiff:
         versions=tuple(_entries(first.metrics["versions"], second.metrics["versions"])),
         levels=tuple(levels),
         ranks=tuple(_ranks(first, second)),
-        pooled=pooled_difference(residuals) if residuals else None,
+        pooled=pooled_difference(residuals, place_m=places) if residuals else None,
         links_first_only=tuple(alone[0]),
         links_second_only=tuple(alone[1]),
         remarks=(*first.remarks, *second.remarks, *_learned_here(first, second)),
@@ -289,10 +289,18 @@ def _instants(table: Any) -> FloatArray:
     return np.asarray(seconds.fillna(table["time_s"]), dtype=np.float64)
 
 
-def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[verdict.LevelDifference], list[_Residuals]]:
-    """Each link that both have, and the residuals of its common samples."""
+def _places_m(table: Any) -> FloatArray:
+    """Position (n, 3) of each sample [m]."""
+    return np.column_stack([_values(table, name) for name in ("east_m", "north_m", "up_m")])
+
+
+def _levels(
+    mine: ReadReport, theirs: ReadReport
+) -> tuple[list[verdict.LevelDifference], list[_Residuals], list[FloatArray]]:
+    """Each link that both have, and the residuals and positions (n, 3) of its common samples."""
     differences: list[verdict.LevelDifference] = []
     residuals: list[_Residuals] = []
+    places: list[FloatArray] = []
     names = ("measured_db", "simulated_dbm", "residual_db")
     for (tower, channel), numbers in links_of(mine.metrics["rss"]).items():
         their_numbers = theirs.metrics["rss"].get(tower, {}).get(channel)
@@ -304,13 +312,14 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[verdict.LevelDif
         offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, their_numbers)]
         scored = [int(table["residual_db"].notna().sum()) for table in tables]
         residuals.append((_instants(a), second[2], first[2]))  # second minus first
+        places.append(_places_m(a))
         differences.append(
             verdict.level_difference(
                 tower, channel, overlap, first, second,
-                scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]),
+                scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]), place_m=places[-1],
             )
         )  # fmt: skip
-    return differences, residuals
+    return differences, residuals, places
 
 
 def _ranks(first: ReadReport, second: ReadReport) -> Iterator[verdict.RankDifference]:
@@ -323,4 +332,4 @@ def _ranks(first: ReadReport, second: ReadReport) -> Iterator[verdict.RankDiffer
         overlap, a, b = _matched(*(s.rank[s.rank["tower"] == tower] for s in (first, second)))
         for k in ks:
             pairs = [(_values(t, "measured_rank"), _values(t, f"{_SIMULATED}{k}")) for t in (a, b)]
-            yield verdict.rank_difference(tower, k, overlap, pairs[0], pairs[1])
+            yield verdict.rank_difference(tower, k, overlap, pairs[0], pairs[1], _places_m(a))

@@ -669,7 +669,10 @@ def _series(
             continue
         cards[key] = level_card(seconds[same], item.measured_db[same], _part(model, same), thresholds)
         errors[key] = np.where(scored, item.measured_db - model.level_db, np.nan)
-    pairs = {key: paired_difference(errors[name], error) for key, error in errors.items() if key != name}
+    pairs = {
+        key: paired_difference(errors[name], error, place_m=item.position_m)
+        for key, error in errors.items() if key != name
+    }  # fmt: skip
     return SeriesVerdict(
         tower=item.tower, channel=item.channel, unit=item.unit, matched=int((near & item.posed).sum()),
         unmatched=int((item.posed & ~near).sum()), cards=cards, differences=pairs,

@@ -340,7 +340,8 @@ def rss_verdict(panel: RssResult) -> str:
     paired = panel.further.compared_with.get(best)
     if paired is not None:
         text += ": " + paired.in_words(pretty(best))
-    return f"{text}; {pretty(best)}: {errors[best]:.1f} dB.{_detection_words(panel)}{_snr_words(panel)}"
+    notes = "".join(f" {note}" for note in panel.further.interval_notes or ())
+    return f"{text}; {pretty(best)}: {errors[best]:.1f} dB.{_detection_words(panel)}{_snr_words(panel)}{notes}"
 
 
 def _detection_words(panel: RssResult) -> str:

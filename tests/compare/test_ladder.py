@@ -33,7 +33,7 @@ def wave(n, seed, sd=1.0):
 
 def along(count):
     """Places on a line, one after the other: cells of places are stretches of time."""
-    return np.column_stack([np.arange(float(count)), np.zeros(count)])
+    return np.column_stack([np.arange(float(count)), np.zeros((count, 2))])
 
 
 def planted(n=2000):
@@ -111,7 +111,7 @@ def test_nothing_measured_recommends_nothing():
 def test_a_place_that_is_visited_twice_is_left_out_as_a_whole():
     """Out and back along a line with a step in level at the middle: the offset of a place never has seen its level."""
     out = np.linspace(0.0, 800.0, 400)
-    position = np.stack([np.r_[out, out[::-1]], np.zeros(800)], axis=1)
+    position = np.column_stack([np.r_[out, out[::-1]], np.zeros((800, 2))])
     place = places_of(position)
     np.testing.assert_array_equal(np.bincount(place), np.full(8, 100))
     np.testing.assert_array_equal(place[:400], place[400:][::-1])

@@ -116,7 +116,9 @@ def test_the_ends_of_any_interval_lie_between_the_outer_thousandth_and_tenth_of_
     for keep in (0.0, 0.5, 0.9, 0.99, 1.0):
         for seed in (n, 22):  # of 60 steps, the second walk would lie outside by its shares
             values = lfilter([1.0], [1.0, -keep], np.random.default_rng(seed).normal(size=n))
-            stretches = [statistics._picked(cosine_terms(values).slow, kind)[2] for kind in ("mean", "power")]
+            slow = cosine_terms(values).slow
+            known = [statistics.known_memories(kind, len(slow)) for kind in ("mean", "power")]
+            stretches = [statistics._picked(slow, each)[2] for each in known]
             assert 0.001 < 1.0 / (1.0 + 39.0 ** max(stretches)) <= 1.0 / (1.0 + 39.0 ** min(stretches)) < 0.1
 
 
@@ -163,3 +165,109 @@ def test_the_likeliest_memory_is_about_that_of_the_sequence(samples: int) -> Non
     rng, keep = np.random.default_rng(samples), np.exp(-1.0 / samples)
     shares = [statistics.memory_share(lfilter([1.0], [1.0, -keep], rng.normal(size=2000))) for _ in range(20)]
     assert np.median(shares) * 2000 == pytest.approx(samples, rel=0.6)
+
+
+def lawnmower(n: int) -> np.ndarray:
+    """Positions (n, 3) on legs of 400 m that lie 60 m apart, a sample every 10 m."""
+    leg, along = np.divmod(np.arange(n), 40)
+    return np.column_stack([np.where(leg % 2 == 0, along, 39 - along) * 10.0, 60.0 * leg, np.zeros(n)])
+
+
+def shadowed(place_m: np.ndarray, length_m: float, flights: int, seed: int) -> np.ndarray:
+    """Errors (flights, n) that are correlated over place, with white noise of 0.4 of their standard deviation."""
+    covariance = np.exp(-np.linalg.norm(place_m[:, None] - place_m, axis=2) / length_m)
+    root = np.linalg.cholesky(covariance + 1e-9 * np.eye(len(place_m)))
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(flights, len(root))) @ root.T + 0.4 * rng.normal(size=(flights, len(root)))
+
+
+def test_a_memory_over_place_is_the_covariance_of_its_terms_along_the_track() -> None:
+    place, terms = lawnmower(100), 24
+    size = np.sqrt(np.square(place - place.mean(axis=0)).sum(axis=1).mean())
+    basis = np.sqrt(2.0) * np.cos(np.pi * np.outer(np.arange(terms + 1), (np.arange(100) + 0.5) / 100)) / 100
+    basis[0] = 0.01
+    apart = np.linalg.norm(place[:, None] - place, axis=2)
+    known = statistics.place_memories(place, terms)
+    assert known is not None
+    for at, length in enumerate(statistics.LENGTHS * size):
+        covariance = basis @ np.exp(-apart / length) @ basis.T
+        inner = covariance[1:, 1:] / np.trace(covariance[1:, 1:])
+        for number, white in enumerate(statistics.PLACE_WHITE):
+            whiten = known.whiten[number * len(statistics.LENGTHS) + at]
+            mixed = (1.0 - white) * inner + white * np.eye(terms) / terms
+            np.testing.assert_allclose(whiten @ mixed @ whiten.T, np.eye(terms), atol=1e-6)
+    assert len(known.power) == len(statistics.LENGTHS) * (len(statistics.PLACE_WHITE) + len(statistics.PLACE_FADING))
+
+
+def test_intervals_of_a_lawnmower_over_shadowing_cover_the_truth() -> None:
+    """By time alone they cover the offset in three of four flights: the track returns next to its earlier legs."""
+    place = lawnmower(400)
+    errors = shadowed(place, 150.0, 150, seed=3)
+    truth = np.sqrt(errors.var(axis=1).mean())
+    held = [(low <= 0.0 <= high, least <= truth <= most) for low, high, least, most in
+            ((*statistics.mean_interval(e, place), *statistics.spread_interval(e, place)) for e in errors)]  # fmt: skip
+    offset, rmse = np.mean(held, axis=0)
+    assert (offset > 0.9, rmse > 0.88) == (True, True), (offset, rmse)
+    alone = np.mean([low <= 0.0 <= high for low, high in map(statistics.mean_interval, errors)])
+    assert alone < 0.85
+
+
+def test_equal_models_on_a_lawnmower_seldom_get_a_verdict() -> None:
+    place, flights = lawnmower(400), 80
+    own, other = (shadowed(place, 150.0, flights, seed) for seed in (5, 6))
+    pairs = [(a, 0.5 * a + np.sqrt(0.75) * b) for a, b in zip(own, other, strict=True)]
+    decided = [
+        np.mean([statistics.paired_difference(*pair, place_m=known).verdict in ("better", "worse") for pair in pairs])
+        for known in (place, None)
+    ]
+    assert decided[0] <= 0.1 < decided[1], decided
+
+
+def test_white_errors_are_not_taken_for_shadowing() -> None:
+    place, errors = lawnmower(400), np.random.default_rng(8).normal(size=(20, 400))
+    widths = np.array([[np.ptp(statistics.mean_interval(e, known)) for known in (place, None)] for e in errors])
+    assert np.median(widths[:, 0] / widths[:, 1]) < 1.1
+
+
+@pytest.mark.parametrize(
+    ("place", "reason"),
+    [
+        (np.random.default_rng(1).normal(0.0, 2.0, (200, 3)), "the UAV hardly left one place"),
+        (np.where(np.arange(200)[:, None] % 2, np.nan, lawnmower(200)), "50 % of the samples have no position"),
+        (np.where(np.arange(200)[:, None] % 8 == 0, np.nan, lawnmower(200)), "12 % of the samples have no position"),
+        (np.full((200, 3), np.nan), "100 % of the samples have no position"),
+    ],
+)
+def test_a_hover_or_missing_positions_leave_correlation_over_time_and_say_so(place: np.ndarray, reason: str) -> None:
+    values = np.cumsum(np.random.default_rng(2).normal(size=200))
+    assert statistics.only_time(place) == reason
+    assert np.array_equal(mean_draws(values, place_m=place), mean_draws(values))
+    (note,) = statistics.error_intervals(np.zeros(200), values, place).notes
+    assert note == f"The intervals consider correlation over time alone: {reason}."
+
+
+def test_positions_that_repeat_or_miss_a_few_samples_serve() -> None:
+    place, values = np.repeat(lawnmower(100), 2, axis=0), np.random.default_rng(4).normal(size=200)
+    some = np.where(np.arange(200)[:, None] % 20 == 0, np.nan, place)
+    for known in (place, some):
+        assert statistics.only_time(known) == ""
+        low, high = statistics.mean_interval(values, known)
+        assert -0.6 < low < values.mean() < high < 0.6
+    assert np.isnan(statistics.mean_interval(values[:2], place[:2])).all(), "two samples have no interval"
+
+
+@pytest.mark.parametrize("keep", [0.0, 0.9])
+def test_a_loud_part_widens_the_rmse_and_is_named(keep: float) -> None:
+    flights = np.array([lfilter([1.0], [1.0, -keep], e) for e in np.random.default_rng(9).normal(size=(60, 400))])
+    assert all(statistics.loud_part(e) == (0.0, 1.0) for e in flights)
+    steady = flights.copy()
+    flights[:, 100:166] *= 5.0
+    found = np.array([statistics.loud_part(e) for e in flights])
+    assert found[:, 0] == pytest.approx(1.0 / 6.0, abs=0.1)
+    assert (found[:, 1] > 4.0).all()
+    truth = np.sqrt(flights.var(axis=1).mean())
+    held = [low <= truth <= high for low, high in map(statistics.spread_interval, flights)]
+    assert np.mean(held) > 0.9
+    assert statistics.error_intervals(np.zeros(400), steady[0]).notes == ()
+    (note,) = statistics.error_intervals(np.zeros(400), flights[0]).notes
+    assert note.startswith("The error is not stationary: it is ")

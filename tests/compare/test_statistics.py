@@ -211,7 +211,7 @@ def test_an_interval_wider_than_twice_its_value_is_a_bound(monkeypatch):
     ramp = np.arange(30.0) - 14.5
     for factor, bound in ((1.9, False), (2.1, True)):
         drawn = np.square(np.linspace(0.0, factor / 0.95 * ramp.std(), 20_001) + 0.5 * ramp.std())
-        monkeypatch.setattr(statistics, "power_draws", lambda _, drawn=drawn: drawn)
+        monkeypatch.setattr(statistics, "power_draws", lambda *_, drawn=drawn: drawn)
         low, high = statistics.spread_interval(ramp)
         assert low == pytest.approx((0.5 + 0.025 * factor / 0.95) * ramp.std(), rel=1e-3)
         assert np.isinf(high) == bound
@@ -222,7 +222,7 @@ def test_a_difference_whose_interval_nobody_can_use_has_none(monkeypatch):
     errors = np.tile([2.0, -2.0], 50), np.tile([2.0, 2.0, -2.0, -2.0], 25)
     for half_db2, given in ((7.9, True), (8.1, False)):
         draws = np.linspace(-half_db2 / 0.95, half_db2 / 0.95, 4097)
-        monkeypatch.setattr(statistics, "mean_draws", lambda *_, draws=draws: draws)
+        monkeypatch.setattr(statistics, "mean_draws", lambda *_, draws=draws, **__: draws)
         for pair in (errors, errors[::-1]):
             known = paired_difference(*pair)
             assert np.isfinite(known.difference_ci95_db).all() == given

@@ -799,7 +799,7 @@ def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
 
 def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
     """Check whether a stream is that of a cell that the flight file, which names others, does not name."""
-    return bool(log.cells) and "pci" in stream.attributes and _home(log, stream) is None
+    return bool(log.cells) and not {"pci", "part"}.isdisjoint(stream.attributes) and _home(log, stream) is None
 
 
 def _home(log: LogSettings, stream: Stream) -> str | None:
@@ -894,11 +894,16 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
     parts = sorted((p for p in group if len(p[1].time)), key=lambda p: p[1].time.min()) or [group[0]]
     for (path, before), (later_path, after) in itertools.pairwise(parts):
         if after.time.min() < before.time.max() or _form(before) != _form(after):
-            where = "two logs" if path != later_path else "two streams of a log"
+            where, cause = f"two logs hold {what}", "a copy: leave one out, by its path or by 'skip'"
+            if path == later_path:
+                where = f"two streams of one log hold {what}"
+                cause = (
+                    "two cells or devices: name the tower's own by 'cells: {STREAM: TOWER}', 'ingest --all' lists them"
+                )
             raise UsageError(
-                f"{where} hold {what} at the same time or in another form: {path!r} and {later_path!r}",
+                f"{where} at the same time or in another form: {path!r} and {later_path!r}",
                 expected="one record of each channel and of each tower's rank",
-                cause="a copy: leave one out, by its path or by 'skip'; another radio: give it its own 'channel'",
+                cause=f"{cause}; another radio: give it its own 'channel'",
             )
     # what does not grow with the record (link, unit) is that of its first part
     first = parts[0][1]

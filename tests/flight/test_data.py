@@ -111,6 +111,16 @@ def test_a_receiver_whose_week_number_rolled_over_is_named_and_shifted(tmp_path:
     assert (shifted.track.start_ns, shifted.track.end_ns) == (right.start_ns, right.end_ns)
 
 
+def test_one_of_two_cells_that_only_a_number_distinguishes_is_chosen_by_its_stream(tmp_path: Path) -> None:
+    begin = 1_748_786_400  # 2025-06-01 14:00:00 UTC, in the sample flight
+    rows = (f"{begin + 60 + i},Op,310,{51200001 + i // 20 % 2 * 513},{-80 - 20 * (i // 20 % 2)}" for i in range(120))
+    (tmp_path / "phone.csv").write_text("\n".join(["timestamp,operator,mcc,cell_id,rsrp", *rows, ""]))
+    with pytest.raises(UsageError, match=r"two streams of one log hold RSS of LW1 P .*'cells: \{STREAM: TOWER\}'"):
+        _flight(tmp_path, "path: phone.csv, node: LW1, channel: P")
+    (series,) = _flight(tmp_path, "path: phone.csv, channel: P, cells: {rsrp_cell51200001: LW1}").rss
+    assert set(series.measured_db) == {-80.0}
+
+
 def test_a_rank_log_in_two_parts_is_one_record(tmp_path: Path) -> None:
     log = "UAV/modem_ri.csv"
     (uncut,) = _flight(tmp_path, f"path: {SAMPLE / log}").rank

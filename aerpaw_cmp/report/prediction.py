@@ -251,7 +251,8 @@ def _against_free_space(correction: Correction) -> Verdict:
     )
     if len(correction.flights) > 1:
         # a mean over few flights, as of calibrate: samples of one flight share its offset and its weather
-        verdict = by_flight(*(_by_part(errors, correction.held_out_parts) for errors in (error, free_space)))
+        parts = correction.held_out_parts
+        verdict = by_flight(_by_part(error, parts), _by_part(free_space, parts))
         return replace(verdict, cause="two flights") if verdict.cause == "no interval" else verdict
     pair = paired_difference(error, free_space, free_offset=False)
     return Verdict(cause=pair.verdict, effect=pair.difference_db, interval=pair.difference_ci95_db)

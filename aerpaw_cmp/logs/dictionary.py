@@ -581,9 +581,10 @@ PROGRAMS: tuple[Program, ...] = (
 _LIKE_A_LEVEL = re.compile(
     r"^value$|power|\bpwr|signal|\blevel|\blvl|\bdb(m|fs)?\b|\brss|strength|\bampl|magnitude|rsrp"
 )
-_UNLIKE_A_LEVEL = re.compile(
+UNLIKE_A_LEVEL = re.compile(
     r"batt|volt|current|throttle|gps|water|fuel|noise|gain|loss|\btx|alt|height|elev|\bsea\b|type|quality|source|bars"
     r"|\basu|mode|state|status|charge|energy|consum|\b(avg|mean|min|max|std|log|audio|sound|light|id)\b|threshold|count"
+    r"|\b([xyz]|down|home|gyro|mag)\b|\b(lat|lon|lng|acc|vel|speed|temp|yaw|roll|pitch|heading|offset)"
 )
 
 
@@ -593,7 +594,7 @@ def like_levels(names: Iterable[str]) -> list[str]:
     electric = any(re.search(r"volt|batt|\bcurrent", text) for text in words.values())
     return [
         name for name, text in words.items()
-        if _LIKE_A_LEVEL.search(text) and not _UNLIKE_A_LEVEL.search(text)
+        if _LIKE_A_LEVEL.search(text) and not UNLIKE_A_LEVEL.search(text)
         and not (electric and re.fullmatch(r"(.* )?(power|pwr)( m?w)?", text))
     ]  # fmt: skip
 

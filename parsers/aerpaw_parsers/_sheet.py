@@ -797,7 +797,11 @@ _MAPPED = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg
 def way_to_level(sheet: Sheet) -> list[str]:
     """A sentence with the options that read as the level a column whose name only looks like one, or the RSRQ."""
     like = dictionary.like_levels(sheet.names)
-    named = [i for i, meaning in enumerate(sheet.meanings) if meaning is None and sheet.names[i] in like]
+    named = [
+        i
+        for i, meaning in enumerate(sheet.meanings)
+        if meaning is None and (sheet.names[i] in like or _has_levels(sheet, i))
+    ]
     filled = [i for i in (*named, sheet.find("RSRQ")) if i is not None and np.isfinite(sheet.numbers(i)).any()]
     time = _time_column(sheet) if sheet.find("time") is not None else sheet.find("gps_seconds")
     if not filled or time is None:
@@ -808,6 +812,13 @@ def way_to_level(sheet: Sheet) -> list[str]:
     unit = "dBm" if (sheet.unit_read(filled[0]) or "dBm") == "dBm" and not relative else "dB"
     others = f" (so may {', '.join(repr(sheet.names[i]) for i in filled[1:5])})" if filled[1:] else ""
     return [f"{sheet.names[filled[0]]!r} may be a level, and is not read as one{others}: {options} --unit {unit}"]
+
+
+def _has_levels(sheet: Sheet, column: int) -> bool:
+    """Check whether the numbers of a column are as levels in dBm are, such as those of a tower by its name."""
+    known = sheet.numbers(column)[np.isfinite(sheet.numbers(column))]
+    like = len(known) > 1 and (known < -30).mean() > 0.9 and known.min() > -150
+    return bool(like and not dictionary.UNLIKE_A_LEVEL.search(sheet.plain[column]))
 
 
 def _gps_weeks(sheet: Sheet, time: int | None) -> FloatArray | None:

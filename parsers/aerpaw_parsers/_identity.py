@@ -201,7 +201,14 @@ def _marks(
         # among the rows of one known key: a cell's number that goes with its PCI says nothing more
         same = _of_one_key(table.drop(columns=["time", "levels"]))
         part, time = sheet.part(same), rows.time[same]
-        marks += [i for i in unknown if i != level and level is not None and _takes_turns(time, part, i, level)]
+        for i in unknown if level is not None else ():
+            alternates, in_turns = _alternates(time, part, i, level)
+            marks += [i] if in_turns else []
+            if alternates and not in_turns:
+                rows.warnings.append(
+                    f"column {sheet.names[i]!r}: the level steps with its values from row to row, but they do not take "
+                    "turns: does it name the device or cell of a row? Then call it 'device'"
+                )
     return marks
 
 
@@ -221,25 +228,26 @@ def _few(texts: Iterable[str]) -> bool:
     return 1 < len({*texts}) <= _MOST_MARKS
 
 
-# Rows take turns if this share of them repeats the order of the rows before, and if the median step within a source
-# is below this share of the median step between rows.
-_IN_TURN, _SMALLER, _FEWEST_TURNS = 0.8, 0.5, 8
+# Values alternate if this share of the rows has another value than the row before, and if the median step of the level
+# within a value is below this share of the median step between values. They take turns if this share of the rows
+# repeats the order of the rows before.
+_CHANGED, _SMALLER, _IN_TURN, _FEWEST = 0.3, 0.5, 0.8, 8
 
 
-def _takes_turns(time: AnyArray, sheet: _sheet.Sheet, column: int, level: int) -> bool:
-    """Check whether the values of a column take turns from row to row, and the level with them."""
+def _alternates(time: AnyArray, sheet: _sheet.Sheet, column: int, level: int) -> tuple[bool, bool]:
+    """Return whether a column and the level alternate together between neighbouring rows, and whether in turns."""
     texts = np.array(sheet.texts(column), dtype=object)
-    if not _few(texts.tolist()) or len(texts) < _FEWEST_TURNS:
-        return False
+    if column == level or not _few(texts.tolist()) or len(texts) < _FEWEST:
+        return False, False
     order = np.argsort(time, kind="stable")
     texts, values = texts[order], sheet.numbers(level)[order]
-    count = len({*texts.tolist()})
-    if len(texts) < 2 * count or (texts[1:] != texts[:-1]).mean() < _IN_TURN:
-        return False
-    if (texts[count:] == texts[:-count]).mean() < _IN_TURN:
-        return False
-    within = [np.abs(np.diff(values[texts == text])) for text in {*texts.tolist()}]
-    return _typical(np.concatenate(within)) < _SMALLER * _typical(np.abs(np.diff(values)))
+    changed, count = texts[1:] != texts[:-1], len({*texts.tolist()})
+    if changed.mean() < _CHANGED or len(texts) < 2 * count:
+        return False, False
+    within = np.concatenate([np.abs(np.diff(values[texts == text])) for text in {*texts.tolist()}])
+    alternates = _typical(within) < _SMALLER * _typical(np.abs(np.diff(values))[changed])
+    in_turns = min(changed.mean(), (texts[count:] == texts[:-count]).mean()) >= _IN_TURN
+    return alternates, alternates and bool(in_turns)
 
 
 def _typical(steps: FloatArray) -> float:

@@ -105,3 +105,18 @@ def test_rows_whose_identity_is_empty_are_no_part_of_another(tmp_path: Path) -> 
     rows = "".join(f"{1749564000 + i},{'' if i % 2 else 'A'},{-70 - 40 * (i % 2)}\n" for i in range(20))
     levels = [set(s.frame["rss_db"]) for s in read(tmp_path / "x.csv", f"time,operator,rsrp\n{rows}").streams]
     assert levels == [{-70.0}, {-110.0}]
+
+
+def test_a_column_of_an_unknown_name_whose_values_alternate_without_turns_is_asked_about(tmp_path: Path) -> None:
+    """A second source 12 dB lower, at random between the rows of the first; a waypoint is none."""
+    chance = random.Random(3)
+    rows = [
+        (1749564000 + i, source := chance.randrange(2), -70 - 12 * source - chance.random(), i // 10) for i in range(80)
+    ]
+    text = "".join(f"{time},{'ab'[source]},{level:.1f},{leg}\n" for time, source, level, leg in rows)
+    warnings = read(tmp_path / "x.csv", f"time,box,rsrp,leg\n{text}").warnings
+    assert (
+        [text for text in warnings if "does it name the device or cell" in text]
+        == [text for text in warnings if text.startswith("column 'box'")]
+        != []
+    )

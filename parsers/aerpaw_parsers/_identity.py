@@ -201,7 +201,9 @@ def _marks(
         # among the rows of one known key: a cell's number that goes with its PCI says nothing more
         same = _of_one_key(table.drop(columns=["time", "levels"]))
         part, time = sheet.part(same), rows.time[same]
-        for i in unknown if level is not None else ():
+        if level is None:
+            return marks
+        for i in unknown:
             alternates, in_turns = _alternates(time, part, i, level)
             marks += [i] if in_turns else []
             if alternates and not in_turns:

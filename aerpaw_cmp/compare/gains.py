@@ -1101,18 +1101,21 @@ class KnownProcess:
         Mean and standard deviation (n,) [dB] towards unit vectors (n, 3).
     directions : (m, 3)
     covariance_db2 : (m, m)
+    term : Term
+        Prior of the gain: that of the UAV, or of a tower's antenna.
     """
 
     gain_db: Callable[[FloatArray], FloatArray]
     sd_db: Callable[[FloatArray], FloatArray]
     directions: FloatArray
     covariance_db2: FloatArray
+    term: Term = BODY
 
     @cached_property
     def _factor(self) -> Factor:
-        prior = term_kernel(BODY, self.directions, self.directions)
+        prior = term_kernel(self.term, self.directions, self.directions)
         # the directions have a tenth of a degree: two may be the same
-        prior[np.diag_indices(len(prior))] += 1e-3 * BODY.sd_db**2
+        prior[np.diag_indices(len(prior))] += 1e-3 * self.term.sd_db**2
         return Factor.of(prior)
 
     def moments(self, at: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -1124,19 +1127,13 @@ class KnownProcess:
         independent rest: ``A S A'`` and ``K - A K(G, at)`` of the prior, scaled so that the diagonal is the variance of
         the table.
         """
-        across = term_kernel(BODY, at, self.directions)
+        across = term_kernel(self.term, at, self.directions)
         weights = self._factor.solve(across.T).T
         known = weights @ self.covariance_db2 @ weights.T
-        rest = term_kernel(BODY, at, at) - weights @ across.T
+        rest = term_kernel(self.term, at, at) - weights @ across.T
         left = (self.sd_db(at) ** 2 - np.diag(known)) / np.maximum(np.diag(rest), 1e-6)
         scale = np.sqrt(np.clip(left, 0.0, 1.0))
         return self.gain_db(at), known + scale[:, None] * rest * scale
-
-
-def table_moments(term: Term, sd_db: FloatArray, at: FloatArray) -> FloatArray:
-    """Return the covariance (n, n) of a gain of which only the table is known: the prior's correlation with its SD."""
-    scale = np.minimum(sd_db / term.sd_db, 1.0)
-    return np.asarray(scale[:, None] * term_kernel(term, at, at) * scale)
 
 
 class FlightEvidence:

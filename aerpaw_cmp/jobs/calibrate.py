@@ -642,20 +642,21 @@ def _controls_of(
     }
 
 
-# Directions at the UAV that stand for its gain when its evidence is judged.
+# Directions that stand for the gain of an end when its evidence is judged, and the length of its kernel.
 _KNOWN_SHARE, _MOST_KNOWN = 0.002, 100
+_LENGTHS: Mapping[gains.Frame, float] = {term.frame: term.length for term in gains.ANTENNA_TERMS}
 
 
-def known_directions(fit: gains.GainFit, antenna: str) -> KnownDirections:
-    """Return the directions at the UAV that determine its gain, and the covariance there.
+def known_directions(fit: gains.GainFit, antenna: str, frame: gains.Frame = "body") -> KnownDirections:
+    """Return the directions at one end that determine its gain, and the covariance there.
 
     With 60, 100 or 200 of them the evidence for an airframe differs by at most 3 nat.
     """
     from scipy.spatial.distance import cdist
 
-    flown = fit.seen("body", antenna)
-    at = flown[determining(flown, lambda a, b: np.exp(-cdist(a, b)), _KNOWN_SHARE, _MOST_KNOWN)]
-    return KnownDirections(directions=at, covariance_db2=fit.covariance("body", antenna, at))
+    flown, length = fit.seen(frame, antenna), _LENGTHS[frame]
+    at = flown[determining(flown, lambda a, b: np.exp(-cdist(a, b) / length), _KNOWN_SHARE, _MOST_KNOWN)]
+    return KnownDirections(directions=at, covariance_db2=fit.covariance(frame, antenna, at))
 
 
 def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: Mapping[str, Learned]) -> frozenset[str]:

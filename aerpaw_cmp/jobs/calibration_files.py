@@ -359,17 +359,19 @@ def _learned_series(
         samples = [s for s in mine if s.antenna == antenna]
         # the UAV has one antenna for all towers of a band
         shared = next(s.antenna for s in mine if s.airframe == samples[0].airframe)
-        parts = {"tower": antenna, "pair": antenna, "uav": shared, "known": shared}
+        parts = {"tower": antenna, "pair": antenna, "tower_known": antenna, "uav": shared, "known": shared}
         files = {part: f"{safe_name(f'{name}.{owner}.{part}')}.csv.gz" for part, owner in parts.items()}
         notes = {p: (f"aerpaw-cmp calibrate: {name}, {antenna} {p}", *_provenance_notes(calibration)) for p in files}
-        # these two are never named alone, and fingerprints are most of a table
-        notes |= {part: notes[part][:2] for part in ("known", "pair")}
+        # these are never named alone, and fingerprints are most of a table
+        notes |= {part: notes[part][:2] for part in ("known", "tower_known", "pair")}
         for end in ("tower", "uav"):
             gains = maps[parts[end], end]
             content = sphere_csv(gains.gain_dbi, gains.sd_db, notes[end], decimals=2)
             tables.setdefault(files[end], content.encode())
         if files["known"] not in tables:
             tables[files["known"]] = known_directions(calibration.fit, antenna).table(notes["known"]).encode()
+        known = known_directions(calibration.fit, antenna, "mast")
+        tables[files["tower_known"]] = known.table(notes["tower_known"]).encode()
         both = None
         if (pair := _pair_gain(calibration, antenna)) is not None:
             tables[files["pair"]] = pair.table(notes["pair"]).encode()
@@ -385,6 +387,7 @@ def _learned_series(
                 tower_file=files["tower"],
                 uav_file=files["uav"],
                 known_file=files["known"],
+                tower_known_file=files["tower_known"],
                 pair=both,
                 spread=rounded_spread(calibration.learned.spread(antenna)),
                 sd_db=round(float(np.nanmean(sds)), 2),

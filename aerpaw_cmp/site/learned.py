@@ -204,6 +204,8 @@ class LearnedSeries(StrictModel):
     uav_file: str
     known_file: str
     """Directions at the UAV that determine its gain, and the covariance of the gain there."""
+    tower_known_file: str
+    """The same for the tower's antenna."""
     pair: LearnedPair | None = None
     spread: LearnedSpread
     sd_db: float
@@ -218,7 +220,8 @@ class LearnedSeries(StrictModel):
     @property
     def files(self) -> list[str]:
         """Names of the tables."""
-        return [self.tower_file, self.uav_file, self.known_file, *([] if self.pair is None else [self.pair.file])]
+        both = [] if self.pair is None else [self.pair.file]
+        return [self.tower_file, self.uav_file, self.known_file, self.tower_known_file, *both]
 
 
 class LearnedReceiver(StrictModel):

@@ -56,11 +56,15 @@ def known_site(folder: Path, turn_deg: int = 0) -> Path:
     place.write_bytes(folder_of("lake_wheeler").with_suffix(".yaml").read_bytes())
     _, _, v = sphere_grid(20.0)
     at = v.reshape(-1, 3)[18:-17]
-    known = KnownDirections(directions=at, covariance_db2=0.05 * term_kernel(ANTENNA_TERMS[0], at, at)).table(())
-    files, series = {"u.csv.gz": table(np.roll(UAV, turn_deg // 5, axis=1)), "k.csv.gz": known.encode()}, []
+    known, of_towers = (
+        KnownDirections(directions=at, covariance_db2=0.05 * term_kernel(term, at, at)).table(()).encode()
+        for term in ANTENNA_TERMS[:2]
+    )
+    uav = table(np.roll(UAV, turn_deg // 5, axis=1))
+    files, series = {"u.csv.gz": uav, "k.csv.gz": known, "m.csv.gz": of_towers}, []
     for channel, gain in TOWERS.items():
         files[f"{channel}.t.csv.gz"] = table(gain)
-        series.append(learned_series(channel, uav_file="u.csv.gz", known_file="k.csv.gz"))
+        series.append(learned_series(channel, uav_file="u.csv.gz", known_file="k.csv.gz", tower_known_file="m.csv.gz"))
     remember(place, "past", learned_entry(*series), files)
     return place
 

@@ -380,7 +380,7 @@ def test_learned_antennas_are_found_from_any_working_folder(
 def test_the_packaged_memory_is_small_and_says_where_it_comes_from() -> None:
     known, place = read_learned("lake_wheeler"), folder_of("lake_wheeler")
     assert {"dataset12", "lte", "afar", "nr_rank"} <= set(known.entries)
-    assert sum(p.stat().st_size for p in place.iterdir()) < 450_000
+    assert sum(p.stat().st_size for p in place.iterdir()) < 550_000
     for entry_ in known.entries.values():
         assert len(entry_.trained_on) >= 2
         assert entry_.command.startswith("aerpaw-cmp calibrate ")

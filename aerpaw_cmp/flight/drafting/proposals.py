@@ -23,6 +23,7 @@ from ...common.errors import InputError, UsageError
 from ...common.jsonable import named
 from ...common.units import FloatArray, spread_out
 from ...compare.gains import (
+    BODY,
     LEAST_ODDS,
     MAST,
     Evidence,
@@ -31,8 +32,8 @@ from ...compare.gains import (
     LinkSamples,
     Moments,
     Spread,
+    Term,
     link_directions,
-    table_moments,
 )
 from ...compare.locate import FEWEST, LevelModel, LevelTrack, fit_places, level_track, locate, place_odds
 from ...logs.records import Stream
@@ -347,6 +348,7 @@ class Remembered:
     tower: SpherePattern
     uav: SpherePattern
     known: KnownDirections
+    tower_known: KnownDirections
 
     @property
     def level(self) -> learned.LearnedLevel:
@@ -367,12 +369,12 @@ class Remembered:
     @cached_property
     def airframe(self) -> KnownProcess:
         """Gain of the UAV with its covariance."""
-        return KnownProcess(
-            gain_db=lambda at: self.uav.gain_dbi(*sphere_angles(at)),
-            sd_db=lambda at: self.uav.gain_sd_db(*sphere_angles(at)),
-            directions=self.known.directions,
-            covariance_db2=self.known.covariance_db2,
-        )
+        return _process(self.uav, self.known, BODY)
+
+    @cached_property
+    def tower_antenna(self) -> KnownProcess:
+        """Gain of the tower's antenna with its covariance."""
+        return _process(self.tower, self.tower_known, MAST)
 
     @property
     def teaches(self) -> bool:
@@ -390,12 +392,21 @@ class Remembered:
 
     def moments(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
         """Return mean (n,) and covariance (n, n) of the gain of both ends [dB, dB^2]."""
-        angles = sphere_angles(samples.at_tower)
         uav_db, covariance = self.airframe.moments(samples.at_uav)
-        covariance += table_moments(MAST, self.tower.gain_sd_db(*angles), samples.at_tower)
+        tower_db, of_tower = self.tower_antenna.moments(samples.at_tower)
         both = np.concatenate([samples.at_uav, samples.at_tower], axis=1)
         pair_db = 0.0 if self.tower.pair is None else self.tower.pair.at(both, np.zeros(len(both)))[0]
-        return uav_db + self.tower.gain_dbi(*angles) + pair_db, covariance
+        return uav_db + tower_db + pair_db, covariance + of_tower
+
+
+def _process(pattern: SpherePattern, known: KnownDirections, term: Term) -> KnownProcess:
+    return KnownProcess(
+        gain_db=lambda at: pattern.gain_dbi(*sphere_angles(at)),
+        sd_db=lambda at: pattern.gain_sd_db(*sphere_angles(at)),
+        directions=known.directions,
+        covariance_db2=known.covariance_db2,
+        term=term,
+    )
 
 
 def every_antenna(site: str | Path) -> list[Remembered]:
@@ -416,8 +427,14 @@ def every_antenna(site: str | Path) -> list[Remembered]:
             if (pair := series.pair) is not None:
                 place, written = folder / pair.file, named.written(pair.file)
                 tower.pair = read_pair(place, pair.length, pair.prior_sd_db, written)
-            known = read_known(folder / series.known_file, named.written(series.known_file))
-            out.append(Remembered(name=name, entry=entry, series=series, tower=tower, uav=uav, known=known))
+            known, of_tower = (
+                read_known(folder / file, named.written(file)) for file in (series.known_file, series.tower_known_file)
+            )
+            out.append(
+                Remembered(
+                    name=name, entry=entry, series=series, tower=tower, uav=uav, known=known, tower_known=of_tower
+                )
+            )
     return out
 
 

@@ -307,6 +307,8 @@ class OrdinaryKriging:
         Of the random selection.
     outside : {"nan", "nearest"}
         What happens where no sample lies within the radius.
+    bounds : (low, high), optional
+        Limits of the estimates, such as (1, 4) for ranks.
 
     Attributes
     ----------
@@ -318,6 +320,11 @@ class OrdinaryKriging:
         Place of each sample.
     sill_ : (fields,)
         v^2 of the variance: the sample variance of each field.
+
+    Notes
+    -----
+    Weights can be negative, so an estimate can lie outside the range of its samples, most with a correlation that is
+    smooth at 0: of ranks 1 and 4 a Gaussian correlation made -6.9 to 11.3. ``bounds`` limits the estimates.
 
     Examples
     --------
@@ -334,6 +341,7 @@ class OrdinaryKriging:
     selection: Literal["nearest", "random"] = "nearest"
     seed: int = 0
     outside: Literal["nan", "nearest"] = "nan"
+    bounds: tuple[float, float] | None = None
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> OrdinaryKriging:
         """Store the samples.
@@ -408,6 +416,8 @@ class OrdinaryKriging:
         return np.asarray(squares.sum(axis=0) / np.maximum(count - 1, 1))
 
     def _shaped(self, estimate: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        if self.bounds is not None:
+            estimate = np.clip(estimate, *self.bounds)
         return (estimate[:, 0], variance[:, 0]) if self._one_field else (estimate, variance)
 
     # --- estimation ----------------------------------------------------------------------------------------------
@@ -736,3 +746,101 @@ def _as_points(points_m: ArrayLike) -> FloatArray:
     if not np.isfinite(points).all():
         raise UsageError("a point without finite coordinates", expected="finite east, north (, up) in metres")
     return points
+
+
+# Samples from which a factor of the trend can be told from a constant.
+_FEWEST_FOR_TREND = 3
+
+
+@from_python
+@dataclass(eq=False)
+class TrendKriging:
+    """Universal Kriging whose trend is a known field, such as a replayed level or rank (external drift).
+
+    Source: Wackernagel, Multivariate Geostatistics (2003), doi:10.1007/978-3-662-05294-5, chapter 37.
+
+    Parameters
+    ----------
+    correlation : callable
+        Phi(distance [m]) of the residual.
+    neighbours, radius_m : int, float
+        As for :class:`OrdinaryKriging`; with fewer than three samples in the radius the nearest are used.
+    bounds : (low, high), optional
+        Limits of the estimates, such as (1, 4) for ranks.
+
+    Notes
+    -----
+    The estimate is ``w . z`` with the weights of the system of :class:`OrdinaryKriging` and one more condition, that
+    the trend f is reproduced: ``w . f = f_0``. If the trend is nearly constant among the neighbours, or fewer than
+    three are known, the condition is left out.
+
+    Examples
+    --------
+    >>> places = [[0.0, 0.0], [60.0, 0.0], [0.0, 60.0], [60.0, 60.0]]
+    >>> model = TrendKriging(lambda d: np.exp(-d / 50.0)).fit(places, [1.0, 3.0, 5.0, 7.0], [0.0, 1.0, 2.0, 3.0])
+    >>> model.predict([[200.0, 0.0]], [10.0])[0].round(9).tolist()  # twice the trend and one
+    [21.0]
+    """
+
+    correlation: Correlation
+    neighbours: int = 20
+    radius_m: float = 150.0
+    _: KW_ONLY
+    bounds: tuple[float, float] | None = None
+
+    def fit(self, points_m: ArrayLike, values: ArrayLike, trend: ArrayLike) -> TrendKriging:
+        """Store samples (n, dims) with a value (n,) and a trend (n,); samples with a NaN on either side are left out.
+
+        Raises
+        ------
+        UsageError
+            If the shapes differ, or no sample has both.
+        """
+        points, value, known = _as_points(points_m), unmasked(values), unmasked(trend)
+        if not value.shape == known.shape == (len(points),):
+            raise UsageError(
+                f"values of shape {value.shape}, trend {known.shape} for {len(points)} points", expected="(n,) each"
+            )
+        both = np.isfinite(value) & np.isfinite(known)
+        if not both.any():
+            raise UsageError("no sample with a value and a trend", expected="one or more")
+        self.points_m_, merged, _ = _merge_places(points[both], np.column_stack([value, known])[both])
+        self.values_, self.trend_ = merged.T
+        centred = self.values_ - np.polyval(
+            np.polyfit(self.trend_, self.values_, int(np.ptp(self.trend_) > 0)), self.trend_
+        )
+        self.sill_ = float(centred @ centred / max(len(centred) - 2, 1))
+        return self
+
+    def predict(self, targets_m: ArrayLike, trend: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Return estimate and Kriging variance (t,) at targets (t, dims) with their trend (t,); NaN without a trend."""
+        targets, wanted = _as_points(targets_m), unmasked(trend)
+        if wanted.shape != (len(targets),):
+            raise UsageError(f"trend of shape {wanted.shape} for {len(targets)} targets", expected="(t,)")
+        estimate, variance = np.full((2, len(targets)), np.nan)
+        chosen = nearest(self.points_m_, targets, self.neighbours, np.inf)
+        within = np.where(chosen.distance_m <= self.radius_m + TIE_M, chosen.index, -1)
+        index = np.where(((within >= 0).sum(axis=1) >= _FEWEST_FOR_TREND)[:, None], within, chosen.index)
+        for row in np.flatnonzero(np.isfinite(wanted)):
+            used = index[row][index[row] >= 0]
+            estimate[row], variance[row] = self._one(used, targets[row], float(wanted[row]))
+        return (estimate if self.bounds is None else np.clip(estimate, *self.bounds)), variance
+
+    def _one(self, used: IntArray, target_m: FloatArray, trend: float) -> tuple[float, float]:
+        """Return estimate and variance at one target from the samples ``used``."""
+        points, f = self.points_m_[used], self.trend_[used]
+        conditions, aim = [np.ones(len(used))], [1.0]
+        if len(used) >= _FEWEST_FOR_TREND and np.ptp(f) > 1e-6 * max(float(np.abs(f).max()), 1.0):
+            scale = float(np.ptp(f))  # conditions of one size: a trend in dBm beside a one makes the system stiff
+            conditions, aim = [*conditions, (f - f.mean()) / scale], [*aim, (trend - float(f.mean())) / scale]
+        n, extra = len(used), len(conditions)
+        between = np.linalg.norm(points[:, None] - points[None], axis=-1)
+        system = np.zeros((n + extra, n + extra))
+        system[:n, :n] = np.where(between > TIE_M, 1.0 - np.minimum(self.correlation(between), 1.0), 0.0)
+        system[n:, :n] = conditions
+        system[:n, n:] = system[n:, :n].T
+        away = np.linalg.norm(points - target_m, axis=1)
+        right = np.where(away > TIE_M, 1.0 - np.minimum(self.correlation(away), 1.0), 0.0)
+        solution = np.linalg.lstsq(system, np.concatenate([right, aim]), rcond=1e-12)[0]
+        variance = self.sill_ * float(solution @ np.concatenate([right, aim]))
+        return float(solution[:n] @ self.values_[used]), max(variance, 0.0)

@@ -2,6 +2,7 @@
 
 import dataclasses
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from aerpaw_cmp.flight.clock import (
     _judged,
     _likelihood,
     _Parts,
+    _shown_without,
     judge_clock,
 )
 
@@ -138,6 +140,21 @@ def test_no_single_place_of_a_flight_shifts_its_clock(spoilt, seeds):
         clock = judge_clock([beside_a_tower(seed, spoilt)])
         assert clock.verdict != SHIFTED
         assert clock.ci95_s[0] <= 0.0 <= clock.ci95_s[1]
+
+
+@pytest.mark.parametrize(("begin", "end", "shown"), [(0.41, 0.59, False), (0.2, 0.8, True)])
+def test_a_shift_that_less_than_a_fifth_of_the_flight_supports_is_not_shown(
+    begin: float, end: float, shown: bool
+) -> None:
+    """Each second of one part of the flight is evidence of 1 nat for the shift; the other seconds know nothing."""
+    mean_s = np.arange(1000.0)
+    evidence = (mean_s >= 1000.0 * begin) & (mean_s < 1000.0 * end)
+
+    def likelihood(lags: Any, _parts: Any, kept: Any) -> Any:
+        return (evidence & kept).sum() * (lags == 1.5)[None, None, :].astype(float)
+
+    bins: Any = {("A",): SimpleNamespace(mean_s=mean_s, likelihood=likelihood)}
+    assert _shown_without(bins, {("A",): []}, 1.5) is shown
 
 
 def test_a_lone_dip_moves_no_estimate():

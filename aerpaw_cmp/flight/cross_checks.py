@@ -272,7 +272,11 @@ _MANY_WITHOUT_POSE = 0.1
 
 
 def doubts(
-    track: Track, telemetry: Stream, series: Sequence[tuple[str, AnyArray]], undated: Sequence[str] = ()
+    track: Track,
+    telemetry: Stream,
+    series: Sequence[tuple[str, AnyArray]],
+    undated: Sequence[str] = (),
+    takeoff_ground_m: float = 0.0,
 ) -> tuple[str, ...]:
     """Clauses on clocks and heights that the first words of a report repeat.
 
@@ -285,6 +289,8 @@ def doubts(
         Names and times of what is compared on the track.
     undated : sequence of str
         Logs with positions whose times the flight file dates, beside telemetry with a clock.
+    takeoff_ground_m : float
+        Height of the site's ground at the take-off; minus its height above the sea if the log counts from there.
 
     Returns
     -------
@@ -308,6 +314,7 @@ def doubts(
     if undated:
         texts.append(f"{_listed(undated)} has no clock: by its positions it may be of another flight on this route")
     low_m, assumed = _lowest_m(telemetry), telemetry.attributes.get("height_from") == "assumed"
+    low_m = None if low_m is None else low_m + takeoff_ground_m
     if low_m is not None and (low_m > _TOO_HIGH_M or (assumed and abs(low_m) > _GROUND_M)):
         texts.append(f"the lowest height above take-off is {low_m:.0f} m, probably above another datum")
     return tuple(texts)

@@ -552,7 +552,8 @@ def gather(
     _check_overlap(data)
     asked = tuple(site.cautions(series.tower for series in (*data.rss, *data.rank)))
     if track is not None:
-        asked += doubts(track, telemetry[0][1], _times_on_track(data), _undated(data, telemetry[0][0]))
+        undated = _undated(data, telemetry[0][0])
+        asked += doubts(track, telemetry[0][1], _times_on_track(data), undated, site.takeoff_ground_m)
         asked += check_heights(site, *telemetry[0])
     # after the overlap was checked: a flight that shares no time stops with its own message
     every = (*cautions, *_idle_attitude(data), *data.warnings, *(f"{text}." for text in asked))

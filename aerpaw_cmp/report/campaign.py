@@ -422,7 +422,7 @@ def step_words(data: CampaignData) -> list[str]:
         for night, name, step in reversed(steps)
     ]
     if not any(step.shown == last for _, _, step in steps):
-        out.insert(0, f"No offset steps on {last}, the last date.")
+        out.append(f"No offset steps on {last}, the last date.")
     smallest = max(judged, key=lambda node: node.smallest_db)
     return [
         *out,

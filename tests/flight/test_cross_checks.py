@@ -3,12 +3,15 @@
 import zipfile
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.flight.cross_checks import _lowest_m, questions
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.flight.cross_checks import _lowest_m, check_heights, doubts, questions
 from aerpaw_cmp.flight.drafting.proposals import Placer
 from aerpaw_cmp.logs.ingest import IngestedFile
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
@@ -95,6 +98,29 @@ def test_a_log_that_ends_in_the_air_begins_on_the_ground(step_m: float, after_m:
     log = _log("plain.csv", "2024-07-02T15:00:00").result.streams[0]
     frame = log.frame.iloc[np.zeros(len(height), dtype=np.int64)].assign(altitude_m=height)
     assert _lowest_m(replace(log, frame=frame)) == pytest.approx(low_m)
+
+
+@pytest.mark.parametrize(("low_m", "asked"), [(140.0, True), (90.0, True), (180.0, False), (60.0, False)])
+def test_heights_near_the_ground_above_the_sea_are_asked_about_in_the_air(low_m: float, asked: bool) -> None:
+    """The ground is 120 m above the sea; the part of a flight at 90 m above its take-off is no mistake."""
+    site = replace(load_site("lake_wheeler"), ground_above_sea_m=120.0)
+    (log,) = _log("plain.csv", "2024-07-02T15:00:00", low_m=low_m).result.streams
+    aloft = replace(log, frame=log.frame.iloc[10:])
+    clauses = check_heights(site, "plain.csv", aloft)
+    assert len(clauses) == asked
+    assert all("write 'takeoff_ground_m: -120'" in text for text in clauses)
+    if asked:  # at rest before it climbs: this is the take-off
+        with pytest.raises(InputError, match=r"takeoff_ground_m: -120"):
+            check_heights(site, "plain.csv", log)
+    assert not check_heights(replace(site, takeoff_ground_m=-low_m), "plain.csv", log)
+
+
+def test_heights_are_not_doubted_once_the_site_has_the_ground_of_the_take_off() -> None:
+    (log,) = _log("plain.csv", "2024-07-02T15:00:00", low_m=1690.0).result.streams
+    track: Any = SimpleNamespace(start_ns=0)
+    (clause,) = doubts(track, log, ())
+    assert "the lowest height above take-off is 1690 m" in clause
+    assert not doubts(track, log, (), (), -1690.0)
 
 
 def test_what_is_assumed_is_asked_and_what_is_written_is_not() -> None:

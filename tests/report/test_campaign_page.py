@@ -51,9 +51,9 @@ def test_every_date_of_a_step_is_named_with_the_latest_first(data):
     nodes = (NodeOffset(node="LW3", steps=(old,), **sizes), NodeOffset(node="LW1", steps=(rain,), **sizes))
     words = campaign_words.step_words(dataclasses.replace(data, season=dataclasses.replace(data.season, nodes=nodes)))
     assert words[:-1] == [
-        "No offset steps on 2026-06-24, the last date.",
         "On 2026-06-20 the offset of LW1 steps by -3.0 dB (95 %: -4.0 to -2.0 dB) and is back on 2026-06-21.",
         "On 2026-06-13 the offset of LW3 steps by +1.9 dB (95 %: +1.2 to +2.6 dB).",
+        "No offset steps on 2026-06-24, the last date.",
     ]
 
 

@@ -13,6 +13,7 @@ Columns of a CSV and variables of a NetCDF file: ``time`` or ``time_utc``, or ``
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,8 +55,8 @@ _WANTED = (
     "path_loss_db (docs/referee.md has an example)"
 )
 
-# A file of more bytes is refused.
-_MOST_BYTES = 4 * LARGEST_TABLE
+# A file of more bytes, or with more rows (towers times positions), is refused: a row needs 200 bytes of memory.
+_MOST_BYTES, _MOST_ROWS = 4 * LARGEST_TABLE, 5_000_000
 
 # A prediction whose positions lie farther from the site is one of another place [m].
 _FAR_M = 50_000.0
@@ -135,9 +136,28 @@ def read_foreign(path: Path, data: FlightData) -> ForeignPrediction:
 
 def _csv(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
     with parsing(path, "a CSV with a header: " + _WANTED, cause="another format"):
-        frame = pd.read_csv(io.BytesIO(content), comment="#", skipinitialspace=True, low_memory=False)
+        frame = pd.read_csv(
+            io.BytesIO(content), comment="#", skipinitialspace=True, low_memory=False, nrows=_MOST_ROWS + 1
+        )
+    _check_rows(len(frame), path)
     frame.columns = [str(name).strip().lower() for name in frame.columns]
     return frame, "CSV", []
+
+
+def _check_rows(rows: int, path: Path) -> None:
+    """Refuse a prediction with more than :data:`_MOST_ROWS` rows before its table is made.
+
+    Raises
+    ------
+    InputError
+    """
+    if rows > _MOST_ROWS:
+        raise InputError(
+            f"the prediction has more than {_MOST_ROWS} rows",
+            expected=f"at most {_MOST_ROWS} rows (towers times positions or times)",
+            cause="a map of a larger area, or finer than the flight needs; leave out what lies far from its route",
+            path=path,
+        )
 
 
 def _netcdf(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
@@ -163,6 +183,7 @@ def _netcdf(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
     if main is None:
         raise InputError("no variable with a level", expected=_WANTED, path=path)
     shape = dict(zip(dims[main], arrays[main].shape, strict=True))
+    _check_rows(math.prod(shape.values()), path)
     if "series" in shape and "series" in arrays:  # tower and channel in one name, as 'predict' writes them
         words = [str(name).partition(" ") for name in arrays["series"]]
         for name, values in (("tower", [w[0] for w in words]), ("channel", [w[2] for w in words])):
@@ -211,6 +232,7 @@ def _radio_map(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]
             expected="path_gain (towers, rows, columns), cell_centers (rows, columns, 3), tx_names (towers,)",
             path=path,
         )
+    _check_rows(gain.size, path)
     with np.errstate(divide="ignore", invalid="ignore"):
         loss = -10.0 * np.log10(gain.astype(np.float64).reshape(len(names), -1))
     loss[~np.isfinite(loss)] = np.nan

@@ -7,9 +7,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+import xarray
 import yaml
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.jobs import referee
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
@@ -174,6 +176,23 @@ def test_damaged_files_are_one_message(flight: Path, capsys: pytest.CaptureFixtu
         (flight / name).write_bytes(content)
         assert name in refused(flight, flight / name, capsys)
     assert "gone.csv" in refused(flight, flight / "gone.csv", capsys)
+
+
+def test_a_prediction_with_too_many_rows_is_refused_in_every_format(
+    flight: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Short rows of 250 MB took 3.4 GB of memory: a limit of the bytes alone bounds nothing."""
+    monkeypatch.setattr(referee, "_MOST_ROWS", 30)
+    rows = "".join(f"{k},0,30,LW1,-60\n" for k in range(31))
+    (flight / "many.csv").write_text("east_m,north_m,height_m,tower,level_dbm\n" + rows + "this row is not read\n")
+    centre = np.zeros((4, 8, 3))
+    np.savez(flight / "many.npz", path_gain=np.ones((1, 4, 8)), cell_centers=centre, tx_names=np.array(["LW1"]))
+    cells = {"east_m": ("cell", np.zeros(31)), "north_m": ("cell", np.zeros(31)), "height_m": ("cell", np.zeros(31))}
+    xarray.Dataset({**cells, "level_dbm": ("cell", np.zeros(31)), "tower": ("cell", ["LW1"] * 31)}).to_netcdf(
+        flight / "many.nc"
+    )
+    for name in ("many.csv", "many.npz", "many.nc"):
+        assert "more than 30 rows" in refused(flight, flight / name, capsys)
 
 
 def test_the_logs_of_an_emulated_flight_are_a_prediction(flight: Path) -> None:

@@ -59,6 +59,7 @@ SMALLEST: dict[str, list[str]] = {
     "freeze": ["record", "{folder}/record.npz", "--quick"],
     "fuzz_commands": ["--calls", "20"],
     "fuzz_inputs": ["--inputs", "20"],
+    "injected_causes": ["--only", "flat", "--simulated", "1"],
     "interrupts": ["--only", "formats", "--moments", "2"],
     "ingest": ["--scale", "2000", "--format", "sounder_log"],
     "interval_weights": ["mean", "--sequences", "4"],
@@ -92,7 +93,7 @@ SMALLEST: dict[str, list[str]] = {
     "wheels": ["--pythons", sys.executable],
 }
 
-ON_FIELD_DATA = ("learned_map", "left_out_reports", "real_ground")
+ON_FIELD_DATA = ("injected_causes", "learned_map", "left_out_reports", "real_ground")
 
 AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 

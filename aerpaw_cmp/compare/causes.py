@@ -51,6 +51,8 @@ _OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
 # Causes that must bring the error back to what is usual, and the least part of what all candidates take off together.
 _RESTORING = frozenset({"pattern", "heading", "height", "telemetry", "clock", "saturation", "place", "channels"})
 _LEAST_PART = 0.5
+# Causes whose level the log must follow.
+_FOLLOWED = frozenset({"pattern", "heading", "height", "telemetry", "place", "tower"})
 # Half of the 95 % point of chi-squared with one degree of freedom.
 _NEAR = 1.92
 _EPOCH = np.datetime64(0, "s")
@@ -330,8 +332,10 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     certain, least_share = lead >= _CERTAIN, _LEAST_SHARE
     if name in _OF_ANTENNA and sound[0].evidence.antenna == "learned":
         certain, least_share = False, _LEARNED_SHARE
-    # a log of noise alone likes another antenna better, too: it must leave less than a constant level does
-    if name == _CATCH_ALL and any(m.residual_db.std() >= m.evidence.measured_db.std() for m in alone_models):
+    # a log of noise, or of a gain control, likes any smoother level: a cause must leave less than a constant does
+    most = {_CATCH_ALL: 1.0}.get(name, 1.0 - _LEAST_SHARE)
+    follows = name in _FOLLOWED
+    if follows and any(m.residual_db.std() >= most * m.evidence.measured_db.std() for m in alone_models):
         return False
     # a floor that the settings leave out explains why the low links that are left look too strong, and is known
     if (name == "floor" and sound[0].evidence.floored) or known_db - alone_db < SHOWN_DB:

@@ -584,7 +584,8 @@ def _without_cause(pooled: FlightVerdict | None, panels: Sequence[RssResult]) ->
     """Return the sentence of a flight without a likely cause; none after a good result."""
     if is_one_place(panels):
         return ONE_PLACE
-    if pooled is not None and (pooled.rmse_db <= _SMALL_ERROR_DB or pooled.ci95_db[1] < 0.0):
+    good = pooled is not None and (pooled.rmse_db <= _SMALL_ERROR_DB or pooled.ci95_db[1] < 0.0)
+    if good or expected_sentence(panels):  # the error is that of other flights
         return ""
     if max(panel.score.n for panel in panels) < FEWEST_SAMPLES:
         return FEW_SAMPLES.format(n=FEWEST_SAMPLES)

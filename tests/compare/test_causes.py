@@ -471,3 +471,25 @@ def test_too_few_samples_or_levels_have_no_cause(levels: str) -> None:
     coarse = np.where(stepped.measured_db > np.median(stepped.measured_db), -60.0, -70.0)
     few = np.where(np.arange(300) % 4 == 0, stepped.measured_db, np.nan)
     assert _named(replace(stepped, measured_db=few if levels == "few" else coarse)) == NONE
+
+
+def test_a_limit_that_the_page_counts_is_not_found_again() -> None:
+    """Both levels no lower than the floor: the error that the page states has no floor, lock or step in it."""
+    sound = _sound()
+    floor = float(np.quantile(sound.measured_db, 0.4))
+    locked = (sound.measured_db > floor).astype(np.float64)
+    logged = np.where(sound.measured_db > floor, sound.measured_db, floor - 15.0)
+    assert _named(replace(sound, measured_db=logged, locked=locked)) == "lock or no detection"
+    scored = replace(
+        sound, measured_db=np.maximum(logged, floor), predicted_db=np.maximum(sound.predicted_db, floor - MEASURED_DB),
+        turned_db={}, locked=locked, limits_known=True,
+    )  # fmt: skip
+    assert _named(scored) == NONE
+
+
+def test_a_gain_control_that_levels_all_is_no_other_tower() -> None:
+    """What a smoother level leaves must be less than what a constant leaves."""
+    sound = _sound()
+    levelled = MEASURED_DB + 1.5 * (sound.measured_db - sound.predicted_db - MEASURED_DB) + 0.1 * sound.predicted_db
+    flat = {"LW5": 0.5 * np.cos(sound.time_s / 40.0)}
+    assert _named(replace(sound, measured_db=levelled, other_towers_db=flat)) not in ("tower", "place", "pattern")

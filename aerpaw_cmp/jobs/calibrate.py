@@ -367,7 +367,7 @@ def calibrate(
         taught = teaching(observed, campaigns, fits)
     with stages("curve"):
         curve = learning_curve(observed, recipe)
-    warnings += _mount_warnings(learned)
+    warnings += [*_mount_warnings(learned), *_contradictions(scores["campaign_left_out"], controls, campaigns)]
     if further:
         with stages("score"):
             further_scores, remarks = _score_further(further, flights, learned, observed)
@@ -676,6 +676,26 @@ def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: M
         )
         passed.setdefault(campaigns[flight], []).append(FlightEvidence(series).of_airframe(process).fits)
     return frozenset(name for name, each in passed.items() if 2 * sum(each) > len(each))
+
+
+def _contradictions(
+    scores: Sequence[Score], controls: Mapping[str, Sequence[Score]], campaigns: Mapping[str, str]
+) -> list[str]:
+    """Return a sentence for every campaign that the airframe of the others predicts worse than free space or a copy."""
+    out = []
+    for name in dict.fromkeys(campaigns[s.flight] for s in scores):
+
+        def mean(some: Sequence[Score], key: str = "rmse_db", name: str = name) -> float:
+            return calibration.mean_rmse([s for s in some if campaigns[s.flight] == name], key)
+
+        alone, free = mean(scores), mean(scores, "free_space_rmse_db")
+        turned = min((mean(some) for title, some in controls.items() if "rotated" in title), default=math.inf)
+        if alone > min(free, turned):
+            out.append(
+                f"{name} contradicts the other campaigns: RMSE {alone:.2f} dB with their airframe, {turned:.2f} dB with"
+                f" it rotated, {free:.2f} dB in free space; give it its own 'source: {{airframe: ...}}'"
+            )
+    return out
 
 
 def _mount_warnings(learned: Learned) -> list[str]:

@@ -81,8 +81,8 @@ class Errors(StrictModel):
     """Of the airframe of other campaigns alone, on the flights of this one."""
     heights_m: list[float] = Field(default_factory=list)
 
-    def expected(self, height_m: float, *, unseen: bool) -> Errors:
-        """Return the errors with the RMSE of the kind of a flight.
+    def expected(self, height_m: float, *, unseen: bool) -> tuple[Errors, str]:
+        """Return the errors with the RMSE of the kind of a flight, and the kind.
 
         Parameters
         ----------
@@ -92,9 +92,15 @@ class Errors(StrictModel):
             Most directions were not flown.
         """
         new_height = bool(self.heights_m) and min(abs(height_m - h) for h in self.heights_m) > _SAME_HEIGHT_M
-        kinds = ((unseen, self.sector_rmse_db), (new_height, self.height_rmse_db))
-        rmse_db = next((value for is_so, value in kinds if is_so and value is not None), self.rmse_db)
-        return self.model_copy(update={"rmse_db": rmse_db})
+        kinds = (
+            (unseen, self.sector_rmse_db, "in directions that were not flown"),
+            (new_height, self.height_rmse_db, "at a height that was not flown"),
+        )
+        rmse_db, kind = next(
+            ((value, kind) for is_so, value, kind in kinds if is_so and value is not None),
+            (self.rmse_db, "on another flight"),
+        )
+        return self.model_copy(update={"rmse_db": rmse_db}), kind
 
 
 # Flights whose cruise heights differ by less are at one height.
@@ -264,17 +270,14 @@ class Entry(StrictModel):
         values = self.model_dump(mode="json", exclude={"sha256"}, exclude_none=True)
         return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
-    def about(self, errors: Errors | None = None) -> str:
+    def about(self, errors: Errors | None = None, kind: str = "on another flight") -> str:
         """Return one sentence: learned from which flights, and which error to expect (default: held-out flights)."""
         errors = errors or self.errors
         days = f" of {', '.join(self.flown)}" if self.flown else ""  # none where the logs have relative times
         text = f"learned on {counted(len(self.flights), 'flight')}{days}"
         text += f", the UAV also on {', '.join(self.joined)}" if self.joined else ""
         if errors is not None:
-            text += (
-                f"; expect an RMSE of {errors.rmse_db:.1f} dB on another flight, free space "
-                f"{errors.free_space_rmse_db:.1f} dB"
-            )
+            text += f"; expect an RMSE of {errors.rmse_db:.1f} dB {kind}, free space {errors.free_space_rmse_db:.1f} dB"
         for lock in [item.lock for item in self.series if item.lock is not None][:1]:
             text += (
                 f", {lock.floor_rmse_db:.1f} and {lock.free_space_floor_rmse_db:.1f} dB where levels below "

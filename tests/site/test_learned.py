@@ -23,6 +23,7 @@ from aerpaw_cmp.flight.training import mark_of
 from aerpaw_cmp.site import learned as memory
 from aerpaw_cmp.site.learned import (
     Entry,
+    Errors,
     LearnedLock,
     LearnedReceiver,
     SpherePattern,
@@ -461,3 +462,14 @@ def test_an_edited_value_is_refused_and_replaced_by_learning_again(folder: Path)
         read_learned(site)
     remember(site, "d12", entry("A"), learned_tables("A"))
     assert read_learned(site).entries["d12"].series[0].spread.noise_sd_db == 0.0
+
+
+def test_the_error_to_expect_is_that_of_flights_of_the_same_kind() -> None:
+    errors = Errors(series=2, rmse_db=3.0, rmse_4s_db=2.5, free_space_rmse_db=6.0, inside_90=0.9, sector_rmse_db=5.6,
+                    height_rmse_db=3.7, heights_m=[40.0, 70.0])  # fmt: skip
+    kinds = {(height_m, unseen): errors.expected(height_m, unseen=unseen)[0].rmse_db
+             for height_m in (42.0, 100.0) for unseen in (False, True)}  # fmt: skip
+    assert kinds == {(42.0, False): 3.0, (42.0, True): 5.6, (100.0, False): 3.7, (100.0, True): 5.6}
+    assert "expect an RMSE of 3.7 dB at a height that was not flown, free space 6.0 dB" in learned_entry(
+        errors=errors
+    ).about(*errors.expected(100.0, unseen=False))

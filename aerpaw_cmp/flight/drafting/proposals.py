@@ -530,7 +530,8 @@ def _antennas_for(
             if not _same_place(item.series, series.tower, nodes) or not _in_band(item, series, band):
                 continue
             named_odds = _named_odds(data, series, item)
-            airframe = item.airframe if item.teaches else None
+            # antennas of another name must also win against their airframe at an unknown antenna
+            airframe = item.airframe if item.teaches and named_odds <= 0.0 else None
             odds = evidence.of_link(number, item.moments, airframe).with_prior(named_odds)
             best = chosen.setdefault(item.name, {})
             key = f"{series.tower}.{series.channel}"
@@ -543,11 +544,11 @@ def _antennas_for(
     if fits and odds.over_own >= LEAST_ODDS and odds.over_turned > -_MOUNTED_AS_LEARNED:
         first = next(iter(fits.values()))[0]
         samples = evidence.rows[0]
-        errors = _expected(first.entry, first.series, samples.position_m, first.gain_db(samples)[1])
+        errors, kind = _expected(first.entry, first.series, samples.position_m, first.gain_db(samples)[1])
         names = {key: f"{site}/{entry}_{k.series.tower}.{k.series.channel}" for key, (k, _) in fits.items()}
         return Proposal(
             antennas=names | {"uav": f"{site}/{entry}_uav"},
-            antennas_about=f"{first.entry.about(errors)}; {_odds(odds)}",
+            antennas_about=f"{first.entry.about(errors, kind)}; {_odds(odds)}",
             carrier_hz=first.series.carrier_hz,
         )
     return _airframe_for(data, known, site, evidence, band=learned.AIRFRAME_BAND if carrier_known else math.inf)
@@ -570,8 +571,7 @@ def _airframe_for(
     if not odds.fits:
         text = f"none of the learned airframes fits these levels; the best one, {best.name}: {_odds(odds)}"
         return Proposal(antennas_about=text)
-    errors = _expected(best.entry, None)
-    about = best.entry.about(errors) if errors is not None else best.entry.about()
+    about = best.entry.about(*_expected(best.entry, None))
     return Proposal(
         antennas={"uav": f"{site}/{best.name}_uav"},
         antennas_about=f"the airframe alone, {about}; {_odds(odds)}",
@@ -723,7 +723,7 @@ def errors_elsewhere(
     except (InputError, UsageError):
         return None
     antenna = None if name is None else named.antenna("tower", series.link.carrier_hz)
-    return _expected(named.entry, antenna, *(flown or ()))
+    return _expected(named.entry, antenna, *(flown or ()))[0]
 
 
 # Directions whose standard deviation is so many times that of flown ones were not flown.
@@ -735,16 +735,17 @@ def _expected(
     series: learned.LearnedSeries | None,
     position_m: FloatArray | None = None,
     sd_db: FloatArray | None = None,
-) -> learned.Errors | None:
-    """Return the errors to expect of an antenna of an entry, of its airframe alone for a series of None."""
-    errors = entry.errors
+) -> tuple[learned.Errors | None, str]:
+    """Return the errors to expect of an antenna of an entry, of its airframe alone for a series of None; their kind."""
+    errors, usual = entry.errors, "on another flight"
     if errors is None:
-        return None
+        return None, usual
     if series is None:
         alone_db = errors.airframe_rmse_db
-        return None if alone_db is None else errors.model_copy(update={"rmse_db": alone_db})
+        alone = None if alone_db is None else errors.model_copy(update={"rmse_db": alone_db})
+        return alone, "with the airframe alone"
     if position_m is None or sd_db is None or not np.isfinite(sd_db).any():
-        return errors
+        return errors, usual
     heights, count = np.unique(np.round(position_m[np.isfinite(position_m[:, 2]), 2]), return_counts=True)
     unseen = bool(np.nanmedian(sd_db) > _UNSEEN_SD * series.sd_db)
     return errors.expected(float(heights[count.argmax()]), unseen=unseen)

@@ -156,7 +156,10 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
                 )
             classes = {name: _text(item.attrs.get("MATLAB_class", b"")) for name, item in items.data_sets.items()}
             attributes = {name: _text(value) for name, value in book.attrs.items() if np.ndim(value) == 0}
-            notes = {"attributes": attributes, "classes": {name: word for name, word in classes.items() if word}}
+            notes: dict[str, Any] = {
+                "attributes": attributes,
+                "classes": {name: word for name, word in classes.items() if word},
+            }
             if netcdf:
                 notes["dims"] = {name: _dimensions(item) for name, item in items.data_sets.items()}
                 units = {name: _text(item.attrs.get("units", b"")) for name, item in items.data_sets.items()}

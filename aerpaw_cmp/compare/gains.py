@@ -73,7 +73,7 @@ def link_directions(tower_m: FloatArray, position_m: FloatArray, rotation: Float
 def rotated(direction: FloatArray, turn_deg: float) -> FloatArray:
     """Return directions (n, 3) in the body frame, rotated anticlockwise about its vertical axis."""
     c, s = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
-    return direction @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+    return np.asarray(direction @ np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -1227,7 +1227,7 @@ def _noise_covariance(rows: LinkSamples) -> FloatArray:
 
 
 def _centred(rows: LinkSamples) -> FloatArray:
-    return rows.residual_db - rows.residual_db.mean()
+    return np.asarray(rows.residual_db - rows.residual_db.mean())
 
 
 def _log_likelihood(covariance: FloatArray, values: FloatArray) -> float:

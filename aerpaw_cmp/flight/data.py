@@ -550,7 +550,7 @@ def gather(
     for path, stream in (*telemetry[:1], *placed):
         check_place(site, path, stream)
     _check_overlap(data)
-    asked = tuple(site.cautions(series.tower for series in (*data.rss, *data.rank)))
+    asked = tuple(site.cautions([*(series.tower for series in data.rss), *(series.tower for series in data.rank)]))
     if track is not None:
         undated = _undated(data, telemetry[0][0])
         asked += doubts(track, telemetry[0][1], _times_on_track(data), undated, site.takeoff_ground_m)

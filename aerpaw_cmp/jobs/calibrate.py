@@ -667,13 +667,7 @@ def teaching(observed: Sequence[Observed], campaigns: Mapping[str, str], fits: M
         antenna = next((s.antenna for s in series if s.antenna in learned.fit.antennas), None)
         if antenna is None:  # nothing that was learned without this flight is of its campaign
             continue
-        fit, known = learned.fit, known_directions(learned.fit, antenna)
-        process = KnownProcess(
-            gain_db=lambda at, fit=fit, antenna=antenna: fit.gain("body", antenna, at)[0],
-            sd_db=lambda at, fit=fit, antenna=antenna: fit.gain("body", antenna, at)[1],
-            directions=known.directions,
-            covariance_db2=known.covariance_db2,
-        )
+        process = _airframe(learned, antenna)
         passed.setdefault(campaigns[flight], []).append(FlightEvidence(series).of_airframe(process).fits)
     return frozenset(name for name, each in passed.items() if 2 * sum(each) > len(each))
 
@@ -696,6 +690,17 @@ def _contradictions(
                 f" it rotated, {free:.2f} dB in free space; give it its own 'source: {{airframe: ...}}'"
             )
     return out
+
+
+def _airframe(learned: Learned, antenna: str) -> KnownProcess:
+    """Return the learned gain of the UAV towards a tower's antenna, with its covariance."""
+    known = known_directions(learned.fit, antenna)
+    return KnownProcess(
+        gain_db=lambda at: learned.fit.gain("body", antenna, at)[0],
+        sd_db=lambda at: learned.fit.gain("body", antenna, at)[1],
+        directions=known.directions,
+        covariance_db2=known.covariance_db2,
+    )
 
 
 def _mount_warnings(learned: Learned) -> list[str]:

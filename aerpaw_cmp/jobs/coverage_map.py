@@ -755,10 +755,10 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
     result, s = outcome.shown, outcome.settings
     raster = result.grid.raster
     for layer in _budget_layers(outcome):
-        quantity, _, height = layer.title.partition(", ")
-        height, _, foliage = height.partition(", nearest tower, foliage ")
+        quantity, _, where = layer.title.partition(", ")
+        above, _, foliage = where.partition(", nearest tower, foliage ")
         yield page.MapLayer(
-            quantity=quantity, unit="dB", axes={"Foliage": foliage, "Height": height}, values=raster(layer.values)
+            quantity=quantity, unit="dB", axes={"Foliage": foliage, "Height": above}, values=raster(layer.values)
         )
     for name, values in (("Singular-value spread", result.spread_db), ("Condition number", result.condition_db)):
         joint = values[..., result.serving, np.arange(len(result.grid))]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
@@ -134,7 +134,7 @@ def read_metrics(file: Path, named: Path) -> dict[str, Any]:
     return content  # type: ignore[no-any-return]
 
 
-def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
+def _table(path: Path, kind: str, columns: Sequence[str]) -> Any:
     """A table of samples; every fault of it names its line."""
     import pandas as pd
 

@@ -198,12 +198,12 @@ _APART_M, _APART_SHARE, _FIX_3D = 15.0, 0.05, 3
 def _apart(flight: Flight, time_s: FloatArray, values: dict[str, AnyArray]) -> list[str]:
     """Return the sentence about positions of the autopilot that are far from those of its receiver; else nothing."""
     fixed = flight.fix.near("fix", time_s) >= _FIX_3D
-    receiver = [np.where(fixed, flight.fix.near(name, time_s), np.nan) for name in _pose.PLACE[:2]]
-    place = [values[name] for name in _pose.PLACE[:2]]
-    if not np.isfinite(receiver[0] + place[0]).any():
+    there_n, there_e = (np.where(fixed, flight.fix.near(name, time_s), np.nan) for name in _pose.PLACE[:2])
+    here_n, here_e = (values[name] for name in _pose.PLACE[:2])
+    if not np.isfinite(there_n + here_n).any():
         return []
-    origin = float(np.nanmedian(place[0])), float(np.nanmedian(place[1]))
-    apart_m = np.hypot(*(rough_m(*place, origin) - rough_m(*receiver, origin)).T)
+    origin = float(np.nanmedian(here_n)), float(np.nanmedian(here_e))
+    apart_m = np.linalg.norm(rough_m(here_n, here_e, origin) - rough_m(there_n, there_e, origin), axis=1)
     far, both = apart_m > _APART_M, np.isfinite(apart_m).sum()
     if far.sum() <= _APART_SHARE * both:
         return []

@@ -220,8 +220,9 @@ class Placer:
         estimate = locate(track) if any(taught.values()) or odds_tower.max() < _TOWER_ODDS else None
         known = np.full(len(towers), -np.inf)
         for i, tower in enumerate(towers):
-            gains = taught.get(tower.name, ()) if estimate is not None else ()
-            if gains := [each for each in gains if self._supports(track, tower.name, each)]:
+            if estimate is None:
+                continue
+            if gains := [each for each in taught.get(tower.name, ()) if self._supports(track, tower.name, each)]:
                 taught_odds = max(self._taught_odds(track, tower.name, each) for each in gains) - np.log(len(gains))
                 # as odds against any place, like those of the search
                 taught_odds -= estimate.anywhere + _TAUGHT_MORE

@@ -50,7 +50,7 @@ SMALLEST: dict[str, list[str]] = {
     "all": ["--only", "kriging", "--no-history"],
     "clock_power": ["sample_logs/UAV", "--quiet"],
     "country": ["--receivers", "1e3", "--workers", "1"],
-    "coverage_of_intervals": ["--flights", "20"],
+    "coverage_of_intervals": ["--quick"],
     "diffraction": ["sample_logs/flight.yaml"],
     "drafts": ["sample_logs"],
     "exports": ["--samples", "20000"],

@@ -263,10 +263,9 @@ class _Climber:
         chosen = ladder.error_db[ladder.recommended]
         # Both must hold, so neither level is corrected for there being two: whichever of the gains is none is taken for
         # one by its own test in at most 2.5 %, hence both are (intersection-union, Berger 1982, doi 10.2307/1267823).
-        places = [s.replayed.poses.position_m[s.picked] for s in self._series]
         for other in (ladder.error_db[0], ladder.error_db[-1]):
             columns = [(s.time_s, a, b) for s, a, b in zip(self._series, chosen, other, strict=True)]
-            pair = pooled_difference(columns, free_offset=False, place_m=places)
+            pair = pooled_difference(columns, free_offset=False, place_m=ladder.position_m)
             if pair.verdict != "better" or pair.difference_db > -_SHOWN_DB:
                 return False
         return True

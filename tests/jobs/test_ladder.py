@@ -264,7 +264,8 @@ def test_a_gain_that_no_page_could_show_is_no_advice(share: float, line: float, 
     error_db = 3.0 * np.random.default_rng(1).normal(size=3000)
     climber = _Climber.__new__(_Climber)
     climber._series = [SimpleNamespace(time_s=np.arange(3000.0))]  # type: ignore[list-item]
-    ladder = SimpleNamespace(recommended=1, error_db=([line * error_db], [share * error_db], [error_db]))
+    errors = ([line * error_db], [share * error_db], [error_db])
+    ladder = SimpleNamespace(recommended=1, error_db=errors, position_m=[np.full((3000, 3), np.nan)])
     assert paired_difference(share * error_db, error_db).verdict == "better"
     assert climber._is_better(ladder) == gains  # type: ignore[arg-type]
 

@@ -121,6 +121,8 @@ def with_logs(path: Path, *logs: dict[str, str]) -> None:
     """The flight file with other logs after its track; ranks are of LW3."""
     content = yaml.safe_load(path.read_text())
     content |= {"logs": [content["logs"][0], *logs], "rank": {"tower": "LW3"}}
+    content["flight"]["plan"].pop("offsets_db", None)
+    content["flight"]["plan"].pop("clock_shift_s", None)
     path.write_text(yaml.safe_dump(content))
 
 

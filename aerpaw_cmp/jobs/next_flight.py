@@ -107,7 +107,7 @@ class PlanOptions:
     avoid: tuple[Path, ...] = ()
     routes: tuple[Path, ...] = ()
     towers: tuple[str, ...] = ()
-    target: TargetOptions = field(default_factory=lambda: TargetOptions(spacing_m=60.0))
+    target: TargetOptions = field(default_factory=lambda: TargetOptions(grid_spacing_m=60.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -103,22 +103,25 @@ class TargetOptions:
     ----------
     heights_m : tuple of float
         Of a grid; the first also of route points without a height.
-    spacing_m : float
-        Of a grid.
+    spacing_m : float, optional
+        Distance between the positions of a grid. Default: ``grid_spacing_m``; refused along a route.
     heading_deg : float, optional
         At all points; without it that of the route, and where none is said all headings count alike.
     site : str, optional
         Where neither flights nor the place name it.
     carrier_hz, tx_power_dbm : float, optional
         Of a prediction before any flight.
+    grid_spacing_m : float
+        Spacing of a grid if nobody names one.
     """
 
     heights_m: tuple[float, ...] = (40.0,)
-    spacing_m: float = 30.0
+    spacing_m: float | None = None
     heading_deg: float | None = None
     site: str | None = None
     carrier_hz: float | None = None
     tx_power_dbm: float | None = None
+    grid_spacing_m: float = 30.0
 
 
 def level_samples(
@@ -206,7 +209,7 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
         targets = local
     else:
         targets = _route(where, site, options)
-    if targets.grid is None and options.spacing_m != TargetOptions().spacing_m:
+    if targets.grid is None and options.spacing_m is not None:
         raise UsageError("--spacing along a route", expected="a site: the spacing is that of a grid")
     if options.heading_deg is not None:
         targets = replace(targets, yaw_deg=np.full(len(targets), options.heading_deg % 360.0))
@@ -219,7 +222,7 @@ def find_targets(where: Path, site: Site, options: TargetOptions, logs_root: Pat
 
 
 def _grid(site: Site, options: TargetOptions) -> Targets:
-    grid = Grid.over_area(site.area_m, options.spacing_m)
+    grid = Grid.over_area(site.area_m, options.spacing_m or options.grid_spacing_m)
     position = np.concatenate([grid.positions_m(h) for h in options.heights_m])
     if site.dem is not None:
         position[:, 2] += site.dem.ground_m(position[:, 0], position[:, 1])

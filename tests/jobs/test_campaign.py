@@ -318,6 +318,7 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
     for seed, name in enumerate(OFFSETS_DB, start=1):
         settings = flight_settings(name, seed, YAW_DEG)
         settings["flight"]["name"] = f"rank_{name}"
+        settings["flight"]["plan"].pop("offsets_db")
         settings["flight"]["plan"].update(rank_k=10, rank_interval_s=1.0, start=f"2025-06-0{seed}T10:00:00")
         if name == "second":  # ranks are simulated without noise: those of one route would be one log
             settings["flight"]["plan"]["waypoints"].reverse()

@@ -167,6 +167,7 @@ def tiny_flight(folder: Path) -> Path:
         "bad_lines": 0,
         "rss_interval_s": 0.2,
         "clock_shift_s": {},
+        "offsets_db": {"LW1": {"USRP1": content["flight"]["plan"]["offsets_db"]["LW1"]["USRP1"]}},
     }
     content["logs"] = [
         log for log in content["logs"] if "USRP" not in log["path"] or log["path"].startswith("LW1/USRP1")

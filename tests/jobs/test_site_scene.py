@@ -147,9 +147,7 @@ def test_a_report_of_a_scene_is_audited_and_its_paths_explained(
     assert len(explained["paths"]) > 1
 
 
-@pytest.mark.parametrize(
-    "option", ["--origin 1,2", "--tower A=1,2,3", "--material a=concrete", "--turn 5", "--untagged forest"]
-)
+@pytest.mark.parametrize("option", ["--origin 1,2", "--material a=concrete", "--turn 5", "--untagged forest"])
 def test_an_option_of_the_other_kind_is_refused(
     option: str, room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

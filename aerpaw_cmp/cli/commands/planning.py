@@ -40,7 +40,7 @@ def predict(
         list[float] | None,
         Option(help="Height of a grid [m], repeatable; of route points without one  [default: 40]"),
     ] = None,
-    spacing: Annotated[float, Option(min=1.0, help="Spacing of a grid [m].")] = 30.0,
+    spacing: Annotated[float | None, Option(min=1.0, help="Spacing of a grid [m]  [default: 30]")] = None,
     heading: Annotated[
         float | None,
         Option(help="Heading at all points [deg]  [default: that of the route; where it says none, all count alike]"),
@@ -138,7 +138,7 @@ def plan(
         avoid=tuple(avoid or ()),
         routes=tuple(routes or ()),
         towers=tuple(tower or ()),
-        target=TargetOptions(heights_m=tuple(height or (40.0,)), spacing_m=60.0, site=site),
+        target=TargetOptions(heights_m=tuple(height or (40.0,)), grid_spacing_m=60.0, site=site),
     )
     outcome = run_plan(
         target, flights or (), options, RunOptions(out=out, logs_root=logs_root, force=force, progress=say, dry=dry_run)

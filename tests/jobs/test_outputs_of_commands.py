@@ -172,6 +172,7 @@ def tiny_flight(folder: Path) -> Path:
     content["logs"] = [
         log for log in content["logs"] if "USRP" not in log["path"] or log["path"].startswith("LW1/USRP1")
     ]
+    del content["link"]["channels"]["USRP2"]
     content |= {"rt": {"engine": "image", "max_depth": 1, "audit_links": 0}, "rss": {"lag": "off"}}
     (folder / "flight.yaml").write_text(yaml.safe_dump(content))
     simulate(folder / "flight.yaml")

@@ -47,6 +47,7 @@ _LEAST_SHARE, _CERTAIN = 0.1, 30.0
 # The sentence states the error without a cause and with it: they must differ in print, however certain the cause.
 SHOWN_DB = 0.1
 # Learned antennas miss some decibels of each flight by themselves: less is no trouble of this one.
+_PLACE_SHARE = 0.3
 _OF_ANTENNA, _LEARNED_SHARE = ("heading", "pattern"), 0.25
 # Causes that must bring the error back to what is usual, and the least part of what all candidates take off together.
 _RESTORING = frozenset({"pattern", "heading", "height", "telemetry", "clock", "saturation", "place", "channels"})
@@ -330,6 +331,8 @@ def _explains(name: str, shown: Sequence[_Models], lead: float, beside: Set[str]
     known_db, alone_db = _rmse_db(sound), _rmse_db(alone_models)
     share = max(alone_db / known_db, _share_of_error(shown, beside, {*beside, name})) if known_db else 1.0
     certain, least_share = lead >= _CERTAIN, _LEAST_SHARE
+    if name == "place":  # the nearest of all places takes up a part of many an error
+        certain, least_share = False, _PLACE_SHARE
     if name in _OF_ANTENNA and sound[0].evidence.antenna == "learned":
         certain, least_share = False, _LEARNED_SHARE
     # a log of noise, or of a gain control, likes any smoother level: a cause must leave less than a constant does
@@ -369,6 +372,8 @@ def _together_db(table: _Models) -> float:
         columns += [] if trial.change_db is None else [trial.change_db]
         columns += [] if trial.columns is None else list(trial.columns.T)
     design, target = np.column_stack(columns), e.measured_db - e.predicted_db
+    # a place at the tower itself has no level
+    design = design[:, np.isfinite(design).all(axis=0)]
     residual = target - design @ np.linalg.lstsq(design, target, rcond=1e-9)[0]
     return float(np.sqrt((residual**2).sum() / max(len(target) - design.shape[1], 1)))
 
@@ -529,7 +534,9 @@ def _binned(evidence: LevelEvidence) -> LevelEvidence | None:
 
     changed = {f.name: binned(f.name, getattr(evidence, f.name)) for f in dataclasses.fields(evidence)}
     at = level == level.min()
-    often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level))
+    # of rounded levels each is there again and again, the least one less often than the next
+    next_often = (level == level[~at].min()).sum() if not at.all() else 0
+    often = at.sum() >= max(_AT_END, _SHARE_AT_END * len(level), next_often)
     changed["least"] = np.bincount(place, at) > 0.5 * count if often else _undetected(mean(evidence.measured_db))
     return LevelEvidence(**changed)  # type: ignore[arg-type]
 
@@ -963,6 +970,7 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
     elevation = _GAIN_DB * np.column_stack([up, up**2, up**3])
     rivals = [_SLOPE * e.predicted_db[:, None], elevation]
     rivals += [] if e.distance_db is None else [_SLOPE * e.distance_db[:, None]]
+    others = [Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=columns) for columns in rivals]
     for factor, words in ((0.5, "half"), (2.0, "twice")):
         trial = Trial(
             name="decibels", cost=2.0 * _RARE + math.log(2.0), change_db=(factor - 1.0) * e.predicted_db,
@@ -972,16 +980,14 @@ def _decibels(e: LevelEvidence) -> Iterator[Trial]:
         if not _nearer(e, factor * e.predicted_db):
             continue
         fit = _fitted(e, trial)
-        if not _is_slope(e, factor, fit.memories):
-            continue
-        others = [
-            _fitted(e, Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=columns), at=fit.memories)
-            for columns in rivals
-        ]
+        slope, *apart = (_fitted(e, other, at=fit.memories).log_likelihood for other in others)
         # what is left above a floor changes by fewer decibels than the link
-        least = -math.inf if e.floored else max(other.log_likelihood for other in others[1:])
-        if fit.log_likelihood > max(least + _RARE, others[0].log_likelihood):
+        least = -math.inf if e.floored else max(apart) + _RARE
+        if _is_slope(e, factor, fit.memories) and fit.log_likelihood > max(least, slope):
             yield trial
+            return
+    # another slope or exponent has no name: a cause that changes levels alike must be likelier
+    yield from (others[0], *others[2:])
 
 
 # Standard deviation of the slope of levels about their prediction, before the flight.
@@ -1203,6 +1209,9 @@ def _gain_step(e: LevelEvidence) -> Iterator[Trial]:
     # every so many: a step is seen from the bins beside its own
     starts = starts[:: 1 + len(starts) // _MOST_STARTS]
     masks = (np.arange(n)[None, :] >= starts[:, None]).astype(np.float64)
+    # a gain that creeps is no step, and has no name
+    creep = _STEP_DB * (np.arange(n) / n)[:, None]
+    yield Trial(name=_UNNAMED, cost=0.0, sentence="", next_step="", columns=creep)
     for phi in _SEARCHED_PHI:
         shift, error, gain = _shift(residual, masks, phi)
         at = int(np.argmax(gain))

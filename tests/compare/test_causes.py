@@ -493,3 +493,19 @@ def test_a_gain_control_that_levels_all_is_no_other_tower() -> None:
     levelled = MEASURED_DB + 1.5 * (sound.measured_db - sound.predicted_db - MEASURED_DB) + 0.1 * sound.predicted_db
     flat = {"LW5": 0.5 * np.cos(sound.time_s / 40.0)}
     assert _named(replace(sound, measured_db=levelled, other_towers_db=flat)) not in ("tower", "place", "pattern")
+
+
+def test_a_gain_that_creeps_is_no_step_and_rounded_levels_have_no_floor() -> None:
+    sound = _sound()
+    creeping = sound.measured_db + 8.0 * sound.time_s / 300.0
+    assert _named(replace(sound, measured_db=creeping)) == NONE
+    rounded = 4.0 * np.round(sound.measured_db / 4.0)
+    assert _named(replace(sound, measured_db=rounded)) != "no detection"
+
+
+def test_another_slope_is_no_antenna_and_no_height() -> None:
+    """Levels with 1.6 times the decibels of the link, which an antenna or a height explains in part."""
+    sound = _sound()
+    steep = sound.measured_db + 0.6 * sound.predicted_db
+    height = {rise: 0.4 * rise / 40.0 * sound.predicted_db for rise in (-15.0, 15.0, 40.0)}
+    assert _named(replace(sound, measured_db=steep, raised_db=height)) == NONE

@@ -447,10 +447,12 @@ def power_draws(values: FloatArray, place_m: FloatArray | None = None) -> FloatA
     third = 2.0 / (9.0 * terms.fast_freedom)
     # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
     fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * second_normal, 0.05) ** 3
-    tails = np.exp(heavy_tails(values) * np.where(normal > 0.0, CALM, 1.0) * normal)
+    share, ratio = loud_part(values)
+    # a loud part alone makes the tails of the whole flight heavy, and is counted below
+    heavy = (0.7 if share else 1.0) * heavy_tails(values)
+    tails = np.exp(heavy * np.where(normal > 0.0, CALM, 1.0) * normal)
     drawn = (scale * known.joined("power")[index] + fast) * tails
     log = _stretched(np.log(drawn), stretch)
-    share, ratio = loud_part(values)
     # a loud part has fewer independent samples than the flight: what the variance of a weighted mean grows by
     more = np.sqrt(share * ratio**2 + 1.0 - share) / (share * ratio + 1.0 - share)
     middle = np.median(log)

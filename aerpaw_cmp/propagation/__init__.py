@@ -1,9 +1,9 @@
-"""From a site, a link and poses to paths and channel matrices.
+"""Paths and channel matrices from a site, a link and poses.
 
-``replay.replay(site, link, poses, Search(...), Field(...), Run(...))`` is the door; ``search.sionna`` alone loads
-Sionna.
+The entry point is ``replay.replay(site, link, poses, Search(...), Field(...), Run(...))``. Only ``search.sionna``
+loads Sionna.
 
-Each formula has one place:
+Each formula has one implementation:
 
 ======================================  ==============================================================
 Fresnel coefficients of a face          ``field.fresnel.coefficients`` (``half_space``, ``slab``)

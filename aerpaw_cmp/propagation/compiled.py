@@ -1,12 +1,13 @@
-"""Use of the compiled path search: the choice whether it runs, the folder that keeps its code, threads.
+"""Use of the compiled path search: whether it runs, the folder for its code, and threads.
 
-numba is optional (extra ``fast``). Importing it and reading compiled code takes about a second, compiling it once a
-machine ten to thirty. So a job is compiled where NumPy would take longer than that: the estimated seconds of all jobs
-of a process decide, and a first report never waits for a compiler. ``AERPAW_CMP_COMPILED`` decides otherwise: ``auto``,
-``never`` or ``always``.
+numba is optional (extra ``fast``). Importing numba and reading compiled code takes about a second. Compiling takes ten
+to thirty seconds, once per machine. A job is therefore compiled only if NumPy would take longer: the sum of the
+estimated seconds of all jobs of a process decides, and a first report never waits for a compiler.
+``AERPAW_CMP_COMPILED`` overrides the choice: ``auto``, ``never`` or ``always``.
 
-numba's cache on disk notices a change in the file of a kernel alone: laws and constants that a kernel takes from
-another file would stay as they were compiled. So the folder is named by a hash of every source of compiled code.
+numba's cache on disk notices only changes in the file of a kernel. Formulas and constants that a kernel imports from
+another file would stay as they were compiled. The folder name therefore contains a hash of every source of compiled
+code.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ SOURCES = (
 COMPILE_S = 25.0
 # CPU seconds of NumPy from which numba's import and reading what was compiled before pay off.
 READ_S = 0.4
-# A job that NumPy does in less stays there, whatever is loaded.
+# A job that NumPy finds in less time always uses NumPy, even if numba is loaded.
 LEAST_S = 0.25
 
 # CPU seconds of NumPy per link and face, sequences of two reflections: 2.2 s in a map of 12 780 links, 245 faces and
@@ -56,7 +57,7 @@ MIRRORS_S = 7e-8
 
 @dataclass(frozen=True, slots=True)
 class State:
-    """Compiled code, or why there is none."""
+    """The compiled code, or the reason why it is not available."""
 
     kernels: ModuleType | None
     reason: str
@@ -87,16 +88,19 @@ def _source_hash() -> str:
 
 @lru_cache(maxsize=1)
 def code_folder() -> Path | None:
-    """Folder of compiled code, this user's alone: in ``NUMBA_CACHE_DIR``, the package or the user's cache; or None."""
+    """Return the private folder of compiled code, or None if no folder can be used.
+
+    It is in ``NUMBA_CACHE_DIR``, the package or the user's cache.
+    """
     named = os.environ.get("NUMBA_CACHE_DIR")
     for base in (Path(named),) if named else (ROOM / "__pycache__", cache_folder("compiled")):
         folder = base / f"kernels-{_source_hash()}"
         try:
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-            # in a folder that others can write to, anybody could leave code for us to run
+            # other users could leave code for us to run in a folder that they can write to
             if not _is_private(folder.stat()):
                 continue
-            # trying is the only sure way: rights, quotas and read-only mounts look alike
+            # only a trial is reliable: rights, quotas and read-only mounts cannot be distinguished otherwise
             with tempfile.TemporaryFile(dir=folder):
                 return folder
         except OSError:
@@ -105,12 +109,12 @@ def code_folder() -> Path | None:
 
 
 def _is_private(status: os.stat_result) -> bool:
-    """Check whether nobody but this user can write in a folder: what is in it will be run."""
+    """Check whether only this user can write to a folder, because its contents will be executed."""
     return not hasattr(os, "geteuid") or (status.st_uid == os.geteuid() and not status.st_mode & 0o022)
 
 
 class _Spent:
-    """Estimated CPU seconds of NumPy that this process has spent on searches: many small jobs are a large one."""
+    """The estimated CPU seconds of NumPy that this process spent on searches: many small jobs count as a large one."""
 
     seconds = 0.0
 
@@ -145,20 +149,20 @@ def _cost_s() -> float:
 
 @lru_cache(maxsize=1)
 def load() -> State:
-    """Import kernels and try them; whatever goes wrong there is a reason to do without, not an error.
+    """Import the kernels and try them. Any failure is a reason to use NumPy, not an error.
 
-    A broken installation shows itself in many ways (no LLVM for this processor, a NumPy too new, a cache cut short),
-    and NumPy gives the same answer.
+    A broken installation has many symptoms (no LLVM for this processor, a NumPy that is too new, a truncated cache),
+    and NumPy returns the same result.
     """
     if find_spec("numba") is None:
         return State(None, "numba is not installed (pip install 'aerpaw-cmp[fast]')")
-    if os.path.lexists(".numba_config.yaml"):  # it names files that numba then writes: a stranger's, it may be
+    if os.path.lexists(".numba_config.yaml"):  # it names files that numba then writes, and may come from a third party
         return State(None, "the working folder holds a .numba_config.yaml, which numba would obey")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba's own, about its cache
             kernels = import_module(f"aerpaw_cmp.{BEAMS}")
-            # a broken LLVM shows itself when something is compiled, not on import
+            # a broken LLVM fails only when something is compiled, not on import
             kernels.try_out()
             if (folder := code_folder()) is not None:
                 (folder / f"{BEAMS}.compiled").touch()
@@ -183,9 +187,9 @@ def thread_count() -> int:
 
 
 def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int) -> list[Any]:
-    """``call`` of each part, results in order; kernels release the interpreter's lock.
+    """Return ``call(part)`` for each part, in order. Kernels release the interpreter's lock.
 
-    No thread stays: what is forked later has none.
+    No thread remains afterwards, so a process that is forked later has no threads.
     """
     parts = list(parts)
     count = min(threads, len(parts))
@@ -202,6 +206,6 @@ def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int) -
 
 
 def column(values: AnyArray, kind: Any = np.float64) -> AnyArray:
-    """An array as kernels take it: of one type, contiguous, writable (a read-only one would be compiled for anew)."""
-    # numba compiles anew for every layout, and for what is read-only
+    """Return an array with the layout that kernels require: one type, contiguous and writable."""
+    # numba compiles separately for every layout and for read-only arrays
     return np.require(values, kind, ["C", "W"])

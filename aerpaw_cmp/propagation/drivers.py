@@ -4,21 +4,21 @@ A replay in parts of its poses, put together again: bounds the memory of long fl
 
 A replay whose tower moves, too: a rover or a second UAV with its own place at every pose.
 
-Every place of the node is a source of its own, so nothing is approximated: the poses are taken in blocks of a few
-places, each place a tower that has links to its own poses alone. Poses at one and the same place share a tower, so a
-node that stands still is replayed as a fixed tower is, bit by bit.
+Every position of the node is a separate source, so there is no approximation. The poses are processed in blocks of a
+few positions. Each position is a tower that has links only to its poses. Poses at the same position share a tower, so a
+node that does not move is replayed exactly as a fixed tower.
 
 Channels of many antenna geometries at once, on line of sight and ground reflection.
 
-Which way a modem's antennas point and how its ports are slanted is hardly ever written down. Trying thousands of
-geometries takes no thousand replays: the field of an element slanted by ``s`` is ``cos s`` times that of a vertical
-plus ``sin s`` times that of a horizontal one at the same place, so one evaluation with both at every port
-(:func:`aerpaw_cmp.propagation.field.sum.of_one_depth`, float64, every pair of elements) serves all slants, and the
-ground reflection is one ray that is added at any strength.
+The orientation of a modem's antennas and the slants of its ports are rarely documented. Thousands of geometries can be
+tried without a replay for each. The field of an element slanted by ``s`` is ``cos s`` times that of a vertical element
+plus ``sin s`` times that of a horizontal element at the same position. One evaluation with both at every port
+(:func:`aerpaw_cmp.propagation.field.sum.of_one_depth`, float64, every pair of elements) therefore serves all slants.
+The ground reflection is one ray, which can be added at any strength.
 
-The rank that a modem reports is for its whole band. Over 100 MHz the ground ray turns against the direct one by about a
-cycle where the two differ by 3 m, so beside the coherent sum at the carrier there is the power sum
-``L L^H + g^2 G G^H`` over the receiving ports, whose eigenvalues are the squares of the singular values in the mean.
+The rank that a modem reports is for its whole band. If the ground ray is 3 m longer than the direct ray, their phase
+difference turns by about one cycle over 100 MHz. In addition to the coherent sum at the carrier there is therefore the
+power sum ``L L^H + g^2 G G^H`` over the receiving ports. Its eigenvalues are the mean squared singular values.
 """
 
 from __future__ import annotations
@@ -59,13 +59,13 @@ def replay_in_parts(
     Returns
     -------
     Replay
-        That of all poses at once.
+        The replay of all poses, as if they were replayed at once.
     """
     rows = np.array_split(np.arange(len(poses)), max(1, -(-len(poses) // size)))
     if len(rows) == 1:
         return replay(site, link, poses, search, field, run)
     links = len(poses) * len(link.tower_arrays)
-    # each part would count from 0 to 1 again
+    # each part would report its progress from 0 to 1
     progress, run = run.progress, replace(run, progress=None, job=Job.of(poses.position_m, links))
 
     def of(at: IntArray) -> Replay:
@@ -76,7 +76,7 @@ def replay_in_parts(
 
 
 def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | None) -> Replay:
-    """One replay of parts that are made as they are asked for; ``rows`` are their poses."""
+    """Join partial replays into one replay as they are produced. ``rows`` contains the poses of each part."""
     replays: list[Replay] = []
     finished, count = 0, max(1, sum(map(len, rows)))
     for at, part in zip(rows, parts, strict=True):
@@ -88,9 +88,9 @@ def in_turn(rows: list[IntArray], parts: Iterable[Replay], progress: Progress | 
 
 
 def _put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
-    """One replay of parts, poses in their order; the parts are taken apart, so that memory holds them once."""
+    """Join parts into one replay, with the poses in order. The parts are consumed to save memory."""
     first, count = parts[0], sum(map(len, rows))
-    # planes of terrain are numbered as they are met: other blocks have others
+    # planes of terrain are numbered in order of first use, so blocks have different planes
     faces, shifted = _joined_faces(parts)
     pieces = [shifted, *zip(*(part.further for part in parts), strict=True)]
     further: dict[str, Any] = {
@@ -121,7 +121,7 @@ def _in_flight(parts: Sequence[RowsT], rows: list[IntArray]) -> RowsT:
 
 
 def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
-    """Faces of all blocks and their paths over them; faces that all blocks share are held once."""
+    """Return the faces of all blocks, and their paths over these faces. Shared faces are stored once."""
     common = min(_shared(parts[0].faces, part.faces) for part in parts)
     if all(len(part.faces) == common for part in parts):
         return parts[0].faces, [part.paths for part in parts]
@@ -237,12 +237,12 @@ def replay_moving(
     Returns
     -------
     Replay
-        As of one tower. ``paths`` run from the place that the tower had at their pose.
+        The replay of one tower. ``paths`` start at the position that the tower had at their pose.
 
     Raises
     ------
     UsageError
-        Another engine than ``image``, more than one tower; what :func:`replay` raises.
+        If the engine is not ``image``, or there is more than one tower. Also everything that :func:`replay` raises.
 
     Notes
     -----
@@ -280,20 +280,20 @@ def replay_moving(
 def _scene_of(
     site: Site, link: Link, name: str, poses: Poses, block: _Block
 ) -> tuple[Site, Link, Poses, BoolArray | None]:
-    """Site, link and poses of a block, each place a tower; which links count."""
-    # one place keeps the tower's own name, so that it is replayed as a fixed tower is
+    """Return site, link and poses of a block with a tower for each position, and which links count."""
+    # a single position keeps the tower's name, so that it is replayed as a fixed tower
     names = [name] if len(block.places_m) == 1 else [f"{name}@{i}" for i in range(len(block.places_m))]
     towers = {n: _moved(site, site.towers[name], n, at) for n, at in zip(names, block.places_m, strict=True)}
     moved_site = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
     several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
     some = poses[block.rows]
-    # each place has links to its own poses alone: all others would be searched for nothing
+    # each position has links only to its poses: other links would be searched without use
     links = None if len(names) == 1 else np.arange(len(names))[:, None] == block.place[None, :]
     return moved_site, several, some, links
 
 
 def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
-    """Replay of a block as of one tower, which had its own place at each pose."""
+    """Return the replay of a block as a replay of one tower, which had a separate position at each pose."""
     row = np.arange(len(block.rows))
 
     def at_place(values: AnyArray) -> AnyArray:
@@ -345,7 +345,7 @@ class Geometry:
         return self.uav_yaw_deg, self.uav_pitch_deg, self.uav_roll_deg
 
     def in_words(self) -> str:
-        """For tables."""
+        """Return a description for tables."""
         slants = "/".join(f"{s:g}" for s in self.uav_slant_deg)
         tower = "/".join(f"{s:g}" for s in self.tower_slant_deg)
         turn = f"yaw {self.uav_yaw_deg:g}, pitch {self.uav_pitch_deg:g}, roll {self.uav_roll_deg:g} deg"
@@ -359,16 +359,16 @@ def every_geometry(
     grounds: Sequence[float],
     sums: Sequence[Ground] = ("power_sum",),
 ) -> tuple[Geometry, ...]:
-    """All combinations; mounts are (yaw, pitch, roll). Geometries of one mount follow each other.
+    """Return all combinations. Mounts are (yaw, pitch, roll), and geometries with the same mount are adjacent.
 
     Parameters
     ----------
     mounts_deg : sequence of (yaw, pitch, roll)
-        Of the UAV's array [deg].
+        Mounts of the UAV's array [deg].
     tower_slants_deg, uav_slants_deg : sequence of tuple of float
         Polarisation of each port from vertical [deg].
     grounds : sequence of float
-        Strength of the ground reflection against Fresnel's.
+        Strength of the ground reflection relative to Fresnel's coefficient.
     sums : sequence of {"power_sum", "coherent", ...}
         How the two rays add up.
 
@@ -413,12 +413,13 @@ def singular_values_of(
     Yields
     ------
     (n, ports)
-        Of the next geometry.
+        Singular values of the next geometry, one row per pose.
 
     Notes
     -----
-    Over receiving ports at the UAV. With the power sum they are the roots of the eigenvalues of ``L L^H + g^2 G G^H``:
-    the mean of ``H H^H`` over a band in which the ground ray takes all phases against the direct one.
+    The values are over the receiving ports at the UAV. With the power sum they are the roots of the eigenvalues of
+    ``L L^H + g^2 G G^H``, the mean of ``H H^H`` over a band in which the phase of the ground ray against the direct ray
+    takes all values.
     """
     runs = [(mount, list(run)) for mount, run in groupby(geometries, lambda g: g.mount_deg)]
     for mount, run in runs:

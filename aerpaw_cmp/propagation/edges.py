@@ -1,14 +1,14 @@
-"""Paths over one edge of a building: their search, their part of H, their words.
+"""Paths over one edge of a building: search, contribution to H, and description.
 
 An edge is where two faces of a building meet at an exterior angle above 180 degrees: the rim of a flat roof and its
 upright corners. A path runs from the source, or its image in the ground, to the point of the edge where both legs make
 the same angle with it (Keller's cone), and on to the target or its image in the ground. It exists when that point lies
 on the edge, both legs are free, and the point is on no other building's wall or inside one.
 
-A bent leg is straight in the space of the mirrored end, and over the edge the path is straight once both legs are
-turned into one plane: places of elements in that plane give the length of each pair. Directions, patterns and the
-diffraction matrix are those of the array centres, as the paths are: the field stays continuous where a direct or
-reflected path of the centres ends.
+A reflected leg is straight in the space of the mirrored end. The whole path is straight once both legs are rotated
+about the edge into one plane, and positions of elements in that plane determine the length of each pair. Directions,
+patterns and the diffraction matrix are those of the array centres, like the paths. The field is therefore continuous
+where a direct or reflected path between the centres ends.
 
 The uniform theory of diffraction at one edge: how a wedge passes a wave on.
 
@@ -68,22 +68,22 @@ def wedge(
     Returns
     -------
     bb, bp, pp : (...) complex
-        Elements (after, before) of the matrix over (beta, phi), times the square root of the wave number; that of (phi,
-        beta) is ``-bp``. A wave of amplitude ``e^{-j k s'} / s'`` at the edge leaves
-        ``matrix / sqrt(k) * sqrt(s' / (s (s + s'))) e^{-j k s}`` of it.
+        Elements (after, before) of the matrix over (beta, phi), times the square root of the wave number. The element
+        (phi, beta) is ``-bp``. A wave of amplitude ``e^{-j k s'} / s'`` at the edge becomes
+        ``matrix / sqrt(k) * sqrt(s' / (s (s + s'))) e^{-j k s}``.
 
     Notes
     -----
     ``-e^{-j pi/4} / (2 n sqrt(2 pi) sin_beta) [(T(pi + d) + T(pi - d)) I + T(pi + u) R_n + T(pi - u) R_0]`` with
     ``d = phi_out - phi_in``, ``u = phi_out + phi_in`` and ``T(x) = cot(x / 2n) F(2 distance cos^2(...))`` (Kouyoumjian
-    and Pathak, eq. 25). Matrices ``R`` of the faces stand in place of Luebbers' plus and minus one, so that a screen
-    that conducts perfectly is theirs, and the sum with direct and reflected waves is continuous at any obliquity.
+    and Pathak, eq. 25). Reflection matrices ``R`` of the faces replace Luebbers' plus and minus one. A perfectly
+    conducting screen is therefore theirs, and the sum with direct and reflected waves is continuous at any obliquity.
     """
     less, more = phi_out - phi_in, phi_out + phi_in
     shadow = edge_term(np.pi + less, exterior, distance) + edge_term(np.pi - less, exterior, distance)
     at_n, at_0 = edge_term(np.pi + more, exterior, distance), edge_term(np.pi - more, exterior, distance)
     upright, across = obliquity(phi_in, phi_out, exterior)
-    # of grazing incidence, which is the cosine from the normal that Fresnel's formulas take
+    # sine of the grazing angle, equal to the cosine from the normal in Fresnel's formulas
     sine = upright * np.sqrt(1.0 - cos_beta * cos_beta)
     # from face n both the angles and the edge run the other way, which leaves the matrix as it is
     te, tm = 0.0, 0.0
@@ -109,10 +109,10 @@ def wedge(
 def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Sine and cosine of the angle under which the faces of a wedge are taken to be hit, in the plane across the edge.
 
-    Away from the reflection boundary no angle of incidence is given. Taken is that on the mirror through the edge
-    which would send the ray to the target, half of ``pi - less``, times a factor that is 1 on both reflection
-    boundaries (continuity), the same both ways (reciprocity), and 0 where source or target lies in a face: there the
-    field of a face that does not conduct perfectly vanishes.
+    The angle of incidence is only defined at the reflection boundary. Elsewhere this function uses the angle on the
+    mirror through the edge which would send the ray to the target, half of ``pi - less``, times a factor. The factor is
+    1 on both reflection boundaries (continuity), the same in both directions (reciprocity), and 0 if source or target
+    lies in a face. There the field of a face that is not a perfect conductor vanishes.
 
     Parameters
     ----------
@@ -122,8 +122,8 @@ def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> 
     Returns
     -------
     upright, across : (...)
-        The sine is never negative: cos(less / 2) alone would change its sign, and the wave that a face turns from one
-        polarisation into the other with it, where the target enters the shadow.
+        The sine is never negative. Otherwise cos(less / 2) would change its sign where the target enters the shadow,
+        and with it the wave that a face converts from one polarisation into the other.
     """
     less = phi_out - phi_in
     up, down = (np.abs(np.sin((np.pi + turn) / (2.0 * exterior))) for turn in (less, -less))
@@ -136,9 +136,9 @@ def obliquity(phi_in: FloatArray, phi_out: FloatArray, exterior: FloatArray) -> 
 
 
 def edge_term(angle: FloatArray, exterior: FloatArray, distance: FloatArray) -> ComplexArray:
-    """``cot(angle / 2n) F(x)``, whose pole at a shadow boundary F takes away.
+    """``cot(angle / 2n) F(x)``, whose pole at a shadow boundary is cancelled by F.
 
-    Round the edge the angle repeats every 2 pi n; measured from the nearest boundary the argument of F is
+    The angle repeats every 2 pi n round the edge. If it is measured from the nearest boundary, the argument of F is
     ``x = 2 distance sin^2(angle / 2)``, so the factor sin(angle / 2) cancels the pole in closed form.
 
     Parameters
@@ -175,15 +175,16 @@ NEAREST_M = 0.01
 # Exterior angles nearer than this to 180 degrees [rad] are a plane.
 _SHARPEST = 1e-6
 
-# The law is asymptotic: a face that is lower than this many wavelengths is no wedge, and the building no obstacle.
+# The formula is asymptotic: faces lower than this many wavelengths are not treated as wedges, nor their building as an
+# obstacle.
 _LEAST_WAVELENGTHS = 0.5
 
-# How far beside an edge point the air on both of its faces is looked for.
+# Distance from an edge point at which the air on both of its faces is checked.
 # Far above the rounding of coordinates at 1 km, far below the gap between two walls of a map.
 _PROBE_M = 1e-3
 
-# Pairs of edge and pose that are looked at together; paths whose field is evaluated together.
-# Both bound the memory; no result depends on them.
+# Number of pairs of edge and pose that are examined together, and of paths whose fields are evaluated together. Both
+# limit the memory and do not change a result.
 LINKS_AT_ONCE, PATHS_AT_ONCE = 200_000, 4096
 
 
@@ -220,7 +221,7 @@ class EdgePaths(Further):
 
     def lines(self) -> PathSet:
         """The same polylines without faces."""
-        # legs() wants the corners in use first; their order stays, for the sort is stable
+        # legs() requires used corners first; the stable sort keeps their order
         used = np.isfinite(self.vertices_m).all(axis=2)
         first = np.argsort(~used, axis=1, kind="stable")
         vertices = np.take_along_axis(self.vertices_m, first[..., None], axis=1)
@@ -229,7 +230,7 @@ class EdgePaths(Further):
 
     @property
     def touched(self) -> IntArray:
-        """Ground, both faces of the edge, ground (paths, 4); -1 is none."""
+        """The ground, both faces of the edge, and the ground again (paths, 4). -1 means no face."""
         return np.column_stack([self.ground[:, :1], self.wedge, self.ground[:, 1:]])
 
     @property
@@ -240,7 +241,7 @@ class EdgePaths(Further):
 
     def words(self, faces: Faces) -> list[str]:
         """Corners of each path, from tower to UAV."""
-        label = (*faces.label, "")  # of -1, no face
+        label = (*faces.label, "")  # the last entry is for -1, which means no face
         edges = zip(self.wedge.tolist(), self.vertices_m[:, 1].tolist(), strict=True)
         middle = (f"edge of {label[f]} and {label[n]} at {', '.join(f'{x:.1f}' for x in at)} m" for (f, n), at in edges)
         steps = zip(self.ground.tolist(), middle, strict=True)
@@ -331,7 +332,7 @@ DIFFRACTION: dict[str, tuple[Callable[..., Further], ...]] = {"none": (), "edges
 
 
 def diffracted(name: str) -> tuple[Callable[..., Further], ...]:
-    """Searches that ``rt.diffraction`` asks for; :class:`UsageError` of an unknown value."""
+    """Return the searches for a value of ``rt.diffraction``. Raise :class:`UsageError` for an unknown value."""
     if name not in DIFFRACTION:
         raise UsageError(f"unknown diffraction {name!r}", expected=" or ".join(map(repr, DIFFRACTION)))
     return DIFFRACTION[name]
@@ -401,7 +402,7 @@ def _of_solid(
     first = {_corner(faces, wall, 0): wall for wall in walls}
     for wall in walls:
         top, low = faces.upper[wall, 1], max(float(faces.lower[wall, 1]), ground_m)
-        # neither its rim nor its corner is an edge in the sense of an asymptotic law
+        # neither its rim nor its corners are edges in the sense of an asymptotic formula
         if top - low <= least_m:
             continue
         near, far = (_point(faces, wall, end, top) for end in (0, 1))
@@ -503,7 +504,7 @@ class _Search:
         return good
 
     def _exposed(self, edge: IntArray, points_m: FloatArray) -> BoolArray:
-        """Check whether points (paths, 3) of edges (paths,) have air beside both faces."""
+        """Check whether points (paths, 3) of edges (paths,) have air next to both faces."""
         good = np.ones(len(edge), dtype=np.bool_)
         rows = np.flatnonzero(self.doubtful[edge])
         for side in (0, 1):
@@ -513,7 +514,7 @@ class _Search:
         return good
 
     def _round_edges(self, points_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Places (edges, points) along edges and distances from them; -1 inside the wedge or too near."""
+        """Return positions (edges, points) along edges, and distances from them. -1 inside the wedge or too close."""
         edges = self.edges
         axes = np.stack([edges.along, edges.face_axis, edges.normal, edges.normal_n])
         start = (axes * edges.start_m).sum(axis=2)
@@ -523,7 +524,7 @@ class _Search:
         return along, np.where((far >= NEAREST_M) & ((up >= 0.0) | (up_n >= 0.0)), far, -1.0)
 
     def _on_ground(self, ground: int, image_m: FloatArray, points_m: FloatArray) -> FloatArray:
-        """Points where the lines from images to points (paths, 3) pass a ground plane; NaN for -1."""
+        """Return where the lines from images to points (paths, 3) cross a ground plane. NaN if ``ground`` is -1."""
         if ground < 0:
             return np.full_like(points_m, np.nan)
         below, above = self.faces.height_m(ground, image_m), self.faces.height_m(ground, points_m)
@@ -538,9 +539,9 @@ class _Search:
 class _End(NamedTuple):
     """One end of paths in the space where its leg is straight.
 
-    ``centre_m`` (paths, 3), ``axes`` (paths, 3, 3) of the device as rows, ``normal`` (paths, 3) and ``face`` (paths, 3)
-    of the leg's mirror, ``bounced`` (paths,) whether there is one; places (paths or 1, 3, elements) and slants
-    (paths or 1, 2, elements) of the elements.
+    ``centre_m`` (paths, 3); ``axes`` (paths, 3, 3) of the device as rows. ``normal`` (paths, 3) and ``face`` (paths, 3)
+    belong to the leg's mirror, and ``bounced`` (paths,) is True if there is a mirror. Positions (paths or 1, 3,
+    elements) and slants (paths or 1, 2, elements) belong to the elements.
     """
 
     centre_m: FloatArray
@@ -610,9 +611,9 @@ def amplitudes(paths: EdgePaths, faces: Faces, sources_m: FloatArray, poses: Pos
 def _ends(
     paths: EdgePaths, faces: Faces, table: FloatArray, sources_m: FloatArray, poses: Poses, link: Link
 ) -> tuple[_End, _End]:
-    """Source and target of each path, mirrored where their leg is bent."""
+    """Return the source and target of each path, mirrored if their leg is reflected."""
     arrays, uav = list(link.tower_arrays.values()), link.uav_array
-    # transposed: rows of the axes are what the laws take
+    # transposed, because the formulas take the axes as rows
     mounts = np.stack([array.mount.T for array in arrays])
     axes = np.einsum("nij,jk->nki", poses.rotation[paths.pose], uav.mount)
     places, slants = np.stack([a.positions_m.T for a in arrays]), np.stack([a.slant_parts for a in arrays])
@@ -654,7 +655,7 @@ def _round_edge(
     end: _End, way: FloatArray, sign: float, along: FloatArray, cosine: FloatArray,
     pattern: tuple[ComplexArray, ComplexArray],
 ) -> tuple[ComplexArray, ComplexArray]:  # fmt: skip
-    """Fields (paths, elements) of an end's elements in the edge-fixed basis, times the sine with the edge.
+    """Return fields (paths, elements) of an end's elements in the edge-fixed basis, times the sine with the edge.
 
     ``way`` (paths, 3) is the direction of the wave at the edge's end of the leg; ``sign`` is 1 at the source and -1 at
     the target, which radiates against it.

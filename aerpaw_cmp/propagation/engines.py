@@ -31,9 +31,9 @@ from .search import mirror
 # Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same.
 MANY_FACES = 400
 
-# PathSolver finds a wall of solid angle W with the chance ``1 - exp(-N W / 4 pi)``, so what a scene needs depends on
-# its smallest and farthest walls: pilots on a batch of poses, each with more rays than the one before, until two find
-# the same paths. A wall that both miss and that other poses see can still be lost: the audit says so.
+# PathSolver finds a wall of solid angle W with probability ``1 - exp(-N W / 4 pi)``, so the required rays depend on the
+# smallest and farthest walls. Pilot searches on a batch of poses use more rays each time, until two find the same
+# paths. A wall that both miss and that other poses see can still be lost; the audit reports this.
 # Rays per tower of the first pilot.
 FIRST = 10_000
 
@@ -71,7 +71,7 @@ def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) ->
         ``pilot(samples)`` gives the paths of the pilot's poses.
     faces : Faces
     poses : int
-        Of the pilot, for the words.
+        Number of poses of the pilot, for the explanation.
 
     Returns
     -------
@@ -114,7 +114,7 @@ def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache
     few = poses[some]
 
     def pilot(samples: int) -> PathSet:
-        # through the cache, or each report would cast the pilots anew
+        # through the cache, or each report would repeat the pilots
         return search_or_read(part, link, few, replace(search, samples=samples), Run(), cache)[0]
 
     return enough_samples(pilot, scene.faces, len(some))
@@ -209,7 +209,7 @@ def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
 # Raised whenever the entries or the search change.
 LAYOUT = 4
 
-# Stands behind the entry, before the SHA-256 of all bytes in front of it.
+# Written after the entry, before the SHA-256 of all preceding bytes.
 _SEAL = b"AERPAWCP"
 
 _COLUMNS = ("pose", "tower", "depth", "faces", "vertices_m")
@@ -270,7 +270,7 @@ class PathCache:
         return content_digest(decides, faces.polygon, columns, mesh, links)
 
     def load(self, key: str) -> tuple[PathSet, float] | None:
-        """Paths and the seconds that their search took; None where there is no whole entry (see ``warnings``)."""
+        """Return the paths and the seconds of their search. None if there is no valid entry (see ``warnings``)."""
         place = self.folder / f"{key}.npz"
         try:
             entry = read_sealed(place, _SEAL)
@@ -286,7 +286,7 @@ class PathCache:
             return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
 
     def save(self, key: str, paths: PathSet, seconds: float) -> None:
-        """Write an entry; another process sees either nothing or all of it."""
+        """Write an entry atomically."""
         entry = io.BytesIO()
         np.savez(entry, seconds=np.float64(seconds), **named(paths, " ".join(_COLUMNS)))
         write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)

@@ -221,7 +221,7 @@ class Rows:
 
     @classmethod
     def one_after_another(cls: type[RowsT], pieces: Sequence[RowsT]) -> RowsT:
-        """The paths of all pieces, one at least, as they come; nothing is sorted."""
+        """Return the paths of all pieces, at least one, in the given order. Nothing is sorted."""
         names = [column.name for column in fields(cls)]  # type: ignore[arg-type]
         return cls(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in names})
 
@@ -276,7 +276,7 @@ class PathSet(Rows):
 
     @classmethod
     def from_tower(cls, tower: int, pose: IntArray, faces: IntArray, vertices_m: FloatArray, max_depth: int) -> PathSet:
-        """Paths of one tower over sequences (paths, depth), padded to ``max_depth``; -1 is no face.
+        """Create the paths of one tower over sequences (paths, depth), padded to ``max_depth``. -1 means no face.
 
         Parameters
         ----------
@@ -297,13 +297,13 @@ class PathSet(Rows):
         points = np.full((len(pose), max_depth, 3), np.nan)
         depth = faces.shape[1]
         sequence[:, :depth] = faces
-        # a sequence may end early: what stands behind its last face is no point
+        # a sequence may end early: entries after its last face are not points
         points[:, :depth] = np.where((faces >= 0)[..., None], vertices_m, np.nan)
         return cls(pose, np.full(len(pose), tower), (sequence >= 0).sum(axis=1), sequence, points)
 
     @classmethod
     def empty(cls, max_depth: int) -> PathSet:
-        """No path at all."""
+        """Return a set without paths."""
         zero = np.zeros(0, dtype=np.int64)
         return cls(zero, zero, zero, np.zeros((0, max_depth), dtype=np.int64), np.zeros((0, max_depth, 3)))
 
@@ -390,7 +390,7 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
 
 @lru_cache(maxsize=4)
 def _faces(grounds: tuple[float, ...], ground_material: str, buildings: tuple[Building, ...]) -> Faces:
-    """Faces of ground planes and buildings; kept, for a replay in parts asks again with each part."""
+    """Return the faces of ground planes and buildings. They are cached, because each part of a replay requests them."""
     faces = [*(_ground(height, ground_material, len(grounds) > 1) for height in grounds), *_solids(buildings)]
     columns: dict[str, Any] = dict(zip(_Face._fields, zip(*faces, strict=True), strict=True))
     numbers = {name: np.array(columns[name]) for name in _Face._fields if name not in ("material", "label", "polygon")}
@@ -399,7 +399,7 @@ def _faces(grounds: tuple[float, ...], ground_material: str, buildings: tuple[Bu
 
 @lru_cache(maxsize=1)
 def _solids(buildings: tuple[Building, ...]) -> list[_Face]:
-    """Walls and roofs; each tower's ground asks for the same."""
+    """Return walls and roofs. They are cached, because the ground of each tower requests them."""
     parts = [(building, part, at) for at, building in enumerate(buildings) for part in _parts(building.footprint)]
     return [face for part in parts for face in (*_walls(*part), _roof(*part))]
 
@@ -420,7 +420,7 @@ def _ground(height_m: float, material: str, several: bool) -> _Face:
 
 def _parts(footprint: Polygon) -> list[Polygon]:
     """Valid, counter-clockwise polygons (holes clockwise) without collinear vertices."""
-    # a ring that crosses itself becomes several, and perhaps lines, which are no walls
+    # a self-crossing ring becomes several polygons, and perhaps lines, which are not walls
     valid = footprint if footprint.is_valid else shapely.make_valid(footprint)
     polygons = [part for part in shapely.get_parts(valid) if part.geom_type == "Polygon" and part.area > 0.0]
     # counter-clockwise, so that every edge has the building on its left
@@ -431,9 +431,9 @@ def _parts(footprint: Polygon) -> list[Polygon]:
 
 def _corners(ring: shapely.LinearRing) -> FloatArray:
     """Vertices (corners, 2) of a ring at which it turns."""
-    # a ring repeats its first corner; a third coordinate of the map is no height of ours
+    # a ring repeats its first corner; a third coordinate of the map is not used as a height
     points = np.asarray(ring.coords, dtype=np.float64)[:-1, :2]
-    # a triangle stays one, however flat
+    # a triangle keeps its corners, even if it is very flat
     while len(points) > 3:
         before = points - np.roll(points, 1, axis=0)
         after = np.roll(points, -1, axis=0) - points
@@ -478,14 +478,14 @@ def _walls(building: Building, footprint: Polygon, solid: int) -> list[_Face]:
 
 
 def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
-    """Roof; its axes follow the longest edge, so that a rectangular roof fills its bounds."""
+    """Return the roof. Its axes follow the longest edge, so that a rectangular roof fills its bounds."""
     points = np.asarray(footprint.exterior.coords, dtype=np.float64)
     edges = np.diff(points, axis=0)
     longest = edges[np.argmax(np.hypot(edges[:, 0], edges[:, 1]))]
     along = np.array([longest[0], longest[1], 0.0]) / np.hypot(*longest)
     across = np.array([-along[1], along[0], 0.0])
     turned = shapely.transform(footprint, lambda p: p @ np.column_stack([along[:2], across[:2]]))
-    # a rectangle that is turned fills its bounds only along its own axes
+    # a rotated rectangle fills its bounds only along its axes
     low_a, low_b, high_a, high_b = turned.bounds
     # most roofs: bounds alone then say what is inside, which costs no polygon
     fills = np.isclose(turned.area, (high_a - low_a) * (high_b - low_b), rtol=1e-12, atol=0.0)
@@ -544,7 +544,7 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
 
 
 def corners(faces: Faces, reach_m: float = np.inf) -> FloatArray:
-    """Corners (faces, 4, 3) of the in-plane bounds, in order round the face; infinite ones cut at ``reach_m``."""
+    """Return corners (faces, 4, 3) of the in-plane bounds, in order round the face, cut at ``reach_m`` if infinite."""
     low = np.clip(faces.lower, -reach_m, reach_m)
     high = np.clip(faces.upper, -reach_m, reach_m)
     a = np.stack([low[:, 0], high[:, 0], high[:, 0], low[:, 0]], axis=1)
@@ -614,11 +614,11 @@ class Pattern(Protocol):
 
     @property
     def name(self) -> str:
-        """For reports."""
+        """The name of the pattern, for reports."""
         ...
 
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """Complex field components (theta, phi)."""
+        """Return the complex field components (theta, phi)."""
         ...
 
 
@@ -811,11 +811,11 @@ def uav_comparison_array(
     slant_deg: tuple[float, ...] = (45.0, -45.0, -45.0, 45.0),
     pattern: Pattern | None = None,
 ) -> Array:
-    """UAV array of the comparison: 2 x 2 at half a wavelength, rolled by 90 degrees, numbered column first.
+    """Return the UAV array of the comparison: 2 x 2 at half a wavelength, rolled by 90 degrees, numbered column first.
 
-    Slants alternate between neighbours in both directions. Which mounting the modem had is not published: with the
-    tower at 12 m this one leaves a total variation of 0.06 and 0.09 to the measured ranks of two flights at K = 10,
-    alternating along the numbering 0.07 and 0.11.
+    Slants alternate between neighbours in both directions. The modem's mounting is not published. With the tower at 12
+    m this mounting has a total variation distance of 0.06 and 0.09 from the measured ranks of two flights at K = 10;
+    slants that alternate along the numbering have 0.07 and 0.11.
 
     Parameters
     ----------
@@ -826,12 +826,12 @@ def uav_comparison_array(
     slant_deg : tuple of 4 float
         Polarisation of each port from vertical [deg].
     pattern : Pattern, optional
-        Of every element; isotropic by default.
+        Pattern of every element. Default: isotropic.
 
     Returns
     -------
     Array
-        Of four ports.
+        The array of four ports.
     """
     half = wavelength_m / 4
     # the left column first, its upper port before its lower one
@@ -840,22 +840,22 @@ def uav_comparison_array(
 
 
 def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern: Pattern | None = None) -> Array:
-    """Horizontal line of vertical elements; the paper's maps use 4 at half a wavelength along the y axis.
+    """Return a horizontal line of vertical elements. The paper's maps use 4 at half a wavelength along the y axis.
 
     Parameters
     ----------
     elements : int
     spacing_m : float
-        Between neighbours [m].
+        Distance between neighbours [m].
     yaw_deg : float
-        Of the boresight, counter-clockwise from east; the line is across it [deg].
+        Direction of the boresight, counter-clockwise from east [deg]. The line is perpendicular to it.
     pattern : Pattern, optional
-        Of every element; isotropic by default.
+        Pattern of every element. Default: isotropic.
 
     Returns
     -------
     Array
-        Centred on its position, boresight horizontal.
+        The array, centred on its position, with a horizontal boresight.
     """
     along = np.arange(elements, dtype=np.float64) * spacing_m
     return _mounted(_centred_line(along), (0.0,) * elements, pattern, yaw_deg)

@@ -2,9 +2,9 @@
 
 Standard library only, so that set-up can use it before anything else works.
 
-Why a trial: Dr.Jit 1.5 refuses LLVM 14 and loads LLVM 15 and 16, but on machines with AVX-512 these two abort the
-whole process in the first solver call ("Cannot select: fmaximum"). An abort cannot be caught, so the choice is tried
-in a child process with an empty kernel cache (a cached kernel would hide the fault).
+A trial is necessary. Dr.Jit 1.5 refuses LLVM 14 and loads LLVM 15 and 16, but on machines with AVX-512 these two abort
+the process in the first solver call ("Cannot select: fmaximum"). An abort cannot be caught. The choice is therefore
+tried in a child process with an empty kernel cache, because a cached kernel would hide the fault.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ import sionna.rt
 
 @dataclass(frozen=True, slots=True)
 class Library:
-    """A libLLVM file; ``version`` is empty when its name does not tell."""
+    """A libLLVM file. ``version`` is empty if its name does not contain a version."""
 
     path: Path
     version: tuple[int, ...]
@@ -115,10 +115,10 @@ class Library:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """Result of trying one library, or one GPU variant (``library`` is None), in a child process.
+    """The result of trying one library, or one GPU variant (``library`` is None), in a child process.
 
-    ``reason`` is empty when ``ok``; ``blames_library`` is False when the trial could not even start, and
-    ``missing`` then names the shared library that Dr.Jit itself lacks, if that was the cause.
+    ``reason`` is empty if ``ok``. ``blames_library`` is False if the trial could not even start. ``missing`` then names
+    the shared library that Dr.Jit could not load, if that was the cause.
     """
 
     library: Library | None
@@ -129,7 +129,7 @@ class Trial:
 
 
 def version_in_name(name: str) -> tuple[int, ...] | None:
-    """Version told by a libLLVM file name; empty if it tells none, None if it is no libLLVM.
+    """Return the version in a libLLVM file name: empty if the name has no version, None if the file is not a libLLVM.
 
     >>> version_in_name("libLLVM.so.19.1"), version_in_name("libLLVM-15.so.1"), version_in_name("libLLVM.so")
     ((19, 1), (15,), ())
@@ -144,19 +144,19 @@ def version_in_name(name: str) -> tuple[int, ...] | None:
 
 
 def _library(path: Path) -> Library | None:
-    """The file behind a name; links are followed because ``libLLVM.so`` often points to ``libLLVM.so.19.1``."""
-    # a link to nothing is left where a package was removed
-    if path.suffix == ".a" or not path.is_file():  # an LLVM to compile against brings two hundred of them
+    """Return the file behind a name. Links are followed because ``libLLVM.so`` often points to ``libLLVM.so.19.1``."""
+    # a broken link can remain after a package was removed
+    if path.suffix == ".a" or not path.is_file():  # an LLVM for compiling against contains two hundred static libraries
         return None
     versions = [version_in_name(name) for name in (path.resolve().name, path.name)]
     if versions == [None, None]:
         return None
-    # of two names the one with the release: 'libLLVM.so.1' says the revision of an interface
+    # prefer the name with the release: 'libLLVM.so.1' contains the revision of an interface
     return Library(path.resolve(), max((version for version in versions if version), default=()))
 
 
 def _system_paths() -> list[Path]:
-    """Every file the linker or the usual folders offer under a libLLVM name."""
+    """Return every file with a libLLVM name that the linker or the usual folders contain."""
     paths: list[Path] = []
     # /sbin is not in the path of a plain Debian user
     if ldconfig := shutil.which("ldconfig") or shutil.which("/sbin/ldconfig"):
@@ -193,7 +193,8 @@ def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
     else:
         paths = _system_paths()
     by_path: dict[Path, Library] = {}
-    for library in filter(None, map(_library, paths)):  # one file under several names: the one that tells the release
+    # for one file under several names keep the name with the release
+    for library in filter(None, map(_library, paths)):
         by_path[library.path] = max(by_path.get(library.path, library), library, key=lambda file: file.version)
     # an empty version sorts below every number, so unknown files come last
     return sorted(by_path.values(), key=lambda library: (library.version, str(library.path)), reverse=True)
@@ -211,7 +212,7 @@ def _missing_library(text: str) -> str:
 
 
 def _failure(child: subprocess.CompletedProcess[str]) -> str:
-    """Reason why a child failed, in one line: the signal that ended it and what it said last."""
+    """Return in one line why a child failed: the signal that ended it and its last message."""
     if missing := _missing_library(child.stderr):
         return f"Dr.Jit cannot be loaded, the system has no {missing}"
     lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
@@ -264,7 +265,7 @@ def try_library(
     program: str = _SIONNA_LOADS,
     timeout_s: float = _TRIAL_TIMEOUT_S,
 ) -> Trial:
-    """Trace two paths with this library in a child process (about 2 s with Sionna); never raises, never crashes.
+    """Trace two paths with this library in a child process (about 2 s with Sionna). It never raises or crashes.
 
     Parameters
     ----------
@@ -302,20 +303,19 @@ def _verdict(library: Library | None, reason: str) -> Trial:
 
 
 def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], Trial] | None = None) -> list[Trial]:
-    """Try libraries in order (by default with :func:`try_library`) until one works; the trials made, that one last."""
+    """Try libraries in order (default: :func:`try_library`) until one works. Return the trials, the good one last."""
     attempt = attempt or try_library
     trials: list[Trial] = []
     for library in libraries:
         trials.append(attempt(library))
-        # what is missing is Sionna itself: the next library would fare no better
-        # a failure of Sionna itself would come back with every library
+        # stop if the fault is not the library's (e.g. sionna is not installed): another LLVM would fail in the same way
         if trials[-1].ok or not trials[-1].blames_library:
             break
     return trials
 
 
 def _verdict_file(library: Library) -> Path:
-    """File where a good trial is remembered: it holds for this library file, these versions and this processor."""
+    """Return the file that stores a good trial for this library file, these versions and this processor."""
     try:
         processor = next(
             (line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))),
@@ -331,13 +331,13 @@ def _verdict_file(library: Library) -> Path:
 
 
 def _remembered_trial(library: Library) -> Trial:
-    """As :func:`try_library` without Sionna, once per machine where it is good. Failures are tried anew each time."""
+    """Return a stored good trial of :func:`try_library` without Sionna, else try. Failures are not stored."""
     note = _verdict_file(library)
     if note.is_file() and not _too_old(library.version):
         return Trial(library, True)
     trial = try_library(library, program=TRIAL_PROGRAM)
     if trial.ok:
-        with suppress(OSError):  # an unwritable cache costs half a second per run, nothing else
+        with suppress(OSError):  # an unwritable cache only costs half a second per run
             note.parent.mkdir(parents=True, exist_ok=True)
             note.write_text(f"{library.label}\n")
     return trial
@@ -354,7 +354,7 @@ class SionnaMissingError(CheckError):
 
 
 def prepare_llvm() -> Path:
-    """Point Dr.Jit to an LLVM that works; call it before importing drjit, mitsuba or sionna.
+    """Select an LLVM that works for Dr.Jit. Call this before importing drjit, mitsuba or sionna.
 
     Returns
     -------
@@ -397,9 +397,9 @@ def sionna_fails(trials: Sequence[Trial]) -> bool:
 
 
 def explain(trials: Sequence[Trial]) -> str:
-    """One sentence on why none of the tried libraries serves."""
+    """Return one sentence on why none of the tried libraries works."""
     if sionna_fails(trials):
-        return f"Sionna RT cannot be loaded, whatever the LLVM ({trials[-1].reason})"
+        return f"Sionna RT cannot be loaded with any LLVM ({trials[-1].reason})"
     if not trials:
         return f"Dr.Jit needs LLVM {MINIMUM_MAJOR} or newer, and no libLLVM was found"
     tried = "; ".join(f"{trial.library.label if trial.library else 'GPU'}: {trial.reason}" for trial in trials)
@@ -410,12 +410,12 @@ def explain(trials: Sequence[Trial]) -> str:
 
 
 def os_families() -> set[str]:
-    """Names of the distribution and of those that it is like; the system where there is none."""
+    """Return the names of the distribution and of related ones. Without a distribution, return the system's name."""
     try:
         release = platform.freedesktop_os_release()
     except OSError:
         return {platform.system().lower()}
-    # Mint and Pop say that they are like Ubuntu
+    # Mint and Pop declare that they are like Ubuntu
     return {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
 
 
@@ -431,7 +431,7 @@ def apt_packages(search_output: str) -> list[str]:
 
 
 def known_to_apt() -> str:
-    """Entries of apt's lists for LLVM runtimes of any version; empty where there are no lists."""
+    """Return the entries of apt's lists for LLVM runtimes of any version. Empty if there are no lists."""
     apt_cache = shutil.which("apt-cache")
     if apt_cache is None:
         return ""

@@ -1,4 +1,4 @@
-"""Compiler options of every kernel; imported only where numba is there."""
+"""Compiler options of every kernel. This module is imported only if numba is available."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ _PART: dict[str, Any] = {"forceinline": True, "_nrt": False}
 
 
 def kernel(function: Callable[..., Any], **options: Any) -> Any:
-    """Decorator of a kernel: compiled at its first call, kept in :data:`FOLDER` where something can be written."""
-    options = options or {"_nrt": True}  # said, or it would be that of the first caller
+    """Compile a kernel at its first call, and cache it in :data:`FOLDER` if that can be written."""
+    options = options or {"_nrt": True}  # set explicitly, or the option of the first caller would be used
     compiled = numba.njit(nogil=True, **_MATHS, **options)(function)
     if FOLDER is not None:
         before = config.CACHE_DIR
-        config.CACHE_DIR = str(FOLDER)  # numba wants a folder of its own, in which it then keeps nothing
+        config.CACHE_DIR = str(FOLDER)  # numba requires a private folder here, but does not store anything in it
         try:
             compiled.enable_caching()
         finally:
             config.CACHE_DIR = before
-        # after numba has made its own, which would unpickle whatever lies in the folder
+        # after numba has created its cache, which would unpickle any file in the folder
         compiled._cache._cache_file = _Sealed(function)
     return compiled
 
 
 class _Sealed:
-    """Compiled code of one kernel on disk, in place of numba's files, whose damage ends in any exception or a crash.
+    """The compiled code of one kernel on disk, instead of numba's files, whose damage raises any exception or crashes.
 
-    An entry has its SHA-256 behind it: a damaged one is none, and is compiled anew. The folder is this user's alone
-    (:func:`aerpaw_cmp.propagation.compiled.code_folder`), since an entry holds machine code.
+    An entry is followed by its SHA-256. A damaged entry is ignored, and the kernel is compiled again. Only this user
+    can write to the folder (:func:`aerpaw_cmp.propagation.compiled.code_folder`), since an entry contains machine code.
     """
 
     def __init__(self, function: Callable[..., Any]) -> None:
@@ -55,7 +55,7 @@ class _Sealed:
         return FOLDER / f"{self._name}-{sha256(repr(key).encode()).hexdigest()[:32]}.kernel"
 
     def load(self, key: Any) -> Any:
-        """Compiled code of a signature; None where none is kept."""
+        """Return the compiled code of a signature. None if it is not stored."""
         try:
             content = read_sealed(self._place(key), _MARK)
         except ValueError:
@@ -77,5 +77,5 @@ def part(function: Callable[..., Any]) -> Any:
 
 
 def law(function: Callable[..., Any], *, inline: bool = True) -> None:
-    """Let kernels call a law of plain Python, which NumPy evaluates as it is; in place of the call, or by a call."""
+    """Let kernels use a formula in plain Python, which NumPy also evaluates. ``inline`` inserts its body."""
     register_jitable(**_MATHS, forceinline=inline)(function)

@@ -1,4 +1,4 @@
-"""Options of a replay, beside site, link and poses: how to search, what a path loses, how to run."""
+"""Options of a replay, in addition to site, link and poses: how to search, which losses to add, how to run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from ..common.units import BoolArray, FloatArray
 from .geometry import PathSet
 
 Engine = Literal["image", "sionna"]
-# Values of ``rt.diffraction``; their searches stand in :data:`aerpaw_cmp.propagation.edges.DIFFRACTION`.
+# Values of ``rt.diffraction``. Their searches are in :data:`aerpaw_cmp.propagation.edges.DIFFRACTION`.
 Diffraction = Literal["none", "edges"]
 Samples = int | Literal["auto"]
 # ``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target.
@@ -69,12 +69,12 @@ class Field:
     loss: Loss | None = None
 
     def loss_db(self, paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray | None:
-        """Further loss (paths,) [dB] between sources and targets (poses, 3); None where none is lost.
+        """Return further loss (paths,) [dB] between sources and targets (poses, 3). None if there is no loss model.
 
-        Sources are (towers, 3), or (poses, 1, 3) of a tower that moves.
+        Sources are (towers, 3), or (poses, 1, 3) for a tower that moves.
         """
         if self.loss is not None and sources_m.ndim == 3:
-            # a loss looks its source up by tower: here each pose has its own
+            # a loss looks up its source by tower, but here each pose has a separate source
             paths, sources_m = replace(paths, tower=paths.pose), sources_m[:, 0]
         return None if self.loss is None else self.loss(paths, sources_m, targets_m)
 
@@ -107,13 +107,13 @@ Progress = Callable[[float], None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Run:
-    """Options of running a replay; nothing here changes a number.
+    """Options of running a replay. They do not change any result.
 
     Parameters
     ----------
     cache_dir : path, optional
-        Keep paths here, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for the
-        ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
+        Folder that stores paths, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for
+        the ``sionna`` engine. The ``image`` engine is faster than a cache and only uses one that is named.
     job : Job, optional
         What the poses are a part of.
     progress : callable, optional

@@ -1,13 +1,13 @@
-"""The replay of a flight, stage by stage: scene, paths, what lets them pass, field, levels.
+"""The replay of a flight, stage by stage: scene, paths, obstacles, field, levels.
 
-Table of the paths of a replay: delay, gain per element pair, directions and Doppler, each path by itself.
+The path table of a replay contains delay, gain per element pair, directions and Doppler of each path separately.
 
-H is the sum of the gains; the field of a path alone is the sum over a path set of one path, so there is no second law.
+H is the sum of the gains. The field of one path is the sum over a path set of one path, so there is only one formula.
 
 Directions are unit vectors away from the ends: azimuth counter-clockwise from east and elevation above the horizon in
 the site frame, from the boresight and its plane in the array frame (:mod:`aerpaw_cmp.propagation.geometry`).
 
-Ray tracing for notebooks: ``trace(site, link, poses)`` takes what is at hand and gives a :class:`Replay`.
+For notebooks, ``trace(site, link, poses)`` does ray tracing with the inputs at hand and returns a :class:`Replay`.
 """
 
 from __future__ import annotations
@@ -47,11 +47,11 @@ from .scene import Omission, Scene, buried_towers, within_reach
 from .search import mirror
 from .search.terrain import on_terrain
 
-# Codes of ``kind``; what else bends a path follows by its name.
-# Their numbers stand in files of channels: new kinds go behind them.
+# Codes of ``kind``; names of other kinds of bends follow. The codes are stored in channel files, so append new kinds at
+# the end.
 _KINDS = ("line_of_sight", "reflection", "edge")
 
-# Gains are those of the carrier: materials, patterns and foliage are not evaluated at other frequencies.
+# Gains are computed at the carrier: materials, patterns and foliage are not evaluated at other frequencies.
 WIDEST_BAND = 0.1
 
 
@@ -93,19 +93,19 @@ class PathTable:
     pose, tower, number : (paths,) int
         ``number`` counts the paths of a link.
     kind : (paths,) int
-        Of ``kinds``.
+        Index into ``kinds``.
     via : (paths,) int
-        Which of ``names``: the faces from tower to UAV.
+        Index into ``names``: the faces from tower to UAV.
     gain : (paths, n_rx, n_tx) complex
-        With the phase of the carrier.
+        Gain of each element pair, with the phase of the carrier.
     length_m : (paths,)
-        Between the centres of the arrays.
+        Length between the centres of the arrays.
     at_tower, at_uav : (paths, 3)
         Directions in which the path leaves the ends, site frame.
     turns : (paths,) int
-        A digit a corner from tower to UAV, 1 a reflection, 2 an edge; 0 is the line of sight.
+        One digit per corner from tower to UAV: 1 is a reflection, 2 a diffraction. 0 is the line of sight.
     vertices_m : (paths, most, 3)
-        Corners; NaN where unused.
+        Corners. NaN if unused.
     names, kinds : tuple of str
     """
 
@@ -149,22 +149,22 @@ class PathTable:
         ----------
         carrier_hz : float
         velocity_mps : (poses, 3)
-            Of the UAV: east, north, up.
+            Velocity of the UAV: east, north, up.
         tower_mps : (poses, 3), optional
-            Of a tower that moves.
+            Velocity of a tower that moves.
 
         Returns
         -------
         (paths,)
         """
-        # zero stands for a tower that stands
+        # zero velocity for a fixed tower
         tower = np.broadcast_to(unmasked(tower_mps), velocity_mps.shape)
         closing = np.einsum("ni,ni->n", velocity_mps[self.pose], self.at_uav)
         closing += np.einsum("ni,ni->n", tower[self.pose], self.at_tower)
         return np.asarray(carrier_hz / SPEED_OF_LIGHT_MPS * closing)
 
     def angles_deg(self, ends: Ends) -> dict[str, FloatArray]:
-        """Azimuth and elevation (paths,) of departure and arrival, in the site frame and in the array frame."""
+        """Return azimuth and elevation (paths,) of departure and arrival, in the site frame and in the array frame."""
         mounts = np.stack([array.mount for array in ends.link.tower_arrays.values()])[self.tower]
         mounted = ends.poses.rotation[self.pose] @ ends.link.uav_array.mount
         names = ("arrival", "departure") if ends.link.uav_transmits else ("departure", "arrival")
@@ -203,13 +203,13 @@ def path_table(
         lines, code = item.lines(), 0 if isinstance(item, PathSet) else kinds.index(item.name)
         loss_db = ends.field.loss_db(lines, ends.sources_m, ends.poses.position_m)
         good = counts[lines.pose, lines.tower]
-        # a path that loses everything is no path of the table, though it stays in the search's list
+        # omit paths with infinite loss from the table; the search result still contains them
         good &= True if loss_db is None else np.isfinite(loss_db)
         item, lines, loss_db = item.select(good), lines.select(good), None if loss_db is None else loss_db[good]
         unique, via = np.unique(item.touched, axis=0, return_inverse=True)
         texts = [", ".join(labels[i] for i in row if i >= 0) for row in unique.tolist()]
         codes = np.array([names.setdefault(text, len(names)) for text in texts], dtype=np.int64)
-        # centres of the arrays: delays and directions are one a path, gains one a pair
+        # from the centres of the arrays: delays and directions are per path, gains per element pair
         places = sources_of(lines, ends.sources_m), lines.vertices_m, ends.poses.position_m[lines.pose]
         away = list(legs(*places))
         back = next(legs(places[2], lines.vertices_m[:, ::-1], places[0]))  # from the UAV
@@ -217,7 +217,7 @@ def path_table(
             {
                 "pose": item.pose,
                 "tower": item.tower,
-                # however many reflections: their number stands in ``turns``
+                # for any number of reflections: ``turns`` contains the number
                 "kind": np.full(len(lines), code) if code else np.minimum(lines.depth, 1),
                 "via": codes[via.ravel()],
                 "gain": _gains(item, faces, ends, loss_db),
@@ -244,7 +244,7 @@ def _gains(item: Any, faces: Faces, ends: Ends, loss_db: FloatArray | None) -> C
     pieces, order = [], []
     for tower, (name, array) in enumerate(ends.link.tower_arrays.items()):
         rows = np.flatnonzero(item.tower == tower)
-        # each path at a pose of its own: H of that pose is then its gain, by the one law there is
+        # give each path a separate pose: H of that pose is then its gain, by the same formula
         some, own, link = item.select(rows), np.arange(len(rows)), replace(ends.link, tower_arrays={name: array})
         places, lost = sources_of(some, ends.sources_m)[:, None], None if loss_db is None else loss_db[rows]
         alone = replace(some, pose=own, tower=0 * own)
@@ -338,8 +338,8 @@ def subcarriers_hz(bandwidth_hz: float, count: int) -> FloatArray:
     return np.asarray((np.arange(count) - count // 2) * (bandwidth_hz / count))
 
 
-# Poses of which levels are made at once.
-# H of so many poses stays in a processor's cache between its two sums.
+# Number of poses whose levels are computed together. H of these poses stays in a processor's cache between its two
+# sums.
 LEVELS_AT_ONCE = 1024
 
 # Arrays (poses, towers, ...) of a replay.
@@ -364,24 +364,24 @@ class Replay:
         (:class:`~aerpaw_cmp.propagation.field.sum.Further`) that was asked for.
     faces : Faces
     ends : Ends
-        Link, poses, places of the towers and further losses.
+        Link, poses, positions of the towers and further losses.
     seconds : float
-        Of this call: path search (or reading the cache) and fields.
+        Time of this call [s]: path search (or reading the cache) and fields.
     search_seconds : float
-        Of the path search alone, when it was made: an entry of the cache remembers it.
+        Time of the path search alone [s]. A cache entry contains the time of its original search.
     engine : str
     omitted : list of Omission
-        What was not modelled; ``left_out`` says it for the report.
+        Parts that were not modelled. ``left_out`` contains them as sentences for the report.
     towers : tuple of str
         Order of the tower axis.
     from_cache : bool
-        Nothing was searched.
+        Whether the paths came from the cache.
     samples : int
         Rays per tower; 0 for an engine without rays.
     samples_reason : str
-        Why so many, where the number was found by pilots.
+        Reason for this number of rays, if pilots determined it.
     surfaces : Surfaces, optional
-        What the faces are made of, where the site is a scene of triangles.
+        Materials and triangles of the faces, if the site is a scene of triangles.
     """
 
     rss_dbm: FloatArray
@@ -412,13 +412,13 @@ class Replay:
         return self.contributions[1:]
 
     def level_dbm(self, summed: Literal["coherent", "power"]) -> FloatArray:
-        """Level (poses, towers) of the paths, added up as fields or as powers [dBm]; NaN without a path."""
+        """Return the level (poses, towers) of the paths, added as fields or as powers [dBm]. NaN without a path."""
         return self.rss_power_dbm if summed == "power" else self.rss_dbm
 
     @property
     def left_out(self) -> list[str]:
         """Sentences on what was not modelled."""
-        # what was counted and never met needs no sentence
+        # omissions with a count of zero do not need a sentence
         return [str(item) for item in self.omitted if 0 not in item.counts[:1]]
 
     def __repr__(self) -> str:
@@ -429,11 +429,11 @@ class Replay:
         )
 
     def path_table(self, names: dict[str, int] | None = None) -> PathTable:
-        """Every path with delay, gain per element pair and directions; ``names`` of earlier poses' faces."""
+        """Return every path with delay, gain per element pair and directions. ``names`` continues earlier poses."""
         return path_table(self.contributions, self.faces, self.ends, self.has_path, {"": 0} if names is None else names)
 
     def paths_frame(self) -> Any:
-        """A row per path: ``pose tower kind faces delay_s power_db`` and the angles [deg] of departure and arrival.
+        """Return a row per path: ``pose tower kind faces delay_s power_db`` and the angles [deg] of both ends.
 
         ``power_db`` is the mean over the element pairs.
         """
@@ -532,9 +532,9 @@ def replay(
     choice = chosen_samples(scene, link, poses, search, cache)
     search = search if choice is None else replace(search, samples=choice.samples)
     paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
-    # a damaged entry is said in the report: the numbers are right, the time is not
+    # report a damaged entry: the numbers are right, but the time is not
     notes += map(Omission, cache.warnings) if cache else []
-    # on the scene before terrain changed it: these paths reflect off level ground
+    # on the scene before terrain changes it: these paths reflect off level ground
     further = further_paths(site, scene, link, poses, search, field)
     scene, paths, stopped = passed(site, scene, link, poses, paths, search)
     fields, has_path = _channels(scene, link, poses, paths, [added for _, added in further], field)
@@ -570,12 +570,12 @@ def passed(
     site, scene, link, poses, search
         As for :func:`replay`.
     paths : PathSet
-        Of the engine.
+        Paths from the engine.
 
     Returns
     -------
     scene : Scene
-        With the planes of terrain that a path meets.
+        Scene with the terrain planes that a path meets.
     paths : PathSet
     notes : list of Omission
         What was stopped or left out.
@@ -587,7 +587,7 @@ def passed(
     notes += [Omission("paths end at the terrain of the elevation model", (lost, len(level)))]
     paths = level.select(clear) if lost else level
     if len(shaped):
-        # None: planes of terrain that touch are no repeated faces
+        # None: adjacent planes of terrain are not repeated faces
         paths = mirror.merge([paths, shaped], search.max_depth, None)
     return scene, paths, notes
 
@@ -661,21 +661,22 @@ def _channels(
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
-    # a blocked path adds zero to H; only the flag tells it from one that fades
+    # a blocked path adds zero to H; only the flag distinguishes it from a path that fades
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
     for item in further:
-        # path_power stays that of the reflections: each kind keeps its own
+        # path_power remains that of the reflections; other kinds are separate
         fields = Fields(fields.h + item.h, fields.path_power, fields.power + item.power)
         has_path |= item.power > 0.0
     return fields, has_path
 
 
 def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray, FloatArray]:
-    """Levels (poses, towers) of H and of the summed powers; below the noise floor H and ``has_path`` become nothing."""
+    """Return levels (poses, towers) of H and of the summed powers. Below the noise floor clear H and ``has_path``."""
     h, sent, floor = fields.h, link.transmit_power_dbm, link.noise_floor_dbm
     level_dbm, power_dbm = np.empty(has_path.shape), np.empty(has_path.shape)
-    for first in range(0, len(h), LEVELS_AT_ONCE):  # in the cache; a second thread would gain nothing
+    # a block fits in the processor's cache; a second thread would not help
+    for first in range(0, len(h), LEVELS_AT_ONCE):
         part = slice(first, first + LEVELS_AT_ONCE)
         level_dbm[part] = rss_dbm(mean_pair_power(h[part]), sent, floor)
         power_dbm[part] = rss_dbm(fields.power[part], sent, floor)

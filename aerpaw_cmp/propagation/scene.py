@@ -30,7 +30,7 @@ class Scene:
     excluded : (towers, poses) bool
         Links without a path: an end inside a building or under the ground.
     surfaces : Surfaces or None
-        Of a site with a scene of triangles: what its faces are made of. They stand in for ground planes.
+        The faces' materials and triangles, for a site with a scene of triangles. They replace ground planes.
     """
 
     faces: Faces
@@ -52,7 +52,7 @@ class Scene:
             )
         surfaces, towers = surfaces_of(site), [site.towers[name] for name in names]
         sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
-        # said beforehand: the search would follow every face for a link that cannot exist
+        # excluded before the search, which would follow every face for a link that cannot exist
         excluded = inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
         if surfaces is not None:
             usable = np.ones((len(names), len(surfaces)), dtype=np.bool_)
@@ -60,12 +60,12 @@ class Scene:
         faces = site_faces(site, names)
         ground = np.array([tower.ground_m for tower in towers])
         is_ground = faces.solid < 0
-        # each tower sees its own ground plane alone; walls and roofs are everybody's
+        # each tower sees only the ground plane at its foot; all towers share walls and roofs
         usable = ~is_ground[None, :] | (faces.offset_m[None, :] == ground[:, None])
-        # a pose below a tower's own plane but above the lowest ground, or above the terrain's, is no buried pose
+        # a pose below a tower's plane but above the lowest ground, or above the terrain, is not buried
         lowest = np.minimum(ground, 0.0)[:, None]
         if site.dem is not None:
-            # fmin, not minimum: beyond the model (NaN) the plane decides
+            # fmin, not minimum: outside the model (NaN) the plane decides
             lowest = np.fmin(lowest, site.dem.ground_m(*poses.position_m[:, :2].T))
         return cls(faces, sources, usable, excluded | (poses.position_m[:, 2] < lowest))
 
@@ -75,38 +75,38 @@ class Scene:
 
 
 def surfaces_of(site: Site) -> Surfaces | None:
-    """Faces of the site's scene of triangles and of the buildings beside it; None where it has no scene."""
+    """Return the faces of the site's scene of triangles and of its buildings. None without such a scene."""
     if site.scene is None:
         return None
     scene = site.scene
     for building in site.buildings:
-        # triangles hide and reflect by one law: prisms beside them would need the other
+        # triangles hide and reflect by one formula: prisms would need the other formula
         scene = added(scene, *building_mesh(building), building.name, material(building.material).name)
     return _merged(scene)
 
 
 @lru_cache(maxsize=2)
 def _merged(scene: TriangleScene) -> Surfaces:
-    """Faces of a scene; the same scene is merged once."""
+    """Return the faces of a scene. The same scene is merged once."""
     if compiled.beams().kernels is None:
         raise UsageError(
             f"the site is a scene of triangles, but {compiled.beams().reason}",
             expected="numba that works: pip install 'aerpaw-cmp[fast]'",
             cause="its thousands of faces are searched by compiled code alone",
         )
-    from .search.merging import merged  # compiled: loaded where there is a scene
+    from .search.merging import merged  # compiled, so loaded only for a scene of triangles
 
     return merged(scene)
 
 
-# Poses further than this from every tower [m] are no poses of the site.
-# Radio horizon of a UAV at 600 m; a row at 0, 0 degrees lies thousands of kilometres off.
+# Reject poses farther than this from every tower [m]: they do not belong to the site. It is the radio horizon of a UAV
+# at 600 m; a row at 0, 0 degrees is thousands of kilometres away.
 REACH_M = 100_000.0
 
 
 @dataclass(frozen=True, slots=True)
 class Omission:
-    """One thing that a replay leaves out: ``counts`` is how many, and of how many, where it is counted."""
+    """A part that a replay does not model. ``counts`` contains how many, and of how many, if it is counted."""
 
     what: str
     counts: tuple[int, ...] = ()
@@ -148,11 +148,11 @@ def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[Omission]]:
 
 
 def buried_towers(site: Site, link: Link) -> list[Omission]:
-    """Towers whose antenna is inside a building, said so: a wrong footprint would look like a dead tower."""
+    """Report towers whose antenna is inside a building: a wrong footprint would look like a tower without signal."""
     lines = []
     names = list(link.tower_arrays)
     places = np.array([site.towers[name].position_m for name in names]).reshape(-1, 3)
-    # one building after the other, for the name: asked of buried towers alone
+    # one building after the other to find the name, for buried towers only
     for number in np.flatnonzero(inside_solids(site, places)):
         name = names[number]
         for building in site.buildings:

@@ -1,13 +1,13 @@
-"""One engine checked against the other on a spread of links, and its fields against two references.
+"""An audit of one engine by the other on a sample of links, and of its fields by two references.
 
-The field of a replay checked by two others: Sionna's own coefficients, and a second implementation.
+The field of a replay is checked by Sionna's own coefficients and by a second implementation.
 
-1. *Sionna* traces the audited links once more and gives, for each path, its own complex coefficient with one element at
-   each array centre, in both slants, from its own materials, patterns and rotations. Float32: entries within
-   ``_ENTRY_TOLERANCE`` of the strongest, phase within ``_PHASE_TOLERANCE_RAD`` on paths shorter than
+1. *Sionna* traces the audited links again and returns a complex coefficient for each path. It uses one element at
+   each array centre, both slants, and its own materials, patterns and rotations. The results are float32: entries must
+   agree within ``_ENTRY_TOLERANCE`` of the strongest, phases within ``_PHASE_TOLERANCE_RAD`` on paths shorter than
    ``_PHASE_RANGE_M``.
-2. :mod:`aerpaw_cmp.propagation.check.reference` computes a few links of each replay from the settings: its paths, H of
-   every element pair with foliage, RSS and rank. Both are float64: the difference is rounding.
+2. :mod:`aerpaw_cmp.propagation.check.reference` computes a few links of each replay from the settings: their paths,
+   H of every element pair with foliage, RSS and rank. Both are float64, so only rounding may differ.
 """
 
 from __future__ import annotations
@@ -39,44 +39,46 @@ if TYPE_CHECKING:
     from ..search.sionna import Coefficients
 
 
-# Of the strongest of a path's four entries: float32 leaves some 5e-4 of rotations, patterns and Fresnel coefficients.
+# Relative to the strongest of a path's four entries: float32 has errors of about 5e-4 in rotations, patterns and
+# Fresnel coefficients.
 _ENTRY_TOLERANCE = 3e-3
 
-# Sionna's reflection points are barycentric on triangles that reach so far: float32 has 24 bits for a coordinate.
+# Sionna's reflection points are barycentric on large triangles, and float32 has 24 bits for a coordinate.
 _FLOAT32_ULP = 2.0**-22
 
-# Float32 moves a reflection point off its plane by 1e-4 m at most within ``_PHASE_RANGE_M``: 7e-3 rad at 3.4 GHz.
+# Within ``_PHASE_RANGE_M`` float32 moves a reflection point off its plane by at most 1e-4 m: 7e-3 rad at 3.4 GHz.
 _PHASE_TOLERANCE_RAD = 0.01
 
 _PHASE_RANGE_M = 300.0
 
-# Coherent RSS of a link of near paths [dB].
+# Tolerance for the coherent RSS of a link whose paths are all shorter than ``_PHASE_RANGE_M`` [dB].
 _LINK_TOLERANCE_DB = 0.1
 
-# Of H against the second implementation, relative to the root of the links' mean path power; both are float64.
+# Tolerance for H against the second implementation, relative to the root of the link's total path power. Both are
+# float64.
 _EXACT_TOLERANCE = 1e-6
 
-# A path that a move of an edge by this much makes or breaks may differ in float32.
+# A path whose existence changes when an edge moves by this distance may differ in float32.
 _SIONNA_MARGIN_M = 2e-3
 
-# Links per replay for the second implementation.
-# Of some 0.1 s each: the second implementation takes one element pair after the other.
+# Poses per replay for the second implementation.
+# Each link takes about 0.1 s, because the second implementation computes one element pair after the other.
 REFERENCE_LINKS = 8
 
-# Patterns of this package that Sionna has too, under the same names.
+# Patterns that Sionna and this package share, under the same names.
 _SIONNA_PATTERNS = ("iso", "hw_dipole", "tr38901")
 
 
 @dataclass(frozen=True, slots=True)
 class Expected:
-    """Settings of a flight, for the second implementation."""
+    """The settings of a flight, for the second implementation."""
 
     link: ExpectedLink
     loss: ExpectedLoss = field(default_factory=ExpectedLoss)
 
     @classmethod
     def of(cls, link: Link, loss: ExpectedLoss | None = None) -> Expected:
-        """From a link itself: layout, slants and mounts are then taken as they are."""
+        """Return the settings of a link: its layout, slants and mounts as they are."""
         towers = {name: expected_array(array) for name, array in link.tower_arrays.items()}
         uav = expected_array(link.uav_array)
         settings = (link.carrier_hz, link.transmit_power_dbm, link.uav_transmits)
@@ -85,8 +87,8 @@ class Expected:
 
 
 def expected_array(array: Array) -> ExpectedArray:
-    """An array's own numbers."""
-    # one pattern stands for all elements
+    """Return the positions, slants, patterns and mount of an array for the second implementation."""
+    # one pattern is used for all elements
     patterns = array.patterns * len(array) if len(array.patterns) == 1 else array.patterns
     return ExpectedArray(
         tuple((float(x), float(y), float(z)) for x, y, z in array.positions_m),
@@ -97,7 +99,7 @@ def expected_array(array: Array) -> ExpectedArray:
 
 
 def scalar_pattern(pattern: Any) -> Any:
-    """One direction of a pattern of this package."""
+    """Return a function that evaluates a pattern of this package in one direction."""
 
     def of(theta: float, phi: float) -> tuple[complex, complex]:
         e_theta, e_phi = pattern.field(np.array(theta), np.array(phi))
@@ -119,14 +121,14 @@ def against_reference(
     ks: Sequence[float],
     max_depth: int,
 ) -> FieldAudit:
-    """A few links of a replay computed a second time.
+    """Compute a few links of a replay with the second implementation, and compare.
 
     Parameters
     ----------
     site, poses, replay
-        Of the replay.
+        Inputs and result of the replay.
     chosen : (links,) int
-        Poses; each tower of the replay is taken at each.
+        Pose indices. Each tower of the replay is checked at each of these poses.
     expected : Expected
     ks : sequence of float
     max_depth : int
@@ -146,7 +148,8 @@ def against_reference(
         for row in chosen:
             mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
             stands = in_woods[mine].any()
-            # it knows level ground and no medium: saying so is better than a false failure
+            # the second implementation supports only level ground and no media: reporting that is better than a false
+            # failure
             if beyond[mine].any() or stands:
                 total += FieldAudit(not_covered=(_STANDS if stands else _ON_TERRAIN,))
                 continue
@@ -154,14 +157,14 @@ def against_reference(
             total += link.paths_checked(max_depth, site.dem is None)
             try:
                 total += link.field_checked(ks)
-            # a material outside its own table of P.2040
+            # a material outside the second implementation's table of P.2040
             except LookupError as error:
                 total += FieldAudit(not_covered=(f"the material {error.args[0]} at this carrier",))
     return total
 
 
 def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expected: Expected) -> FieldAudit:
-    """Paths ``rows`` of a replay, which the other engine lacks, that cannot exist.
+    """Count the paths ``rows`` of a replay, which the other engine does not have, that cannot exist.
 
     Parameters
     ----------
@@ -169,14 +172,14 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
     poses : Poses
     replay : Replay
     rows : (m,) int
-        Paths of the replay.
+        Paths of the replay that the other engine does not have.
     expected : Expected
-        Arrays and loss as the settings say, read a second time.
+        Arrays and loss according to the settings, read a second time.
 
     Returns
     -------
     FieldAudit
-        ``phantom_paths`` and their failures; all else empty.
+        ``phantom_paths`` and their failures; all other fields are empty.
     """
     count, beyond = 0, _over_terrain(replay)
     for row in rows[~beyond[rows]]:
@@ -195,7 +198,7 @@ _ON_TERRAIN = "reflections off shaped ground"
 
 
 def _over_terrain(replay: Replay) -> BoolArray:
-    """Paths (paths,) off ground that is no level plane."""
+    """Check for each path (paths,) whether it reflects off terrain that is not a level plane."""
     shaped = np.append(replay.faces.solid == TERRAIN, False)
     return np.asarray(shaped[replay.paths.faces].any(axis=1))
 
@@ -219,17 +222,17 @@ class _OneLink:
         return f"{self.replay.towers[self.tower]}, pose {self.row}"
 
     def sequence(self, path: int) -> tuple[Mirror, ...] | None:
-        """The mirrors of a path of the replay, looked up in the site; None where the site has no such face."""
+        """Return the mirrors of a path of the replay, looked up in the site. None if the site has no such face."""
         return _mirrors_of(self.reference, self.replay.faces, self.replay.paths, path)
 
     def paths_checked(self, max_depth: int, complete: bool) -> FieldAudit:
-        """Paths that cannot exist, and paths that are not there."""
+        """Count paths that cannot exist and paths that are missing."""
         failures: list[str] = []
         keys = set()
         phantom = doubtful = missing = 0
         ground = self.reference.site.towers[self.replay.towers[self.tower]].ground_m
         gap = math.dist(self.target, self.reference.source)
-        # a pose is beyond reach where it is so from every tower, not from this one alone
+        # a pose is out of reach only if it is too far from every tower, not only from this tower
         nearest = min(math.dist(self.target, tower.position_m) for tower in self.reference.site.towers.values())
         # buried, in the near field, or beyond reach: the replay must have no path there
         nowhere = self.target[2] < min(ground, 0.0) or gap < 0.01 or nearest > 1e5
@@ -242,9 +245,9 @@ class _OneLink:
         if phantom:
             failures.append(f"{self.name}: {counted(phantom, 'path')} that cannot exist")
         if complete and not nowhere:
-            # None: too many sequences to try; what is there is still judged
+            # None: there are too many sequences to try; the paths of the replay are still judged
             for sequence in self.reference.sequences(self.target, max_depth) or ():
-                # only what exists beyond doubt can be missing
+                # only a path that certainly exists can be missing
                 if self.reference.verdict(sequence, self.target) and (key := _key(sequence)) not in keys:
                     missing += 1
                     keys.add(key)
@@ -253,14 +256,14 @@ class _OneLink:
         return FieldAudit(missing_paths=missing, phantom_paths=phantom, doubtful=doubtful, failures=tuple(failures))
 
     def field_checked(self, ks: Sequence[float]) -> FieldAudit:
-        """H, RSS and rank from the replay's own list of paths."""
+        """Compare H, RSS and rank, computed from the replay's own list of paths."""
         paths, replay = [], self.replay
-        if replay.further:  # the second implementation knows straight ways and mirrors
+        if replay.further:  # the second implementation computes only direct paths and reflections
             return FieldAudit(not_covered=tuple(f"paths {some.kind}" for some in replay.further))
         for path in self.mine:
             sequence = self.sequence(path)
             if sequence is None:
-                return FieldAudit(doubtful=1)  # a failure already
+                return FieldAudit(doubtful=1)  # already counted as a failure
             loss = self.reference.loss_db(sequence, self.target)
             if loss is None:
                 return FieldAudit(doubtful=1)
@@ -269,17 +272,17 @@ class _OneLink:
         return self._against(h.T if self.reference.link.uav_transmits else h, power, ks, len(paths))
 
     def _against(self, h: ComplexArray, power: float, ks: Sequence[float], paths: int) -> FieldAudit:
-        """H, RSS and rank of the replay against those of so many paths with their sum of powers."""
+        """Compare H, RSS and rank of the replay with the expected ``h`` and total path ``power`` of a link."""
         link, ours, failures = self.reference.link, self.replay.h[self.row, self.tower], []
         over = _decibel(float((np.abs(h) ** 2).mean())) + link.transmit_power_dbm - link.noise_floor_dbm
-        # so near to the floor that rounding decides whether there is a channel
+        # so close to the noise floor that rounding decides whether there is a channel
         if abs(over) < 1e-3:
             return FieldAudit(doubtful=1)
         if over < 0:  # below the receiver's floor: no channel
             h = np.zeros_like(h)
         if ours.shape != h.shape:
             return FieldAudit(failures=(f"{self.name}: H is {ours.shape}, expected {h.shape}",))
-        # of the powers, not of H: in a fade H is small, and its error is not
+        # relative to the path powers, not to H: H is small in a fade, but its error is not
         size = math.sqrt(power) or 1e-30
         under = _decibel(power) + link.transmit_power_dbm < link.noise_floor_dbm
         error = float(np.abs(ours - h).max()) / size
@@ -287,7 +290,7 @@ class _OneLink:
             failures.append(f"{self.name}: H differs by {error:.2g} of its size")
         worst, level_of_h = 0.0, float((np.abs(h) ** 2).mean())
         for level, value in ((self.replay.rss_dbm, level_of_h), (self.replay.rss_power_dbm, 0.0 if under else power)):
-            # both levels: the coherent one from H, the other from the powers
+            # the coherent level comes from H, the other from the path powers
             off = _level_error(float(level[self.row, self.tower]), value, link.transmit_power_dbm, size)
             if off > 1e-3:
                 failures.append(f"{self.name}: RSS differs by {off:.2g} dB")
@@ -308,7 +311,7 @@ def _another_rank(ours: ComplexArray, expected: ComplexArray, ks: Sequence[float
     sigma = np.linalg.svd(expected, compute_uv=False)
     if not sigma[0] > 0:
         return any(int(channel_rank(ours, k)) for k in ks)
-    # a singular value at the threshold counts or not by its last digit
+    # rounding decides whether a singular value at the threshold counts
     clear = [k for k in ks if not (np.abs(sigma * k / sigma[0] - 1.0) < 1e-4).any()]
     return any(int(channel_rank(ours, k)) != int((sigma > sigma[0] / k).sum()) for k in clear)
 
@@ -318,8 +321,11 @@ def _decibel(power: float) -> float:
 
 
 def _level_error(level_dbm: float, power: float, transmit_dbm: float, size: float) -> float:
-    """Difference of a level [dB] beyond what rounding does in a fade; infinite where only one of the two is covered."""
-    if power <= (1e-9 * size) ** 2:  # nothing, or a fade deeper than 180 dB
+    """Return how far a level exceeds the rounding error of a fade [dB].
+
+    Infinite if only one of the two is in coverage.
+    """
+    if power <= (1e-9 * size) ** 2:  # no power, or a fade deeper than 180 dB
         return 0.0 if not math.isfinite(level_dbm) or power > 0 else math.inf
     if not math.isfinite(level_dbm):
         return math.inf
@@ -332,7 +338,7 @@ def _mirror_of(reference: Reference, faces: Faces, face: int, vertex: FloatArray
     normal, offset = faces.normal[face], float(faces.offset_m[face])
     solid = int(faces.solid[face])
     point = tuple(vertex.tolist())
-    # by plane and building, not by number: numbers are the replay's own
+    # by plane and building, because the replay has its own face numbers
     same = [
         m
         for m in reference.mirrors
@@ -344,7 +350,7 @@ def _mirror_of(reference: Reference, faces: Faces, face: int, vertex: FloatArray
 
 
 def _mirrors_of(reference: Reference, faces: Faces, paths: PathSet, row: int) -> tuple[Mirror, ...] | None:
-    """The mirrors of a path, looked up in the site; None where the site has no such face."""
+    """Return the mirrors of a path, looked up in the site. None if the site has no such face."""
     met = zip(paths.faces[row].tolist(), paths.vertices_m[row], strict=True)
     mirrors = [_mirror_of(reference, faces, face, vertex) for face, vertex in met if face >= 0]
     known = tuple(mirror for mirror in mirrors if mirror is not None)
@@ -352,12 +358,12 @@ def _mirrors_of(reference: Reference, faces: Faces, paths: PathSet, row: int) ->
 
 
 def _key(sequence: Sequence[Mirror]) -> tuple[tuple[float, ...], ...]:
-    """Planes of a sequence: coplanar faces are one mirror."""
+    """Return the planes of a sequence. Coplanar faces are the same mirror."""
     return tuple(tuple(round(x, 6) + 0.0 for x in (*m.normal, m.offset_m)) for m in sequence)
 
 
 def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
-    """Poses of ``chosen`` that together meet as many faces as possible."""
+    """Choose ``count`` poses of ``chosen`` that together meet as many faces as possible."""
     if len(chosen) <= count:
         return chosen
     kinds: dict[int, set[tuple[int, ...]]] = {int(row): set() for row in chosen}
@@ -369,7 +375,7 @@ def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
     picked: list[int] = []
     met: set[tuple[int, ...]] = set()
     candidates = list(kinds)
-    # greedily, the pose that meets most faces not yet met; exact covers are not needed
+    # greedy: take the pose that meets most faces not met yet; an optimal cover is not needed
     while len(picked) < count:
         best = max(candidates, key=lambda row: (len(kinds[row] - met), len(kinds[row])))
         picked.append(best)
@@ -391,7 +397,7 @@ def against_sionna(
     search: Search,
     known: dict[str, Any] | None = None,
 ) -> FieldAudit:
-    """Each path's power, phase and polarisation against what Sionna itself computes.
+    """Compare each path's power, phase and polarisation with Sionna's own coefficient.
 
     Parameters
     ----------
@@ -400,18 +406,18 @@ def against_sionna(
     poses : Poses
     replay : Replay
     chosen : (m,) int
-        Poses that are asked.
+        Indices of the poses to check.
     expected : Expected
-        Arrays and loss as the settings say, read a second time.
+        Arrays and loss according to the settings, read a second time.
     search : Search
         Depth, rays and batch of Sionna's search.
     known : dict, optional
-        What Sionna answered before, by what it was asked.
+        Earlier results of Sionna by the digest of their inputs.
 
     Returns
     -------
     FieldAudit
-        Counts and largest errors over the paths that both have.
+        Counts and largest errors over the paths that both engines have.
     """
     few = poses[chosen]
     scene = Scene.of(site, link, few)
@@ -439,11 +445,11 @@ def against_sionna(
 def _own(
     scene: Scene, links: Links, probe: Link, turns: tuple[FloatArray, FloatArray], search: Search, known: dict[str, Any]
 ) -> Coefficients:
-    """Sionna's own coefficients in the slants of a probe; it is asked once for upright and level elements."""
+    """Return Sionna's own coefficients in the slants of a probe. Sionna runs once, with crossed elements."""
     from ..search.sionna import Rays, own_coefficients
 
     arrays, cross = list(probe.tower_arrays.items()), np.array([0.0, np.pi / 2])
-    # the slant of an element is a rotation, so two crossed elements answer for every slant
+    # the slant of an element is a rotation, so two crossed elements determine every slant
     upright = replace(
         probe,
         tower_arrays={name: replace(array, slant_rad=cross) for name, array in arrays},
@@ -460,7 +466,10 @@ def _own(
 
 
 def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
-    """The link with two crossed elements in each array's centre, with the pattern and slant of its first element."""
+    """Return the link with two crossed elements at each array's centre, and the patterns that Sionna does not have.
+
+    The elements have the pattern and slant of the array's first element.
+    """
     unasked: list[str] = []
 
     def centre(array: Array) -> Array:
@@ -468,7 +477,7 @@ def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
         if first.name not in _SIONNA_PATTERNS:
             unasked.append(f"the antenna pattern '{first.name}' (Sionna is asked with isotropic elements)")
             first = Isotropic()
-        # two crossed elements hold all of the polarisation
+        # two crossed elements contain all of the polarisation
         slants = array.slant_rad[0] + np.array([0.0, np.pi / 2])
         return Array(np.zeros((2, 3)), slants, (first,), array.mount)
 
@@ -479,7 +488,7 @@ def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
 
 
 def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Faces) -> tuple[IntArray, IntArray]:
-    """Indices of the paths that both have."""
+    """Return the indices of the paths that both engines have, in ``ours`` and in ``theirs``."""
     from ..geometry import joined
 
     plane = planes_of(joined(our_faces, their_faces))
@@ -492,12 +501,14 @@ def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Face
 def _paths_against_sionna(
     ours: PathSet, replay: Replay, scene: Scene, few: Poses, probe: Link, theirs: Coefficients, chosen: IntArray
 ) -> FieldAudit:
-    """Paths, row by row those of Sionna ``theirs``; ``chosen`` (poses,) numbers the poses in the replay."""
+    """Compare paths with the same rows of Sionna's ``theirs``.
+
+    ``chosen`` (poses,) contains the poses' numbers in the replay.
+    """
     count = len(ours)
     if not count:
         return FieldAudit()
-    # each path alone: a pose of its own
-    # H of a pose with one path is that path's coefficient
+    # each path gets a separate pose: H of a pose with one path is the coefficient of that path
     alone = replace(ours, pose=np.arange(count))
     spots = few[ours.pose]
     h = channel_matrices(alone, replay.faces, scene.sources_m, spots, probe).h[np.arange(count), ours.tower]
@@ -505,9 +516,9 @@ def _paths_against_sionna(
     # a coefficient of zero has no phase
     turn = np.where(turn == 0.0, 1.0, turn)
     phase, near = np.abs(np.angle(turn)), theirs.length_m < _PHASE_RANGE_M
-    # float32 has no digits for a weak entry: all count as shares of the path's strongest
+    # float32 has too few digits for a weak entry, so errors are relative to the path's strongest entry
     strongest = np.abs(theirs.gain).max(axis=(1, 2))
-    # phases are compared apart: over 1 km float32 has lost them
+    # phases are compared separately: over 1 km float32 has lost them
     aligned = h * (turn.conj() / np.abs(turn))[:, None, None]
     share = np.abs(aligned - theirs.gain).max(axis=(1, 2)) / np.where(strongest > 0.0, strongest, 1.0)
     power = 20.0 * np.log10(1.0 + share)
@@ -515,7 +526,7 @@ def _paths_against_sionna(
     rss = _link_error(ours, h, theirs.gain, near, len(few), len(replay.towers))
     failures = []
     for error, bad, unit in (
-        # not share > allowed: so NaN is a failure, too
+        # not share > allowed: NaN must be a failure, too
         (power, ~(share <= allowed), "dB"),
         (phase, near & ~(phase <= _PHASE_TOLERANCE_RAD), "rad"),
     ):
@@ -543,15 +554,16 @@ def _paths_against_sionna(
 def _turned_by_float32(
     ours: PathSet, faces: Faces, scene: Scene, spots: Poses, probe: Link, theirs: Coefficients
 ) -> FloatArray:
-    """Angles (paths,) [rad] by which the rounding of Sionna's reflection points turns polarisations.
+    """Return angles (paths,) [rad] by which the rounding of Sionna's reflection points rotates polarisations.
 
-    A point that lies nearly above an end, seen along a face's normal or the axis of a device, turns the plane of
-    incidence, or the basis of the pattern, by its shift over that small distance. Shifts beyond float32 excuse nothing.
+    A point nearly above an end, seen along a face's normal or a device's axis, is at a small distance from that axis.
+    Its shift over this distance rotates the plane of incidence, or the basis of the pattern. Shifts larger than the
+    rounding of float32 are not tolerated.
     """
     mounts = np.stack([array.mount for array in probe.tower_arrays.values()])
     ends = scene.sources_m[ours.tower], spots.position_m
     # as search.sionna builds its ground: coordinates so large round a reflection point
-    reach = 4.0 * max(float(np.abs(np.concatenate(ends)).max()), 100.0)  # that of the ground's triangles
+    reach = 4.0 * max(float(np.abs(np.concatenate(ends)).max()), 100.0)  # size of the ground's triangles
     shift = np.nan_to_num(np.abs(theirs.paths.vertices_m - ours.vertices_m)).max(axis=(1, 2), initial=0.0)
     axes = [mounts[ours.tower][:, :, 2], (spots.rotation @ probe.uav_array.mount)[:, :, 2]]
     both = (list(legs(ends[0], vertices, ends[1])) for vertices in (ours.vertices_m, theirs.paths.vertices_m))
@@ -568,7 +580,7 @@ def _turned_by_float32(
 def _link_error(
     paths: PathSet, h: ComplexArray, reference: ComplexArray, near: BoolArray, poses: int, towers: int
 ) -> float:
-    """Largest difference of the coherent power of links near by that are not in a fade [dB]."""
+    """Return the largest difference of coherent power [dB] over near links that are not in a fade."""
     link = paths.pose * towers + paths.tower
     sums = []
     for value in (h, reference):
@@ -577,7 +589,7 @@ def _link_error(
         sums.append((np.abs(total) ** 2).mean(axis=(1, 2)))
     alone = np.bincount(link, weights=(np.abs(h) ** 2).mean(axis=(1, 2)), minlength=poses * towers)
     all_near = np.bincount(link, weights=~near, minlength=poses * towers) == 0
-    # in a fade of 20 dB an error of 0.01 rad is a tenth of the field that is left
+    # in a fade of 20 dB an error of 0.01 rad is a tenth of the remaining field
     good = all_near & (sums[1] > 0.01 * alone) & (alone > 0)
     return float(np.abs(10 * np.log10(sums[0][good] / sums[1][good])).max(initial=0.0))
 
@@ -585,14 +597,14 @@ def _link_error(
 def _lacking(
     site: Site, replay: Replay, theirs: PathSet, faces: Faces, rows: IntArray, few: Poses, expected: Expected
 ) -> FieldAudit:
-    """Paths that only Sionna has: missing where they exist beyond doubt, else its float32 edge."""
+    """Count paths that only Sionna has: missing if they certainly exist, else doubtful because of its float32."""
     missing = doubtful = 0
     references = [Reference(site, name, expected.link, expected.loss) for name in replay.towers]
     for row in rows:
         reference = references[int(theirs.tower[row])]
         sequence = _mirrors_of(reference, faces, theirs, row)
         east, north, up = few.position_m[theirs.pose[row]].tolist()
-        # with a wider margin: what 2 mm decide may differ in float32
+        # with a wider margin, because float32 may differ within 2 mm
         exists = None if sequence is None else reference.verdict(sequence, (east, north, up), _SIONNA_MARGIN_M)
         missing += exists is True
         doubtful += exists is not True
@@ -600,7 +612,7 @@ def _lacking(
     return FieldAudit(missing_paths=missing, doubtful=doubtful, failures=failures)
 
 
-# Rays of the solve that gives Sionna's own coefficients: which paths there are is asked before, with all of them.
+# Rays of the solve for Sionna's own coefficients. The paths themselves were searched before with all rays.
 _FIELD_SAMPLES = 100_000
 
 # Singular-value ratios of the paper.
@@ -609,19 +621,19 @@ RANK_K = (10.0, 100.0, 1000.0)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
-    """Differences between two replays of the same poses.
+    """The differences between two replays of the same poses.
 
     Parameters
     ----------
     missing_paths, extra_paths : int
-        Paths of the reference that the engine lacks; paths of the engine that the reference lacks.
+        Paths only in the reference, and paths only in the engine that is checked.
     reference_paths : int
     rss_max_error_db, rss_rms_error_db : float
-        Of the coherent RSS, over links that both cover; NaN when there is none.
+        Errors of the coherent RSS over links that both cover. NaN if there is no such link.
     coverage_differs : int
-        Links that only one of the two covers.
+        Number of links that only one of the two covers.
     rank_disagreement : dict of float to float
-        Share of links whose rank differs, for each K; a link without a path has rank 0.
+        Share of links whose rank differs, for each K. A link without a path has rank 0.
     """
 
     missing_paths: int
@@ -635,7 +647,7 @@ class Difference:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Audit(Difference):
-    """A replay checked by the other engine: how it differs on the checked links, and what that took.
+    """A check of a replay by the other engine: differences on the checked links, and computing time.
 
     Parameters
     ----------
@@ -643,14 +655,14 @@ class Audit(Difference):
     links : int
         Pose-tower pairs checked.
     seconds, reference_seconds : float
-        Time of the replay (all its links) and of the reference on the checked links; a reference whose paths came
-        from the cache counts with the time its search once took.
+        Time of the replay (all its links) and of the reference on the checked links. If the reference's paths came from
+        the cache, the time of their original search counts.
     samples : int
         Rays per tower that PathSolver shot, in the replay or the reference.
     samples_reason : str
-        Why so many.
+        Reason for this number of rays.
     field : FieldAudit or None
-        Of the fields, where one was asked for.
+        Check of the fields, if requested.
     """
 
     engine: str
@@ -665,22 +677,22 @@ class Audit(Difference):
 
 @dataclass(frozen=True, slots=True)
 class Second:
-    """Settings of an audit: the part that is checked, and the reference it is checked against.
+    """The settings of an audit: the links to check, and the reference.
 
     Parameters
     ----------
     reference : {"image", "sionna"}, optional
-        Default: the engine that the replay did not take.
+        Default: the engine that the replay did not use.
     links : int or None
-        About this many pose-tower pairs, poses evenly spread over the flight; None checks all.
+        About this number of pose-tower pairs, with poses evenly spread over the flight. None checks all.
     expected : Expected, optional
-        What the settings say. With it fields are checked too (:mod:`aerpaw_cmp.propagation.check.audit`).
+        Settings, read a second time. If given, fields are checked too (:mod:`aerpaw_cmp.propagation.check.audit`).
     ks : sequence of float
         Singular-value ratios of the rank comparison.
     reference_links : int
         Poses that the second implementation computes.
     known : dict
-        Sionna's own coefficients by what they depend on: channels with one tower and track share them.
+        Sionna's own coefficients by the digest of their inputs: channels with the same tower and track share them.
     """
 
     reference: Engine | None = None
@@ -695,16 +707,16 @@ def audit(
     site: Site, link: Link, poses: Poses, replay: Replay,
     search: Search = Search(), field: Field = Field(), run: Run = Run(), second: Second = Second(),
 ) -> Audit:  # fmt: skip
-    """Check a replay by another engine, on the whole scene (nothing left out).
+    """Check a replay by another engine, on the whole scene.
 
     Parameters
     ----------
     site, link, poses
-        As given to the replay.
+        As passed to the replay.
     replay : Replay
         The result to check.
     search, field, run
-        As given to the replay.
+        As passed to the replay.
     second : Second
         The other engine, how many links, and what the second implementation checks.
 
@@ -715,13 +727,13 @@ def audit(
     chosen = _spread(poses, None if second.links is None else -(-second.links // max(1, len(replay.towers))))
     engine: Engine = second.reference or ("image" if replay.engine == "sionna" else "sionna")
     search = replace(search, engine=engine)
-    # on few poses, for the other engine is some hundred times slower
+    # on few poses, because the other engine is some hundred times slower
     few = poses[chosen]
     checked = run_replay(site, link, few, search, Field(field.loss), run)
     rays = checked.samples or (_FIELD_SAMPLES if search.samples == "auto" else search.samples)
     fields, ks, expected = None, second.ks, second.expected
     if expected is not None:
-        # open sheets need a law of their own, which the second implementation lacks
+        # open sheets need a separate formula, which the second implementation does not have
         fields = FieldAudit(not_covered=("the second implementation: it knows prisms, no scene of triangles",))
         if site.scene is None:
             few_kinds = spread_over_paths(replay, chosen, second.reference_links)
@@ -738,7 +750,7 @@ def audit(
         seconds=replay.seconds,
         samples=max(checked.samples, replay.samples),
         samples_reason=checked.samples_reason or replay.samples_reason,
-        # read from the cache it took no time: what its search once took is the honest number
+        # a reference from the cache took no time now: report the time of its original search
         reference_seconds=checked.seconds + (checked.search_seconds if checked.from_cache else 0.0),
     )
 
@@ -750,14 +762,14 @@ def _spread(poses: Poses, count: int | None) -> IntArray:
 
 
 def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[float] = RANK_K) -> Difference:
-    """Differences of a replay from a reference that has only the poses ``chosen``.
+    """Compare a replay with a reference that has only the poses ``chosen``.
 
     Parameters
     ----------
     replay : Replay
-        Of all poses.
+        The replay of all poses.
     reference : Replay
-        Of the chosen poses, by the other engine.
+        The replay of the chosen poses, by the other engine.
     chosen : (m,) int
         Rows of ``replay`` that the reference has, in its order.
     ks : sequence of float
@@ -766,8 +778,8 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
     Returns
     -------
     Difference
-        Paths that one has and the other lacks, errors of the level [dB], links in coverage of one alone, and ranks
-        that differ.
+        Paths that only one of the two has, errors of the level [dB], links in coverage of only one, and ranks that
+        differ.
     """
     ours, theirs = (keys.keys() for keys in _keys_of_both(replay, reference, chosen))
     return Difference(
@@ -781,14 +793,14 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
 def channels_differ(
     channels: tuple[ComplexArray, FloatArray], reference: tuple[ComplexArray, FloatArray], ks: Sequence[float]
 ) -> dict[str, Any]:
-    """Differences of H and levels (poses, towers) [dBm] from those of a reference, as :class:`Difference` has them."""
+    """Return differences of H and levels (poses, towers) [dBm] from a reference, as fields of :class:`Difference`."""
     from ...compare.rank import channel_rank
 
     (h, level), (reference_h, expected) = channels, reference
     covered = np.isfinite(level) & np.isfinite(expected)
     error = np.abs(level[covered] - expected[covered])
     return {
-        # NaN where nothing was compared: a zero would say that all agrees
+        # NaN if nothing was compared: zero would mean perfect agreement
         "rss_max_error_db": float(error.max()) if error.size else float("nan"),
         "rss_rms_error_db": float(np.sqrt((error**2).mean())) if error.size else float("nan"),
         "coverage_differs": int((np.isfinite(level) != np.isfinite(expected)).sum()),
@@ -797,28 +809,28 @@ def channels_differ(
 
 
 def extra_rows(replay: Replay, reference: Replay, chosen: IntArray) -> IntArray:
-    """Paths of a replay that the reference, which has only the poses ``chosen``, has not."""
+    """Return the paths of a replay that the reference, which has only the poses ``chosen``, does not have."""
     ours, theirs = _keys_of_both(replay, reference, chosen)
     return np.array([row for key, row in ours.items() if key not in theirs], dtype=np.int64)
 
 
-# Rows of paths by place of the pose among the chosen ones, tower and planes.
+# Rows of paths by the pose's index in ``chosen``, tower and planes.
 _Keys = dict[tuple[int, ...], int]
 
 
 def _keys_of_both(replay: Replay, reference: Replay, chosen: IntArray) -> tuple[_Keys, _Keys]:
-    """Paths of a replay and of a reference that has only the poses ``chosen``."""
-    # numbered together: the planes of terrain that a replay lists depend on its poses
+    """Return the keyed paths of a replay and of a reference that has only the poses ``chosen``."""
+    # numbered together, because the terrain planes that a replay lists depend on its poses
     plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
     return _keys(replay, plane[0], chosen), _keys(reference, plane[1], np.arange(len(chosen)))
 
 
 def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> _Keys:
-    """Rows of paths by (place in ``chosen``, tower, planes): coplanar faces are the same mirror."""
+    """Return rows of paths by (index in ``chosen``, tower, planes). Coplanar faces are the same mirror."""
     place = np.full(int(max(chosen.max(initial=-1), replay.paths.pose.max(initial=-1))) + 1, -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
     index = np.flatnonzero(place[replay.paths.pose] >= 0)
     paths = replay.paths.select(index)
-    # faces in one plane are one mirror, and engines may name either
+    # faces in one plane are one mirror, and engines may name either of them
     keys = plane_keys(replace(paths, pose=place[paths.pose]), planes)
     return dict(zip(keys, index.tolist(), strict=True))

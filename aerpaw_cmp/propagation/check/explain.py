@@ -1,8 +1,9 @@
-"""Composition of the paths of one link, term by term, and reasons why others are not there.
+"""The composition of the paths of one link, term by term, and reasons why other paths do not exist.
 
-The level of a path is the mean over element pairs of the power it brings. Each term is the ratio [dB] of that mean
-after and before a step (tower's antenna, reflections, spreading, UAV's antenna, polarisation), so the terms add up to
-the level whatever the arrays are; with one element at both ends they are the gains and losses of the textbook.
+The level of a path is the mean, over element pairs, of the power that it adds. Each term is the ratio [dB] of that
+mean after and before a step (tower's antenna, reflections, spreading, UAV's antenna, polarisation). The terms
+therefore add up to the level for any arrays. With one element at both ends they are the gains and losses of the
+textbook.
 """
 
 from __future__ import annotations
@@ -78,7 +79,7 @@ class ExplainedPath:
         return ", ".join(bounce.face for bounce in self.bounces) or "line of sight"
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON; what is infinite (no field at all) becomes None."""
+        """Return plain values for JSON. Infinite values (no field at all) become None."""
         return {"path": self.words, **json_safe({k: v for k, v in fields_of(self).items() if k != "planes"})}
 
 
@@ -95,15 +96,15 @@ def explain_paths(
     Parameters
     ----------
     paths : PathSet
-        Of one pose and one tower.
+        The paths of one pose and one tower.
     faces : Faces
     source_m : (3,)
     poses : Poses
-        The pose.
+        The pose, as the only row.
     link : Link
-        With that tower alone.
+        The link with only that tower.
     further_db : dict of str to (paths,)
-        Losses besides the field's own, by name; positive.
+        Losses in addition to the field's own [dB], positive, by name.
 
     Returns
     -------
@@ -115,7 +116,7 @@ def explain_paths(
     for row in range(len(paths)):
         recorded: list[tuple[str, AnyArray]] = []
         single = paths.select(np.array([row]))
-        # the link has that tower alone, whatever its number in the replay
+        # the link has only that tower, so its number is 0 here
         columns = geometry(replace(single, tower=np.zeros(1, np.int64)), faces, table, source_m[None], poses, link)
         ends = pattern_ends(columns, elements, link)
         field = amplitudes(columns, elements, ends, wavelength, lambda *step: recorded.append(step))  # noqa: B023
@@ -235,7 +236,7 @@ def power_sum_dbm(paths: tuple[ExplainedPath, ...]) -> float:
 def why_not(
     faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray, surfaces: Surfaces | None = None
 ) -> str:
-    """Give the reason why a sequence of faces (depth,) makes no path between two points; "" where it makes one.
+    """Return the reason why a sequence of faces (depth,) makes no path between two points, or "" if it makes a path.
 
     Parameters
     ----------
@@ -243,28 +244,28 @@ def why_not(
     source_m, target_m : (3,)
         The two points [m].
     sequence : (depth,) int
-        Faces from the source on; -1 is none.
+        Faces in order from the source. -1 is an empty entry.
     surfaces : Surfaces, optional
-        The triangles, where the site is a scene of them.
+        The triangles, if the site is a scene of triangles.
 
     Returns
     -------
     str
-        The first reason that was met.
+        The first reason that was found.
     """
     if surfaces is not None:
         return _why_not_there(surfaces, source_m, target_m, sequence)
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
     images = images_of(faces, sequence[None], source_m[None])
-    # on whole planes, so that how far a point misses its face can be said in metres
-    planes = Faces(faces.normal, faces.offset_m, faces.material, faces.label)  # every face a whole plane
+    # on unbounded planes, so that the message can give the distance in metres by which a point misses its face
+    planes = Faces(faces.normal, faces.offset_m, faces.material, faces.label)  # every face as an unbounded plane
     points, ahead = trace_back(planes, sequence[None], images, target_m[None], tolerance)
     if not ahead[0]:
         return "an end or an image lies behind a face: it has no reflection point"
     for step, face in enumerate(sequence):
         far = _outside_m(faces, int(face), points[0, step])
-        # the first face that is missed: later points follow from it and would mislead
+        # stop at the first missed face: later points follow from it and would mislead
         if far > tolerance:
             return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
     corners = np.concatenate([source_m[None], points[0], target_m[None]])
@@ -279,14 +280,14 @@ def why_not(
 
 
 def _why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:
-    """As :func:`why_not` of a scene of triangles, by the rules of its search."""
-    from ..search.beams import EDGE_M, obstacle, reflection_points  # compiled: loaded where there is a scene
+    """Return the same as :func:`why_not` for a scene of triangles, by the rules of its search."""
+    from ..search.beams import EDGE_M, obstacle, reflection_points  # compiled, so loaded only for a scene of triangles
 
     sequence = sequence[sequence >= 0]
     points = np.zeros((0, 3))
     if len(sequence):
         ends = source_m[None], target_m[None]
-        # sides first, wherever the points lie; then whether they lie in their faces
+        # check the sides first, with faces of any size; then whether the points lie in their faces
         _, _, ahead = reflection_points(surfaces, sequence[None], *ends, edge_m=1e9)
         if not ahead[0]:
             return "the ends of a reflection lie on two sides of its face"
@@ -304,7 +305,7 @@ def _metres(length: float) -> str:
 
 
 def _outside_m(faces: Faces, face: int, point: FloatArray) -> float:
-    """Distance in its plane from a face to a point; 0 inside."""
+    """Return the distance of a point from a face, in the face's plane [m]. 0 if it lies inside."""
     import shapely
 
     place = np.array([faces.along[face] @ point, faces.across[face] @ point])

@@ -1,10 +1,10 @@
 """A second, independent replay of single links: slow, one element pair at a time, for the audit.
 
-Written from the recommendations, not from the rest of this package, and sharing no code with it: rotations as
-products of three turns, arrays from their published layout, constants of ITU-R P.2040-4 and P.833 a second time,
-reflection by components across and along the plane of incidence, paths by trying every sequence of faces against the
-footprints, chords in crowns by bisection. What it is given is the site, the settings and the poses. Patterns of
-antennas are taken from the replay as they are: Sionna's own judge the formulas, and tests the tables.
+It is written from the recommendations and shares no code with the rest of this package. Rotations are products of
+three rotations, and arrays come from their published layout. The constants of ITU-R P.2040-4 and P.833 are typed in
+separately. Reflection uses components across and along the plane of incidence. Paths are found by trying every sequence
+of faces against the footprints, and chords in crowns by bisection. Its inputs are the site, the settings and the poses.
+Antenna patterns are taken from the replay unchanged: Sionna's patterns check the formulas, and tests check the tables.
 """
 
 from __future__ import annotations
@@ -127,9 +127,9 @@ def layout_positions(
     wavelength : float
         [m].
     elements : int
-        Of ``linear``.
+        Number of elements, for ``linear``.
     positions_m : sequence of (3,), optional
-        Of ``custom`` [m].
+        Element positions [m], for ``custom``.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def layout_positions(
 
 
 def permittivity(name: str, carrier_hz: float) -> tuple[complex, float | None] | None:
-    """Complex relative permittivity and thickness of a material; None where the table above has none."""
+    """Return a material's complex relative permittivity and thickness. None if the table above does not have it."""
     key = name.lower().replace("-", "_").replace(" ", "_")
     key = key[4:] if key.startswith("itu_") else key
     ghz = carrier_hz / 1e9
@@ -226,7 +226,7 @@ class Mirror:
     offset_m : float
     material : str
     start, along, length_m, low_m, high_m
-        Of a wall: plan position of one end, its direction, its length, foot and top.
+        For a wall: plan position of one end, its direction, its length, foot and top.
     roof : Polygon, optional
     solid : int
         Building, -1 for the ground.
@@ -252,7 +252,7 @@ class Mirror:
         return _plus(p, self.normal, -2.0 * self.height(p))
 
     def box(self) -> tuple[Vector, Vector]:
-        """Least and greatest coordinates of the face; without end where it is the ground."""
+        """Return the minimum and maximum coordinates of the face. They are infinite for the ground."""
         if self.roof is not None:
             west, south, east, north = self.roof.bounds
             return (west, south, self.offset_m), (east, north, self.offset_m)
@@ -264,7 +264,7 @@ class Mirror:
         return (west, south, self.low_m), (east, north, self.high_m)
 
     def margin(self, p: Vector) -> float:
-        """Distance of a point of the plane from the edges of the face [m]; positive inside, negative outside."""
+        """Return how far a point of the plane is from the face's edges [m], positive inside and negative outside."""
         if self.roof is not None:
             spot = Point(p[0], p[1])
             # holes have boundaries too
@@ -320,14 +320,14 @@ class Blocks:
         self._shapes: dict[float, list[Polygon]] = {}
 
     def cut(self, a: Vector, b: Vector, grow_m: float, spared: tuple[int, ...] = ()) -> bool:
-        """Check whether a segment runs through a building; those in ``spared`` (it ends on them) are shrunk a little.
+        """Check whether a segment crosses a building. Buildings in ``spared``, on which it ends, are shrunk a little.
 
         Parameters
         ----------
         a, b : (3,)
             Ends [m].
         grow_m : float
-            Every other building is taken this much larger on all sides [m].
+            Enlarge every other building by this much on all sides [m].
         spared : tuple of int
             Numbers of the buildings that the segment ends on.
 
@@ -340,7 +340,7 @@ class Blocks:
             # a segment ends on its own wall: grown, that building would cut it always
             grown = -MARGIN_M / 10 if number in spared else grow_m
             top = building.base_m + building.height_m + grown
-            # passes over the roof, whatever lies below
+            # a segment above the roof passes, regardless of what lies below
             if min(a[2], b[2]) >= top or not self._near(number, a, b):
                 continue
             shape = self._shape(number, grown)
@@ -431,7 +431,7 @@ class Reference:
         return (tower.east_m, tower.north_m, tower.ground_m + tower.antenna_height_m)
 
     def sequences(self, target: Vector, max_depth: int, budget: int = 20_000) -> list[tuple[Mirror, ...]] | None:
-        """All sequences that may lead to a target; None when the tower can begin more than the budget.
+        """Return all sequences that may lead to a target. None if there are more than ``budget`` from the tower.
 
         Their images lie on the right sides, and their points of reflection within the boxes of the faces.
         """
@@ -449,7 +449,7 @@ class Reference:
         levels = [(rows, images)]
         for depth in range(max_depth):
             height = images[:, -1] @ self._planes.normal.T - self._planes.offset_m
-            # the source may stand on a face; an image may not
+            # the source may lie on a face; an image may not
             facing = height > (0.0 if depth else -MARGIN_M)
             # a face twice in a row would send the ray back into itself
             if depth:
@@ -477,7 +477,7 @@ class Reference:
         return good
 
     def verdict(self, sequence: Sequence[Mirror], target: Vector, margin_m: float = MARGIN_M) -> bool | None:
-        """Check whether a path over the mirrors exists; None where a change of ``margin_m`` would decide."""
+        """Check whether a path over the mirrors exists. None if a change of ``margin_m`` would decide."""
         points = _bounces(sequence, self.source, target)
         if points is None:
             return False
@@ -540,15 +540,15 @@ class Reference:
         received = element_wave(uav, rx, uav_turn, (-rays[-1][0], -rays[-1][1], -rays[-1][2]))
         wavelength = C_MPS / self.link.carrier_hz
         coupling = sum(a * b for a, b in zip(received, wave, strict=True))
-        # nobody receives more than was sent: free space has no near field
+        # limit to the transmitted power: the free-space formula is not valid in the near field
         spreading = min(1.0, wavelength / (4 * math.pi * length))
-        # whole cycles are taken off before the exponential: 1 km are 11 000 of them at 3.4 GHz
+        # whole cycles are subtracted before the exponential: 1 km are 11 000 cycles at 3.4 GHz
         return coupling * spreading * cmath.exp(-2j * math.pi * math.fmod(length / wavelength, 1.0))
 
     def _reflected(self, mirror: Mirror, wave: _Wave, ray: Vector, onward: Vector) -> _Wave:
         cosine = min(1.0, abs(_dot(mirror.normal, ray)))
         across = _cross(ray, mirror.normal)
-        if math.sqrt(_dot(across, across)) < 1e-12:  # straight on: any direction will do
+        if math.sqrt(_dot(across, across)) < 1e-12:  # normal incidence: any direction is valid
             across = _cross(mirror.normal, (1.0, 0.0, 0.0) if abs(mirror.normal[0]) < 0.9 else (0.0, 1.0, 0.0))
         s = _unit(across)
         p_in, p_out = _cross(s, ray), _cross(s, onward)
@@ -562,7 +562,7 @@ class Reference:
         return e[0], e[1], e[2]
 
     def loss_db(self, sequence: Sequence[Mirror], target: Vector) -> float | None:
-        """Foliage and reflection loss of a path; None where an opaque tree is only just touched."""
+        """Return the foliage and reflection loss of a path [dB]. None if it only just touches an opaque tree."""
         total = self.loss.reflection_db * len(sequence) + self._rough_db(sequence, target)
         if self.loss.model == "none" or not len(self.site.trees):
             return total
@@ -604,7 +604,7 @@ class Reference:
         h = np.zeros((uav, tower), dtype=np.complex128)
         power = 0.0
         for sequence, loss in paths:
-            # of the amplitude, so half of the decibels of a power
+            # a factor on the amplitude, so its exponent is half that of a power
             factor = 0.0 if math.isinf(loss) else 10 ** (-loss / 20)
             amplitudes = np.array(
                 [[factor * self.pair(sequence, t, u, target, turn) for t in range(tower)] for u in range(uav)]
@@ -619,16 +619,16 @@ def _is_ground(mirror: Mirror) -> bool:
 
 
 def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: float) -> tuple[complex, complex]:
-    """Reflection (TE, TM) of ITU-R P.2040-4 (31): half-space; with a thickness the slab of (43) and (44).
+    """Return the reflection coefficients (TE, TM) of ITU-R P.2040-4: a half-space (31) or a slab (43), (44).
 
     Parameters
     ----------
     cosine : float
-        Of the angle of incidence from the normal.
+        Cosine of the angle of incidence from the normal.
     eta : complex
         Relative permittivity.
     thickness_m : float or None
-        Of the slab [m]; None: half-space.
+        Thickness of the slab [m]. None means a half-space.
     wavelength : float
         In vacuum [m].
 
@@ -646,7 +646,7 @@ def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: 
 
 
 def element_wave(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -> _Wave:
-    """Field of an element along ``ray`` in site axes; TR 38.901 7.3.2, model 2.
+    """Return the field of an element along ``ray`` in site axes, by TR 38.901 7.3.2, model 2.
 
     Parameters
     ----------
@@ -696,7 +696,7 @@ def _bounces(sequence: Sequence[Mirror], source: Vector, target: Vector) -> list
 
 
 def foliage_db(loss: ExpectedLoss, depth_m: float, carrier_hz: float) -> float:
-    """ITU-R P.833 woodland or Weissberger; leafless trees attenuate 1/1.2 of it."""
+    """Return the loss in foliage [dB] by ITU-R P.833 woodland or Weissberger. Leafless trees attenuate 1/1.2 of it."""
     if loss.model == "weissberger":
         # Weissberger's models are of trees in leaf
         f = (carrier_hz / 1e9) ** 0.284 / (1.0 if loss.in_leaf else 1.2)
@@ -725,8 +725,8 @@ def _p833(mhz: float) -> tuple[float, float]:
 def crown_depth_m(trees: Trees, a: Vector, b: Vector, *, trunks: bool = False) -> float:
     """Length of a segment inside crowns (cones) or trunks (cylinders).
 
-    The largest of the distances outside base, top and side is a convex function along the segment: its minimum by
-    golden section, then the two ends of the chord by bisection.
+    The largest of the distances outside base, top and side is a convex function along the segment. Golden section finds
+    its minimum, then bisection finds the two ends of the chord.
 
     Parameters
     ----------

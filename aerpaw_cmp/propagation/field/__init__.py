@@ -1,1 +1,1 @@
-"""From paths to channel matrices and levels: Fresnel, dyads, the sum over paths, foliage, baselines."""
+"""Channel matrices and levels from paths: Fresnel coefficients, dyads, sum over paths, foliage and baselines."""

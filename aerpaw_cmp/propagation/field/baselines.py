@@ -1,4 +1,4 @@
-"""Closed-form baselines beside every ray-traced number: free space and two-ray ground reflection."""
+"""Closed-form baselines for comparison with ray tracing: free space and two-ray ground reflection."""
 
 from __future__ import annotations
 

@@ -1,13 +1,13 @@
-"""Laws of one element pair over one path: directions, the element's field vector, the dyad of a reflection, reception.
+"""Formulas for one element pair over one path: directions, element field, dyad of a reflection, and reception.
 
-A path over mirrors ``M_1 .. M_d`` is straight in the space of the last image. With ``k`` the unit vector from the
-image of the tower element to the UAV element and ``n`` the normal of a face in that space, a reflection turns the
+A path over mirrors ``M_1 .. M_d`` is straight in the space of the last image. ``k`` is the unit vector from the
+image of the tower element to the UAV element, and ``n`` the normal of a face in that space. A reflection changes the
 field vector ``w`` into::
 
     -r_tm w + (r_te + r_tm) s (s . w) / |s|^2,    s = k x n,    cos theta = |k . n|
 
-which is ``r_te e_s + r_tm e_p'`` of the textbook, mirrored. At normal incidence ``s`` is not defined, but there
-``r_te + r_tm`` is zero. Every formula takes arrays or numbers.
+This is ``r_te e_s + r_tm e_p'`` of the textbook, mirrored. At normal incidence ``s`` is not defined, but there
+``r_te + r_tm`` is zero. Every formula accepts arrays or numbers.
 """
 
 from __future__ import annotations
@@ -101,9 +101,9 @@ def slant_rotation(e_theta: Number, e_phi: Number, cosine: Number, sine: Number)
     Parameters
     ----------
     e_theta, e_phi : Number
-        Of the pattern.
+        Field components of the pattern.
     cosine, sine : Number
-        Of the slant: 0 vertical, pi/2 horizontal.
+        Cosine and sine of the slant: 0 is vertical, pi/2 horizontal.
 
     Returns
     -------
@@ -186,8 +186,8 @@ def reflected(
 
 
 def spreading(cycles: Number) -> Number:
-    """``lambda / (4 pi L)`` of a length in wavelengths, at most 1: nobody receives more than was sent."""
-    # where two elements meet the length is zero: infinity becomes 1
+    """Return ``lambda / (4 pi L)`` for a length in wavelengths, at most 1: no more arrives than was sent."""
+    # where two elements coincide the length is zero: infinity becomes 1
     return np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))
 
 

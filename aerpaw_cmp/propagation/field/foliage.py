@@ -1,19 +1,20 @@
 """Loss in trees along traced paths, in closed form.
 
-Crowns are not in the traced scene. The polyline of each path (source, reflection points, target) is cut with every
-crown near it; the chords add up to the path's depth in foliage, and a model turns depth into loss. Nothing is traced
-again when a parameter changes, and the phase is left alone.
+Crowns are not in the traced scene. The polyline of each path (source, reflection points, target) is intersected with
+every crown near the path. The chords add up to the path's depth in foliage, and a model converts depth into loss. A
+changed parameter does not require new ray tracing, and foliage does not change the phase.
 
 Where crowns overlap both chords count. Trunks count only for :class:`Opaque`: as thin cylinders they shade
-centimetres where a crown shades metres.
+centimetres, and crowns shade metres.
 
-Loss at forests that are a medium: through the canopy, over it and around it.
+For forests that are a medium, the loss is that through the canopy, over it and around it.
 
-A stand is a forest with a height: crowns from ``crown_base_m`` up to ``height_m`` over its area, trunks below. What a
-segment of a path loses there is that of three components whose powers add up (ITU-R P.833-10 section 3.2): through, by
-the length in the canopy; over the top, two knife edges where the ray enters and leaves; around either side. Near the
-top part of the Fresnel zone is in the canopy: what goes through is that of a ray lowered until the zone is below the
-top, and detours pass what it lacks, so that the level has no step where a ray leaves the canopy.
+A forest stand is a forest with a height: crowns from ``crown_base_m`` up to ``height_m`` over its area, trunks below. A
+segment of a path passes it by three components whose powers add up (ITU-R P.833-10 section 3.2): through the canopy, by
+the length inside it; over the top, with two knife edges where the ray enters and leaves; and around either side. Near
+the top, part of the Fresnel zone is in the canopy. The component through the canopy is then that of a ray lowered until
+the zone is below the top, and the detours only add the power that is missing. The level therefore has no step where a
+ray leaves the canopy.
 """
 
 from __future__ import annotations
@@ -39,17 +40,17 @@ Shape = Literal["cone", "cylinder"]
 LEAFLESS_FACTOR = 1 / 1.2
 
 _PIECE_M = 8.0  # paths are looked up in pieces of this length
-# Of the order of a crown's radius, so that a cell lists few crowns.
+# About the radius of a crown, so that a cell lists few crowns.
 _CELL_M = 4.0
 _MAX_CELLS = 4_000_000
-_PAIRS_AT_ONCE = 1_500_000  # of a piece and a body; about 150 MB of temporary arrays
+_PAIRS_AT_ONCE = 1_500_000  # pairs of a piece and a body; about 150 MB of temporary arrays
 
 
 # ---------------------------------------------------------------- models: depth in foliage to loss
 
 
 class FoliageModel(Protocol):
-    """Anything that turns depth in foliage (...) [m] into loss (...) [dB]."""
+    """A model that converts depth in foliage (...) [m] into loss (...) [dB]."""
 
     def loss_db(self, depth_m: FloatArray) -> FloatArray:
         """Loss [dB], 0 at depth 0."""
@@ -67,10 +68,10 @@ class NoFoliage:
 
 @dataclass(frozen=True, slots=True)
 class Opaque:
-    """Whatever touches a crown or a trunk is blocked (loss inf), as in arXiv 2502.10324."""
+    """A model in which any contact with a crown or a trunk blocks the path (loss inf), as in arXiv 2502.10324."""
 
     def loss_db(self, depth_m: FloatArray) -> FloatArray:
-        """Inf where depth > 0."""
+        """Return inf where the depth is above 0, else 0. NaN stays NaN."""
         depth = np.asarray(depth_m, dtype=np.float64)
         return np.where(np.isnan(depth), np.nan, np.where(depth > 0, np.inf, 0.0))
 
@@ -115,15 +116,15 @@ class P833:
 
     @classmethod
     def at(cls, frequency_hz: float, *, in_leaf: bool = True) -> P833:
-        """Parameters from the table, log-log interpolated.
+        """Return parameters from P.833's table, interpolated log-log.
 
-        Beyond its ends (106 MHz, 2.1 GHz) the nearest entry is continued with f^0.70 (gamma) and f^0.43 (A_m): 0.47
+        Beyond its ends (106 MHz, 2.1 GHz) the nearest entry is extrapolated with f^0.70 (gamma) and f^0.43 (A_m): 0.47
         dB/m and 42 dB at 3.4 GHz, in leaf. Leafless gamma is ``LEAFLESS_FACTOR`` times that.
 
         Raises
         ------
         UsageError
-            Outside 30 MHz to 100 GHz, the scope of P.833.
+            If the frequency is outside 30 MHz to 100 GHz, the scope of P.833.
         """
         if not 30e6 <= frequency_hz <= 100e9:
             raise UsageError(f"P.833 at {frequency_hz / 1e6:g} MHz", expected="30 MHz to 100 GHz")
@@ -144,9 +145,9 @@ class P833:
 class Weissberger:
     """Modified exponential decay of Weissberger (1982), 0.23 to 95 GHz, depths to 400 m.
 
-    ``0.45 f^0.284 d`` up to 14 m, ``1.33 f^0.284 d^0.588`` beyond (f in GHz); at 14 m the two differ by 0.3 %.
-    Deeper than 400 m the second form is continued. Leafless trees take ``LEAFLESS_FACTOR`` of the loss: the model is
-    for trees in leaf and gives no other number.
+    The loss is ``0.45 f^0.284 d`` up to 14 m and ``1.33 f^0.284 d^0.588`` beyond (f in GHz). At 14 m the two differ by
+    0.3 %. Deeper than 400 m the second form is extrapolated. The loss of leafless trees is multiplied by
+    ``LEAFLESS_FACTOR``, because the model only covers trees in leaf.
     """
 
     frequency_hz: float = 3.4e9
@@ -180,7 +181,7 @@ def foliage_model(
     name : str
     frequency_hz : float
     in_leaf : bool
-        Season of the tables.
+        Whether the trees are in leaf.
     gamma_db_per_m, maximum_db : float, optional
         Specific attenuation [dB/m] and largest loss [dB] in place of P.833's table.
 
@@ -250,7 +251,7 @@ def foliage_loss_db(
 def foliage_depth_m(
     source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray, trees: Trees | CrownIndex
 ) -> FloatArray:
-    """Length of each path inside crowns (paths,) [m]; arguments as for :func:`foliage_loss_db`.
+    """Return the length of each path inside crowns (paths,) [m].
 
     Parameters
     ----------
@@ -273,7 +274,7 @@ def foliage_depth_m(
     for start, end in reversed([*legs(source, vertices, target)]):
         moved = (start != end).any(axis=1)
         depth[moved] += index.chords_m(start[moved], end[moved])
-    # legs() takes a missing corner for one not used; a missing end is no path
+    # legs() treats a missing corner as unused, but a missing end means that there is no path
     depth[~(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))] = np.nan
     return depth
 
@@ -282,7 +283,7 @@ _last_index: list[CrownIndex] = []
 
 
 def crown_index(trees: Trees) -> CrownIndex:
-    """The index of cones of these trees; the last one is kept: a flight asks many times, the next has its site."""
+    """Return the spatial index of the cones of these trees. The last index is cached for repeated calls."""
     index = next((item for item in _last_index if item.trees is trees or _same(item.trees, trees)), None)
     if index is None:
         index = CrownIndex(trees)
@@ -292,7 +293,7 @@ def crown_index(trees: Trees) -> CrownIndex:
 
 def _same(first: Trees, second: Trees) -> bool:
     """Check whether two sets of trees are equal to the last digit."""
-    # by value: each task of a campaign loads the site anew
+    # compare values: each task of a campaign loads the site separately
     return all(np.array_equal(getattr(first, of.name), getattr(second, of.name)) for of in fields(Trees))
 
 
@@ -364,7 +365,7 @@ class CrownIndex:
         np.cumsum(np.bincount(cells, minlength=len(self._row) - 1), out=self._row[1:])
 
     def chords_m(self, start_m: FloatArray, end_m: FloatArray) -> FloatArray:
-        """Length inside bodies of each segment (n,) [m]; ends (n, 3)."""
+        """Return the length inside bodies of each segment (n,) [m] between the ends (n, 3)."""
         total = np.zeros(len(start_m))
         if not len(self._bodies) or not len(start_m):
             return total
@@ -393,14 +394,14 @@ class CrownIndex:
     def _sum(
         self, start: FloatArray, end: FloatArray, first: FloatArray, last: FloatArray, pieces: IntArray
     ) -> FloatArray:
-        """Chords of a batch, looked up piece by piece; each body counts in the piece nearest to it."""
+        """Return the chords of a batch, looked up piece by piece. Each body counts in the piece nearest to it."""
         move = end - start
         segment = np.repeat(np.arange(len(start)), pieces)
         number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
         width = (last - first) / pieces
         piece, body = self._candidates(start, move, first[segment] + (number + 0.5) * width[segment], segment)
 
-        # the piece that holds the point nearest to the body's axis speaks for the whole segment
+        # only the piece that contains the point nearest to the body's axis adds the chord, for the whole segment
         owner = segment[piece]
         low, wide = first[owner], width[owner]
         step_east, step_north = move[owner, 0], move[owner, 1]
@@ -512,9 +513,9 @@ TRUNKS = 0.3
 # At 0.55 of the first Fresnel radius nu is -0.78, where the knife edge's loss begins.
 _CLEAR = 0.55
 
-# Seen from above an upright segment is a point, which crosses no area; shifted by so much it does.
+# Seen from above an upright segment is a point, which crosses no area. Shifted by this distance it crosses one.
 _UPRIGHT_M = 1e-6
-# Of a segment and a side of a stand; about 100 MB of temporary arrays.
+# Pairs of a segment and a side of a forest stand; about 100 MB of temporary arrays.
 _SIDES_AT_ONCE = 1_000_000
 
 
@@ -542,7 +543,7 @@ def stand_loss_db(
         Depth in crowns to loss. Nothing gets through, over or around where it is opaque.
     wavelength_m : float
     in_leaf : FoliageModel, optional
-        Of the evergreen share of a stand; by default ``model``.
+        Model for the evergreen share of a forest stand. Default: ``model``.
 
     Returns
     -------
@@ -593,13 +594,13 @@ class _Crossing:
     ----------
     stand : Forest
     segment : (k,) int
-        Of the segments that were asked about.
+        Numbers of the segments in the caller's arrays.
     start, end : (k, 3)
         Their ends [m].
     piece : (n,) int
-        Which of the ``k`` each piece within the area belongs to.
+        Index into the ``k`` segments for each piece within the area.
     share : (n, 2)
-        Where it begins and ends, as shares of the way.
+        Where each piece begins and ends, as shares of the segment.
     ground_m : (n,)
         Up of the ground below it.
     """
@@ -629,11 +630,11 @@ class _Crossing:
 
 
 def _crossings(site: Site, start_m: FloatArray, end_m: FloatArray) -> Iterator[_Crossing]:
-    """Segments between points (segments, 3) [m] over each stand of a site; those without a length cross none."""
+    """Yield the segments between points (segments, 3) [m] that cross each stand of a site, except zero-length ones."""
     stands = [forest for forest in site.forests if forest.height_m is not None]
     if not stands:
         return
-    # bounding boxes alone: what crosses is decided below, exactly
+    # bounding boxes only: the exact test follows below
     tree = shapely.STRtree([stand.area for stand in stands])
     moved = np.flatnonzero(
         np.isfinite(start_m).all(axis=1) & np.isfinite(end_m).all(axis=1) & (start_m != end_m).any(axis=1)
@@ -713,9 +714,9 @@ def _loss_db(crossing: _Crossing, model: FoliageModel, in_leaf: FoliageModel, wa
     passed, some = np.zeros(count), np.flatnonzero(outside & (through > 0.0))  # what loses nothing needs no detour
     over = Profile(length[some], share[:, some], intrusion[:, some])
     for way in (over, *_around(stand, source[some], target[some])):
-        # as powers: nobody knows the edge of a canopy to a wavelength
+        # add powers: the edge of a canopy is not known to a wavelength
         passed[some] += 10.0 ** (-deygout_db(way, wavelength_m) / 10.0)
-    # as shares that are lacking: so a detour of full power leaves no loss, and none leaves all
+    # multiply the missing shares: a detour of full power then removes the loss, and without detours all loss remains
     blocked = (1.0 - 10.0 ** (-through / 10.0)) * (1.0 - np.minimum(passed, 1.0))
     return np.asarray(-10.0 * np.log10(1.0 - blocked))
 
@@ -745,8 +746,8 @@ def _around(stand: Forest, start: FloatArray, end: FloatArray) -> Iterator[Profi
 class Profile(NamedTuple):
     """Edges under straight lines, a column of samples each.
 
-    ``length_m`` (links,) is that of the lines, ``share`` (samples, links) the part of the way to each sample,
-    ``intrusion_m`` the height of the edge above the line there, NaN where it is unknown.
+    ``length_m`` (links,) is the length of the lines, ``share`` (samples, links) the part of the line up to each sample,
+    and ``intrusion_m`` the height of the edge above the line there. It is NaN if the height is unknown.
     """
 
     length_m: FloatArray
@@ -755,17 +756,17 @@ class Profile(NamedTuple):
 
 
 def knife_edge_db(nu: FloatArray) -> FloatArray:
-    """Loss of one knife edge [dB] by its parameter nu; 0 below -0.78.
+    """Return the loss of one knife edge [dB] from its parameter nu. It is 0 below -0.78.
 
     Source: ITU-R P.526-15 eq. 31.
     """
-    # far below -0.78 the root of x squared loses all digits beside x
+    # far below -0.78 the root of x squared loses all digits when x is added
     x = np.maximum(nu, -0.78) - 0.1
     return np.where(nu > -0.78, np.maximum(6.9 + 20.0 * np.log10(np.sqrt(x * x + 1.0) + x), 0.0), 0.0)
 
 
 def _parameter(height_m: FloatArray, before_m: FloatArray, after_m: FloatArray, wavelength_m: float) -> FloatArray:
-    """Parameter nu of edges; -inf at the ends of a line and where the height is unknown."""
+    """Return the parameter nu of edges. It is -inf at the ends of a line and where the height is unknown."""
     # an edge at an end has no distance to it, and nu would be infinite
     inner = (before_m > 0.0) & (after_m > 0.0) & np.isfinite(height_m)
     product = np.where(inner, before_m * after_m, 1.0)
@@ -781,9 +782,9 @@ def deygout_db(profile: Profile, wavelength_m: float) -> FloatArray:
 
     Notes
     -----
-    ``A + (A_1 - C_1) + (A_2 - C_2)``: the main edge and the main one of each side on the way to it, less
-    ``C = (6 - A + A_e) cos(alpha)``, with A_e the loss of the side's edge alone on the direct line and
-    ``cos(alpha)^2 = d_1 d_34 / (d_12 d_234)``; neither term is negative.
+    The loss is ``A + (A_1 - C_1) + (A_2 - C_2)``: the main edge and the main edge on each side of it, minus
+    ``C = (6 - A + A_e) cos(alpha)``. A_e is the loss of the side's edge alone on the direct line, and
+    ``cos(alpha)^2 = d_1 d_34 / (d_12 d_234)``. Neither term is negative.
     """
     length_m, share, intrusion_m = profile
     nu = _parameter(intrusion_m, share * length_m, (1.0 - share) * length_m, wavelength_m)

@@ -1,6 +1,6 @@
-"""Fresnel coefficients of half-spaces and slabs, and what the faces of a scene are made of.
+"""Fresnel coefficients of half-spaces and slabs, and the materials of a scene's faces.
 
-Each formula is written once, for arrays and for numbers alike. Complex numbers are pairs (re, im): their parts are
+Each formula is written once, for arrays and for numbers. Complex numbers are pairs (re, im): their parts are
 evaluated in place, without arrays of complex intermediate results.
 """
 
@@ -60,7 +60,7 @@ def echo(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
 
 
 def slab(r_re: Any, r_im: Any, echo_re: Any, echo_im: Any) -> tuple[Any, Any]:
-    """Coefficient of a slab from that of its first face: ``r (1 - e) / (1 - r^2 e)``; r itself without an echo e.
+    """Return the coefficient of a slab, ``r (1 - e) / (1 - r^2 e)``. Without an echo e it is r.
 
     Source: ITU-R P.2040-3 eq. 43.
 
@@ -92,9 +92,9 @@ def returned(thickness: Any, root_re: Any, root_im: Any) -> tuple[Any, Any]:
 
 
 def reflection(cosine: Any, material: Any) -> tuple[Any, Any, Any, Any]:
-    """TE and TM coefficients (re, im each) of slabs and, of infinite thickness, of half-spaces.
+    """Return TE and TM coefficients (re and im of each) of slabs. Infinite thickness means a half-space.
 
-    ``material`` is the permittivity (re, im) and the thickness in wavelengths, as in all laws of a face.
+    ``material`` is the permittivity (re, im) and the thickness in wavelengths, as in all formulas of a face.
     """
     eta_re, eta_im, thickness = material
     te_re, te_im, tm_re, tm_im, root_re, root_im = half_space(cosine, eta_re, eta_im)
@@ -134,7 +134,7 @@ def reflection_coefficients(
     Returns
     -------
     te, tm : (...) complex
-        Of the electric field across and in the plane of incidence.
+        Coefficients of the electric field across and in the plane of incidence.
 
     Examples
     --------
@@ -149,14 +149,14 @@ def reflection_coefficients(
 
 @dataclass(frozen=True, slots=True)
 class FaceMaterials:
-    """Permittivity and thickness per face; the entry at -1 is a harmless one for paths without a face."""
+    """The permittivity and thickness per face. The last entry (-1) is a placeholder for paths without a face."""
 
     permittivity: ComplexArray
     thickness_m: FloatArray
 
     @classmethod
     def of(cls, faces: Faces, carrier_hz: float) -> FaceMaterials:
-        """Those of all faces at a carrier."""
+        """Return the materials of all faces at a carrier."""
         known = {name: material(name) for name in set(faces.material)}
         eta = {name: face.relative_permittivity(carrier_hz) for name, face in known.items()}
         thick = {name: np.inf if face.thickness_m is None else face.thickness_m for name, face in known.items()}

@@ -115,17 +115,17 @@ def geometry(
 
 
 def rows_of(matrix: FloatArray) -> dyads.Rotation:
-    """Rotations (n, 3, 3) as the laws take them, against pairs (n, pairs)."""
+    """Return rotations (n, 3, 3) in the form that the formulas take, for broadcasting with (n, pairs)."""
     return tuple(tuple(matrix[:, i, j, None] for j in range(3)) for i in range(3))  # type: ignore[return-value]
 
 
 def parts_of(vector: AnyArray) -> dyads.Vector:
-    """Vectors (n, 3) as the laws take them, against pairs (n, pairs)."""
+    """Return vectors (n, 3) in the form that the formulas take, for broadcasting with (n, pairs)."""
     return vector[:, 0, None], vector[:, 1, None], vector[:, 2, None]
 
 
 def directions(g: Geometry, elements: Elements) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
-    """Unit vectors and lengths (paths, pairs) from the towers' images to the UAV."""
+    """Return unit vectors and lengths (paths, pairs) from the towers' images to the UAV."""
     tower_m = elements.tower_m[g.tower]
     ways = dyads.direction(
         parts_of(g.image_m), rows_of(g.frame), (tower_m[:, 0], tower_m[:, 1], tower_m[:, 2]),
@@ -164,5 +164,5 @@ def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: d
 
 
 def plain(patterns: tuple[Pattern, ...]) -> bool:
-    """Check whether every pattern is 1 along theta in all directions; a subclass of Isotropic may mean another."""
+    """Check whether every pattern is 1 along theta in all directions. Subclasses of Isotropic are excluded."""
     return all(type(pattern) is Isotropic for pattern in patterns)

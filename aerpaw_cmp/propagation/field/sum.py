@@ -1,13 +1,14 @@
 """The sum over paths: channel matrices in float64 for every pair of elements, and levels.
 
-For a pair (tower element ``t``, UAV element ``u``) and a path over the faces ``f1 .. fd`` the image of ``t`` gives the
-length ``L`` and all directions; the entry of the channel matrix is::
+For a pair (tower element ``t``, UAV element ``u``) and a path over the faces ``f1 .. fd``, the image of ``t``
+determines
+the length ``L`` and all directions. The entry of the channel matrix is::
 
     g_u . M_d ... M_1 . g_t   *   min(1, lambda / (4 pi L))   *   exp(-j 2 pi L / lambda)   *   10^(-loss / 20)
 
-with ``g`` the complex field of the element as a vector and ``M_k`` the dyad of reflection ``k`` with the Fresnel
-coefficients of ITU-R P.2040 at this pair's own angle (:mod:`dyads`, :mod:`fresnel`). Time factor ``e^{+j omega t}``.
-The pattern of the receiving element enters without conjugation (reciprocity), so turning a link round transposes H.
+Here ``g`` is the complex field of an element as a vector. ``M_k`` is the dyad of reflection ``k`` with the Fresnel
+coefficients of ITU-R P.2040 at this pair's angle (:mod:`dyads`, :mod:`fresnel`). The time factor is ``e^{+j omega t}``.
+The pattern of the receiving element is not conjugated (reciprocity), so swapping the ends of a link transposes H.
 Each path is evaluated alone and added in the order of the path set: results do not depend on chunks and threads.
 """
 
@@ -54,9 +55,10 @@ class Fields:
 
 
 class Further(Rows):
-    """Paths of a kind beside reflections, a row each: all that replays, their parts, drawings and words ask of them.
+    """Paths of a kind other than reflections, one per row, with all that replays, drawings and descriptions need.
 
-    ``kind`` stands after "path" in words, ``name`` in tables; ``missing`` is what of the kind is not modelled.
+    ``kind`` follows "path" in descriptions, and ``name`` is for tables. ``missing`` is the part of the kind that is not
+    modelled.
     """
 
     __slots__ = ()
@@ -90,19 +92,19 @@ class Further(Rows):
 
     @property
     def touched(self) -> IntArray:
-        """Faces (paths, n) that each path touches, from tower to UAV; -1 is none."""
+        """The faces (paths, n) that each path touches, from tower to UAV. -1 means no face."""
         return np.full((len(self.pose), 1), -1)
 
     @property
     def turns(self) -> IntArray:
-        """A digit for each corner (paths,), from tower to UAV: 1 a reflection, 2 an edge or what else bends a path."""
+        """One digit per corner (paths,), from tower to UAV: 1 is a reflection, 2 a diffraction or another bend."""
         return 2 * self.lines().turns
 
 
 def fields_of(
     paths: Any, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None = None
 ) -> Fields:
-    """Part of any contribution of a replay in H and in the powers.
+    """Return the part of any contribution to a replay in H and in the powers.
 
     Parameters
     ----------
@@ -206,13 +208,13 @@ def amplitudes(
     wavelength : float
         [m]
     record : callable, optional
-        Gets the power (paths, pairs) of the "wave" after the tower and after each reflection, the "spreading" of the
-        amplitude, and the power of the "uav"; for paths of one depth.
+        Called with the power (paths, pairs) of the "wave" after the tower and after each reflection, the "spreading" of
+        the amplitude, and the power of the "uav". It requires paths of one depth.
 
     Returns
     -------
     (paths, pairs, 2)
-        Real and imaginary parts.
+        Real and imaginary parts of the amplitude.
     """
     pairs = elements.tower_m.shape[2]
     out = np.empty((len(g.depth), pairs, 2))
@@ -237,15 +239,15 @@ def of_one_depth(
     wavelength: float,
     record: Callable[[str, AnyArray], None] | None = None,
 ) -> FloatArray:
-    """As :func:`amplitudes`, of paths of one depth.
+    """Compute the same as :func:`amplitudes`, for paths of one depth.
 
     Parameters
     ----------
     g, elements, ends, wavelength, record
-        As there.
+        As for :func:`amplitudes`.
     slants : twice (cosine, sine)
-        Of tower and UAV against (paths, pairs). Further axes in front of these come first in the answer, and what does
-        not depend on them is evaluated once.
+        Slants of tower and UAV, broadcast with (paths, pairs). Additional leading axes are the first axes of the
+        result. Parts that do not depend on them are evaluated once.
 
     Returns
     -------
@@ -288,10 +290,10 @@ def _power(re: dyads.Vector, im: dyads.Vector) -> FloatArray:
 
 
 def pattern_ends(g: Geometry, elements: Elements, link: Link) -> Ends:
-    """Pattern fields (paths, 4, pairs) of both ends along the paths; None where all are 1 along theta."""
+    """Return pattern fields (paths, 4, pairs) of both ends along the paths. None if all are 1 along theta."""
     arrays, uav = list(link.tower_arrays.values()), link.uav_array
     plain_towers, plain_uav = all(plain(array.patterns) for array in arrays), plain(uav.patterns)
-    # 1 along theta needs no table of directions
+    # 1 along theta does not need a table of directions
     if plain_towers and plain_uav:
         return None, None
     x, y, z, _ = directions(g, elements)
@@ -342,7 +344,7 @@ def parts_between_poses(pose: IntArray, most: int = PATHS_PER_PART) -> list[slic
 
 
 def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float = -np.inf) -> FloatArray:
-    """Received power [dBm]; NaN where ``power`` is zero (no path) or the level is below the noise floor [dBm].
+    """Return the received power [dBm]. NaN if ``power`` is zero (no path) or the level is below the noise floor [dBm].
 
     ``power`` is the mean over element pairs of ``|h|^2``: the transmit power is shared equally by the transmitting
     ports, which send independent signals, and the received power is the mean over the receiving ports. With one
@@ -353,13 +355,13 @@ def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float
 
 
 def mean_pair_power(h: ComplexArray) -> FloatArray:
-    """Mean over the last two axes of ``|h|^2``; tiny and huge channels neither vanish nor overflow."""
-    # the square of a complex number's size is the sum of two squares: no root is taken
+    """Return the mean over the last two axes of ``|h|^2``, without underflow or overflow."""
+    # the squared magnitude of a complex number is the sum of two squares, so no root is needed
     parts = np.ascontiguousarray(h).view(np.float64).reshape(*h.shape[:-2], 2 * h.shape[-2] * h.shape[-1])
     pairs = max(parts.shape[-1] // 2, 1)
     with np.errstate(over="ignore", under="ignore"):
         power = np.asarray(np.einsum("...i,...i->...", parts, parts) / pairs)
-    odd = ~((power > 1e-280) & (power < 1e280))  # squares may have lost digits: scaled by the largest entry
+    odd = ~((power > 1e-280) & (power < 1e280))  # squares may have lost digits: scale by the largest entry
     if odd.any():
         some = h[odd]
         scale = np.abs(some).max(axis=(-2, -1), keepdims=True, initial=0.0)

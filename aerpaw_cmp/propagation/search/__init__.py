@@ -1,1 +1,1 @@
-"""Paths between towers and poses: mirror images, beams, Sionna; what hides and what crowns reflect."""
+"""Paths between towers and poses: mirror images, beams, Sionna, obstacles, and reflections off crowns."""

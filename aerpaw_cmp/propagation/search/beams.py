@@ -1,18 +1,17 @@
-"""Every specular path among thousands of faces: sequences grown face by face along beams, compiled.
+"""Search of every specular path among thousands of faces: compiled, with sequences grown along beams.
 
-The source is mirrored at a first face. The beam from that image through the face's outline meets the tree of faces;
-those that it meets are second faces, and so on. At each step the receivers, in a tree of their own, are cut by all
-side planes of the beam: those of the last face and those of the faces before it, mirrored. What is left is computed:
-reflection points, whether each lies in its face, whether a triangle cuts a segment. First faces that lie wholly in the
-shadow of one convex face are left out. All cuts are conservative, so the paths are the same with each of them off.
+The source is mirrored at a first face. The beam from that image through the face's outline meets the tree of faces. The
+faces that it meets are second faces, and so on. At each step the receivers, which have a separate tree, are cut by all
+side planes of the beam: those of the last face and the mirrored planes of earlier faces. For the remaining receivers
+the search computes the reflection points, whether each lies in its face, and whether a triangle cuts a segment. First
+faces that lie completely in the shadow of one convex face are skipped. All cuts are conservative, so the paths do not
+depend on them. Pairs are streamed: memory does not grow with their number.
 
-Pairs are streamed: memory does not grow with their number.
+For thousands of prisms, compiled beams find candidates, and the exact rules of the image engine decide.
 
-Thousands of prisms: candidates by compiled beams, decided by the exact rules of the image engine.
-
-The beams of :mod:`aerpaw_cmp.propagation.search.beams` are cut with tolerances a thousand times wider than those that
-decide, and a candidate is given up only where a segment runs through the middle of a wall or roof. What is left, hardly
-more than the paths, is decided as in :mod:`aerpaw_cmp.propagation.search.mirror`, so both have the same paths.
+The beams are cut with tolerances a thousand times wider than those that decide. A candidate is rejected only if a
+segment runs through the middle of a wall or roof. The remaining candidates, hardly more than the paths, are decided as
+in :mod:`aerpaw_cmp.propagation.search.mirror`, so both searches find the same paths.
 """
 
 from __future__ import annotations
@@ -115,7 +114,7 @@ def grow_paths(
     Returns
     -------
     PathSet
-        Sorted by pose, tower, depth, faces; of coincident paths one.
+        Sorted by pose, tower, depth, faces, with one of several coincident paths.
     """
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
@@ -232,12 +231,12 @@ _COINCIDENT_M = 5e-3
 
 
 def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
-    """Of paths over the same planes, or over planes within a few merge tolerances of each other, one each."""
+    """Keep one of several paths over the same planes, or over planes within a few merge tolerances of each other."""
     if not len(paths):
         return paths
     plane = np.append(surfaces.plane, -1)[paths.faces]
     key = np.column_stack([paths.pose, paths.tower, paths.depth, plane])
-    # the first of each: paths come sorted, so the choice does not depend on threads
+    # the first of each: paths are sorted, so the choice does not depend on threads
     _, first = np.unique(key, axis=0, return_index=True)
     paths = paths.select(np.sort(first))
     # near coincidence: neighbours in a grid of twice the tolerance, asked pairwise within a link
@@ -329,7 +328,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
 
 @kernel
 def _face_at(mirrors, f, coplanar, point, edge):  # type: ignore[no-untyped-def]
-    """The face ``f`` where a point lies in it, else the first of those ``coplanar`` with it; -1 in none."""
+    """Return the face ``f`` if a point lies in it, else the first coplanar face that contains it, else -1."""
     _, _, along, across, _, _, _, _, _, first, flat = mirrors
     if in_face(first, flat, along, across, f, point, edge):
         return f
@@ -343,8 +342,8 @@ def _face_at(mirrors, f, coplanar, point, edge):  # type: ignore[no-untyped-def]
 def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-untyped-def]
     """Check whether a triangle cuts the segment ``a`` - ``b``.
 
-    ``before`` and ``after`` are the planes of mirrors at the ends, with a normal of zeros for an antenna: there a
-    surface within the clearance of the mirror's plane, or of the antenna, cuts nothing. Edges included.
+    ``before`` and ``after`` are the planes of mirrors at the ends, with a normal of zeros for an antenna. A surface
+    within the clearance of the mirror's plane, or of the antenna, does not cut the segment. Edges are included.
 
     Parameters
     ----------
@@ -384,7 +383,7 @@ def segment_cut(corners, tree, a, b, before, after, rules):  # type: ignore[no-u
 
 @kernel
 def _first_cut(corners, a, b, before, after, rules):  # type: ignore[no-untyped-def]
-    """Triangle that cuts a segment first, by the rules of :func:`segment_cut`; -1 where none does."""
+    """Return the triangle that first cuts a segment, by the rules of :func:`segment_cut`, or -1."""
     way = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     length = np.sqrt(way[0] * way[0] + way[1] * way[1] + way[2] * way[2])
     first, share = -1, 1.0
@@ -397,7 +396,7 @@ def _first_cut(corners, a, b, before, after, rules):  # type: ignore[no-untyped-
 
 @part
 def _cut_at(corners, a, way, length, before, after, rules):  # type: ignore[no-untyped-def]
-    """Share of the way at which a triangle cuts a segment; -1 where it cuts nothing."""
+    """Return the share of the segment at which a triangle cuts it, or -1."""
     t = _share_to(corners, a, way, length, rules.margin)
     # the open segment: its ends lie on mirrors and antennas
     if t <= 0.0 or t >= 1.0:
@@ -410,12 +409,12 @@ def _cut_at(corners, a, way, length, before, after, rules):  # type: ignore[no-u
 
 @part
 def _share_to(corners, a, way, length, margin):  # type: ignore[no-untyped-def]
-    """Share of the way from ``a`` at which it meets a triangle; -1 where it misses it.
+    """Return the share of the segment from ``a`` at which it meets a triangle, or -1.
 
     Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997), doi:10.1080/10867651.1997.10487468.
     """
     c, (d0, d1, d2) = corners, way
-    # seams between triangles of a sheet must not leak; of a solid, a graze must not cut
+    # seams between triangles of a sheet must not leak; a graze of a solid must not cut
     edge = margin if margin > 0.0 else -1e-9
     e0, e1, e2 = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2]
     g0, g1, g2 = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
@@ -474,7 +473,7 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
         if not mirrors.usable[f]:
             continue
         height = _height(normal, offset, f, source)
-        # a sheet has two sides and is none for a source in its own plane; a solid has an outside
+        # a sheet has two sides, but not for a source in its plane; a solid has an outside
         if (abs(height) <= rules.side and rules.margin == 0.0) or (mirrors.front_only[f] and height < -rules.side):
             continue
         good[f] = not (rules.shadows and _wholly_hidden(mirrors, face_tree, source, f, -1, 0.0, rules, stack))
@@ -570,7 +569,7 @@ def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def
 
 @kernel
 def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
-    """Side planes of the beam from ``apex`` through an outline, added behind the first ``count``; how many then."""
+    """Append the side planes of the beam from ``apex`` through an outline to the first ``count``. Return the total."""
     m0 = m1 = m2 = 0.0
     for k in range(WINDOW):
         m0 += outline[k, 0] / WINDOW
@@ -667,14 +666,14 @@ def _ahead(normal, offset, f, sign, outline, side):  # type: ignore[no-untyped-d
 
 @part
 def _reflects(shapes, level, chain, signs, images, points, target, rules):  # type: ignore[no-untyped-def]
-    """Check whether a path to a target meets each face of the sequence; its ``points`` there."""
+    """Check whether a path to a target meets each face of the sequence, and write its ``points`` there."""
     normal, offset, along, across, first, flat = shapes
     side, strict, point = rules.side, rules.margin == 0.0, target
     for step in range(level, -1, -1):
         g = chain[step]
         top = signs[step] * _height(normal, offset, g, point)
         low = signs[step] * _height(normal, offset, g, images[step])
-        # both ends before the mirror
+        # both ends must be in front of the mirror
         if top < -side or low < -side or top + low <= (side if strict else 1e-12):
             return False
         if step < level and top <= (side if strict else -side):
@@ -755,7 +754,7 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
         if level > 0 and beams:
             if not _ahead(normal, offset, f, sign, window[before], side):
                 continue
-            worthwhile = rules.shadows and level + 1 < depth  # of a last face it would cost more than it saves
+            worthwhile = rules.shadows and level + 1 < depth  # for a last face the test would cost more than it saves
             last = signs[level - 1]
             if worthwhile and _wholly_hidden(mirrors, face_tree, place, f, before, last, rules, stack):
                 continue
@@ -769,7 +768,7 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
         mine, number = planes[level], 1
         mine[0, 0], mine[0, 1], mine[0, 2] = sign * n0, sign * n1, sign * n2
         mine[0, 3] = -sign * offset[f] + side
-        # plane 0 of the level before is the face itself: behind it nothing is lost, and it is no side of the beam
+        # plane 0 of the level before is the face itself: nothing behind it is lost, and it is not a side of the beam
         for p in range(1, many[level - 1] if beams and level > 0 else 1):
             b0, b1, b2 = planes[level - 1, p, 0], planes[level - 1, p, 1], planes[level - 1, p, 2]
             twice = 2.0 * (b0 * n0 + b1 * n1 + b2 * n2)
@@ -811,7 +810,7 @@ def _follow(mirrors, solids, receivers, source, firsts, rules):  # type: ignore[
 
 
 def obstacle(surfaces: Surfaces, points_m: FloatArray, sequence: IntArray) -> int | None:
-    """Face that cuts a path (depth + 2, 3) over the faces ``sequence`` first, from the source; None where none does."""
+    """Return the face that first cuts a path (depth + 2, 3) over the faces ``sequence``, from the source, or None."""
     rules, antenna = _rules(surfaces, len(sequence), solids=False), (np.zeros(3), 0.0)
     normal, offset = np.ascontiguousarray(surfaces.faces.normal), surfaces.faces.offset_m
     ends = [antenna, *((normal[face], float(offset[face])) for face in sequence), antenna]
@@ -853,12 +852,12 @@ def find_paths(
     max_depth: int = 2,
     extent_m: FloatArray | None = None,
 ) -> PathSet:
-    """As :func:`aerpaw_cmp.propagation.search.mirror.find_paths`, for scenes with too many sequences for it.
+    """Find the paths of :func:`aerpaw_cmp.propagation.search.mirror.find_paths` in scenes with too many sequences.
 
     Parameters
     ----------
     faces, links, max_depth, extent_m
-        As there.
+        As for that function.
     run : Run
 
     Returns
@@ -872,7 +871,7 @@ def find_paths(
     paths = grow_paths(solid_surfaces(faces, sources_m, targets_m), links, run, max_depth=max_depth, solids=True)
     hiding = Occlusion(faces, tolerance_m)
     pieces = []
-    # of one depth at once: tracing back takes sequences of one length
+    # one depth at a time, because tracing back requires sequences of one length
     for depth in range(max_depth + 1):
         some = paths.select(paths.depth == depth)
         source, target = sources_m[some.tower], targets_m[some.pose]
@@ -886,13 +885,13 @@ def find_paths(
 
 
 def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -> Surfaces:
-    """Faces of solids as the compiled search takes them; the ground, which hides nothing, is no obstacle."""
+    """Return the faces of solids for the compiled search. The ground is not an obstacle."""
     known = targets_m[np.isfinite(targets_m).all(axis=1)]
     finite = [np.abs(x[np.isfinite(x)]).max(initial=0.0) for x in (faces.lower, faces.upper, faces.offset_m)]
     reach = REACH * float(max(1.0, *finite, *(np.abs(p).max(initial=0.0) for p in (known, sources_m))))
     vertices, triangle, owner = triangles(faces, reach)
     points = vertices[triangle]
-    # a bounding quadrilateral, which for a roof with corners cut is larger than the roof: a cut may keep more
+    # a bounding quadrilateral may be larger than a roof without right angles: the beam then keeps more
     outline = corners(faces, reach)
     axes = np.stack([faces.along[owner], faces.across[owner]], axis=1)
     flat = np.einsum("tki,tai->tka", points, axes)

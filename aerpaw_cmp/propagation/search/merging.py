@@ -1,12 +1,12 @@
-"""Triangles to planar faces, compiled.
+"""Planar faces merged from triangles, compiled.
 
-Triangles of one shape that share an edge and lie within a stated tolerance of one plane are one face; faces that touch
-or overlap in one plane, of whatever shape, share that plane, so that a reflection there is one reflection.
+Triangles of one shape that share an edge and lie within a given tolerance of one plane are one face. Faces that touch
+or overlap in one plane share that plane, regardless of their shape. A reflection there is therefore one reflection.
 
-A tree of boxes over triangles, faces or points, compiled; and what a search asks of it.
+The module also contains a tree of boxes over triangles, faces or points, compiled, and its queries.
 
-Nodes are columns: bounds, the first of two children (or -1), and for leaves the items they hold. Every answer of the
-tree is conservative; what decides is computed on the items themselves, in float64.
+Nodes are columns: bounds, the first of two children (or -1), and for leaves their items. Every answer of the
+tree is conservative. The decisive tests are computed on the items themselves, in float64.
 """
 
 from __future__ import annotations
@@ -80,7 +80,7 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
         order = np.argsort(middle[mine, longest])
         items[first : first + many] = mine[order]
         half = many // 2
-        # the second child stands behind the first
+        # the second child follows the first
         child[node] = nodes
         start[nodes], count[nodes] = first, half
         start[nodes + 1], count[nodes + 1] = first + half, many - half
@@ -136,7 +136,7 @@ law(next_leaf)
 
 
 def _collected(tree: BoxTree, missed: Any, region: Any, todo: IntArray, hits: IntArray) -> int:
-    """Items of the leaves whose box a region meets, into ``hits``; how many."""
+    """Write the items of the leaves whose box a region meets into ``hits``, and return their number."""
     lower, upper, child, start, many, items = tree
     total, todo[0] = 0, 0
     node, waiting = next_leaf(lower, upper, child, todo, 1, missed, region)
@@ -153,7 +153,7 @@ law(_collected)
 
 @kernel
 def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
-    """Items whose leaf meets the box ``low``, ``high`` (3,), into ``hits``; how many.
+    """Write the items whose leaf meets the box ``low``, ``high`` (3,) into ``hits``, and return their number.
 
     Parameters
     ----------
@@ -173,7 +173,7 @@ def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
 
 @kernel
 def within_planes(tree, planes, many, todo, hits):  # type: ignore[no-untyped-def]
-    """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``hits``; how many.
+    """Write the items whose leaf is partly inside each of the first ``many`` planes into ``hits``. Return their number.
 
     A plane (4,) is ``a x + b y + c z + d >= 0`` inside.
 
@@ -225,12 +225,12 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     Returns
     -------
     bool
-        False may also be said of a box that only the planes together leave outside.
+        False is also possible for a box that only the combination of planes excludes.
     """
     for p in range(many):
         a, b, c = planes[p, 0], planes[p, 1], planes[p, 2]
         best = planes[p, 3]
-        # the corner farthest along the normal: is even that outside, all of the box is
+        # the corner farthest along the normal: if it is outside, the whole box is outside
         best += a * (upper[node, 0] if a > 0.0 else lower[node, 0])
         best += b * (upper[node, 1] if b > 0.0 else lower[node, 1])
         best += c * (upper[node, 2] if c > 0.0 else lower[node, 2])
@@ -378,13 +378,13 @@ def _planes(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def _axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """In-plane unit axes: level and uphill where there is such a thing."""
-    # across the slope: level where the face is no ground
+    """Return in-plane unit axes: level and uphill, if the face has a slope."""
+    # across the slope, so level unless the face is level
     along = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
     size = np.linalg.norm(along, axis=1)
     level = size < 1e-6
     along = np.where(level[:, None], np.array([1.0, 0.0, 0.0]), along / np.where(level, 1.0, size)[:, None])
-    # the axis of a nearly level face still leans out of it
+    # the axis of a nearly level face still leans out of the face
     along -= np.einsum("fi,fi->f", along, normal)[:, None] * normal
     along /= np.linalg.norm(along, axis=1, keepdims=True)
     return along, np.cross(normal, along)
@@ -436,7 +436,7 @@ def _merge_neighbours(order, corners, normal, offset, neighbours, merge_m):  # t
 
 @kernel
 def _joining(triangle, number, face, todo, corners, plane, neighbours, merge_m):  # type: ignore[no-untyped-def]
-    """Neighbours of a triangle that lie in the plane of its face join that, and wait in ``todo``; how many."""
+    """Add neighbours of a triangle in its face's plane to the face and to ``todo``. Return their number."""
     edges, triangle_of, start = neighbours
     many = 0
     for edge in edges[triangle]:

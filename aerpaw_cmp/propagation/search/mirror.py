@@ -12,15 +12,15 @@ A solid hides with its open inside (:mod:`aerpaw_cmp.propagation.search.mirror`)
 there is no crack between two walls. An end that lies on a face reflects there like one a hair before it: nothing jumps
 when a UAV lands.
 
-Occlusion of segments by buildings: the open segment against the open solid.
+Segments are occluded by buildings if the open segment meets the open solid.
 
-A building is a prism: its footprint, cut into convex pieces, from its foot to its roof. A segment is cut when a part of
-it runs inside a piece, deeper than a tolerance that only takes up rounding; so a touch of a wall, an edge, a corner or
-a roof cuts nothing, wherever it lies and whether or not the segment ends there. The inside of two buildings that touch
-is one: a segment that runs in the seam between them, outside both, is cut too.
+A building is a prism: its footprint, cut into convex pieces, from its foot to its roof. A segment is cut if a part of
+it runs inside a piece, deeper than a tolerance for rounding. A touch of a wall, an edge, a corner or a roof does not
+cut, regardless of its position and of the segment's ends. The inside of two buildings that touch is one solid: a
+segment that runs in the seam between them, outside both, is cut too.
 
-Triangles have a law of their own (:func:`.beams.segment_cut`): an open sheet has no inside, and a sheet's law decides
-198 of 3 984 segments of a grid about two boxes that touch otherwise, where they run along walls or in the seam.
+Triangles have a separate rule (:func:`.beams.segment_cut`), because an open sheet has no inside. A sheet's rule decides
+198 of 3 984 segments of a grid about two touching boxes differently, where they run along walls or in the seam.
 """
 
 from __future__ import annotations
@@ -101,11 +101,11 @@ class Occlusion:
         return cut
 
     def _cut(self, start: FloatArray, end: FloatArray) -> BoolArray:
-        # from coarse to fine: all segments at once, then each box by itself, then the planes of a piece
+        # from coarse to fine: all segments at once, then each box separately, then the planes of a piece
         solids = self._solids_near(start, end)
         near = self._boxes(start, end, solids)
         result = np.zeros(len(start), dtype=np.bool_)
-        # most segments touch nothing, so seams are looked at once all pieces were asked
+        # most segments touch nothing, so seams are examined after all pieces
         seams: list[tuple[IntArray, FloatArray, FloatArray, int, int]] = []
         for column, solid in enumerate(solids.tolist()):
             # one cut is enough
@@ -187,14 +187,14 @@ class Occlusion:
         length_m = float(np.linalg.norm(end - start))
         breaks = np.unique([share for enter, leave, _ in runs for share in (enter, leave)])
         long = np.flatnonzero(np.diff(breaks) * length_m > 10.0 * radius_m)
-        # between two breaks the same pieces run along: one point speaks for the stretch
+        # between two breaks the segment runs along the same pieces, so one point is sufficient
         for share in (breaks[long] + breaks[long + 1]) / 2:
             point = start + share * (end - start)
             ring = point + radius_m * _AROUND
             covered = np.zeros(len(ring), dtype=np.bool_)
             for enter, leave, (normal, offset) in runs:
                 height = ring @ normal.T - offset
-                # between roof and foot: above a roof nothing is surrounded
+                # between roof and foot: a point above a roof is not surrounded
                 if enter < share < leave and (height[:, :2] < -self.tolerance_m).all():
                     covered |= (height[:, 2:] <= self.tolerance_m).all(axis=1)
             if covered.all():
@@ -203,9 +203,9 @@ class Occlusion:
 
 
 def _within(before: FloatArray, after: FloatArray, level: float) -> tuple[FloatArray, FloatArray]:
-    """Shares (enter, leave) between which a segment lies below ``level`` over all planes; enter >= leave: nowhere.
+    """Return shares (enter, leave) between which a segment is below ``level`` of all planes. Nowhere if enter >= leave.
 
-    Cyrus and Beck (1978): the planes that it goes down through give where it enters, the others where it leaves.
+    Cyrus and Beck (1978): it enters at planes that it crosses downwards and leaves at the others.
     """
     slope = after - before
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -315,7 +315,7 @@ def _planes(footprints: list[Polygon], foot: FloatArray, top: FloatArray) -> lis
 
 
 def _abutting(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
-    """For each piece, whether another piece comes within the tolerance."""
+    """Check for each piece whether another piece comes within the tolerance."""
     touched = np.zeros(len(footprints), dtype=np.bool_)
     if len(footprints) > 1:
         first, second = shapely.STRtree(footprints).query(footprints, predicate="dwithin", distance=tolerance_m)
@@ -323,7 +323,7 @@ def _abutting(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
     return touched
 
 
-# Of the largest coordinate: some thousand times the rounding error of a plane equation.
+# Relative to the largest coordinate: about a thousand times the rounding error of a plane equation.
 RELATIVE_TOLERANCE = 1e-12
 
 # A link shorter than this has no path: there is no far field, and no direction when it is zero.
@@ -427,7 +427,7 @@ def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Bounds:
-    """In-plane bounds of the faces.
+    """The in-plane bounds of the faces.
 
     Parameters
     ----------
@@ -468,13 +468,13 @@ class Sequences:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Growth:
-    """Growth of face sequences, face by face, wherever the tower stands.
+    """The growth of face sequences, face by face, for any position of the tower.
 
     Parameters
     ----------
     faces : Faces
     bounds : _Bounds
-        Of the faces.
+        Bounds of the faces.
     facing : (faces, faces) bool
         Faces that can follow each other.
     tolerance_m : float
@@ -527,10 +527,10 @@ class _Growth:
                 before = now[row, -1]
                 beam = last_image[row], box.corners_m[before], box.centre_m[face], box.reach_m[face]
                 keep = _beam_meets(*beam, self.tolerance_m)
-                # the ground is met by any beam that goes down, and its cut corners are no outline
+                # any beam that goes down meets the ground, and its cut corners are not an outline
                 keep |= ~np.isfinite(faces.lower[face, 0]) | ~np.isfinite(faces.lower[before, 0])
                 row, face = row[keep], face[keep]
-            # the image counts for every target, so it is made once a sequence
+            # the image is the same for every target, so it is computed once per sequence
             mirrored = last_image[row] - 2.0 * height[row, face][:, None] * faces.normal[face]
             grown.append(np.concatenate([now[row], face[:, None]], axis=1))
             images.append(np.concatenate([past[row], mirrored[:, None]], axis=1))
@@ -559,7 +559,7 @@ class _Growth:
 
 
 class Mirrors:
-    """Faces that one reflection may reach a box over; built once for many boxes.
+    """The faces over which one reflection may reach a box. Build it once for many boxes.
 
     Parameters
     ----------
@@ -804,9 +804,9 @@ def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet
     ----------
     pieces : list of PathSet
     max_depth : int
-        Of the set where there is no path at all.
+        Depth of the result if there is no path at all.
     faces : Faces or None
-        Where given, of paths over coplanar faces that overlap only one is kept.
+        If given, keep only one of several paths over coplanar faces that overlap.
 
     Returns
     -------
@@ -825,7 +825,7 @@ def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet
 
 
 def _order(paths: PathSet) -> IntArray:
-    """Rows by pose, tower, depth, faces; at once where they lie so."""
+    """Return the order of rows by pose, tower, depth, faces. It is immediate if they are already sorted."""
     keys = [paths.pose, paths.tower, paths.depth, *paths.faces.T]
     sorted_, tied = np.ones(max(len(paths) - 1, 0), np.bool_), np.ones(max(len(paths) - 1, 0), np.bool_)
     for key in keys:
@@ -852,7 +852,7 @@ def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
 
 
 def planes_of(faces: Faces) -> IntArray:
-    """Number (faces,) of the plane each face lies in; coplanar faces that look the same way share it."""
+    """Return the number (faces,) of each face's plane. Coplanar faces with the same orientation share it."""
     # coplanar to the rounding of a map: a nanometre of tilt, a micrometre of offset
     key = np.column_stack([faces.normal / 1e-9, faces.offset_m / 1e-6]).round()
     order = np.lexsort(key.T)

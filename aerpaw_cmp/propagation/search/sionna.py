@@ -1,17 +1,18 @@
-"""Sionna RT as a path finder; the only file that imports sionna, mitsuba and drjit.
+"""A path finder with Sionna RT. This is the only file that imports sionna, mitsuba and drjit.
 
-Sionna computes in float32 and finds paths by sampling. Only *which faces a path meets* is taken from it; reflection
+Sionna computes in float32 and finds paths by sampling. Only *which faces a path meets* is taken from Sionna. Reflection
 points come from the image method in float64 and fields from :mod:`aerpaw_cmp.propagation.field.sum`.
 
-Guards against what Sionna RT 2.2.0 does silently:
+Guards against silent behaviour of Sionna RT 2.2.0:
 
-- its hash table of candidates is shared by all receivers of a call and loses paths: a table of 2**24 slots and
-  batches of at most 100 poses;
-- it drops candidates past ``max_num_paths_per_src``, of which most are no paths in the end, and corrupts memory when
-  that is below the number of receivers: its own count of candidates is read after each batch, and a batch that had
-  more than the limit, or filled too much of the table, is searched again with room for them;
-- positions given as numbers recompile kernels: they are arrays, and each batch has the same size (the last is padded);
-- a line of sight must have Friis' amplitude and no path a gain above one, or the run stops.
+- Its hash table of candidates is shared by all receivers of a call and loses paths. The guard is a table of 2**24 slots
+  and batches of at most 100 poses.
+- It drops candidates past ``max_num_paths_per_src``, most of which are not paths in the end, and corrupts memory if
+  that limit is below the number of receivers. Its own count of candidates is read after each batch. A batch that
+  exceeded the limit, or filled too much of the table, is searched again with more room.
+- Positions given as numbers recompile kernels. They are arrays here, and each batch has the same size (the last is
+padded).
+- A line of sight must have Friis' amplitude, and no path may have a gain above one, or the run stops.
 """
 
 from __future__ import annotations
@@ -68,18 +69,18 @@ HALF_SPACE_THICKNESS_M = 10.0
 # A float32 reflection point may lie this far outside its face.
 _EDGE_TOLERANCE_M = 1e-3
 
-# Scenes in use. Dr.Jit compiles virtual calls for every material that is alive, those of dead scenes included, and may
-# then define a function twice and abort the process: no scene may stay when the next is made.
+# Scenes in use. Dr.Jit compiles virtual calls for every living material, including those of scenes that are not used
+# any more. It may then define a function twice and abort the process, so no scene may exist when the next is created.
 _ALIVE: WeakSet[Any] = WeakSet()
 
 
 def load_variant(prefer: str | None = None) -> str:
-    """Choose CUDA when a GPU is there, LLVM otherwise; the name of the variant.
+    """Choose CUDA if there is a GPU, else LLVM, and return the name of the variant.
 
     Parameters
     ----------
     prefer : {"cuda", "llvm"}, optional
-        Ask for one of them.
+        Required kind of variant.
 
     Raises
     ------
@@ -105,16 +106,16 @@ def _variant(kinds: Sequence[str]) -> str:
     without_llvm: SionnaMissingError | None = None
     if "llvm" in kinds:
         try:
-            prepare_llvm()  # before Dr.Jit looks for one by itself
+            prepare_llvm()  # before Dr.Jit searches for a library
         except SionnaMissingError as error:
-            without_llvm = error  # a GPU may do without
+            without_llvm = error  # a GPU does not need LLVM
     import mitsuba as mi
 
-    # Mitsuba looks for its plugins, native code, in the working folder first: a stranger's, it may be
+    # Mitsuba searches the working folder first for plugins, which are native code, possibly from a third party
     resolver: Any = mi.file_resolver
     resolver().clear()
     resolver().append(str(Path(mi.__file__).parent))
-    # a variant once set stays: changing it would leave objects of two kinds alive
+    # keep a variant once it is set: changing it would leave objects of two kinds alive
     current = mi.variant()
     if current in [f"{kind}_ad_mono_polarized" for kind in kinds]:
         return str(current)
@@ -220,12 +221,12 @@ class _Builder:
             rows = np.flatnonzero(np.isin(owner, members))
             plain = f"faces-{_plain(name)}"
             material = _material(name, self.carrier_hz, self.own_table)
-            # one mesh a material, not a face: Dr.Jit compiles for what a scene holds
+            # one mesh per material, not per face: Dr.Jit compiles for the contents of a scene
             mesh = self._mesh(plain, vertices, triangle[rows])
             objects.append(rt.SceneObject(mi_mesh=mesh, name=plain, radio_material=material))
             owners.append(owner[rows])
         scene.edit(add=objects)
-        # read when a kernel runs: literals would be compiled anew for each carrier
+        # read when a kernel runs: literals would be compiled again for each carrier
         materials = scene.radio_materials.values()
         dr.make_opaque(scene.frequency, *((m.relative_permittivity, m.conductivity) for m in materials))
         return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
@@ -234,7 +235,7 @@ class _Builder:
         import mitsuba as mi
 
         corners, place = np.unique(triangle, return_inverse=True)
-        # only corners in use: a mesh of all would be sent to the device once a material
+        # only used corners: a mesh with all corners would be sent to the device once per material
         points = vertices[corners]
         mesh = mi.Mesh(name, vertex_count=len(points), face_count=len(triangle))
         parameters = mi.traverse(mesh)
@@ -271,9 +272,9 @@ def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
 
 
 def _slots(built: _Scene, targets: int) -> int:
-    """Slots of PathSolver's table: fewer over bare ground, where so few candidates can be that none shares a slot.
+    """Return the number of slots of PathSolver's table. Bare ground needs fewer, because there are few candidates.
 
-    Of n candidates some ``2 n^2 / slots`` are lost: less than one in two hundred batches.
+    About ``2 n^2 / slots`` of n candidates are lost: less than one in two hundred batches.
     """
     mirrors = sum(len(np.unique(faces)) for faces in built.face_of.values())
     slots = 400.0 * (targets * max(mirrors, 1) ** 2) ** 2
@@ -283,20 +284,20 @@ def _slots(built: _Scene, targets: int) -> int:
 def _points(values: FloatArray) -> Any:
     import mitsuba as mi
 
-    # lists: Dr.Jit would use NumPy's memory as it lies, and compile anew for each alignment of it
+    # lists: Dr.Jit would use NumPy's memory directly, and compile again for each alignment
     return mi.Point3f(*(mi.Float(column) for column in values.T.astype(np.float32).tolist()))
 
 
 @dataclass(frozen=True, slots=True)
 class _Ends:
-    """Devices of one element as PathSolver wants them: centres (devices, 3) and turns (devices, 3, 3)."""
+    """The devices of one element for PathSolver: centres (devices, 3) and rotations (devices, 3, 3)."""
 
     centres_m: FloatArray
     turns: FloatArray
 
     @classmethod
     def points(cls, centres_m: FloatArray) -> _Ends:
-        """Devices that are not turned."""
+        """Return devices without rotation."""
         return cls(centres_m, np.tile(np.eye(3), (len(centres_m), 1, 1)))
 
     def arguments(self) -> tuple[Any, Any, Any]:
@@ -375,7 +376,7 @@ class _Finder:
         generator._shoot_and_bounce = watched
 
     def _share_kernels(self) -> None:
-        """Let kernels read the directions of the rays: their number, a literal, compiled the largest two anew."""
+        """Let kernels read the ray directions. Their number, a literal, would compile the largest two kernels again."""
         import drjit as dr
         import sionna.rt.path_solvers.sb_candidate_generator as generator
         from sionna.rt.utils import fibonacci_lattice
@@ -440,12 +441,12 @@ class _Finder:
         )
 
     def _more_room(self) -> bool:
-        """Check whether the last batch had more candidates than there was room for; then there is room for them now."""
+        """Check whether the last batch had more candidates than room, and increase the room if it had."""
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
         most = 0 if self.candidates is None else int(np.asarray(self.candidates.numpy()).max(initial=0))
         slots = self.slots
-        # doubled: the slots of a table stay a power of two
+        # doubled, so that the slots of a table stay a power of two
         while most > _FULLEST_TABLE * slots:
             slots *= 2
         slots = max(self.slots, min(slots, _MOST_SLOTS // max(1, len(self.built.scene.transmitters))))
@@ -618,15 +619,15 @@ def own_coefficients(
 ) -> Coefficients:
     """Sionna's complex coefficient of each path, for the audit of the field.
 
-    Sionna's constants of P.2040, rotations, patterns, slants, Fresnel coefficients and spreading; only the carrier
-    phase is taken over the length of its path in float64, since it would form ``2 pi f tau`` in float32.
+    Sionna supplies its constants of P.2040, rotations, patterns, slants, Fresnel coefficients and spreading. Only the
+    carrier phase is computed here from the path length in float64, since Sionna would form ``2 pi f tau`` in float32.
 
     Parameters
     ----------
     faces, links, rays, surfaces
         As in :func:`find_paths`.
     probe : Link
-        Two elements of one pattern in each array's centre.
+        Link with two elements of one pattern in each array's centre.
     turns : ((towers, 3, 3), (poses, 3, 3))
         Device to site, of the towers' arrays and of the UAV's at each pose.
 
@@ -721,7 +722,7 @@ def _sequences(
         kind = raw["kind"][step, receiver, tower, path]
         shape = raw["shape"][step, receiver, tower, path]
         primitive = raw["primitive"][step, receiver, tower, path]
-        # 0 is no interaction, 1 a specular reflection
+        # 0 means no interaction, 1 a specular reflection
         good &= (kind == 0) | (kind == 1)
         for number, owner in face_of.items():
             hit = (kind == 1) & (shape == number)
@@ -740,7 +741,7 @@ def _refine(
     tolerance_m: float,
     surfaces: Surfaces | None = None,
 ) -> PathSet:
-    """Reflection points in float64; paths whose points miss their faces are dropped."""
+    """Compute reflection points in float64, and drop paths whose points miss their faces."""
     rows = np.column_stack([pose, tower, sequence])
     # rays that differ by rounding report one path several times
     rows = np.unique(rows, axis=0) if len(rows) else rows

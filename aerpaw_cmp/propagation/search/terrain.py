@@ -1,12 +1,13 @@
 """Reflections off the ground of an elevation model.
 
-A specular point is where the length of the way over the ground is stationary. Along the profile between the ends the
-ground is a polyline: its pieces are mirrors in closed form, and at a crease between two of them the length may turn
-too. Across the profile the point is found by iteration on the bilinear surface. Points whose ways differ by less than
-half a wavelength lie in one Fresnel zone and are one mirror: that with the shortest way. Its plane is tangent to the
-surface, on a crease the plane between both sides that mirrors one end into the other. Where curved ground leaves the
-Fresnel zone of that plane the mirror weakens by the part of the zone that is left along the profile (a ridge's crest is
-none); it never focuses. Level ground at the height of the tower's own is the plane that is there without a model.
+At a specular point the length of the path over the ground is stationary. Along the profile between the ends the ground
+is a polyline. Its pieces are mirrors in closed form, and the length can also be stationary at a crease between two
+pieces. Across the profile the point is found by iteration on the bilinear surface. Points whose path lengths differ by
+less than half a wavelength lie in one Fresnel zone and count as one mirror, that of the shortest path. Its plane is
+tangent to the surface; on a crease it is the plane between both sides that mirrors one end into the other. Where curved
+ground leaves the Fresnel zone of that plane, the reflection is reduced to the part of the zone that remains along the
+profile. It is never focused, and the crest of a ridge reflects nothing. Level ground at the height of the tower's
+ground is the same plane as without an elevation model.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ TERRAIN = -2
 # That is 20 dB below the whole mirror.
 _SMALLEST_PART = 0.1
 
-# A point that still moves after so many gets the plane of a crease.
+# A point that still moves after this many steps gets the plane of a crease.
 _STEPS = 8
 _STILL_M = 1e-6
 
@@ -144,7 +145,7 @@ class _Candidates:
         return rows[rows >= 0], paths.select(_clear(dem, every, links, paths, wavelength_m)), every
 
     def _traced(self, faces: Faces, where: IntArray, sequence: IntArray, links: Links, loss_db: FloatArray) -> PathSet:
-        """Paths over the planes in order, sorted by pose and tower; whether something stops them is not asked."""
+        """Return paths over the planes in order, sorted by pose and tower, without a test for obstacles."""
         depth, vertices = (sequence >= 0).sum(axis=1), np.full((*sequence.shape, 3), np.nan)
         good = np.zeros(len(where), dtype=np.bool_)
         tolerance = RELATIVE_TOLERANCE * max(float(np.abs(links.sources_m).max(initial=1.0)), 1.0)
@@ -210,9 +211,9 @@ def specular_points(
     pair : (points,) int
     place_m : (points, 3)
     normal : (points, 3)
-        Of the tangent plane, upward.
+        Normal of the tangent plane, upward.
     part : (points,)
-        Of the plane's Fresnel zone that the ground fills along the profile, at most 1.
+        Share of the plane's Fresnel zone that the ground fills along the profile, at most 1.
     """
     none = np.zeros(0)
     pieces: list[tuple[IntArray, FloatArray, BoolArray, FloatArray]] = [(none.astype(int), none, none > 0.0, none)]
@@ -287,7 +288,7 @@ def _stationary(
 
 
 def _zone_m(along: FloatArray, at: FloatArray, excess_m: FloatArray, wavelength_m: float) -> FloatArray:
-    """Length of the stretch round ``at`` in which profiles (samples, points) lengthen a way by half a wavelength."""
+    """Return the length round ``at`` over which profiles (samples, points) lengthen a path by half a wavelength."""
     number, point = np.arange(len(along))[:, None], np.arange(len(at))
     half, width = wavelength_m / 2.0, np.zeros(len(at))
     beyond = ~(excess_m < half)

@@ -7,13 +7,13 @@ one-dimensional interpolant over the index is read at the target's index. They f
 - ``spline``: cubic with not-a-knot ends; three samples give the parabola, two the line.
 - ``makima``: modified Akima piecewise cubic Hermite; two samples give the line.
 
-Beyond the first and last sample the end piece is continued; one sample gives its value, none NaN.
+Beyond the first and last sample the end piece is extrapolated. One sample returns its value, and no samples return NaN.
 
-A reader will ask for three more: the nearest sample, inverse distance, and the mean over the area that a tower serves.
-All classes share ``fit(points_m, values)``, ``predict(targets_m)`` and ``leave_one_out()`` with
-:class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`; none knows its error, so the variance they return is NaN.
+Three more are included for comparison: the nearest sample, inverse distance, and the mean over the area that a tower
+serves. All classes share ``fit(points_m, values)``, ``predict(targets_m)`` and ``leave_one_out()`` with
+:class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`. They have no error estimate, so the variance they return is NaN.
 
-Quality of an interpolator: the paper's leave-one-out, and tests in which neighbours do not give the answer away.
+Quality of an interpolator: the paper's leave-one-out, and blocked tests, in which close neighbours are held out too.
 
 Errors are in the unit of the field (rank, dB). Rank is not rounded: the paper's MAE (section VII-C) compares the
 interpolated number. A position without a value (NaN, out of coverage) or without an estimate is not scored.
@@ -100,7 +100,7 @@ def _makima_tangents(slope: FloatArray) -> FloatArray:
 
 
 def spline(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
-    """Cubic spline with not-a-knot ends, one curve per row; shapes as in :func:`makima`."""
+    """Interpolate with a cubic spline with not-a-knot ends, one curve per row. Shapes are as in :func:`makima`."""
     x, y, at = _sorted(index, values, at)
     m = x.shape[-1]
     if m == 1:
@@ -147,9 +147,9 @@ def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
 
 
 def _hermite(x: FloatArray, y: FloatArray, tangent: FloatArray, at: FloatArray) -> FloatArray:
-    """Piecewise cubic Hermite at one abscissa per row; the end pieces continue outside."""
+    """Evaluate a piecewise cubic Hermite curve at one abscissa per row. The end pieces continue outside."""
     m = x.shape[-1]
-    # clipped: beyond the data the end piece is continued, as interp1 with 'extrap' does
+    # clipped: beyond the data the end piece is extrapolated, as interp1 with 'extrap' does
     piece = np.clip((x <= at[..., None]).sum(axis=-1) - 1, 0, m - 2)[..., None]
     left, right = np.take_along_axis(x, piece, -1), np.take_along_axis(x, piece + 1, -1)
     low, high = piece[..., None], piece[..., None] + 1
@@ -199,7 +199,7 @@ class _Local:
     seed: int = 0
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
-        """Store samples (n, dims) with values (n,) or (n, fields); NaN is out of coverage."""
+        """Store samples (n, dims) with values (n,) or (n, fields). NaN means out of coverage."""
         self.points_m_ = unmasked(points_m)
         fields = unmasked(values)
         if len(fields) != len(self.points_m_):
@@ -255,7 +255,7 @@ class IndexInterpolation(_Local):
     kind : {"spline", "makima"}
         The interpolant.
     grid : Grid
-        Gives each sample and target its index; all must lie on distinct cells.
+        Determines the index of each sample and target. All must lie in distinct cells.
     neighbours, radius_m, selection, seed
         As in :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`.
     """
@@ -272,7 +272,10 @@ class IndexInterpolation(_Local):
 
 
 class InverseDistance(_Local):
-    """Mean weighted by the inverse square of distance (Shepard 1968, doi:10.1145/800186.810616); exact at samples."""
+    """The mean weighted by the inverse square of distance, exact at samples.
+
+    Source: Shepard 1968, doi:10.1145/800186.810616.
+    """
 
     def _combine(self, near: _Near) -> FloatArray:
         at = near.distance_m < kriging.TIE_M
@@ -298,7 +301,7 @@ class ServingTowerMean:
         self.towers_m = towers_m
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
-        """Sum the samples (n, dims) with values (n,) or (n, fields) by tower; NaN does not count."""
+        """Sum the samples (n, dims) with values (n,) or (n, fields) by tower. NaN is ignored."""
         fields = unmasked(values)
         self._one_field = fields.ndim == 1
         self.values_ = fields[:, None] if self._one_field else fields
@@ -330,30 +333,30 @@ class ServingTowerMean:
 
 
 class Predictor(Protocol):
-    """Interface that :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging` and the baselines have in common."""
+    """The interface that :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging` and the baselines share."""
 
     def fit(self, points_m: ArrayLike, values: ArrayLike) -> Any:
-        """Store samples; returns itself."""
+        """Store samples and return the predictor."""
 
     def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Estimate and variance at targets."""
+        """Return estimate and variance at targets."""
         ...
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
-        """Estimate and variance at each sample from the others."""
+        """Return estimate and variance at each sample from the other samples."""
         ...
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """Errors of each field; every array has the shape of the fields, such as (altitudes, K).
+    """The errors of each field. Every array has the shape of the fields, such as (altitudes, K).
 
     Parameters
     ----------
     mae, rmse : ndarray
-        Mean absolute and root mean square error; NaN where nothing was scored.
+        Mean absolute and root mean square error. NaN if nothing was scored.
     n : ndarray of int
-        Scored positions.
+        Number of scored positions.
     """
 
     mae: FloatArray
@@ -386,14 +389,14 @@ def score(values: ArrayLike, estimate: ArrayLike) -> Score:
 
 
 def leave_one_out(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> Score:
-    """The paper's evaluation: each position from all others; values (n, altitudes, K) give MAE (altitudes, K)."""
+    """Score each position from all others, as in the paper. Values (n, altitudes, K) return MAE (altitudes, K)."""
     data = unmasked(values)
     estimate, _ = model.fit(points_m, data.reshape(len(data), -1)).leave_one_out()
     return score(data, estimate.reshape(data.shape))
 
 
 def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: float = 300.0) -> Score:
-    """Leave out one square block of the area at a time.
+    """Hold out one square block of the area at a time.
 
     Near neighbours of a left-out position are left out with it, so that the score says how the interpolator
     bridges gaps of about ``block_m``. Blocks start at the south-western position.
@@ -447,9 +450,9 @@ class Study:
     Parameters
     ----------
     correlation : BinnedCorrelation
-        Of the positions' vectors.
+        Correlation of the positions' vectors.
     fit : BiExponential
-        The curve through it.
+        Curve fitted to the correlation.
     scores : mapping of str to Score
         "Kriging", "makima", "spline" (the paper's), "nearest", "inverse distance", "serving-tower mean"; arrays of
         shape (altitudes, K).
@@ -463,9 +466,9 @@ class Study:
 def rank_fields(
     result: MapResult, out_of_coverage: Literal["missing", "zero"] = "missing"
 ) -> tuple[tuple[float, ...], FloatArray]:
-    """Altitudes and joint ranks (n, altitudes, K) to interpolate, from 30 m on: the paper leaves 3 m out.
+    """Return altitudes and joint ranks (n, altitudes, K) to interpolate, from ``LOWEST_M`` on as in the paper.
 
-    ``out_of_coverage``: a rank of 0 becomes NaN (no sample), or stays the number 0.
+    ``out_of_coverage`` determines whether a rank of 0 becomes NaN (no sample) or stays the number 0.
 
     Source: arXiv 2502.10324 eq. 7; arXiv 2502.10324 eq. 8.
     """
@@ -509,7 +512,7 @@ def interpolation_study(
     fit = _curve(correlation)
     rule: dict[str, Any] = {"neighbours": neighbours, "radius_m": radius_m, "selection": selection, "seed": seed}
     models: dict[str, Predictor] = {
-        # of one sample the weight is 1 at any distance
+        # the weight of a single sample is 1 at any distance
         "nearest": InverseDistance(neighbours=1, radius_m=radius_m),
         "inverse distance": InverseDistance(neighbours=neighbours, radius_m=radius_m),
         "serving-tower mean": ServingTowerMean(towers_m),
@@ -563,6 +566,6 @@ def kriging_wins(scores: Mapping[str, Score]) -> int:
 def _curve(correlation: variogram.BinnedCorrelation) -> variogram.BiExponential:
     if np.isfinite(correlation.correlation[1:]).any():
         return variogram.fit_biexponential(correlation.distance_m, correlation.correlation)
-    # Kriging needs some curve, and says that it is not one of these data
-    reason = "no two positions have varying rank vectors: the paper's curve stands in"
+    # Kriging requires a curve, and reports that this curve was not fitted to these data
+    reason = "no two positions have varying rank vectors: the paper's curve is used"
     return replace(variogram.PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)

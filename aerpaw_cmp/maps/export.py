@@ -55,8 +55,8 @@ class MapLayers:
     borders : sequence of Border
         Lines between the areas that two towers serve.
     credit : str
-        Of the map that the site was made of, "" for none: its licence asks for it in what is made of it. A CSV table
-        has no place for it.
+        Attribution of the map from which the site was made, "" if there is none. Its licence requires the attribution
+        in derived works. A CSV table has no place for it.
     """
 
     grid: Grid
@@ -102,7 +102,7 @@ def write_csv(path: str | Path, maps: MapLayers) -> Path:
         "longitude_deg": np.round(longitude, 9),
         **{layer.name: layer.values for layer in maps.layers},
     }
-    # names of towers may be a stranger's, and a spreadsheet runs a cell that begins with =
+    # names of towers may be third-party input, and a spreadsheet executes a cell that begins with =
     target = Path(path)
     guarded(pd.DataFrame(table)).to_csv(target, index=False, lineterminator="\n")
     return target
@@ -139,9 +139,10 @@ def write_kmz(path: str | Path, maps: MapLayers, *, title: str = "Coverage and r
 
 
 def _bounding_box(maps: MapLayers) -> tuple[float, float, float, float]:
-    """North, south, east, west [deg] of the grid's edge.
+    """Return north, south, east and west [deg] of the grid's edge.
 
-    A KML box follows meridians and parallels, the grid the site's east and north; over 2 km the corners agree
+    A KML box follows meridians and parallels, and the grid follows the site's east and north. Over 2 km the corners
+    agree
     within 0.3 m, so the middles of the four edges are used.
     """
     half = maps.grid.spacing_m / 2
@@ -155,7 +156,7 @@ def _bounding_box(maps: MapLayers) -> tuple[float, float, float, float]:
 
 
 def _range(layer: Layer) -> tuple[float, float]:
-    """Colour range: 2nd to 98th percentile, so that one position beside a tower does not flatten the map."""
+    """Return the colour range, 2nd to 98th percentile: one position next to a tower must not flatten the map."""
     finite = np.asarray(layer.values, dtype=np.float64)
     finite = finite[np.isfinite(finite)]
     if not finite.size:
@@ -165,7 +166,7 @@ def _range(layer: Layer) -> tuple[float, float]:
 
 
 def _colours(layer: Layer, low: float, high: float) -> AnyArray:
-    """Colours (n, 4) between 0 and 1; out of coverage is the grey of Z, half transparent."""
+    """Return colours (n, 4) between 0 and 1. Positions out of coverage are grey and half transparent."""
     from matplotlib import colormaps
     from matplotlib.colors import to_rgba_array
 
@@ -236,7 +237,7 @@ def maps_dataset(
     for layer in further:
         plane = first.grid.raster(np.asarray(layer.values))
         if layer.classes:
-            # rank_1, not 1: beside flag_values a bare number would be taken for a value
+            # rank_1, not 1: next to flag_values a bare number would be mistaken for a value
             codes = tuple(f"rank_{c}" if c.isdigit() else c for c in layer.classes)
             variables[layer.name] = _PLANE, plane.astype(np.int8), _codes(codes, layer.title)
         else:

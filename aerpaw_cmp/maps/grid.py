@@ -1,19 +1,19 @@
-"""The map grid in the paper's order, the tower that serves each position, and coverage as a class of its own.
+"""The map grid in the paper's order, the serving tower of each position, and out of coverage as a separate class.
 
 Positions are numbered from the south-west corner, east first, then one row north (arXiv 2502.10324,
-section VI-A), so that position ``i`` of ``columns`` lies in row ``i // columns`` and column ``i % columns``.
-Each position is the centre of its cell: 1080 m x 2130 m at 30 m gives 36 x 71 = 2556 positions.
+section VI-A). Position ``i`` of ``columns`` is therefore in row ``i // columns`` and column ``i % columns``.
+Each position is the centre of its cell: 1080 m x 2130 m at 30 m contains 36 x 71 = 2556 positions.
 
 The map job: RSS and rank of every tower at every position and altitude, alone and jointly.
 
-The replay engine is handed in as a function, so that nothing here knows an engine::
+The replay engine is passed as a function, so that this module does not depend on an engine::
 
     evaluate(position_m (n, 3), tower_names) -> Evaluation
 
-It is called for one altitude and at most ``chunk`` positions at a time; what grows with the number of altitudes is
-the result alone: per tower and position 24 bytes of levels, 16 bytes of singular-value ratios, 1 byte of rank per K.
+The function is called for one altitude and at most ``chunk`` positions at a time. Only the result grows with the number
+of altitudes: per tower and position 24 bytes of levels, 16 bytes of singular-value ratios, and 1 byte of rank per K.
 
-The link budget of a map: transmit power, noise floor, and the level from which a position counts as covered.
+The link budget of a map: transmit power, noise floor, and the lowest level of a covered position.
 """
 
 from __future__ import annotations
@@ -72,16 +72,16 @@ class Grid:
             raise ValueError(f"grid spacing is {self.spacing_m} m; expected a positive length")
         for name, axis in (("east_m", self.east_m), ("north_m", self.north_m)):
             if axis.ndim != 1 or len(axis) == 0 or not np.allclose(np.diff(axis), self.spacing_m, rtol=1e-9):
-                raise ValueError(f"{name} is no ascending axis with a step of {self.spacing_m} m")
+                raise ValueError(f"{name} is not an ascending axis with a step of {self.spacing_m} m")
 
     @classmethod
     def over_area(cls, area_m: tuple[float, float, float, float], spacing_m: float = PAPER_SPACING_M) -> Grid:
-        """Cells of ``spacing_m`` centred in ``(east_min, east_max, north_min, north_max)``; a remainder is left out.
+        """Return cells of ``spacing_m`` centred in ``(east_min, east_max, north_min, north_max)``, without a remainder.
 
         Raises
         ------
         UsageError
-            If not one cell fits into the area.
+            If the area is smaller than one cell.
         """
         east_min, east_max, north_min, north_max = area_m
         axes = []
@@ -132,31 +132,31 @@ class Grid:
         return np.column_stack([self.points_m, np.full(len(self), float(altitude_m))])
 
     def raster(self, values: ArrayLike) -> AnyArray:
-        """Values ``(n, ...)`` in index order as ``(rows, columns, ...)``; row 0 is the south."""
+        """Return values ``(n, ...)`` in index order as ``(rows, columns, ...)``. Row 0 is the south."""
         array = unmasked(values) if isinstance(values, np.ma.MaskedArray) else np.asarray(values)
         return array.reshape(*self.shape, *array.shape[1:])
 
     def index_of(self, points_m: ArrayLike) -> IntArray:
-        """Position index of the cell that holds each point (n, 2+); -1 outside the grid."""
+        """Return the position index of the cell that contains each point (n, 2+). -1 outside the grid."""
         points = unmasked(points_m)
         rows, columns = self.shape
         # a point on the border of two cells belongs to the eastern or northern one
         column = np.floor((points[..., 0] - self.east_m[0]) / self.spacing_m + 0.5)
         row = np.floor((points[..., 1] - self.north_m[0]) / self.spacing_m + 0.5)
         inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-        # outside, row and column may be NaN, which no integer is
+        # outside, row and column may be NaN, which cannot be an integer
         return np.where(inside, np.where(inside, row, 0) * columns + np.where(inside, column, 0), -1).astype(np.int64)
 
 
 def serving_tower(points_m: ArrayLike, towers_m: ArrayLike) -> IntArray:
-    """Index of the nearest tower (horizontal distance) of each point; a tie goes to the first in drawing order.
+    """Return the index of the nearest tower (horizontal distance) for each point. The first tower wins a tie.
 
     Parameters
     ----------
     points_m : (n, 2) or (n, 3)
         East, north (, up) [m].
     towers_m : (towers, 2) or (towers, 3)
-        The same for towers; heights do not count.
+        East, north (, up) of the towers [m]. Heights are ignored.
 
     Returns
     -------
@@ -288,7 +288,7 @@ Antennas = Literal["siso", "mimo"]
 
 @dataclass(frozen=True, slots=True)
 class Evaluation:
-    """Result of the engine at n positions and t towers; NaN (singular values: NaN or 0) where there is no path.
+    """The result of the engine at n positions and t towers. Levels are NaN if there is no path.
 
     Parameters
     ----------
@@ -297,7 +297,7 @@ class Evaluation:
     level_sd_db : (n, t)
         Standard deviation of the level over the element pairs of the arrays.
     singular_values : (n, t, r)
-        Of the channel matrix, descending.
+        Singular values of the channel matrix, descending. NaN or 0 if there is no path.
     """
 
     rss_siso_dbm: FloatArray
@@ -356,15 +356,15 @@ class MapResult:
     borders: tuple[Border, ...]
 
     def rss(self, antennas: Antennas = "mimo", tower: str | None = None) -> FloatArray:
-        """RSS (altitudes, n) of one tower, or jointly: of the serving tower of each position."""
+        """Return RSS (altitudes, n) of one tower, or of the serving tower of each position."""
         return self._of(self.rss_siso_dbm if antennas == "siso" else self.rss_mimo_dbm, tower)
 
     def ranks(self, tower: str | None = None) -> NDArray[np.int8]:
-        """Rank (altitudes, K, n) of one tower, or jointly."""
+        """Return rank (altitudes, K, n) of one tower, or of the serving tower of each position."""
         return np.asarray(self._of(self.rank, tower), dtype=np.int8)
 
     def rank_shares(self, tower: str | None = None) -> FloatArray:
-        """Shares (altitudes, K, 1 + highest rank) of the classes Z, 1, 2, ... (the paper's rank distributions)."""
+        """Return shares (altitudes, K, 1 + highest rank) of out of coverage and of ranks 1, 2, ... as in the paper."""
         rank = self.ranks(tower)
         return np.stack([(rank == number).mean(axis=-1) for number in range(HIGHEST_RANK + 1)], axis=-1)
 
@@ -463,13 +463,13 @@ def map_job(
 
 
 def rank_of_singular_values(singular_values: ArrayLike, ks: Sequence[float]) -> IntArray:
-    """Channel rank (..., K): how many of ``sigma`` (..., r), descending, exceed ``sigma_1 / k``; 0 for no channel."""
+    """Return the channel rank (..., K): the number of ``sigma`` (..., r) above ``sigma_1 / k``. 0 for no channel."""
     sigma = unmasked(singular_values)
     return np.stack([rank_from_singular_values(sigma, k) for k in ks], axis=-1)
 
 
 def _ratios_db(singular_values: FloatArray) -> FloatArray:
-    """sigma_1 / sigma_2 and sigma_1 / sigma_last (2, n, t) [dB]."""
+    """Return sigma_1 / sigma_2 and sigma_1 / sigma_last (2, n, t) [dB]."""
     sigma = np.nan_to_num(singular_values)
     covered = sigma[..., 0] > 0
     # one element at an end: there is no second value, and the ratio of the first to itself is 1
@@ -551,7 +551,7 @@ def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
 
 
 def _label(tower: str | None) -> tuple[str, str]:
-    """Give the parts of a layer's name and title that speak of a tower."""
+    """Return the parts of a layer's name and title that identify its tower."""
     # names of layers become columns, files in the KMZ and variables of NetCDF
     return (re.sub(r"\W", "_", tower), f", {tower}") if tower else ("joint", ", nearest tower")
 
@@ -633,20 +633,20 @@ class LinkBudget:
 
     @property
     def noise_dbm(self) -> float | None:
-        """Noise floor of the receiver [dBm]; None without a bandwidth."""
+        """The noise floor of the receiver [dBm]. None without a bandwidth."""
         if self.bandwidth_mhz is None:
             return None
         return THERMAL_NOISE_DBM_HZ + 10.0 * math.log10(self.bandwidth_mhz * 1e6) + self.noise_figure_db
 
     @property
     def level_dbm(self) -> float | None:
-        """Lowest covered level [dBm]; None if every path counts."""
+        """The lowest covered level [dBm]. None if every path counts."""
         if self.threshold_snr_db is not None and self.noise_dbm is not None:
             return self.noise_dbm + self.threshold_snr_db
         return self.threshold_dbm
 
     def covered(self, level_dbm: FloatArray) -> FloatArray:
-        """Return 1 for covered positions and 0 for others, in the shape of the levels [dBm]; NaN is not covered."""
+        """Return 1 for covered positions and 0 for others, in the shape of the levels [dBm]. NaN is not covered."""
         lowest = -math.inf if self.level_dbm is None else self.level_dbm
         return (level_dbm >= lowest).astype(float)
 

@@ -1,8 +1,8 @@
 """Ordinary Kriging in moving neighbourhoods, in the plane or in space.
 
 The semivariogram of the paper is ``gamma = v^2 (1 - Phi)`` (arXiv 2502.10324, section VI-B). The weights do not
-depend on ``v^2``, and ``v^2 = 0`` would make the textbook system singular, so the system is solved for
-``1 - Phi`` and ``v^2`` enters only the variance::
+depend on ``v^2``, and ``v^2 = 0`` would make the textbook system singular. The system is therefore solved for
+``1 - Phi``, and ``v^2`` only scales the variance::
 
     [ 1 - Phi  1 ] [ w ]   [ 1 - Phi_0 ]
     [    1     0 ] [ L ] = [     1     ]        variance = v^2 (w . (1 - Phi_0) + L)
@@ -10,27 +10,29 @@ depend on ``v^2``, and ``v^2 = 0`` would make the textbook system singular, so t
 Rules, each with a test:
 
 nugget
-    ``1 - Phi(0+)``. It is a jump, not a smoothing: gamma of a sample with itself is 0, so that a target at the
-    place of a sample takes its value with variance 0.
+    ``1 - Phi(0+)``. It is a jump, not a smoothing: gamma of a sample with itself is 0. A target at the position of a
+    sample therefore takes its value with variance 0.
 places
-    Samples at the same place (to a micrometre) become one, their mean; leaving one out leaves out the place.
+    Samples at the same position (to a micrometre) become one sample, their mean. Leave-one-out holds out the position.
 near-singular systems
-    A system whose condition number (1-norm) exceeds 1e10, or whose variances are not all positive (a correlation
-    that is no covariance), is solved in the space of weights that sum to 1 by an eigenvalue decomposition.
-    Directions with less than 1e-10 of the largest variance, or less than the most negative one, are dropped. In
+    A system is near-singular if its condition number (1-norm) exceeds 1e10, or if a variance is not positive because
+    the correlation is not a valid covariance. It is solved by an eigenvalue decomposition in the space of weights that
+    sum to
+    1. Directions with less than 1e-10 of the largest variance, or less than the most negative variance, are dropped. In
     dropped directions the weights stay equal.
 out of coverage
-    NaN values take no part, field by field.
+    NaN values are ignored in each field.
 too few samples
-    With fewer than M within the radius all of them are used; with one, its value; with none the estimate and its
-    variance are NaN, or (``outside="nearest"``) the M nearest are used whatever their distance.
+    If fewer than M samples are within the radius, all of them are used. A single sample is the estimate. If there is
+    no sample, the estimate and its variance are NaN, or (``outside="nearest"``) the M nearest samples are used
+    regardless of their distance.
 
-Choice of the samples that an interpolator may use: the M nearest within a radius, or M at random within it.
+An interpolator may use the M nearest samples within a radius, or M random samples within the radius.
 
-The tie rule. Distances that agree to a micrometre are tied. Tied samples are taken by their offset from the
-target: lower first, then southern first, then western first. On a regular grid the rule gives every inner
-target the same pattern of neighbours, and it does not depend on the order in which samples were given (only samples
-at the same place are taken in that order).
+The tie rule: distances that agree to a micrometre are tied. Tied samples are ordered by their offset from the target:
+lower first, then southern, then western. On a regular grid every inner target therefore has the same pattern of
+neighbours. The pattern does not depend on the order in which samples were given, except for samples at the same
+position.
 """
 
 from __future__ import annotations
@@ -91,9 +93,9 @@ def nearest(
     m : int
         Largest number of samples per target.
     radius_m : float
-        May be infinite.
+        Search radius, may be infinite.
     skip : (targets,) int, optional
-        One sample per target that does not count (leave-one-out); -1 for none.
+        One sample per target that is excluded (leave-one-out). -1 means none.
 
     Returns
     -------
@@ -105,7 +107,7 @@ def nearest(
     if len(samples_m) == 0 or len(targets_m) == 0:
         return chosen
     tree = cKDTree(samples_m)
-    # one more than wanted: only its distance tells whether a tie goes on beyond the last
+    # one more than required: its distance shows whether a tie continues beyond the last neighbour
     least = m + 1 + (skip is not None)
     candidates = least
     order = in_strips(targets_m, QUERY_CHUNK)
@@ -149,12 +151,12 @@ def by_rule(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, skip: IntA
 
 
 def renumbered(taken: BoolArray) -> IntArray:
-    """Number of each sample among those of a mask (samples,); -1 of the others."""
+    """Return the number of each sample among those of a mask (samples,). -1 for samples outside the mask."""
     return np.where(taken, np.cumsum(taken) - 1, -1)
 
 
 def in_strips(places_m: FloatArray, together: int) -> IntArray:
-    """Order of places in which ``together`` of them in a row fill a square: strips from south to north."""
+    """Return an order of positions in which ``together`` of them in a row fill a square: strips from south to north."""
     if not len(places_m):
         return np.empty(0, dtype=np.int64)
     east, north = (places_m - places_m.min(axis=0)).T[:2]
@@ -171,25 +173,25 @@ def _fill_nearest(
     candidates: int,
     chosen: Neighbours,
 ) -> IntArray:
-    """Fill the rows ``todo`` from so many ``candidates``; the rows for which a tie reaches the last candidate."""
+    """Fill the rows ``todo`` from ``candidates`` per target. Return the rows whose tie reaches the last candidate."""
     samples_m, m = tree.data, chosen.index.shape[1]
     candidates = min(candidates, len(samples_m))
-    # a list of ranks, for a plain 1 would drop an axis; the bound itself would be left out by the tree
+    # a list of ranks, because a plain 1 would drop an axis; the tree excludes the bound itself
     distance, who = tree.query(targets_m[todo], k=np.arange(1, candidates + 1), distance_upper_bound=radius_m + TIE_M)
     last = _in_micrometres(distance[:, -1])
     exhausted = (candidates == len(samples_m)) | ~np.isfinite(last)
     if skip is not None:
-        # asked for and taken out, for a tree without it would have to be built for every target
+        # queried and then removed: a tree without this sample would have to be built for every target
         excluded = who == skip[todo, None]
         distance[excluded] = np.inf
-        # the sample left out goes to the end, the order of the others stays
+        # the excluded sample goes to the end, and the order of the others stays
         order = np.argsort(excluded, axis=1, kind="stable")
         distance, who = np.take_along_axis(distance, order, axis=1), np.take_along_axis(who, order, axis=1)
     ring = _in_micrometres(distance)
     tied = (ring[:, 1:] == ring[:, :-1]) & np.isfinite(ring[:, 1:])
     rows = np.flatnonzero(tied.any(axis=1))
     if len(rows):
-        # where there is no further neighbour the tree answers with the number of samples, which is no row
+        # for a missing neighbour the tree returns the number of samples, which is not a valid row
         numbers = np.where(np.isfinite(distance[rows]), who[rows], 0)
         order = _tie_order(distance[rows], numbers, samples_m, targets_m[todo[rows]])
         distance[rows], who[rows] = (np.take_along_axis(a[rows], order, axis=1) for a in (distance, who))
@@ -247,19 +249,19 @@ def _random_within(rule: Rule, samples_m: FloatArray, targets_m: FloatArray, ski
 # Correlation as a function of distance [m]; vectorised.
 Correlation = Callable[[FloatArray], FloatArray]
 
-# Of float64's sixteen digits a solution then keeps six.
+# A solution then keeps six of float64's sixteen digits.
 CONDITION_LIMIT = 1e10
-# Sum of magnitudes beyond which an estimate is said to be doubtful; correlations that fall from 0 on stay below 3.
+# Sum of magnitudes above which an estimate is reported as doubtful. Correlations that fall from 0 on stay below 3.
 LARGEST_WEIGHTS = 100.0
 # Targets whose neighbours' offsets agree to this share one set of weights.
 _SHARE_M = 1e-9
-# Below this bound of the condition number a Cholesky solution has 9 digits and more, and needs no second look.
+# Below this bound of the condition number a Cholesky solution has at least 9 digits, so no second solution is needed.
 SOUND_CONDITION = 1e6
-# Pivots alone bound nothing, but of 40 000 systems of six correlations, samples in lines and clusters among them, none
-# whose pivots gave less had a bound above 1e5; the bound itself takes as long as the solution.
+# Pivots alone are not a bound. But among 40 000 systems of six correlations, including samples in lines and clusters,
+# no system with a pivot ratio below this had a bound above 1e5. The bound takes as long as the solution.
 PLAINLY_SOUND = 3e3
-# Targets that may share weights and whose systems are factored at once: enough to hide the calls. Systems of many
-# neighbours are fewer, so that a factor stays at this many numbers.
+# Number of targets that may share weights and whose systems are factored together, large enough to hide the calls. It
+# is smaller for systems of many neighbours, so that a factor has at most this many numbers.
 CHUNK, FACTOR_NUMBERS = 2048, 2**20
 
 
@@ -304,16 +306,16 @@ class OrdinaryKriging:
     selection : {"nearest", "random"}
         The M nearest (ties by the rule of :mod:`~aerpaw_cmp.maps.kriging`), or M drawn within the radius.
     seed : int
-        Of the random selection.
+        Seed of the random selection.
     outside : {"nan", "nearest"}
-        What happens where no sample lies within the radius.
+        Result where no sample lies within the radius.
     bounds : (low, high), optional
         Limits of the estimates, such as (1, 4) for ranks.
 
     Attributes
     ----------
     points_m_ : (places, dims)
-        Distinct sample places.
+        Distinct sample positions.
     values_ : (places, fields)
         Their values.
     place_ : (samples,) int
@@ -323,8 +325,9 @@ class OrdinaryKriging:
 
     Notes
     -----
-    Weights can be negative, so an estimate can lie outside the range of its samples, most with a correlation that is
-    smooth at 0: of ranks 1 and 4 a Gaussian correlation made -6.9 to 11.3. ``bounds`` limits the estimates.
+    Weights can be negative, so an estimate can lie outside the range of its samples. The effect is largest for a
+    correlation that is smooth at 0: from ranks 1 and 4 a Gaussian correlation produced -6.9 to 11.3. ``bounds`` limits
+    the estimates.
 
     Examples
     --------
@@ -367,7 +370,7 @@ class OrdinaryKriging:
             )
         if np.isinf(fields).any():
             raise UsageError("an infinite sample value", expected="finite values, NaN where out of coverage")
-        # remembered, so that estimates come back in the shape that the values had
+        # estimates are returned in the shape of the values
         self._one_field = fields.ndim == 1
         fields = fields[:, None] if self._one_field else fields
         self.points_m_, self.values_, self.place_ = _merge_places(points, fields)
@@ -375,20 +378,20 @@ class OrdinaryKriging:
         return self
 
     def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Estimate and Kriging variance at targets (t, dims), each ``(t,)`` or ``(t, fields)`` like the values."""
+        """Return estimate and Kriging variance at targets (t, dims), both (t,) or (t, fields) like the values."""
         targets = _as_points(targets_m)
         if targets.shape[1] != self.points_m_.shape[1]:
             raise UsageError(f"targets with {targets.shape[1]} coordinates, samples with {self.points_m_.shape[1]}")
         return self._shaped(*self._estimate(targets, None))
 
     def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
-        """Estimate and variance at every sample from the others; shapes as the values given to ``fit``."""
+        """Return estimate and variance at every sample from the others, in the shape of the values of ``fit``."""
         place = np.arange(len(self.points_m_))
         estimate, variance = self._estimate(self.points_m_, place)
         return self._shaped(estimate[self.place_], variance[self.place_])
 
     def weights(self, targets_m: ArrayLike) -> Weights:
-        """Weights at targets for a field with a value at every place."""
+        """Return the weights at targets for a field with a value at every position."""
         return self._weights(self.points_m_, _as_points(targets_m), None)
 
     # --- settings and shapes -------------------------------------------------------------------------------------
@@ -423,10 +426,10 @@ class OrdinaryKriging:
     # --- estimation ----------------------------------------------------------------------------------------------
 
     def _estimate(self, targets: FloatArray, place: IntArray | None) -> tuple[FloatArray, FloatArray]:
-        """Estimate and variance (targets, fields); ``place`` is the one that each target must not use."""
+        """Return estimate and variance (targets, fields). ``place`` is the position that each target must not use."""
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
         variance = np.full_like(estimate, np.nan)
-        # fields with values at the same places share one set of weights, as the 27 ranks of a map do
+        # fields with values at the same positions share one set of weights, like the 27 ranks of a map
         for covered, columns in coverage_patterns(self.values_):
             skip = None if place is None else renumbered(covered)[place]
             rule = self._weights(self.points_m_[covered], targets, skip)
@@ -516,9 +519,9 @@ class OrdinaryKriging:
         if len(hard := np.flatnonzero(~sound)):
             w, variance[hard], regularised[hard] = _solve_doubtful(_square(between[:, hard], m), to_target.T[hard])
             weight[:, hard] = w.T
-        # beside a sample the true variance is 0, and rounding lies on either side of it
+        # next to a sample the true variance is 0, and rounding can make it negative
         variance = np.maximum(variance, 0.0)
-        at = here.any(axis=0)  # the solution is known there; rounding must not blur it
+        at = here.any(axis=0)  # the solution is known there; rounding must not change it
         weight[:, at], variance[at] = here[:, at], 0.0
         return weight, variance, regularised
 
@@ -542,16 +545,16 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
 
     Notes
     -----
-    With ``C = 1 - gamma = L L'`` and ``c = 1 - gamma_0`` the bordered system is ``C w = c + mu 1``: a Cholesky factor,
-    and the Lagrange multiplier ``mu`` from the Schur complement ``1' C^-1 1``. The trace of ``C^-1`` bounds the
-    condition number of C by ``m trace``; it is taken where the pivots do not rule out that this is large.
+    With ``C = 1 - gamma = L L'`` and ``c = 1 - gamma_0`` the bordered system is ``C w = c + mu 1``. A Cholesky factor
+    solves it, with the Lagrange multiplier ``mu`` from the Schur complement ``1' C^-1 1``. The trace of ``C^-1`` bounds
+    the condition number of C by ``m trace``. It is computed unless the pivots rule out a large bound.
     """
     m, t = to_target.shape
     # by columns, so that a step adds up planes that lie in a row in memory; two rows more: L^-1 c and L^-1 1
     factor, weight, inverse_pivot = np.empty((m, m + 2, t)), np.empty((m, t)), np.empty((m, t))
     # a slice of ``gamma`` is one column of the lower triangle, in the order of _between
     end = 0
-    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # NaN where C is no covariance
+    with np.errstate(invalid="ignore", divide="ignore", over="ignore"):  # NaN if C is not a covariance
         for j in range(m):
             start, end = end, end + m - 1 - j
             column = factor[j, j:]
@@ -577,7 +580,7 @@ def solve_schur(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, F
 
 
 def _trace_of_inverse(factor: FloatArray, inverse_pivot: FloatArray) -> FloatArray:
-    """Trace (t,) of ``C^-1``, the sum of squares in ``L^-1``; ``L`` by columns (m, m and more, t)."""
+    """Return the trace (t,) of ``C^-1``, the sum of squares in ``L^-1``. ``L`` is by columns (m, m or more, t)."""
     inverse = np.zeros((len(factor), *inverse_pivot.shape))
     for j, pivot in enumerate(inverse_pivot):
         np.multiply(np.einsum("kt,kit->it", factor[:j, j], inverse[:j, :j]), -pivot, out=inverse[j, :j])
@@ -634,11 +637,11 @@ def _solve_reduced(gamma: FloatArray, to_target: FloatArray) -> FloatArray:
     spread = _contrasts(gamma)
     right = basis @ (gamma.mean(axis=2) - to_target)[:, :, None]
     level, direction = np.linalg.eigh((spread + spread.transpose(0, 2, 1)) / 2)
-    # a direction weaker than the most negative one, an impossible variance, is not told from error
+    # a direction weaker than the most negative one, which is an impossible variance, may be only rounding error
     strong = level > np.maximum(np.maximum(level[:, -1:], 1e-300) / CONDITION_LIMIT, -level[:, :1])
     along = (direction.transpose(0, 2, 1) @ right)[:, :, 0]
     along = np.where(strong, along / np.where(strong, level, 1.0), 0.0)
-    # the equal weights solve the constraint; the basis holds what may be added without breaking it
+    # equal weights satisfy the constraint; the basis contains what may be added without breaking it
     return np.asarray(1.0 / m + (direction @ along[:, :, None])[:, :, 0] @ basis)
 
 
@@ -657,13 +660,13 @@ def _is_definite(gamma: FloatArray) -> BoolArray:
     covariance = _contrasts(gamma)
     try:
         np.linalg.cholesky(covariance)
-    except np.linalg.LinAlgError:  # at least one is not; the slower way tells which
+    except np.linalg.LinAlgError:  # at least one is not; the slower method finds which
         return np.asarray(np.linalg.eigvalsh(covariance)[:, 0] > 0)
     return np.ones(len(gamma), dtype=bool)
 
 
 def _variance_of(weight: FloatArray, gamma: FloatArray, to_target: FloatArray) -> FloatArray:
-    """Normalised variance of any weights that sum to 1: 2 w.g0 - w.G.w."""
+    """Return the normalised variance of any weights that sum to 1: 2 w.g0 - w.G.w."""
     return np.asarray(2 * (weight * to_target).sum(axis=1) - np.einsum("ti,tij,tj->t", weight, gamma, weight))
 
 
@@ -685,7 +688,7 @@ def _apply(rule: Weights, values: FloatArray) -> FloatArray:
 
 
 def _reference(values: FloatArray) -> FloatArray:
-    """First finite value of each field (fields,); 0 for a field without any."""
+    """Return the first finite value of each field (fields,). 0 for a field without finite values."""
     finite = np.isfinite(values)
     if not len(values):
         return np.zeros(values.shape[1])
@@ -728,14 +731,14 @@ def _same_geometry(offset_m: FloatArray) -> tuple[IntArray | slice, IntArray | s
     t = offset_m.shape[2]
     alone = slice(None), slice(None)
     if len(np.unique(np.round(offset_m[:, 0].sum(axis=0) / TIE_M))) == t:
-        return alone  # scattered samples: seen at a tenth of the cost
-    # integers compare exactly, and a nanometre takes up the rounding of coordinates of kilometres
+        return alone  # scattered samples: detected at a tenth of the cost
+    # integers compare exactly, and a nanometre covers the rounding of coordinates of kilometres
     offset = np.round(offset_m.reshape(-1, t) / _SHARE_M).astype(np.int64)
-    # one number tells a target: the sum with random odd factors, modulo 2^64
+    # one number identifies a target: the sum with random odd factors, modulo 2^64
     factors = np.random.default_rng(0).integers(1, 2**62, len(offset), dtype=np.int64) | 1
     _, example, group = np.unique(factors @ offset, return_index=True, return_inverse=True)
     if not (offset[:, example[group]] == offset).all():
-        return alone  # two targets with one number: nothing is shared, the result is the same
+        return alone  # two targets with the same number: nothing is shared, and the result is the same
     return example, group
 
 
@@ -748,7 +751,7 @@ def _as_points(points_m: ArrayLike) -> FloatArray:
     return points
 
 
-# Samples from which a factor of the trend can be told from a constant.
+# Fewest samples from which a factor of the trend can be distinguished from a constant.
 _FEWEST_FOR_TREND = 3
 
 
@@ -770,9 +773,9 @@ class TrendKriging:
 
     Notes
     -----
-    The estimate is ``w . z`` with the weights of the system of :class:`OrdinaryKriging` and one more condition, that
-    the trend f is reproduced: ``w . f = f_0``. If the trend is nearly constant among the neighbours, or fewer than
-    three are known, the condition is left out.
+    The estimate is ``w . z`` with the weights of the system of :class:`OrdinaryKriging` and one more condition: the
+    trend f must be reproduced, ``w . f = f_0``. The condition is omitted if the trend is nearly constant among the
+    neighbours, or if fewer than three are known.
 
     Examples
     --------
@@ -789,7 +792,7 @@ class TrendKriging:
     bounds: tuple[float, float] | None = None
 
     def fit(self, points_m: ArrayLike, values: ArrayLike, trend: ArrayLike) -> TrendKriging:
-        """Store samples (n, dims) with a value (n,) and a trend (n,); samples with a NaN on either side are left out.
+        """Store samples (n, dims) with a value (n,) and a trend (n,). Samples with a NaN in either are ignored.
 
         Raises
         ------
@@ -813,7 +816,7 @@ class TrendKriging:
         return self
 
     def predict(self, targets_m: ArrayLike, trend: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """Return estimate and Kriging variance (t,) at targets (t, dims) with their trend (t,); NaN without a trend."""
+        """Return estimate and Kriging variance (t,) at targets (t, dims) with their trend (t,). NaN without a trend."""
         targets, wanted = _as_points(targets_m), unmasked(trend)
         if wanted.shape != (len(targets),):
             raise UsageError(f"trend of shape {wanted.shape} for {len(targets)} targets", expected="(t,)")
@@ -831,7 +834,8 @@ class TrendKriging:
         points, f = self.points_m_[used], self.trend_[used]
         conditions, aim = [np.ones(len(used))], [1.0]
         if len(used) >= _FEWEST_FOR_TREND and np.ptp(f) > 1e-6 * max(float(np.abs(f).max()), 1.0):
-            scale = float(np.ptp(f))  # conditions of one size: a trend in dBm beside a one makes the system stiff
+            # scale the conditions equally: a trend in dBm next to a one makes the system ill-conditioned
+            scale = float(np.ptp(f))
             conditions, aim = [*conditions, (f - f.mean()) / scale], [*aim, (trend - float(f.mean())) / scale]
         n, extra = len(used), len(conditions)
         between = np.linalg.norm(points[:, None] - points[None], axis=-1)

@@ -1,23 +1,23 @@
-"""Tiles of a map in a Zarr store: written as they come, read back as a map; one that is half written is gone on with.
+"""Tiles of a map in a Zarr store. They are written as they are computed, and a partial store is continued.
 
-The store has the variables of ``maps.nc`` (:mod:`aerpaw_cmp.maps.export`), a tile a chunk. ``tile_sha256`` has the
-SHA-256 of the chunk files of each tile, entered when they are written: a killed run costs what was in work, and a tile
-whose files are missing or were changed is computed again.
+The store has the variables of ``maps.nc`` (:mod:`aerpaw_cmp.maps.export`), with one chunk per tile. ``tile_sha256``
+contains the SHA-256 of the chunk files of each tile and is written with them. A killed run loses only the tiles in
+work, and a tile whose files are missing or changed is computed again.
 
-A store that is there is data of somebody else until its metadata were compared, as text, with those that this job
-writes: Zarr runs the codecs that a store names.
+An existing store is untrusted until its metadata match, as text, those that this job would write, because Zarr runs the
+codecs that a store names.
 
-Tiles of a map: what can reach each, and their values joined again.
+The module also determines what can reach each tile, and joins the values of tiles.
 
-A tile is evaluated with the towers and buildings that can reach it. None that matters is left out where at most one
-reflection is followed over level ground: seen from above a path then lies on the line between its ends, or on the two
-lines from a tower to a wall and on to the tile. So a building counts if it comes near
+A tile is evaluated with the towers and buildings that can reach it. No relevant building is omitted if at most one
+reflection is followed over level ground: seen from above, a path then lies on the line between its ends, or on the two
+lines from a tower to a wall and on to the tile. A building therefore counts if it comes near
 
-- the convex hull of tower and tile (which also holds the reflections off ground and roofs), or
-- the hull of tower and wall, or of wall and the part of the tile in its beam, for each wall whose beam from the
-  mirrored tower may meet the tile.
+- the convex hull of tower and tile (which also contains the reflections off ground and roofs), or
+- the hull of tower and wall, or of wall and the part of the tile in its beam. This holds for each wall whose beam from
+  the mirrored tower may meet the tile.
 
-With more reflections, terrain or a scene of triangles every building is kept.
+With more reflections, terrain or a scene of triangles every building is included.
 """
 
 from __future__ import annotations
@@ -60,14 +60,14 @@ PLANES = ("rss_siso_dbm", "rss_mimo_dbm", "level_sd_db", "rank", "spread_db", "c
 
 @dataclass(frozen=True, slots=True)
 class Tiling:
-    """A grid in square tiles of ``cells`` positions a side, numbered as positions are; the last may be smaller."""
+    """A grid in square tiles with ``cells`` positions per side, numbered like positions. The last may be smaller."""
 
     grid: Grid
     cells: int
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Rows and columns of tiles."""
+        """The rows and columns of tiles."""
         rows, columns = self.grid.shape
         return -(-rows // self.cells), -(-columns // self.cells)
 
@@ -117,9 +117,9 @@ class Budget:
     ----------
     carrier_hz, transmit_power_dbm : float
     gain_db : float
-        Of the arrays, when all elements add in phase.
+        Gain of the arrays when all elements add in phase.
     floor_dbm : float
-        A level below it is out of coverage.
+        Levels below it are out of coverage.
     """
 
     carrier_hz: float
@@ -270,12 +270,12 @@ class TileStore:
         self._force, self.damaged = force, 0
 
     def begin(self, empty: Mapping[str, MapResult], frame: SiteFrame, about: Mapping[str, str]) -> list[int]:
-        """Make the store unless it is there; the tiles that it lacks.
+        """Create the store unless it exists, and return the tiles that are missing.
 
         Parameters
         ----------
         empty : mapping of str to MapResult
-            Maps of any tile, by foliage mode: their form.
+            Maps of any tile, by foliage mode. They define the variables.
         frame : SiteFrame
         about : mapping of str to str
             Attributes of the store.
@@ -288,9 +288,9 @@ class TileStore:
         Raises
         ------
         UsageError
-            The store is that of another job, or holds files of others.
+            If the store belongs to another job, or contains other files.
         InputError
-            It is no store of this tool, or a damaged one.
+            If the folder is not a store written by this tool, or is damaged.
         """
         self._frame, self._about = frame, about
         skeleton = self._skeleton(maps_dataset(empty, frame, about).to_xarray())
@@ -312,9 +312,9 @@ class TileStore:
         return missing
 
     def _skeleton(self, like: Any) -> dict[str, bytes]:
-        """The files of a store without tiles, by their names below its folder; its own metadata first."""
+        """Return the files of a store without tiles, by their names below its folder, its metadata first."""
         grid, tiles = self.tiling.grid, self.tiling.shape
-        # made in memory first: Zarr itself then opens no folder that a stranger may have filled
+        # created in memory first, so that Zarr does not open a folder with untrusted contents
         files: dict[str, Any] = {}
         memory = self._zarr.storage.MemoryStore(files)
         self._planes = [name for name, variable in like.variables.items() if {"y", "x"} <= {*variable.dims}]
@@ -353,7 +353,7 @@ class TileStore:
         return {_ROOT: content.pop(_ROOT), **content}
 
     def _is_other_job(self, skeleton: Mapping[str, bytes]) -> bool:
-        """Check whether a store that is there is that of another job and may be replaced; errors as :meth:`begin`."""
+        """Check whether an existing store belongs to another job and may be replaced. Raises like :meth:`begin`."""
         if not self.path.is_dir():
             raise self._not_ours("a file")
         self._refuse_foreign({name.partition("/")[0] for name in skeleton if "/" in name})
@@ -409,7 +409,7 @@ class TileStore:
         )
 
     def _repair(self, place: Path, content: bytes) -> None:
-        """Write a file of the skeleton unless it is there; when the store was written is not looked at."""
+        """Write a file of the skeleton unless it exists. The store's creation time is ignored in the comparison."""
         with suppress(OSError):
             before = place.read_bytes()
             if before == content or (place == self.path / _ROOT and _undated(before) == _undated(content)):
@@ -418,7 +418,7 @@ class TileStore:
         write_whole(place, content)
 
     def _chunks(self, number: int) -> Iterator[tuple[str, Path]]:
-        """Names and places of the chunk files of one tile; one that holds nothing but missing values has no file."""
+        """Yield names and paths of the chunk files of one tile. A chunk of only missing values has no file."""
         for form in self._chunk_names:
             name = form.format(*divmod(number, self.tiling.shape[1]))
             yield name, self.path / name
@@ -427,7 +427,7 @@ class TileStore:
         digest = hashlib.sha256()
         for name, place in self._chunks(number):
             content = place.read_bytes() if place.exists() else b""
-            # with its length, so that bytes cannot move from one chunk into the next unseen
+            # with its length, so that bytes cannot move between chunks undetected
             digest.update(f"{name} {len(content)} ".encode() + content)
         return digest.digest()
 
@@ -436,7 +436,7 @@ class TileStore:
         return self.path / LEDGER / "c" / str(row) / str(column) / "0"
 
     def _is_kept(self, number: int) -> bool:
-        """Check whether a tile is there as it was written; what is left of any other goes, before Zarr decodes it."""
+        """Check whether a tile exists unchanged. Remove all other files of it before Zarr decodes them."""
         entry = self._entry(number)
         entered = entry.exists()
         if entered and entry.read_bytes() == self._digest(number):
@@ -451,15 +451,15 @@ class TileStore:
         return np.asarray(self._group[_PATHS][:])
 
     def write(self, number: int, maps: Mapping[str, MapResult], paths: int) -> None:
-        """Write one tile; :class:`~aerpaw_cmp.common.errors.OutputError` where the disk does not take it.
+        """Write one tile. Raise :class:`~aerpaw_cmp.common.errors.OutputError` if the disk cannot be written.
 
         Parameters
         ----------
         number : int
         maps : mapping of str to MapResult
-            By foliage mode.
+            The tile's maps, by foliage mode.
         paths : int
-            How many there are.
+            Number of paths in the tile.
         """
         rows, columns = self.tiling.part(number)
         with explained_os_errors(self.path):
@@ -473,7 +473,10 @@ class TileStore:
             write_whole(entry, self._digest(number))
 
     def read(self, empty: Mapping[str, MapResult], step: int) -> dict[str, MapResult]:
-        """Maps of every ``step``-th position each way, by foliage mode; ``empty`` as for :meth:`begin`."""
+        """Return maps of every ``step``-th position in both directions, by foliage mode.
+
+        ``empty`` is as for :meth:`begin`.
+        """
         full = self.tiling.grid
         grid = Grid(full.east_m[::step], full.north_m[::step], full.spacing_m * step)
         maps = {}
@@ -489,7 +492,7 @@ class TileStore:
 
 
 def _undated(metadata: bytes) -> Any:
-    """Metadata of a store without the time at which it was made; None of what is none."""
+    """Return the metadata of a store without its creation time. None if they are not valid metadata."""
     try:
         content = json.loads(metadata)
         content["attributes"].pop("history", None)

@@ -11,10 +11,10 @@ Three correlations, all averaged over pairs of positions in bins of distance:
 All three serve RSS as well as rank. NaN is out of coverage; whether a rank of 0 is a number or NaN is the caller's
 choice.
 
-The curve through it, :func:`fit_biexponential`, lives in :mod:`~aerpaw_cmp.maps.variogram`.
+The fitted curve, :func:`fit_biexponential`, is in :mod:`~aerpaw_cmp.maps.variogram`.
 
-Bins follow the paper: bin ``n`` holds the pairs whose distance is nearest to ``n`` times the width (half-way goes
-up); bin 0 holds each position with itself, where the correlation is 1 by definition.
+Bins follow the paper. Bin ``n`` contains the pairs whose distance is nearest to ``n`` times the width; half-way values
+go up. Bin 0 contains each position with itself, where the correlation is 1 by definition.
 
 The paper's correlation curve (arXiv 2502.10324, section VI-A) and its fit by variable projection.
 """
@@ -37,7 +37,7 @@ TINY = 1e-300
 
 @dataclass(frozen=True, slots=True)
 class BiExponential:
-    """``c1 exp(c2 d) + c3 exp(c4 d)``, d in metres; the faster decay first.
+    """The curve ``c1 exp(c2 d) + c3 exp(c4 d)``, d in metres, with the faster decay first.
 
     Source: arXiv 2502.10324 eq. 14.
 
@@ -92,25 +92,25 @@ def fit_biexponential(distance_m: ArrayLike, correlation: ArrayLike) -> BiExpone
 
     Source: arXiv 2502.10324 eq. 14.
 
-    For given rates the best amplitudes are a bounded linear problem of two unknowns with a closed form, so only the
-    logarithms of the two rates are searched: a grid over the bounds, then a trust-region search from its
-    :data:`STARTS` best cells.
+    For given rates the best amplitudes are a bounded linear problem of two unknowns with a closed form. Only the
+    logarithms of the two rates are searched: a grid over the bounds, then a trust-region search from its :data:`STARTS`
+    best cells.
 
     Parameters
     ----------
     distance_m, correlation : (n,)
-        The points; NaN pairs do not count.
+        The points. NaN pairs are ignored.
 
     Returns
     -------
     BiExponential
-        ``degenerate`` tells when one exponential does as well, an amplitude vanishes, the rates coincide or one
-        of them lies at a bound.
+        ``degenerate`` is True if one exponential fits as well, an amplitude vanishes, the rates coincide, or one of
+        them lies at a bound.
 
     Raises
     ------
     UsageError
-        With fewer than two usable points.
+        If there are fewer than two usable points.
 
     Notes
     -----
@@ -232,9 +232,9 @@ class _Projection:
         cost_single = self._single_cost(single)
         c1, c3 = (float(a) for a in amplitude)
         c2, c4 = (-float(rate) for rate in np.exp(log_rates))
-        # where both curves meet every point the ratio must be 1, not 0 by 0
+        # if both curves meet every point the ratio must be 1, not 0 / 0
         scale = 1e-20 * float((self.y**2).sum())
-        # Bayesian information criterion: two more coefficients must pay for themselves
+        # Bayesian information criterion: two more coefficients must improve the fit enough
         gain = n * np.log((cost_single + scale) / (cost + scale)) - 2 * np.log(n)
         reasons = []
         if gain <= 0:
@@ -289,14 +289,14 @@ _PAPER_WIDTH_M = 30.0
 _PAPER_MAXIMUM_M = 500.0
 # The paper's step between altitudes.
 _HEIGHT_BIN_M = 10.0
-# Fewest components that a pair of positions must share where some are missing.
-# Of two any pair correlates by plus or minus 1.
+# Fewest components that a pair of positions must share if some are missing. Two components always correlate by plus or
+# minus 1.
 _MINIMUM_COMMON = 3
 
 
 @dataclass(frozen=True, slots=True)
 class BinnedCorrelation:
-    """Correlation (or semivariance) against distance.
+    """The correlation (or semivariance) against distance.
 
     Source: arXiv 2502.10324 eq. 11; arXiv 2502.10324 eq. 12; arXiv 2502.10324 eq. 13.
 
@@ -307,13 +307,13 @@ class BinnedCorrelation:
     mean_distance_m : (bins,)
         Mean distance of its pairs.
     correlation : (bins,)
-        Mean over the pairs; NaN in a bin without any.
+        Mean over the pairs. NaN in a bin without pairs.
     pairs : (bins,) int
-        Number of pairs; a position with itself counts once.
+        Number of pairs. A position with itself counts once.
     positions : int
-        Positions that took part.
+        Number of positions used.
     excluded_constant : int
-        Positions (or fields) left out because all their values are equal: their correlation is undefined.
+        Positions (or fields) excluded because all their values are equal: their correlation is undefined.
     """
 
     distance_m: FloatArray
@@ -340,7 +340,7 @@ def vector_correlation(
     points_m : (n, 2+)
         East, north [m].
     vectors : (n, ...)
-        Rank or RSS over altitudes and K, flattened per position; of NaN a pair uses the components that both have.
+        Rank or RSS over altitudes and K, flattened per position. With NaN, a pair uses the components that both have.
     width_m, maximum_m : float
         Bin width (the paper's d_rx) and the largest distance [m].
 
@@ -368,15 +368,15 @@ def vector_correlation(
 def field_correlation(
     points_m: ArrayLike, fields: ArrayLike, *, width_m: float = _PAPER_WIDTH_M, maximum_m: float = _PAPER_MAXIMUM_M
 ) -> BinnedCorrelation:
-    """Horizontal correlation of fields (n, ...), each standardised over the positions; mean over pairs and fields.
+    """Return the horizontal correlation of fields (n, ...), each standardised over the positions, averaged over pairs.
 
-    NaN values take no part; a pair counts once, with the mean over the fields that both positions have. Fields that
-    are constant or have fewer than two values are left out and counted.
+    NaN values are ignored. A pair counts once, with the mean over the fields that both positions have. Fields that are
+    constant or have fewer than two values are excluded and counted.
 
     Parameters
     ----------
     points_m : array_like, (n, 2) or (n, 3)
-        Distances are horizontal.
+        Positions. Distances are horizontal.
     fields : array_like, (n, ...)
         Values at the positions, NaN unknown.
     width_m, maximum_m : float
@@ -408,13 +408,13 @@ def vertical_correlation(altitudes_m: ArrayLike, maps: ArrayLike) -> BinnedCorre
     altitudes_m : (altitudes,)
         Heights [m].
     maps : (altitudes, n) or (altitudes, fields, n)
-        Rank or RSS at the same positions; a field is one K. The Pearson correlation of a pair of altitudes is taken
+        Rank or RSS at the same positions. A field is one K. The Pearson correlation of a pair of altitudes is computed
         over the positions that both have, per field, and averaged over the fields.
 
     Returns
     -------
     BinnedCorrelation
-        ``positions`` counts altitudes, ``pairs`` pairs of altitudes and fields; constant maps are left out, counted.
+        ``positions`` counts altitudes, ``pairs`` pairs of altitudes and fields. Constant maps are excluded and counted.
     """
     altitudes = unmasked(altitudes_m)
     data = unmasked(maps)
@@ -522,15 +522,15 @@ class _PairwisePearson:
         vary_x = square_x - sum_x**2 / safe
         vary_y = square_y - sum_y**2 / safe
         covary = x @ y - sum_x * sum_y / safe
-        # a variance this small beside the squares it is a difference of is their rounding
+        # a variance this small, compared with the squares that it is a difference of, is their rounding
         good = (n >= self.minimum_common) & (vary_x > 1e-12 * square_x) & (vary_y > 1e-12 * square_y)
         scale = np.sqrt(np.where(good, vary_x * vary_y, 1.0))
-        # rounding takes equal vectors beyond 1
+        # rounding can take equal vectors above 1
         return np.where(good, np.clip(covary / scale, -1.0, 1.0), np.nan)
 
 
 def _mean_product(scaled: FloatArray, present: BoolArray) -> Block:
-    """Mean product of standardised fields that both positions have."""
+    """Return the mean product of standardised fields that both positions have."""
     known, complete = present.astype(np.float64), bool(present.all())
 
     def of(rows: IntArray, columns: IntArray) -> FloatArray:
@@ -592,12 +592,12 @@ def _bin_pairs(
 
 
 def _blocks_within(points: FloatArray, reach_m: float) -> Iterator[tuple[IntArray, IntArray]]:
-    """Blocks of rows with the columns that may be within reach; both sorted by north, so that far ones drop out."""
+    """Yield blocks of rows with the columns that may be within reach, both sorted by north."""
     order = np.argsort(points[:, 1], kind="stable")
     north = points[order, 1]
     for start in range(0, len(order), BLOCK):
         rows = order[start : start + BLOCK]
-        # rows of a block lie side by side in north, so their columns are one run
+        # rows of a block are adjacent in north, so their columns are one run
         low = np.searchsorted(north, points[rows, 1].min() - reach_m)
         high = np.searchsorted(north, points[rows, 1].max() + reach_m, side="right")
         yield rows, order[low:high]

@@ -1,16 +1,11 @@
-"""Calibrations of a site from flights, beside its file: ``NAME.learned/learned.yaml`` and the tables that it names.
+"""Calibrations of a site from flights, in the folder of its file: ``NAME.learned/learned.yaml`` and its tables.
 
-Each entry is a calibration: learned antennas by tower, channel and reader, its airframe, or a rank receiver, with the
-band and the logs (SHA-256) that it was learned from, its errors on flights left out, the source of the flights and the
-command that made it.
+Each entry is a campaign: learned antennas by tower and channel, their airframe, or a rank receiver, with the band and
+the logs (SHA-256) that they were learned from, errors on held-out flights, the source of the flights and the command
+that learns them again. Every table and every entry is verified by its SHA-256 when it is read.
 
-The gain that a channel has towards both ends at once, beside its two antennas: learned, written, interpolated.
-
-Antenna files over the full sphere with a standard deviation: read, written, and as cuts for planning tools.
-
-Directions at which the gain of an airframe is known, and the covariance of the gain there: written and read.
-
-Tables to which a name leads in the memory of a site, checked: of the same band, learned from the logs it says.
+The tables: gain over the full sphere with its standard deviation (also as cuts for planning tools), the gain towards
+both ends at once besides two antennas, and the directions at which a gain is known with its covariance there.
 """
 
 from __future__ import annotations

@@ -180,18 +180,11 @@ def test_the_reference_has_every_public_name_and_every_command(pages: Path) -> N
     assert all(f"aerpaw-cmp {name}" in listed for name in COMMANDS)
 
 
-def test_pages_that_a_user_reads_are_short() -> None:
-    """Research notes and the reference may be long; every other page has at most 1200 words, and a place in the menu."""
+def test_every_page_has_a_place_in_the_menu() -> None:
     menu = (ROOT / "mkdocs.yml").read_text().partition("\nnav:\n")[2]
-    sections = re.split(r"^  - (?=[A-Z])", menu, flags=re.MULTILINE)
-    long = {page for part in sections if part.startswith("Reference:") for page in re.findall(r"[\w/]+\.md", part)}
-    assert len(long) > 10
-    for page in sorted((ROOT / "docs").rglob("*.md")):
-        name = page.relative_to(ROOT / "docs").as_posix()
-        assert name in menu, name
-        if name not in long and not name.startswith("research/"):
-            assert len(page.read_text(encoding="utf-8").split()) <= 1200, name
-    assert len((ROOT / "README.md").read_text(encoding="utf-8").split()) <= 1300
+    pages = [page.relative_to(ROOT / "docs").as_posix() for page in sorted((ROOT / "docs").rglob("*.md"))]
+    assert len(pages) > 30
+    assert [name for name in pages if name not in menu] == []
 
 
 def test_each_claim_of_security_names_a_test_that_exists() -> None:

@@ -60,6 +60,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
             "start": f"2025-06-0{number}T10:00:00",
             "seed": number,
             "speed_mps": 2.5,
+            "fading_db": 1.0,  # without noise the second flight would be a copy of the first
             "offsets_db": {FORMULA: {"+A1": 4.0, "@B1": 5.0}},
             "waypoints": [{"east_m": e, "north_m": n, "height_m": h, "label": "=A"} for e, n, h in corners],
         }

@@ -55,6 +55,9 @@ _FEWEST, _LEAST_R, _LEAST_Z = 80, 0.5, 7.5
 # copy with half or a quarter of the rows has the same runs.
 _RUN, _LEAST_CHANGES, _STRIDES = 24, 8, (1, 2, 4)
 
+# A series with fewer different values has no runs: ranks along one route change in the same way on every flight.
+_FEWEST_VALUES = 6
+
 # Runs in a mark, and shared ones from which two marks are of one log: of 64, a tenth of a log shares about 6.
 _RUNS, _LEAST_SHARED = 64, 3
 
@@ -109,6 +112,8 @@ def mark_of(time: AnyArray, readings: FloatArray) -> str:
 
 def _runs(values: FloatArray) -> str:
     """Return the smallest hashes of runs of changes [1/1000]; changes, because a gain shifts a copy."""
+    if len(np.unique(values)) < _FEWEST_VALUES:
+        return ""
     found = np.concatenate([_hashes(values[phase::stride]) for stride in _STRIDES for phase in range(stride)])
     # a few of them alone are sorted: millions would take a second
     least = np.partition(found, 10 * _RUNS)[: 10 * _RUNS] if len(found) > 10 * _RUNS else found

@@ -440,6 +440,20 @@ def in_campaigns(
     """Return samples with their campaign, and with their airframe and band, of several campaigns.
 
     Airframes of one name share their gain within 7 % of frequency, from the lowest carrier of each band on.
+
+    Parameters
+    ----------
+    settings : CalibrationFile
+    observed : sequence of Observed
+    flights : sequence of FlightData
+        That the samples are of.
+    campaigns : mapping of str to str
+        By flight.
+
+    Returns
+    -------
+    list of Observed
+        Unchanged if there is one campaign only.
     """
     of = settings.by_campaign()
     if len(of) < 2:

@@ -176,6 +176,10 @@ def settings_text(calibration: Calibration, folder_name: str, files: Mapping[str
         Content of the antenna files by name.
     command : str
         Command that makes them.
+
+    Returns
+    -------
+    str
     """
     lines = [
         f"{_MARK}: {calibration.settings.calibration}. Learned from {', '.join(calibration.names)}.",

@@ -654,7 +654,10 @@ def run_calibrate(
             with stages("rank"):
                 ranked = fit_rank(reports)
         command = f"aerpaw-cmp calibrate {path.name}" + (f" --into-site {into_site}" if into_site is not None else "")
-        calibrated = Calibrated(settings, tuple(flights), tuple(remarks), calibration, ranked, command, campaigns)
+        calibrated = Calibrated(
+            settings=settings, flights=tuple(flights), remarks=tuple(remarks), calibration=calibration, ranked=ranked,
+            command=command, campaigns=campaigns,
+        )  # fmt: skip
         with output.filling() as place:
             metrics, text = write_files(calibrated, place, folder.name, stages.seconds)
         file.write(sealed(text))

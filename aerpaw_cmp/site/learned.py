@@ -675,6 +675,10 @@ def read_pair(path: Path, length: float, prior_sd_db: float, written: Written | 
     written : Written, optional
         The table must be as it was written.
 
+    Returns
+    -------
+    PairGain
+
     Raises
     ------
     InputError

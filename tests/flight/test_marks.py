@@ -103,6 +103,17 @@ def test_runs_of_a_quantised_level_are_shared_by_copies_only() -> None:
     assert max(len(runs[i] & runs[j]) for i in range(6) for j in range(i)) == 0
 
 
+def test_ranks_of_a_repeat_flight_are_another_log() -> None:
+    """Ranks follow the place: without noise two flights of one route report the same ones, on any day."""
+    t = np.arange(0.0, 600.0, 0.5)
+    place = np.sin(2 * np.pi * t / 37.0) + np.sin(2 * np.pi * (t / 130) ** 2)
+    ranks = np.clip(np.round(2.5 + place + np.random.default_rng(4).normal(0, 0.7, len(t))), 1, 4)
+    first, again = (mark(t, ranks, start) for start in ("2025-06-01T10:00:00", "2025-06-02T10:20:00"))
+    assert first
+    assert not among(again, [first])
+    assert among(mark(t[99:], ranks[99:], "2025-06-01T10:00:00"), [first])
+
+
 def test_what_tells_too_little_has_no_mark() -> None:
     """Constants, levels of the route alone, what repeats itself, too short a log, no times, nothing."""
     t, v = flown(1)

@@ -266,7 +266,10 @@ class Placer:
         at_uav, at_tower = link_directions(place, track.position_m, track.rotation)
         free = free_space_dbm(place[None, :], track.position_m, CARRIER_HZ, POWER_DBM)[:, 0]
         level = np.where(track.below, np.nan, track.level_db)
-        samples = LinkSamples("", tower, "", track.time_s, track.position_m, at_uav, at_tower, level - free)
+        samples = LinkSamples(
+            flight="", tower=tower, channel="", time_s=track.time_s, position_m=track.position_m,
+            at_uav=at_uav, at_tower=at_tower, residual_db=level - free,
+        )  # fmt: skip
         odds = FlightEvidence([samples]).of_link(0, gains.moments)
         return odds.fits
 
@@ -715,6 +718,10 @@ def errors_elsewhere(
     flown : (n, 3) and (n,), optional
         Positions [m], and standard deviation of the learned gain there [dB]: a new height, or new directions, have the
         errors of such.
+
+    Returns
+    -------
+    Errors or None
     """
     name = antennas.get(f"{series.tower}.{series.channel}")
     if "uav" not in antennas:

@@ -655,7 +655,7 @@ class PairGain:
         """Return the content of a table of the directions, gains and standard deviations, with comments at its head."""
         angles = np.concatenate([angles_of(self.directions[:, :3]), angles_of(self.directions[:, 3:])], axis=1)
         rows = np.column_stack([angles, self.gain_db, self.sd_db])
-        lines = [f"# {note}" for note in notes] + [",".join(PAIR_COLUMNS)]
+        lines = [guarded_comment(f"# {note}") for note in notes] + [",".join(PAIR_COLUMNS)]
         lines += [f"{a:.1f},{b:.1f},{c:.1f},{d:.1f},{g:.2f},{s:.2f}" for a, b, c, d, g, s in rows]
         return "\n".join(lines) + "\n"
 
@@ -961,7 +961,7 @@ class KnownDirections:
 
     def table(self, notes: Sequence[str]) -> str:
         """Return the content of the table, with comments at its head."""
-        lines = [f"# {note}" for note in notes] + [",".join(_COLUMNS)]
+        lines = [guarded_comment(f"# {note}") for note in notes] + [",".join(_COLUMNS)]
         for number, (azimuth, elevation) in enumerate(angles_of(self.directions)):
             row = self.covariance_db2[number, : number + 1]
             lines.append(f"{azimuth:.1f},{elevation:.1f}," + ",".join(f"{value:.2f}" for value in row))

@@ -50,11 +50,13 @@ LOG = {
     "reader": "generic_csv", "node": "LW9", "channel": "Q", "frequency_hz": 2e9, "unit": "dBm", "floor_db": -50.0,
     "ri_base": "zero", "columns": {"time": "x"}, "kind": "rss", "time_origin": "2024-06-01T10:00:00Z", "clock": "utc",
     "timezone": "America/Chicago", "cells": {5: "LW1"}, "height_m": 30.0, "skip": ["none"], "path": "none.txt",
+    "gps_rollovers": 1,
 }  # fmt: skip
+ENDS = ("uav", "tower", "towers")
 # Values that differ from those of BASE, by key; LINE and END stand for one log and one end of a link.
 VALUES: dict[str, Any] = {
     **{f"logs.{line}.{key}": value for line in (0, 1) for key, value in LOG.items()},
-    **{f"link.rss.{end}.{key}": value for end in ("uav", "tower", "towers.LW3") for key, value in ARRAY.items()},
+    **{f"link.rss.{end}.{key}": value for end in (*ENDS[:2], "towers.LW3") for key, value in ARRAY.items()},
     "site.file": "none.yaml", "site.coordinates": "Z", "site.antenna_height_m": 15.0, "site.without_buildings": True,
     "site.tower_ground": "offsets", "towers": {"LW1": {"latitude_deg": 35.7, "longitude_deg": -78.7}},
     "timezone": "America/Chicago", "antennas": {"uav": "lake_wheeler/dataset12_uav"},
@@ -78,7 +80,8 @@ ELSEWHERE = {
     "link.rss.uav_transmits": "the level is reciprocal: exports of 'channel'",
     "link.rank.uav_transmits": "the rank is reciprocal: exports of 'channel'",
     "rt.engine": "both engines find the same paths here", "rt.audit_links": "the audit",
-    "report": "figures",
+    "report": "figures", "logs.receiver": "which learned antennas of the site fit",
+    **{f"link.rss.{end}.antenna.learned": "what 'calibrate' writes beside a learned file" for end in ENDS},
 }  # fmt: skip
 
 

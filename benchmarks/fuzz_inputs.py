@@ -605,7 +605,7 @@ def _report(path: Path) -> Any:
     from aerpaw_cmp.jobs.diff_reports import run_diff
     from aerpaw_cmp.report.columns import RANK, RSS, header
 
-    with tempfile.TemporaryDirectory(dir=SCRATCH) as folder:
+    with tempfile.TemporaryDirectory(dir=path.parent) as folder:
         path.rename(Path(folder) / "metrics.json")
         for name, columns in (("rss.csv", header(RSS)), ("rank.csv", header(RANK))):
             (Path(folder) / name).write_text(",".join(columns) + "\n", encoding="utf-8")

@@ -82,7 +82,7 @@ def test_bad_logs(run: Run, name: str, files: dict[str, bytes | str | None], cod
     ("change", "words"),
     [
         (("site: lake_wheeler", "sit: lake_wheeler"), "'site'"),
-        (("site: lake_wheeler", "site: lake_wheeler\nsite: lake_wheeler"), "stands twice"),
+        (("site: lake_wheeler", "site: lake_wheeler\nsite: lake_wheeler"), "duplicate key"),
         (("site: lake_wheeler", "site: lake_weeler"), "lake_wheeler"),
         (("node: LW1", "node: LW9"), "LW9"),
         (("timezone: America/New_York\n", ""), "timezone"),

@@ -1,1 +1,1 @@
-"""Vocabulary shared by every room: errors, units, files, geodesy, YAML."""
+"""Definitions shared by every subpackage: errors, units, files, geodesy and YAML."""

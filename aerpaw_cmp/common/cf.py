@@ -50,7 +50,7 @@ def site_crs(frame: SiteFrame) -> Any:
 
 
 def file_attributes(title: str, source: str, comment: str) -> dict[str, str]:
-    """Attributes of a file: what it holds and who wrote it when.
+    """Return the attributes of a file: its content, its author program and its time.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def file_attributes(title: str, source: str, comment: str) -> dict[str, str]:
 
 @dataclass(frozen=True, slots=True)
 class Variable:
-    """A variable of a file; ``encoding`` may hold ``_FillValue`` and what netCDF4 takes to deflate it."""
+    """A variable of a file. ``encoding`` may contain ``_FillValue`` and the compression options of netCDF4."""
 
     dims: tuple[str, ...]
     values: AnyArray
@@ -83,14 +83,14 @@ class Variable:
 
 
 class Dataset:
-    """Variables by name and attributes, as an ``xarray.Dataset`` has them; xarray takes a second to load.
+    """The variables by name and the attributes of a file, like ``xarray.Dataset``. It avoids a second to load xarray.
 
     Parameters
     ----------
     variables : mapping
-        Dimensions (one alone may be its name), values, attributes and encoding, by name.
+        Dimensions (a single one may be its name), values, attributes and encoding, by name.
     attributes : mapping
-        Of the file.
+        Attributes of the file.
     """
 
     def __init__(self, variables: Mapping[str, Sequence[Any]], attributes: Mapping[str, Any]) -> None:
@@ -99,7 +99,7 @@ class Dataset:
             self.variables[name] = Variable((dims,) if isinstance(dims, str) else dims, np.asarray(values), *rest)
 
     def to_xarray(self) -> Any:
-        """The same as an ``xarray.Dataset``.
+        """Return the same data as an ``xarray.Dataset``.
 
         Raises
         ------
@@ -142,7 +142,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
         if {*dims} & {*grows}:
             encoding["chunksizes"] = (64,) * len(dims) if values.dtype.kind == "S" else _chunk(dims, values, grows)
         made = book.createVariable(name, values.dtype, dims, fill_value=encoding.pop("_FillValue", None), **encoding)
-        # the values are as the file shall hold them: netCDF4 would take them for physical ones and scale them
+        # the values are packed already: netCDF4 would treat them as physical values and scale them
         made.set_auto_maskandscale(False)
         made.setncatts(attributes)
         made[...] = values
@@ -150,7 +150,7 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
 
 
 def _chunk(dims: Sequence[str], values: AnyArray, grows: Sequence[str]) -> tuple[int, ...]:
-    """Shape of a chunk: one along a dimension that grows, a power of two of at most a MiB along the first of them."""
+    """Return the shape of a chunk: 1 along a dimension that grows, at most a MiB along the first growing dimension."""
     sizes = dict(zip(dims, values.shape, strict=True))
     fixed = math.prod(size for name, size in sizes.items() if name not in grows)
     step = max(1, min(sizes.get(grows[0], 1), (1 << 20) // max(values.dtype.itemsize * fixed, 1)))
@@ -159,19 +159,19 @@ def _chunk(dims: Sequence[str], values: AnyArray, grows: Sequence[str]) -> tuple
 
 
 class GrowingNetcdf:
-    """A NetCDF-4 file of data sets that come one after another, in the memory of one of them; a context.
+    """A context that writes data sets to a NetCDF-4 file one after another, with only one of them in memory.
 
     Parameters
     ----------
     path : Path
     grows : sequence of str
-        Dimensions without a limit. Data sets follow each other along the first; along the others the file is as long
-        as the longest, and holds ``_FillValue`` where another is shorter. A variable without the first one is written
-        anew with each data set.
+        Dimensions without a limit. Data sets follow each other along the first. Along the others the file is as long as
+        the longest data set, and contains ``_FillValue`` where another is shorter. A variable without the first
+        dimension is overwritten by each data set.
 
     Notes
     -----
-    A ``_FillValue`` of 0 fills and is then taken out of the attributes: readers take it for a value.
+    A ``_FillValue`` of 0 fills and is then removed from the attributes, because readers would mask it.
     """
 
     def __init__(self, path: Path, grows: Sequence[str]) -> None:
@@ -221,13 +221,13 @@ class GrowingNetcdf:
         self._sink.raise_spared()
 
     def describe(self, **attributes: str) -> None:
-        """Write attributes of the file anew."""
+        """Overwrite attributes of the file."""
         for name, text in attributes.items():
             self._book.attrs[name] = text.encode()
 
 
 def _stored(name: str, variable: Any) -> tuple[tuple[str, ...], AnyArray]:
-    """Dimensions and values of a variable as a file has them: text as characters."""
+    """Return the dimensions and values of a variable as stored in a file: text as characters."""
     values = np.asarray(variable.values)
     if values.dtype.kind not in "OU":
         return variable.dims, values

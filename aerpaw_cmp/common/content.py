@@ -19,7 +19,7 @@ from shapely.geometry.base import BaseGeometry
 
 
 def content_digest(*values: Any) -> str:
-    """SHA-256, in hexadecimal, of values and all that they hold; an object that hides its content is like no other."""
+    """Return the SHA-256, in hexadecimal, of values and their contents. Opaque objects never match others."""
     digest = hashlib.sha256()
     for value in values:
         _feed(digest, value)
@@ -27,7 +27,7 @@ def content_digest(*values: Any) -> str:
 
 
 def _feed(digest: Any, value: Any) -> None:
-    # the bytes of an array of objects are addresses, others in each process
+    # the bytes of an array of objects are addresses, which differ between processes
     if isinstance(value, np.ndarray) and value.dtype != object:
         digest.update(f"{value.dtype}{value.shape}".encode() + np.ascontiguousarray(value).tobytes())
     elif dataclasses.is_dataclass(value):
@@ -47,7 +47,7 @@ def _feed(digest: Any, value: Any) -> None:
         digest.update(repr(value).encode() + b"\n")
 
 
-# Of YAML and JSON files; in front of a colon in the comments of a table.
+# Keys in YAML and JSON files. The comments of a table have a colon after them.
 KEY, MARKS = "trained_on", "marks"
 
 # one pattern for a YAML list of either style, an array of JSON and the comment of a table
@@ -58,7 +58,7 @@ _MARK = re.compile(r"[0-9a-f.]{100,}")
 
 
 def trained_on(text: str) -> tuple[str, ...]:
-    """SHA-256 of every log that a learned file names: an antenna table, a receiver, calibrated.yaml; none of others.
+    """Return the SHA-256 of every log that a learned file lists, such as an antenna table, receiver or calibrated.yaml.
 
     Examples
     --------

@@ -3,16 +3,16 @@
 ======================  =========  =====================================
 class                   exit code  meaning
 ======================  =========  =====================================
-:class:`CheckError`     1          the job ran, a stated check failed
+:class:`CheckError`     1          the job ran, a requested check failed
 :class:`UsageError`     2          wrong usage or configuration
 :class:`InputError`     3          an input could not be read
 :class:`OutputError`    3          an output could not be written
 ======================  =========  =====================================
 
-A message says what was found, what was expected, the likely cause and the place.
-Any other exception that reaches a user is a bug of ours.
+A message contains what was found, what was expected, the likely cause and the place.
+Any other exception that reaches a user is a bug in this package.
 
-Text on what to type after a failure: the last part of every message.
+The last part of every message is the command or edit to try after a failure.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ _T = TypeVar("_T")
 
 
 def one_line(text: str) -> str:
-    r"""Text for one line of a message: line breaks, control characters and bytes that are no UTF-8 as escapes.
+    r"""Return text for one line of a message, with line breaks, control characters and non-UTF-8 bytes escaped.
 
-    The narrow space within numbers (6 550) stays: Python calls it unprintable.
+    The narrow space within numbers (6 550) is kept, although Python does not consider it printable.
 
     Examples
     --------
@@ -68,7 +68,7 @@ def add_note(error: BaseException, text: str) -> None:
 
 @contextmanager
 def noting_interrupts(text: str) -> Iterator[None]:
-    """An interrupt inside says ``text`` when it is told."""
+    """Add ``text`` to the message of an interrupt that occurs inside."""
     try:
         yield
     except KeyboardInterrupt as error:
@@ -77,7 +77,7 @@ def noting_interrupts(text: str) -> Iterator[None]:
 
 
 class AerpawCmpError(Exception):
-    """A message for the user; never shown with a traceback.
+    """A message for the user, shown without a traceback.
 
     Parameters
     ----------
@@ -86,7 +86,7 @@ class AerpawCmpError(Exception):
     expected : str, optional
         What was expected instead.
     cause : str, optional
-        The likely cause, or the line that mends it.
+        The likely cause, or the command or line that fixes it.
     path : str or Path, optional
         The file.
     line : int, optional
@@ -146,11 +146,11 @@ def about_file(path: str | Path) -> Iterator[None]:
 _IN_WORDS: dict[Any, str] = {
     RecursionError: "it is nested too deep",
     MemoryError: "it does not fit into the memory",
-    UnicodeError: "it is no UTF-8 text",
+    UnicodeError: "it is not UTF-8 text",
 }
 
 
-# Raised by a line of this package, these are its own faults and not those of a file.
+# Exceptions that are bugs of this package, not errors in a file, if a line of this package raised them.
 _FAULTS = (TypeError, AttributeError, NameError, AssertionError, NotImplementedError, ImportError)
 
 
@@ -158,18 +158,20 @@ _FAULTS = (TypeError, AttributeError, NameError, AssertionError, NotImplementedE
 def parsing(
     path: str | Path, expected: str | None = None, cause: str = "a damaged file", *, any_shape: bool = False
 ) -> Iterator[None]:
-    """Whatever a file's content makes its parser raise is an :class:`InputError` about the file.
+    """Convert exceptions that a parser raises because of a file's content into :class:`InputError` about that file.
 
-    The one place for it, since libraries raise two dozen kinds on damage (RecursionError of a nested JSON, csv.Error of
-    a long cell, struct.error, MemoryError of a forged length, ...). Only reading stands inside, no computation.
+    Libraries raise two dozen kinds of exceptions for damaged files, such as RecursionError for a nested JSON, csv.Error
+    for a long cell, struct.error, and MemoryError for a forged length. Only reading belongs inside this context, no
+    computation.
 
     Parameters
     ----------
     path : str or Path
     expected, cause : str, optional
-        Of the message, for what the parser does not foresee itself.
+        Parts of the message for errors that the parser does not handle.
     any_shape : bool
-        Inside, JSON is walked through whose shape nobody has checked: there a TypeError is of the file, elsewhere ours.
+        Whether the block walks through JSON of an unchecked shape. A TypeError is then an error of the file, else a
+        bug.
 
     Yields
     ------
@@ -186,7 +188,7 @@ def parsing(
         if isinstance(error, _FAULTS) and not any_shape and _is_raised_here(error):
             raise
         words = f"{type(error).__name__}: {one_line(str(error)[:200])}"
-        # of a class by its base: UnicodeDecodeError is a UnicodeError
+        # match the base class: UnicodeDecodeError is a UnicodeError
         words = next((text for kind, text in _IN_WORDS.items() if isinstance(error, kind)), words)
         raise InputError(
             f"cannot be read ({words})",
@@ -279,7 +281,7 @@ class UsageError(AerpawCmpError):
 
     exit_code = 2
     others: Any = ()
-    """Logs that were read all the same, beside the log that lacks an option."""
+    """Logs that were read successfully, in addition to the log that requires an option."""
 
 
 class InputError(AerpawCmpError):
@@ -299,7 +301,7 @@ _OF_LOGS = [["report"], ["explain"], ["calibrate"], ["campaign"], ["predict"], [
 
 
 def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
-    """Return the step that most likely remedies a failure of a command line; empty if there is none.
+    """Return the step that most likely fixes a failure of a command line. Empty if there is none.
 
     Parameters
     ----------
@@ -328,7 +330,7 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
         return f"'{reader[1]} {one_line(str(place))}'"
     if place is not None and place.suffix in _SETTINGS and _exists(place) and words[:1] != ["ingest"]:
         line = "" if error.line is None else f", line {error.line},"
-        return f"mend {one_line(place.name)}{line} and run the same command"
+        return f"fix {one_line(place.name)}{line} and run the same command"
     if place is not None and error.expected == "a YAML file" and _exists(place) and place.is_dir():
         settings = sorted(path for path in place.iterdir() if path.suffix in _SETTINGS)
         if len(settings) == 1:
@@ -340,15 +342,15 @@ def next_step(error: AerpawCmpError, arguments: Sequence[str]) -> str:
     if not _exists(place):
         return _nearest(place)
     if not place.is_file():
-        return f"'ls {one_line(str(place))}' shows what the folder holds"
+        return f"'ls {one_line(str(place))}' shows what the folder contains"
     if words[:1] == ["ingest"]:
-        # a file that is known for what it is, or a hint of columns, leaves nothing else to type
+        # a recognised file, or a hint about columns, already contains the next step
         unknown = "no reader knows" in error.found and "--map" not in (error.cause or "")
         return "'aerpaw-cmp formats' lists what can be read" if unknown else ""
     if "--tower NAME=" in (error.expected or ""):
         return "the same command with --tower NAME=LATITUDE,LONGITUDE,HEIGHT"
     if words[:1] in _OF_LOGS:
-        return f"'aerpaw-cmp ingest {one_line(str(place))}' shows what the file holds"
+        return f"'aerpaw-cmp ingest {one_line(str(place))}' shows what the file contains"
     return f"the same command with another file than {one_line(place.name)}"
 
 
@@ -368,7 +370,7 @@ def _nearest(place: Path) -> str:
         names = [item.name for item in folder.iterdir()]
     except OSError:
         names = []
-    # nearly alike: a far name would send to another flight
+    # suggest close matches only: a loose match could be another flight's file
     near = get_close_matches(place.name, names, n=1, cutoff=0.8) if folder == place.parent else []
     if near:
         return f"the same command with {one_line(str(folder / near[0]))}"

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all."""
+"""Atomic writing of files, bounded reading, and the cache folder."""
 
 from __future__ import annotations
 
@@ -14,26 +14,26 @@ from pathlib import Path, PureWindowsPath
 
 from .errors import AerpawCmpError, InputError, OutputError, one_line
 
-# Of small files that are read whole: antenna patterns, receivers, the numbers of a report [bytes].
+# Size limit of small files that are read at once: antenna patterns, receivers, the numbers of a report [bytes].
 LARGEST_TABLE = 64 << 20
 
 
 def inside(
     folder: Path, name: str, source: Path, *, plain: bool = False, error: type[AerpawCmpError] = InputError
 ) -> Path:
-    """Place below a folder of a file that another file names: the only way from such a name to a path.
+    """Return the path of a file that another file names, below a folder. Use no other way from such a name to a path.
 
     Parameters
     ----------
     folder : Path
     name : str
-        As the other file, which somebody may have handed on, writes it.
+        Name in the other file, which may come from a third party.
     source : Path
-        That file, for the message.
+        The other file, for the message.
     plain : bool
-        Refuse names of files in folders below, too.
+        Also refuse names of files in subfolders.
     error : type
-        Of what is raised.
+        Class of the exception.
 
     Returns
     -------
@@ -42,7 +42,7 @@ def inside(
     Raises
     ------
     AerpawCmpError
-        The name is absolute, holds ``..`` or NUL, or a link on its way leaves the folder.
+        If the name is absolute, contains ``..`` or NUL, or a link on its path leaves the folder.
     """
     parts = PureWindowsPath(name)  # both separators, drives, and all that POSIX knows
     depth, place = len(parts.parts), folder.joinpath(*parts.parts)
@@ -51,16 +51,16 @@ def inside(
         raise error(
             f"it names '{one_line(name)}', {'no file of its folder' if wrong else 'a link that leaves its folder'}",
             expected=f"the name of a file {'in' if plain else 'in or below'} {one_line(str(folder))}",
-            cause="it was changed by hand, or somebody wants to reach your other files",
+            cause="the file was edited by hand, or crafted to access your other files",
             path=source,
         )
     return place
 
 
 def cache_folder(*parts: str) -> Path:
-    """Place in the folder of all that this program can make again: ``AERPAW_CMP_CACHE``, else below the user's cache.
+    """Return a path in the cache folder, which contains only data that this program can compute again.
 
-    The user's cache is where ``XDG_CACHE_HOME`` says, ``~/.cache`` without it.
+    The folder is ``AERPAW_CMP_CACHE`` or in the user's cache: ``XDG_CACHE_HOME``, else ``~/.cache``.
     """
     chosen = os.environ.get("AERPAW_CMP_CACHE")
     folder = Path(chosen) if chosen else Path(os.environ.get("XDG_CACHE_HOME") or "~/.cache", "aerpaw-cmp")
@@ -75,11 +75,11 @@ _ENTRY = re.compile(
 
 
 def clear_cache() -> tuple[int, int]:
-    """Remove what the cache holds, and nothing that only stands in its folder; number of files and their bytes."""
+    """Remove the entries of the cache, but no other files in its folder. Return the number of files and bytes."""
     folder, files, size = cache_folder(), 0, 0
-    for place, below, names in os.walk(folder):  # follows no link
+    for place, below, names in os.walk(folder):  # os.walk does not follow links
         if Path(place) == folder:
-            # AERPAW_CMP_CACHE may name a folder with other things: only ours are entered
+            # AERPAW_CMP_CACHE may name a folder with other contents: enter only our subfolders
             below[:] = sorted({"llvm", "outcomes", "audits", "compiled"}.intersection(below))
         for path in (Path(place, name) for name in names):
             if _ENTRY.fullmatch(path.relative_to(folder).as_posix()) and not path.is_symlink():
@@ -182,7 +182,7 @@ def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
 
 
 def read_input(path: Path, most: int, expected: str = "a file") -> bytes:
-    """Content of a file of at most so many bytes; InputError where it holds more, or cannot be read."""
+    """Return the content of a file of at most ``most`` bytes. InputError if it is larger or cannot be read."""
     try:
         return read_bounded(path, most, expected)
     except OSError as error:
@@ -213,9 +213,9 @@ def unseal(entry: bytes, mark: bytes) -> bytes:
 
 
 def write_sealed(path: Path, content: bytes, mark: bytes) -> None:
-    """Write an entry of a cache whole or not at all, with a mark and the SHA-256 of its content behind it.
+    """Write a cache entry atomically, followed by a mark and the SHA-256 of its content.
 
-    A cache that cannot be written is no reason to fail: then there is no entry.
+    If the cache cannot be written, nothing is stored and no exception is raised.
     """
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -224,12 +224,12 @@ def write_sealed(path: Path, content: bytes, mark: bytes) -> None:
 
 
 def read_sealed(path: Path, mark: bytes) -> bytes | None:
-    """The content of an entry that :func:`write_sealed` wrote; None where there is none.
+    """Return the content of an entry that :func:`write_sealed` wrote. None if there is no entry.
 
     Raises
     ------
     ValueError
-        As :func:`unseal`.
+        If the entry is damaged, as in :func:`unseal`.
     """
     try:
         entry = path.read_bytes()
@@ -239,7 +239,7 @@ def read_sealed(path: Path, mark: bytes) -> bytes | None:
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all; OutputError where it cannot be written."""
+    """Write a file atomically. OutputError if it cannot be written."""
     try:
         with atomic_path(path) as part:
             part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
@@ -248,7 +248,7 @@ def write_whole(path: Path, content: str | bytes) -> None:
 
 
 def plain_mode() -> int:
-    """Rights of an ordinary new file."""
+    """Return the permissions of an ordinary new file."""
     # the mask can be read by setting it alone
     mask = os.umask(0)
     os.umask(mask)

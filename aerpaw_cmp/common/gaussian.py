@@ -1,8 +1,8 @@
-"""Gaussian processes: a kernel, the points that determine a process, and what known values say of the rest.
+"""Gaussian processes: a kernel, the points that determine a process, and predictions from known values.
 
-A process is given by covariances alone, with ``C`` that of the known values (their noise included), ``K`` that of
-targets with them, and ``L L' = C``. The white values ``L^-1 y`` of known ``y`` make every answer a product (Rasmussen
-and Williams, Gaussian Processes for Machine Learning, algorithm 2.1).
+A process is given by covariances alone. ``C`` is the covariance of the known values (including their noise), ``K`` that
+of targets with them, and ``L L' = C``. With the white values ``L^-1 y`` of known ``y`` every prediction is a product
+(Rasmussen and Williams, Gaussian Processes for Machine Learning, algorithm 2.1).
 """
 
 from __future__ import annotations
@@ -49,30 +49,30 @@ class Factor:
 
     @classmethod
     def of(cls, covariance: FloatArray) -> Factor:
-        """Of a symmetric matrix (n, n), in its place.
+        """Factor a symmetric matrix (n, n) in place.
 
         Raises
         ------
         InputError
-            It is not positive definite, or not finite.
+            If the matrix is not positive definite, or not finite.
         """
         from scipy.linalg import LinAlgError, cholesky
 
         try:
-            # one NaN or infinity makes the sum one; a mask of the matrix would cost an eighth of its memory
+            # one NaN or infinity makes the sum non-finite; a mask of the matrix would cost an eighth of its memory
             if not np.isfinite(covariance.sum()):
                 raise ValueError("numbers that are not finite")
-            # the transpose is the same matrix in the order that LAPACK works on
+            # the transpose is the same matrix in the order that LAPACK uses
             return cls(np.asarray(cholesky(covariance.T, lower=True, overwrite_a=True, check_finite=False)))
         except (LinAlgError, ValueError) as error:
             raise InputError(
                 f"the equations of the fit cannot be solved ({error})",
                 expected="levels that are finite and vary",
-                cause="a channel that never changes, or values that are no levels",
+                cause="a channel that never changes, or values that are not levels",
             ) from None
 
     def whiten(self, values: FloatArray) -> FloatArray:
-        """``L^-1 y`` of values (n,) or (n, k): without correlation, of unit variance."""
+        """Return ``L^-1 y`` of values (n,) or (n, k), which are uncorrelated with unit variance."""
         from scipy.linalg import solve_triangular
 
         return np.asarray(solve_triangular(self.lower, values, lower=True, check_finite=False))

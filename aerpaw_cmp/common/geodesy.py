@@ -1,9 +1,9 @@
-"""WGS84 to and from the site frame (east, north, up; metres).
+"""Conversion between WGS84 and the site frame (east, north, up in metres).
 
-East and north come from an azimuthal equidistant projection centred on the site origin. Up is a height
-difference, not the third axis of a tangent frame: the flat ground plane of the scene follows the ellipsoid,
-so that 100 m above ground stays 100 m above ground 2 km from the origin (a tangent plane would give 99.7 m).
-Horizontal distances within 3 km differ from the geodesic by less than 1 mm.
+East and north come from an azimuthal equidistant projection centred on the site origin. Up is a height difference, not
+the third axis of a tangent frame. The flat ground plane of the scene therefore follows the ellipsoid: 100 m above
+ground is still 100 m above ground 2 km from the origin (a tangent plane would have 99.7 m there). Horizontal distances
+within 3 km differ from the geodesic by less than 1 mm.
 """
 
 from __future__ import annotations
@@ -48,16 +48,16 @@ class SiteFrame:
         object.__setattr__(self, "_projection", projection)
 
     def to_local(self, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """East and north [m] of WGS84 positions [deg]; NaN stays NaN."""
+        """Return east and north [m] of WGS84 positions [deg]. NaN stays NaN."""
         latitude = unmasked(latitude_deg)
         longitude = unmasked(longitude_deg)
         east, north = in_shape(self._projection, longitude, latitude)
-        # PROJ gives infinity for them, which would pass for a place far away
+        # PROJ returns infinity for NaN, which would be treated as a distant position
         bad = ~(np.isfinite(latitude) & np.isfinite(longitude))
         return np.where(bad, np.nan, east), np.where(bad, np.nan, north)
 
     def to_geographic(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
-        """WGS84 latitude and longitude [deg] of local positions [m]."""
+        """Return WGS84 latitude and longitude [deg] of local positions [m]."""
         longitude, latitude = in_shape(partial(self._projection, inverse=True), east_m, north_m)
         return latitude, longitude
 
@@ -90,17 +90,17 @@ def elevation_rad(vectors: FloatArray) -> FloatArray:
 
 
 def unit_vectors(vectors: FloatArray) -> FloatArray:
-    """Vectors (n, 3) of length one; those without a length stay zero."""
+    """Return vectors (n, 3) scaled to length one. Zero vectors stay zero."""
     # 0 / 1e-300 is 0 and changes no real length; 0 / 0 would be NaN with a warning
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=1, keepdims=True), 1e-300))
 
 
-# Of a degree of a meridian, to 0.5 %: for distances that are held against a limit.
+# Length of one degree of a meridian, to 0.5 %, for distances that are compared with a limit.
 _DEGREE_M = 111_200.0
 
 
 def rough_m(latitude_deg: FloatArray, longitude_deg: FloatArray, about: Sequence[float]) -> FloatArray:
-    """East and north (n, 2) [m] of places about a latitude and longitude, a hundred times faster than a projection.
+    """Return east and north (n, 2) [m] of positions about a latitude and longitude, 100 times faster than a projection.
 
     Examples
     --------
@@ -112,13 +112,15 @@ def rough_m(latitude_deg: FloatArray, longitude_deg: FloatArray, about: Sequence
 
 
 def in_shape(transform: Callable[[Any, Any], Any], x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Coordinates transformed by pyproj, in their common shape; up to 3.7.1 it takes an array of one for a number.
+    """Return coordinates transformed by pyproj, in their common shape.
+
+    pyproj up to 3.7.1 treats an array of one element as a number.
 
     Parameters
     ----------
     transform : callable
     x, y : (...)
-        In pyproj's order.
+        Coordinates in pyproj's order.
     """
     first, second = np.broadcast_arrays(unmasked(x), unmasked(y))
     if first.size == 1:

@@ -1,14 +1,14 @@
-"""Ctrl-C, SIGTERM and SIGHUP are never lost: what Python swallows of one is raised again where a job can be left.
+"""Ctrl-C, SIGTERM and SIGHUP are never lost: an interrupt that Python swallows is raised later, at a safe point.
 
-An interrupt is an exception that may come anywhere, also where Python cannot raise one: in what runs around a fork, in
-a finaliser, in the callback of a weak reference ("Exception ignored in ..."); before Python 3.12 one inside a class
-body becomes a RuntimeError. A command notes that it came, looks again before each stage and before an output takes its
-name, and holds it back for the moments in which a half-done step would be told wrongly.
+An interrupt is an exception that may occur anywhere, even where Python cannot raise it: in code around a fork, in a
+finaliser, in the callback of a weak reference ("Exception ignored in ..."). Before Python 3.12 an interrupt inside a
+class body becomes a RuntimeError. A command records that an interrupt came. It checks before each stage and before an
+output takes its name, and delays the interrupt while a half-done step would be reported wrongly.
 
-A call of compiled code (LLVM, linear algebra, Sionna) may last for minutes, and Python hears nothing before it returns:
-then a second thread ends the process in its place.
+A call of compiled code (LLVM, linear algebra, Sionna) may last for minutes, during which Python handles no signals. A
+second thread then ends the process.
 
-SIGTERM is what scancel, systemd and docker send, SIGHUP what a closed terminal does: both end a command as Ctrl-C does.
+scancel, systemd and docker send SIGTERM, and a closed terminal sends SIGHUP. Both end a command as Ctrl-C does.
 
 Standard streams that are closed, full or gone: none of that is a fault of the program.
 
@@ -47,12 +47,12 @@ _last: int = signal.SIGINT
 
 
 def interrupted() -> bool:
-    """Check whether an interrupt came since :func:`noted` began; False outside of it."""
+    """Check whether an interrupt came since :func:`noted` began. False outside that context."""
     return _signalled
 
 
 def last() -> signal.Signals:
-    """The signal of the latest interrupt, also after :func:`noted` has ended."""
+    """Return the signal of the latest interrupt, also after :func:`noted` has ended."""
     return signal.Signals(_last)
 
 
@@ -70,12 +70,12 @@ def raise_interrupt() -> None:
 
 @contextmanager
 def noted() -> Iterator[None]:
-    """Note the interrupts of a command; a signal that the process ignores (nohup, background) stays ignored.
+    """Record the interrupts of a command. A signal that the process ignores (nohup, background) stays ignored.
 
     Raises
     ------
     KeyboardInterrupt
-        For whatever became of one on its way, which is its cause then.
+        If an interrupt came and became another exception, which is then the cause.
     """
     global _signalled, _last
     ours = _set(SIGNALS, _note)
@@ -104,10 +104,10 @@ def noted() -> Iterator[None]:
 
 
 def _set(numbers: tuple[int, ...], handler: _Handler, *untouched: _Handler) -> list[tuple[int, _Handler]]:
-    """Take the signals that nobody else handles or ignores; gives their handlers of before."""
+    """Handle the signals that have a default handler. Return their previous handlers."""
     if threading.current_thread() is not threading.main_thread():
         return []
-    # a program that embeds this one may handle its signals: those stay its own
+    # a program that embeds this one may handle its signals, so keep its handlers
     untouched = untouched or (signal.SIG_DFL, signal.default_int_handler)
     ours = [(number, signal.getsignal(number)) for number in numbers if signal.getsignal(number) in untouched]
     for number, _ in ours:
@@ -145,25 +145,25 @@ def _watched() -> Iterator[None]:
 
 
 def _watch(signals: int, ended: threading.Event) -> None:
-    """End the process where a signal came, nobody holds it back, and Python could not run its handler for a while."""
+    """End the process if a signal came, is not held, and Python could not run its handler for ``PATIENCE_S``."""
     while number := os.read(signals, 1):
         if not ended.wait(PATIENCE_S) and not _signalled and signal.getsignal(number[0]) is _note:
             _clear()
-            # not print: the stuck thread may hold the lock of the stream
+            # not print: the blocked thread may hold the lock of the stream
             os.write(2, f"aerpaw-cmp: {said(number[0])} in a long calculation; its output was not written\n".encode())
-            # sys.exit would end this thread alone
+            # sys.exit would end only this thread
             os._exit(SIGNALLED + number[0])
     os.close(signals)
 
 
 def said(number: int) -> str:
-    """Words of a message for the end by a signal."""
+    """Return the message text for the end by a signal."""
     return "interrupted" if number == signal.SIGINT else f"ended by {signal.Signals(number).name}"
 
 
 @contextmanager
 def held() -> Iterator[None]:
-    """Hold interrupts back until the block has ended; they are raised then."""
+    """Delay interrupts until the block has ended, then raise them."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -171,7 +171,7 @@ def held() -> Iterator[None]:
     before = {number: signal.getsignal(number) for number in SIGNALS}
     ours = {number: handler for number, handler in before.items() if callable(handler)}
     for number in ours:
-        # not blocked by a mask: a thread of a library would take the signal in this one's place
+        # not blocked by a mask: a thread of a library would receive the signal instead
         signal.signal(number, lambda number, _frame: signals.append(number))
     try:
         yield
@@ -236,12 +236,12 @@ def _stream(number: int, encoding: str, *, buffered: bool) -> io.TextIOWrapper:
 
 
 def output_fault() -> OSError | None:
-    """Bring what was printed out of the process; the error where standard output did not take it."""
+    """Flush standard output. Return the error if that failed, else None."""
     try:
         sys.stdout.flush()
     except OSError as error:
         return error
-    # what a test or a notebook put there has no descriptor of ours
+    # tests and notebooks replace sys.stdout by streams without our _Descriptor
     buffer = getattr(sys.stdout, "buffer", None)
     raw = getattr(buffer, "raw", buffer)
     return raw.fault if isinstance(raw, _Descriptor) else None

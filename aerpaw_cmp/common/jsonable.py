@@ -1,4 +1,4 @@
-"""Values as JSON can hold them."""
+"""Conversion of values for JSON."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ def number_key(number: float) -> str:
 
 
 def json_safe(value: Any) -> Any:
-    """A copy that JSON can hold: NaN and infinity become None, arrays lists, keys text, records mappings by field.
+    """Return a copy for JSON: NaN and infinity become None, arrays lists, keys text, and records mappings by field.
 
-    A field of a record (dataclass) whose default is None is left out where it is None: the record has no such number.
+    A field of a record (dataclass) whose default is None is omitted if it is None: the record has no such number.
 
     Examples
     --------
     >>> json_safe({"rmse_db": float("nan"), 10: np.array([1, 2])})
     {'rmse_db': None, '10': [1, 2]}
     """
-    # is_dataclass is true of the class as well, which has no values
+    # is_dataclass is also true for the class, which has no values
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return json_safe(fields_of(value))
     if isinstance(value, Mapping):
@@ -57,13 +57,13 @@ def json_safe(value: Any) -> Any:
 
 
 def json_object(**entries: Any) -> dict[str, Any]:
-    """Entries by name, their values as JSON can hold them."""
+    """Return entries by name, with their values converted for JSON."""
     return {name: json_safe(value) for name, value in entries.items()}
 
 
 def _listed(array: AnyArray) -> Any:
     if array.dtype.kind == "f":  # large maps: one pass, not one call per number
-        # Python's floats: JSON writes them with the fewest digits that read back
+        # Python's floats: JSON writes them with the fewest digits that restore the same value
         boxed = array.astype(object)
         boxed[~np.isfinite(array)] = None
         return boxed.tolist()
@@ -71,12 +71,12 @@ def _listed(array: AnyArray) -> Any:
 
 
 def named(record: Any, names: str) -> dict[str, Any]:
-    """Some fields of a record by name; ``names`` stand apart by blanks."""
+    """Return some fields of a record by name. ``names`` are separated by blanks."""
     return {name: getattr(record, name) for name in names.split()}
 
 
 def fields_of(record: Any) -> dict[str, Any]:
-    """Fields of a dataclass by name, without those that are None because they do not exist."""
+    """Return the fields of a dataclass by name, without optional fields that are None."""
     return {
         field.name: getattr(record, field.name)
         for field in dataclasses.fields(record)

@@ -24,14 +24,14 @@ from .units import FloatArray
 
 
 def xml_root(data: bytes, path: Path | None, expected: str) -> ElementTree.Element:
-    """The root element of an XML text; tags keep their prefix, declared or not (:func:`plain` cuts it).
+    """Return the root element of an XML text. Tags keep their prefix, declared or not (:func:`plain` cuts it).
 
     Raises
     ------
     InputError
-        No XML, with the line; entities, or another encoding than UTF-8.
+        If the text is not XML (with the line), contains entities, or is not UTF-8.
     """
-    # UTF-16 would hide entities from this look
+    # UTF-16 would hide entities from this check
     if data[:2] in (b"\xff\xfe", b"\xfe\xff") or b"<!DOCTYPE" in data or b"<!ENTITY" in data or b"\0" in data:
         raise InputError("the XML declares entities, or is not UTF-8", expected=expected, path=path)
     builder, parser = ElementTree.TreeBuilder(), expat.ParserCreate()  # a KML with gx:Track and no xmlns:gx is common
@@ -59,9 +59,9 @@ def named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]
 
 
 def outermost(root: ElementTree.Element, names: set[str]) -> Iterator[ElementTree.Element]:
-    """Elements below a root with one of the names, in order; nothing inside of them is looked at.
+    """Yield elements below a root with one of the names, in order. Do not search inside these elements.
 
-    Map formats nest none of them in itself: a file that does would be walked through once per level.
+    Map formats do not nest these elements. A file that does would be searched once per level.
     """
     walk = list(reversed(root))
     while walk:
@@ -77,21 +77,21 @@ _DPI = 110
 
 # --- reading -------------------------------------------------------------------------------------------------------
 
-# A named value, and the first place of a shape, on a line of a log.
-# repeats have ends: a line of a stranger may be megabytes long, and each start would search all of it
+# A named value and the first position of a shape, on a line of a log. Repeats are bounded: a third-party line may be
+# megabytes long, and each start would search all of it.
 DATA = re.compile(rb'<Data name="([A-Za-z][A-Za-z0-9 _-]{0,39})">\s{0,40}<value>([^<]{0,200})</value>')
 _DECIMAL = rb"([-+]?[\d.]{1,20})"
 POINT = re.compile(rb"<coordinates>\s{0,40}%b,\s?%b(?:,\s?%b)?" % (_DECIMAL, _DECIMAL, _DECIMAL))
 
 
 def is_kml(head: bytes) -> bool:
-    """Check whether a file begins as KML."""
-    # a declaration, comments and a licence may stand before it
+    """Check whether a file begins with KML."""
+    # a declaration, comments and a licence may come first
     return b"<kml" in head[:2048]
 
 
 def data_of(parts: Iterator[ElementTree.Element]) -> dict[str, str]:
-    """Names and values of ``Data`` and ``SimpleData`` among elements."""
+    """Return names and values of ``Data`` and ``SimpleData`` among elements."""
     tags = {}
     for part in parts:
         if plain_tag(part.tag) == "Data":
@@ -160,21 +160,21 @@ def xml_text(text: str) -> str:
 
 
 def coordinates(longitude: FloatArray, latitude: FloatArray, up_m: FloatArray | float = 0.0) -> list[str]:
-    """Places (n,) as KML writes them; a height below or unknown is 0."""
+    """Return positions (n,) in KML format. Negative or unknown heights become 0."""
     up = np.broadcast_to(np.maximum(np.nan_to_num(up_m), 0.0), np.shape(longitude))
     # 1e-7 degree is a centimetre
     return [f"{a:.7f},{b:.7f},{h:.1f}" for a, b, h in zip(longitude, latitude, up, strict=True)]
 
 
 def mark(name: str, at: str, *, in_the_air: bool = False) -> str:
-    """A named point; in the air it stands on a pole at its height above the ground."""
+    """Return a named point. In the air it is on a pole at its height above the ground."""
     height = "<extrude>1</extrude><altitudeMode>relativeToGround</altitudeMode>" if in_the_air else ""
     point = f"<Point>{height}<coordinates>{at}</coordinates></Point>"
     return f"<Placemark><name>{xml_text(name)}</name>{point}</Placemark>"
 
 
 def line(name: str, at: list[str], shape: str, *, style: str = "", head: str = "") -> str:
-    """A named line through places.
+    """Return a named line through positions.
 
     Parameters
     ----------
@@ -198,12 +198,12 @@ def line(name: str, at: list[str], shape: str, *, style: str = "", head: str = "
 
 
 def line_style(colour: str, width: int) -> str:
-    """A style of lines; KML writes a colour as alpha, blue, green, red."""
+    """Return a line style. KML writes a colour as alpha, blue, green, red."""
     return f"<Style><LineStyle><color>{colour}</color><width>{width}</width></LineStyle></Style>"
 
 
 def folder(name: str, legend: str, content: str, *, visible: bool) -> str:
-    """A folder that can be switched, with a legend in a corner of the screen.
+    """Return a folder that can be switched on and off, with a legend in a corner of the screen.
 
     Parameters
     ----------
@@ -237,7 +237,7 @@ def write_archive(path: Path, title: str, description: str, body: str, pictures:
     ----------
     path : Path
     title, description : str
-        Of the document.
+        Title and description of the document.
     body : str
         KML elements.
     pictures : mapping of str to bytes
@@ -273,14 +273,14 @@ def list_legend(title: str, colours: Mapping[str, str], width: float = 2.6) -> b
 
 
 def bar_legend(title: str, label: str, limits: tuple[float, float]) -> bytes:
-    """A colour bar as PNG; both ends hold what lies beyond."""
+    """Return a colour bar as PNG. Both ends include the values beyond the limits."""
     from matplotlib import colormaps
 
     sheet, (low, high) = _Sheet(title, 4.2, 0.9), limits
     left, wide = 30, sheet.picture.width - 60
     for column, colour in enumerate(colormaps["viridis"](np.linspace(0.0, 1.0, wide), bytes=True)):
         sheet.pen.line((left + column, 26, left + column, 46), fill=tuple(colour))
-    # as many decimals as show a tenth of the span
+    # enough decimals to show a tenth of the range
     digits = max(0, int(np.ceil(1.0 - np.log10(high - low))))
     for share in (0.0, 0.25, 0.5, 0.75, 1.0):
         at, sign = left + share * (wide - 1), {0.0: "≤ ", 1.0: "≥ "}.get(share, "")

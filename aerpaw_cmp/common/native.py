@@ -1,12 +1,12 @@
-"""Strangers' files of native formats (HDF5, GeoTIFF), read in a child process that can open nothing.
+"""Reading of third-party files in native formats (HDF5, GeoTIFF), in a child process that cannot open anything.
 
 Libraries of these formats are C code that follows the file: to other files that it names (external storage and links,
 virtual data sets, VRT), into endless loops, and sometimes over the end of a buffer. The child gets the bytes of the
-file, loads its library, and then gives up the right to any further descriptor (RLIMIT_NOFILE 0: no file, socket or
-process pipe can be opened, by whatever code), to more than ``_MOST_MEMORY`` and to more than ``SECONDS`` of processor
-time. Only then does it look at the bytes. What comes back is a list of plain arrays.
+file, loads its library, and then gives up its rights. It cannot create any further descriptor (RLIMIT_NOFILE 0: no
+file, socket or process pipe), use more than ``_MOST_MEMORY``, or more than ``SECONDS`` of processor time. Only then
+does it read the bytes. The result is a list of plain arrays.
 
-Where there is no ``resource`` module (Windows) the limits do not hold; what a file may contain is checked all the same.
+Without a ``resource`` module (Windows) these limits do not apply, but the content of the file is still checked.
 """
 
 from __future__ import annotations
@@ -23,10 +23,10 @@ import numpy as np
 from .errors import InputError, one_line
 from .units import AnyArray
 
-# Of all arrays of a file together.
+# Limit for all arrays of a file together [bytes].
 MOST_BYTES = 1 << 30
 MOST_RATIO = 200
-# A file may declare so many bytes, and ``MOST_RATIO`` times its own size: text compresses to a hundredth.
+# A file may always declare this many bytes, and ``MOST_RATIO`` times its size: text compresses to a hundredth.
 FREE_BYTES = 1 << 26
 _MOST_ITEMS = 100_000
 _MOST_MEMORY = 4 << 30
@@ -43,9 +43,9 @@ def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
     Parameters
     ----------
     kind : str
-        ``hdf5`` (numeric data sets by their path; notes: ``attributes`` of the root, ``classes`` of MATLAB variables),
-        ``matlab`` (the same of the root group alone), ``netcdf`` (those and texts; notes: also ``dims`` and ``units``
-        by variable) or ``geotiff`` (``band``; notes: ``transform crs unit``).
+        ``hdf5`` returns numeric data sets by their path, with the notes ``attributes`` of the root and ``classes`` of
+        MATLAB variables. ``matlab`` returns the same for the root group only. ``netcdf`` also returns texts, and the
+        notes ``dims`` and ``units`` by variable. ``geotiff`` returns ``band``, with the notes ``transform crs unit``.
     data : bytes
         The file.
 
@@ -69,11 +69,11 @@ def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
 
 
 def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
-    """Exit code, standard output and standard error of the child."""
-    # isolated, and with the paths of this process: the working folder may be a stranger's, with a numpy.py in it
+    """Return exit code, standard output and standard error of the child."""
+    # isolated, with the paths of this process: an untrusted working folder may contain a numpy.py
     command = [sys.executable, "-I", "-c", _CHILD, kind, *(path for path in sys.path if path)]
     try:
-        # limits of the processor's time do not end a child that only waits
+        # limits of processor time do not end a child that only waits
         child = subprocess.run(command, input=data, capture_output=True, timeout=2 * SECONDS, check=False, env=_ENVIRON)
     except subprocess.TimeoutExpired:
         raise InputError(f"the file cannot be read within {2 * SECONDS} s", cause="a damaged file") from None
@@ -122,7 +122,7 @@ def answer(reader: Read, data: bytes) -> tuple[int, bytes, bytes]:
 
 
 def give_up_rights() -> None:
-    """From here on this process opens nothing, and gets little memory and time."""
+    """Remove this process's rights to open files and to use much memory and time."""
     try:
         import resource
     except ImportError:
@@ -184,13 +184,13 @@ def _hdf5(depth: int, netcdf: bool = False) -> Read:
 
 
 def _dimensions(item: Any) -> list[str]:
-    """Return the names of the dimensions of a NetCDF variable; a dimension's own variable has its own name."""
+    """Return the names of the dimensions of a NetCDF variable. A coordinate variable has the name of its dimension."""
     own = item.name.lstrip("/")
     return [next((scale.name.lstrip("/") for scale in dimension.values()), own) for dimension in item.dims]
 
 
 def _plain(values: AnyArray) -> AnyArray:
-    """Return an array that needs no pickle: rows of characters and texts become arrays of text."""
+    """Return an array that does not require pickle: rows of characters and texts become arrays of text."""
     if values.dtype.kind == "S" and values.dtype.itemsize == 1 and values.ndim:
         joined = [
             b"".join(row).decode("utf-8", "replace").rstrip("\0 ") for row in values.reshape(-1, values.shape[-1])

@@ -1,22 +1,23 @@
-"""Output files and folders: they replace nothing that is not this tool's, and appear whole or not at all.
+"""Output files and folders: they overwrite only outputs of this tool, and are written atomically.
 
 Two kinds of result, one rule:
 
 =====================  =======================================================  ==================================
 kind                   is this tool's own, so that it may be replaced           how the new one takes the name
 =====================  =======================================================  ==================================
-:class:`OutputFile`    a seal inside: the SHA-256 of the rest of the file       written beside, synced, renamed
-:class:`OutputFolder`  ``SHA256SUMS`` in it: the SHA-256 of every file of it    filled beside, synced, exchanged
+:class:`OutputFile`    a seal inside: the SHA-256 of the rest of the file       written nearby, synced, renamed
+:class:`OutputFolder`  ``SHA256SUMS`` in it: the SHA-256 of every file of it    filled nearby, synced, swapped
 =====================  =======================================================  ==================================
 
-An input is never replaced, with ``--force`` or without; inputs are known by device and inode, so through links, too.
-What this tool did not write, or what was changed after it was written, is replaced with ``--force`` only.
+An input is never replaced, with or without ``--force``. Inputs are compared by device and inode, so links are
+recognised. Files that this tool did not write, or that were changed afterwards, are replaced only with ``--force``.
 
-The place beside the target (``.NAME.aerpaw-part``) is made before any computation, so that a bad ``-o`` is told first,
-and is locked (flock) until the run ends: a second run into the same target is refused. A killed run leaves at most
-that hidden place; the next run into the target clears it. See docs/security.md for what holds when.
+The hidden path next to the target (``.NAME.aerpaw-part``) is created before any computation, so that a bad ``-o`` is
+reported first. It is locked (flock) until the run ends: a second run into the same target is refused. A killed run
+leaves at most that hidden path, and the next run into the target removes it. See docs/security.md for the exact
+guarantees.
 
-A stream that HDF5 may write to.
+The module also contains a stream that HDF5 can write to.
 """
 
 from __future__ import annotations
@@ -66,7 +67,7 @@ def unsealed(text: str) -> str:
 
 
 def is_sealed(path: Path) -> bool:
-    """Check whether a file is as :func:`sealed` made it, and nobody changed it since."""
+    """Check whether a file is unchanged since :func:`sealed` created it."""
     with path.open("rb") as stream:
         head = stream.readline(len(_SEAL) + 80)
         seal = f"{_SEAL}{_digest(stream)}\n" if head.startswith(_SEAL.encode("ascii")) else ""
@@ -74,7 +75,7 @@ def is_sealed(path: Path) -> bool:
 
 
 def check_seal(path: Path) -> None:
-    """Refuse a file with a seal of :func:`sealed` whose other lines were changed; one without a seal is accepted.
+    """Refuse a file with a seal of :func:`sealed` whose other lines were changed. Accept a file without a seal.
 
     Raises
     ------
@@ -92,9 +93,9 @@ def check_seal(path: Path) -> None:
 
 
 def read_sums(folder: Path) -> dict[str, str] | None:
-    """SHA-256 of each file of a result folder by its relative name; None where there is no list of this tool.
+    """Return the SHA-256 of each file of a result folder by relative name. None without a valid list of this tool.
 
-    A list that names a file outside the folder is none: what it lists may be removed.
+    A list that names a file outside the folder is not valid, because the listed files may be removed.
     """
     try:
         text = (folder / SUMS).read_text(encoding="utf-8")
@@ -141,13 +142,13 @@ def _identity(path: Path) -> _Identity | None:
 
 
 def files_below(folder: Path) -> Iterator[Path]:
-    """Every file below a folder; links to folders are not followed."""
+    """Yield every file below a folder. Links to folders are not followed."""
     for parent, _, names in os.walk(folder):
         yield from (Path(parent, name) for name in names)
 
 
 def _real(path: Path) -> Path:
-    """The place that a path names, links followed; UsageError for a name that cannot be."""
+    """Return the path with links resolved. UsageError for an impossible name."""
     try:
         return Path(os.path.realpath(path))
     except (OSError, ValueError) as error:
@@ -209,7 +210,7 @@ class OutputFile:
         own = False
         with contextlib.suppress(OSError, ValueError):
             own = self._own(self.target)
-        for path in () if own else self._inputs:  # an own earlier output may lie among the logs
+        for path in () if own else self._inputs:  # an earlier output of this tool may be among the logs
             if path.is_dir() and any(_identity(file) == target for file in files_below(path)):
                 raise _replaces_input(self.named, path)
         if not own and not self._force:
@@ -241,7 +242,7 @@ class OutputFile:
             raise_interrupt()
             with held():
                 place.part.rename(self.target)
-                place.leave()  # HDF5 opens no file that somebody locks
+                place.leave()  # HDF5 does not open a locked file
                 self._place = None
                 _sync_folder(self.target.parent)
 
@@ -254,7 +255,7 @@ class OutputFile:
 
 
 def _say_kept(error: BaseException | None, named: Path) -> None:
-    """Add to an interrupt what stands at the output's name."""
+    """Add the state of the output's name to an interrupt."""
     if isinstance(error, KeyboardInterrupt) or (error is not None and interrupted()):
         exists = os.path.lexists(named)
         add_note(error, f"{one_line(str(named))} {'is as it was before' if exists else 'was not written'}")
@@ -272,16 +273,16 @@ def _replaces_input(named: Path, path: Path) -> UsageError:
 
 
 class OutputFolder:
-    """A folder of results, replaced as a whole; a context around the whole command.
+    """A context around the whole command for a folder of results, which is replaced as a whole.
 
     Parameters
     ----------
     target : Path
-        What ``-o`` names; made when missing, with its parents.
+        Value of ``-o``. Created if it is missing, with its parents.
     job : str
         Name of the command, for ``SHA256SUMS``.
     inputs : iterable of Path
-        Files that the command reads; none of them may lie in the folder.
+        Files that the command reads. None of them may be in the folder.
     force : bool
         Replace files that were changed after this tool wrote them; never files of others.
 
@@ -381,7 +382,7 @@ class OutputFolder:
 
     @contextlib.contextmanager
     def filling(self) -> Iterator[Path]:
-        """An empty folder to write the results to; they take the name when the block ends without an error."""
+        """Yield an empty folder for the results. It takes the target's name if the block ends without an error."""
         place = self._place
         assert place is not None, "used as a context"
         with explained_os_errors(self.named):
@@ -409,7 +410,7 @@ class OutputFolder:
         replaced = self.target.is_dir()
         for folder in (place.part, *(entry for entry in place.part.rglob("*") if entry.is_dir())):
             before = self.target / folder.relative_to(place.part)
-            if before.is_dir():  # rights that somebody took away stay so
+            if before.is_dir():  # keep permissions that a user removed
                 folder.chmod(stat.S_IMODE(before.stat().st_mode))
         (place.part / _UNFINISHED).unlink(missing_ok=True)
         _sync_folder(place.part)
@@ -450,18 +451,18 @@ def foreign_entries(folder: Path, own: Iterable[str]) -> Iterator[str]:
 
 
 def _mounted_below(folder: Path) -> list[Path]:
-    """Mount points below a folder, bind mounts of its own file system too; none where the system does not list them."""
+    """Return mount points below a folder, including bind mounts. Empty if the system does not list them."""
     try:
         lines = Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
     except OSError:
         return []
-    # blanks and the like stand there as octal numbers
+    # blanks and similar characters are octal numbers in this list
     points = (re.sub(r"\\(\d{3})", lambda code: chr(int(code[1], 8)), line.split(" ")[4]) for line in lines)
     return [Path(point) for point in points if folder in Path(point).parents]
 
 
 def _make_folders(folder: Path, created: list[Path]) -> None:
-    """Make a folder and its parents; ``created`` gets those that were not there."""
+    """Create a folder and its parents. Append the ones that were missing to ``created``."""
     missing = [place for place in (folder, *folder.parents) if not place.exists()]
     for place in reversed(missing):
         place.mkdir(exist_ok=True)
@@ -469,7 +470,7 @@ def _make_folders(folder: Path, created: list[Path]) -> None:
 
 
 def _remove_folders(created: list[Path]) -> None:
-    """Remove folders made for a run that failed, where nothing is in them."""
+    """Remove empty folders that were created for a failed run."""
     # deepest first: a parent is empty only then
     for place in reversed(created):
         with contextlib.suppress(OSError):
@@ -480,7 +481,7 @@ def _remove_folders(created: list[Path]) -> None:
 
 
 def hidden_name(target: Path, suffix: str) -> Path:
-    """The hidden name of a place beside the target; short where the name is long (255 bytes are the limit)."""
+    """Return the hidden name of a path next to the target, shortened if it is long (255 bytes are the limit)."""
     name = target.name
     if len(os.fsencode(name)) > 200:
         name = hashlib.sha256(os.fsencode(name)).hexdigest()[:32]
@@ -488,7 +489,7 @@ def hidden_name(target: Path, suffix: str) -> Path:
 
 
 class _Place:
-    """``.NAME.aerpaw-part``, made and locked; what a killed run left there is cleared."""
+    """The locked path ``.NAME.aerpaw-part``. Remains of a killed run are cleared."""
 
     def __init__(self, target: Path, named: Path, *, folder: bool) -> None:
         self.named = named
@@ -496,7 +497,7 @@ class _Place:
         self._further: list[int] = []
         self._left = False
         with explained_os_errors(named):
-            with held():  # an interrupt finds the place known to AT_END, or not made
+            with held():  # an interrupt finds the place either registered in AT_END or not created
                 self.descriptor = self._claim(folder)
                 AT_END.append(self.leave)
             try:
@@ -509,7 +510,7 @@ class _Place:
                 raise
 
     def _empty(self) -> None:
-        """Clear what a killed run left; UsageError where something else is there."""
+        """Clear the remains of a killed run. UsageError if there is anything else."""
         with contextlib.suppress(OSError):
             _clear(self.part, keep=True)
         if foreign := next(self.part.iterdir(), None):
@@ -528,7 +529,8 @@ class _Place:
                         self.part.mkdir()
                     descriptor = os.open(self.part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
                 else:
-                    # no link is followed: in a shared folder somebody may have put one there; private until it is done
+                    # links are not followed, because another user could have put one into a shared folder; private
+                    # until finished
                     descriptor = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
             except FileNotFoundError as error:
                 if not self.part.parent.is_dir():
@@ -568,12 +570,12 @@ class _Place:
         return _identity(self.part) == (status.st_dev, status.st_ino)
 
     def refuse_gone(self) -> None:
-        """OutputError where somebody removed or replaced the place."""
+        """Raise an error if the place was removed or replaced."""
         if not self._is_there(self.descriptor):
             raise FileNotFoundError(errno.ENOENT, "removed while the run went on", str(self.part))
 
     def leave(self) -> None:
-        """Remove what did not take the name, and unlock."""
+        """Remove the parts that did not take the target's name, and unlock."""
         if self._left:
             return
         self._left = True
@@ -588,12 +590,12 @@ class _Place:
 
 
 def _is_own(status: os.stat_result) -> bool:
-    """Check whether a file or folder belongs to this user; True on systems without users."""
+    """Check whether a file or folder belongs to this user. True on systems without users."""
     return not hasattr(os, "geteuid") or status.st_uid == os.geteuid()
 
 
 def _lock(descriptor: int) -> bool:
-    """Check whether the lock was had; True as well on systems and disks that have no locks."""
+    """Check whether the lock was obtained. True also on systems and disks without locks."""
     try:
         import fcntl
 
@@ -601,18 +603,19 @@ def _lock(descriptor: int) -> bool:
     except ImportError:
         return True
     except OSError as error:
-        # every other failure is of a disk without locks, and no reason to refuse
+        # every other failure means a disk without locks, which is not a reason to refuse
         return error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
     return True
 
 
 def _clear(part: Path, *, keep: bool = False) -> None:
-    """Empty a place and, unless ``keep``, remove it; OSError where something is in it that is not this tool's.
+    """Empty a place and, unless ``keep``, remove it. OSError if it contains files that are not this tool's.
 
-    A place with ``.unfinished`` was being filled: all in it is ours. Without it, it is the set that was replaced, and
-    ours is what its list names. Both signs go last, so that a killed run can be gone on with.
+    A place with ``.unfinished`` was being filled, so all its files are ours. Without it, it is the set that was
+    replaced, and only the files in its list are ours. Both markers are removed last, so that a killed run can be
+    continued.
     """
-    # os.walk goes through mounts, and unlink would empty the disk behind one
+    # os.walk enters mounts, and unlink would empty the mounted disk
     if _mounted_below(part):
         raise OSError(errno.EXDEV, "a file system is mounted there", str(part))
     signs = [part / _UNFINISHED, part / SUMS]
@@ -635,7 +638,7 @@ def _clear(part: Path, *, keep: bool = False) -> None:
 
 
 def _exchange(part: Path, target: Path) -> None:
-    """Two folders swap their names in one step; where the system cannot, in two that :func:`_restore` mends."""
+    """Swap the names of two folders in one step, or in two steps that :func:`_restore` can undo."""
     if _names_swapped(part, target):
         return
     old = hidden_name(target, "old")
@@ -645,7 +648,7 @@ def _exchange(part: Path, target: Path) -> None:
 
 
 def _restore(target: Path) -> None:
-    """Mend what a run killed between the two steps left: the old set has its name again."""
+    """Undo the first step of a swap that was killed between its steps: the old set gets its name back."""
     old = hidden_name(target, "old")
     if not old.is_dir() or not _is_own(old.lstat()):
         return
@@ -656,7 +659,7 @@ def _restore(target: Path) -> None:
 
 
 def _names_swapped(first: Path, second: Path) -> bool:
-    """RENAME_EXCHANGE (Linux) or RENAME_SWAP (macOS); False where kernel, library or file system have it not."""
+    """Swap names with RENAME_EXCHANGE (Linux) or RENAME_SWAP (macOS). Return False if that is not supported."""
     library = ctypes.CDLL(None, use_errno=True)
     names = os.fsencode(first), os.fsencode(second)
     if sys.platform == "darwin":
@@ -685,7 +688,7 @@ def _sync_tree(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    """Bring the names in a folder to the disk; not every system lets folders be synced."""
+    """Sync the names in a folder to the disk. Not every system can sync folders."""
     try:
         sync(folder)
     except OSError as error:
@@ -707,7 +710,7 @@ _WRONG_NAMES = (errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, e
 
 
 def _taken(path: Path) -> bool:
-    """Check whether anything has the name; OSError where nothing can, which ``lexists`` takes for a free one."""
+    """Check whether the name is in use. Raise OSError for an impossible name, which ``lexists`` treats as free."""
     try:
         path.lstat()
     except FileNotFoundError:

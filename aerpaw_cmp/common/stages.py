@@ -31,9 +31,12 @@ logging.getLogger("aerpaw_cmp").addHandler(logging.NullHandler())
 
 
 def logged(text: str, fraction: float | None = None, /) -> None:
-    """Progress of what Python calls: INFO, shares DEBUG, on the logger of its room, such as ``aerpaw_cmp.flight``."""
+    """Log progress of Python calls as INFO, shares as DEBUG, on the logger of the caller's subpackage.
+
+    An example is ``aerpaw_cmp.flight``.
+    """
     frame = sys._getframe(1)
-    # common speaks for the room that called it
+    # the logger of the subpackage that called common
     while frame.f_back is not None and not re.match(r"aerpaw_cmp\.(?!common)", frame.f_globals["__name__"]):
         frame = frame.f_back
     room = ".".join(frame.f_globals["__name__"].split(".")[:2])
@@ -57,7 +60,7 @@ def duration(seconds: float) -> str:
 
 
 def share_of(progress: Progress, text: str) -> Callable[[float], None]:
-    """The progress of one step, for code that knows its share and not its name."""
+    """Return the progress of one step, for code that knows its share but not its name."""
 
     def step(fraction: float) -> None:
         progress(text, fraction)
@@ -67,7 +70,7 @@ def share_of(progress: Progress, text: str) -> Callable[[float], None]:
 
 @dataclass(frozen=True, slots=True)
 class PlannedStage:
-    """A stage: what it works on, and seconds that it took, or will by what kept tasks took; None where unknown."""
+    """A planned stage. ``work`` is its input, ``seconds`` its measured or estimated time, None if unknown."""
 
     name: str
     work: str
@@ -94,7 +97,7 @@ class Plan:
     stages: tuple[PlannedStage, ...] = ()
 
     def as_dict(self) -> dict[str, Any]:
-        """The plan as JSON can hold it."""
+        """Return the plan as plain values for JSON."""
         return {
             "job": self.job,
             "inputs": [str(path) for path in self.inputs],
@@ -104,7 +107,7 @@ class Plan:
 
 
 class NotRun(Exception):  # noqa: N818  # the end that a dry run has, no error
-    """A dry run came to where computing would begin; ``plan`` says what the run would do."""
+    """The exception at the point where a dry run would begin to compute. ``plan`` contains what a run would do."""
 
     def __init__(self, plan: Plan) -> None:
         super().__init__(f"{plan.job} was not run")
@@ -120,9 +123,9 @@ class Stages:
     progress : Progress
         Gets the name of each stage as it begins.
     seconds : dict of str to float
-        What has been spent; a name that comes twice adds up.
+        Time of each stage [s]. Stages with the same name are added.
     plan : Plan, optional
-        Of a dry run.
+        Plan of a dry run.
 
     Examples
     --------
@@ -145,28 +148,28 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time one stage; one that comes again is not announced again. A swallowed interrupt is raised first."""
+        """Time one stage. A repeated stage is announced once. A swallowed interrupt is raised first."""
         raise_interrupt()
         if name not in self.seconds:
             self.progress(name)
-        # by this clock: time of day may be set while a job runs
+        # a monotonic clock: the time of day may be set while a job runs
         start = time.perf_counter()
         try:
             yield
         finally:
-            # also where it failed or was interrupted: the page says what was spent
+            # also after a failure or an interrupt: the page reports the time spent
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
             give_memory_back()
 
 
 def begin_peak() -> None:
-    """Let the high-water mark of this process's memory begin anew, where the system can (proc(5))."""
+    """Reset the high-water mark of this process's memory, if the system can (proc(5))."""
     with suppress(OSError):
         Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
 
 
 def peak_mib() -> float:
-    """High-water mark of this process's memory [MiB]; NaN where the system has none."""
+    """Return the high-water mark of this process's memory [MiB]. NaN if the system does not report it."""
     try:
         return float(Path("/proc/self/status").read_text(encoding="ascii").split("VmHWM:")[1].split()[0]) / 1024.0
     except (OSError, IndexError):
@@ -174,10 +177,10 @@ def peak_mib() -> float:
 
 
 def give_memory_back() -> None:
-    """Hand freed pages back to the system, where the C library can (glibc: ``malloc_trim``).
+    """Return freed pages to the system, if the C library can (glibc: ``malloc_trim``).
 
-    A stage frees most of what it asked for, in pieces among those that stay: a flight of ten hours kept a quarter of
-    a GiB of such holes from stage to stage.
+    A stage frees most of its memory, in pieces between others that stay. After a flight of ten hours a quarter of a GiB
+    of such free pieces would remain from stage to stage.
     """
     trim = getattr(_library(), "malloc_trim", None)
     if trim is not None:

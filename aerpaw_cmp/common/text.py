@@ -2,11 +2,12 @@
 
 The commands and their one-line help, for ``--help`` without loading anything and for the command line itself.
 
-Numbers of things in words.
+The module also formats numbers of things as words.
 
-Text cells of CSV files: names come from strangers' logs, and a spreadsheet runs what begins with = + - or @.
+Text cells of CSV files are guarded: names come from third-party logs, and a spreadsheet runs cells that begin with = +
+- or @.
 
-A small HTML table: what a notebook shows of a record.
+Records are shown in notebooks as a small HTML table.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ COMMANDS: dict[str, str] = {
 
 
 def counted(number: int, noun: str, plural: str = "") -> str:
-    """A number with its noun, thousands set apart as in the tables; the plural has an s unless it is given.
+    """Return a number with its noun. The plural has an s unless it is given, and thousands are separated.
 
     Examples
     --------
@@ -50,7 +51,7 @@ def counted(number: int, noun: str, plural: str = "") -> str:
     >>> counted(1, "row is", "rows are"), counted(2, "row is", "rows are")
     ('1 row is', '2 rows are')
     """
-    # a narrow blank at which no line breaks: a comma is the decimal sign of many readers
+    # a narrow no-break space, because a comma is the decimal sign of many readers
     return f"{number:,} {noun if number == 1 else plural or noun + 's'}".replace(",", "\N{NARROW NO-BREAK SPACE}")
 
 
@@ -63,14 +64,14 @@ _IN_COMMENT = re.compile(r"([,;\t]\s*)(?=[=@]|[+\-](?![\d.]|inf|nan))")
 
 
 def guarded(table: Any) -> Any:
-    """A data frame whose texts no spreadsheet takes for formulas: an apostrophe stands before those that it would.
+    """Return a data frame without text that a spreadsheet would run as a formula. An apostrophe precedes such text.
 
-    Numbers stay numbers. :func:`unguarded` gives the texts back.
+    Numbers stay numbers. :func:`unguarded` restores the texts.
     """
     guarded_columns = {}
     for name in table.columns:
         if table[name].dtype.kind == "O" or str(table[name].dtype).startswith("str"):
-            # by distinct word: a million rows hold a few names
+            # by distinct word: a million rows contain a few names
             words = [word for word in table[name].unique() if isinstance(word, str) and _BEGINNING.search(word)]
             if words:
                 texts = table[name].astype(object)
@@ -113,7 +114,7 @@ def unguarded(word: str) -> str:
 
 
 def html_table(titles: Sequence[str], rows: Iterable[Sequence[object]], caption: str = "") -> str:
-    """A table with a head; every text is escaped.
+    """Return an HTML table with a head. Every text is escaped.
 
     Examples
     --------
@@ -122,6 +123,6 @@ def html_table(titles: Sequence[str], rows: Iterable[Sequence[object]], caption:
     """
     head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
     body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
-    # a caption comes first in a table: HTML allows it nowhere else
+    # HTML only allows a caption as the first child of a table
     name = f"<caption>{html.escape(caption)}</caption>" if caption else ""
     return f"<table>{name}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"

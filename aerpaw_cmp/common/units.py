@@ -1,4 +1,4 @@
-"""Constants and conversions used by more than one room.
+"""Constants and conversions used by several subpackages.
 
 Logarithmic and angular units are part of every name: ``_db`` is a ratio, ``_dbm`` a power.
 """
@@ -38,7 +38,7 @@ THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
 
 
 class Printed(float):
-    """A number of a sentence: its minus is one in print, and names that stand beside it keep their hyphens.
+    """A number in a sentence: its minus is printed as a minus sign, and hyphens of names next to it are kept.
 
     Examples
     --------
@@ -83,18 +83,18 @@ def wavelength_m(frequency_hz: float) -> float:
 
 
 def db_from_power(power: ArrayLike) -> FloatArray:
-    """10 log10 of a power ratio; zero gives -inf without a warning."""
+    """Return 10 log10 of a power ratio. Zero returns -inf without a warning."""
     with np.errstate(divide="ignore"):
         return np.asarray(10.0 * np.log10(unmasked(power)))
 
 
 def power_from_db(level_db: ArrayLike) -> FloatArray:
-    """Power ratio of a level in dB."""
+    """Return the power ratio of a level in dB."""
     return np.asarray(10.0 ** (unmasked(level_db) / 10.0))
 
 
 def db_from_amplitude(amplitude: ArrayLike) -> FloatArray:
-    """20 log10 of a ratio of magnitudes (voltages, fields, singular values); zero gives -inf without a warning.
+    """Return 20 log10 of a ratio of magnitudes (voltages, fields, singular values). Zero returns -inf silently.
 
     Examples
     --------
@@ -116,7 +116,7 @@ def wrap_degrees(angle_deg: ArrayLike) -> FloatArray:
 
 
 def finite_mean(values: ArrayLike) -> float:
-    """Mean of the finite values; NaN without any.
+    """Return the mean of the finite values. NaN if there are none.
 
     Examples
     --------
@@ -140,7 +140,7 @@ def spread_out(count: int, most: int) -> IntArray:
 
 
 def carrier_fault(carrier_hz: float) -> str:
-    """Return what is wrong with a carrier frequency; empty if a radio can have it.
+    """Return what is wrong with a carrier frequency. Empty if a radio can use it.
 
     Examples
     --------

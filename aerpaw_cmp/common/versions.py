@@ -19,7 +19,7 @@ NOT_INSTALLED = "not installed"
 
 @cache
 def version(package: str) -> str:
-    """Version of an installed package, "not installed" where it is not; its metadata is read once."""
+    """Return the version of an installed package, else "not installed". Its metadata is read once."""
     try:
         return metadata.version(package)
     except metadata.PackageNotFoundError:
@@ -28,9 +28,9 @@ def version(package: str) -> str:
 
 @cache
 def commit() -> str:
-    """Commit of this tree, ``abc1234`` or ``abc1234.dirty``, where it is no release; "" where it is one.
+    """Return the commit of this tree, ``abc1234`` or ``abc1234.dirty``. "" for a release.
 
-    A checkout asks Git; a wheel holds the answer of the tree that it was built from (``tools/commit_file.py``).
+    A checkout queries Git. A wheel contains the commit of the tree from which it was built (``tools/commit_file.py``).
     """
     package = Path(__file__).parents[1]
     written = package / COMMIT_FILE
@@ -53,29 +53,29 @@ def commit() -> str:
     return "" if answer.startswith(f"{release}-0-g") and "." not in answer[len(release) :] else answer.split("-g")[-1]
 
 
-# Of a wheel, beside the package's own files.
+# File of a wheel, next to the package's other files.
 COMMIT_FILE = "commit.txt"
 
-# A checkout without Git, or one that Git distrusts, is no release either.
+# A checkout without Git, or one that Git distrusts, is not a release either.
 UNKNOWN = "unknown"
 
 
 def tool_version() -> str:
-    """Version of this program, with the commit of a tree that is no release: ``0.4.0+gabc1234``."""
+    """Return the version of this program, with the commit unless it is a release: ``0.4.0+gabc1234``."""
     mark = commit() and ("+" if commit() == UNKNOWN else "+g") + commit()
     return __version__ + mark
 
 
 def utc_now() -> str:
-    """The present instant in UTC, ISO 8601 to the second."""
+    """Return the present time in UTC, ISO 8601 to the second."""
     return datetime.now(timezone.utc).isoformat(timespec="seconds")
 
 
 def versions() -> dict[str, str]:
-    """Versions by name; "not installed" where a package is not."""
+    """Return versions by name. "not installed" for a missing package."""
     return {"aerpaw-cmp": tool_version(), **library_versions()}
 
 
 def library_versions() -> dict[str, str]:
-    """The same without this program."""
+    """Return the versions of Python and the libraries."""
     return {"python": platform.python_version()} | {name: version(name) for name in _PACKAGES}

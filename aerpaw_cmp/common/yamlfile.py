@@ -1,12 +1,12 @@
-"""YAML files to checked settings: every mistake is one message with the line that mends it.
+"""Reading of YAML files as checked settings. Every mistake becomes one message with its line and its fix.
 
-``load_yaml(path, Model)`` is the only door. A model is a pydantic class, usually a :class:`StrictModel`.
+``load_yaml(path, Model)`` is the only entry point. A model is a pydantic class, usually a :class:`StrictModel`.
 
-YAML is read by the core schema of YAML 1.2, because 1.1 (PyYAML's default) turns ``11:48:16`` into the number
-42496, ``no`` into False and leaves ``1e6`` a word. No tag builds an object. Duplicate keys, several documents,
-aliases that unfold to more than :data:`_MAX_NODES` nodes and nesting deeper than :data:`_MAX_DEPTH` are refused.
+YAML is read by the core schema of YAML 1.2, because 1.1 (PyYAML's default) turns ``11:48:16`` into the number 42496 and
+``no`` into False, and reads ``1e6`` as text. No tag creates an object. Duplicate keys, several documents, aliases that
+expand to more than :data:`_MAX_NODES` nodes and nesting deeper than :data:`_MAX_DEPTH` are refused.
 
-YAML files with other values at some keys: every other line, its comments and its order stay as they were written.
+Values of some keys can be edited in a YAML file: every other line, its comments and its order stay unchanged.
 
 Files that a settings file names: inputs, which no output may replace.
 
@@ -63,17 +63,17 @@ ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 
 
 class StrictModel(pydantic.BaseModel):
-    """Base of all settings: nothing unknown, every number one, no change after loading."""
+    """The base class of all settings: no unknown keys, only finite numbers, and no change after loading."""
 
-    # neither NaN nor infinity: no comparison refuses NaN, and JSON holds neither
-    # deferred: the validator of a part is made with that of the whole, once, and of what nobody asks for never
+    # neither NaN nor infinity: comparisons do not refuse NaN, and JSON contains neither. Deferred: a validator of a
+    # part is built with that of the whole, once, and never if it is not used.
     model_config: ClassVar[pydantic.ConfigDict] = pydantic.ConfigDict(
         extra="forbid", frozen=True, allow_inf_nan=False, defer_build=True
     )
 
 
 def nearest(name: object, choices: Iterable[str]) -> str | None:
-    """The choice most like ``name``, or None when none is near.
+    """Return the choice most similar to ``name``, or None if there is no close match.
 
     Examples
     --------
@@ -129,16 +129,16 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
 
 
 def load_yaml_and_lines(path: str | Path, model: type[ModelT]) -> tuple[ModelT, LineOf]:
-    """As :func:`load_yaml`, and a function that gives the line of a key such as ``("towers", "LW1")``.
+    """Return the settings of :func:`load_yaml`, and a function that returns the line of a key as ``("towers", "LW1")``.
 
-    For checks that need more than the file, whose messages shall name the line too.
+    It is for checks that need more than the file and whose messages must also contain the line.
     """
     document = _parse(_read_text(Path(path)), path)
     return _checked(document, model, path), document.line
 
 
 def dump_yaml(content: Mapping[str, Any]) -> str:
-    """Settings as YAML text that :func:`load_yaml` reads back to the same values.
+    """Return settings as YAML text that :func:`load_yaml` reads back to the same values.
 
     PyYAML writes for YAML 1.1, where ``1e3`` is a word; words that YAML 1.2 reads as something else are quoted here.
     """
@@ -166,7 +166,7 @@ def _dumper() -> Any:
 
 
 def parse_yaml(text: str, model: type[ModelT], path: str | Path | None = None) -> ModelT:
-    """YAML text as a checked model; ``path`` is for the messages only."""
+    """Parse YAML text into a checked model. ``path`` is only for the messages."""
     return _checked(_parse(text, path), model, path)
 
 
@@ -250,7 +250,7 @@ def _tab_indents(text: str, mark: Any) -> bool:
 
 
 class _Builder:
-    """Values from parser events; :data:`_MAX_DEPTH` bounds the recursion, so that no input can overflow the stack."""
+    """A builder of values from parser events. :data:`_MAX_DEPTH` bounds the recursion, to avoid a stack overflow."""
 
     def __init__(self, path: str | Path | None) -> None:
         self.path = path
@@ -280,7 +280,7 @@ class _Builder:
             self._fail(event, f"the file unfolds to more than {_MAX_NODES} values (aliases of aliases?)")
 
     def _value(self, event: Any, location: Location) -> Any:
-        """Scalar, list or mapping that begins with an event; an anchor is known from its end on."""
+        """Return the scalar, list or mapping that begins with an event. An anchor is known from its end on."""
         if isinstance(event, yaml.AliasEvent):
             if event.anchor not in self.anchors:
                 self._fail(event, f"the alias '*{event.anchor}' names no anchor above it, or contains itself")
@@ -317,14 +317,14 @@ class _Builder:
             place = (*location, key)
             if key in content:
                 first = self.document.lines.get(place)
-                self._fail(event, f"the key '{key}' stands twice (first on line {first})")
+                self._fail(event, f"duplicate key '{key}' (first on line {first})")
             line = self.document.lines[place] = event.start_mark.line + 1
             value = self._value(next(self.events), place)
             if key == "<<":
                 merges.append((value, line))
             else:
                 content[key] = value
-        # last: keys of the mapping itself win, wherever '<<' stands
+        # last: keys of the mapping take precedence, regardless of the position of '<<'
         for merged, line in merges:
             for part in merged if isinstance(merged, list) else [merged]:
                 if not isinstance(part, dict):
@@ -333,9 +333,9 @@ class _Builder:
         return content
 
     def _key(self, event: Any) -> str:
-        """A key is a name: 'on', 1 or 1.5 stays what was written, for pydantic wants words."""
+        """Return a key as text: 'on', 1 or 1.5 is kept as written, because pydantic requires text."""
         if isinstance(event, yaml.CollectionStartEvent):
-            self._fail(event, "a list or mapping stands where a key should be")
+            self._fail(event, "a list or mapping is used as a key")
         key = self._value(event, ())
         if key is None or isinstance(key, list | dict):
             self._fail(event, "a key is empty or not a word")
@@ -373,7 +373,7 @@ def _explain(
     error: pydantic.ValidationError, model: type[pydantic.BaseModel], document: _Document, path: str | Path | None
 ) -> UsageError:
     if (kind := _kind(document.value)) and kind != _kind(_field_names(model)):
-        # no near name mends what is all unknown
+        # suggesting near names is not useful if all names are unknown
         return UsageError(
             f"these are the settings of a {kind}", expected=_KEYS.format(_listed(_field_names(model)[:4])), path=path
         )
@@ -381,7 +381,7 @@ def _explain(
     for item in error.errors(include_url=False):
         problem, cause = _finding(item, model)
         findings.append((document.line(item["loc"]), problem, cause))
-    # in the order of the file; pydantic has them in that of the model
+    # in the order of the file; pydantic reports them in the order of the model
     findings.sort(key=lambda finding: finding[0] or 0)
     if len(findings) == 1:
         line, problem, cause = findings[0]
@@ -470,7 +470,7 @@ def _field_names(*models: type[pydantic.BaseModel]) -> list[str]:
 
 
 def _models_at(model: type[pydantic.BaseModel], location: Location) -> list[type[pydantic.BaseModel]]:
-    """Models that may stand at a location; parts that name no field are indices, keys or union members."""
+    """Return models that are possible at a location. Parts that are not fields are indices, keys or union members."""
     models: list[type[pydantic.BaseModel]] = [model]
     for part in location:
         fields = [field for candidate in models for field in candidate.model_fields.items()]
@@ -490,19 +490,19 @@ KeyPath = tuple[str, ...]
 
 
 def edited(text: str, changes: Mapping[KeyPath, Any]) -> str:
-    r"""Text with other values at some keys; the value None takes a key away.
+    r"""Return text with other values at some keys. The value None removes a key.
 
     Parameters
     ----------
     text : str
-        A mapping.
+        Text of a mapping.
     changes : mapping of tuple of str to value
         Plain values by the keys that lead to them.
 
     Raises
     ------
     UsageError
-        If another key would change, too: of values that several keys share (anchors).
+        If another key would change too, because several keys share a value (anchors).
 
     Examples
     --------
@@ -558,7 +558,7 @@ def _flow(value: Any) -> str:
 
 
 def _span(text: str, node: Any) -> tuple[int, int]:
-    """First and last character of a value; a block ends with its last line that is no comment."""
+    """Return the first and last character of a value. A block ends with its last line that is not a comment."""
     start, end = node.start_mark.index, node.end_mark.index
     lines = text[start:end].splitlines(keepends=True)
     while len(lines) > 1 and (not lines[-1].strip() or lines[-1].lstrip().startswith("#")):

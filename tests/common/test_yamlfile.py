@@ -42,7 +42,7 @@ def test_words_numbers_and_clocks_stay_what_was_written() -> None:
 def test_duplicate_key_names_both_lines() -> None:
     error = failure("name: a\nmasts:\n  LW1: {height_m: 1}\n  LW1: {height_m: 2}\n")
     assert (error.line, error.exit_code) == (4, 2)
-    assert "'LW1' stands twice (first on line 3)" in error.found
+    assert "duplicate key 'LW1' (first on line 3)" in error.found
 
 
 @pytest.mark.parametrize(

@@ -183,7 +183,7 @@ SQUARE = "[[0, 0], [10, 0], [10, 10], [0, 10]]"
         ("trees:\n  single: [{at_m: [1e9, 0]}]", 6, "map coordinates"),
         ("sead: 1", 5, "unknown key 'sead'"),
         ("trees: {sead: 1}", 5, "unknown key 'trees.sead'. Likely cause: did you mean 'seed'"),
-        ("name: again", 5, r"the key 'name' stands twice \(first on line 1\)"),
+        ("name: again", 5, r"duplicate key 'name' \(first on line 1\)"),
         ("ground_material: medium_dry_grund", 5, "ground_material: unknown material .*did you mean 'medium_dry_ground'"),
         (f"buildings:\n- {{name: b, height_m: -1, polygon_m: {SQUARE}}}", 6, "height_m: found -1"),
         ("buildings:\n- {name: b, height_m: 1}", 6, "give polygon_m .* or polygon_deg"),

@@ -1,6 +1,6 @@
-"""Is this machine ready? Each check says what it found and, when it is not well, the line that mends it.
+"""Checks whether this machine is ready. Each reports what it found and, if there is a problem, how to fix it.
 
-Nothing here changes the machine; ``tools/setup_llvm.py`` (run by ``make setup``) does.
+These checks do not change the machine. ``tools/setup_llvm.py`` (run by ``make setup``) does.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Check:
     found : str
         What was found.
     remedy : str
-        What mends it; empty when ``ok``.
+        How to fix it. Empty if ``ok``.
     """
 
     name: str
@@ -125,7 +125,7 @@ def llvm_checks() -> Iterator[Check]:
 
 
 def _gpu_check() -> Check:
-    """Mitsuba variant that a replay would use; a GPU is tried the same way as LLVM, in a child process."""
+    """Check which Mitsuba variant a replay would use. A GPU is tried like LLVM, in a child process."""
     # a container may have the driver without its command line tool
     if shutil.which("nvidia-smi") is None and not Path("/proc/driver/nvidia").exists():
         return Check("GPU", "ok", "none found: replays use llvm_ad_mono_polarized")
@@ -152,8 +152,8 @@ def available_memory_bytes(root: Path = Path("/")) -> int | None:
     except (OSError, StopIteration, ValueError, IndexError):
         return None
     group = root / "sys/fs/cgroup"
-    with suppress(OSError, ValueError):  # no such group: the machine is the limit
-        # names of control groups of version 2; under version 1 the machine's own number stands
+    with suppress(OSError, ValueError):  # without such a group the machine is the limit
+        # names of control groups of version 2; under version 1 the machine's memory is the limit
         limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
         if limit != "max":
             available = min(available, int(limit) - int(used))
@@ -161,7 +161,7 @@ def available_memory_bytes(root: Path = Path("/")) -> int | None:
 
 
 def memory_check(available: int | None = None) -> Check:
-    """Enough memory for a report."""
+    """Check whether there is enough memory for a report."""
     available = available_memory_bytes() if available is None else available
     if available is None:
         return Check("Memory", "warn", "unknown on this system", "have 2 GiB free for a report")
@@ -187,14 +187,14 @@ def cache_check(folder: Path) -> Check:
     existing = next((place for place in (folder, *folder.parents) if place.exists()), folder)
     if not existing.is_dir():
         return Check("Cache", "warn", f"{existing} is not a folder", remedy)
-    # a folder without the right to enter refuses new files, whatever its right to write says
+    # a folder without the right to enter refuses new files, even if it is writable
     if not os.access(existing, os.W_OK | os.X_OK):
         return Check("Cache", "warn", f"{folder} cannot be written to", remedy)
     return Check("Cache", "ok", str(folder))
 
 
 def readers_check() -> Check:
-    """The log formats that this installation reads."""
+    """List the log formats that this installation reads."""
     from ..logs.readers import catalogue
 
     try:
@@ -207,16 +207,16 @@ def readers_check() -> Check:
 
 
 def holders(device: str) -> list[str]:
-    """Processes that have a device open, as ``name (pid)``; those of other users are visible to root only."""
+    """Return the processes that have a device open, as ``name (pid)``. Only root sees those of other users."""
     try:
         from ..live import ports
-    except ImportError:  # no termios: not a system that the tap runs on
+    except ImportError:  # without termios: the tap does not run on this system
         return []
     return [f"{holder.name} ({holder.pid})" for holder in ports.holders(Path(device), others_only=False)]
 
 
 def serial_checks() -> Iterator[Check]:
-    """Serial ports, whether this user may open them and who holds them; no port is opened."""
+    """Check serial ports: whether this user may open them, and which processes use them. No port is opened."""
     if missing := [name for name in ("fcntl", "termios") if not _importable(name)]:
         lacking = f"this system has no {' and no '.join(missing)}: 'tap' and 'modem-sim' need Linux, all else works"
         yield Check("Serial", "warn", lacking, "run the tap on Linux")
@@ -247,11 +247,11 @@ def serial_check(device: str, description: str = "") -> Check:
     """One port: present, allowed, free."""
     port = f"{device} {description}".strip()
     if not os.access(device, os.R_OK | os.W_OK):
-        # the kernel gives a new group to new logins alone
-        remedy = f"sudo usermod -aG {_group(device)} $USER, then log in anew"
+        # the kernel applies a new group to new logins only
+        remedy = f"sudo usermod -aG {_group(device)} $USER, then log in again"
         return Check("Serial", "warn", f"{port}: not allowed", remedy)
     if busy := holders(device):
-        # it opens every port of a new modem by itself, and reads away the answers to ours
+        # it opens every port of a new modem automatically, and reads the answers to our commands
         stop = "sudo systemctl stop ModemManager" if any("ModemManager" in name for name in busy) else "stop it"
         return Check("Serial", "warn", f"{port}: held by {', '.join(busy)}", stop)
     return Check("Serial", "ok", port)

@@ -167,7 +167,7 @@ def test_a_port_that_is_not_ours_names_the_group(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(doctor.os, "access", lambda *_: False)
     check = doctor.serial_check("/dev/ttyUSB77")
     assert check.status == "warn"
-    assert check.remedy == "sudo usermod -aG dialout $USER, then log in anew"
+    assert check.remedy == "sudo usermod -aG dialout $USER, then log in again"
 
 
 def test_without_fcntl_nothing_is_said_about_pyserial(monkeypatch: pytest.MonkeyPatch) -> None:

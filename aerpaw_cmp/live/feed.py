@@ -1,8 +1,8 @@
 """The state that the tap's page shows: rows of measurements and predictions, the state of each modem, alarms.
 
-The tap hands a record over with :meth:`Feed.put`, which appends to a bounded queue and returns: it takes no lock that
-a browser could hold. A thread of the server digests the queue; each browser asks for what is newer than its cursor.
-Rows stand in rings of fixed size, so memory does not grow with the flight nor with browsers that do not read.
+The tap passes records to :meth:`Feed.put`, which appends to a bounded queue and returns without a lock that a browser
+could hold. A thread of the server processes the queue. Each browser requests what is newer than its cursor. Rows are
+stored in rings of fixed size, so memory does not grow with the flight or with browsers that do not read.
 """
 
 from __future__ import annotations
@@ -43,18 +43,18 @@ _POINTS_AHEAD = 40
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
 PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
-# Faults that a record of unforeseen content can raise: it is left out of the page, and no poll waits for it.
+# Errors that a record of unexpected content can raise. It is left out of the page, and no poll waits for it.
 _MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
-# a version, then two rows for each of sixteen modems at most; a longer one is no cursor of ours
+# a version, then two rows for each of at most sixteen modems; a longer text is not a cursor of this page
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
 
-# What the page shows of a status as it is.
+# Fields of a status that the page shows unchanged.
 _STATUS = ("connected", "records", "bytes_written", "disk_free_bytes", "disk_fault", "gaps", "missed", "predicts")
 
 
 class Rows:
-    """The last rows of a table of 32-bit floats, in memory taken once; rows count from zero for ever."""
+    """The last rows of a table of 32-bit floats, in memory of fixed size. Row numbers count from zero for ever."""
 
     def __init__(self, columns: int, size: int = ROWS) -> None:
         self._columns, self._size = columns, size
@@ -62,15 +62,15 @@ class Rows:
         self.count = 0
 
     def add(self, row: Sequence[float | None]) -> None:
-        """Append a row; None becomes NaN."""
+        """Append a row. None becomes NaN."""
         start = self.count % self._size * self._columns
         values = (math.nan if value is None else value for value in row)
         self._values[start : start + self._columns] = array("f", values)
         self.count += 1
 
     def after(self, first: int, most: int = CHUNK) -> tuple[int, str]:
-        """Number of the first row given, and the rows from it on as little-endian floats in base64."""
-        # what the ring has overwritten is gone; beyond the end, where only a crafted cursor lies, is nothing
+        """Return the number of the first row, and the rows from there on as little-endian floats in base64."""
+        # overwritten rows are lost; a cursor beyond the end can only be crafted, and gets no rows
         first = max(first, self.count - self._size) if first <= self.count else self.count
         last = min(self.count, first + most)
         a, b = first % self._size * self._columns, last % self._size * self._columns
@@ -80,7 +80,7 @@ class Rows:
 
 @dataclass(slots=True)
 class Alarm:
-    """One alarm and its time; ``end_s`` None: it lasts."""
+    """An alarm and its time. ``end_s`` is None while it is active."""
 
     number: int
     modem: int
@@ -93,7 +93,7 @@ class Alarm:
 
 @dataclass(slots=True)
 class _Modem:
-    """One modem as the page shows it; times are steady seconds since the feed began."""
+    """The state of one modem for the page. Times are monotonic seconds since the feed began."""
 
     name: str
     port: str = ""
@@ -144,12 +144,12 @@ class _Modem:
 
 
 class Feed:
-    """State of the page; see the head of this module.
+    """The state of the page. See the head of this module.
 
     Parameters
     ----------
     names : sequence of str
-        One per modem.
+        Names of the modems.
     mono_ns, utc_ns : callable
         The clocks that time the records [ns].
     """
@@ -174,18 +174,18 @@ class Feed:
         self._ended: Mapping[str, Any] | None = None
 
     def put(self, modem: int, item: Record | TapStatus) -> None:
-        """Hand over a record or a status; returns at once, and the oldest goes where too many wait."""
+        """Add a record or a status, without blocking. The oldest is dropped if too many wait."""
         self._pending.append((modem, item))
 
     def end(self, ended: Mapping[str, Any]) -> None:
-        """The session is over; ``ended`` is shown by the page."""
+        """End the session. The page shows ``ended``."""
         self.digest()
         with self._changed:
             self._ended = ended
             self._bump()
 
     def now(self) -> float:
-        """Steady seconds since the feed began."""
+        """Return the monotonic seconds since the feed began."""
         return (self._steady_ns() - self.start_ns) / 1e9
 
     # the server's thread ----------------------------------------------------------------------------------
@@ -201,9 +201,9 @@ class Feed:
                 self._bump()
 
     def after(self, cursor: str, wait_s: float = 0.0) -> tuple[dict[str, Any] | None, str]:
-        """Everything newer than the cursor, and the next cursor; None if nothing came within the time.
+        """Return everything newer than the cursor, and the next cursor. None if nothing came within the time.
 
-        A cursor of another session, or none, begins from the start.
+        A cursor of another session, or an invalid cursor, starts from the beginning.
         """
         epoch, version, rows = self._parsed(cursor)
         with self._changed:
@@ -295,7 +295,7 @@ class Feed:
                 modem.rank_s = t
             if record["status"] == "ok":
                 modem.times.append(t)
-            # levels come with another query, at a slower rate: the last known ones stand beside each rank
+            # levels come from another query, at a slower rate: store the last known levels next to each rank
             modem.measured.add((t, modem.rank, modem.rsrp_dbm, modem.sinr_db))
             modem.sent.append((record["sent_utc_ns"], t))
 
@@ -351,7 +351,7 @@ class Feed:
         return alarm
 
     def _update_alarms(self) -> bool:
-        """Open and close alarms by the present state; True if one changed."""
+        """Open and close alarms according to the present state. Return whether one changed."""
         changed = False
         for modem in self._modems:
             conditions = {} if modem.ended or self._ended else _alarms_of(modem, self.now())
@@ -365,12 +365,12 @@ class Feed:
 
 
 def _finite(value: Any) -> float | None:
-    """A number of a record; None for what is none, as a crafted log may hold."""
+    """Return a finite number of a record, else None. A crafted log may contain anything."""
     return value if isinstance(value, (int, float)) and math.isfinite(value) else None
 
 
 def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
-    """Alarms that hold at this moment, by kind."""
+    """Return the alarms that are active at this moment, by kind."""
     alarms: dict[str, str] = {}
     stale_s, lost_s = max(STALE_S, 3 * modem.period_s), max(_GPS_LOST_S, 3 * modem.period_s)
     if modem.gap_text:
@@ -400,7 +400,7 @@ def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
 
 
 def _rest_of_route(rest: Mapping[str, Any]) -> dict[str, Any]:
-    """Rest of a route as the page shows it; ValueError where a level is no number."""
+    """Return the rest of a route as the page shows it. Raise ValueError if a level is not a number."""
     level, (low, high) = float(rest["level_dbm"]), map(float, rest["interval_dbm"])
     points = [[float(v) for v in point[:5]] for point in rest["points"][:_POINTS_AHEAD]]
     if not all(map(math.isfinite, [level, low, high, *(v for point in points for v in point)])):

@@ -1,16 +1,16 @@
 """The tap's durable log: append-only JSONL segments.
 
-One record is one line, written by one ``write`` to an ``O_APPEND`` file: what was written before a SIGKILL is
+One record is one line, written by one ``write`` to an ``O_APPEND`` file, so a record that was written before a SIGKILL
+is
 in the file. ``fdatasync`` follows at an interval, so a power loss costs at most that interval. Each line ends with
-the CRC-32 of what stands before it; a torn or rotten line is told from a record.
+the CRC-32 of the preceding text, which distinguishes records from truncated or damaged lines.
 
-A disk that is full or read-only does not stop the caller: records wait in memory (bounded), in order, and go to the
-disk when it takes them again; what had to be let go is counted in a ``disk`` record.
+A disk that is full or read-only does not stop the caller. Records wait in bounded memory, in order, and are written
+when the disk accepts them again. Records that had to be dropped are counted in a ``disk`` record.
 
-A disk that stalls for seconds, as memory cards do, delays no poll: each record is handed to a thread that writes it
-(:class:`LogWriter`), and the polling waits for it, so that in the ordinary case a record is in the kernel's hands
-before the next command goes out. It waits at most ``patience_s``: if the disk takes longer, records queue up in memory
-(bounded) and the polling goes on.
+A disk that stalls for seconds, as memory cards do, does not delay polls. Each record is passed to a thread that writes
+it (:class:`LogWriter`). The polling waits at most ``patience_s`` for it, so a record is normally in the kernel before
+the next command is sent. If the disk takes longer, records wait in bounded memory and the polling continues.
 """
 
 from __future__ import annotations
@@ -33,14 +33,14 @@ from ..logs.files import Record, encode_record
 
 @dataclass(frozen=True, slots=True)
 class Clock:
-    """Wall and monotonic clock [ns]; a test gives its own."""
+    """The wall and monotonic clock [ns]. A test supplies others."""
 
     utc_ns: Callable[[], int] = time.time_ns
     mono_ns: Callable[[], int] = time.monotonic_ns
 
 
 def boot_id() -> str:
-    """Identity of this boot; monotonic times compare only within one."""
+    """Return the identity of this boot. Monotonic times are only comparable within one boot."""
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text().strip()
     except OSError:
@@ -48,9 +48,9 @@ def boot_id() -> str:
 
 
 def clock_synchronised() -> bool | None:
-    """Check whether the kernel holds the wall clock for synchronised (adjtimex(2)); None if it cannot be asked."""
+    """Check whether the kernel considers the wall clock synchronised (adjtimex(2)). None if that is unknown."""
     try:
-        # modes = 0 only reads; the structure is 208 bytes, we need none of it; 5 is TIME_ERROR
+        # modes = 0 only reads; the structure has 208 bytes, all unused here; 5 is TIME_ERROR
         state = ctypes.CDLL(None, use_errno=True).adjtimex(ctypes.create_string_buffer(512))
     except (OSError, AttributeError):
         return None
@@ -66,7 +66,7 @@ def _sync_directory(folder: Path) -> None:
 
 
 class _Syncer(threading.Thread):
-    """``fdatasync`` beside the polling, so that a slow card delays no poll."""
+    """A thread that calls ``fdatasync`` in parallel to the polling, so that a slow card does not delay polls."""
 
     def __init__(self, on_error: Callable[[OSError], None]) -> None:
         super().__init__(name="tap-fdatasync", daemon=True)
@@ -157,18 +157,18 @@ class SegmentLog:
     Parameters
     ----------
     folder : Path
-        Made if missing.
+        Folder of the segments. Created if missing.
     header : callable
-        Gives the header record of each segment.
+        Returns the header record of each segment.
     settings : LogSettings
     clock : Clock
     on_fault : callable
-        Called with a sentence when the disk fails and when it is back.
+        Called with a sentence when the disk fails and when it works again.
 
     Raises
     ------
     InputError
-        From :meth:`open`, if the folder cannot be written to at all.
+        From :meth:`open`, if the folder cannot be written.
     """
 
     folder: Path
@@ -215,9 +215,9 @@ class SegmentLog:
             self._syncer.start()
 
     def append(self, record: Record) -> bool:
-        """Write one record; True once the kernel has it, False if it waits in memory.
+        """Write one record. Return True once the kernel has it, False if it waits in memory.
 
-        The record gets its number ``n`` in the session here.
+        The number ``n`` of the record in the session is set here.
         """
         record["n"] = self._number
         self._number += 1
@@ -291,7 +291,7 @@ class SegmentLog:
                 self.fault.lost += 1
 
     def _drain(self) -> bool:
-        """Write what waits; False while the disk does not take it."""
+        """Write the waiting records. Return False while the disk cannot be written."""
         if self.fault is not None:
             now = self.clock.mono_ns()
             if now < self._retry_ns:
@@ -329,8 +329,8 @@ class SegmentLog:
         self.on_fault(f"the disk takes records again; {fault.lost} were lost")
 
     def _write(self, line: bytes) -> None:
-        """One write; a short one is taken back, so that no torn line stays inside the file."""
-        # what could not be cut off becomes a line of its own, which its checksum refuses
+        """Write a line at once. A partial write is cut off, so that no truncated line stays inside the file."""
+        # a part that could not be cut off becomes a separate line, which its checksum refuses
         data = b"\n" + line if self._torn else line
         written = os.write(self._fd, data)
         # the disk filled up within the line
@@ -446,24 +446,24 @@ class LogWriter:
 
     @property
     def fault(self) -> str:
-        """Reason why the disk takes no records now; empty while it does."""
+        """The reason why the disk cannot be written now. Empty if it can."""
         fault = self.log.fault
         return "" if fault is None else fault.reason
 
     def messages(self) -> list[str]:
-        """Messages about the disk since the last call."""
-        # by number: the writing thread may add to them meanwhile
+        """Return the messages about the disk since the last call."""
+        # by number: the writing thread may add messages meanwhile
         return [self._messages.popleft() for _ in range(len(self._messages))]
 
     def open(self) -> None:
-        """Open the log; raises ``InputError`` as :meth:`SegmentLog.open` does."""
+        """Open the log. Raises ``InputError`` as :meth:`SegmentLog.open` does."""
         self.log.open()
         self.free_bytes = self.log.free_bytes()
         self._thread.start()
 
     def append(self, record: Record) -> bool:
-        """Hand over one record; True once the kernel has it, False if it waits in memory."""
-        # about what the other fields of a record take as text
+        """Pass one record to the writer. Return True once the kernel has it, False if it waits in memory."""
+        # approximate size of the other fields of a record as text
         size = 500 + sum(len(line) for line in record.get("lines", ()) if isinstance(line, str))
         settings = self.log.settings
         with self._changed:
@@ -479,14 +479,14 @@ class LogWriter:
         return done and self.log.fault is None
 
     def sync(self) -> None:
-        """``fdatasync`` soon; waits for it at most ``patience_s``."""
+        """Request ``fdatasync``, and wait at most ``patience_s`` for it."""
         with self._changed:
             self._sync_wanted = True
             self._changed.notify_all()
             self._changed.wait_for(self._idle, self.log.settings.patience_s)
 
     def close(self, timeout_s: float = 30.0) -> None:
-        """Write what waits and close; a disk that still hangs after the time is left alone."""
+        """Write the waiting records and close. A disk that still hangs after the time is abandoned."""
         with self._changed:
             self._closing = True
             self._changed.notify_all()

@@ -9,14 +9,14 @@ at community.teltonika.lt/t/read-csi-information/5568. SA and EN-DC order RSRQ a
 named after the token of the radio access technology, never after their place in the answer as a whole. A field
 outside its physical range becomes None with a flag; the row and the raw line stay.
 
-Bytes of an AT port to answers and unsolicited lines: no file, no port, no clock.
+The module converts bytes of an AT port to answers and unsolicited lines, without file, port or clock.
 
-:class:`Framer` knows the command in flight. It gives the same events however the bytes are cut into pieces, and holds
-a bounded buffer: a line is kept up to :data:`_MAX_LINE_BYTES`, an answer up to ``max_lines``; the rest is counted, not
-stored.
+:class:`Framer` knows the command in flight. It returns the same events regardless of how the bytes are split. Its
+buffer is bounded: it stores a line up to :data:`_MAX_LINE_BYTES` and an answer up to ``max_lines``, and only counts the
+rest.
 
 A line ends at any run of CR and LF (a modem with echo ends the echo with CR CR LF). Bytes become text as Latin-1,
-so nothing that came in is lost, whatever it was.
+so no byte is lost.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ _INVALID = (-32768, -3276)
 
 
 def _split_fields(payload: str) -> list[str | None]:
-    """Comma-separated fields without quotes; ``-`` and nothing are None.
+    """Split comma-separated fields and remove quotes. ``-`` and empty fields are None.
 
     Examples
     --------
@@ -137,16 +137,16 @@ _LTE_BANDWIDTH_MHZ = (1.4, 3, 5, 10, 15, 20)
 
 
 def number(name: str, text: str | None, flags: list[str], *, prefix: str = "") -> int | None:
-    """Integer field in its range, else None; why goes into ``flags``.
+    """Return an integer field in its range, else None. The reason is added to ``flags``.
 
     Parameters
     ----------
     name : str
         Field, a key of ``RANGES``.
     text : str or None
-        As the modem wrote it.
+        Text from the modem.
     flags : list of str
-        Receives why there is no value.
+        Receives the reason for a missing value.
     prefix : str
         Before the field in the flag.
 
@@ -179,7 +179,7 @@ _WORDS = frozenset({"duplex", "cell_id", "tac", "state", "rat"})
 
 
 def _named(names: Sequence[str], fields: Sequence[str | None], flags: list[str], prefix: str) -> Values:
-    """Fields under their names; missing ones None, unknown further ones under ``extra``."""
+    """Return fields under their names. Missing fields are None, and unknown further fields are in ``extra``."""
     values: Values = {}
     for index, name in enumerate(names):
         text = fields[index] if index < len(fields) else None
@@ -190,7 +190,7 @@ def _named(names: Sequence[str], fields: Sequence[str | None], flags: list[str],
 
 
 def _fields_of(lines: Sequence[str], prefix: str, flags: list[str]) -> Iterator[list[str | None]]:
-    """Fields of the lines that start with a prefix; a flag for each that does not."""
+    """Yield the fields of lines that start with a prefix. Add a flag for each other line."""
     for line in lines:
         payload = _payload_of(line, prefix)
         if payload is None:
@@ -203,7 +203,7 @@ def _fields_of(lines: Sequence[str], prefix: str, flags: list[str]) -> Iterator[
 
 
 def _decode_csi(lines: Sequence[str], flags: list[str], which: str) -> Values:
-    """``+QNWCFG: "nr5g_csi",<mcs>,<ri>,<cqi>,<pmi>``; RI 0 is no CSI, so ``rank`` is None."""
+    """Decode ``+QNWCFG: "nr5g_csi",<mcs>,<ri>,<cqi>,<pmi>``. RI 0 means no CSI, so ``rank`` is None."""
     rows = []
     for line in lines:
         payload = _payload_of(line, "+QNWCFG")
@@ -260,7 +260,7 @@ def _lte(fields: Sequence[str | None], flags: list[str]) -> Values:
 
 
 def _decode_servingcell(lines: Sequence[str], flags: list[str]) -> Values:
-    """``+QENG`` of SA, EN-DC (three lines) and LTE, told apart by the token of each line."""
+    """Decode ``+QENG`` of SA, EN-DC (three lines) and LTE, distinguished by the token of each line."""
     values: Values = {"state": None, "rat": None}
     for fields in _fields_of(lines, "+QENG", flags):
         if fields[0] == "servingcell":
@@ -286,11 +286,11 @@ def _decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind:
     Parameters
     ----------
     lines : sequence of str
-        Of the answer.
+        Lines of the answer.
     flags : list of str
-        Receives what was odd.
+        Receives flags for unusual content.
     command, kind : str
-        Such as ``+QRSRP``; the field that its values get.
+        Such as ``+QRSRP``, and the key of its values in the result.
 
     Returns
     -------
@@ -313,12 +313,12 @@ def _decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind:
 
 
 def _decode_text(lines: Sequence[str], _flags: list[str]) -> Values:
-    """For answers kept for the record, not computed with."""
+    """Return answers that are stored but not evaluated."""
     return {"text": list(lines)}
 
 
 def _decode_csi_ctrl(lines: Sequence[str], flags: list[str]) -> Values:
-    """``+QNWCFG: "csi_ctrl",<lte>,<nr5g>``."""
+    """Decode ``+QNWCFG: "csi_ctrl",<lte>,<nr5g>``."""
     for line in lines:
         match = re.match(r'\+QNWCFG: ?"csi_ctrl", ?([01]), ?([01])$', line)
         if match:
@@ -366,12 +366,12 @@ _CSI_WRITE = re.compile(r'AT\+QNWCFG="csi_ctrl",[01],[01]')
 
 
 def csi_write(lte: int, nr5g: int) -> str:
-    """The command that switches CSI reporting; the only one that changes the modem."""
+    """Return the command that switches CSI reporting. It is the only command that changes the modem."""
     return f'AT+QNWCFG="csi_ctrl",{int(bool(lte))},{int(bool(nr5g))}'
 
 
 def encode(command: str, *, allow_csi: bool = False) -> bytes:
-    r"""Bytes of an allowed command.
+    r"""Return the bytes of an allowed command.
 
     Raises
     ------
@@ -394,7 +394,7 @@ def encode(command: str, *, allow_csi: bool = False) -> bytes:
 
 
 def decode(name: str, lines: Sequence[str]) -> Decoded:
-    """Meaning of the information lines of a query's answer; never raises on what a modem sends.
+    """Decode the information lines of a query's answer. No answer of a modem raises an exception.
 
     Examples
     --------
@@ -436,8 +436,8 @@ class Redactor:
         self.count = 0
 
     def clean(self, text: str, *, cut: bool = False) -> str:
-        """The line without personal data; ``cut`` says that its end is missing."""
-        if self._message_follows and not text.startswith("+Q"):  # an answer may come between
+        """Return the line without personal data. ``cut`` means that its end is missing."""
+        if self._message_follows and not text.startswith("+Q"):  # an answer may come before the message
             self._message_follows = False
             self.count += 1
             return "<redacted message>"
@@ -462,7 +462,7 @@ Status = Literal["ok", "error", "cme", "cms", "timeout", "lost", "cut"]
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One line without its end; ``dropped`` bytes of it were not kept."""
+    """A line without its end. ``dropped`` is the number of bytes that were not stored."""
 
     text: str
     dropped: int = 0
@@ -470,7 +470,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Response to one command.
+    """The response to one command.
 
     Parameters
     ----------
@@ -526,7 +526,7 @@ _GLUED_OK = re.compile(r"[0-9\"\-]OK$")
 
 
 def _final_result(text: str) -> tuple[Status, str | None] | None:
-    """Status and code if the whole line is a final result, else None (3GPP TS 27.007, clause 9; TS 27.005, 3.2.5).
+    """Return status and code if the line is a final result, else None (3GPP TS 27.007, clause 9; TS 27.005, 3.2.5).
 
     Examples
     --------
@@ -551,7 +551,7 @@ def is_unsolicited(text: str) -> bool:
 
 
 def unglue(text: str) -> tuple[str, ...]:
-    """Answers that a modem put on one line, apart; quotes protect what looks like a start.
+    """Split answers that a modem put on one line. Quotes protect text that looks like a start.
 
     Examples
     --------
@@ -576,14 +576,14 @@ def unglue(text: str) -> tuple[str, ...]:
 
 
 class LineBuffer:
-    """Bytes to lines with a bounded buffer: of a longer line the rest is counted in :attr:`Line.dropped`."""
+    """A bounded buffer that splits bytes into lines. :attr:`Line.dropped` counts the rest of a longer line."""
 
     def __init__(self) -> None:
         self._buffer = bytearray()
         self._dropped = 0
 
     def feed(self, data: bytes) -> Iterator[Line]:
-        """Complete lines, blank ones left out."""
+        """Yield complete lines except blank ones."""
         start = 0
         for match in _LINE_END.finditer(data):
             self._keep(data, start, match.start())
@@ -601,7 +601,7 @@ class LineBuffer:
         return self._buffer.decode("latin-1")
 
     def flush(self) -> list[Line]:
-        """The unfinished line as a line, if it is not blank; the buffer is empty then."""
+        """Return the unfinished line, if it is not blank, and empty the buffer."""
         text = self._buffer.decode("latin-1").strip(" \t")
         line = Line(text, self._dropped)
         self._buffer.clear()
@@ -633,13 +633,13 @@ def _matches(text: str, prefixes: tuple[str, ...] | None) -> bool:
 class Framer:
     r"""Answers to known commands, one in flight at a time.
 
-    A command that timed out still owes an answer. What comes for it later is a :class:`Late` event, told from the
-    next command's answer by its prefix, or by the echo where the modem echoes.
+    A command that timed out may still be answered. A late answer becomes a :class:`Late` event. It is distinguished
+    from the next command's answer by its prefix, or by the echo if the modem echoes.
 
     Parameters
     ----------
     max_lines : int
-        Of an answer that are kept.
+        Number of lines of an answer that are stored.
 
     Examples
     --------
@@ -751,14 +751,14 @@ class Framer:
             now.too_many += 1
 
     def _is_echo(self, text: str, now: _Open) -> bool:
-        # rubbish from before may stand in front of the echo on the same line
+        # rubbish from before may come before the echo on the same line
         upper, command = text.upper(), now.command.upper()
-        # a short command, as AT, ends many lines that are no echo
+        # many lines that are not an echo end with a short command such as AT
         if now.echoed or not (upper == command or (len(command) > 6 and upper.endswith(command))):
             return False
         now.echoed = self._echo_seen = True
         self._flag("echo" if len(text) == len(now.command) else "echo_with_rubbish")
-        if self._owed and now.lines:  # they came before our echo, so they are not ours
+        if self._owed and now.lines:  # these lines came before our echo, so they answer another command
             self._stray += now.lines
             now.lines.clear()
         return True

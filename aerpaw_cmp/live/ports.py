@@ -1,16 +1,16 @@
-"""Serial ports: find the modem's AT port, open it for us alone, say who else holds it.
+"""Serial ports of the tap: find the modem's AT port, open it exclusively, and report other processes that use it.
 
-The port is opened with ``termios`` directly. pyserial empties the input queue when it opens (answers that wait
-there would be lost), insists on a DTR ioctl that some USB paths refuse, and reports an unplugged cable by three
-unrelated exceptions (its issues 401 and 417); here it is always :class:`PortGoneError`.
+The port is opened with ``termios`` directly. pyserial empties the input queue when it opens, which would lose waiting
+answers. It requires a DTR ioctl that some USB paths refuse, and reports an unplugged cable by three
+unrelated exceptions (its issues 401 and 417). Here it is always :class:`PortGoneError`.
 
-Settings, status and summary of a session of the tap.
+The module also contains settings, status and summary of a session of the tap.
 
-The status goes to the terminal beside the polling: one that hangs (Ctrl-S, a lost ssh connection) holds no poll.
+A separate thread writes the status to the terminal: a hanging terminal (Ctrl-S, a lost ssh connection) delays no poll.
 
-Schedule of the queries: which one is due when.
+A schedule determines which query is due when.
 
-A request to end that wakes whoever waits.
+A request to end wakes the waiting threads.
 """
 
 from __future__ import annotations
@@ -41,14 +41,15 @@ from ..common.text import counted
 from .log import LogSettings
 
 _QUECTEL_VENDOR = "2c7c"
-# Of 2c7c:0800: 00 is DIAG, 01 NMEA, 02 and 03 take AT commands (ModemManager's 77-mm-quectel-port-types.rules).
+# Interfaces of 2c7c:0800: 00 is DIAG, 01 NMEA, 02 and 03 take AT commands (ModemManager's
+# 77-mm-quectel-port-types.rules).
 _AT_INTERFACES = ("02", "03")
 
 _GONE = {errno.ENOENT, errno.ENXIO, errno.EIO, errno.ENODEV, errno.ENOTCONN, errno.ESHUTDOWN}
 
 
 class PortGoneError(Exception):
-    """The port is not there (any more); it may come back."""
+    """The error for a port that does not exist at present. It may come back."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,14 +87,14 @@ class Holder:
 
 @dataclass(frozen=True, slots=True)
 class Roots:
-    """Folders where the system keeps devices; tests give their own tree."""
+    """The folders where the system lists devices. Tests use a separate tree."""
 
     dev: Path = Path("/dev")
     sys: Path = Path("/sys")
 
 
 def _usb_of(tty: str, roots: Roots) -> tuple[str, str] | None:
-    """``(vendor:product, interface)`` of a tty by sysfs."""
+    """Return ``(vendor:product, interface)`` of a tty from sysfs."""
     device = roots.sys / "class/tty" / tty / "device"
     if not device.exists():
         return None
@@ -110,7 +111,7 @@ def _usb_of(tty: str, roots: Roots) -> tuple[str, str] | None:
 
 
 def _entries(folder: Path, pattern: str) -> list[Path]:
-    """Entries of a folder by name; none if it vanishes meanwhile, as /dev/serial/by-id does with its last device."""
+    """Return sorted entries of a folder. Empty if it vanishes, as /dev/serial/by-id does with its last device."""
     try:
         names = os.listdir(folder)  # noqa: PTH208 (Path.iterdir and glob are lazy: they may raise in the middle)
     except OSError:
@@ -119,7 +120,7 @@ def _entries(folder: Path, pattern: str) -> list[Path]:
 
 
 def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
-    """AT ports of Quectel modems, the likeliest first: by-id names, then USB interface numbers, then PCIe nodes."""
+    """Return AT ports of Quectel modems, the likeliest first: by-id names, USB interface numbers, then PCIe nodes."""
     roots = roots or Roots()
     ports: list[PortInfo] = []
     for interface in _AT_INTERFACES:
@@ -178,7 +179,7 @@ _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.]{1,12})://(.*)", re.DOTALL)
 
 
 def _refuse_url(port: str | Path | None) -> None:
-    """The tap opens devices itself (see the head of this file); what pyserial calls a URL is refused by name."""
+    """Refuse a pyserial URL, because the tap opens devices itself (see the head of this file)."""
     match = _URL.fullmatch(port) if isinstance(port, str) else None
     if match is None:
         return
@@ -196,7 +197,7 @@ def _refuse_url(port: str | Path | None) -> None:
 
 
 def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
-    """Processes that have the port open, by ``/proc`` (as far as we may look); without our own by default."""
+    """Return processes that have the port open, as far as ``/proc`` is readable, by default without this process."""
     try:
         wanted = path.stat().st_rdev
     except OSError:
@@ -225,7 +226,7 @@ def _open_files(process: Path) -> Iterator[os.stat_result]:
 
 
 def modem_manager() -> Holder | None:
-    """ModemManager if it runs; its name can be seen even where its open files cannot."""
+    """Return ModemManager if it runs. Its name is visible even if its open files are not."""
     for process in _processes():
         with contextlib.suppress(OSError):
             if (holder := _holder(process)).name == "ModemManager":
@@ -280,9 +281,9 @@ class SerialPort:
         Raises
         ------
         PortGoneError
-            If it is not there or vanishes meanwhile.
+            If the port does not exist or vanishes meanwhile.
         InputError
-            If we may not open it, another process holds it, or it is no serial port.
+            If this user may not open the port, another process uses it, or it is not a serial port.
         """
         try:
             fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -291,7 +292,7 @@ class SerialPort:
         try:
             if not os.isatty(fd):
                 raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
-            users = holders(path)  # before anything is changed on a port that another one uses
+            users = holders(path)  # before changing anything on a port that another process uses
             if users:
                 raise _busy(path, users)
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
@@ -329,7 +330,7 @@ class SerialPort:
         return self._fd
 
     def read(self, limit: int = 65_536) -> bytes:
-        """Read what is there now; ``b""`` if nothing."""
+        """Return the bytes that are available now, ``b""`` if there are none."""
         try:
             data = os.read(self._fd, limit)
         except BlockingIOError:
@@ -341,7 +342,7 @@ class SerialPort:
         return data
 
     def write(self, data: bytes, timeout_s: float = 1.0) -> None:
-        """Write all of it within the time; a port that takes nothing for so long counts as gone."""
+        """Write all bytes within the time. A port that accepts no bytes for this time counts as gone."""
         deadline = time.monotonic() + timeout_s
         while data:
             try:
@@ -355,7 +356,7 @@ class SerialPort:
                 raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
 
     def close(self) -> None:
-        """Give the port back; harmless if it is gone."""
+        """Close the port. It is safe to call if the port is gone."""
         if self._fd >= 0:
             with contextlib.suppress(OSError, termios.error):
                 fcntl.ioctl(self._fd, termios.TIOCNXCL)
@@ -364,25 +365,25 @@ class SerialPort:
 
 
 def make_raw(fd: int, baud: int) -> None:
-    """No echo, no line editing, 8N1, no flow control; what waits in the queue stays."""
+    """Set a port to no echo, no line editing, 8N1 and no flow control, and keep its input queue."""
     _, _, cflag, _, _, _, cc = termios.tcgetattr(fd)
-    # HUPCL stays as it was: whether a modem is told that its port closes is the system's choice, not ours
+    # HUPCL is kept: whether a modem is notified that its port closes is the system's choice
     cflag = (cflag & termios.HUPCL) | termios.CS8 | termios.CREAD | termios.CLOCAL
     cc[termios.VMIN], cc[termios.VTIME] = 1, 0
-    # every flag of input, output and local mode changes or holds back bytes: none is wanted
+    # every flag of input, output and local mode changes or delays bytes, so all are cleared
     termios.tcsetattr(fd, termios.TCSANOW, [0, 0, cflag, 0, baud, baud, cc])
 
 
 @dataclass(frozen=True, slots=True)
 class TapSettings:
-    """Settings of the tap; the defaults suit a flight.
+    """The settings of the tap. The defaults suit a flight.
 
     Parameters
     ----------
     folder : Path
-        Where the log segments go (``-o``); made if missing.
+        Folder of the log segments (``-o``). Created if missing.
     port : str, optional
-        The serial port; None: the first AT port of a Quectel modem.
+        The serial port. None: the first AT port of a Quectel modem.
     ri_hz : float
         Rate of ``nr5g_csi`` [Hz].
     other_hz : float
@@ -392,27 +393,27 @@ class TapSettings:
     answer_timeout_s : float
         An answer later than this is a ``late`` record [s].
     probe_timeout_s : float
-        Each of the two probes of a newly opened port waits so long [s].
+        Time limit for each of the two probes of a newly opened port [s].
     silent_s : float
-        Without any final result for so long, the port is opened anew [s].
+        The port is reopened after this time without a final result [s].
     enable_csi : bool
-        Switch CSI reporting on, and back on exit (the only command that writes).
+        Switch CSI reporting on, and restore it on exit (the only command that writes).
     no_csi_alarm_s : float, optional
-        Alarm when no rank came for so long [s].
+        Raise an alarm after this time without a rank [s].
     no_csi_exit : bool
-        End with exit code 1 on that alarm instead of going on.
+        End with exit code 1 on that alarm instead of continuing.
     status_s : float
         Interval of the status calls [s].
     duration_s : float, optional
-        End by itself after so long [s].
+        End the session after this time [s].
     wait_for_port_s : float
-        At the start, wait so long for the port to appear [s].
+        Longest wait for the port at the start [s].
     reconnect_min_s, reconnect_max_s : float
-        Back-off after a loss [s].
+        Back-off after a loss of the port [s].
     log : LogSettings
         Durability and rotation.
     roots : Roots
-        Where devices are looked for.
+        Folders where devices are searched.
     """
 
     folder: Path
@@ -453,15 +454,15 @@ class TapStatus:
     ----------
     connected : bool
     rank : int or None
-        Of the last answer; None: no CSI.
+        Rank of the last answer. None: no CSI.
     rsrp_dbm, sinr_db : int or None
-        NR, last known.
+        Last known values of NR.
     ri_rate_hz : float
-        Answers with status ok over the last 10 s.
+        Rate of answers with status ok over the last 10 s.
     gaps, records, bytes_written : int
     disk_free_bytes : int or None
     disk_fault : str
-        Why the disk takes no records now; empty while it does.
+        Reason why the disk cannot be written now. Empty if it can.
     missed : int
         Poll slots that passed unused while connected.
     predicted_rank : int or None
@@ -492,12 +493,12 @@ class TapStatus:
 
 
 class StatusNotifier:
-    """Calls ``on_status`` in a thread of its own, in order; what a hanging terminal cannot take is let go.
+    """A thread that calls ``on_status`` in order. Statuses that a hanging terminal cannot take are dropped.
 
     Parameters
     ----------
     on_status : callable
-        If it raises, it is not called again: a broken terminal must not end the log.
+        If it raises, it is not called again, because a broken terminal must not end the log.
     """
 
     def __init__(self, on_status: Callable[[TapStatus], None]) -> None:
@@ -507,8 +508,8 @@ class StatusNotifier:
         self._thread.start()
 
     def notify(self, status: TapStatus) -> None:
-        """Pass a status on; a mere line is let go while others wait, a message only when memory is full."""
-        # a line is written over by the next one, a message is said once
+        """Queue a status. A plain line is dropped while others wait, a message only if the queue is full."""
+        # the next line overwrites a line, but a message is shown once
         if status.message or self._queue.qsize() < 10:
             try:
                 self._queue.put_nowait(status)
@@ -516,7 +517,7 @@ class StatusNotifier:
                 return
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Pass on what waits, but do not wait for a terminal that hangs."""
+        """Write the waiting statuses, but do not wait for a terminal that hangs."""
         try:
             self._queue.put_nowait(None)
         except queue.Full:
@@ -539,14 +540,14 @@ class TapSummary:
     Parameters
     ----------
     reason : str
-        ``SIGINT``, ``SIGTERM``, ``SIGHUP``, ``duration``, ``no_csi`` or what the caller's stop said.
+        ``SIGINT``, ``SIGTERM``, ``SIGHUP``, ``duration``, ``no_csi`` or the reason of the caller's stop.
     exit_code : int
-        0; 1 if the no-CSI alarm ended it or records were lost to the disk.
+        0, or 1 if the no-CSI alarm ended the session or records were lost because of the disk.
     segments : tuple of Path
     answers : mapping
-        Query to ``{status: count}``.
+        Counts by status, for each query.
     rates_hz, missed : mapping
-        Query to achieved rate, and to poll slots passed unused while connected.
+        For each query, the achieved rate, and the number of unused poll slots while connected.
     gaps : int
     gap_s, duration_s : float
     records, lost_records, redacted : int
@@ -568,7 +569,7 @@ class TapSummary:
 
 
 def format_status(status: TapStatus) -> str:
-    """One line for the terminal; nothing in it comes from the modem as text."""
+    """Return one line for the terminal. It contains no text from the modem."""
     if not status.connected:
         head = "NO PORT"
     elif status.rank is None:
@@ -592,19 +593,19 @@ def format_status(status: TapStatus) -> str:
     return "  ".join(parts)
 
 
-# A slot that is late by at most so many periods is still polled, at once; older ones are missed and counted.
+# A slot that is late by at most this many periods is polled at once. Older slots are missed and counted.
 _CATCH_UP = 2
 
 
 class Schedule:
-    """Order and times of the queries. The first name goes first whenever it is due; the others by age.
+    """The order and times of the queries. The first name has priority whenever it is due, then the longest due.
 
-    After a short stall the polls that fell due meanwhile follow each other without a rest (each record has its true
-    times), so that a hiccup of the machine costs no answer; after a long one the schedule starts from now.
+    After a short stall the missed polls follow each other immediately, with their true times in the records, so no
+    answer is lost. After a long stall the schedule starts from now.
 
     Parameters
     ----------
-    periods_ns : mapping
+    Period of each query by name.
         Name to period.
     """
 
@@ -615,18 +616,18 @@ class Schedule:
         self.missed: Counter[str] = Counter()
 
     def reset(self, now_ns: int) -> None:
-        """Start anew: all due now."""
+        """Restart the schedule, with all queries due now."""
         self._due = dict.fromkeys(self._periods, now_ns)
 
     def next(self, now_ns: int) -> tuple[str, int]:
-        """Name and due time of the next poll."""
+        """Return the name and due time of the next poll."""
         if self._due[self._first] <= now_ns:
             return self._first, self._due[self._first]
         name = min(self._due, key=lambda n: self._due[n])
         return name, self._due[name]
 
     def started(self, name: str, now_ns: int) -> None:
-        """A poll begins; slots that cannot be caught up any more are missed."""
+        """Record that a poll begins. Slots that cannot be caught up are missed."""
         period = self._periods[name]
         late = max(0, (now_ns - self._due[name]) // period)
         skipped = late if late > _CATCH_UP else 0
@@ -634,15 +635,15 @@ class Schedule:
         self._due[name] += (skipped + 1) * period
 
     def slots(self, duration_ns: int) -> dict[str, int]:
-        """Polls that a gap of this length cost."""
+        """Return the number of polls that a gap of this length costs."""
         return {name: duration_ns // period for name, period in self._periods.items()}
 
 
 class Stop:
-    """A request to end, from a signal or another thread; wakes the waiting tap.
+    """A request to end, from a signal or another thread, which wakes the waiting tap.
 
-    As a context it is asked by SIGINT, SIGTERM and SIGHUP, and is closed at the end. Signals reach the main thread
-    alone, and an ignored one (nohup) stays so.
+    As a context it reacts to SIGINT, SIGTERM and SIGHUP, and is closed at the end. Only the main thread receives
+    signals, and an ignored signal (nohup) stays ignored.
     """
 
     def __init__(self) -> None:
@@ -663,21 +664,21 @@ class Stop:
         self.close()
 
     def __call__(self, reason: str = "stop") -> None:
-        """Ask for the end; a second time: at once."""
+        """Request the end. A second request means at once."""
         self.reason = self.reason or reason
         self.count += 1
         with contextlib.suppress(OSError):
             os.write(self._write, b"x")
 
     def wait(self, timeout_s: float) -> bool:
-        """Wait until asked, at most so long; whether asked."""
+        """Wait for a request to end, at most ``timeout_s``. Return whether there is one."""
         poller = select.poll()
         poller.register(self._read, select.POLLIN)
         poller.poll(timeout_s * 1e3)
         return self.count > 0
 
     def fileno(self) -> int:
-        """Readable once asked."""
+        """Return a descriptor that is readable once the end is requested."""
         return self._read
 
     def close(self) -> None:

@@ -1,9 +1,9 @@
-"""The rank and the level that the replay predicts now, computed beside the polling, with intervals.
+"""The rank and level that the replay predicts for the present pose, computed in parallel to the polling.
 
-The tap passes a time and gets records back; how a time becomes a pose and a pose a rank is the caller's:
-:class:`~aerpaw_cmp.live.predict.TelemetryFollower` gives the pose from a telemetry log that still grows.
+The tap passes a time and gets records back. The caller determines how a time becomes a pose and a pose a rank.
+:class:`~aerpaw_cmp.live.predict.TelemetryFollower` returns the pose from a telemetry log that is still being written.
 
-The present pose from a telemetry log that is still being written.
+The follower only reads the lines that were appended since its last call.
 """
 
 from __future__ import annotations
@@ -31,24 +31,24 @@ Learn = Callable[[int, float], "dict[str, Any] | None"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Prediction:
-    """Prediction at the pose of one moment, and what the telemetry said of it.
+    """The prediction at the pose of one moment, and the state of the telemetry at that moment.
 
     Parameters
     ----------
     rank : int or None
-        None: no pose, or out of coverage.
+        Predicted rank. None: no pose, or out of coverage.
     level_dbm : float or None
-        Before any offset.
+        Predicted level before any offset [dBm].
     east_m, north_m, up_m : float or None
-        Position in the site frame; None: no pose for that time.
+        Position in the site frame. None: no pose for that time.
     fix : float or None
         Kind of the GPS fix; below 3 it gives no position.
     telemetry_age_s : float or None
         Age of the newest line of the telemetry log; None: no line so far.
     telemetry_delay_s : float or None
-        Least delay of the lines that came lately: negative where the telemetry's clock is ahead of ours.
+        Smallest recent delay of the telemetry lines. Negative if the telemetry's clock is ahead of ours.
     learn : callable, optional
-        ``learn(utc_ns, rsrp_dbm)`` takes what was measured here and gives the rest of the route anew, or None.
+        ``learn(utc_ns, rsrp_dbm)`` takes a measurement here and returns an updated rest of the route, or None.
     """
 
     rank: int | None = None
@@ -72,17 +72,18 @@ class RunningInterval:
     Parameters
     ----------
     share : float
-        Share of residuals that shall lie inside.
+        Share of residuals that must lie inside.
     least : int
-        No interval before so many residuals.
+        Fewest residuals for an interval.
     keep : int
-        Residuals remembered.
+        Number of stored residuals.
 
     Notes
     -----
-    The bounds are order statistics of the last ``keep`` residuals. Neighbours in time are alike, so quantiles alone
-    would hold less than they say: after each residual the tail share ``a`` moves by ``a += step (1 - share - outside)``
-    (Gibbs and Candes 2021, doi 10.48550/arXiv.2106.00170), which makes the long-run share right for any sequence.
+    The bounds are order statistics of the last ``keep`` residuals. Neighbours in time are correlated, so quantiles
+    alone would cover less than ``share``. After each residual the tail share ``a`` therefore moves by ``a += step (1 -
+    share - outside)`` (Gibbs and Candes 2021, doi 10.48550/arXiv.2106.00170), which makes the long-run share correct
+    for any sequence.
 
     Examples
     --------
@@ -108,21 +109,21 @@ class RunningInterval:
         return self._sorted[len(self._sorted) // 2] if self._sorted else None
 
     def bounds(self) -> tuple[float, float] | None:
-        """Bounds of the next residual; None while too few are known or the interval has no bounds."""
+        """Return bounds of the next residual. None if too few residuals are known or the interval is unbounded."""
         n = len(self._sorted)
         if n < self._least or self._tails <= 0.0:
             return None
-        # the two order statistics must not cross, however wide the tails have grown
+        # the two order statistics must not cross, however wide the tails are
         beyond = min((n - 1) // 2, max(0, math.floor(0.5 * self._tails * (n + 1)) - 1))
         return self._sorted[beyond], self._sorted[n - 1 - beyond]
 
     def add(self, residual: float) -> None:
-        """Take a residual in, after its interval was given."""
+        """Add a residual after its interval was reported."""
         bounds = self.bounds()
         outside = bounds is not None and not bounds[0] <= residual <= bounds[1]
         if bounds is not None:
             self.given += 1
-            # counted before the residual is taken in: an interval must not know what it is judged by
+            # counted before the residual is added: an interval must not depend on the value that it is judged by
             self.inside += not outside
         if len(self._sorted) >= self._least:
             self._tails += self.STEP * (1.0 - self._share - outside)
@@ -143,7 +144,7 @@ class Asked:
 
 
 class PredictionWorker:
-    """Runs ``predict`` in one thread; while it is busy, further requests are let go and counted.
+    """A thread that runs ``predict``. While it is busy, further requests are dropped and counted.
 
     Parameters
     ----------
@@ -152,7 +153,7 @@ class PredictionWorker:
 
     def __init__(self, predict: Predict) -> None:
         self._predict = predict
-        # one may wait: a prediction of the past would come too late for whoever flies
+        # only one request may wait: a prediction of the past would come too late for the pilot
         self._wanted: queue.Queue[Asked | None] = queue.Queue(maxsize=1)
         self._done: deque[dict[str, Any]] = deque(maxlen=1000)
         self._rank, self._level = RunningInterval(), RunningInterval()
@@ -196,7 +197,7 @@ class PredictionWorker:
             self._done.append(result)
 
     def _compared(self, asked: Asked, now: Prediction) -> dict[str, Any]:
-        """Fields of the record: prediction, interval, residual; the measurement counts only for later intervals."""
+        """Return the record's prediction, interval and residual. The measurement affects only later intervals."""
         places = ("east_m", "north_m", "up_m", "fix", "telemetry_age_s", "telemetry_delay_s")
         fields: dict[str, Any] = {"predicted": now.rank}
         fields |= {name: _rounded(getattr(now, name)) for name in places}
@@ -226,13 +227,13 @@ def _rounded(value: float | None) -> float | None:
 
 
 _MAX_AGE_S = 2.0
-# Of a log that is long already, only its end is read.
+# Only the end of a log that is already long is read.
 _TAIL_BYTES = 65_536
 
 
 @dataclass(frozen=True, slots=True)
 class TelemetrySample:
-    """Position and attitude of the UAV at ``utc_ns``; angles as in the telemetry record."""
+    """Position and attitude of the UAV at ``utc_ns``, with angles as in the telemetry record."""
 
     utc_ns: int
     latitude_deg: float
@@ -250,21 +251,21 @@ _DELAYS = 20
 
 
 class TelemetryFollower:
-    """Reads what was appended to a telemetry log since the last look.
+    """A reader of the lines that were appended to a telemetry log since the last call.
 
-    For formats whose lines stand alone (``vehicleOut``). A torn last line waits for its rest; a file that was
-    replaced or cut is read anew.
+    It supports formats with independent lines (``vehicleOut``). A truncated last line waits for its rest. A file that
+    was replaced or cut is read from scratch.
 
     Parameters
     ----------
     path : Path
-        May not exist yet.
+        Telemetry log, which may not exist yet.
     options : ReadOptions
-        Zone of the log's clock and so on.
+        Options such as the time zone of the log's clock.
     reader : Reader, optional
-        None: told by the content.
+        Reader of the log. None: identified from the content.
     keep_s : float
-        History kept in memory [s].
+        Length of the history in memory [s].
     """
 
     def __init__(
@@ -291,7 +292,7 @@ class TelemetryFollower:
         Raises
         ------
         InputError
-            If the content is no telemetry.
+            If the content is not telemetry.
         """
         from ..logs import limits  # loads pandas, as any reader does
 
@@ -324,15 +325,15 @@ class TelemetryFollower:
 
     @property
     def delay_s(self) -> float | None:
-        """Least delay between the time in a line and its arrival, lately; negative: the log's clock is ahead."""
+        """The smallest recent delay from the time in a line to its arrival. Negative if the log's clock is ahead."""
         return min(self._delays) if self._delays else None
 
     def latest(self) -> TelemetrySample | None:
-        """The last sample."""
+        """Return the last sample."""
         return self._samples[-1] if self._samples else None
 
     def at(self, utc_ns: int) -> TelemetrySample | None:
-        """The sample nearest in time, None if it is further away than :data:`_MAX_AGE_S`."""
+        """Return the sample nearest in time. None if it is farther away than :data:`_MAX_AGE_S`."""
         if not self._samples:
             return None
         samples = list(self._samples)
@@ -357,7 +358,7 @@ class TelemetryFollower:
         return data[:end]
 
     def _find_place(self, file: BinaryIO) -> None:
-        """Begin anew in a file that was replaced or cut."""
+        """Start from scratch in a file that was replaced or cut."""
         state = os.fstat(file.fileno())
         identity = (state.st_dev, state.st_ino)
         if identity == self._identity and state.st_size >= self._position:

@@ -72,7 +72,7 @@ class FlightModem:
         if write:
             self.csi = [int(write.group(1)), int(write.group(2))]
             return ("OK",)
-        # PMI counts the questions, so that each answer can be told from the others
+        # PMI counts the queries, so that each answer can be distinguished
         csi = f"{min(27, 4 + 6 * rank)},{rank},{min(15, 4 + 2 * rank)},{self._asked % 60_000}" if rank else "0,0,0,0"
         answers: dict[str, tuple[str, ...]] = {
             "sync": (),
@@ -119,14 +119,14 @@ def ranks_of(path: Path, options: ReadOptions) -> Callable[[float], int] | None:
 
 
 class ModemSimulator:
-    """A simulated modem on a pseudo-terminal, served by a thread; a context manager.
+    """A context manager for a simulated modem on a pseudo-terminal, served by a thread.
 
     Parameters
     ----------
     modem : FlightModem, optional
-        Answers; default: a built-in flight.
+        Answers of the modem. Default: a built-in flight.
     link : Path, optional
-        A symbolic link to the port; None: no link.
+        Symbolic link to the port. None: no link.
 
     Examples
     --------
@@ -206,7 +206,7 @@ class ModemSimulator:
             if not ready:
                 return b""
             if not ready[0][1] & select.POLLIN:
-                self._stop.wait(0.02)  # nobody has the port open: poll reports a hang-up at once
+                self._stop.wait(0.02)  # if no process has the port open, poll reports a hang-up at once
                 return b""
             return os.read(fd, 4096)
         except OSError:
@@ -214,7 +214,7 @@ class ModemSimulator:
             return b""
 
     def _write(self, data: bytes) -> bool:
-        """Write all of it; False where that fails."""
+        """Write all bytes. Return False if that fails."""
         while data and not self._stop.is_set():
             try:
                 with self._lock:

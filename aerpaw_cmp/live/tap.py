@@ -1,8 +1,8 @@
-"""The tap: polls the modem, writes every answer down, survives what happens in a field.
+"""The tap: it polls the modem, records every answer, and survives field conditions.
 
-One polling thread, one command in flight. A record is in the kernel's hands before the next command goes out, unless
+There is one polling thread and one command in flight. A record is in the kernel before the next command is sent, unless
 the disk stalls (:class:`~aerpaw_cmp.live.log.LogWriter`). The port may vanish and come back under another
-number, the disk may fill, the clock may step, signals may come: each leaves its own record, and the polling goes on.
+number, the disk may fill, the clock may step, signals may come. Each event is recorded, and the polling continues.
 """
 
 from __future__ import annotations
@@ -277,7 +277,7 @@ class Tap:
         )
 
     def _restore_csi(self) -> bool | None:
-        """Put CSI reporting back as it was; None if it was not changed."""
+        """Restore the former state of CSI reporting. None if it was not changed."""
         if not self._csi_changed:
             return None
         answer = None
@@ -305,7 +305,7 @@ class Tap:
         raise first_error
 
     def _ports_to_try(self) -> list[PortInfo]:
-        """At the start what the user named, or every AT port; after a loss the same interface, wherever it is now."""
+        """Return the named port or every AT port at the start, and the same interface after a loss."""
         roots, last = self._settings.roots, self._info
         if last is None:
             named = self._settings.port
@@ -339,7 +339,7 @@ class Tap:
         self._last_final_ns = self._last_csi_ns = self._clock.mono_ns()
 
     def _probe(self) -> bool:
-        """Ask a bare ``AT``; an answer brings the modem in step, so that a late one is not taken for the next."""
+        """Send a bare ``AT``. An answer synchronises the modem, so that a late answer is not taken for the next."""
         answer, _ = self._exchange("sync", timeout_s=self._settings.probe_timeout_s)
         if answer.status in ("timeout", "lost"):
             return False
@@ -452,12 +452,12 @@ class Tap:
     def _exchange(
         self, name: str, command: str | None = None, *, timeout_s: float | None = None
     ) -> tuple[Answer, Decoded]:
-        """Send one command and wait for its end; the record is written before this returns.
+        """Send one command and wait for its end. The record is written before this returns.
 
         Raises
         ------
         PortGoneError
-            After the record of what had come.
+            After recording the bytes that had come.
         """
         assert self._port is not None
         query = QUERIES[name]
@@ -501,12 +501,12 @@ class Tap:
             self._tick()
 
     def _read(self) -> Answer | None:
-        """Take what the port has; everything but the answer in flight is recorded here."""
+        """Read the available bytes. Record everything except the answer in flight."""
         assert self._port is not None
         data = self._port.read()
         self._received += len(data)
         if self._first_bytes is not None:
-            # enough to tell NMEA and DIAG apart, however long a wrong port goes on
+            # enough to distinguish NMEA from DIAG, however much a wrong port sends
             self._first_bytes += data[: 4096 - len(self._first_bytes)]
         answer = None
         for event in self._framer.feed(data):
@@ -555,7 +555,7 @@ class Tap:
             if answer.status == "ok":
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
-                    # the pose at the middle of the exchange: nobody knows when in it the rank was taken
+                    # the pose at the middle of the exchange, because the time of the rank within it is unknown
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
                     self._worker.ask(
                         Asked(middle, record["sent_utc_ns"], decoded.values.get("rank"), self._last["rsrp_dbm"])
@@ -587,18 +587,18 @@ class Tap:
     # waiting ----------------------------------------------------------------------------------------------
 
     def _select(self, timeout_s: float) -> bool:
-        """Check whether the port has bytes, waiting at most so long; a stop request ends the waiting."""
+        """Check whether the port has bytes, waiting at most ``timeout_s``. A stop request ends the wait."""
         poller = select.poll()
         if not self._stop.count:
             poller.register(self._stop.fileno(), select.POLLIN)
         if self._port is not None:
             poller.register(self._port.fileno(), select.POLLIN)
-        # wake for the regular duties too
+        # wake for the periodic tasks too
         ready = poller.poll(max(0.0, min(timeout_s, self._settings.status_s)) * 1e3)
         return any(fd != self._stop.fileno() for fd, _ in ready)
 
     def _wait(self, duration_s: float) -> None:
-        """Wait, and take what the modem says unasked meanwhile."""
+        """Wait, and record unsolicited lines of the modem meanwhile."""
         deadline = self._clock.mono_ns() + int(duration_s * 1e9)
         while not self._stop.count:
             remaining_ns = deadline - self._clock.mono_ns()

@@ -1,10 +1,10 @@
-"""The tap's page for browsers: one page and one stream of events, by the standard library.
+"""The tap's page for browsers: one page and one stream of events, with the standard library.
 
-It answers GET of ``/`` and ``/events`` and nothing else, reads no file, and refuses what other sites ask for (Host,
+It only answers GET requests for ``/`` and ``/events``, reads no file, and refuses requests from other sites (Host,
 Origin, Sec-Fetch-Site), so that a page on the Internet cannot read it by DNS rebinding. Every request needs the token
-of the printed address, or the cookie that the first visit with it gave: the loopback belongs to all users of a machine.
-Each browser has a thread that only reads the :class:`~aerpaw_cmp.live.feed.Feed`: one that takes nothing for some
-seconds is dropped and refills when it comes back; the tap never waits for it.
+of the printed address, or the cookie that the first visit with it set, because all users of a machine share the
+loopback. Each browser has a thread that only reads the :class:`~aerpaw_cmp.live.feed.Feed`. A browser that accepts no
+data for some seconds is disconnected and refilled when it comes back. The tap never waits for it.
 """
 
 from __future__ import annotations
@@ -32,9 +32,10 @@ from .feed import Feed
 
 DEFAULT = "127.0.0.1:8765"
 _ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
-# Bytes handed to a browser's socket at once: each piece has its own time limit, so a slow link is no dead one.
+# Bytes written to a browser's socket at once. Each piece has its time limit, so a slow connection is not taken for a
+# dead one.
 _PIECE = 16_384
-# Connections that wait for their request, of all addresses.
+# Limit of connections, of all addresses, that wait for their request.
 _MOST_WAITING = 256
 _LOW_WATER = socket.SOL_SOCKET, socket.SO_RCVLOWAT
 _TOKEN_WANTED = "the token is missing or wrong: use the address that the tap printed"
@@ -50,13 +51,13 @@ class Page:
 
     @property
     def digest(self) -> str:
-        """Identity of the page: a browser that shows another one loads it anew."""
+        """The identity of the page. A browser that shows another page reloads it."""
         return hashlib.sha256(self.body).hexdigest()[:16]
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Bounds on what browsers may take.
+    """The limits of what browsers may use.
 
     Parameters
     ----------
@@ -89,12 +90,12 @@ class Address:
 
     @classmethod
     def parse(cls, text: str) -> Address:
-        """Address of ``HOST:PORT``; no host is the loopback.
+        """Parse the address ``HOST:PORT``. An empty host means the loopback.
 
         Raises
         ------
         UsageError
-            If it is none.
+            If the text is not an address.
 
         Examples
         --------
@@ -165,7 +166,7 @@ class WebServer:
 
     @property
     def urls(self) -> list[str]:
-        """Addresses for a browser; of a server on all interfaces, this computer's as other computers see it first."""
+        """The addresses for a browser. For all interfaces, the address that other computers see comes first."""
         query = f"/?token={quote(self.token) if self._printed else '...'}"
         hosts = [self.address.host]
         if self.address.host in ("0.0.0.0", "::"):
@@ -173,7 +174,7 @@ class WebServer:
         return [f"http://{Address(host, self.address.port)}{query}" for host in hosts]
 
     def close(self, wait_s: float = 1.5) -> None:
-        """Let browsers take what is new, for a moment, and close."""
+        """Wait a moment until browsers have the latest data, and close."""
         self.feed.digest()
         self.closing = True
         until = time.monotonic() + wait_s
@@ -191,11 +192,11 @@ class WebServer:
 
 
 class _Server(ThreadingHTTPServer):
-    """Threads for browsers that have the token; whoever has not is refused without.
+    """A server with a thread per browser that has the token. Other requests are refused without a thread.
 
-    A connection waits in one loop until its request is there. An address that does not show the token gets so many
-    refusals, and is closed without a word beyond: a flood, of another computer or of pictures in another page of the
-    same browser, keeps itself out and nobody else.
+    A connection waits in one loop until its request is complete. An address without the token gets a limited number of
+    refusals, and is then closed without an answer. A flood, from another computer or from pictures in another page of
+    the same browser, therefore only blocks its address.
     """
 
     daemon_threads = True
@@ -235,10 +236,10 @@ class _Server(ThreadingHTTPServer):
             request.close()
 
     def _accept(self, ready: selectors.BaseSelector) -> None:
-        """Let a connection wait for its request; of too many the oldest of the most frequent address goes."""
+        """Let a connection wait for its request. If too many wait, close the oldest of the most frequent address."""
         try:
             request, address = self.socket.accept()
-        except OSError:  # gone again, or too many files are open
+        except OSError:  # closed already, or too many files are open
             time.sleep(0.01)
             return
         request.setblocking(False)
@@ -297,7 +298,7 @@ class _Server(ThreadingHTTPServer):
         super().shutdown_request(request)
 
     def let_in(self, request: Any) -> bool:
-        """Note a connection that showed the token; False where too many of these are open."""
+        """Register a connection that showed the token. Return False if too many of these are open."""
         with self._lock:
             if len(self.browsers) >= self.web.limits.connections:
                 return False
@@ -305,17 +306,17 @@ class _Server(ThreadingHTTPServer):
             return True
 
     def close_all(self) -> None:
-        """End every connection."""
+        """Close every connection."""
         for request in list(self.browsers):
             with contextlib.suppress(OSError):
                 request.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: Any, client_address: Any) -> None:
-        """Say nothing: a browser that went away is no fault, and the terminal belongs to the tap."""
+        """Print nothing: a browser that disconnects is not an error, and the terminal belongs to the tap."""
 
 
 class _Handler(BaseHTTPRequestHandler):
-    """One request; HTTP/1.0, so that each connection ends with its answer."""
+    """A request handler with HTTP/1.0, so that each connection ends with its answer."""
 
     server: _Server
     server_version = "aerpaw-cmp"
@@ -324,7 +325,7 @@ class _Handler(BaseHTTPRequestHandler):
     def setup(self) -> None:
         super().setup()
         self.connection.settimeout(self.server.web.limits.send_s)
-        # what the kernel buffers hides a browser that reads nothing: the less, the sooner it is dropped
+        # data in the kernel's buffer hides a browser that does not read: a small buffer detects it sooner
         self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 * _PIECE)
 
     def do_GET(self) -> None:
@@ -360,7 +361,7 @@ class _Handler(BaseHTTPRequestHandler):
         web, headers = self.server.web, self.headers
         hosts, origins = headers.get_all("Host", []), headers.get_all("Origin", [])
         if len(hosts) != 1 or not _own_host(hosts[0], web.address.loopback):
-            return HTTPStatus.FORBIDDEN, "the Host is no name of this computer"
+            return HTTPStatus.FORBIDDEN, "the Host is not a name of this computer"
         if any(origin.lower() != f"http://{hosts[0]}".lower() for origin in origins):
             return HTTPStatus.FORBIDDEN, "the request comes from another site"
         opened = path == "/" and headers.get("Sec-Fetch-Dest", "document") == "document"
@@ -426,7 +427,7 @@ class _Handler(BaseHTTPRequestHandler):
         super().end_headers()
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:  # noqa: ARG002
-        """Answer what http.server refuses; nothing of the request stands in the answer."""
+        """Answer requests that http.server refuses. The answer contains nothing from the request."""
         self._text(HTTPStatus(code), HTTPStatus(code).phrase)
 
     def _text(self, status: HTTPStatus, text: str) -> None:
@@ -452,7 +453,7 @@ def _is_loopback(host: str) -> bool:
 
 
 def _own_host(text: str, loopback: bool) -> bool:
-    """Check whether a Host header names this computer by an address or its own name; the port may be a tunnel's."""
+    """Check whether a Host header names this computer by an address or its host name. The port may be a tunnel's."""
     match = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(:[0-9]{1,5})?", text)
     if match is None:
         return False
@@ -468,15 +469,15 @@ def _own_host(text: str, loopback: bool) -> bool:
 
 
 def _outward() -> list[str]:
-    """Address of this computer as other computers see it; nothing is sent to find it."""
+    """Return the address of this computer that other computers see, without sending a packet."""
     with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.connect(("192.0.2.1", 9))  # TEST-NET-1: a route is looked up, no packet goes out
+        probe.connect(("192.0.2.1", 9))  # TEST-NET-1: a route is looked up, but no packet is sent
         return [str(probe.getsockname()[0])]
     return []
 
 
 def _refused(address: Address, error: OSError) -> UsageError:
-    """The error for an address that cannot be had."""
+    """Return the error for an address that cannot be used."""
     cause = {
         errno.EADDRINUSE: "another tap or another server has this port",
         errno.EACCES: "ports below 1024 belong to the administrator",

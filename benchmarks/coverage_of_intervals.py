@@ -26,6 +26,7 @@ import json
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from scipy.signal import lfilter
@@ -128,7 +129,7 @@ class Shadowing:
     @cached_property
     def root(self) -> FloatArray:
         """Lower root of :attr:`over_place`."""
-        return np.linalg.cholesky(self.over_place + 1e-9 * np.eye(self.n))
+        return np.asarray(np.linalg.cholesky(self.over_place + 1e-9 * np.eye(self.n)))
 
     @cached_property
     def places(self) -> IntArray:
@@ -436,7 +437,7 @@ def judge(rows: list[dict[str, object]]) -> None:
         print(f"  {len(outside)} of {len(rows)} kinds outside, beyond chance {sure or 0}; too wide: {wide or 0}")
 
 
-def judge_verdicts(rows: list[dict[str, object]], flights: int) -> None:
+def judge_verdicts(rows: list[dict[str, Any]], flights: int) -> None:
     """Print which kinds have too many false verdicts beyond chance, and which less than 60 % of the power."""
     for name in ("false", "false_shared", "false_route"):
         sure = [row["flight"] for row in rows if wilson(row[name], flights)[0] > FALSE]

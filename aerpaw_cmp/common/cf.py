@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -35,6 +36,13 @@ WGS84 = {
     "prime_meridian_name": "Greenwich",
     "long_name": "coordinate reference system",
 }
+
+
+def flags(meanings: Sequence[str], dtype: type[np.integer[Any]] = np.int8, first: int = 0) -> dict[str, Any]:
+    """Return the attributes of integer codes ``first``, ``first`` + 1, ... with these meanings."""
+    # the characters that CF allows in a meaning; blanks separate the meanings
+    words = [re.sub(r"[^A-Za-z0-9_.+@-]", "_", text) or "_" for text in meanings]
+    return {"flag_values": np.arange(first, first + len(words), dtype=dtype), "flag_meanings": " ".join(words)}
 
 
 def site_crs(frame: SiteFrame) -> Any:
@@ -99,7 +107,7 @@ class Dataset:
             self.variables[name] = Variable((dims,) if isinstance(dims, str) else dims, np.asarray(values), *rest)
 
     def to_xarray(self) -> Any:
-        """Return the same data as an ``xarray.Dataset``.
+        """Return the data as an ``xarray.Dataset``, with times since a date as ``datetime64``.
 
         Raises
         ------
@@ -107,14 +115,17 @@ class Dataset:
             If xarray is not installed.
         """
         columns = {n: (v.dims, v.values, v.attrs, dict(v.encoding)) for n, v in self.variables.items()}
-        return library("xarray").Dataset(columns, attrs=self.attrs)
+        xarray = library("xarray")
+        return xarray.decode_cf(
+            xarray.Dataset(columns, attrs=self.attrs), mask_and_scale=False, decode_coords=False, concat_characters=False
+        )
 
 
 def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
     """A NetCDF-4 file of a :class:`Dataset`, made in memory: HDF5 ends the process where a disk is full.
 
-    Arrays are deflated; text becomes characters in UTF-8, which every reader of CF takes. A variable with NaN has it as
-    ``_FillValue``; another has none, unless its ``encoding`` says so. ``grows`` are dimensions without a limit, the
+    Arrays are deflated; text becomes characters in UTF-8, which every reader of CF takes. NetCDF has no complex
+    numbers: ``NAME_real`` and ``NAME_imag`` are written in place of ``NAME``. A variable with NaN has it as ``_FillValue``; another has none, unless its ``encoding`` says so. ``grows`` are dimensions without a limit, the
     first of them that along which :class:`GrowingNetcdf` appends.
 
     Raises
@@ -124,8 +135,8 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
     """
     book = library("netCDF4").Dataset("data", "w", memory=1 << 20)
     book.setncatts(data.attrs)
-    for name, variable in data.variables.items():
-        dims, values = _stored(name, variable)
+    for name, variable in _parts(data).items():
+        dims, values = variable.dims, variable.values
         for dim, size in zip(dims, values.shape, strict=True):
             if dim not in book.dimensions:
                 book.createDimension(dim, None if dim in grows else size)
@@ -171,7 +182,8 @@ class GrowingNetcdf:
 
     Notes
     -----
-    A ``_FillValue`` of 0 fills and is then removed from the attributes, because readers would mask it.
+    A ``_FillValue`` other than NaN fills the file and is then removed from the attributes: it is a value (a gain of 0, a
+    flag of -1), which readers would replace by NaN.
     """
 
     def __init__(self, path: Path, grows: Sequence[str]) -> None:
@@ -203,16 +215,17 @@ class GrowingNetcdf:
             # h5py goes on where netCDF4 began: that library appends to no stream
             self._book = library("h5py").File(self._sink, "r+")
             for variable in self._book.values():
-                if "_FillValue" in variable.attrs and variable.attrs["_FillValue"][0] == 0:
+                if "_FillValue" in variable.attrs and not np.isnan(variable.attrs["_FillValue"][0]):
                     del variable.attrs["_FillValue"]
-        parts = {name: _stored(name, variable) for name, variable in data.variables.items()}
-        sizes = {name: size for dims, values in parts.values() for name, size in zip(dims, values.shape, strict=True)}
+        parts = _parts(data)
+        sizes = {name: size for part in parts.values() for name, size in zip(part.dims, part.values.shape, strict=True)}
         along, start = self._grows[0], self._sizes[self._grows[0]]
         sizes[along] += start
         self._sizes = {name: max(size, sizes[name]) for name, size in self._sizes.items()}
         for name in self._grows:
             self._book[name].resize((self._sizes[name],))
-        for name, (dims, values) in parts.items():
+        for name, part in parts.items():
+            dims, values = part.dims, part.values
             if {*dims} & {*self._grows}:
                 stored = self._book[name]
                 stored.resize(tuple(self._sizes.get(dim, size) for dim, size in zip(dims, stored.shape, strict=True)))
@@ -220,19 +233,28 @@ class GrowingNetcdf:
                 stored[tuple(slice(first, first + n) for first, n in zip(shift, values.shape, strict=True))] = values
         self._sink.raise_spared()
 
-    def describe(self, **attributes: str) -> None:
-        """Overwrite attributes of the file."""
-        for name, text in attributes.items():
-            self._book.attrs[name] = text.encode()
+    def describe(self, variable: str | None = None, **attributes: Any) -> None:
+        """Replace attributes of the file, or of a variable."""
+        attrs = (self._book if variable is None else self._book[variable]).attrs
+        for name, value in attributes.items():
+            attrs[name] = value.encode() if isinstance(value, str) else value
 
 
-def _stored(name: str, variable: Any) -> tuple[tuple[str, ...], AnyArray]:
-    """Return the dimensions and values of a variable as stored in a file: text as characters."""
-    values = np.asarray(variable.values)
-    if values.dtype.kind not in "OU":
-        return variable.dims, values
-    text = np.char.encode(values.astype(str), "utf-8")
-    return (*variable.dims, f"{name}_length"), text.view("S1").reshape(*values.shape, text.dtype.itemsize)
+def _parts(data: Any) -> dict[str, Variable]:
+    """Return the variables as a file has them: text as characters, complex numbers as two variables."""
+    parts = {}
+    for name, variable in data.variables.items():
+        dims, values, about = variable.dims, np.asarray(variable.values), dict(variable.attrs)
+        if values.dtype.kind == "c":
+            for half, numbers in (("real", values.real), ("imag", values.imag)):
+                named = {"long_name": f"{about['long_name']} ({half})"}
+                parts[f"{name}_{half}"] = Variable(dims, numbers, about | named, variable.encoding)
+            continue
+        if values.dtype.kind in "OU":
+            text = np.char.encode(values.astype(str), "utf-8")
+            dims, values = (*dims, f"{name}_length"), text.view("S1").reshape(*values.shape, text.dtype.itemsize)
+        parts[name] = Variable(dims, values, about, variable.encoding)
+    return parts
 
 
 def library(name: str) -> Any:

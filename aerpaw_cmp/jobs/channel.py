@@ -243,7 +243,9 @@ def _planned(data: FlightData, route: Path, step_s: float) -> Along:
         remarks = (*remarks, "The route gives no heading: the nose points along the course.")
     level = np.zeros(len(yaw))
     rotation = rotation_from_aircraft(level, level, level + 90.0 if data.settings.rt.attitude == "ignored" else yaw)
-    return Along(name=targets.name, poses=Poses(position, rotation), time_s=time, remarks=remarks)
+    number = np.arange(float(len(time))) if len(time) > 1 and not time.any() else None
+    poses = Poses(position, rotation)
+    return Along(name=targets.name, poses=poses, time_s=time, number=number, remarks=remarks)
 
 
 def _levels_of(data: FlightData, link: Link, name: str, remarks: list[str]) -> Callable[[Poses], dict[str, Any]]:

@@ -168,8 +168,6 @@ def _netcdf(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
     dims = {name: notes["dims"][name][: values.ndim] for name, values in arrays.items()}
     arrays = {name.lower(): values for name, values in arrays.items()}
     dims = {name.lower(): names for name, names in dims.items()}
-    if "tower_name" in arrays:  # of an older channel.nc
-        arrays["tower"], dims["tower"] = arrays["tower_name"], dims["tower_name"]
     if "height_m" not in arrays and "up_m" in arrays:
         arrays["height_m"], dims["height_m"] = arrays["up_m"], dims["up_m"]
     remarks: list[str] = []
@@ -184,10 +182,6 @@ def _netcdf(content: bytes, path: Path) -> tuple[pd.DataFrame, str, list[str]]:
         raise InputError("no variable with a level", expected=_WANTED, path=path)
     shape = dict(zip(dims[main], arrays[main].shape, strict=True))
     _check_rows(math.prod(shape.values()), path)
-    if "series" in shape and "series" in arrays:  # tower and channel in one name, as 'predict' writes them
-        words = [str(name).partition(" ") for name in arrays["series"]]
-        for name, values in (("tower", [w[0] for w in words]), ("channel", [w[2] for w in words])):
-            arrays[name], dims[name] = np.array(values, dtype=np.str_), ["series"]
     columns = {}
     known = ("time", "time_utc", "tower", "channel", *_PLACE, *_GEOGRAPHIC, *QUANTITIES, *_OPTIONAL)
     for name in (name for name in known if name in arrays and set(dims[name]) <= set(shape)):

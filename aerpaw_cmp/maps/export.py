@@ -20,7 +20,6 @@ Both need ``pip install aerpaw-cmp[geo]``.
 from __future__ import annotations
 
 import io
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -29,7 +28,7 @@ from typing import Any
 import numpy as np
 
 from ..common import kml
-from ..common.cf import DB, DBM, Dataset, site_crs
+from ..common.cf import DB, DBM, Dataset, flags, site_crs
 from ..common.geodesy import SiteFrame
 from ..common.kml import CLASS_COLOURS
 from ..common.text import guarded
@@ -207,7 +206,7 @@ def _legend(layer: Layer, low: float, high: float) -> bytes:
 
 
 _PLANE = ("y", "x")
-_LABELS = "foliage_mode latitude longitude"
+_COORDINATES = "latitude longitude"
 _Variable = tuple[tuple[str, ...], AnyArray, dict[str, Any]]
 
 
@@ -233,7 +232,7 @@ def maps_dataset(
     """
     first = next(iter(maps.values()))
     variables = {**_places(first, frame), **_levels(maps), **_ranks(maps)}
-    variables["foliage_mode"] = _text("foliage", maps, "how trees act")
+    variables["foliage"] = _text("foliage", maps, "how trees act")
     for layer in further:
         plane = first.grid.raster(np.asarray(layer.values))
         if layer.classes:
@@ -265,7 +264,7 @@ def _places(maps: MapResult, frame: SiteFrame) -> dict[str, _Variable]:
     """Axes, towers, latitude and longitude, the tower that serves, the reference system."""
     variables: dict[str, _Variable] = {
         "k": (("k",), np.array(maps.ks), {"long_name": "singular-value ratio K of the rank", "units": "1"}),
-        "tower_name": _text("tower", maps.tower_names, "name of the tower"),
+        "tower": _text("tower", maps.tower_names, "name of the tower"),
     }
     height = {"standard_name": "height", "units": "m", "positive": "up", "axis": "Z"}
     for name, heights, what in (
@@ -355,7 +354,7 @@ def _stacked(
     described = {
         **attributes,
         "long_name": str(attributes["long_name"]) + (", nearest tower" if joint else ""),
-        "coordinates": _LABELS if joint else f"{_LABELS} tower_name",
+        "coordinates": _COORDINATES,
         "grid_mapping": "crs",
     }
     return ("foliage", *between, *_PLANE), numbers, described
@@ -365,8 +364,6 @@ def _codes(meanings: Sequence[str], long_name: str) -> dict[str, Any]:
     """Attributes of a variable of classes 0, 1, ..."""
     return {
         "long_name": long_name,
-        "flag_values": np.arange(len(meanings), dtype=np.int8),
-        # all that CF allows in a meaning
-        "flag_meanings": " ".join(re.sub(r"[^A-Za-z0-9_.+@-]", "_", item) or "_" for item in meanings),
+        **flags(meanings),
         "grid_mapping": "crs",
     }

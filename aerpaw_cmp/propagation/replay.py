@@ -464,12 +464,12 @@ class Replay:
         return frequency_responses(self.path_table(), self.ends, offsets_hz)
 
     def to_xarray(self) -> Any:
-        """The replay as an ``xarray.Dataset`` with dimensions pose, tower, n_rx, n_tx.
+        """Return the replay as an ``xarray.Dataset`` over pose, tower, rx and tx, each with its coordinate.
 
         Returns
         -------
         xarray.Dataset
-            ``rss_dbm``, ``rss_power_dbm``, ``has_path``, ``h_real`` and ``h_imag`` with units as attributes.
+            ``rss_dbm``, ``rss_power_dbm``, ``has_path`` and complex ``h``, with units as attributes.
 
         Raises
         ------
@@ -478,15 +478,16 @@ class Replay:
         """
         level = {"units": "dBm", "long_name": "received power, coherent sum of the paths"}
         power = {"units": "dBm", "long_name": "received power, sum of the paths' powers"}
-        ports = ("pose", "tower", "n_rx", "n_tx")
+        poses, _, *ports = self.h.shape
+        numbers = {"pose": poses, "rx": ports[0], "tx": ports[1]}
         return Dataset(
             {
                 "rss_dbm": (("pose", "tower"), self.rss_dbm, level),
                 "rss_power_dbm": (("pose", "tower"), self.rss_power_dbm, power),
                 "has_path": (("pose", "tower"), self.has_path),
-                "h_real": (ports, self.h.real, {"units": "1"}),
-                "h_imag": (ports, self.h.imag, {"units": "1"}),
+                "h": (("pose", "tower", "rx", "tx"), self.h, {"units": "1", "long_name": "channel matrix"}),
                 "tower": ("tower", list(self.towers)),
+                **{name: (name, np.arange(count)) for name, count in numbers.items()},
             },
             {"engine": self.engine, "seconds": self.seconds},
         ).to_xarray()

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from ..common.cf import Dataset, GrowingNetcdf, file_attributes
+from ..common.cf import Dataset, GrowingNetcdf, file_attributes, flags
 from ..common.content import KEY
 from ..common.stages import Stages
 from ..common.text import guarded
@@ -23,11 +23,11 @@ from ..propagation.drivers import added_up
 from ..propagation.geometry import Poses
 from ..propagation.replay import PathTable, Replay, frequency_responses, impulse_responses
 
-_LINK, _PORTS = ("pose", "tower"), ("rx", "tx")
+_LINK, _PORTS = ("time", "tower"), ("rx", "tx")
 _PATH = ("path", *_LINK)
 _SITE, _ARRAY = "site frame, azimuth from east, counter-clockwise", "array frame, from the boresight, counter-clockwise"
-# Dimensions along which the file grows, pose by pose or with the link that has most paths.
-_GROWS = ("pose", "path", "faces_of_a_path", "face_names_length")
+# Dimensions along which the file grows: with each part, and with the link that has most paths.
+_GROWS = ("time", "path")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,6 +42,8 @@ class Along:
         Since ``start``.
     start : datetime64, optional
         UTC; None of a route that was not flown.
+    number : (poses,), optional
+        The number of each pose, if the route has no times.
     towers_m : (poses, 3), optional
         Places of a tower that moves.
     velocity_mps, tower_mps : (poses, 3), optional
@@ -53,6 +55,7 @@ class Along:
     poses: Poses
     time_s: FloatArray
     start: Any = None
+    number: FloatArray | None = None
     towers_m: FloatArray | None = None
     velocity_mps: FloatArray | None = None
     tower_mps: FloatArray | None = None
@@ -60,7 +63,7 @@ class Along:
 
     def part(self, rows: slice) -> Along:
         """Some of the poses."""
-        arrays = {"time_s": self.time_s, "towers_m": self.towers_m, "velocity_mps": self.velocity_mps,
+        arrays = {"time_s": self.time_s, "number": self.number, "towers_m": self.towers_m, "velocity_mps": self.velocity_mps,
                   "tower_mps": self.tower_mps}  # fmt: skip
         some: Any = {name: None if values is None else values[rows] for name, values in arrays.items()}
         return replace(self, poses=self.poses[rows], **some)
@@ -121,31 +124,40 @@ class Channel:
 
 
 def channel_dataset(channel: Channel) -> Dataset:
-    """The channel as variables: paths by (path, pose, tower), H and levels by (pose, tower)."""
-    variables: dict[str, Any] = {}
-    for name, values, dimensions, *about in _quantities(channel):
-        if values is not None:
-            variables |= _variables(name, values, dimensions, *about)
-    link, kinds = channel.replay.ends.link, channel.table.kinds
+    """Return the channel as labelled variables: paths by (path, time, tower), H and levels by (time, tower)."""
+    variables = {
+        name: _variable(name, values, dimensions, *about)
+        for name, values, dimensions, *about in _quantities(channel)
+        if values is not None
+    }
+    link, along = channel.replay.ends.link, channel.along
     written = file_attributes(
-        title=f"Channel along {channel.along.name}, link {channel.link}",
+        title=f"Channel along {along.name}, link {channel.link}",
         source="ray tracing along a flight",
         comment=" ".join(channel.warnings),
     )
     ends = {"transmitter": "UAV" if link.uav_transmits else "tower"}
-    data = Dataset(variables, {**written, "carrier_hz": link.carrier_hz,
-                                          "transmit_power_dbm": link.transmit_power_dbm, **ends})  # fmt: skip
+    data = Dataset(variables, {**written, "link": channel.link, "carrier_hz": link.carrier_hz,
+                               "transmit_power_dbm": link.transmit_power_dbm, **ends})  # fmt: skip
     described = {name: variable.attrs for name, variable in data.variables.items()}
-    described["kind"] |= {"flag_values": np.arange(len(kinds), dtype=np.int8), "flag_meanings": " ".join(kinds)}
-    if channel.along.start is not None:
-        start = str(channel.along.start).replace("T", " ")
-        described["time"] |= {"long_name": f"since {start} UTC", "units": f"seconds since {start[:19]} UTC"}
+    described["kind"] |= flags(("no_path", *channel.table.kinds), np.int8, -1)
+    described["faces"] |= _face_flags(channel)
+    if along.start is not None:
+        start = str(along.start.astype("datetime64[s]")).replace("T", " ")
+        described["time"] |= {"standard_name": "time", "long_name": "time of the pose", "units": f"seconds since {start} UTC"}
+    elif along.number is not None:
+        described["time"] |= {"long_name": "number of the pose: the route has no times", "units": "1"}
     if channel.level_db is not None:
         described["level_db"]["comment"] = f"unit: {channel.level_unit}; the paths and H do not use what was learned"
         # of the levels alone: no other variable of the file is learned from logs
         for name in ("level_db", "level_sd_db"):
             described[name][KEY] = " ".join(channel.trained_on)
     return data
+
+
+def _face_flags(channel: Channel) -> dict[str, Any]:
+    """Return the meanings of ``faces``: the faces that a path touches, from tower to UAV."""
+    return flags(("no_path", *(name or "line_of_sight" for name in channel.table.names)), np.int32, -1)
 
 
 def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[str, ...], str, str]]:
@@ -155,11 +167,12 @@ def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[
     cfr = None if offsets is None else frequency_responses(table, ends, offsets)
     yield "gain", of(table.gain, 0.0), (*_PATH, *_PORTS), "1", _GAIN
     yield "kind", of(table.kind.astype(np.int8), -1), _PATH, "", "kind of the path"
-    yield "faces", of(table.via.astype(np.int32), -1), _PATH, "", "row of face_names"
-    faces = np.array(table.names, dtype=object)
-    yield "face_names", faces, ("faces_of_a_path",), "", "faces that a path touches, from tower to UAV"
+    yield "faces", of(table.via.astype(np.int32), -1), _PATH, "", "faces that a path touches, from tower to UAV"
     yield "h", replay.h, ports, "1", "channel matrix: sum of the gains over the paths"
-    yield "tower_name", np.array(replay.towers, dtype=object), ("tower",), "", "name of the tower"
+    yield "tower", np.array(replay.towers, dtype=object), ("tower",), "", "name of the tower"
+    meanings = "number of the path, the shortest first", "port of the receiver", "port of the transmitter"
+    for name, count, meaning in zip(("path", *_PORTS), (table.most, *replay.h.shape[2:]), meanings, strict=True):
+        yield name, np.arange(count, dtype=np.int32), (name,), "1", meaning
     yield "delay_s", of(table.delay_s), _PATH, "s", "delay between the array centres"
     doppler = "Doppler shift, positive while the path gets shorter"
     yield "doppler_hz", of(channel.doppler_hz), _PATH, "Hz", doppler
@@ -171,32 +184,34 @@ def _quantities(channel: Channel) -> Iterator[tuple[str, AnyArray | None, tuple[
     yield "level_sd_db", sd, _LINK, "1", "standard deviation of level_db [dB], larger where no flight taught"
     yield "cfr", cfr, (*ports, "subcarrier"), "1", "channel matrix at the subcarriers"
     yield "subcarrier_hz", offsets, ("subcarrier",), "Hz", "offset of a subcarrier from the carrier"
-    yield "time", channel.along.time_s, ("pose",), "s", "since the start of the route"
-    sources, along = (ends.sources_m[:, 0], "pose") if ends.moving else (ends.sources_m, "tower")
+    yield "time", _times(channel.along), ("time",), "s", "seconds since the start of the route, whose date is not known"
+    sources, along = (ends.sources_m[:, 0], "time") if ends.moving else (ends.sources_m, "tower")
     for i, name in enumerate(("east", "north", "up")):
-        yield f"{name}_m", ends.poses.position_m[:, i], ("pose",), "m", f"{name} of the site origin, UAV"
+        yield f"{name}_m", ends.poses.position_m[:, i], ("time",), "m", f"{name} of the site origin, UAV"
         yield f"tower_{name}_m", sources[:, i], (along,), "m", f"{name} of the site origin, tower"
         velocity = None if speed is None else speed[:, i]
-        yield f"velocity_{name}_mps", velocity, ("pose",), "m s-1", f"velocity {name}, UAV"
+        yield f"velocity_{name}_mps", velocity, ("time",), "m s-1", f"velocity {name}, UAV"
 
 
 _GAIN = "gain of a path at the carrier, its phase included; 0 without a path"
 
 
-def _variables(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: str, meaning: str) -> dict[str, Any]:
-    """A variable as ``xarray`` takes it, by name; two of complex numbers."""
+def _times(along: Along) -> FloatArray:
+    """Return the coordinate (poses,): seconds since a whole second in UTC or since the start [s], or numbers of poses."""
+    if along.start is None:
+        return along.time_s if along.number is None else along.number
+    return along.time_s + (along.start - along.start.astype("datetime64[s]")) / np.timedelta64(1, "s")
+
+
+def _variable(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: str, meaning: str) -> tuple[Any, ...]:
+    """Return dimensions, values, attributes and encoding of a variable."""
     about = {"long_name": meaning, **({"units": unit} if unit else {})}
     if np.iscomplexobj(values):
-        # digits of a phase do not deflate: level 1 takes out the zeros alone
-        encoding = {"complevel": 1, **({"_FillValue": 0.0} if name == "gain" else {})}
-        halves = (("real", values.real), ("imag", values.imag))
-        return {
-            f"{name}_{part}": (dimensions, half, about | {"long_name": f"{meaning} ({part})"}, encoding)
-            for part, half in halves
-        }
+        # digits of a phase do not deflate: level 1 removes only the zeros
+        return dimensions, values, about, {"complevel": 1, **({"_FillValue": 0.0} if name == "gain" else {})}
     missing: Any = {"i": values.dtype.type(-1), "f": np.nan}.get(values.dtype.kind)
     of_links = dimensions[: len(_PATH)] == _PATH or dimensions == _LINK
-    return {name: (dimensions, values, about, {"_FillValue": missing} if of_links else {})}
+    return dimensions, values, about, {"_FillValue": missing} if of_links else {}
 
 
 # --- files ---------------------------------------------------------------------------------------------------------
@@ -253,7 +268,9 @@ def _netcdf(folder: Path) -> Any:
         def write(channel: Channel, folder: Path) -> Path:
             data = channel_dataset(channel)
             book.append(data)
-            book.describe(comment=data.attrs["comment"])  # of all parts so far
+            # later parts add remarks and faces
+            book.describe(comment=data.attrs["comment"])
+            book.describe("faces", **_face_flags(channel))
             return folder / "channel.nc"
 
         yield write

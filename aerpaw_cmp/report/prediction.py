@@ -335,10 +335,14 @@ class PredictionPage(Made):
     warnings: Sequence[str]
 
     @property
+    def levels(self) -> pd.DataFrame:
+        """Rows that have a level, of all towers and channels."""
+        return self.table[self.table["channel"] != "rank"]
+
+    @property
     def series(self) -> list[tuple[str, pd.DataFrame]]:
         """Rows of each tower and channel that has levels."""
-        levels = self.table[self.table["channel"] != "rank"]
-        each = levels.groupby(["tower", "channel"], sort=False, observed=True)
+        each = self.levels.groupby(["tower", "channel"], sort=False, observed=True)
         return [(f"{t} {c}", part) for (t, c), part in each]
 
 
@@ -464,17 +468,29 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
 
 
 def _dataset(data: PredictionPage) -> Dataset:
-    """Points along one dimension, towers and channels along another."""
-    series = data.series
-    names, first = [name for name, _ in series], series[0][1]
-    variables: dict[str, Any] = {"series": ("series", np.array(names), {"long_name": "tower and channel"})}
-    for name, unit in (("time_s", "s"), ("east_m", "m"), ("north_m", "m"), ("height_m", "m"), ("yaw_deg", "degree")):
-        variables[name] = ("point", first[name].to_numpy(np.float64), {"units": unit})
+    """Return the levels by (tower, channel, time), or by (tower, channel, point) if the positions have no times."""
+    first, time = data.series[0][1], data.series[0][1]["time_s"].to_numpy(np.float64)
+    timed = data.kind == "route" and bool((np.diff(time) > 0.0).all())
+    along = "time" if timed else "point"
+    meaning = "seconds since the start of the route, whose date is not known" if timed else "number of the position"
+    axis = time if timed else np.arange(len(time), dtype=np.int32)
+    variables: dict[str, Any] = {along: (along, axis, {"long_name": meaning, "units": "s" if timed else "1"})}
+    links = data.levels[["tower", "channel"]].astype(str)
+    labels = {name: list(dict.fromkeys(links[name])) for name in ("tower", "channel")}
+    for name, texts in labels.items():
+        variables[name] = (name, np.array(texts, dtype=object), {"long_name": f"name of the {name}"})
+    for name, unit in (("east_m", "m"), ("north_m", "m"), ("height_m", "m"), ("yaw_deg", "degree")):
+        variables[name] = (along, first[name].to_numpy(np.float64), {"units": unit})
+    at = [tuple(labels[n].index(str(part[n].iloc[0])) for n in labels) for _, part in data.series]
     ends = ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db")
     for name in (*ends, "p_serving", "p_lock", "locked_db", "locked_sd_db", "lost_db", "lost_sd_db"):
         if name in first:
-            values = np.stack([part[name].to_numpy(np.float32) for _, part in series])
-            variables[name] = (("series", "point"), values, {"units": "dB" if name.endswith("_db") else "1"})
+            # NaN for a channel that a tower does not have
+            values = np.full((*map(len, labels.values()), len(axis)), np.nan, dtype=np.float32)
+            for place, (_, part) in zip(at, data.series, strict=True):
+                values[place] = part[name]
+            unit = {"units": "dB" if name.endswith("_db") else "1"}
+            variables[name] = ((*labels, along), values, unit)
     variables["level_db"][2]["comment"] = ", ".join(f"{name}: {unit}" for name, unit in data.units.items())
     about = file_attributes(
         f"Predicted levels, {data.name}",

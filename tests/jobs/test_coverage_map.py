@@ -251,7 +251,6 @@ def test_netcdf_is_written_where_its_library_is(made):
 
     table = pd.read_csv(made[0] / "layers.csv")
     with xarray.open_dataset(made[0] / "maps.nc") as data:
-        data = data.assign_coords(tower=data["tower_name"].astype(str), foliage=data["foliage_mode"].astype(str))
         for mode in ("none", "opaque"):
             here = data.sel(foliage=mode, y=xarray.DataArray(table["north_m"]), x=xarray.DataArray(table["east_m"]))
             rank = here["rank"].sel(k=10.0, height_of_rank=30.0, tower="LW3")

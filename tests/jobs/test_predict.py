@@ -158,7 +158,7 @@ def test_a_table_of_points_is_refused_before_all_of_it_is_read(tmp_path, monkeyp
     assert rows == [101]
 
 
-def test_files_agree_with_each_other(tmp_path, prediction):
+def test_files_agree_with_each_other(tmp_path, prediction, cf_faults):
     files, _ = write_prediction(prediction.page, tmp_path)
     table = pd.read_csv(tmp_path / "prediction.csv")
     levels = table[table["channel"] != "rank"]
@@ -172,7 +172,11 @@ def test_files_agree_with_each_other(tmp_path, prediction):
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("netCDF4")
     with xarray.open_dataset(tmp_path / "prediction.nc") as book:
-        np.testing.assert_allclose(book["level_db"].to_numpy().ravel(), levels["level_db"], atol=1e-3)
+        assert {"tower", "channel"} <= set(book.indexes)
+        for (tower, channel), part in levels.groupby(["tower", "channel"]):
+            level = book.level_db.sel(tower=tower, channel=channel)
+            np.testing.assert_allclose(level, part["level_db"], atol=1e-3)
+    assert cf_faults(tmp_path / "prediction.nc") == []
 
 
 @pytest.fixture

@@ -207,8 +207,9 @@ def channel(
     )
     outcome = run_channel(flight, chosen, RunOptions(out=out, logs_root=logs_root, force=force, progress=say))
     m = outcome.metrics
+    which = f"Link {m['link']}{'' if link else ' (the default)'}, {m['carrier_hz'] / 1e9:g} GHz"
     size = f"{counted(m['paths'], 'path')}, {counted(m['poses'], 'pose')}"
-    _print(outcome, f"{size}, towers {', '.join(m['towers'])}, link {m['link']}")
+    _print(outcome, f"{which}: {size}, towers {', '.join(m['towers'])}")
 
 
 def _print(outcome: Any, sentence: str) -> None:

@@ -117,7 +117,10 @@ class Dataset:
         columns = {n: (v.dims, v.values, v.attrs, dict(v.encoding)) for n, v in self.variables.items()}
         xarray = library("xarray")
         return xarray.decode_cf(
-            xarray.Dataset(columns, attrs=self.attrs), mask_and_scale=False, decode_coords=False, concat_characters=False
+            xarray.Dataset(columns, attrs=self.attrs),
+            mask_and_scale=False,
+            decode_coords=False,
+            concat_characters=False,
         )
 
 
@@ -125,8 +128,9 @@ def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
     """A NetCDF-4 file of a :class:`Dataset`, made in memory: HDF5 ends the process where a disk is full.
 
     Arrays are deflated; text becomes characters in UTF-8, which every reader of CF takes. NetCDF has no complex
-    numbers: ``NAME_real`` and ``NAME_imag`` are written in place of ``NAME``. A variable with NaN has it as ``_FillValue``; another has none, unless its ``encoding`` says so. ``grows`` are dimensions without a limit, the
-    first of them that along which :class:`GrowingNetcdf` appends.
+    numbers: ``NAME_real`` and ``NAME_imag`` are written in place of ``NAME``. A variable with NaN has it as
+    ``_FillValue``; another variable has no ``_FillValue``, unless its ``encoding`` contains one. ``grows`` are
+    dimensions without a limit; :class:`GrowingNetcdf` appends along the first of them.
 
     Raises
     ------
@@ -182,8 +186,8 @@ class GrowingNetcdf:
 
     Notes
     -----
-    A ``_FillValue`` other than NaN fills the file and is then removed from the attributes: it is a value (a gain of 0, a
-    flag of -1), which readers would replace by NaN.
+    A ``_FillValue`` other than NaN fills the file and is then removed from the attributes: it is a value (a gain of
+    0, a flag of -1), which readers would replace by NaN.
     """
 
     def __init__(self, path: Path, grows: Sequence[str]) -> None:

@@ -63,8 +63,8 @@ class Along:
 
     def part(self, rows: slice) -> Along:
         """Some of the poses."""
-        arrays = {"time_s": self.time_s, "number": self.number, "towers_m": self.towers_m, "velocity_mps": self.velocity_mps,
-                  "tower_mps": self.tower_mps}  # fmt: skip
+        arrays = {"time_s": self.time_s, "number": self.number, "towers_m": self.towers_m,
+                  "velocity_mps": self.velocity_mps, "tower_mps": self.tower_mps}  # fmt: skip
         some: Any = {name: None if values is None else values[rows] for name, values in arrays.items()}
         return replace(self, poses=self.poses[rows], **some)
 
@@ -144,7 +144,8 @@ def channel_dataset(channel: Channel) -> Dataset:
     described["faces"] |= _face_flags(channel)
     if along.start is not None:
         start = str(along.start.astype("datetime64[s]")).replace("T", " ")
-        described["time"] |= {"standard_name": "time", "long_name": "time of the pose", "units": f"seconds since {start} UTC"}
+        described["time"] |= {"standard_name": "time", "long_name": "time of the pose"}
+        described["time"]["units"] = f"seconds since {start} UTC"
     elif along.number is not None:
         described["time"] |= {"long_name": "number of the pose: the route has no times", "units": "1"}
     if channel.level_db is not None:
@@ -197,10 +198,11 @@ _GAIN = "gain of a path at the carrier, its phase included; 0 without a path"
 
 
 def _times(along: Along) -> FloatArray:
-    """Return the coordinate (poses,): seconds since a whole second in UTC or since the start [s], or numbers of poses."""
+    """Return the coordinate (poses,): seconds since a whole second or since the start [s], or numbers of poses."""
     if along.start is None:
         return along.time_s if along.number is None else along.number
-    return along.time_s + (along.start - along.start.astype("datetime64[s]")) / np.timedelta64(1, "s")
+    fraction = (along.start - along.start.astype("datetime64[s]")) / np.timedelta64(1, "s")
+    return np.asarray(along.time_s + fraction, dtype=np.float64)
 
 
 def _variable(name: str, values: AnyArray, dimensions: tuple[str, ...], unit: str, meaning: str) -> tuple[Any, ...]:

@@ -12,7 +12,7 @@ import pandas as pd
 from markupsafe import Markup
 from numpy.typing import ArrayLike
 
-from ..common.cf import Dataset, file_attributes, netcdf_bytes
+from ..common.cf import DB, Dataset, file_attributes, netcdf_bytes
 from ..common.errors import UsageError
 from ..common.jsonable import json_object
 from ..common.text import guarded
@@ -337,7 +337,8 @@ class PredictionPage(Made):
     @property
     def levels(self) -> pd.DataFrame:
         """Rows that have a level, of all towers and channels."""
-        return self.table[self.table["channel"] != "rank"]
+        levels: pd.DataFrame = self.table[self.table["channel"] != "rank"]
+        return levels
 
     @property
     def series(self) -> list[tuple[str, pd.DataFrame]]:
@@ -469,7 +470,8 @@ def write_prediction(data: PredictionPage, folder: Path) -> tuple[list[Path], li
 
 def _dataset(data: PredictionPage) -> Dataset:
     """Return the levels by (tower, channel, time), or by (tower, channel, point) if the positions have no times."""
-    first, time = data.series[0][1], data.series[0][1]["time_s"].to_numpy(np.float64)
+    series = [part for _, part in data.series]
+    first, time = series[0], series[0]["time_s"].to_numpy(np.float64)
     timed = data.kind == "route" and bool((np.diff(time) > 0.0).all())
     along = "time" if timed else "point"
     meaning = "seconds since the start of the route, whose date is not known" if timed else "number of the position"
@@ -480,24 +482,24 @@ def _dataset(data: PredictionPage) -> Dataset:
     for name, texts in labels.items():
         variables[name] = (name, np.array(texts, dtype=object), {"long_name": f"name of the {name}"})
     for name, unit in (("east_m", "m"), ("north_m", "m"), ("height_m", "m"), ("yaw_deg", "degree")):
-        variables[name] = (along, first[name].to_numpy(np.float64), {"units": unit})
-    at = [tuple(labels[n].index(str(part[n].iloc[0])) for n in labels) for _, part in data.series]
+        variables[name] = (along, first[name].to_numpy(np.float64), {"units": unit, "long_name": name})
+    at = [tuple(labels[n].index(str(part[n].iloc[0])) for n in labels) for part in series]
     ends = ("level_db", "sd_db", "slow_sd_db", "q05_db", "q95_db")
     for name in (*ends, "p_serving", "p_lock", "locked_db", "locked_sd_db", "lost_db", "lost_sd_db"):
         if name in first:
             # NaN for a channel that a tower does not have
             values = np.full((*map(len, labels.values()), len(axis)), np.nan, dtype=np.float32)
-            for place, (_, part) in zip(at, data.series, strict=True):
+            for place, part in zip(at, series, strict=True):
                 values[place] = part[name]
-            unit = {"units": "dB" if name.endswith("_db") else "1"}
-            variables[name] = ((*labels, along), values, unit)
+            about = {"units": DB, "comment": "unit: dB"} if name.endswith("_db") else {"units": "1"}
+            variables[name] = ((*labels, along), values, {"long_name": name, **about})
     variables["level_db"][2]["comment"] = ", ".join(f"{name}: {unit}" for name, unit in data.units.items())
-    about = file_attributes(
+    attributes = file_attributes(
         f"Predicted levels, {data.name}",
         f"{data.chosen['title']}, learned from {', '.join(data.flights)}",
         data.verdict,
     )
-    return Dataset(variables, about)
+    return Dataset(variables, attributes)
 
 
 def _groups(data: PredictionPage) -> Iterator[Places]:

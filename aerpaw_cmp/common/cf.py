@@ -125,7 +125,7 @@ class Dataset:
 
 
 def netcdf_bytes(data: Any, grows: Sequence[str] = ()) -> Any:
-    """A NetCDF-4 file of a :class:`Dataset`, made in memory: HDF5 ends the process where a disk is full.
+    """Make a NetCDF-4 file of a :class:`Dataset` in memory: HDF5 ends the process where a disk is full.
 
     Arrays are deflated; text becomes characters in UTF-8, which every reader of CF takes. NetCDF has no complex
     numbers: ``NAME_real`` and ``NAME_imag`` are written in place of ``NAME``. A variable with NaN has it as

@@ -80,7 +80,7 @@ def mapped(site: Path, receivers: float, workers: int, cells: int) -> dict[str, 
     seconds = time.perf_counter() - started
     answer = json.loads(done.stdout)
     usage = json.loads((folder / "usage.json").read_text(encoding="utf-8"))
-    files = [path.stat().st_size for path in (folder / "out.zarr").rglob("*") if path.is_file()]
+    files = [path.stat().st_size for path in (folder / "out" / "maps.zarr").rglob("*") if path.is_file()]
     here, there = usage["RUSAGE_SELF"], usage["RUSAGE_CHILDREN"]
     count = answer["tiles"]["positions"]
     return {

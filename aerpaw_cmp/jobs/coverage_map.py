@@ -75,6 +75,9 @@ RATIOS = ("spread", "condition")
 # Those of the paper.
 INTERPOLATORS = ("Kriging", "makima", "spline")
 
+# Name of the store with every position of a map in tiles, in the output folder.
+ZARR = "maps.zarr"
+
 # A map of more receivers (positions times heights) is written in tiles of so many positions a side (some 0.7 MB of
 # values per tower, height and foliage mode); so many positions of it are drawn and exported beside the store.
 _TILED_ABOVE, _TILE_CELLS, SHOWN_POSITIONS = 1_000_000, 128, 20_000
@@ -410,6 +413,7 @@ class MapOutcome:
     correlations: dict[str, BinnedCorrelation] = field(default_factory=dict)
     paths: int = 0
     tiles: dict[str, Any] = field(default_factory=dict)
+    store: TileStore | None = None
     corrected: CorrectedMaps | None = None
     flights: tuple[ReportData, ...] = ()
 
@@ -430,8 +434,7 @@ def make_maps(
     *,
     workers: Workers | None = None,
     name: str = "",
-    store: Path | None = None,
-    force: bool = False,
+    out: Path | None = None,
 ) -> MapOutcome:
     """Evaluate the grid of a site in every foliage mode.
 
@@ -444,10 +447,8 @@ def make_maps(
         Share the pieces of the grid.
     name : str
         The site as workers load it.
-    store : Path, optional
-        Where a map in tiles is written; without it every map is made in one piece.
-    force : bool
-        Replace the store of another map.
+    out : Path, optional
+        Output folder; finished tiles are files of ``NAME.tiles`` in the same folder. None: a map in one piece.
 
     Returns
     -------
@@ -457,13 +458,13 @@ def make_maps(
     Raises
     ------
     UsageError, InputError, OutputError
-        The store is not that of this map; tiles were lost; the disk does not take them.
+        zarr is not installed; tiles were lost; the disk does not take them.
     """
     outcome = MapOutcome(site, settings)
     grid = Grid.over_area(site.area_m, settings.spacing_m)
     crew = workers or InProcess()
     share = share_of(stages.progress, "maps")
-    tile_cells = None if store is None else settings.tile_cells(grid)
+    tile_cells = None if out is None else settings.tile_cells(grid)
     # four tiles a worker: with one each all would wait for the slowest
     shared = math.ceil(math.sqrt(len(grid) / (4 * crew.count)))
     tiling = Tiling(grid, tile_cells or (shared if crew.count > 1 else max(grid.shape)))
@@ -471,9 +472,11 @@ def make_maps(
         channels = SiteChannels(site, settings)
         evaluate = partial(channels.tile, progress=share if len(tiling) < 2 else None) if crew.count < 2 else map_tile
         order = partial(TileOrder, site=name, settings=settings, cells=tiling.cells)
-        if store is not None and tile_cells:
-            book = TileStore(store, tiling, _job_of(name, settings), force=force)
-            _write_tiles(outcome, book, channels, partial(crew.run, evaluate), order, stages.progress)
+        if out is not None and tile_cells:
+            folder, empty = out.with_name(f"{out.name}.tiles"), channels.empty(tiling.grid_of(0))
+            outcome.store = TileStore(folder, tiling, _job_of(name, settings), empty)
+            _write_tiles(outcome, outcome.store, partial(crew.run, evaluate), order, stages.progress)
+            outcome.tiles["store"] = str(out / ZARR)
             return outcome
         parts: dict[int, Mapping[str, job.MapResult]] = {}
 
@@ -493,16 +496,14 @@ def make_maps(
 def _write_tiles(
     outcome: MapOutcome,
     store: TileStore,
-    channels: SiteChannels,
     run: Callable[..., None],
     order: Callable[..., TileOrder],
     progress: Progress,
 ) -> None:
-    """Compute the tiles that a store lacks, write each as it comes, and read some positions of all for the page."""
-    empty, tiling = channels.empty(store.tiling.grid_of(0)), store.tiling
-    missing = store.begin(empty, outcome.site.frame, _about_maps(outcome.site))
+    """Compute the missing tiles, write a file for each, and read some positions of all tiles for the page."""
+    tiling, missing = store.tiling, store.missing()
     if store.damaged:
-        progress(f"{counted(store.damaged, 'finished tile')} with missing or changed chunks: computed again")
+        progress(f"{counted(store.damaged, 'finished tile')} damaged: computed again")
     if len(missing) < len(tiling):
         progress(f"{len(tiling) - len(missing)} of {counted(len(tiling), 'tile')} computed before")
     lost: list[str] = []
@@ -515,21 +516,18 @@ def _write_tiles(
         store.write(missing[number], result.maps, result.paths)
         progress("maps", next(written) / len(tiling))
 
-    with noting_interrupts(f"{store.path} keeps the finished tiles: the same command goes on"):
+    with noting_interrupts(f"{store.folder} contains the finished tiles: the same command computes the others"):
         run([order(number=number) for number in missing], done)
     if lost:
         raise InputError(
             f"{len(lost)} of {counted(len(tiling), 'tile')} lost: {lost[0]}",
             cause="too little memory; the finished tiles are kept, and the same command computes the others",
         )
-    outcome.paths = int(store.paths().sum())
     step = math.ceil(math.sqrt(len(tiling.grid) / SHOWN_POSITIONS))
-    outcome.maps |= store.read(empty, step)
+    outcome.maps, outcome.paths = store.every_nth(step)
     # every n-th position has no neighbours at the distances that the study is about
     outcome.settings = replace(outcome.settings, study=False)
-    outcome.tiles = {
-        "store": str(store.path), "tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step,
-    }  # fmt: skip
+    outcome.tiles = {"tiles": len(tiling), "positions": len(tiling.grid), "shown_every": step}
 
 
 def _job_of(site: str, settings: MapSettings) -> dict[str, Any]:
@@ -868,7 +866,7 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
 
 
 def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[Path]:
-    """layers.csv and maps.kmz; maps.nc where its libraries are installed.
+    """Write layers.csv and maps.kmz, maps.zarr of a map in tiles, and maps.nc where its libraries are installed.
 
     ``progress`` is told where it is left out, and why.
     """
@@ -886,6 +884,8 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
         export.write_csv(folder / "layers.csv", table),
         export.write_kmz(folder / "maps.kmz", replace(table, layers=shown), title=site.name),
     ]
+    if outcome.store is not None:
+        written.append(outcome.store.write_zarr(folder / ZARR, site.frame, _about_maps(site)))
     try:
         maps = maps_dataset(dict(outcome.ordered()), site.frame, _about_maps(site), flown)
         (folder / "maps.nc").write_bytes(netcdf_bytes(maps))
@@ -896,7 +896,7 @@ def export_maps(outcome: MapOutcome, folder: Path, progress: Progress) -> list[P
 
 
 def _about_maps(site: Site) -> dict[str, str]:
-    """Attributes of maps.nc and of a store of tiles."""
+    """Return the attributes of maps.nc and maps.zarr."""
     about = file_attributes(
         title=site.name,
         source="ray tracing",

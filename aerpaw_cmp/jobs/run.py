@@ -480,7 +480,7 @@ def run_map(
         with open_workers(options.workers, options.scheduler, paths=file, progress=progress) as crew:
             outcome = mapping.make_maps(
                 place, settings, stages, workers=crew, name=str(file[0] if file else site),
-                store=folder.with_name(f"{folder.name}.zarr"), force=options.force,
+                out=folder,
             )  # fmt: skip
         if flights:
             from .predict import corrected_maps
@@ -502,6 +502,8 @@ def run_map(
             if record.paper:
                 written.append(part / "paper.md")
                 written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
+        if outcome.store is not None:
+            outcome.store.remove()
         return JobOutcome(folder=folder, metrics=maps_metrics(record), files=output.placed([*written, *files]))
 
 

@@ -1,11 +1,8 @@
-"""Tiles of a map in a Zarr store. They are written as they are computed, and a partial store is continued.
+"""Tiles of a map: a file for each finished tile, and a Zarr store that is written from the files at the end.
 
-The store has the variables of ``maps.nc`` (:mod:`aerpaw_cmp.maps.export`), with one chunk per tile. ``tile_sha256``
-contains the SHA-256 of the chunk files of each tile and is written with them. A killed run loses only the tiles in
-work, and a tile whose files are missing or changed is computed again.
-
-An existing store is untrusted until its metadata match, as text, those that this job would write, because Zarr runs the
-codecs that a store names.
+A killed run loses the tiles that were being computed; the same command computes only these. A tile file has no format
+that could run code: its SHA-256, the number of paths, and the planes of :data:`PLANES` as 32-bit floats. A file with
+another length or digest is computed again.
 
 The module also determines what can reach each tile, and joins the values of tiles.
 
@@ -24,10 +21,9 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
+import math
 import re
-import shutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -36,10 +32,10 @@ from typing import Any
 import numpy as np
 import shapely
 
-from ..common.errors import InputError, UsageError, one_line, parsing
-from ..common.files import read_input, write_whole
+from ..common.errors import InputError, UsageError
+from ..common.files import read_bounded, write_whole
 from ..common.geodesy import SiteFrame
-from ..common.outputs import explained_os_errors, foreign_entries
+from ..common.outputs import explained_os_errors
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray, wavelength_m
 from ..propagation.geometry import corners, site_faces
 from ..propagation.scene import REACH_M
@@ -77,7 +73,11 @@ class Tiling:
     def part(self, number: int) -> tuple[slice, slice]:
         """Rows and columns of the grid that are one tile."""
         row, column = divmod(number, self.shape[1])
-        return slice(row * self.cells, (row + 1) * self.cells), slice(column * self.cells, (column + 1) * self.cells)
+        rows, columns = self.grid.shape
+        return (
+            slice(row * self.cells, min((row + 1) * self.cells, rows)),
+            slice(column * self.cells, min((column + 1) * self.cells, columns)),
+        )
 
     def grid_of(self, number: int) -> Grid:
         """Positions of one tile."""
@@ -222,34 +222,27 @@ def _apart(tower: Tower, box_m: FloatArray) -> FloatArray:
     return np.maximum(np.maximum(box_m[0, :2] - at, at - box_m[1, :2]), 0.0)
 
 
-LEDGER = "tile_sha256"
-_PATHS = "tile_paths"
-_JOB = "aerpaw_cmp_job"
-_ROOT = "zarr.json"
-_LARGEST_METADATA = 1 << 20
-# Parts of an array's metadata that say how its chunks are decoded, and those that follow from the job.
-_DECODING = ("zarr_format", "node_type", "codecs", "chunk_key_encoding", "storage_transformers")
-_OF_THE_JOB = ("shape", "data_type", "chunk_grid", "fill_value")
-_NAMES = dict(zip(PLANES, ("rss_siso", "rss_mimo", "rss_sd", "rank", "spread", "condition"), strict=True))
+# Files of a tile store; of another run's, too, which a finished run removes.
+_TILE_FILE = re.compile(r"tile-[0-9a-f]{16}-\d+|\.tile-[0-9a-f]{16}-\d+\.\w+\.part")
 
 
 class TileStore:
-    """A store that tiles of one job are written to.
+    """A folder with a file for each finished tile of one job.
 
     Parameters
     ----------
-    path : Path
-        Folder of the store; made by :meth:`begin`.
+    folder : Path
+        Created with the first tile. Files of others in it are neither read nor removed.
     tiling : Tiling
     job : mapping
-        All that the values depend on, as JSON takes it; a store of another job is refused.
-    force : bool
-        Replace the store of another job.
+        All that the values depend on, as JSON takes it. Tiles of another job are not used.
+    empty : mapping of str to MapResult
+        Maps of any tile, by foliage mode: their form.
 
     Attributes
     ----------
     damaged : int
-        Tiles that :meth:`begin` found entered, with chunks that are missing or differ.
+        Number of tile files that :meth:`missing` found to be damaged.
 
     Raises
     ------
@@ -257,7 +250,7 @@ class TileStore:
         If zarr is not installed.
     """
 
-    def __init__(self, path: Path, tiling: Tiling, job: Mapping[str, Any], *, force: bool = False) -> None:
+    def __init__(self, folder: Path, tiling: Tiling, job: Mapping[str, Any], empty: Mapping[str, MapResult]) -> None:
         try:
             import zarr
         except ImportError:
@@ -265,66 +258,111 @@ class TileStore:
                 "zarr is not installed, and a map in tiles is a Zarr store",
                 expected="pip install 'aerpaw-cmp[geo]' with Python 3.11 or newer, or a larger --spacing",
             ) from None
-        # through JSON and back: as it will be read again, where tuples are lists
-        self.path, self.tiling, self._zarr, self._job = path, tiling, zarr, json.loads(json.dumps(job))
-        self._force, self.damaged = force, 0
+        self.folder, self.tiling, self._empty, self._zarr, self.damaged = folder, tiling, empty, zarr, 0
+        self._job = hashlib.sha256(json.dumps([job, tiling.cells], sort_keys=True).encode()).hexdigest()[:16]
 
-    def begin(self, empty: Mapping[str, MapResult], frame: SiteFrame, about: Mapping[str, str]) -> list[int]:
-        """Create the store unless it exists, and return the tiles that are missing.
+    def missing(self) -> list[int]:
+        """Return the numbers of the tiles that must be computed."""
+        with explained_os_errors(self.folder):
+            missing = [number for number in range(len(self.tiling)) if self._content(number) is None]
+            self.damaged = sum(self._file(number).exists() for number in missing)
+        return missing
+
+    def write(self, number: int, maps: Mapping[str, MapResult], paths: int) -> None:
+        """Write the file of one tile atomically.
 
         Parameters
         ----------
-        empty : mapping of str to MapResult
-            Maps of any tile, by foliage mode. They define the variables.
+        number : int
+        maps : mapping of str to MapResult
+            By foliage mode.
+        paths : int
+            Number of paths to all positions of the tile.
+
+        Raises
+        ------
+        OutputError
+            The disk does not take the file.
+        """
+        planes = (getattr(maps[mode], name).astype("<f4").tobytes() for mode in self._empty for name in PLANES)
+        content = paths.to_bytes(8, "little") + b"".join(planes)
+        with explained_os_errors(self.folder):
+            self.folder.mkdir(parents=True, exist_ok=True)
+            write_whole(self._file(number), hashlib.sha256(content).digest() + content)
+
+    def read(self, number: int) -> tuple[dict[str, MapResult], int]:
+        """Return the maps of one tile by foliage mode, and its number of paths; InputError if its file is damaged."""
+        with explained_os_errors(self.folder):
+            content = self._content(number)
+        if content is None:
+            raise InputError(
+                "a finished tile is missing or damaged",
+                expected="the file as it was written: run the same command again",
+                cause="another program changed or removed the file during this run",
+                path=self._file(number),
+            )
+        values, start, maps = np.frombuffer(content, dtype="<f4", offset=8), 0, {}
+        grid = self.tiling.grid_of(number)
+        for mode, like in self._empty.items():
+            planes = {}
+            for name in PLANES:
+                form = getattr(like, name)
+                shape = (*form.shape[:-1], len(grid))
+                stop = start + math.prod(shape)
+                planes[name] = values[start:stop].reshape(shape).astype(form.dtype)
+                start = stop
+            maps[mode] = over_grid(like, grid, planes)
+        return maps, int.from_bytes(content[:8], "little")
+
+    def every_nth(self, step: int) -> tuple[dict[str, MapResult], int]:
+        """Return maps of every ``step``-th position along either axis, by foliage mode, and all tiles' paths."""
+        full, paths = self.tiling.grid, 0
+        grid = Grid(full.east_m[::step], full.north_m[::step], full.spacing_m * step)
+        rasters = {
+            (mode, name): np.empty((*getattr(like, name).shape[:-1], *grid.shape), dtype=getattr(like, name).dtype)
+            for mode, like in self._empty.items()
+            for name in PLANES
+        }
+        for number in range(len(self.tiling)):
+            maps, in_tile = self.read(number)
+            paths += in_tile
+            part = self.tiling.part(number)
+            inner = tuple(slice(-axis.start % step, None, step) for axis in part)
+            outer = tuple(slice(-(-axis.start // step), -(-axis.stop // step)) for axis in part)
+            for (mode, name), raster in rasters.items():
+                plane = getattr(maps[mode], name)
+                raster[(..., *outer)] = plane.reshape(*plane.shape[:-1], *maps[mode].grid.shape)[(..., *inner)]
+        flat = {key: raster.reshape(*raster.shape[:-2], -1) for key, raster in rasters.items()}
+        joined = {
+            mode: over_grid(like, grid, {name: flat[mode, name] for name in PLANES})
+            for mode, like in self._empty.items()
+        }
+        return joined, paths
+
+    def write_zarr(self, path: Path, frame: SiteFrame, about: Mapping[str, str]) -> Path:
+        """Write all tiles as a new Zarr store with the variables of ``maps.nc``, one chunk per tile.
+
+        Parameters
+        ----------
+        path : Path
+            Must not exist.
         frame : SiteFrame
         about : mapping of str to str
             Attributes of the store.
 
         Returns
         -------
-        list of int
-            Numbers of the tiles.
-
-        Raises
-        ------
-        UsageError
-            If the store belongs to another job, or contains other files.
-        InputError
-            If the folder is not a store written by this tool, or is damaged.
+        Path
         """
-        self._frame, self._about = frame, about
-        skeleton = self._skeleton(maps_dataset(empty, frame, about).to_xarray())
-        with explained_os_errors(self.path):
-            there = os.path.lexists(self.path) and not (self.path.is_dir() and not any(self.path.iterdir()))
-            if there and self._is_other_job(skeleton):
-                shutil.rmtree(self.path)
-                there = False
-            try:
-                for name, content in skeleton.items():
-                    self._repair(self.path / name, content)
-            except BaseException:
-                if not there:
-                    shutil.rmtree(self.path, ignore_errors=True)
-                raise
-            missing = [number for number in range(len(self.tiling)) if not self._is_kept(number)]
-            # r+ makes nothing and removes nothing
-            self._group = self._zarr.open_group(self.path, mode="r+", zarr_format=3)
-        return missing
-
-    def _skeleton(self, like: Any) -> dict[str, bytes]:
-        """Return the files of a store without tiles, by their names below its folder, its metadata first."""
-        grid, tiles = self.tiling.grid, self.tiling.shape
-        # created in memory first, so that Zarr does not open a folder with untrusted contents
-        files: dict[str, Any] = {}
-        memory = self._zarr.storage.MemoryStore(files)
-        self._planes = [name for name, variable in like.variables.items() if {"y", "x"} <= {*variable.dims}]
-        axes = like.drop_vars(self._planes).assign_coords(
+        grid = self.tiling.grid
+        like = maps_dataset(self._empty, frame, about).to_xarray()
+        planes = [name for name, variable in like.variables.items() if {"y", "x"} <= {*variable.dims}]
+        axes = like.drop_vars(planes).assign_coords(
             x=("x", grid.east_m, like.x.attrs), y=("y", grid.north_m, like.y.attrs)
         )
-        axes.to_zarr(memory, mode="w", consolidated=False, zarr_format=3)
-        group = self._zarr.open_group(memory, mode="r+")
-        self._chunk_names = []
-        for name in self._planes:
+        axes.to_zarr(path, mode="w-", consolidated=False, zarr_format=3)
+        group = self._zarr.open_group(path, mode="r+", zarr_format=3)
+        for name in planes:
             variable = like[name].variable
             leading = variable.shape[:-2]
             tile = np.minimum(self.tiling.cells, grid.shape).tolist()
@@ -336,166 +374,30 @@ class TileStore:
                 dtype=variable.dtype, fill_value=np.nan if variable.dtype.kind == "f" else 0,
                 dimension_names=variable.dims, attributes=plain,
             )  # fmt: skip
-            self._chunk_names.append("/".join([name, "c", *"0" * len(leading), "{}", "{}"]))
-        group.create_array(
-            _PATHS, shape=tiles, chunks=(1, 1), dtype=np.int64, fill_value=0, dimension_names=("tile_y", "tile_x"),
-            attributes={"long_name": "paths of each tile"},
-        )  # fmt: skip
-        self._chunk_names.append(f"{_PATHS}/c/{{}}/{{}}")
-        group.create_array(
-            LEDGER, shape=(*tiles, 32), chunks=(1, 1, 32), dtype=np.uint8, fill_value=0,
-            compressors=None,  # a chunk file is the digest itself: reading it decodes nothing
-            dimension_names=("tile_y", "tile_x", "byte"),
-            attributes={"long_name": "SHA-256 of the chunks of each tile", "comment": "0: not computed yet"},
-        )  # fmt: skip
-        group.attrs[_JOB] = json.dumps(self._job)
-        content = {name: buffer.to_bytes() for name, buffer in files.items()}
-        return {_ROOT: content.pop(_ROOT), **content}
+        for number in range(len(self.tiling)):
+            rows, columns = self.tiling.part(number)
+            computed = maps_dataset(self.read(number)[0], frame, about).variables
+            for name in planes:
+                group[name][..., rows, columns] = computed[name].values
+        return path
 
-    def _is_other_job(self, skeleton: Mapping[str, bytes]) -> bool:
-        """Check whether an existing store belongs to another job and may be replaced. Raises like :meth:`begin`."""
-        if not self.path.is_dir():
-            raise self._not_ours("a file")
-        self._refuse_foreign({name.partition("/")[0] for name in skeleton if "/" in name})
-        attributes = self._metadata(_ROOT).get("attributes")
-        with parsing(self.path):
-            job = json.loads(attributes[_JOB]) if isinstance(attributes, dict) and _JOB in attributes else None
-        if not isinstance(job, dict):
-            raise self._not_ours(f"{_ROOT} names no job of this tool")
-        differs = sorted(key for key in {*job, *self._job} if job.get(key) != self._job.get(key))
-        parts = _DECODING if differs else (*_DECODING, *_OF_THE_JOB)
-        for name, content in skeleton.items():
-            if name.endswith(_ROOT) and os.path.lexists(self.path / name):
-                ours, theirs = json.loads(content), self._metadata(name)
-                if wrong := next((part for part in parts if ours.get(part) != theirs.get(part)), None):
-                    raise self._not_ours(f"{wrong} in {name} is {one_line(json.dumps(theirs.get(wrong)))[:80]}")
-        if differs and not self._force:
-            key = differs[0]
-            more = f" and {len(differs) - 1} more" if len(differs) > 1 else ""
-            raise UsageError(
-                f"the store holds tiles of another job: {key}{more} differs ({job.get(key)}, now {self._job.get(key)})",
-                expected="another name after -o, or --force to replace the store",
-                path=self.path,
-            )
-        return bool(differs)
+    def remove(self) -> None:
+        """Remove all tile files, those of killed runs with other settings too, and the folder if it is then empty."""
+        with suppress(OSError):  # the results are complete; the next run tries again
+            for place in self.folder.iterdir():
+                if _TILE_FILE.fullmatch(place.name):
+                    place.unlink()
+            self.folder.rmdir()
 
-    def _refuse_foreign(self, arrays: set[str]) -> None:
-        """UsageError where a store holds what this tool did not write."""
-        ours = re.compile(rf"zarr\.json|({'|'.join(map(re.escape, arrays))})/(zarr\.json|c(/\d+)*)")
-        names = (entry.relative_to(self.path).as_posix() for entry in self.path.rglob("*"))
-        # a disk that was full may have left a folder without its chunk
-        below = (name + more for name in names for more in ("", "/c", "/0"))
-        if foreign := next(foreign_entries(self.path, filter(ours.fullmatch, below)), None):
-            raise UsageError(
-                f"the store holds what this tool did not write: {one_line(foreign)}",
-                expected="another name after -o: a store is replaced as a whole",
-                path=self.path,
-            )
+    def _file(self, number: int) -> Path:
+        return self.folder / f"tile-{self._job}-{number}"
 
-    def _metadata(self, name: str) -> dict[str, Any]:
-        """Metadata of the store that is there, as JSON and no more."""
-        with parsing(self.path / name):
-            content = json.loads(read_input(self.path / name, _LARGEST_METADATA, "metadata of a map store"))
-        if not isinstance(content, dict):
-            raise self._not_ours(f"{name} is no metadata of Zarr 3")
-        return content
-
-    def _not_ours(self, reason: str) -> InputError:
-        return InputError(
-            f"no map store of this tool: {reason}",
-            expected="another name after -o, or this store moved away",
-            cause="data of another program, another version of zarr, or a damaged file",
-            path=self.path,
-        )
-
-    def _repair(self, place: Path, content: bytes) -> None:
-        """Write a file of the skeleton unless it exists. The store's creation time is ignored in the comparison."""
-        with suppress(OSError):
-            before = place.read_bytes()
-            if before == content or (place == self.path / _ROOT and _undated(before) == _undated(content)):
-                return
-        place.parent.mkdir(parents=True, exist_ok=True)
-        write_whole(place, content)
-
-    def _chunks(self, number: int) -> Iterator[tuple[str, Path]]:
-        """Yield names and paths of the chunk files of one tile. A chunk of only missing values has no file."""
-        for form in self._chunk_names:
-            name = form.format(*divmod(number, self.tiling.shape[1]))
-            yield name, self.path / name
-
-    def _digest(self, number: int) -> bytes:
-        digest = hashlib.sha256()
-        for name, place in self._chunks(number):
-            content = place.read_bytes() if place.exists() else b""
-            # with its length, so that bytes cannot move between chunks undetected
-            digest.update(f"{name} {len(content)} ".encode() + content)
-        return digest.digest()
-
-    def _entry(self, number: int) -> Path:
-        row, column = divmod(number, self.tiling.shape[1])
-        return self.path / LEDGER / "c" / str(row) / str(column) / "0"
-
-    def _is_kept(self, number: int) -> bool:
-        """Check whether a tile exists unchanged. Remove all other files of it before Zarr decodes them."""
-        entry = self._entry(number)
-        entered = entry.exists()
-        if entered and entry.read_bytes() == self._digest(number):
-            return True
-        self.damaged += entered
-        for place in (entry, *(place for _, place in self._chunks(number))):
-            place.unlink(missing_ok=True)
-        return False
-
-    def paths(self) -> Any:
-        """Paths of each tile (tile rows, tile columns)."""
-        return np.asarray(self._group[_PATHS][:])
-
-    def write(self, number: int, maps: Mapping[str, MapResult], paths: int) -> None:
-        """Write one tile. Raise :class:`~aerpaw_cmp.common.errors.OutputError` if the disk cannot be written.
-
-        Parameters
-        ----------
-        number : int
-        maps : mapping of str to MapResult
-            The tile's maps, by foliage mode.
-        paths : int
-            Number of paths in the tile.
-        """
-        rows, columns = self.tiling.part(number)
-        with explained_os_errors(self.path):
-            for name, variable in maps_dataset(maps, self._frame, self._about).variables.items():
-                if {"y", "x"} <= {*variable.dims}:
-                    self._group[name][..., rows, columns] = variable.values
-            self._group[_PATHS][divmod(number, self.tiling.shape[1])] = paths
-            entry = self._entry(number)
-            entry.parent.mkdir(parents=True, exist_ok=True)
-            # last: a tile is there when its entry is, and a run killed before computes it again
-            write_whole(entry, self._digest(number))
-
-    def read(self, empty: Mapping[str, MapResult], step: int) -> dict[str, MapResult]:
-        """Return maps of every ``step``-th position in both directions, by foliage mode.
-
-        ``empty`` is as for :meth:`begin`.
-        """
-        full = self.tiling.grid
-        grid = Grid(full.east_m[::step], full.north_m[::step], full.spacing_m * step)
-        maps = {}
-        for number, (mode, like) in enumerate(empty.items()):
-            values = {}
-            for field, name in _NAMES.items():
-                plane = np.asarray(self._group[name][number, ..., ::step, ::step])
-                leading = range(plane.ndim - 2)[::-1]
-                kind = np.int8 if field == "rank" else np.float64
-                values[field] = plane.transpose(*leading, -2, -1).reshape(*plane.shape[-3::-1], -1).astype(kind)
-            maps[mode] = over_grid(like, grid, values)
-        return maps
-
-
-def _undated(metadata: bytes) -> Any:
-    """Return the metadata of a store without its creation time. None if they are not valid metadata."""
-    try:
-        content = json.loads(metadata)
-        content["attributes"].pop("history", None)
-    except (ValueError, LookupError, TypeError, AttributeError, RecursionError):
+    def _content(self, number: int) -> bytes | None:
+        """Return paths and planes of one tile as bytes; None if there is no intact file."""
+        values = sum(getattr(like, name)[..., 0].size for like in self._empty.values() for name in PLANES)
+        size = 40 + 4 * values * len(self.tiling.grid_of(number))
+        with suppress(FileNotFoundError, NotADirectoryError, InputError):
+            content = read_bounded(self._file(number), size)
+            if len(content) == size and hashlib.sha256(content[32:]).digest() == content[:32]:
+                return content[32:]
         return None
-    return content

@@ -252,8 +252,6 @@ def map_(
     for path in outcome.files:
         if path.parent == outcome.folder:
             show(path)
-    if outcome.metrics["tiles"]:
-        show(outcome.metrics["tiles"]["store"])
 
 
 def _print_coverage(rows: list[dict[str, Any]], settings: Any) -> None:
